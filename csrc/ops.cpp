@@ -10,43 +10,44 @@
 namespace globalsplat {
 namespace {
 
-thread_local rust::Vec<rust::String> noted;
+thread_local rust::Vec<rust::String> op_names;
 thread_local at::CallbackHandle callback = at::INVALID_CALLBACK_HANDLE;
 thread_local bool only_outermost = false;
-thread_local int within = 0;  // number of ops that have begun and not ended
+thread_local int depth = 0;  // number of nested ops that are running
 
-// Returns true for a step of autograd's engine, which calls ops but is no op itself.
-bool is_of_engine(const at::RecordFunction& function) {
+// Returns true if `function` is a node of autograd's graph. Nodes call ops but aren't ops. Ops of this library have no operator name,
+// either, but names with the prefix globalsplat::.
+bool is_autograd_node(const at::RecordFunction& function) {
   return !function.operator_name() && std::strncmp(function.name(), "globalsplat::", 13) != 0;
 }
 
-std::unique_ptr<at::ObserverContext> note(const at::RecordFunction& function) {
-  if (only_outermost && (is_of_engine(function) || within++ > 0)) return nullptr;
+std::unique_ptr<at::ObserverContext> on_op_begin(const at::RecordFunction& function) {
+  if (only_outermost && (is_autograd_node(function) || depth++ > 0)) return nullptr;
   const auto op = function.operator_name();
   std::string name = op ? c10::toString(*op) : std::string(function.name());
-  // `to(device)` calls the overload with all options and sets the device alone.
+  // `to(device)` calls the overload `dtype_layout` without a dtype.
   if (name == "aten::to.dtype_layout" && function.inputs()[1].isNone()) name = "aten::to.device";
-  noted.push_back(name);
+  op_names.push_back(name);
   return nullptr;
 }
 
-void leave(const at::RecordFunction& function, at::ObserverContext*) {
-  if (only_outermost && !is_of_engine(function)) --within;
+void on_op_end(const at::RecordFunction& function, at::ObserverContext*) {
+  if (only_outermost && !is_autograd_node(function)) --depth;
 }
 
 }  // namespace
 
 void start_recording_ops(bool outermost) {
-  noted.clear();
+  op_names.clear();
   only_outermost = outermost;
-  within = 0;
-  const auto noting = at::RecordFunctionCallback(note, leave).needsInputs(true).scopes({at::RecordScope::FUNCTION});
-  callback = at::addThreadLocalCallback(noting);
+  depth = 0;
+  const auto recorder = at::RecordFunctionCallback(on_op_begin, on_op_end).needsInputs(true).scopes({at::RecordScope::FUNCTION});
+  callback = at::addThreadLocalCallback(recorder);
 }
 
 rust::Vec<rust::String> stop_recording_ops() {
   at::removeCallback(callback);
-  return std::exchange(noted, {});
+  return std::exchange(op_names, {});
 }
 
 }  // namespace globalsplat

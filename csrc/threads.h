@@ -1,12 +1,12 @@
-// Number of threads of our own kernels.
+// Number of threads that the kernels of this library use.
 #pragma once
 
 namespace globalsplat {
 
-// Returns the number of threads: libtorch's, unless set_threads() has set another one.
+// Returns the number that set_threads() has set, by default libtorch's number of threads.
 int threads();
 
-// Sets the number of threads; 0 selects libtorch's.
+// Sets the number of threads; 0 restores the default.
 void set_threads(int count);
 
 }  // namespace globalsplat

@@ -17,7 +17,8 @@ fn main() -> Result<()> {
     let model = load_model(Path::new(weights), Device::Cpu)?;
     let capture = open_capture(Path::new(scene))?;
     let data = &model.config.data;
-    // As many photos as the model saw in training, spread along the camera path, cropped and resized to the model's image size.
+    // The views are as many photos as the model saw in training, spread along the camera path, cropped and resized to the model's image
+    // size.
     let views = load_context(&capture, Holdout::None, Some(data.context_views), data.image_size)?;
 
     let reconstruction = reconstruct(&model, &views, &[])?;

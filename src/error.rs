@@ -20,7 +20,7 @@ pub enum Error {
         "distributed communication failed ({message}); restart the processes to resume from the last checkpoint"
     )]
     Distributed {
-        /// What was being exchanged, and why it failed.
+        /// Description of the exchange and of the reason for its failure.
         message: String,
     },
     /// Error of libtorch.

@@ -1,5 +1,5 @@
-// Gaussians and cameras drawn with a fixed seed: the kinds of parity/harness/scenes.py, values without a defined result, and scenes large
-// enough to split every stage's work.
+// Gaussians and cameras drawn with fixed seeds: scenes like those of parity/harness/scenes.py, scenes with special values such as NaN, and
+// scenes that are large enough to split the work of every stage.
 #pragma once
 
 #include <algorithm>
@@ -13,7 +13,7 @@
 
 namespace globalsplat::checks {
 
-// Arrays of Gaussians. Each is a separate vector, so that out-of-bounds reads are detected.
+// Arrays of Gaussians. Each is a separate vector, so that AddressSanitizer detects out-of-bounds reads.
 template <class T>
 struct Arrays {
   std::vector<T> means, scales, quaternions, opacities, sh;
@@ -22,8 +22,8 @@ struct Arrays {
 template <class T>
 struct Scene {
   std::string name;
-  int width, height, bases;
-  std::vector<Arrays<T>> gaussians;  // one item per scene
+  int width, height, bases;            // bases: spherical harmonics per channel
+  std::vector<Arrays<T>> gaussians;    // one item per scene of the batch
   std::vector<raster::View<T>> views;
 };
 
@@ -47,8 +47,8 @@ class Random {
   std::mt19937_64 bits_;
 };
 
-// Returns a camera with the rotation of the quaternion (1, x, y, z).
-inline raster::Camera<double> turned(double x, double y, double z) {
+// Returns a camera at the origin with the rotation of the quaternion (1, x, y, z), not normalized.
+inline raster::Camera<double> rotated_camera(double x, double y, double z) {
   const double s = 2 / (1 + x * x + y * y + z * z);
   return {{1 - s * (y * y + z * z), s * (x * y - z), s * (x * z + y),      //
            s * (x * y + z), 1 - s * (x * x + z * z), s * (y * z - x),      //
@@ -56,7 +56,8 @@ inline raster::Camera<double> turned(double x, double y, double z) {
           {0, 0, 0}, 1, 1, 0, 0};
 }
 
-// Creates a scene whose splats range from less than a pixel to a third of the image, some of them outside of it, at all opacities.
+// Creates a scene whose splats have sizes from less than a pixel to a third of the image, and opacities from 0 to 1. Some are outside of
+// the image.
 inline Scene<double> scattered(Random& random, std::string name, int width, int height, int batch, int cameras, size_t count,
                                int bases) {
   Scene<double> scene{name, width, height, bases, {}, {}};
@@ -75,7 +76,7 @@ inline Scene<double> scattered(Random& random, std::string name, int width, int 
     g.sh = random.normal(size_t(bases) * 3 * count, 0.3);
     scene.gaussians.push_back(g);
     for (int c = 0; c < cameras; ++c) {
-      raster::Camera<double> camera = turned(0.04 * random.normal(), 0.04 * random.normal(), 0.04 * random.normal());
+      raster::Camera<double> camera = rotated_camera(0.04 * random.normal(), 0.04 * random.normal(), 0.04 * random.normal());
       for (double& t : camera.translation) t = 0.2 * random.normal();
       camera.fx = side * random.uniform(0.8, 1.2);
       camera.fy = side * random.uniform(0.8, 1.2);
@@ -87,10 +88,11 @@ inline Scene<double> scattered(Random& random, std::string name, int width, int 
   return scene;
 }
 
-// Creates a scene in front of a camera without rotation, and optionally a second one beside it.
-inline Scene<double> before(Random& random, std::string name, int bases, std::vector<double> means,
-                            std::vector<double> scales, std::vector<double> opacities, int cameras = 1, int width = 48,
-                            int height = 33) {
+// Creates a scene of the given Gaussians, with random rotations and colours. The first camera is at the origin, without rotation; others
+// are translated.
+inline Scene<double> scene_of(Random& random, std::string name, int bases, std::vector<double> means,
+                              std::vector<double> scales, std::vector<double> opacities, int cameras = 1, int width = 48,
+                              int height = 33) {
   const size_t count = opacities.size();
   Scene<double> scene{name, width, height, bases, {}, {}};
   scene.gaussians.push_back({means, scales, random.normal(4 * count, 1), opacities,
@@ -100,21 +102,22 @@ inline Scene<double> before(Random& random, std::string name, int bases, std::ve
   return scene;
 }
 
-// Returns means at the given depths, within the view of `before` and a little beyond.
-inline std::vector<double> around(Random& random, const std::vector<double>& depths, double spread = 0.6) {
+// Returns means at the given depths, within the view of the first camera of scene_of(), or within a part of it if `spread` is smaller.
+inline std::vector<double> means_at(Random& random, const std::vector<double>& depths, double spread = 0.6) {
   std::vector<double> means;
   for (const double depth : depths)
     means.insert(means.end(), {spread * random.uniform(-1, 1) * depth, spread * random.uniform(-1, 1) * depth, depth});
   return means;
 }
 
-// Repeats `values` cyclically, `count` values in all.
+// Returns `count` values that repeat `values` cyclically.
 inline std::vector<double> repeated(const std::vector<double>& values, size_t count) {
   std::vector<double> out(count);
   for (size_t i = 0; i < count; ++i) out[i] = values[i % values.size()];
   return out;
 }
 
+// Returns all scenes but crowd().
 inline std::vector<Scene<double>> all_scenes(int bases) {
   Random random(7);
   std::vector<Scene<double>> scenes;
@@ -123,7 +126,7 @@ inline std::vector<Scene<double>> all_scenes(int bases) {
   };
   const auto add = [&](const char* name, std::vector<double> means, std::vector<double> scales,
                        std::vector<double> opacities, int cameras = 1, int width = 48, int height = 33) {
-    scenes.push_back(before(random, name, bases, means, scales, opacities, cameras, width, height));
+    scenes.push_back(scene_of(random, name, bases, means, scales, opacities, cameras, width, height));
   };
   const auto depths = [&](size_t count) { return random.uniform(count, 1, 3); };
 
@@ -143,7 +146,7 @@ inline std::vector<Scene<double>> all_scenes(int bases) {
   near = repeated(near, 30);
   std::vector<double> scales = random.uniform(90, 0.05, 0.4);
   for (size_t i = 0; i < 90; ++i) scales[i] *= std::max(std::abs(near[i / 3]), 1e-3);
-  add("near plane", around(random, near), scales, repeated({0.4}, 30));
+  add("near plane", means_at(random, near), scales, repeated({0.4}, 30));
 
   std::vector<double> means;
   scales.clear();
@@ -154,16 +157,16 @@ inline std::vector<Scene<double>> all_scenes(int bases) {
       for (int k = 0; k < 3; ++k) scales.push_back(far * depth * random.uniform(0.1, 1));
     }
   add("far outside", means, scales, repeated({0.5}, 24), 2);
-  add("needles and discs", around(random, depths(24)),
+  add("needles and discs", means_at(random, depths(24)),
       repeated({1e-7, 1e-7, 1, 1, 1e-7, 1, 1e-3, 1e-4, 0.5, 1e-12, 1e-12, 1e-12}, 72), repeated({0.5}, 24));
   scales = random.uniform(24, 0.5, 1.5);
   for (double& scale : scales) scale *= std::pow(10, random.uniform(1, 3));
-  add("huge", around(random, depths(8)), scales, repeated({0.3}, 8));
-  // More pairs than the initial allocation holds.
-  add("huge in many tiles", around(random, depths(150)), random.uniform(450, 5, 50), random.uniform(150, 0, 0.05), 1, 128, 96);
-  add("opacities", around(random, depths(24)), random.uniform(72, 0.02, 0.3),
+  add("huge", means_at(random, depths(8)), scales, repeated({0.3}, 8));
+  // There are more pairs than the initial allocation holds.
+  add("huge in many tiles", means_at(random, depths(150)), random.uniform(450, 5, 50), random.uniform(150, 0, 0.05), 1, 128, 96);
+  add("opacities", means_at(random, depths(24)), random.uniform(72, 0.02, 0.3),
       repeated({0, 1e-12, 0.0039, 0.0040, 0.5, 1}, 24));  // 1/255 is 0.00392
-  means = around(random, repeated({2}, 30));
+  means = means_at(random, repeated({2}, 30));
   std::copy_n(means.begin(), 30, means.begin() + 60);
   add("equal depths", means, random.uniform(90, 0.05, 0.4), random.uniform(30, 0.1, 0.9), 2);
   means.clear();
@@ -175,39 +178,39 @@ inline std::vector<Scene<double>> all_scenes(int bases) {
   add("tile borders", means, scales, random.uniform(20, 0.1, 0.9));
   std::vector<double> stack(60);
   for (size_t i = 0; i < 60; ++i) stack[i] = 1 + 3 * double(i) / 59;
-  add("opaque stack", around(random, stack, 0.2), repeated({1}, 180), random.uniform(60, 0.3, 1));
-  add("all behind", around(random, repeated({-2}, 5)), repeated({0.3}, 15), repeated({0.9}, 5));
+  add("opaque stack", means_at(random, stack, 0.2), repeated({1}, 180), random.uniform(60, 0.3, 1));
+  add("all behind", means_at(random, repeated({-2}, 5)), repeated({0.3}, 15), repeated({0.9}, 5));
   add("no Gaussian", {}, {}, {});
 
   add_scattered("quaternions of any length", 48, 33, 1, 2, 45);
   std::vector<double>& quaternions = scenes.back().gaussians[0].quaternions;
   for (size_t k = 0; k < quaternions.size(); ++k) quaternions[k] *= std::exp2(25. * double(k / 4 % 9) - 100);
 
-  // Every special value in every position, each in its own Gaussian.
+  // For each special value, 15 Gaussians that have it in one component each.
   const double infinity = std::numeric_limits<double>::infinity();
-  const std::vector<double> strange = {std::nan(""), infinity, -infinity, 0,     -1,   1e-45,
+  const std::vector<double> special = {std::nan(""), infinity, -infinity, 0,     -1,   1e-45,
                                        1e-30,        1e30,     3e38,      -3e38, 1e18, 1e5};
-  add_scattered("strange numbers", 48, 33, 1, 2, 15 * strange.size() + 4);
+  add_scattered("special values", 48, 33, 1, 2, 15 * special.size() + 4);
   Arrays<double>& g = scenes.back().gaussians[0];
-  for (size_t n = 0; n < strange.size(); ++n) {
+  for (size_t n = 0; n < special.size(); ++n) {
     size_t i = 15 * n;
-    for (size_t k = 0; k < 3; ++k) g.means[3 * i++ + k] = strange[n];
-    for (size_t k = 0; k < 3; ++k) g.scales[3 * i++ + k] = strange[n];
-    for (size_t k = 0; k < 4; ++k) g.quaternions[4 * i++ + k] = strange[n];
-    for (size_t k = 0; k < 4; ++k) g.sh[size_t(bases) * 3 * i++ + k % size_t(3 * bases)] = strange[n];
-    g.opacities[i] = strange[n];
+    for (size_t k = 0; k < 3; ++k) g.means[3 * i++ + k] = special[n];
+    for (size_t k = 0; k < 3; ++k) g.scales[3 * i++ + k] = special[n];
+    for (size_t k = 0; k < 4; ++k) g.quaternions[4 * i++ + k] = special[n];
+    for (size_t k = 0; k < 4; ++k) g.sh[size_t(bases) * 3 * i++ + k % size_t(3 * bases)] = special[n];
+    g.opacities[i] = special[n];
   }
-  for (size_t k = 0; k < 4; ++k) g.quaternions[60 * strange.size() + k] = 0;  // no rotation
+  for (size_t k = 0; k < 4; ++k) g.quaternions[60 * special.size() + k] = 0;  // a quaternion of length 0
 
-  // Cameras with the same special values.
-  add_scattered("strange cameras", 17, 9, 1, int(4 * strange.size()), 6);
-  for (size_t n = 0; n < 4 * strange.size(); ++n) {
+  // Cameras with each special value in four of their parameters.
+  add_scattered("special values of cameras", 17, 9, 1, int(4 * special.size()), 6);
+  for (size_t n = 0; n < 4 * special.size(); ++n) {
     raster::Camera<double>& camera = scenes.back().views[n].camera;
     double* const places[] = {&camera.fx, &camera.cy, &camera.rotation[4], &camera.translation[2]};
-    *places[n % 4] = strange[n / 4];
+    *places[n % 4] = special[n / 4];
   }
 
-  // More pairs in a tile than a GPU sorts at once.
+  // A tile has more pairs than a GPU sorts in shared memory.
   add_scattered("a long list", 8, 8, 1, 1, 10000);
   return scenes;
 }
@@ -218,6 +221,7 @@ inline Scene<double> crowd(int bases) {
   return scattered(random, "crowd", 20, 20, 1, 1, 66000, bases);
 }
 
+// Converts a scene to numbers of type T.
 template <class T>
 Scene<T> as(const Scene<double>& scene) {
   const auto numbers = [](const std::vector<double>& from) { return std::vector<T>(from.begin(), from.end()); };

@@ -8,9 +8,9 @@
 
 namespace globalsplat::checks {
 
-// Renders `scene` with the kernels, forward and backward, with blocks and threads in the orders of these seeds, and with the CPU backend.
-// Returns a description of the first difference; empty if images have the CPU's bits, gradients are close to the CPU's, and no order
-// changes a bit.
+// Renders `scene`, forward and backward, with the CPU backend and with the kernels, once per seed; a seed determines the order of blocks
+// and threads. Images must have the CPU's bits, gradients must be close to the CPU's, and all orders must give the same bits. Returns a
+// description of the first difference, empty if there is none.
 std::string schedules_differ(const Scene<float>& scene, const std::vector<uint64_t>& seeds);
 
 // Tests the prefix sums that sorting needs, with more counts than one block processes. Returns a description of the difference; empty if

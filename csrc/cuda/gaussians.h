@@ -65,8 +65,8 @@ __global__ void __launch_bounds__(kGaussianThreads)
 }
 
 // Computes the gradients of Gaussians, with one row of blocks per scene. The records of Gaussian i in a view are first[view·N + i] …
-// first[view·N + i + 1] − 1. If `camera_gradients` isn't null, it receives the gradients of the views' cameras from the Gaussians of every warp:
-// [views, warps of a view].
+// first[view·N + i + 1] − 1. If `camera_gradients` isn't null, it receives the gradients of the views' cameras from the Gaussians of every
+// warp: [views, warps of a view].
 //
 // With several cameras, the warps of a block process the same Gaussians and divide the cameras among themselves; their sums are added in
 // the warps' order. Spherical harmonics, three quarters of all values, go through shared memory, which makes their global memory accesses

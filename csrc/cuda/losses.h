@@ -1,5 +1,5 @@
-// Losses that compare images with photos, and their gradients: the kernels of ../kernels/ssim.h and smooth.h for GPUs. Results have the same
-// bits as on the CPU except for sums over blocks. Each block writes one weighted partial sum to `parts`.
+// Losses that compare images with photos, and their gradients: the kernels of ../kernels/ssim.h and smooth.h for GPUs. Results have the
+// same bits as on the CPU except for sums over blocks. Each block writes one weighted partial sum to `parts`.
 #pragma once
 
 #include "call.h"
@@ -73,8 +73,8 @@ __global__ void __launch_bounds__(kFitThreads) gs_ssim(FitPlanes of, double each
   if (threadIdx.x == 0) parts[blockIdx.x] = each * total;
 }
 
-// Computes Σ |x − y| of a tile of pixels times `l1_weight`, and its gradient plus `ssim_weight` times that of Σ SSIM, from all windows' slopes
-// if they aren't null. `gradient`, [planes, H, W], may be null.
+// Computes Σ |x − y| of a tile of pixels times `l1_weight`, and its gradient plus `ssim_weight` times that of Σ SSIM, from all windows'
+// slopes if they aren't null. `gradient`, [planes, H, W], may be null.
 __global__ void __launch_bounds__(kFitThreads)
     gs_fit_gradient(FitPlanes of, const float* slopes, double l1_weight, float ssim_weight, float* gradient, double* parts) {
   const int columns = of.width - raster::kWindow + 1, last = of.height - raster::kWindow;

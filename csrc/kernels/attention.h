@@ -86,7 +86,7 @@ inline void attend(const AttentionHead<float>& head, Rows<float> out, float* log
   }
 }
 
-// Packs some of a head's queries, and the results of the forward pass for them, for attend_backward().
+// Packs some of a head's queries for attend_backward(), with the output of the forward pass and its gradient.
 inline void pack_queries(const AttentionHead<float>& head, const AttentionPast<float>& past, const PackedQueries& to) {
   const int width = head.width, columns = attention_columns(width);
   const float scale = float(kLog2E / __builtin_sqrt(double(width)));
@@ -100,8 +100,9 @@ inline void pack_queries(const AttentionHead<float>& head, const AttentionPast<f
   }
 }
 
-// Backward pass for the keys and values in `head`, which may be a part of those that softmax is over. Computes their gradients, and their
-// contribution to the gradient of q · √w, [whole_product_rows(queries), attention_columns(width)].
+// Computes the backward pass for the keys and values in `head`, which may be only some of those of the forward pass. Writes their gradients
+// to `dk` and `dv`. Writes their contribution to the gradient of q, times √w, to `dq`, [whole_product_rows(queries),
+// attention_columns(width)].
 inline void attend_backward(const AttentionHead<float>& head, const PackedQueries& of, const float* log_sums, float* dq, Rows<float> dk,
                             Rows<float> dv, float* memory) {
   using V = Vector<float>;

@@ -1,32 +1,34 @@
-// Attention of one head as in attention.h, forward and backward, for bfloat16 inputs. Products are provided by the caller, who has
-// instructions for them. Scores, their maxima and all sums are float32. The weights p and the gradients ds of the scores are rounded to
-// bfloat16 before they are multiplied, as in libtorch.
+// Attention of one head for bfloat16 inputs, forward and backward; attention.h has the equations. The caller provides the matrix products,
+// so that they can use instructions outside of this file's instruction set. Scores, their maxima and all sums are float32. As in libtorch,
+// the weights p and the gradients ds of the scores are rounded to bfloat16 before they are multiplied.
 #pragma once
 
 #include "attention.h"
 
 namespace globalsplat::raster::GS_ISA {
 
-// Rounds to the nearest bfloat16 value, ties to even. The result is in the upper half; the lower half is undefined.
+// Rounds to the nearest bfloat16 values, ties to even. They are in the upper halves of the result; the lower halves are unspecified.
 GS_INLINE Bits rounded(Vector<float> v) {
   const Bits bits = (Bits)v;
   return bits + 0x7fff + ((bits >> 16) & 1);
 }
 
+// Stores the upper halves.
 GS_INLINE void store_bf16(Bf16* to, Bits rounded) {
   typedef Bf16 Halves __attribute__((vector_size(kVectorBytes / 2)));
   const Halves halves = __builtin_convertvector(rounded >> 16, Halves);
   __builtin_memcpy(to, &halves, sizeof halves);
 }
 
-// Interleaves two rows.
+// Stores the upper halves of two rows, interleaved.
 GS_INLINE void store_pair(Bf16* to, Bits even, Bits odd) {
   const Bits both = (even >> 16) | (odd & 0xffff0000);
   __builtin_memcpy(to, &both, sizeof both);
 }
 
-// Transposes `count` rows of `width` elements into panels of kBf16Columns columns, one per row: the layout of a product's second matrix,
-// with pairs of a row's elements adjacent. `width` is a multiple of 8 and the rows' stride even. The last panel is padded with zeros.
+// Transposes `count` rows of `width` elements into the layout of a product's second matrix: panels [width / 2, kBf16Columns, 2], in which
+// each row is a column and pairs of its elements are adjacent. `width` is a multiple of 8, and the stride of the rows is even. The last
+// panel is padded with zeros.
 GS_INLINE void pack_transposed(Rows<const Bf16> from, int64_t count, int width, Bf16* out) {
   for (int64_t first = 0; first < count; first += kBf16Columns, out += int64_t(width) * kBf16Columns)
     for (int64_t j = 0; j < kBf16Columns; j += 4) {
@@ -48,13 +50,14 @@ GS_INLINE void pack_transposed(Rows<const Bf16> from, int64_t count, int width, 
     }
 }
 
-// Transposes `count` rows of `width` elements, a multiple of 8: element (row, c) goes to out[c · stride + row]. Rows are padded with zeros
-// up to `whole`, a multiple of 8.
+// Transposes `count` rows of `width` elements: element (row, c) goes to out[c · stride + row]. Pads with zero rows up to `whole`. `width`
+// and `whole` are multiples of 8.
 GS_INLINE void pack_columns(Rows<const Bf16> from, int64_t count, int width, int64_t whole, int64_t stride, Bf16* out) {
   const Bf16 zeros[kAttentionWidth] = {};
   for (int64_t j = 0; j < whole; j += 8)
     for (int c = 0; c < width; c += 8) {
-      Bf16 pairs[4][16];  // of rows, which a transposition of 32-bit words makes contiguous
+      // Four pairs of rows, interleaved. Transposing them as 32-bit words makes eight elements of a column contiguous.
+      Bf16 pairs[4][16];
       for (int n = 0; n < 4; ++n) {
         const auto row = [&](int64_t j) { return (j < count ? from.data + j * from.stride : zeros) + c; };
         const Bf16 *const even = row(j + 2 * n), *const odd = row(j + 2 * n + 1);
@@ -67,7 +70,8 @@ GS_INLINE void pack_columns(Rows<const Bf16> from, int64_t count, int width, int
     }
 }
 
-// Copies `count` rows of `width` elements to kBf16Columns rows of `columns` elements, with pairs of rows interleaved, and pads with zeros.
+// Copies `count` rows of `width` elements to kBf16Columns rows of `columns` elements, with pairs of rows interleaved. Pads with zeros and
+// drops elements beyond `columns`.
 GS_INLINE void pack_pairs(Rows<const Bf16> from, int64_t count, int width, int columns, Bf16* out) {
   const Bf16 zeros[kBf16Columns] = {};
   const int present = width < columns ? width : columns;
@@ -82,8 +86,8 @@ GS_INLINE void pack_pairs(Rows<const Bf16> from, int64_t count, int width, int c
   }
 }
 
-// Forward pass of a head. Scores are transposed, with those of a key contiguous, here and in the backward pass: they are processed by
-// queries, and products take them in this layout, outᵀ = vᵀ pᵀ.
+// Computes the forward pass of a head. Scores are stored transposed, k qᵀ, here and in the backward pass. So a vector holds the scores of
+// adjacent queries, and pᵀ is ready to be the second matrix of the product outᵀ = vᵀ pᵀ.
 inline void attend_bf16(const AttentionHead<Bf16>& head, const Bf16Products& products, Rows<Bf16> out, float* log_sums,
                         float* memory) {
   using V = Vector<float>;
@@ -95,15 +99,15 @@ inline void attend_bf16(const AttentionHead<Bf16>& head, const Bf16Products& pro
 
   ScratchArena scratch(memory);
   const auto take_bf16 = [&](int64_t count) { return reinterpret_cast<Bf16*>(scratch.take(count / 2)); };
-  float* const sums = scratch.take(queries * width);  // of values, in panels of queries, [width, kBf16Columns]
+  float* const sums = scratch.take(queries * width);  // outᵀ before division by l, in panels of queries, [width, kBf16Columns]
   float* const weights = scratch.take(queries);       // l
-  float* const most = scratch.take(queries);          // m without the factor
+  float* const maxima = scratch.take(queries);        // m without the factor log₂e / √w
   float* const scores = scratch.take(kBf16Keys * kBf16Columns);
   Bf16* const p = take_bf16(kBf16Keys * kBf16Columns);
   Bf16* const v = take_bf16(kBf16Keys * width);
   Bf16* const q = take_bf16(queries * width);
   pack_transposed(head.q, head.queries, width, q);
-  for (int64_t i = 0; i < queries; ++i) most[i] = -__builtin_inff(), weights[i] = 0;
+  for (int64_t i = 0; i < queries; ++i) maxima[i] = -__builtin_inff(), weights[i] = 0;
 
   for (int64_t first = 0; first < head.keys; first += kBf16Keys) {
     const int64_t count = head.keys - first < kBf16Keys ? head.keys - first : kBf16Keys;
@@ -113,12 +117,12 @@ inline void attend_bf16(const AttentionHead<Bf16>& head, const Bf16Products& pro
     for (int64_t panel = 0; panel < queries; panel += kBf16Columns) {
       float* const values = sums + panel * width;
       products.multiply(count, kBf16Columns, width, k.stride, kBf16Columns, kBf16Columns, false, k.data, q + panel * width, scores);
-      V now[vectors], shift[vectors], sum[vectors];
-      for (int n = 0; n < vectors; ++n) now[n] = load<float>(most + panel + n * lanes);
+      V new_max[vectors], shift[vectors], sum[vectors];
+      for (int n = 0; n < vectors; ++n) new_max[n] = load<float>(maxima + panel + n * lanes);
       for (int64_t j = 0; j < count; ++j)
 #pragma GCC unroll 8
-        for (int n = 0; n < vectors; ++n) now[n] = larger(load<float>(scores + j * kBf16Columns + n * lanes), now[n]);
-      for (int n = 0; n < vectors; ++n) shift[n] = -now[n] * factor, sum[n] = V{};
+        for (int n = 0; n < vectors; ++n) new_max[n] = larger(load<float>(scores + j * kBf16Columns + n * lanes), new_max[n]);
+      for (int n = 0; n < vectors; ++n) shift[n] = -new_max[n] * factor, sum[n] = V{};
       for (int64_t j = 0; j < whole; j += 2)
 #pragma GCC unroll 8
         for (int n = 0; n < vectors; ++n) {
@@ -132,12 +136,12 @@ inline void attend_bf16(const AttentionHead<Bf16>& head, const Bf16Products& pro
           store_pair(p + j * kBf16Columns + 2 * n * lanes, even, round(j + 1));
         }
       for (int n = 0; n < vectors; ++n) {
-        float *const before = most + panel + n * lanes, *const weight = weights + panel + n * lanes;
-        const V smaller = power_of_two((load<float>(before) - now[n]) * factor);
-        store<float>(before, now[n]);
-        store<float>(weight, add_product(load<float>(weight), smaller, sum[n]));
+        float *const maximum = maxima + panel + n * lanes, *const weight = weights + panel + n * lanes;
+        const V rescale = power_of_two((load<float>(maximum) - new_max[n]) * factor);
+        store<float>(maximum, new_max[n]);
+        store<float>(weight, add_product(load<float>(weight), rescale, sum[n]));
         for (int64_t at = n * lanes; first > 0 && at < width * kBf16Columns; at += kBf16Columns)
-          store<float>(values + at, load<float>(values + at) * smaller);
+          store<float>(values + at, load<float>(values + at) * rescale);
       }
       products.multiply(width, kBf16Columns, whole, kBf16Keys, kBf16Columns, kBf16Columns, first > 0, v, p, values);
     }
@@ -145,13 +149,13 @@ inline void attend_bf16(const AttentionHead<Bf16>& head, const Bf16Products& pro
   products.done();
   for (int64_t i = 0; i < head.queries; ++i) {
     const float* const values = sums + i / kBf16Columns * kBf16Columns * width + i % kBf16Columns;
-    log_sums[i] = most[i] * scale + float(__builtin_log2(double(weights[i])));
+    log_sums[i] = maxima[i] * scale + float(__builtin_log2(double(weights[i])));
     for (int c = 0; c < width; ++c) out.data[i * out.stride + c] = to_bf16(values[c * kBf16Columns] / weights[i]);
   }
 }
 
-// Packs one panel of a head's queries, which begins at query `first`, and the results of the forward pass for them, for
-// attend_backward_bf16(). `whole` is the number of queries with the last panel padded by zeros.
+// Packs one panel of a head's queries for attend_backward_bf16(), with the output of the forward pass and its gradient. The panel begins at
+// query `first`. `whole` is the number of queries rounded up to whole panels.
 inline void pack_queries_bf16(const AttentionHead<Bf16>& head, const AttentionPast<Bf16>& past, const float* log_sums, int64_t first,
                               int64_t whole, const PackedBf16Queries& to) {
   const int width = head.width, columns = attention_columns(width);
@@ -175,9 +179,10 @@ inline void pack_queries_bf16(const AttentionHead<Bf16>& head, const AttentionPa
   }
 }
 
-// Backward pass for the keys and values in `head`, which may be a part of those that softmax is over. Computes their gradients, and their
-// contribution to the gradient of q · √w in panels of kBf16Columns queries, [width, kBf16Columns]: dv = pᵀ g, dk = dsᵀ q, dqᵀ = kᵀ dsᵀ.
-inline void attend_backward_bf16(const AttentionHead<Bf16>& head, const Bf16Products& products, const PackedBf16Queries& of, float* dq,
+// Computes the backward pass for the keys and values in `head`, which may be only some of those of the forward pass. Writes their gradients
+// to `dk` and `dv`. Writes their contribution to the gradient of q, times √w, to `dq`, in panels of kBf16Columns queries, [width,
+// kBf16Columns]: dqᵀ = kᵀ dsᵀ.
+inline void attend_backward_bf16(const AttentionHead<Bf16>& head, const Bf16Products& products, const PackedBf16Queries& packed, float* dq,
                                  Rows<Bf16> dk, Rows<Bf16> dv, float* memory) {
   using V = Vector<float>;
   constexpr int lanes = Simd<float>::lanes;
@@ -211,12 +216,12 @@ inline void attend_backward_bf16(const AttentionHead<Bf16>& head, const Bf16Prod
           products.multiply(count, kBf16Columns, width, keys.stride, kBf16Columns, kBf16Columns, false, keys.data,
                             queries + query * width, to);
         };
-        multiply(k, of.q_columns, scores);
-        multiply(v, of.grad_out_columns, dp);
+        multiply(k, packed.q_columns, scores);
+        multiply(v, packed.grad_out_columns, dp);
         Bf16* const pairs = ds_pairs + i * kBf16BackwardKeys;
         for (int64_t j = 0; j < whole; j += 2)
           for (int64_t c = 0; c < kBf16Columns; c += lanes) {
-            const V shift = load<float>(of.log_sums + query + c), mean = load<float>(of.means + query + c);
+            const V shift = load<float>(packed.log_sums + query + c), mean = load<float>(packed.means + query + c);
             const auto round = [&](int64_t j) {
               if (j >= count) return Bits{};
               const int64_t at = j * kBf16Columns + c, to = j * kBf16BackwardQueries + i + c;
@@ -238,8 +243,8 @@ inline void attend_backward_bf16(const AttentionHead<Bf16>& head, const Bf16Prod
           products.multiply(count, panel, depth, kBf16BackwardQueries, panel, columns, tile > 0, keys, rows + c * queries + tile * panel,
                             sums + c);
         };
-        multiply(p, of.grad_out_rows, dv_sums);
-        multiply(ds, of.q_rows, dk_sums);
+        multiply(p, packed.grad_out_rows, dv_sums);
+        multiply(ds, packed.q_rows, dk_sums);
       }
     }
     for (int64_t j = 0; j < count; ++j)

@@ -17,7 +17,8 @@ struct FitJob {
   int width, height;
 };
 
-// Computes `l1_weight` · mean |x − y| + `ssim_weight` · mean SSIM. Means are over all planes and over pixels, or windows that lie inside (spec
+// Computes `l1_weight` · mean |x − y| + `ssim_weight` · mean SSIM. Means are over all planes and over pixels, or windows that lie inside
+// (spec
 // 9.4). Writes the gradient with respect to the images, [planes, H, W], if it isn't null.
 template <class T>
 double photometric(const FitJob<T>& job, double l1_weight, double ssim_weight, T* gradient, int threads);

@@ -8,14 +8,14 @@
 namespace globalsplat::raster {
 namespace {
 
-constexpr int64_t kNumbers = int64_t(1) << 14;  // values per task of Adam
+constexpr int64_t kAdamTask = int64_t(1) << 14;  // values per task of Adam
 
 }  // namespace
 
 template <class T>
 void adam(const AdamStep& step, const AdamNumbers<T>& numbers, int64_t count, int threads) {
-  parallel_for(threads, (count + kNumbers - 1) / kNumbers, [&](int64_t task) {
-    kernels().of<T>().adam(step, numbers, task * kNumbers, std::min((task + 1) * kNumbers, count));
+  parallel_for(threads, (count + kAdamTask - 1) / kAdamTask, [&](int64_t task) {
+    kernels().of<T>().adam(step, numbers, task * kAdamTask, std::min((task + 1) * kAdamTask, count));
   });
 }
 

@@ -393,8 +393,8 @@ GS_INLINE Mask<T> sum_records(const SplatRecords<T>& from, int64_t first, int co
 }
 
 // Computes all gradients of the group that begins at Gaussian `i` from the pixel sums of `views` cameras; records_of(view) returns a
-// camera's records. If `of_cameras` is set, add_camera_gradient(view, numbers) is called with the group's gradient of each camera, in CameraGradient's
-// order.
+// camera's records. If `of_cameras` is set, add_camera_gradient(view, numbers) is called with the group's gradient of each camera, in
+// CameraGradient's order.
 template <class T, class RecordsOf, class AddCameraGradient>
 GS_INLINE void project_backward_group(const Gaussians<T>& g, int64_t i, int64_t end, const Lens<T>* lenses, int64_t views,
                                       const RecordsOf& records_of, const GaussianGradients<T>& out, bool of_cameras,

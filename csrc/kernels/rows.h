@@ -1,4 +1,4 @@
-// Inputs and outputs of attention: plain memory and numbers, as in types.h.
+// Inputs, outputs and block sizes of attention. As in types.h, structs contain only pointers and numbers.
 #pragma once
 
 #include <cstdint>
@@ -6,17 +6,18 @@
 
 namespace globalsplat::raster {
 
-// Rows at a distance of `stride` elements: for a head, its own part of rows that all heads share.
+// Rows of a matrix, `stride` elements apart. The rows of a head are a slice of rows that contain all heads.
 template <class Number>
 struct Rows {
   Number* data;
   int64_t stride;
 
+  // Returns the rows from index `first`.
   Rows from(int64_t first) const { return {data + first * stride, stride}; }
 };
 
-// A bfloat16 value: the upper half of a float's bits. The conversions are inlined into their caller, whichever instruction set it is
-// compiled for.
+// Bits of a bfloat16 value, the upper half of a float's. The conversions are always inlined, so that they are compiled for the caller's
+// instruction set.
 using Bf16 = uint16_t;
 
 [[gnu::always_inline]] inline float to_float(Bf16 number) {
@@ -33,7 +34,7 @@ using Bf16 = uint16_t;
   return Bf16((bits + 0x7fff + (bits >> 16 & 1)) >> 16);
 }
 
-// Queries, keys and values of one head, all with rows of `width` elements.
+// Queries, keys and values of one head. All rows have `width` elements.
 template <class Number>
 struct AttentionHead {
   Rows<const Number> q, k, v;
@@ -41,31 +42,36 @@ struct AttentionHead {
   int width;
 };
 
-// Implementation of products of bfloat16 matrices.
+// Functions that multiply bfloat16 matrices.
 struct Bf16Products {
-  // Computes c [m, n] = a [m, k] · b [k, n], added to c if `adds`. k is even, and pairs of b's rows are interleaved, [k / 2, n, 2]. c is
-  // float32. a_row, b_row and c_row are the strides between rows in elements (for b: between pairs of rows, halved).
+  // Computes c [m, n] = a [m, k] · b [k, n] in float32, or adds the product to c if `adds`. k is even, and pairs of b's rows are
+  // interleaved: [k / 2, n, 2]. a_row, b_row and c_row are the strides between rows in elements; for b, half the stride between pairs of
+  // rows.
   void (*multiply)(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row, int64_t c_row, bool adds, const Bf16* a,
                    const Bf16* b, float* c);
-  // Called by a thread after its last product for now.
+  // Releases the calling thread's hardware state, such as AMX tiles. Each task calls it after its last product.
   void (*done)();
 };
 
-// Output of the forward pass, and its gradient.
+// Output of the forward pass, and the gradient with respect to it.
 template <class Number>
 struct AttentionPast {
   Rows<const Number> out, grad_out;
 };
 
-// Packed rows of all queries of a head, whole_product_rows() of attention_columns() with zero padding: the queries times log₂e / √w, and
-// the gradients of the output. `means` holds for every query the dot product of the output and its gradient.
+// Packed queries of a head for the backward pass: `q` has the queries times log₂e / √w, and `grad_out` the gradients of the output. Both
+// are padded with zeros to [whole_product_rows(queries), attention_columns(width)]. `means` has for every query the dot product of its
+// output and the gradient of that, which is the mean of g vᵀ weighted by p (attention.h).
 struct PackedQueries {
   float *q, *grad_out, *means;
 };
 
-// Packed bfloat16 rows of whole_bf16_columns() queries: the queries themselves (without a factor) and the gradients of the output, each in
-// both layouts in which products take their second matrix. As columns: in panels of kBf16Columns queries, [width / 2, kBf16Columns, 2]. As
-// rows: in panels of kBf16Columns elements, [queries / 2, panel, 2].
+// Packed bfloat16 queries of a head for the backward pass: the queries, unscaled, and the gradients of the output, padded with zeros to
+// whole_bf16_columns() rows. Both are stored in two layouts, one for each product in which they are the second matrix:
+// - `q_columns` and `grad_out_columns` have panels of kBf16Columns queries, [width / 2, kBf16Columns, 2].
+// - `q_rows` and `grad_out_rows` have panels of kBf16Columns elements of each row, [queries / 2, kBf16Columns, 2]. The last panel may be
+//   narrower.
+// `log_sums` is L of attention.h, and `means` is as in PackedQueries.
 struct PackedBf16Queries {
   Bf16 *q_columns, *grad_out_columns, *q_rows, *grad_out_rows;
   float *log_sums, *means;
@@ -73,26 +79,30 @@ struct PackedBf16Queries {
 
 // Number of rows of a product whose sums are in registers at a time (product.h).
 inline constexpr int64_t kProductRows = 6;
+// Rounds up to a multiple of kProductRows.
 inline constexpr int64_t whole_product_rows(int64_t rows) { return (rows + kProductRows - 1) / kProductRows * kProductRows; }
 
 // Maximum width of a head.
 inline constexpr int kAttentionWidth = 128;
 
-// Returns the number of columns of packed rows: whole vectors on every machine.
+// Returns the number of columns of packed rows: `width` rounded up to whole vectors of every instruction set.
 inline constexpr int attention_columns(int width) { return (width + 15) / 16 * 16; }
 
-// Maximum number of queries per forward task: that many share the cost of packing all keys and values.
+// Maximum number of queries per task of the forward pass. Every task packs all keys and values, a cost that its queries share.
 inline constexpr int64_t kAttentionQueries = 1032;
 
-// Block sizes of keys, and in the backward pass of queries, too, for which packed inputs and sums stay in the second-level cache.
+// Sizes of the blocks of keys and, in the backward pass, of queries. Packed inputs and sums of a block fit into the L2 cache.
 inline constexpr int64_t kForwardKeys = 256, kBackwardKeys = 384, kBackwardQueries = 48;
 
-// Block sizes for bfloat16, and the number of columns of a packed panel, which are queries or elements of a row.
-inline constexpr int64_t kBf16Keys = 256, kBf16Columns = 64;
-inline constexpr int64_t kBf16BackwardKeys = 128, kBf16BackwardQueries = 128;
+// Sizes of the blocks for bfloat16.
+inline constexpr int64_t kBf16Keys = 256, kBf16BackwardKeys = 128, kBf16BackwardQueries = 128;
+
+// Number of columns of a packed bfloat16 panel. Columns are queries or elements of a row.
+inline constexpr int64_t kBf16Columns = 64;
+// Rounds up to a multiple of kBf16Columns.
 inline constexpr int64_t whole_bf16_columns(int64_t count) { return (count + kBf16Columns - 1) / kBf16Columns * kBf16Columns; }
 
-// Return the number of elements of scratch memory that a task needs.
+// Each of these functions returns the number of floats of scratch memory that a task needs.
 inline constexpr int64_t attention_scratch_size(int width) {
   return (2 * kAttentionQueries + 2 * kForwardKeys) * attention_columns(width) + 17 * kAttentionQueries + kProductRows * kForwardKeys + 16;
 }

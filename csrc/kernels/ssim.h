@@ -8,8 +8,8 @@
 
 namespace globalsplat::raster::GS_ISA {
 
-// Returns Σ SSIM over the windows whose first row is in [begin, end), and writes their slopes if requested. `scratch` has fit_scratch_size(width)
-// elements, also in the functions below.
+// Returns Σ SSIM over the windows whose first row is in [begin, end), and writes their slopes if requested. `scratch` has
+// fit_scratch_size(width) elements, also in the functions below.
 template <class T>
 double ssim(const FitPlane<T>& plane, int begin, int end, T* scratch) {
   using V = Vector<T>;
@@ -45,8 +45,8 @@ double ssim(const FitPlane<T>& plane, int begin, int end, T* scratch) {
   return sum_of_lanes<T>(sum);
 }
 
-// Returns Σ |x − y| over the rows [begin, end). If requested, writes the gradient there: `l1_weight` times that of Σ |x − y| plus `ssim_weight`
-// times that of Σ SSIM. All slopes must be known unless `ssim_weight` is 0.
+// Returns Σ |x − y| over the rows [begin, end). If requested, writes the gradient there: `l1_weight` times that of Σ |x − y| plus
+// `ssim_weight` times that of Σ SSIM. All slopes must be known unless `ssim_weight` is 0.
 template <class T>
 double fit_gradient(const FitPlane<T>& plane, T l1_weight, T ssim_weight, int begin, int end, T* scratch) {
   using V = Vector<T>;

@@ -97,6 +97,6 @@ def compare(answer, expected, tolerance, doubtful=None):
     findings = [
         compare_tensor(name, answer.get(name), value, tolerance, scale, doubtful) for name, value in expected.items()
     ]
-    strangers = sorted(answer.keys() - expected.keys())
-    findings += [Finding(name, answer[name].shape, "exact", 0.0, problem="unexpected tensor") for name in strangers]
+    unexpected = sorted(answer.keys() - expected.keys())
+    findings += [Finding(name, answer[name].shape, "exact", 0.0, problem="unexpected tensor") for name in unexpected]
     return findings

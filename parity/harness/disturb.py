@@ -1,4 +1,4 @@
-"""Perturbations of correct results. The comparison must reject each of them, or it would miss such an error."""
+"""Perturbations of correct results, for the self-test of the comparison: it must reject each of them."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -6,16 +6,20 @@ import numpy as np
 
 from .compare import gradient_scale, compare_tensor, norm
 
+# Factor by which a tensor is multiplied.
 FACTOR = 1.001
-# The dropped slice is the smallest one whose norm is at least this fraction of the tensor's norm.
-SMALLEST_SHARE = 1e-2
-# Errors are at least this multiple of the tolerance, for wide tolerances.
+# Minimum change that zeroing a slice or swapping axes makes, relative to the tensor's norm.
+MIN_SHARE = 1e-2
+# Minimum change relative to the tolerance. It takes effect where the tolerance is wide.
 BEYOND = 2.0
 THREADS = 2
 
 
 def disturbances(array, tolerance, is_zero, scale):
-    """Yields (description, perturbed tensor). For a tensor that should be zero, the error is relative to `scale`."""
+    """Yields pairs of a description and a perturbed tensor; None stands for a missing tensor.
+
+    If `is_zero`, the tensor should be zero, and its perturbation is relative to `scale`.
+    """
     yield "left out", None
     if array.size == 0:
         return
@@ -28,13 +32,16 @@ def disturbances(array, tolerance, is_zero, scale):
         return
     factor = max(FACTOR, 1.0 + BEYOND * tolerance)
     yield f"times {factor:g}", array * array.dtype.type(factor)
-    share = max(SMALLEST_SHARE, BEYOND * tolerance)
-    yield from without_a_slice(array, share)
-    yield from transposed(array, share)
+    share = max(MIN_SHARE, BEYOND * tolerance)
+    yield from with_zeroed_slice(array, share)
+    yield from with_swapped_axes(array, share)
 
 
-def without_a_slice(array, share):
-    """Yields the tensor with a slice set to zero, for each axis in turn."""
+def with_zeroed_slice(array, share):
+    """Yields the tensor with one slice set to zero, for each axis.
+
+    The slice is the smallest one whose norm is at least `share` of the tensor's norm.
+    """
     for axis in range(array.ndim):
         if array.shape[axis] == 1:
             continue
@@ -47,8 +54,8 @@ def without_a_slice(array, share):
             yield f"slice {shares.argmin()} of axis {axis} dropped", dropped
 
 
-def transposed(array, share):
-    """Yields the tensor with two axes of equal length swapped: the last such pair, if the change is large enough."""
+def with_swapped_axes(array, share):
+    """Yields the tensor with two axes of equal length swapped, for the last such pair whose swap changes it by more than `share`."""
     for second in reversed(range(array.ndim)):
         for first in reversed(range(second)):
             if array.shape[first] == array.shape[second] > 1:
@@ -59,14 +66,14 @@ def transposed(array, share):
 
 
 def undetected(answer, expected, tolerance, doubtful=None):
-    """Perturbs a result that passes. Returns the number of perturbations, and those that still pass, as descriptions.
+    """Perturbs a result that passes, one tensor at a time, and compares the perturbed tensor.
 
-    One tensor is perturbed at a time, so only this tensor is compared.
+    Returns the number of perturbations and descriptions of those that still pass.
     """
     scale = gradient_scale(expected)
 
     def disturb(name):
-        # compare_tensor() computes in float64: convert once for all perturbations.
+        # compare_tensor() computes in float64, so one conversion serves all perturbations.
         value = expected[name] if expected[name].dtype.kind == "i" else np.asarray(expected[name], dtype=np.float64)
         finding = compare_tensor(name, answer[name], value, tolerance, scale, doubtful)
         is_zero = finding.measure == "zero" or norm(value) == 0.0
@@ -77,7 +84,7 @@ def undetected(answer, expected, tolerance, doubtful=None):
                 missed.append(f"{name}: {what}")
         return tried, missed
 
-    # For a large model this is most of the work, and numpy releases the GIL.
+    # Threads save time because numpy releases the GIL. For a large model, these comparisons are most of the self-test's work.
     with ThreadPoolExecutor(THREADS) as pool:
         found = list(pool.map(disturb, expected))
     return sum(tried for tried, _ in found), [what for _, missed in found for what in missed]

@@ -206,7 +206,7 @@ def test_shared_storages_and_any_strides_are_read(weights, tmp_path, legacy):
 
 
 @pytest.mark.parametrize("change", [{"streams": "single"}, {"camera_code": False}, {"sh_degree": 0, "candidates": 8}])
-def test_every_kind_of_model_is_told_by_its_shapes(tmp_path, change):
+def test_the_model_configuration_is_inferred_from_shapes(tmp_path, change):
     ours = made(tmp_path, model=change)
     torch.save({f"model.{name}": tensor for name, tensor in load_file(ours).items()}, tmp_path / "model.ckpt")
     succeed("import", "--from", tmp_path / "model.ckpt", "--out", tmp_path / "copy.safetensors")
@@ -374,7 +374,7 @@ def test_damage_in_a_zip_is_noticed(weights, tmp_path):
     assert "checksum" in refuse("import", "--from", file, "--out", tmp_path / "model.safetensors")
 
 
-def test_what_is_no_model_is_told(weights, tmp_path):
+def test_files_without_a_model_are_refused(weights, tmp_path):
     file, out = tmp_path / "model.ckpt", tmp_path / "out.safetensors"
 
     def refusal(contents):

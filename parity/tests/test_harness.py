@@ -113,12 +113,12 @@ def test_pictures_are_compared_by_their_largest_difference_where_rounding_does_n
 # ---- self-test -------------------------------------------------------------------------------------------------------
 
 
-def test_every_disturbance_of_a_right_answer_is_noticed():
+def test_every_perturbation_of_a_correct_answer_is_detected():
     tried, missed = undetected(canned(), canned(), FLOAT32)
     assert tried > 15 and missed == []
 
 
-def test_a_blind_comparison_is_noticed():
+def test_a_comparison_that_excludes_all_pixels_is_detected():
     """If all pixels are excluded, images with any values pass."""
     pictures = {"out.alpha": np.full((1, 1, 2, 3), 0.5)}
     tried, missed = undetected(pictures, pictures, FLOAT32, np.ones((1, 1, 2, 3), bool))

@@ -93,7 +93,8 @@ pub struct Rate {
     pub share_of_peak: f64,
 }
 
-/// Floating-point operations per pair in `csrc/kernels/pixel.h`: offset 2, p and r 4, exponent 4, 2^e 15, cap 1, T 2, w 1, and A, C and D 9.
+/// Floating-point operations per pair in `csrc/kernels/pixel.h`: offset 2, p and r 4, exponent 4, 2^e 15, cap 1, T 2, w 1, and A, C and D
+/// 9.
 const FORWARD_OPERATIONS: f64 = 38.;
 /// Floating-point operations per pair of the backward pass: 28 up to T as in the forward pass, w 1, q 8, the remainder 2, ν with a
 /// reciprocal 8, and the ten sums 19.

@@ -102,8 +102,8 @@ impl Convert {
         let psnr = psnr_between(&original, &copy, &cameras)?;
         let views = cameras.len();
         if self.json {
-            let told = json!({ "from": from, "to": to, "views": views, "psnr": psnr, "same_pixels": psnr.is_none() });
-            print_json(&told);
+            let report = json!({ "from": from, "to": to, "views": views, "psnr": psnr, "same_pixels": psnr.is_none() });
+            print_json(&report);
         } else {
             let loss = match psnr {
                 Some(psnr) => format!("{psnr:.2} dB between renders of both"),
@@ -142,10 +142,10 @@ fn description(path: &Path, splat: &Splat) -> Result<Value> {
     }))
 }
 
-fn line(told: &Value) -> String {
-    let name = told["splat"].as_str().unwrap_or_default();
+fn line(report: &Value) -> String {
+    let name = report["splat"].as_str().unwrap_or_default();
     format!(
         "{name}: {} Gaussians, SH degree {}, {} bytes",
-        told["gaussians"], told["sh_degree"], told["bytes"]
+        report["gaussians"], report["sh_degree"], report["bytes"]
     )
 }

@@ -89,7 +89,7 @@ impl Doctor {
             }));
             return Ok(());
         }
-        let line = |name: &str, told: &dyn Display| println!("{name:<12} {told}");
+        let line = |name: &str, value: &dyn Display| println!("{name:<12} {value}");
         line("globalsplat", &env!("CARGO_PKG_VERSION"));
         line("libtorch", &libtorch);
         line("devices", &devices.join(", "));
@@ -188,7 +188,7 @@ fn or_error<T>(found: &Result<T, String>, tell: impl FnOnce(&T) -> Value) -> Val
 
 /// Returns the driver's GPUs as JSON. Those that torch can use come first, and have their kernels.
 fn gpus(driver: &Driver, prepared: &[Result<Prepared, String>], unusable: &str) -> Value {
-    let told = driver.gpus.iter().enumerate().map(|(number, gpu)| {
+    let entries = driver.gpus.iter().enumerate().map(|(number, gpu)| {
         json!({
             "name": gpu.name,
             "compute_capability": capability(gpu.architecture),
@@ -197,7 +197,7 @@ fn gpus(driver: &Driver, prepared: &[Result<Prepared, String>], unusable: &str) 
             "kernels": state_of_kernels(prepared.get(number), unusable),
         })
     });
-    told.collect()
+    entries.collect()
 }
 
 fn state_of_kernels(prepared: Option<&Result<Prepared, String>>, unusable: &str) -> String {
@@ -226,10 +226,10 @@ fn memory_of_training(config: &Config, as_json: bool) -> globalsplat::Result<()>
     let here: Vec<(String, u64, MemoryEstimate)> =
         machine.into_iter().chain(gpus.map(|of| (of.name.clone(), of.memory as u64, gpu))).collect();
     if as_json {
-        let told = |estimate: &MemoryEstimate| {
-            let mut told = json!(estimate);
-            told["total"] = json!(estimate.total());
-            told
+        let to_json = |estimate: &MemoryEstimate| {
+            let mut json = json!(estimate);
+            json["total"] = json!(estimate.total());
+            json
         };
         let devices: Vec<Value> = here
             .iter()
@@ -237,7 +237,7 @@ fn memory_of_training(config: &Config, as_json: bool) -> globalsplat::Result<()>
                 json!({ "name": name, "memory_bytes": bytes, "fits": needed.fits_into(*bytes) })
             })
             .collect();
-        print_json(&json!({ "cpu": told(&cpu), "gpu": told(&gpu), "devices": devices }));
+        print_json(&json!({ "cpu": to_json(&cpu), "gpu": to_json(&gpu), "devices": devices }));
         return Ok(());
     }
     let (batch, at_once) = (cpu.batch, cpu.scenes_at_once);
@@ -286,14 +286,14 @@ fn kernels(as_json: bool) -> globalsplat::Result<()> {
         of_all.push((architecture, kernels));
     }
     if as_json {
-        let told = of_all.iter().map(|(architecture, kernels)| {
+        let entries = of_all.iter().map(|(architecture, kernels)| {
             let kernels: Vec<Value> = kernels
                 .iter()
                 .map(|k| json!({ "name": k.name, "registers": k.registers, "shared": k.shared, "stack": k.stack, "spills": k.spills }))
                 .collect();
             json!({ "compute_capability": capability(*architecture), "kernels": kernels })
         });
-        print_json(&told.collect());
+        print_json(&entries.collect());
         return Ok(());
     }
     println!("Registers of a thread, shared bytes of a block, and bytes spilled, by compute capability\n");

@@ -17,7 +17,7 @@ static IS_REPORTED: AtomicBool = AtomicBool::new(false);
 #[global_allocator]
 static ALLOCATOR: ExitOnFailedAllocation = ExitOnFailedAllocation;
 
-// SAFETY: it is the system's allocator, except for what follows a failed allocation.
+// SAFETY: it forwards to the system's allocator, and ends the process if an allocation fails.
 unsafe impl GlobalAlloc for ExitOnFailedAllocation {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         // SAFETY: the caller upholds the contract of the system's allocator.

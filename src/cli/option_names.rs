@@ -49,7 +49,7 @@ mod tests {
             add_sources(&Path::new(env!("CARGO_MANIFEST_DIR")).join(folder), &mut text);
         }
         for phrase in PHRASES.iter().map(|(phrase, _)| *phrase).chain([OVERRIDE]) {
-            // Of a setting, the source has only the name.
+            // The source contains only the name of a setting, without " is ".
             let phrase = phrase.strip_suffix(" is ").unwrap_or(phrase);
             assert!(text.contains(phrase), "no error of the library says {phrase:?}");
         }

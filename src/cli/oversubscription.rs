@@ -46,8 +46,8 @@ pub fn start_guard() -> Option<Background> {
 /// Starts an additional, sleeping team of libgomp threads that lives until the returned value is dropped.
 fn start_idle_team() -> Option<Background> {
     Background::start("idle_team", |until: Receiver<()>| {
-        // Large enough for libtorch to split across threads: a thread that libgomp didn't start gets a team of its own, and
-        // keeps it until it ends.
+        // A thread that libgomp didn't start gets its own team at its first parallel op, and keeps the team until it ends. This op is
+        // large enough for libtorch to split across threads.
         let _ = Tensor::zeros(1 << 17, (Kind::Uint8, Device::Cpu)).bitwise_not();
         let _ = until.recv();
     })

@@ -92,11 +92,11 @@ impl WeightsOut {
         let bytes = if written == self.out { std::fs::metadata(&written)?.len() } else { bytes as u64 };
         let parameters: usize = vs.trainable_variables().iter().map(|t| t.numel()).sum();
         if self.json {
-            let mut told = json!({ "weights": written.to_string_lossy(), "parameters": parameters, "bytes": bytes, "stage": stage });
+            let mut report = json!({ "weights": written.to_string_lossy(), "parameters": parameters, "bytes": bytes, "stage": stage });
             for (key, value) in more.as_object().into_iter().flatten() {
-                told[key] = value.clone();
+                report[key] = value.clone();
             }
-            print_json(&told);
+            print_json(&report);
         } else {
             let notes: String = [model::early_stage(stage, config), note]
                 .into_iter()

@@ -28,7 +28,8 @@ pub enum Method<'a> {
     Renders(PathBuf),
 }
 
-/// Result of a method for a scene. The first image of a target view is rendered at once, the others one by one when [`score_output`] needs them.
+/// Result of a method for a scene. The first image of a target view is rendered at once, the others one by one when [`score_output`] needs
+/// them.
 #[derive(Debug)]
 pub struct MethodOutput {
     /// Scene with its context and target views.

@@ -75,7 +75,7 @@ mod tests {
     }
 
     #[test]
-    fn bands_are_the_whole() {
+    fn metrics_in_bands_match_those_of_whole_images() {
         tch::manual_seed(1);
         // Three bands, the last of them a single row.
         let height = 2 * BAND_PIXELS / 40_000 + 1;

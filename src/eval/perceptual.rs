@@ -27,8 +27,8 @@ impl Perceptual {
         Ok(Perceptual { vgg: load(LpipsNetwork::Vgg16)?, alex: load(LpipsNetwork::AlexNet)? })
     }
 
-    /// Returns `score` with the LPIPS distances between an image `[3, H, W]`, clamped to [0, 1], and the photo `ground_truth`. A distance is
-    /// `None` if its network is missing or the view is too small for it.
+    /// Returns `score` with the LPIPS distances between an image `[3, H, W]`, clamped to [0, 1], and the photo `ground_truth`. A distance
+    /// is `None` if its network is missing or the view is too small for it.
     pub(super) fn add_to(&self, score: ViewScore, image: &Tensor, ground_truth: &View) -> ViewScore {
         ViewScore {
             lpips_vgg: distance(self.vgg.as_ref(), image, &ground_truth.image),

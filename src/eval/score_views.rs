@@ -8,8 +8,8 @@ use crate::error::Result;
 use crate::render::render_views;
 use crate::scene::Gaussians;
 
-/// Scores a splat on `views`, including LPIPS if `perceptual` is given. `should_continue` is called before each view with the number of finished
-/// views. If it returns `false`, the means are over the finished views. Returns `None` if no view is finished.
+/// Scores a splat on `views`, including LPIPS if `perceptual` is given. `should_continue` is called before each view with the number of
+/// finished views. If it returns `false`, the means are over the finished views. Returns `None` if no view is finished.
 ///
 /// # Errors
 /// Fails if the rasterizer fails.

@@ -145,8 +145,8 @@ impl DatasetEvaluation<'_> {
     }
 
     /// Scores the scenes that the index and the dataset have in common. `on_progress` is called with the number of finished scenes and the
-    /// total, and returns `false` to stop. `load_perceptual` loads the networks of LPIPS. With several ranks, each scores its share, and all of them
-    /// return the whole.
+    /// total, and returns `false` to stop. `load_perceptual` loads the networks of LPIPS. With several ranks, each scores its share, and
+    /// all of them return the whole.
     ///
     /// # Errors
     /// Fails if there is no scene in common, if `out` holds scores of another method, if every scene fails, if another rank is gone, or if

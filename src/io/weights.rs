@@ -70,7 +70,8 @@ pub fn write_checkpoint(path: &Path, weights: &Weights) -> Result<()> {
     Ok(torch_file::write_checkpoint(path, &tensors, &weights.metadata)?)
 }
 
-/// Alignment of the tensors' bytes in a file. Kernels of libtorch round differently where a mapped file's values aren't aligned to 16 bytes.
+/// Alignment of the tensors' bytes in a file. Kernels of libtorch round differently where a mapped file's values aren't aligned to 16
+/// bytes.
 const ALIGNMENT: usize = 64;
 
 /// Returns the length of the header, which follows the eight bytes that hold it.

@@ -126,10 +126,11 @@ impl PerceptualLoss {
         }
     }
 
-    /// Computes the mean loss over `rendered` [R·B, C, 3, H, W], which holds R renderings of `ground_truth` [B, C, 3, H, W] along the batch. The
-    /// features of the ground truth are computed once and used R times. If a gradient is needed, it is computed in the forward pass, one
-    /// image at a time on a CPU and a few at a time on a GPU: the activations of all images would take nearly as much memory as the rest of
-    /// a training step. The number of images that go together depends on their size alone, because the last bits of sums depend on it.
+    /// Computes the mean loss over `rendered` [R·B, C, 3, H, W], which holds R renderings of `ground_truth` [B, C, 3, H, W] along the
+    /// batch. The features of the ground truth are computed once and used R times. If a gradient is needed, it is computed in the forward
+    /// pass, one image at a time on a CPU and a few at a time on a GPU: the activations of all images would take nearly as much memory as
+    /// the rest of a training step. The number of images that go together depends on their size alone, because the last bits of sums depend
+    /// on it.
     pub fn loss(&self, rendered: &Tensor, ground_truth: &Tensor) -> Tensor {
         let pixels = ground_truth.size()[3..].iter().product();
         let chunk_size = Self::chunk_size(pixels, rendered.device());

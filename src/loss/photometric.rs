@@ -5,10 +5,10 @@ use crate::ffi::take_outputs;
 use globalsplat_csrc::fit;
 use tch::Tensor;
 
-/// Computes `l1_weight` times the mean absolute difference plus `ssim_weight` times the mean SSIM. Both are means over images and channels; the
-/// first is over all pixels, the second over pixels whose 11×11 window lies inside the image. The result is a scalar, differentiable with
-/// respect to `image`; on the CPU, forward and backward take one pass each. Images are [.., H, W] in [0, 1] and of the same shape, H and
-/// W at least 11; float64 if `image` is, and float32 otherwise.
+/// Computes `l1_weight` times the mean absolute difference plus `ssim_weight` times the mean SSIM. Both are means over images and channels;
+/// the first is over all pixels, the second over pixels whose 11×11 window lies inside the image. The result is a scalar, differentiable
+/// with respect to `image`; on the CPU, forward and backward take one pass each. Images are [.., H, W] in [0, 1] and of the same shape, H
+/// and W at least 11; float64 if `image` is, and float32 otherwise.
 ///
 /// # Panics
 /// Panics if the shapes differ or the images are smaller.

@@ -119,8 +119,8 @@ impl Encoder {
         Memory::from_views(&self.memory_registers, views, view, self.precision)
     }
 
-    /// Encodes `scene_tokens` [M, d] with `memory`, the result of [`Encoder::memory`]. Calls `after_layers` each time that some of the weights
-    /// have been used.
+    /// Encodes `scene_tokens` [M, d] with `memory`, the result of [`Encoder::memory`]. Calls `after_layers` each time that some of the
+    /// weights have been used.
     pub fn forward(&self, scene_tokens: &Tensor, memory: &Memory, after_layers: &dyn Fn()) -> EncodedTokens {
         let mut slots = self.start(scene_tokens, memory.common.size()[0]);
         after_layers();

@@ -71,8 +71,8 @@ pub(crate) fn repeat_scene_tokens(tokens: &Tensor, noise: &Tensor) -> Tensor {
     tokens.repeat_interleave_self_int(latent_ratio, 0, None) + noise * (SPREAD * tokens.std(false))
 }
 
-/// Shifts the opacity logits in the parameter head's bias, [10·K], so that `latent_ratio` overlapping Gaussians, of which each was half opaque,
-/// together cover half of what is behind them (spec 4.7).
+/// Shifts the opacity logits in the parameter head's bias, [10·K], so that `latent_ratio` overlapping Gaussians, of which each was half
+/// opaque, together cover half of what is behind them (spec 4.7).
 pub(crate) fn shared_opacities(bias: &Tensor, latent_ratio: i64) -> Tensor {
     let shift = bias.zeros_like();
     let shared = ((1. / latent_ratio as f64).exp2() - 1.).ln();

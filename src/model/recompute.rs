@@ -19,7 +19,8 @@ pub(crate) struct CheckpointedRounds<'a> {
 }
 
 impl Encoder {
-    /// Runs [`Encoder::forward`] with activation checkpointing. Run the backward pass of the result first, then [`CheckpointedRounds::backward`].
+    /// Runs [`Encoder::forward`] with activation checkpointing. Run the backward pass of the result first, then
+    /// [`CheckpointedRounds::backward`].
     pub(crate) fn forward_checkpointed(
         &self,
         scene_tokens: &Tensor,

@@ -80,8 +80,8 @@ impl StreamRound {
         own.chain(self.blocks.iter().flat_map(SelfAttentionBlock::linear_layers))
     }
 
-    /// Updates the slots. `slots` is [B, S, d] with the registers last; the result is [B, S, d]. Calls `after_layers` each time that some of
-    /// the weights have been used.
+    /// Updates the slots. `slots` is [B, S, d] with the registers last; the result is [B, S, d]. Calls `after_layers` each time that some
+    /// of the weights have been used.
     pub fn forward(
         &self,
         slots: &Tensor,

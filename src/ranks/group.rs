@@ -10,8 +10,8 @@ use serde::de::DeserializeOwned;
 use std::fmt;
 use tch::{Device, Tensor};
 
-/// Timeout of a collective, in seconds: 20 days, in practice as long as the processes live. [`super::Watchdog`] notices a rank that is gone.
-/// The collective waits for a rank that has more to do, writes to a slow disk, or waits for free space on a full one. The timeout in
+/// Timeout of a collective, in seconds: 20 days, in practice as long as the processes live. [`super::Watchdog`] notices a rank that is
+/// gone. The collective waits for a rank that has more to do, writes to a slow disk, or waits for free space on a full one. The timeout in
 /// milliseconds fits into 32 bits.
 pub(super) const COLLECTIVE_TIMEOUT_SECONDS: i64 = 20 * 24 * 60 * 60;
 

@@ -177,7 +177,7 @@ impl PeerHeartbeats {
     fn listen(&mut self, store: &ffi::Store) -> std::result::Result<Option<String>, cxx::Exception> {
         store.add(&key::beats(self.rank), 1)?;
         if store.add(key::FAILED, 0)? > 0 {
-            // That rank has printed its error before.
+            // The rank that failed has already printed its error.
             return Ok(Some("another process has failed".into()));
         }
         let silent = |rank: usize| {

@@ -8,8 +8,8 @@ use serde::{Deserialize, Serialize};
 /// Maximum length of a side in pixels.
 const MAX_SIDE: u32 = 16_384;
 
-/// Conversion of photos to the views that a model sees: a photo with `phase` times as many rows and columns as the images that the model was
-/// trained with becomes phase² views of the training size, which divide its pixels among themselves.
+/// Conversion of photos to the views that a model sees: a photo with `phase` times as many rows and columns as the images that the model
+/// was trained with becomes phase² views of the training size, which divide its pixels among themselves.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Input {
     phase: u32,

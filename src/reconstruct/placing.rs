@@ -16,8 +16,8 @@ const SEARCH_OFFSETS: [[f64; 2]; 2] = [[0.15, 0.], [0., 0.1]];
 /// Factors of the changes in each round.
 const ROUNDS: [f64; 2] = [1., 0.5];
 
-/// Runs the model over `views`, the views of each photo, at each of `data.scene_scales` and at placements around the best of them. Returns the
-/// result that matches `photos` best. `normalization` has the poses of the photos, followed by those of the targets.
+/// Runs the model over `views`, the views of each photo, at each of `data.scene_scales` and at placements around the best of them. Returns
+/// the result that matches `photos` best. `normalization` has the poses of the photos, followed by those of the targets.
 ///
 /// # Errors
 /// Fails if a pass or rendering fails.

@@ -28,9 +28,9 @@ struct IsotropicGaussian {
 
 /// Creates `count` Gaussians at the depths on which the photos agree, and at `points` of the scene, if some are known. The size of each
 /// matches the part of the images that it covers. Those of the `known` Gaussians, at most `count`, that don't contradict the photos are
-/// kept. At least two views are required. `should_continue` is called before each photo with the number of photos that are done. If it returns
-/// `false`, Gaussians are created from the photos that are done, or `None` is returned if there are none. Depths are computed on `device`,
-/// and the Gaussians are returned there.
+/// kept. At least two views are required. `should_continue` is called before each photo with the number of photos that are done. If it
+/// returns `false`, Gaussians are created from the photos that are done, or `None` is returned if there are none. Depths are computed on
+/// `device`, and the Gaussians are returned there.
 pub fn gaussians_from_photos(
     views: &[View],
     points: &[Point],

@@ -1,25 +1,24 @@
-//! Configuration of the refinement. The defaults were chosen by measurements: see docs/refine.md.
+//! Configuration of the refinement. docs/refine.md has the measurements by which the defaults were chosen.
 
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
-/// Hyperparameters of the optimization. Learning rates are those of Adam. Lengths are in units of the scene's depth, see
-/// [`super::scene_depth`].
+/// Hyperparameters of the optimization. Learning rates are those of Adam. The unit of lengths is the depth of the scene, which
+/// [`super::scene_depth`] computes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RefineConfig {
     /// Number of views in a step.
     pub views: usize,
-    /// Fractions of the optimization at which images become twice as wide and high. Before the first of them, images have the smallest
-    /// size.
+    /// Fractions of the optimization at which the width and height of images double, up to the full size after the last fraction.
     pub resolution_schedule: Vec<f64>,
     /// Final degree of the spherical harmonics.
     pub sh_degree: i64,
-    /// Fraction of the optimization after which the degree of the spherical harmonics increases by one, repeatedly.
+    /// Interval between increases of the degree of the spherical harmonics by one, as a fraction of the optimization.
     pub sh_every: f64,
     /// Initial learning rate of the means, in scene depths.
     pub means: f64,
-    /// Final factor of the means' learning rate.
+    /// Final learning rate of the means, relative to the initial one. The decay is exponential.
     pub means_end: f64,
     /// Learning rate of the logarithms of scales.
     pub log_scales: f64,
@@ -31,19 +30,19 @@ pub struct RefineConfig {
     pub colours: f64,
     /// Learning rate of the higher spherical harmonics, relative to that of the colours.
     pub harmonics: f64,
-    /// Final factor of all other learning rates.
+    /// Final value of all other learning rates, relative to the initial ones. The decay is exponential.
     pub lr_final_factor: f64,
     /// Learning rate of the cameras' rotations, in radians, and translations, in scene depths, if poses are corrected.
     pub poses: f64,
     /// Learning rate of the logarithms of exposures, if exposures are corrected.
     pub exposures: f64,
-    /// Weight of 1 − SSIM. The weight of absolute differences is one minus this.
+    /// Weight of the loss 1 − SSIM. The weight of the L1 loss is one minus this.
     pub ssim_weight: f64,
-    /// Weight of the mean opacity.
+    /// Weight of the penalty on the mean opacity.
     pub opacity: f64,
-    /// Weight of the mean scale in scene depths.
+    /// Weight of the penalty on the mean scale in scene depths.
     pub scale: f64,
-    /// Weight of the unevenness of depths, see [`crate::loss::depth_smoothness`].
+    /// Weight of the loss [`crate::loss::depth_smoothness`].
     pub depth_smoothness_weight: f64,
     /// Number of steps between relocations of dead Gaussians; 0 disables relocation.
     pub relocate_every: u64,
@@ -90,9 +89,10 @@ const RENAMED: [(&str, &str); 5] = [
     ("smooth", "depth_smoothness_weight"),
 ];
 
-/// Former key, the learning rate of tokens.
+/// Former key that is no longer accepted, the learning rate of tokens.
 const REMOVED: &str = "tokens";
 
+/// Returns the current name of a key, which may be a former name.
 fn current_name(key: String) -> String {
     RENAMED.iter().find(|(former, _)| *former == key).map_or(key, |(_, current)| current.to_string())
 }
@@ -101,28 +101,29 @@ fn current_name(key: String) -> String {
 const MAX_SIZES: usize = 8;
 
 impl RefineConfig {
-    /// Returns the defaults, for a start from a splat or without one, changed by `overrides`, each `key=value` with a TOML value.
+    /// Returns the defaults with `overrides` applied, each of which is `key=value` with a TOML value. `from_splat` selects the defaults of
+    /// [`RefineConfig::from_splat`].
     ///
     /// # Errors
     /// Fails if a key is unknown, or if a value has the wrong type or is out of range.
     pub fn with(overrides: &[String], from_splat: bool) -> Result<Self> {
         let defaults = if from_splat { RefineConfig::from_splat() } else { RefineConfig::default() };
-        let mut table = toml::Table::try_from(&defaults).expect("plain numbers");
+        let mut table = toml::Table::try_from(&defaults).expect("values that TOML can represent");
         for assignment in overrides {
-            let refused = |why: &str| Error::request(format!("override {assignment}: {why}"));
-            let set: toml::Table = assignment.parse().map_err(|_| refused("expected KEY=VALUE"))?;
+            let error = |why: &str| Error::request(format!("override {assignment}: {why}"));
+            let set: toml::Table = assignment.parse().map_err(|_| error("expected KEY=VALUE"))?;
             if set.len() != 1 {
-                return Err(refused("expected KEY=VALUE"));
+                return Err(error("expected KEY=VALUE"));
             }
             if set.contains_key(REMOVED) {
-                return Err(refused("only Gaussians are optimized, and no longer a model's tokens"));
+                return Err(error("only Gaussians are optimized, and no longer a model's tokens"));
             }
             table.extend(set.into_iter().map(|(key, value)| (current_name(key), value)));
             let config: RefineConfig =
-                table.clone().try_into().map_err(|e| refused(&e.message().replace('\n', " ")))?;
-            config.check().map_err(|expected| refused(&format!("expected {expected}")))?;
+                table.clone().try_into().map_err(|e| error(&e.message().replace('\n', " ")))?;
+            config.check().map_err(|expected| error(&format!("expected {expected}")))?;
         }
-        Ok(table.try_into().expect("what was just tried"))
+        Ok(table.try_into().expect("a table that was converted before"))
     }
 
     /// Checks that every value is in the range that the method supports.
@@ -141,12 +142,12 @@ impl RefineConfig {
             self.exposures,
         ];
         let weights = [self.opacity, self.scale, self.depth_smoothness_weight];
-        let is_size = |&part: &f64| 0. < part && part < 1.;
-        // NaN is in no range, so it fails every rule.
+        let is_inner_fraction = |&fraction: &f64| 0. < fraction && fraction < 1.;
+        // Comparisons with NaN are false, so NaN fails every rule.
         let rules = [
             (self.views >= 1, "1 or more"),
             (self.resolution_schedule.len() <= MAX_SIZES, "8 sizes or fewer"),
-            (self.resolution_schedule.iter().all(is_size), "numbers above 0 and below 1"),
+            (self.resolution_schedule.iter().all(is_inner_fraction), "numbers above 0 and below 1"),
             (self.resolution_schedule.is_sorted_by(|a, b| a < b), "numbers that increase"),
             ((0..=3).contains(&self.sh_degree), "0 to 3"),
             (0. < self.sh_every && self.sh_every.is_finite(), "a finite number above 0"),
@@ -168,7 +169,7 @@ impl RefineConfig {
         RefineConfig { resolution_schedule: vec![], opacity: 0., ..Default::default() }
     }
 
-    /// Returns the number of photo sizes.
+    /// Returns the number of photo sizes, including the full size.
     pub fn levels(&self) -> usize {
         self.resolution_schedule.len() + 1
     }
@@ -179,7 +180,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_that_make_no_sense_are_refused() {
+    fn invalid_overrides_are_refused() {
         let with = |assignment: &str| RefineConfig::with(&[assignment.to_string()], false);
         for (assignment, expected) in [
             ("views=0", "expected 1 or more"),

@@ -1,6 +1,6 @@
 //! Refinement of a splat on the photos that it has to match, in seconds. The optimization keeps the number of Gaussians.
-//! Without a splat, refinement starts from the depths on which the photos agree. [`RefineSession`] does all of it, from a capture to a splat
-//! and its scores.
+//! Without a splat, refinement starts from the depths on which the photos agree. [`RefineSession`] does all of it, from a capture to a
+//! splat and its scores.
 
 mod begin;
 mod config;
@@ -69,8 +69,8 @@ pub struct Task<'a> {
     pub seed: u64,
 }
 
-/// Optimizes the Gaussians of `optimizer` and the `corrections` of the photos. `on_step` is called after every step and ends the work if it returns `false`.
-/// Returns the final Gaussians.
+/// Optimizes the Gaussians of `optimizer` and the `corrections` of the photos. `on_step` is called after every step and ends the work if it
+/// returns `false`. Returns the final Gaussians.
 ///
 /// # Errors
 /// Fails if rendering fails.

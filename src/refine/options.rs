@@ -94,7 +94,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn options_that_make_no_sense_are_refused() {
+    fn options_out_of_range_are_refused() {
         let default = RefineOptions::default;
         assert!(default().check().is_ok());
         let config = RefineConfig { views: 0, ..RefineConfig::default() };

@@ -28,8 +28,8 @@ const NEARLY_EQUAL: f64 = 1e-4;
 /// downscaled. `should_continue` is called with the number of photos read so far, and ends the work if it returns `false`.
 ///
 /// # Errors
-/// Fails like [`Capture::load`], if a photo has fewer than [`MIN_SIDE`] pixels along a side, or if `should_continue` ends the work before all photos
-/// are read.
+/// Fails like [`Capture::load`], if a photo has fewer than [`MIN_SIDE`] pixels along a side, or if `should_continue` ends the work before
+/// all photos are read.
 pub fn load_photos(
     capture: &Capture,
     indices: &[usize],

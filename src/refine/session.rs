@@ -174,8 +174,8 @@ pub struct RefineSession<'a> {
 }
 
 impl<'a> RefineSession<'a> {
-    /// Chooses the photos and the held-out views of the capture, and reads them. `on_event` receives progress events and ends the work if it
-    /// returns `false`.
+    /// Chooses the photos and the held-out views of the capture, and reads them. `on_event` receives progress events and ends the work if
+    /// it returns `false`.
     ///
     /// # Errors
     /// Fails if an option is out of range, like [`load_photos`], and if `on_event` ends the work before all photos are read.
@@ -300,7 +300,8 @@ impl<'a> RefineSession<'a> {
         Ok(gaussians)
     }
 
-    /// Scores the result of [`RefineSession::start`] on the held-out views, optimizes it, and scores patches of the photos before and after.
+    /// Scores the result of [`RefineSession::start`] on the held-out views, optimizes it, and scores patches of the photos before and
+    /// after.
     ///
     /// # Errors
     /// Fails if rendering fails.
@@ -353,8 +354,8 @@ impl<'a> RefineSession<'a> {
     }
 
     /// Scores a result on whole held-out views: those that [`RefineSession::run`] scored before the optimization. With a time budget there
-    /// may be fewer than all. Returns the scores before and after the optimization; `None` if no views are held out, or if `on_event` ended the
-    /// scoring.
+    /// may be fewer than all. Returns the scores before and after the optimization; `None` if no views are held out, or if `on_event` ended
+    /// the scoring.
     ///
     /// # Errors
     /// Fails if rendering fails.

@@ -73,9 +73,9 @@ struct SmallPhoto {
 }
 
 /// Computes depths for the pixels of the views. If there are many views, it processes a subset that together shows what all of them show,
-/// without near duplicates. `points` of the scene, if some are known, determine the nearest depth. `should_continue` is called before each view with
-/// the number of views that are done. If it returns `false`, the result has only these. The work is done on `device`, and the results are
-/// there.
+/// without near duplicates. `points` of the scene, if some are known, determine the nearest depth. `should_continue` is called before each
+/// view with the number of views that are done. If it returns `false`, the result has only these. The work is done on `device`, and the
+/// results are there.
 pub fn sweep(
     views: &[View],
     points: &[Point],

@@ -97,8 +97,8 @@ impl SplatRenderer {
         self.frame
     }
 
-    /// Returns the median rendered depth of the middle one of `cameras`, over the pixels with an alpha of at least 0.5; if there are none, the
-    /// splat's typical distance.
+    /// Returns the median rendered depth of the middle one of `cameras`, over the pixels with an alpha of at least 0.5; if there are none,
+    /// the splat's typical distance.
     ///
     /// # Errors
     /// Fails like [`render`].

@@ -132,7 +132,7 @@ pub struct CheckpointSummary {
 
 /// Returns summaries of the run's checkpoints, oldest first, and of its best one. A checkpoint that is being replaced is left out.
 pub(super) fn checkpoint_summaries(run: &Path) -> (Vec<CheckpointSummary>, Option<CheckpointSummary>) {
-    let told = |path: &PathBuf| {
+    let summary = |path: &PathBuf| {
         let state = read_state(path).ok()?;
         let saved = fs::metadata(path.join(STATE_FILE)).and_then(|file| file.modified()).ok()?;
         Some(CheckpointSummary {
@@ -145,7 +145,7 @@ pub(super) fn checkpoint_summaries(run: &Path) -> (Vec<CheckpointSummary>, Optio
         })
     };
     let checkpoints = list_checkpoints(run).unwrap_or_default();
-    (checkpoints.iter().filter_map(told).collect(), told(&run.join(BEST)))
+    (checkpoints.iter().filter_map(summary).collect(), summary(&run.join(BEST)))
 }
 
 /// Cleans up what a run left if it was killed during a save.

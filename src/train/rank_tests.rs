@@ -134,7 +134,7 @@ fn ranks_make_the_slices_of_one() {
 }
 
 #[test]
-fn a_loss_that_is_no_number_on_one_rank_skips_the_step_on_all() {
+fn a_nan_loss_on_one_rank_skips_the_step_on_all_ranks() {
     if !can_meet() {
         return;
     }
@@ -172,7 +172,7 @@ fn a_skipped_step_reports_the_scenes_of_all_ranks() {
 /// A sharded optimizer gives the same bits as an unsharded one. Each rank updates its share of the parameters, and all ranks get the
 /// others' shares.
 #[test]
-fn a_sharded_optimizer_is_the_whole_one() {
+fn a_sharded_optimizer_matches_an_unsharded_one() {
     if can_meet() {
         [OptimizerKind::AdamW, OptimizerKind::Muon].into_iter().for_each(sharding_changes_nothing);
     }

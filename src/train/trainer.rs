@@ -111,8 +111,8 @@ impl Trainer {
         })
     }
 
-    /// Makes this trainer a rank of `group`. `train.batch_size` is the batch size of each rank. A step equals that of a single process with the
-    /// samples of all ranks.
+    /// Makes this trainer a rank of `group`. `train.batch_size` is the batch size of each rank. A step equals that of a single process with
+    /// the samples of all ranks.
     pub fn with_group(mut self, group: ProcessGroup) -> Self {
         // Parameters notify only one set of buckets, so the old one is dropped first.
         self.buckets = Buckets::new(&ProcessGroup::single(), &[]);
@@ -171,7 +171,8 @@ impl Trainer {
         Ok(())
     }
 
-    /// Draws a batch and updates the weights by its gradient. Calls `should_continue` once; the report says whether it returned `true` on all ranks.
+    /// Draws a batch and updates the weights by its gradient. Calls `should_continue` once; the report says whether it returned `true` on
+    /// all ranks.
     ///
     /// # Errors
     /// Returns an error if loading or rendering fails, or if another rank is gone.
@@ -462,7 +463,7 @@ impl Trainer {
             && self.config.train.micro_batch == 0
             && self.perceptual.is_none()
             && self.config.loss.consistency_depth == 0.;
-        // With at least one thread per slice, the largest slice is as small as possible. There are no more slices than that needs.
+        // The smallest number of slices, each with at least one thread, for which the largest slice has as few scenes as possible.
         if apart { scenes.div_ceil(scenes.div_ceil(tch::get_num_threads() as usize)) } else { 1 }
     }
 

@@ -206,7 +206,7 @@ fn changes_of_same_size_and_time_are_scored_again() {
 }
 
 #[test]
-fn sharded_weights_are_told_apart_by_their_shards() {
+fn sharded_weights_are_identified_by_their_shards() {
     let set = Set::new();
     let weights = read_weights(&tiny_weights(set.folder.path(), &set.path("captures"))).unwrap();
     let plain = set.path("sharded.safetensors");
@@ -323,8 +323,8 @@ fn external_renders_are_scored_by_an_index() {
     let arguments = set.arguments(&["--renders", arg(&renders), "--name", "the photos", "--json"], "chunks");
     let (code, out, err) = run(&arguments, set.folder.path());
     assert_eq!(code, Some(0), "{err}");
-    let told: Value = serde_json::from_str(&out).unwrap();
-    assert_eq!(told["evaluations"][0]["summary"], json!({"psnr": 100., "ssim": 1.}));
+    let report: Value = serde_json::from_str(&out).unwrap();
+    assert_eq!(report["evaluations"][0]["summary"], json!({"psnr": 100., "ssim": 1.}));
     assert_eq!(read_evaluation(&set.path("out")).unwrap().method, "the photos");
 }
 

@@ -54,18 +54,18 @@ impl Set {
         let (room, splat) = (self.room(), self.path("room.ply"));
         let (weights, scene, out) = (arg(&self.weights), arg(&room), arg(&splat));
         let arguments = ["reconstruct", "--weights", weights, "--scene", scene, "--out", out, "--json"];
-        let (code, told, err) = self.run(&arguments, options);
+        let (code, report, err) = self.run(&arguments, options);
         assert_eq!(code, Some(0), "{err}");
-        (serde_json::from_str(&told).unwrap(), err, std::fs::read(splat).unwrap())
+        (serde_json::from_str(&report).unwrap(), err, std::fs::read(splat).unwrap())
     }
 
     /// Returns the JSON of `eval --scene`, and its messages.
     fn score(&self, options: &[&str]) -> (Value, String) {
         let room = self.room();
         let arguments = ["eval", "--weights", arg(&self.weights), "--scene", arg(&room), "--json"];
-        let (code, told, err) = self.run(&arguments, options);
+        let (code, report, err) = self.run(&arguments, options);
         assert_eq!(code, Some(0), "{err}");
-        (serde_json::from_str(&told).unwrap(), err)
+        (serde_json::from_str(&report).unwrap(), err)
     }
 
     /// Runs `eval --data` in the folder `out`.
@@ -84,20 +84,20 @@ impl Set {
     }
 }
 
-fn without_times(mut told: Value) -> Value {
+fn without_times(mut report: Value) -> Value {
     let times = ["load_seconds", "seconds", "seconds_of", "seconds_from_start", "forward_seconds"];
     for name in times.into_iter().chain(["peak_memory_bytes"]) {
-        told.as_object_mut().unwrap().remove(name);
+        report.as_object_mut().unwrap().remove(name);
     }
-    told
+    report
 }
 
 #[test]
 fn photos_become_as_many_views_as_they_have_phases() {
     let set = Set::new();
-    let (told, err, plain) = set.reconstruct(&[]);
+    let (report, err, plain) = set.reconstruct(&[]);
     assert_eq!(
-        (&told["photos"], &told["views"], &told["image_size"]),
+        (&report["photos"], &report["views"], &report["image_size"]),
         (&json!(3), &json!(3), &json!([32, 32]))
     );
     assert!(
@@ -107,12 +107,12 @@ fn photos_become_as_many_views_as_they_have_phases() {
 
     // At the model's own size, `--views-at` changes nothing.
     let (same, said, bytes) = set.reconstruct(&["--views-at", "32"]);
-    assert_eq!((without_times(same), said), (without_times(told), err));
+    assert_eq!((without_times(same), said), (without_times(report), err));
     assert!(bytes == plain, "another splat");
 
-    let (told, err, sharp) = set.reconstruct(&["--views-at", "64"]);
+    let (report, err, sharp) = set.reconstruct(&["--views-at", "64"]);
     assert_eq!(
-        (&told["photos"], &told["views"], &told["image_size"]),
+        (&report["photos"], &report["views"], &report["image_size"]),
         (&json!(3), &json!(12), &json!([64, 64]))
     );
     assert_eq!(err.lines().count(), 1, "{err}");
@@ -122,8 +122,8 @@ fn photos_become_as_many_views_as_they_have_phases() {
     assert!(sharp.len() == plain.len() && sharp != plain);
 
     // A higher resolution than that of the photos.
-    let (told, err, _) = set.reconstruct(&["--views-at", "96", "--views", "2"]);
-    assert_eq!((&told["photos"], &told["views"]), (&json!(2), &json!(18)));
+    let (report, err, _) = set.reconstruct(&["--views-at", "96", "--views", "2"]);
+    assert_eq!((&report["photos"], &report["views"]), (&json!(2), &json!(18)));
     assert!(err.contains("64×64 pixels are cut and resized to 96×96 pixels, 9 views of"), "{err}");
     assert!(err.trim().ends_with("; smaller photos are enlarged, which shows no more of the scene"), "{err}");
     assert_eq!(err.lines().count(), 1, "{err}");
@@ -135,20 +135,20 @@ fn one_capture_is_scored_in_every_setting() {
     let (plain, err) = set.score(&[]);
     assert!(!err.contains("photos are"), "{err}");
     assert_eq!(without_times(set.score(&["--views-at", "32"]).0), without_times(plain.clone()));
-    let (told, err) = set.score(&["--views-at", "64", "--views-as", "polyphase"]);
+    let (report, err) = set.score(&["--views-at", "64", "--views-as", "polyphase"]);
     let expected = json!({"photos": 6, "views": 24, "image_size": [64, 64]});
-    assert_eq!((&told["input"], &told["image_size"]), (&expected, &json!([32, 32])));
-    assert!(told["forward_seconds"].as_f64().unwrap() > 0.);
+    assert_eq!((&report["input"], &report["image_size"]), (&expected, &json!([32, 32])));
+    assert!(report["forward_seconds"].as_f64().unwrap() > 0.);
     assert!(err.starts_with("photos are cut and resized to "), "{err}");
     // The baselines don't depend on the setting.
-    assert_eq!(told["baselines"], plain["baselines"]);
+    assert_eq!(report["baselines"], plain["baselines"]);
     // Scored images of another size are compared with other photos; the splat is the same.
     let (large, _) = set.score(&["--views-at", "64", "--pictures-at", "64"]);
     assert_eq!((&large["input"], &large["image_size"]), (&expected, &json!([64, 64])));
-    assert_ne!((&large["psnr"], &large["baselines"]), (&told["psnr"], &told["baselines"]));
+    assert_ne!((&large["psnr"], &large["baselines"]), (&report["psnr"], &report["baselines"]));
     // Small input photos, large scored images.
-    let (told, err) = set.score(&["--pictures-at", "128"]);
-    assert_eq!((&told["input"]["views"], &told["image_size"]), (&json!(6), &json!([128, 128])));
+    let (report, err) = set.score(&["--pictures-at", "128"]);
+    assert_eq!((&report["input"]["views"], &report["image_size"]), (&json!(6), &json!([128, 128])));
     assert!(err.starts_with("room_000: smaller photos are enlarged"), "{err}");
     // The size applies to a splat, too.
     let (room, splat) = (set.room(), set.path("captures/room_000/truth.ply"));
@@ -170,16 +170,16 @@ fn an_evaluation_does_not_resume_at_another_resolution() {
     let options = ["--views-at", "64", "--pictures-at", "64"];
     let (code, out, err) = set.sweep("sharp", &options);
     assert_eq!(code, Some(0), "{err}");
-    let told: Value = serde_json::from_str(&out).unwrap();
-    let told = &told["evaluations"][0];
-    assert_eq!(told["input"], json!({"phase": 2}));
-    assert_eq!((&told["image_size"], &told["context_views"]), (&json!([64, 64]), &json!(3)));
+    let report: Value = serde_json::from_str(&out).unwrap();
+    let report = &report["evaluations"][0];
+    assert_eq!(report["input"], json!({"phase": 2}));
+    assert_eq!((&report["image_size"], &report["context_views"]), (&json!([64, 64]), &json!(3)));
     let found = read_evaluation(&set.path("sharp")).unwrap();
     assert_eq!(found.method, "tiny polyphase 64");
     let report = std::fs::read_to_string(set.path("sharp").join("report.html")).unwrap();
     assert!(report.contains(&found.method) && report.contains("64×64 pixels"));
 
-    // The same command resumes; another size, of the input or of scored images, is refused.
+    // An unchanged command resumes. Another size of the input or of scored images is refused.
     assert_eq!(set.sweep("sharp", &options).0, Some(0));
     for other in [["--views-at", "96", "--pictures-at", "64"], ["--views-at", "64", "--pictures-at", "32"]] {
         let (code, _, err) = set.sweep("sharp", &other);

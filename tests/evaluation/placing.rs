@@ -70,11 +70,11 @@ fn reconstruct_tells_where_the_scene_was_shown() {
     let model = bundled_model(Device::Cpu).unwrap();
     let photos = photos_of(&room, &model);
     let arguments = ["reconstruct", "--scene", arg(&room), "--out", arg(&out)];
-    let told: Value = serde_json::from_str(&succeed(&[&arguments[..], &["--json"]].concat())).unwrap();
+    let report: Value = serde_json::from_str(&succeed(&[&arguments[..], &["--json"]].concat())).unwrap();
     // Rounding differs between processes, so the search may end at another offset; it starts from the same scale.
     let Placement { extent, .. } = reconstruct(&model, &photos, &[]).unwrap().placement;
-    assert!((told["extent"].as_f64().unwrap() / extent).ln().abs() < 0.302, "{told}");
-    assert!(told["forward"].as_f64().unwrap().abs() < 0.226, "{told}");
+    assert!((report["extent"].as_f64().unwrap() / extent).ln().abs() < 0.302, "{report}");
+    assert!(report["forward"].as_f64().unwrap().abs() < 0.226, "{report}");
     assert!(succeed(&arguments).contains("scene shown in several sizes, "));
 }
 

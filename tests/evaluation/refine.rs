@@ -22,7 +22,8 @@ fn world(folder: &Path, size: &str) -> String {
     format!("{}#7_000000", out.join("000000.torch").display())
 }
 
-fn told(arguments: &[&str]) -> Value {
+/// Runs the program and returns the JSON that it prints.
+fn run_json(arguments: &[&str]) -> Value {
     serde_json::from_str(&succeed(arguments)).expect("JSON")
 }
 
@@ -36,7 +37,7 @@ fn photos_alone_become_a_splat() {
     let folder = tempfile::tempdir().unwrap();
     let (scene, out, sheet) =
         (world(folder.path(), "64"), folder.path().join("a.ply"), folder.path().join("a.png"));
-    let done = told(&[
+    let done = run_json(&[
         "refine",
         "--scene",
         &scene,
@@ -59,7 +60,7 @@ fn photos_alone_become_a_splat() {
     let curve = done["held_out"]["curve"].as_array().unwrap();
     assert!(curve.last().unwrap()["psnr"] == done["held_out"]["after"]["psnr"]);
     // The reported scores are those of the written splat.
-    let scored = told(&["eval", "--splat", arg(&out), "--scene", &scene, "--json"]);
+    let scored = run_json(&["eval", "--splat", arg(&out), "--scene", &scene, "--json"]);
     let held_out: Vec<f64> = [1, 5, 9].map(|i| number(&scored, &format!("/views/{i}/psnr"))).into();
     assert!((held_out.iter().sum::<f64>() / 3. - after).abs() < 0.01, "{held_out:?}, told {after}");
     assert!(sheet.is_file());
@@ -137,9 +138,9 @@ fn photos_of_one_place_count_once() {
         });
         let out = folder.path().join("a.ply");
         let options = ["--gaussians", "2000", "--steps", "200", "--json"];
-        told(&[&["refine", "--scene", arg(&room), "--out", arg(&out)][..], &options].concat());
+        run_json(&[&["refine", "--scene", arg(&room), "--out", arg(&out)][..], &options].concat());
         std::fs::copy(&whole, room.join("cameras.json")).unwrap();
-        let scores = told(&["eval", "--splat", arg(&out), "--scene", arg(&room), "--json"]);
+        let scores = run_json(&["eval", "--splat", arg(&out), "--scene", arg(&room), "--json"]);
         [1, 4, 7].map(|view| number(&scores, &format!("/views/{view}/psnr"))).iter().sum::<f64>() / 3.
     };
     let plain = reached(1, 0.);
@@ -164,8 +165,8 @@ fn photos_from_one_place_are_shown_at_one_distance() {
     let arguments =
         ["refine", "--scene", arg(&room), "--out", arg(&out), "--gaussians", "500", "--steps", "20"];
     let done = command(&arguments).output().unwrap();
-    let told = String::from_utf8_lossy(&done.stderr);
-    assert!(done.status.success() && told.contains("depth can't be estimated"), "{told}");
+    let message = String::from_utf8_lossy(&done.stderr);
+    assert!(done.status.success() && message.contains("depth can't be estimated"), "{message}");
     let means = read_splat(&out).unwrap().means;
     assert!(means.as_flattened().iter().all(|coordinate| coordinate.is_finite()));
 }
@@ -213,7 +214,7 @@ fn units_and_origin_change_nothing() {
         });
         let out = folder.path().join("a.ply");
         let options = ["--gaussians", "500", "--steps", "40", "--json", "--holdout", "every:3+1"];
-        let done = told(&[&["refine", "--scene", arg(&room), "--out", arg(&out)][..], &options].concat());
+        let done = run_json(&[&["refine", "--scene", arg(&room), "--out", arg(&out)][..], &options].concat());
         (number(&done, "/held_out/after/psnr"), Gaussians::from_splat(&read_splat(&out).unwrap()))
     };
     let (plain, gaussians) = refined(1., DVec3::ZERO);
@@ -244,7 +245,7 @@ fn a_splat_becomes_better_or_stays() {
     write_splat(&dull, &splat).unwrap();
     let refined = |from: &Path| {
         let steps = ["--steps", "150", "--json"];
-        told(
+        run_json(
             &[&["refine", "--splat", arg(from), "--scene", arg(&room), "--out", arg(&out)][..], &steps]
                 .concat(),
         )
@@ -266,7 +267,7 @@ fn real_photos_become_a_splat() {
     for capture in captures().unwrap_or_default() {
         let folder = tempfile::tempdir().unwrap();
         let out = folder.path().join("a.ply");
-        let done = told(&[
+        let done = run_json(&[
             "refine",
             "--scene",
             arg(&capture),
@@ -293,7 +294,7 @@ fn many_photos_are_used_as_they_are() {
     let Some(fox) = fox() else { return };
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("a.ply");
-    let done = told(&[
+    let done = run_json(&[
         "refine",
         "--scene",
         arg(&fox),
@@ -368,11 +369,11 @@ fn pose_and_exposure_errors_are_corrected() {
         let base =
             ["refine", "--splat", arg(&ground_truth), "--scene", arg(&room), "--out", arg(&out), "--json"];
         let steps = ["--steps", "300", "--set", "means=1e-4", "--set", "poses=2e-3"];
-        told(&[&base[..], &steps, more].concat())
+        run_json(&[&base[..], &steps, more].concat())
     };
-    let (as_told, corrected) = (refined(&[]), refined(&["--correct-poses", "--correct-exposures"]));
-    assert_eq!(as_told["corrections"], serde_json::json!([]));
-    let [before, after] = [&as_told, &corrected].map(|done| number(done, "/shown/after/psnr"));
+    let (uncorrected, corrected) = (refined(&[]), refined(&["--correct-poses", "--correct-exposures"]));
+    assert_eq!(uncorrected["corrections"], serde_json::json!([]));
+    let [before, after] = [&uncorrected, &corrected].map(|done| number(done, "/shown/after/psnr"));
     assert!(after > before + 3., "{before} → {after}");
     let of = &corrected["corrections"];
     assert_eq!(of.as_array().unwrap().len(), cameras["views"].as_array().unwrap().len());
@@ -381,7 +382,7 @@ fn pose_and_exposure_errors_are_corrected() {
 }
 
 #[test]
-fn what_cannot_be_refined_is_told_in_one_sentence() {
+fn invalid_refinements_are_refused_with_one_sentence() {
     let (folder, room) = room();
     let out = folder.path().join("a.ply");
     let base = ["refine", "--scene", arg(&room), "--out", arg(&out)];

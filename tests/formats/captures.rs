@@ -131,7 +131,7 @@ fn folders_of_captures_are_found() {
 }
 
 #[test]
-fn captures_that_are_not_there_are_told() {
+fn missing_captures_are_reported() {
     let (another, _) = room();
     let empty = tempfile::tempdir().expect("a folder");
     for (name, captures, what) in [

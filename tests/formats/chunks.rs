@@ -150,17 +150,17 @@ fn pack_and_inspect_tell_what_they_did() {
     let folder = tempfile::tempdir().unwrap();
     write_room(&folder.path().join("room"), 1, 3, [24, 24].into()).unwrap();
     let (room, out) = (folder.path().join("room"), folder.path().join("out"));
-    let told: Value =
+    let report: Value =
         serde_json::from_str(&succeed(&["pack", arg(&room), "--out", arg(&out), "--json"])).unwrap();
     assert_eq!(
-        (told["scenes"].as_u64(), told["views"].as_u64(), told["chunks"].as_u64()),
+        (report["scenes"].as_u64(), report["views"].as_u64(), report["chunks"].as_u64()),
         (Some(1), Some(3), Some(1))
     );
     let chunk = out.join("000000.torch");
-    let told: Value = serde_json::from_str(&succeed(&["inspect", arg(&chunk), "--json"])).unwrap();
-    assert_eq!((told["kind"].as_str(), told["views"]["room"].as_u64()), (Some("chunk"), Some(3)));
-    let told: Value = serde_json::from_str(&succeed(&["inspect", arg(&out), "--json"])).unwrap();
-    assert_eq!((told["kind"].as_str(), told["scenes"].as_u64()), (Some("data set"), Some(1)));
+    let report: Value = serde_json::from_str(&succeed(&["inspect", arg(&chunk), "--json"])).unwrap();
+    assert_eq!((report["kind"].as_str(), report["views"]["room"].as_u64()), (Some("chunk"), Some(3)));
+    let report: Value = serde_json::from_str(&succeed(&["inspect", arg(&out), "--json"])).unwrap();
+    assert_eq!((report["kind"].as_str(), report["scenes"].as_u64()), (Some("data set"), Some(1)));
     let again = refuse(&["pack", arg(&room), "--out", arg(&out)]);
     assert!(again.contains("a folder that already contains chunks"), "{again}");
     let twice = refuse(&["pack", arg(&room), arg(&room), "--out", arg(&folder.path().join("twice"))]);
@@ -348,7 +348,7 @@ fn archives_that_inflate_are_refused() {
 }
 
 #[test]
-fn damage_is_noticed() {
+fn corruption_is_detected() {
     let folder = tempfile::tempdir().unwrap();
     let file = packed(folder.path()).join("000001.torch");
     let bytes = std::fs::read(&file).unwrap();
@@ -458,8 +458,8 @@ fn a_scene_is_opened_whatever_signs_its_key_has() {
     for name in names {
         let named = format!("{}#{name}", chunks.join("000000.torch").display());
         assert_eq!(open_capture(Path::new(&named)).unwrap().name, name);
-        let told: Value = serde_json::from_str(&succeed(&["inspect", &named, "--json"])).unwrap();
-        assert_eq!((told["kind"].as_str(), told["name"].as_str()), (Some("capture"), Some(name)));
+        let report: Value = serde_json::from_str(&succeed(&["inspect", &named, "--json"])).unwrap();
+        assert_eq!((report["kind"].as_str(), report["name"].as_str()), (Some("capture"), Some(name)));
     }
 }
 

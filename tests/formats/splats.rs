@@ -84,9 +84,9 @@ fn pictures_are_the_same_from_other_sides() {
 fn endings_that_are_unknown() {
     let folder = tempfile::tempdir().unwrap();
     let splat = written(folder.path(), "a.ply", &random_splat(2, 0, 1));
-    for (name, told) in [("a.obj", "the ending is .obj"), ("a", "the ending is missing")] {
+    for (name, message) in [("a.obj", "the ending is .obj"), ("a", "the ending is missing")] {
         let to = folder.path().join(name);
-        let all = [told, "expected .ply, .compressed.ply, .spz or .splat"];
+        let all = [message, "expected .ply, .compressed.ply, .spz or .splat"];
         assert_says(&refuse(&["convert", arg(&splat), arg(&to)]), &all);
         std::fs::copy(&splat, &to).unwrap();
         assert_says(&refuse(&["convert", arg(&to), arg(&splat)]), &all);
@@ -106,8 +106,8 @@ fn convert_tells_what_is_lost() {
     let ground_truth = room.join("truth.ply");
     let convert = |to: &str, more: &[&str]| -> Value {
         let to = folder.path().join(to);
-        let told = succeed(&[&["convert", arg(&ground_truth), arg(&to), "--json"], more].concat());
-        serde_json::from_str(&told).unwrap()
+        let report = succeed(&[&["convert", arg(&ground_truth), arg(&to), "--json"], more].concat());
+        serde_json::from_str(&report).unwrap()
     };
     let same = convert("a.ply", &[]);
     assert_eq!(same["from"]["gaussians"], same["to"]["gaussians"]);
@@ -119,12 +119,12 @@ fn convert_tells_what_is_lost() {
     assert_eq!(small["to"]["bytes"], std::fs::metadata(folder.path().join("a.spz")).unwrap().len());
     assert!(small["to"]["bytes"].as_u64() < small["from"]["bytes"].as_u64());
     for degree in ["0", "3"] {
-        let told = convert("b.compressed.ply", &["--sh-degree", degree]);
-        assert_eq!(told["to"]["sh_degree"].to_string(), degree);
-        assert_eq!(told["views"], 8);
+        let report = convert("b.compressed.ply", &["--sh-degree", degree]);
+        assert_eq!(report["to"]["sh_degree"].to_string(), degree);
+        assert_eq!(report["views"], 8);
     }
-    let told = succeed(&["convert", arg(&ground_truth), arg(&folder.path().join("c.splat"))]);
-    assert!(told.contains("Gaussians, SH degree 0, ") && told.contains("dB between renders"), "{told}");
+    let report = succeed(&["convert", arg(&ground_truth), arg(&folder.path().join("c.splat"))]);
+    assert!(report.contains("Gaussians, SH degree 0, ") && report.contains("dB between renders"), "{report}");
     let out = folder.path().join("d.ply");
     let higher =
         crate::common::program::globalsplat(&["convert", arg(&ground_truth), arg(&out), "--sh-degree", "4"]);

@@ -201,8 +201,8 @@ fn videos_are_data_like_any_other() {
     let video = Video::new(3, 8, &settings(9, 24));
     let expected: Vec<f32> = (0..9).flat_map(|view| video.depth(view)).collect();
     assert_eq!(depths.into_vec::<f32>().unwrap(), expected);
-    let told = succeed(&["inspect", arg(&out), "--json"]);
-    assert!(told.contains(r#""chunks":1,"kind":"data set","scenes":2"#), "{told}");
+    let report = succeed(&["inspect", arg(&out), "--json"]);
+    assert!(report.contains(r#""chunks":1,"kind":"data set","scenes":2"#), "{report}");
     let weights = folder.path().join("weights.safetensors");
     succeed(&["export", "--config", arg(&tiny_config(folder.path(), &out)), "--out", arg(&weights)]);
     let index = out.join("evaluation_index.json");

@@ -54,7 +54,8 @@ fn moved_splat(splat: &Splat, to: &Similarity) -> Splat {
     transform(&Gaussians::from_splat(splat), &about_origin).to_splat(to.translation).unwrap()
 }
 
-fn told(arguments: &[&str]) -> Value {
+/// Runs the program and returns the JSON that it prints.
+fn run_json(arguments: &[&str]) -> Value {
     serde_json::from_str(&succeed(arguments)).expect("JSON")
 }
 
@@ -93,8 +94,8 @@ fn a_splat_looks_the_same_in_any_unit_and_place() {
             let others = ["--splat", splat, "--frames", "3", "--size", "32x24", "--out", arg(&out)];
             succeed(&[&["render"], cameras, &others].concat());
         }
-        let scores = told(&["eval", "--splat", splat, "--scene", scene, "--json"]);
-        let loss = told(&["convert", splat, arg(&copy), "--scene", scene, "--local-origin", "--json"]);
+        let scores = run_json(&["eval", "--splat", splat, "--scene", scene, "--json"]);
+        let loss = run_json(&["convert", splat, arg(&copy), "--scene", scene, "--local-origin", "--json"]);
         (pictures, scores["psnr"].as_f64().unwrap(), loss["psnr"].as_f64().unwrap())
     };
     let (plain, plain_psnr, plain_loss) = looked_at(&ground_truth, &room, "plain");
@@ -163,7 +164,7 @@ fn powers_of_two_change_no_bit() {
 /// A page has a local origin, and a unit that suits a browser's precision and the page's step sizes.
 #[test]
 fn a_page_is_the_same_in_any_unit_and_place() {
-    if told(&["doctor", "--json"])["viewer"] != true {
+    if run_json(&["doctor", "--json"])["viewer"] != true {
         skip("npm", "this program was built without the viewer");
         return;
     }
@@ -209,7 +210,7 @@ fn a_local_origin_keeps_the_detail() {
     write_moved(&room, &scene, &to);
     write_local_splat(&local, &moved_splat(&ground_truth, &to)).unwrap();
     let psnr = |splat: &Path| {
-        told(&["eval", "--splat", arg(splat), "--scene", arg(&scene), "--json"])["psnr"].as_f64().unwrap()
+        run_json(&["eval", "--splat", arg(splat), "--scene", arg(&scene), "--json"])["psnr"].as_f64().unwrap()
     };
 
     let output = globalsplat(&["convert", arg(&local), arg(&world), "--scene", arg(&scene), "--json"]);
@@ -231,7 +232,7 @@ fn a_local_origin_keeps_the_detail() {
         let written: Value = serde_json::from_slice(&fs::read(origin_file(&copy)).unwrap()).unwrap();
         assert_eq!(written, json!({"origin": centre.to_array()}));
         assert!(psnr(&copy) > psnr(&local).min(45.) - 12., "{ending}: {}", psnr(&copy));
-        let inspected = told(&["inspect", arg(&copy), "--json"]);
+        let inspected = run_json(&["inspect", arg(&copy), "--json"]);
         assert_eq!(inspected["local_origin"], json!(centre.to_array()));
         assert!((inspected["x"][1].as_f64().unwrap() - offset.x).abs() < 5., "{inspected}");
         succeed(&convert);

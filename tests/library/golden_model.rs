@@ -137,7 +137,7 @@ fn every_stage_matches_in_values_and_gradients() {
 }
 
 #[test]
-fn golden_tensors_that_are_not_there_are_told() {
+fn missing_golden_tensors_are_reported() {
     let folder = tempfile::tempdir().expect("a folder");
     let (empty, absent) = (folder.path(), folder.path().join("absent"));
     for name in [

@@ -109,7 +109,7 @@ fn samples_depend_on_seed_and_number_alone() {
     assert_same(&load(3, 3, 0, 17), &all);
     assert_same(&load(3, 2, 5, 12), &all[5..]);
     assert_ne!(load(4, 2, 0, 17)[0].images, all[0].images);
-    // The same scene is augmented differently in another epoch.
+    // A scene is augmented differently in each epoch.
     assert!(
         all.iter().enumerate().all(|(i, scene)| all[..i].iter().all(|other| other.images != scene.images))
     );

@@ -1,4 +1,5 @@
-//! Tests of the library alone: the model, the splat op, losses and loading against golden tensors and twins; the architecture and citations.
+//! Tests of the library alone: the model, the splat op, losses and loading against golden tensors and twins; the architecture and
+//! citations.
 
 #[path = "../common/mod.rs"]
 mod common;

@@ -293,7 +293,7 @@ fn initial_weights_are_as_specified() {
 }
 
 #[test]
-fn configurations_that_do_not_fit_are_refused() {
+fn configurations_out_of_range_are_refused() {
     let refused = [
         (ModelConfig { width: 30, heads: 4, ..small() }, "model.width is 30"),
         (ModelConfig { candidates: 6, ..small() }, "model.candidates is 6"),

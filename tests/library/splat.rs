@@ -132,8 +132,8 @@ fn gaussians_without_a_rotation_are_dropped() {
             [subnormal, 0., 0., 0.],
         ];
         let (g, c) = (gaussians(1, 60, 1, kind, 15), cameras(1, 2, 61, 43, kind));
-        let strange = Tensor::from_slice2(&parts).to_kind(kind);
-        g.quaternions.select(0, 0).narrow(0, 0, parts.len() as i64).copy_(&strange);
+        let special = Tensor::from_slice2(&parts).to_kind(kind);
+        g.quaternions.select(0, 0).narrow(0, 0, parts.len() as i64).copy_(&special);
         let (p, gradients) = differentiated(&g, &c);
         let without = g.map(|t| t.narrow(1, parts.len() as i64, 60 - parts.len() as i64));
         let (expected, _) = differentiated(&without, &c);
@@ -554,7 +554,7 @@ fn nothing_to_see_is_black() {
 }
 
 #[test]
-fn shapes_that_do_not_fit_are_refused() {
+fn mismatched_shapes_are_refused() {
     let c = cameras(1, 1, 20, 10, Kind::Float);
     let good = || gaussians(1, 4, 1, Kind::Float, 13);
     let bad_scales = Gaussians { scales: Tensor::zeros([1, 3, 3], (Kind::Float, Device::Cpu)), ..good() };

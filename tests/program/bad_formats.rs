@@ -36,7 +36,7 @@ fn refused_transforms(change: impl FnOnce(&mut Value), parts: &[&str]) {
 }
 
 #[test]
-fn transforms_that_are_something_else() {
+fn transforms_with_invalid_contents() {
     let broken = |text: &'static str, parts: &[&str]| {
         refused(Format::Transforms, "transforms.json", |bytes| *bytes = text.into(), parts);
     };
@@ -255,7 +255,7 @@ fn open_changed(name: &str, changes: impl Fn(&[u8]) -> Vec<Vec<u8>>) -> (TempDir
 }
 
 #[test]
-fn colmap_binaries_cut_short_anywhere_are_refused() {
+fn truncated_colmap_binaries_are_refused() {
     for name in ["cameras.bin", "images.bin"] {
         let (_folder, errors) =
             open_changed(name, |whole| (0..whole.len()).map(|n| whole[..n].to_vec()).collect());

@@ -1,12 +1,12 @@
-//! Bad input gives one clear sentence that names file, field, what was found and what was expected; exit code 2, or 1 for work
-//! that fails; and no partial output.
+//! Errors for invalid input. The program prints one sentence that names the file, the field, what was found and what was expected. It exits
+//! with code 2, or with 1 if the work itself fails, and leaves no partial output.
 
 use crate::common::program::{arg, command, refuse, room, succeed, tiny_config, tiny_weights};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// Returns a copy of the room with its `cameras.json` changed.
+/// Creates the room with its `cameras.json` changed by `change`.
 fn broken_room(change: impl FnOnce(&mut Value)) -> (tempfile::TempDir, PathBuf) {
     let (folder, room) = room();
     let file = room.join("cameras.json");
@@ -16,7 +16,7 @@ fn broken_room(change: impl FnOnce(&mut Value)) -> (tempfile::TempDir, PathBuf) 
     (folder, room)
 }
 
-/// Returns the error message of evaluating the room's own splat.
+/// Evaluates the room's own splat and returns the error message.
 fn refuse_room(room: &Path) -> String {
     let splat = room.join("truth.ply");
     let error = refuse(&["eval", "--splat", arg(&splat), "--scene", arg(room)]);
@@ -47,7 +47,7 @@ fn an_undecodable_image() {
 }
 
 #[test]
-fn an_image_cut_short() {
+fn a_truncated_image() {
     let (_folder, room) = room();
     let file = room.join("images/003.png");
     let bytes = std::fs::read(&file).unwrap();
@@ -79,7 +79,7 @@ fn a_pose_that_is_not_rigid() {
 }
 
 #[test]
-fn a_pose_that_mirrors() {
+fn a_pose_with_a_reflection() {
     let (_folder, room) = broken_room(|cameras| {
         for row in 0..3 {
             let entry = &mut cameras["views"][2]["c2w"][row][0];
@@ -120,7 +120,7 @@ fn fewer_than_two_views() {
 }
 
 #[test]
-fn a_file_that_is_no_json() {
+fn a_file_with_invalid_json() {
     let (_folder, room) = room();
     std::fs::write(room.join("cameras.json"), "{\"views\": [").unwrap();
     assert_says(&refuse_room(&room), &["cameras.json", "not a description of cameras"]);
@@ -148,7 +148,7 @@ fn an_image_size_that_the_patch_does_not_divide() {
     assert!(!run.exists(), "nothing was begun");
 }
 
-/// Returns the error message of inspecting the room's splat with its bytes changed.
+/// Changes the bytes of the room's splat by `change`, inspects the result, and returns the error message.
 fn broken_splat(change: impl FnOnce(&mut Vec<u8>)) -> String {
     let (folder, room) = room();
     let file = folder.path().join("broken.ply");
@@ -160,6 +160,7 @@ fn broken_splat(change: impl FnOnce(&mut Vec<u8>)) -> String {
     error
 }
 
+/// Returns the length of a PLY file's header in bytes.
 fn header_length(ply: &[u8]) -> usize {
     ply.windows(11).position(|w| w == b"end_header\n").unwrap() + 11
 }
@@ -172,7 +173,7 @@ fn replace_in_header(ply: &mut Vec<u8>, from: &str, to: &str) {
 }
 
 #[test]
-fn a_splat_cut_short() {
+fn a_truncated_splat() {
     assert_says(&broken_splat(|ply| ply.truncate(ply.len() - 10)), &["the body", "cut short"]);
     assert_says(&broken_splat(|ply| ply.truncate(100)), &["the header", "end_header"]);
 }
@@ -193,14 +194,14 @@ fn a_splat_with_nan() {
 }
 
 #[test]
-fn a_splat_that_is_something_else() {
+fn a_splat_that_is_no_gaussian_splat_ply() {
     assert_says(&broken_splat(|ply| *ply = b"hello".to_vec()), &["no PLY"]);
     let error =
         broken_splat(|ply| replace_in_header(ply, "property float f_dc_0", "property list uchar int f_dc_0"));
     assert_says(&error, &["a list"]);
 }
 
-/// Returns the error message of reconstructing with the tiny model's weights after a change of its tensors.
+/// Changes the tensors of the tiny model by `change`, reconstructs with them, and returns the error message.
 fn broken_weights(change: impl FnOnce(&mut std::collections::BTreeMap<String, tch::Tensor>)) -> String {
     let (folder, room) = room();
     let weights = tiny_weights(folder.path(), &room);
@@ -216,18 +217,18 @@ fn broken_weights(change: impl FnOnce(&mut std::collections::BTreeMap<String, tc
 }
 
 #[test]
-fn weights_whose_names_do_not_fit() {
+fn weights_with_missing_and_unknown_tensors() {
     let error = broken_weights(|tensors| {
         tensors.remove("scene_tokens");
         tensors.remove("slot_encoder.mem_regs");
-        let stranger = tensors["slot_encoder.slot_regs"].copy();
-        tensors.insert("stranger".into(), stranger);
+        let unknown = tensors["slot_encoder.slot_regs"].copy();
+        tensors.insert("unknown".into(), unknown);
     });
     assert_says(&error, &["tensor scene_tokens is missing", "[16, 32]", "2 more"]);
 }
 
 #[test]
-fn weights_whose_shapes_do_not_fit() {
+fn weights_with_another_shape() {
     let error = broken_weights(|tensors| {
         let wide = tensors["scene_tokens"].repeat([1, 2]);
         tensors.insert("scene_tokens".into(), wide);
@@ -236,7 +237,7 @@ fn weights_whose_shapes_do_not_fit() {
 }
 
 #[test]
-fn weights_that_are_something_else() {
+fn weights_files_without_a_model() {
     let (folder, room) = room();
     let file = folder.path().join("weights.safetensors");
     std::fs::write(&file, b"no weights at all").unwrap();
@@ -252,16 +253,16 @@ fn weights_that_are_something_else() {
 }
 
 #[test]
-fn options_that_would_be_ignored() {
+fn options_that_do_not_apply() {
     let data = ["eval", "--weights", "w", "--data", "d", "--index", "i.json", "--out", "o"];
-    let of_models = [["--holdout", "every:3"], ["--views", "3"], ["--precision", "bf16"]];
-    let of_data_sets = [["--index", "i.json"], ["--out", "o"], ["--name", "n"]];
-    let of_scenes = [["--holdout", "every:3"], ["--views", "3"], ["--sheet", "s.png"]];
+    let model_options = [["--holdout", "every:3"], ["--views", "3"], ["--precision", "bf16"]];
+    let dataset_options = [["--index", "i.json"], ["--out", "o"], ["--name", "n"]];
+    let scene_options = [["--holdout", "every:3"], ["--views", "3"], ["--sheet", "s.png"]];
     let commands: [(&[&str], [[&str; 2]; 3]); 4] = [
-        (&["eval", "--splat", "s.ply", "--scene", "c"], of_models),
-        (&["eval", "--renders", "r", "--scene", "c"], of_models),
-        (&["eval", "--weights", "w", "--scene", "c"], of_data_sets),
-        (&data, of_scenes),
+        (&["eval", "--splat", "s.ply", "--scene", "c"], model_options),
+        (&["eval", "--renders", "r", "--scene", "c"], model_options),
+        (&["eval", "--weights", "w", "--scene", "c"], dataset_options),
+        (&data, scene_options),
     ];
     for (command_line, options) in commands {
         for option in options {
@@ -274,7 +275,7 @@ fn options_that_would_be_ignored() {
 }
 
 #[test]
-fn precisions_that_are_unknown() {
+fn unknown_precisions() {
     let (folder, room) = room();
     let (weights, splat) = (tiny_weights(folder.path(), &room), folder.path().join("out.ply"));
     let files = ["--weights", arg(&weights), "--scene", arg(&room), "--out", arg(&splat)];
@@ -289,10 +290,10 @@ fn precisions_that_are_unknown() {
 }
 
 #[test]
-fn numbers_that_make_no_sense() {
+fn configured_numbers_out_of_range() {
     let (folder, room) = room();
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
-    let told =
+    let train =
         |setting: &str| refuse(&["train", "--config", arg(&config), "--out", arg(&run), "--set", setting]);
     for (setting, field) in [
         ("train.weight_decay=nan", "train.weight_decay is NaN"),
@@ -300,7 +301,7 @@ fn numbers_that_make_no_sense() {
         ("loss.consistency_depth=inf", "loss.consistency_depth is inf"),
         ("train.batch_size=0", "train.batch_size is 0"),
     ] {
-        assert_says(&told(setting), &["tiny.toml", field]);
+        assert_says(&train(setting), &["tiny.toml", field]);
     }
     let error = refuse(&["bench", "train", "--set", "train.batch_size=4"]);
     assert_says(&error, &["--set train.batch_size=4", "--batch N"]);
@@ -334,11 +335,11 @@ fn configurations_with_unknown_or_ill_typed_keys() {
 }
 
 #[test]
-fn outputs_that_can_not_be_written_are_refused_before_the_work() {
+fn unwritable_outputs_are_refused_before_the_work() {
     let (folder, room) = room();
     let weights = tiny_weights(folder.path(), &room);
     let (splat, config) = (room.join("truth.ply"), tiny_config(folder.path(), &room));
-    // A file where a folder must be: this is refused even for root.
+    // The parent of the output is a file, so that even root can't write it.
     let blocked = room.join("cameras.json").join("below.ply");
     let before = std::fs::read(room.join("cameras.json")).unwrap();
     for arguments in [
@@ -370,7 +371,7 @@ fn outputs_that_can_not_be_written_are_refused_before_the_work() {
 /// Runs the program with a file size limit of `kilobytes`, which acts like a full disk.
 #[cfg(unix)]
 fn on_a_full_disk(kilobytes: u32, arguments: &[&str]) -> std::process::Output {
-    // If SIGXFSZ is ignored, the system refuses the write instead of ending the program.
+    // If SIGXFSZ is ignored, a write beyond the limit fails instead of ending the program.
     let script = format!("trap '' XFSZ; ulimit -f {kilobytes}; exec \"$@\"");
     Command::new("bash")
         .args(["-c", &script, "bash", env!("CARGO_BIN_EXE_globalsplat")])
@@ -381,7 +382,7 @@ fn on_a_full_disk(kilobytes: u32, arguments: &[&str]) -> std::process::Output {
 
 #[cfg(unix)]
 #[test]
-fn a_full_disk_leaves_the_older_file_whole() {
+fn a_full_disk_leaves_the_existing_file_intact() {
     let (folder, room) = room();
     let weights = tiny_weights(folder.path(), &room);
     let (config, splat) = (tiny_config(folder.path(), &room), folder.path().join("out.ply"));
@@ -401,12 +402,12 @@ fn a_full_disk_leaves_the_older_file_whole() {
     }
     let left = std::fs::read_dir(folder.path())
         .unwrap()
-        .filter(|e| e.as_ref().unwrap().file_name().to_string_lossy().contains("partial"));
+        .filter(|entry| entry.as_ref().unwrap().file_name().to_string_lossy().contains("partial"));
     assert_eq!(left.count(), 0, "no partial file is left");
 }
 
 #[test]
-fn a_view_too_many_for_the_split() {
+fn a_split_without_target_views() {
     let (folder, room) = room();
     let weights = tiny_weights(folder.path(), &room);
     let error = refuse(&["eval", "--weights", arg(&weights), "--scene", arg(&room), "--holdout", "none"]);
@@ -414,7 +415,7 @@ fn a_view_too_many_for_the_split() {
 }
 
 #[test]
-fn a_device_that_is_not_there() {
+fn an_unavailable_device() {
     let (folder, room) = room();
     let weights = tiny_weights(folder.path(), &room);
     let eval = |device: &str| {
@@ -445,7 +446,7 @@ fn a_checkpoint_of_another_model() {
 }
 
 #[test]
-fn lpips_weights_of_something_else() {
+fn invalid_lpips_weights() {
     let (folder, room) = room();
     let file = folder.path().join("lpips_vgg.safetensors");
     let splat = room.join("truth.ply");
@@ -492,7 +493,7 @@ fn perceptual_losses_without_their_weights() {
         &["is elsewhere/v.safetensors"],
     );
     assert_says(&train("vgg16", "perceptual_factor=1"), &["unknown variant `vgg16`"]);
-    // Weights of another network.
+    // The file exists but contains the weights of another network.
     let weights = tiny_weights(folder.path(), &room);
     let named = format!("perceptual_weights={:?}", arg(&weights));
     assert_says(&train("vgg19", &named), &["tiny.safetensors", "features.0."]);

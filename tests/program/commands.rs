@@ -420,9 +420,9 @@ fn a_run_goes_from_photos_to_a_splat() {
     let report: Value = serde_json::from_slice(&output.stdout).expect("JSON");
     assert_eq!((&report["weights"], &report["views"]), (&json!("models/tiny.safetensors"), &json!(5)));
     assert_eq!(report["precision"], "f32", "they are narrow");
-    let told = String::from_utf8_lossy(&output.stderr);
+    let message = String::from_utf8_lossy(&output.stderr);
     let expected = "room_000: 5 of 9 photos are shown, spread over the camera's path; 40×40 pixels are cut and resized to ";
-    assert!(told.starts_with(expected) && told.lines().count() == 1, "{told}");
+    assert!(message.starts_with(expected) && message.lines().count() == 1, "{message}");
     let [doctor, as_json] = [succeed(&["doctor"]), succeed(&["doctor", "--json"])];
     assert!(doctor.contains("models/tiny.safetensors") && as_json.contains("models/tiny.safetensors"));
 
@@ -532,9 +532,9 @@ fn doctor_estimates_memory_and_bench_train_fits_the_batch() {
     let config = tiny_config(folder.path(), &room);
     let text = succeed(&["doctor", "--config", arg(&config), "--set", "train.batch_size=3"]);
     assert!(text.contains("3 scenes, 3 at a time") && text.contains("GB: it fits"), "{text}");
-    let told: Value =
+    let report: Value =
         serde_json::from_str(&succeed(&["doctor", "--config", arg(&config), "--json"])).expect("JSON");
-    assert_eq!((&told["cpu"]["scenes_at_once"], &told["devices"][0]["fits"]), (&json!(1), &json!(true)));
+    assert_eq!((&report["cpu"]["scenes_at_once"], &report["devices"][0]["fits"]), (&json!(1), &json!(true)));
     // No machine has enough memory for that many Gaussians.
     let large = ["--set", "model.latents=1000000", "--set", "model.candidates=1024"];
     let text = succeed(&[&["doctor", "--config", arg(&config)][..], &large].concat());
@@ -577,25 +577,28 @@ fn training_on_chunks_reports_skipped_scenes() {
         let (run, share) = (folder.path().join(run), format!("data.max_bad_share={share}"));
         globalsplat(&["train", "--config", arg(&config), "--out", arg(&run), "--json", "--set", &share])
     };
-    let told: Value = serde_json::from_slice(&train("whole", "0").stdout).unwrap();
-    assert_eq!((told["skipped_scenes"]["scenes"].as_u64(), told["held_out"].as_object()), (Some(3), None));
+    let report: Value = serde_json::from_slice(&train("whole", "0").stdout).unwrap();
+    assert_eq!(
+        (report["skipped_scenes"]["scenes"].as_u64(), report["held_out"].as_object()),
+        (Some(3), None)
+    );
 
     let chunk = set.join("000001.torch");
     let mut bytes = std::fs::read(&chunk).unwrap();
     let middle = bytes.len() / 2;
     bytes[middle] ^= 1;
     std::fs::write(&chunk, bytes).unwrap();
-    let told: Value = serde_json::from_slice(&train("part", "0.5").stdout).unwrap();
-    assert_eq!(told["skipped_scenes"]["in_broken_files"].as_u64(), Some(1));
-    assert!(told["skipped_scenes"]["first"].as_str().unwrap().contains("000001.torch"));
+    let report: Value = serde_json::from_slice(&train("part", "0.5").stdout).unwrap();
+    assert_eq!(report["skipped_scenes"]["in_broken_files"].as_u64(), Some(1));
+    assert!(report["skipped_scenes"]["first"].as_str().unwrap().contains("000001.torch"));
     // Held-out views of scenes in chunks are validated as well, for the scenes that can be read.
     let (run, holdout) = (folder.path().join("held_out"), "data.holdout=\"every:3+1\"");
     let settings = ["--set", holdout, "--set", "data.max_bad_share=0.5"];
     let output = globalsplat(
         &[&["train", "--config", arg(&config), "--out", arg(&run), "--json"], &settings[..]].concat(),
     );
-    let told: Value = serde_json::from_slice(&output.stdout).unwrap();
-    let held_out = told["held_out"]["scenes"].as_array().unwrap();
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let held_out = report["held_out"]["scenes"].as_array().unwrap();
     let of = |i: usize| {
         (held_out[i]["ours"]["scene"].as_str(), held_out[i]["ours"]["views"].as_array().map(Vec::len))
     };

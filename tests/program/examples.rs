@@ -23,8 +23,8 @@ fn reconstruct_makes_the_programs_splat() {
     let (folder, room) = room();
     let weights = tiny_weights(folder.path(), &room);
     let [ours, theirs] = ["example.ply", "program.ply"].map(|name| folder.path().join(name));
-    let told = run("reconstruct", &[arg(&weights), arg(&room), arg(&ours)]);
-    assert!(told.contains("64 Gaussians from 3 photos"), "{told}");
+    let printed = run("reconstruct", &[arg(&weights), arg(&room), arg(&ours)]);
+    assert!(printed.contains("64 Gaussians from 3 photos"), "{printed}");
     let given = ["--weights", arg(&weights), "--scene", arg(&room), "--out", arg(&theirs)];
     let arguments = [&["reconstruct", "--precision", "f32"], &given[..]].concat();
     let output = command(&arguments).envs([SAME_BITS]).output().unwrap();
@@ -36,10 +36,10 @@ fn reconstruct_makes_the_programs_splat() {
 fn fit_image_fits_an_image() {
     let (folder, room) = room();
     let picture = folder.path().join("fitted.png");
-    let told = run("fit_image", &[arg(&room.join("images/004.png")), arg(&picture), "60"]);
-    let numbers: Vec<f64> = told.split_whitespace().filter_map(|word| word.parse().ok()).collect();
-    let [before, steps, after] = numbers[..] else { panic!("{told}") };
+    let printed = run("fit_image", &[arg(&room.join("images/004.png")), arg(&picture), "60"]);
+    let numbers: Vec<f64> = printed.split_whitespace().filter_map(|word| word.parse().ok()).collect();
+    let [before, steps, after] = numbers[..] else { panic!("{printed}") };
     assert_eq!(steps, 60.);
-    assert!(before < 16. && after > before + 10., "{told}");
+    assert!(before < 16. && after > before + 10., "{printed}");
     assert_eq!(image::image_dimensions(&picture).unwrap(), (3 * 256 + 2 * 4, 256));
 }

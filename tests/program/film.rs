@@ -52,9 +52,9 @@ fn probed(film: &Path) -> Value {
         .args(["-v", "error", "-count_frames", "-show_streams", "-of", "json", arg(film)])
         .output()
         .unwrap();
-    let mut told: Value = serde_json::from_slice(&output.stdout).unwrap();
-    assert_eq!(told["streams"].as_array().unwrap().len(), 1, "pictures alone");
-    told["streams"][0].take()
+    let mut report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(report["streams"].as_array().unwrap().len(), 1, "pictures alone");
+    report["streams"][0].take()
 }
 
 #[test]
@@ -130,17 +130,17 @@ fn a_browser_plays_an_mp4_from_disk() {
         <video src=film.mp4 muted></video>";
     fs::write(&page, text).unwrap();
     browser.open(&page);
-    let told = browser.evaluate(
+    let measured = browser.evaluate(
         "new Promise((done, failed) => {
             const v = document.querySelector('video');
             const tell = () => done([v.readyState, v.duration, v.videoWidth, v.videoHeight]);
             v.readyState > 1 ? tell() : (v.onloadeddata = tell, v.onerror = () => failed(v.error.message));
         })",
     );
-    assert!(told[0].as_i64() >= Some(2), "{told}");
+    assert!(measured[0].as_i64() >= Some(2), "{measured}");
     // Nine frames at 20 frames per second.
-    assert!((told[1].as_f64().unwrap() - 0.45).abs() < 0.01, "{told}");
-    assert_eq!((told[2].as_i64(), told[3].as_i64()), (Some(384), Some(256)));
+    assert!((measured[1].as_f64().unwrap() - 0.45).abs() < 0.01, "{measured}");
+    assert_eq!((measured[2].as_i64(), measured[3].as_i64()), (Some(384), Some(256)));
     for (i, picture) in pictures(&views).iter().enumerate().step_by(4) {
         // Seek to the middle of the frame.
         browser.evaluate(&format!(
@@ -198,24 +198,24 @@ fn no_film(path: &Path, splat: &Path) -> (String, Option<i32>) {
     let film = out.path().join("film.mp4");
     let output =
         command(&render(splat, &film, &["--orbit", "--frames", "9"])).env("PATH", path).output().unwrap();
-    let told = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(told.lines().count(), 1, "{told}");
-    assert_eq!(names(out.path()), [""; 0], "{told}");
-    (told, output.status.code())
+    let message = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(message.lines().count(), 1, "{message}");
+    assert_eq!(names(out.path()), [""; 0], "{message}");
+    (message, output.status.code())
 }
 
 #[test]
 fn an_mp4_without_an_encoder_is_refused_before_anything_is_read() {
     let nothing = tempfile::tempdir().unwrap();
     let absent = Path::new("no_such_splat.ply");
-    let (told, code) = no_film(nothing.path(), absent);
+    let (message, code) = no_film(nothing.path(), absent);
     assert_eq!(code, Some(2));
     for part in ["film.mp4", "ffmpeg isn't on the PATH", "apt install ffmpeg", ".gif", "PNGs"] {
-        assert!(told.contains(part), "{part}: {told}");
+        assert!(message.contains(part), "{part}: {message}");
     }
     let other = with_ffmpeg("echo ' V....D mpeg4  MPEG-4 part 2'");
-    let (told, code) = no_film(other.path(), absent);
-    assert!(code == Some(2) && told.contains("lacks libx264") && told.contains(".gif"), "{told}");
+    let (message, code) = no_film(other.path(), absent);
+    assert!(code == Some(2) && message.contains("lacks libx264") && message.contains(".gif"), "{message}");
     // A GIF needs no ffmpeg.
     let (folder, room) = room();
     let film = folder.path().join("film.gif");
@@ -229,7 +229,7 @@ fn an_encoder_that_fails_is_quoted_and_leaves_nothing() {
     const KNOWS: &str =
         "case $* in *-encoders*) echo libx264; exit;; esac; for out; do :; done; echo begun > \"$out\"";
     let (_folder, room) = room();
-    for (script, told) in [
+    for (script, message) in [
         ("head -c 9 > /dev/null; echo 'the disk is full' >&2; exit 1", "ffmpeg failed: the disk is full"),
         ("cat > /dev/null; echo 'no trailer' >&2; exit 1", "ffmpeg failed: no trailer"),
         ("cat > /dev/null; kill -9 $$", "ffmpeg failed (signal: 9"),
@@ -237,7 +237,7 @@ fn an_encoder_that_fails_is_quoted_and_leaves_nothing() {
     ] {
         let ffmpeg = with_ffmpeg(&format!("{KNOWS}; {script}"));
         let (sentence, code) = no_film(ffmpeg.path(), &room.join("truth.ply"));
-        assert!(code == Some(1) && sentence.contains(told), "{script}: {sentence}");
+        assert!(code == Some(1) && sentence.contains(message), "{script}: {sentence}");
     }
 }
 
@@ -266,9 +266,9 @@ fn ctrl_c_leaves_no_half_film() {
         }
         assert_eq!(unsafe { libc::kill(program.id() as i32, libc::SIGINT) }, 0);
         let output = program.wait_with_output().unwrap();
-        let told = String::from_utf8(output.stderr).unwrap();
-        assert_eq!(output.status.code(), Some(1), "{told}");
-        assert!(told.contains("stopped after") && told.contains("of 100000 views"), "{told}");
+        let message = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{message}");
+        assert!(message.contains("stopped after") && message.contains("of 100000 views"), "{message}");
         assert_eq!(names(out.path()), [""; 0]);
     }
 }
@@ -288,11 +288,11 @@ fn a_gif_lasts_as_long_as_it_should() {
     // Half a second in total, although 1/24 s is not a whole number of hundredths.
     assert_eq!((delays.len(), delays.iter().sum::<u16>()), (12, 50), "{delays:?}");
 
-    let told = refuse(&render(&splat, &film, &[&orbit[..], &["--fps", "60"]].concat()));
-    assert!(told.contains("frames per second is 60, expected 1 to 50 in a .gif"), "{told}");
+    let message = refuse(&render(&splat, &film, &[&orbit[..], &["--fps", "60"]].concat()));
+    assert!(message.contains("frames per second is 60, expected 1 to 50 in a .gif"), "{message}");
     let views = folder.path().join("views");
-    let told = refuse(&render(&splat, &views, &[&orbit[..], &["--fps", "24"]].concat()));
-    assert!(told.contains("--fps is for films") && !views.exists(), "{told}");
+    let message = refuse(&render(&splat, &views, &[&orbit[..], &["--fps", "24"]].concat()));
+    assert!(message.contains("--fps is for films") && !views.exists(), "{message}");
 }
 
 #[test]
@@ -323,7 +323,7 @@ fn a_smooth_path_goes_from_the_first_camera_to_the_last() {
 fn all_pictures_have_one_scale_of_depth() {
     let (folder, room) = room();
     let splat = room.join("truth.ply");
-    // Same position, eight times the focal length: the centre has the same depth in both.
+    // Both cameras have one position, and the second has eight times the focal length. The centre has the same depth in both images.
     let mut wide = open_capture(&room).unwrap().cameras()[8];
     (wide.intrinsics.cx, wide.intrinsics.cy) = (20., 20.);
     let mut long = wide;
@@ -394,8 +394,8 @@ fn a_path_without_image_sizes_needs_photos_or_size() {
     assert_same(&room, &cameras, 1e-9);
     fs::remove_dir_all(room.join("images")).unwrap();
     let (splat, out) = (room.join("truth.ply"), room.join("row.png"));
-    let told = refuse(&render(&splat, &out, &["--path", arg(&room)]));
-    assert!(told.contains("the size of frame 0 is missing") && told.contains("--size"), "{told}");
+    let message = refuse(&render(&splat, &out, &["--path", arg(&room)]));
+    assert!(message.contains("the size of frame 0 is missing") && message.contains("--size"), "{message}");
     let found = read_camera_path(&room, Some([40, 40].into())).unwrap().cameras;
     assert_eq!((found[0].width, found[0].intrinsics), (40, cameras[0].intrinsics));
     succeed(&render(&splat, &out, &["--path", arg(&room), "--size", "40x40"]));
@@ -463,9 +463,9 @@ fn a_path_of_nerfstudio_s_viewer_is_flown() {
         let mut json = of_viewer(&cameras);
         change(&mut json);
         fs::write(&file, json.to_string()).unwrap();
-        let told = refuse(&render(&room.join("truth.ply"), &out, &["--path", arg(&file)]));
+        let message = refuse(&render(&room.join("truth.ply"), &out, &["--path", arg(&file)]));
         for part in ["2026-01-01.json"].iter().chain(parts) {
-            assert!(told.contains(part), "{part}: {told}");
+            assert!(message.contains(part), "{part}: {message}");
         }
     }
     assert!(!out.exists());
@@ -476,7 +476,7 @@ fn a_path_of_nerfstudio_s_viewer_is_flown() {
         ("{\"frames\": []}", "number of views is 0, expected one or more"),
     ] {
         fs::write(&file, text).unwrap();
-        let told = refuse(&render(&room.join("truth.ply"), &out, &["--path", arg(&file)]));
-        assert!(told.contains(part), "{text}: {told}");
+        let message = refuse(&render(&room.join("truth.ply"), &out, &["--path", arg(&file)]));
+        assert!(message.contains(part), "{text}: {message}");
     }
 }

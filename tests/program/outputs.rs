@@ -239,7 +239,7 @@ fn folders_of_outputs_replace_nothing_that_is_read() {
         refuse_all(folder.path(), &[&["report", arg(&out), "--out", arg(&out.join(name))]]);
     }
     succeed(&["report", arg(&out), "--out", arg(&out.join("report.html"))]);
-    // The same evaluation resumes on its own files, also in a folder of the dataset.
+    // An evaluation that is repeated resumes on its own files, also in a folder of the dataset.
     let within = room.join("scores");
     for _ in 0..2 {
         succeed(&text(&sweep(&index, &["--splat", arg(&splats), "--out", arg(&within)])));
@@ -401,8 +401,8 @@ fn output_image_names_do_not_collide() {
     let render =
         ["render", "--splat", arg(&room.join("truth.ply")), "--scene", arg(&room), "--out", arg(&out)]
             .map(String::from);
-    let told = succeed(&[&text(&render)[..], &["--depth", "--json"]].concat());
-    let files = serde_json::from_str::<Value>(&told).unwrap()["files"].as_array().unwrap().len();
+    let report = succeed(&[&text(&render)[..], &["--depth", "--json"]].concat());
+    let files = serde_json::from_str::<Value>(&report).unwrap()["files"].as_array().unwrap().len();
     assert_eq!((files, names(&out).len()), (18, 18));
     succeed(&text(&render));
     assert_eq!(read_image(&out.join("000_depth.png")).unwrap().dimensions(), (40, 40));
@@ -472,8 +472,8 @@ fn checkpoints_that_list_no_files_or_others_are_broken() {
         assert!(error.contains("state.json: the names in files is"), "{error}");
         // The previous checkpoint is loaded.
         let output = globalsplat(&text(&train(&config, &run, &["train.steps=4"])));
-        let told = String::from_utf8_lossy(&output.stderr);
-        assert!(output.status.success() && told.contains("the previous checkpoint is used"), "{told}");
+        let message = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success() && message.contains("the previous checkpoint is used"), "{message}");
         assert_eq!(
             serde_json::from_str::<Value>(&fs::read_to_string(&state).unwrap()).unwrap()["files"].as_object(),
             Some(&files)

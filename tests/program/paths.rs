@@ -48,13 +48,14 @@ impl Folder {
 
     /// Returns the JSON object that the command prints, and asserts that the values of `keys` are paths.
     fn json(&self, arguments: &[&str], keys: &[&str]) -> Value {
-        let told: Value =
+        let report: Value =
             serde_json::from_str(&self.succeed(&[arguments, &["--json"]].concat())).expect("JSON");
         for key in keys {
-            let path = told.pointer(key).and_then(Value::as_str).unwrap_or_else(|| panic!("{key} of {told}"));
+            let path =
+                report.pointer(key).and_then(Value::as_str).unwrap_or_else(|| panic!("{key} of {report}"));
             assert!(path.contains(SHOWN), "{arguments:?}: {key} is {path}");
         }
-        told
+        report
     }
 }
 
@@ -139,8 +140,8 @@ fn watch(folder: &Folder) {
 
 /// Returns the response to a request for `/state` to the server whose URL is in `line`.
 fn served_state(line: &str) -> Option<String> {
-    let told: Value = serde_json::from_str(line).ok()?;
-    let host = told["url"].as_str()?.strip_prefix("http://")?.trim_end_matches('/');
+    let report: Value = serde_json::from_str(line).ok()?;
+    let host = report["url"].as_str()?.strip_prefix("http://")?.trim_end_matches('/');
     let mut stream = TcpStream::connect(host).ok()?;
     write!(stream, "GET /state HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n").ok()?;
     let mut answer = String::new();

@@ -42,7 +42,7 @@ fn steps_fit_into_the_memory_of_a_large_gpu() {
         let path = entry.expect("an entry").path();
         let config = Config::read(&path, &[]).expect("a configuration");
         let bytes = MemoryEstimate::new(&config, Device::Cuda(0)).expect("a model").total();
-        // Of 80 GB, with a margin for what the estimate doesn't include.
+        // A GPU has 80 GB. The rest is a margin for memory that the estimate doesn't include.
         assert!(bytes < 60_000_000_000, "{}: {:.1} GB", path.display(), bytes as f64 * 1e-9);
     }
 }

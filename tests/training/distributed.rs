@@ -84,7 +84,7 @@ impl Started {
             command.args(["--no-python", "--nnodes=2", "--nproc-per-node=1", "--max-restarts=1"]);
             command.args(["--rdzv-backend=c10d", "--rdzv-id=test", "--local-addr=127.0.0.1"]);
             command.arg(format!("--rdzv-endpoint=127.0.0.1:{port}"));
-            // The same setting as in scripts/slurm_train.sh.
+            // scripts/slurm_train.sh has this setting, too.
             command.env("TORCH_DISABLE_SHARE_RDZV_TCP_STORE", "1").env("OMP_NUM_THREADS", "1");
             command.arg(env!("CARGO_BIN_EXE_globalsplat")).args(arguments);
             command
@@ -112,7 +112,8 @@ impl Started {
         Started::start((0..count).map(rank).collect())
     }
 
-    fn told(&self, file: &str) -> String {
+    /// Returns the contents of an output file of a rank, such as `err0`.
+    fn read_output(&self, file: &str) -> String {
         String::from_utf8_lossy(&fs::read(self.folder.path().join(file)).unwrap()).into_owned()
     }
 
@@ -124,7 +125,7 @@ impl Started {
                 return found;
             }
             let ended = self.processes.iter_mut().any(|process| process.try_wait().unwrap().is_some());
-            assert!(!ended && begun.elapsed() < TIMEOUT, "{what} never came: {}", self.told("err0"));
+            assert!(!ended && begun.elapsed() < TIMEOUT, "{what} never came: {}", self.read_output("err0"));
             sleep(Duration::from_micros(200));
         }
     }
@@ -144,8 +145,8 @@ impl Started {
             self.processes.iter_mut().enumerate().map(|(i, process)| ended(i, process)).collect();
         let ended = |(i, code)| Ended {
             code,
-            out: self.told(&format!("out{i}")),
-            err: self.told(&format!("err{i}")),
+            out: self.read_output(&format!("out{i}")),
+            err: self.read_output(&format!("err{i}")),
         };
         codes.into_iter().enumerate().map(ended).collect()
     }
@@ -221,9 +222,11 @@ fn succeed_together(count: usize, arguments: &[&str]) -> String {
 
 /// Returns the program's own error messages among all lines that torchrun prints.
 fn sentences(err: &str) -> Vec<&str> {
-    let told = err.lines().filter_map(|line| line.strip_prefix("globalsplat: "));
+    let messages = err.lines().filter_map(|line| line.strip_prefix("globalsplat: "));
     // Exclude the progress line that is printed every half minute.
-    told.filter(|line| !(line.starts_with(|c: char| c.is_ascii_digit()) && line.contains(" steps"))).collect()
+    messages
+        .filter(|line| !(line.starts_with(|c: char| c.is_ascii_digit()) && line.contains(" steps")))
+        .collect()
 }
 
 /// Returns a folder of rooms, and a configuration that trains on them.
@@ -403,11 +406,11 @@ fn ranks_that_die_are_survived_to_the_same_bits() {
     }
     let ended = started.end().remove(0);
     assert_eq!(ended.code, Some(0), "{}", ended.err);
-    let told = sentences(&ended.err);
-    let is_lost = |told: &&str| {
-        told.contains("distributed communication failed") && told.contains("restart the processes")
+    let messages = sentences(&ended.err);
+    let is_lost = |message: &&str| {
+        message.contains("distributed communication failed") && message.contains("restart the processes")
     };
-    assert!(told.len() == 3 && told.iter().all(is_lost), "one sentence for each: {told:?}");
+    assert!(messages.len() == 3 && messages.iter().all(is_lost), "one sentence for each: {messages:?}");
 
     assert_same_bits(&run, &whole);
     assert_same_steps(&run, &whole);
@@ -500,7 +503,7 @@ fn a_rank_that_hangs_ends_all_with_one_sentence() {
         assert!(begun.elapsed() < TIMEOUT, "the first rank still waits");
         sleep(Duration::from_millis(20));
     }
-    assert_eq!(sentences(&started.told("err0")), ["rank 1 of 2 sent no heartbeat for 25 seconds"]);
+    assert_eq!(sentences(&started.read_output("err0")), ["rank 1 of 2 sent no heartbeat for 25 seconds"]);
     // torchrun would wait for it half a minute longer.
     signal(second, libc::SIGKILL);
     let ended = started.end().remove(0);
@@ -556,7 +559,7 @@ fn ranks_that_are_asked_to_stop_save_first() {
 }
 
 #[test]
-fn a_mistake_is_told_once() {
+fn an_error_is_printed_once() {
     let Some(_turn) = turn() else { return };
     let (folder, config) = data(2);
     let run = folder.path().join("run");
@@ -580,7 +583,7 @@ fn a_mistake_is_told_once() {
 }
 
 #[test]
-fn ranks_that_train_something_else_are_refused() {
+fn ranks_with_different_training_are_refused() {
     let Some(_turn) = turn() else { return };
     let (folder, config) = data(2);
     let (_more, more) = data(3);
@@ -703,15 +706,15 @@ fn bad_data_is_reported_by_any_rank() {
         "{sentence}"
     );
 
-    let told = |output: &str| -> Value { serde_json::from_str(output).unwrap() };
-    let one = told(&succeed(&text(&arguments("one", "data.max_bad_share=0.5", "train.batch_size=2"))));
+    let parse = |output: &str| -> Value { serde_json::from_str(output).unwrap() };
+    let one = parse(&succeed(&text(&arguments("one", "data.max_bad_share=0.5", "train.batch_size=2"))));
     let two =
-        told(&succeed_together(2, &text(&arguments("two", "data.max_bad_share=0.5", "train.batch_size=1"))));
+        parse(&succeed_together(2, &text(&arguments("two", "data.max_bad_share=0.5", "train.batch_size=1"))));
     assert_eq!(two["skipped_scenes"], one["skipped_scenes"]);
     assert_eq!(two["skipped_scenes"]["with_broken_images"], 1);
     // Its held-out views are not scored, either.
-    let judged = |told: &Value| -> Vec<Value> {
-        told["held_out"]["scenes"]
+    let judged = |report: &Value| -> Vec<Value> {
+        report["held_out"]["scenes"]
             .as_array()
             .unwrap()
             .iter()

@@ -72,7 +72,7 @@ fn a_run_that_is_killed_ten_times_ends_with_the_same_bits() {
     // A checkpoint after every step: saves take about as much time as steps.
     let mut random = ChaCha8Rng::seed_from_u64(7);
     for _ in 0..10 {
-        let lines = told(&killed) + random.random_range(0..=2);
+        let lines = count_metrics_lines(&killed) + random.random_range(0..=2);
         let mut child = run(&killed).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
         wait_for_lines(&mut child, &killed, lines);
         std::thread::sleep(Duration::from_secs_f64(random.random_range(0.0..2. * step_time)));
@@ -83,7 +83,7 @@ fn a_run_that_is_killed_ten_times_ends_with_the_same_bits() {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     assert_same_bits(&whole, &killed);
     let validated = (1..=STEPS / 5).map(|i| 5 * i - 1).collect();
-    assert_eq!(steps(&killed), ((0..STEPS).collect(), validated), "everything is told of once");
+    assert_eq!(steps(&killed), ((0..STEPS).collect(), validated), "every record is written once");
     let of = |run: &Path| std::fs::read(run.join("best/state.json")).unwrap();
     assert_eq!(of(&whole), of(&killed), "the best checkpoint, by the same score");
     let left: Vec<_> = std::fs::read_dir(killed.join("checkpoints")).unwrap().collect();
@@ -126,12 +126,12 @@ fn endless(config: &Path, run: &Path) -> Command {
 }
 
 /// Returns the number of lines of metrics.jsonl.
-fn told(run: &Path) -> usize {
+fn count_metrics_lines(run: &Path) -> usize {
     std::fs::read(run.join("metrics.jsonl")).map_or(0, |text| text.lines().count())
 }
 
 fn wait_for_lines(child: &mut Child, run: &Path, count: usize) {
-    while told(run) < count {
+    while count_metrics_lines(run) < count {
         assert!(child.try_wait().unwrap().is_none(), "it ended by itself");
         std::thread::sleep(Duration::from_millis(1));
     }
@@ -229,10 +229,10 @@ fn numbers_that_are_not_finite_end_a_run_and_leave_the_checkpoint_before_them() 
     }
     assert_eq!(checkpoints(&run), ["step-00000002", "step-00000004"]);
     assert!(tensors(&run).iter().zip(&good).all(|((_, x), (_, y))| x.equal(y)));
-    let told = metrics(&run);
-    let skipped: Vec<bool> = told.iter().filter_map(|line| line["skipped"].as_bool()).collect();
+    let records = metrics(&run);
+    let skipped: Vec<bool> = records.iter().filter_map(|line| line["skipped"].as_bool()).collect();
     assert_eq!(skipped, [[false; 5], [true; 5]].concat());
-    assert_eq!(told.last().unwrap()["scenes"], serde_json::json!(["room_000"]));
+    assert_eq!(records.last().unwrap()["scenes"], serde_json::json!(["room_000"]));
 
     // With a reasonable learning rate, the run resumes from there.
     succeed(&text(&train(&config, &run, &["train.steps=8"])));
@@ -266,8 +266,8 @@ fn a_changed_configuration_is_reported_and_resumes_in_the_data() {
     let same = stderr(&["train.steps=3", "train.batch_size=1"]);
     assert!(!same.contains("configuration"), "{same}");
     let other = stderr(&["train.steps=5", "train.batch_size=2"]);
-    let told = "resuming with a changed configuration: train.batch_size 1 → 2, train.steps 3 → 5\n";
-    assert!(other.contains(told), "{other}");
+    let message = "resuming with a changed configuration: train.batch_size 1 → 2, train.steps 3 → 5\n";
+    assert!(other.contains(message), "{other}");
     let state = std::fs::read(run.join("checkpoints/step-00000005/state.json")).unwrap();
     let state: Value = serde_json::from_slice(&state).unwrap();
     assert_eq!((state["step"].as_u64(), state["samples"].as_u64()), (Some(5), Some(3 + 2 * 2)));
@@ -308,8 +308,8 @@ fn the_best_checkpoint_is_kept_and_exported() {
     let best = validations.iter().fold(validations[0], |a, b| if b.1 > a.1 { *b } else { a });
     assert!(best.0 < 29, "{validations:?}");
     let state: Value = serde_json::from_slice(&std::fs::read(run.join("best/state.json")).unwrap()).unwrap();
-    let told = (state["step"].as_u64(), state["validation"]["psnr"].as_f64());
-    assert_eq!(told, (Some(best.0 + 1), Some(best.1)));
+    let reported = (state["step"].as_u64(), state["validation"]["psnr"].as_f64());
+    assert_eq!(reported, (Some(best.0 + 1), Some(best.1)));
     assert_eq!(checkpoints(&run), ["step-00000030"], "the best one is kept beside them");
 
     let weights = folder.path().join("best.safetensors");
@@ -487,8 +487,8 @@ fn weights_are_used_at_the_stage_that_they_were_trained_to() {
             "--json",
         ];
         let output = command(&arguments).output().unwrap();
-        let told: Value = serde_json::from_slice(&output.stdout).unwrap();
-        assert_eq!(told["gaussians"], gaussians);
+        let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+        assert_eq!(report["gaussians"], gaussians);
         let err = String::from_utf8(output.stderr).unwrap();
         let of_stage = err.lines().find(|line| line.contains(" stage "));
         assert_eq!(said.map(|said| err.contains(said)), of_stage.map(|_| true), "{err}");
@@ -516,7 +516,7 @@ fn weights_are_used_at_the_stage_that_they_were_trained_to() {
 }
 
 #[test]
-fn scenes_of_training_among_those_held_out_are_told() {
+fn validation_scenes_that_are_also_trained_on_are_reported() {
     let (folder, room) = room();
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
     let said = |scenes: &Path| {

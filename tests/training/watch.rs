@@ -69,8 +69,8 @@ impl Watch {
             command(&["watch", arg(run), "--json"]).stdout(Stdio::piped()).spawn().expect("a program");
         let mut line = String::new();
         BufReader::new(process.stdout.take().expect("a pipe")).read_line(&mut line).expect("a line");
-        let told: Value = serde_json::from_str(&line).expect("JSON");
-        let url = told["url"].as_str().expect("an address");
+        let report: Value = serde_json::from_str(&line).expect("JSON");
+        let url = report["url"].as_str().expect("an address");
         let port = url.strip_prefix("http://127.0.0.1:").and_then(|rest| rest.strip_suffix('/'));
         Watch { process, port: port.and_then(|port| port.parse().ok()).unwrap_or_else(|| panic!("{url}")) }
     }
@@ -186,10 +186,10 @@ fn appended_and_rewritten_metrics_are_followed() {
     );
     let state = watch.state();
     assert_eq!([&state["step"], &state["curves"]["psnr"][STEPS]], [&json!(8), &json!([6, 31.5])]);
-    let told = notices(&state);
+    let message = notices(&state);
     assert!(
-        told.starts_with("1 step was skipped") && told.ends_with("step 7, and showed a, b, c, 1 more"),
-        "{told}"
+        message.starts_with("1 step was skipped") && message.ends_with("step 7, and showed a, b, c, 1 more"),
+        "{message}"
     );
 
     // A stalled run.
@@ -428,9 +428,9 @@ fn a_browser_shows_it_and_follows_the_run() {
         return document.querySelector(".reading").textContent;
     })()"#;
     let first = written(run(), |line| &line["psnr"])[0][1].as_f64().unwrap();
-    let told = browser.evaluate(hover);
-    let told = told.as_str().unwrap();
-    assert!(told.starts_with(&format!("in training {first:.2} dB (step 0), held out")), "{told}");
+    let tooltip = browser.evaluate(hover);
+    let tooltip = tooltip.as_str().unwrap();
+    assert!(tooltip.starts_with(&format!("in training {first:.2} dB (step 0), held out")), "{tooltip}");
 
     assert_eq!(browser.errors(), [&json!(null); 0]);
     let foreign: Vec<_> = browser.requests().into_iter().filter(|asked| !asked.starts_with(&url)).collect();

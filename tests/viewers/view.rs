@@ -322,9 +322,9 @@ fn without_a_browser_view_says_where_the_page_is() {
         .output()
         .unwrap();
     assert!(done.status.success());
-    let told: Value = serde_json::from_slice(&done.stdout).unwrap();
-    assert_eq!(told["opened"], false);
-    assert!(Path::new(told["page"].as_str().unwrap()).is_file());
+    let report: Value = serde_json::from_slice(&done.stdout).unwrap();
+    assert_eq!(report["opened"], false);
+    assert!(Path::new(report["page"].as_str().unwrap()).is_file());
     let err = String::from_utf8(done.stderr).unwrap();
     assert!(err.starts_with("no browser could be started (") && err.lines().count() == 1, "{err}");
 }
@@ -350,8 +350,8 @@ fn pages_are_private_and_replaced_by_the_next() {
             .output()
             .unwrap();
         assert!(done.status.success());
-        let told: Value = serde_json::from_slice(&done.stdout).unwrap();
-        let page = PathBuf::from(told["page"].as_str().unwrap());
+        let report: Value = serde_json::from_slice(&done.stdout).unwrap();
+        let page = PathBuf::from(report["page"].as_str().unwrap());
         assert_eq!(std::fs::metadata(&page).unwrap().permissions().mode() & 0o777, 0o600);
         assert_eq!(std::fs::read_dir(&temporary).unwrap().count(), 2, "the page, and what isn't ours");
         assert!(before.is_none_or(|before| !before.exists()));

@@ -68,15 +68,15 @@ fn show(browser: &mut Browser, page: &Path, file: &Path, camera: &Camera) -> (Va
     });
     let bytes = STANDARD.encode(std::fs::read(file).unwrap());
     let ending = file.extension().unwrap().to_str().unwrap();
-    let told = browser.evaluate(&format!(
+    let report = browser.evaluate(&format!(
         "show(Uint8Array.from(atob({bytes:?}), (letter) => letter.charCodeAt(0)), {ending:?}, {camera})"
     ));
     assert!(browser.errors().is_empty(), "{:?}", browser.errors());
-    let png = told["png"].as_str().unwrap().strip_prefix("data:image/png;base64,").unwrap();
+    let png = report["png"].as_str().unwrap().strip_prefix("data:image/png;base64,").unwrap();
     let folder = tempfile::tempdir().unwrap();
     let picture = folder.path().join("picture.png");
     std::fs::write(&picture, STANDARD.decode(png).unwrap()).unwrap();
-    (told, tensor_from_rgb(&read_image(&picture).unwrap()))
+    (report, tensor_from_rgb(&read_image(&picture).unwrap()))
 }
 
 /// Returns the corners of the bounding box of the means.
@@ -124,12 +124,12 @@ fn public_viewers_show_our_splats_as_we_do() {
         let ending = file.extension().unwrap().to_str().unwrap();
         for (viewer, page) in &viewers {
             let what = format!("{name}, .{ending}, in {viewer}");
-            let (told, picture) = show(&mut browser, page, &file, &camera);
+            let (report, picture) = show(&mut browser, page, &file, &camera);
             screenshots.save(&format!("{name}-{ending}-{viewer}"), &picture);
-            assert_eq!(told["count"].as_i64(), Some(splat.len() as i64), "{what}");
+            assert_eq!(report["count"].as_i64(), Some(splat.len() as i64), "{what}");
             for (corner, own) in ["low", "high"].iter().zip(bounds(&splat)) {
                 // Spark stores means in half precision.
-                for (a, b) in numbers(&told[*corner]).iter().zip(own) {
+                for (a, b) in numbers(&report[*corner]).iter().zip(own) {
                     assert!((a - b).abs() <= 1e-3 * b.abs(), "{what}: {corner} {a}, {b}");
                 }
             }

@@ -157,7 +157,7 @@ fn remove(value: &mut Value, keys: &[&str]) {
 }
 
 #[test]
-fn lenses_of_transforms_may_be_told_in_many_ways() {
+fn transforms_specify_intrinsics_in_several_ways() {
     let with = |change: fn(&mut Intrinsics)| {
         let mut all = cameras();
         all.iter_mut().for_each(|camera| change(&mut camera.intrinsics));
@@ -310,7 +310,7 @@ fn assert_warns(capture: &Capture, parts: &[&str]) {
 }
 
 #[test]
-fn photos_that_are_not_there_are_left_out_and_named() {
+fn missing_photos_are_left_out_with_a_warning() {
     for format in [None, Some(Format::Transforms), Some(Format::ColmapText), Some(Format::ColmapBinary)] {
         let folder = original();
         format.into_iter().for_each(|format| rewrite(folder.path(), format));
@@ -357,7 +357,7 @@ fn the_first_format_that_can_be_read_is_taken() {
 }
 
 #[test]
-fn an_unknown_folder_is_told_what_was_looked_for() {
+fn the_error_for_an_unknown_folder_lists_the_formats() {
     let error = open_capture(photos_alone().path()).unwrap_err().to_string();
     for part in ["no known format", "cameras.json", "transforms_train.json", "sparse/0", "CHUNK.torch#KEY"] {
         assert!(error.contains(part), "{part:?} is not in: {error}");

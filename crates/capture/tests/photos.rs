@@ -234,7 +234,7 @@ fn jpegs() -> Vec<(String, Vec<u8>)> {
 }
 
 #[test]
-fn jpegs_cut_short_are_refused_by_name() {
+fn truncated_jpegs_are_refused_by_name() {
     let decode = |bytes: &[u8]| decode_photo(bytes, "cut.jpg".as_ref(), (45, 37)).map(|photo| photo.pixels);
     for (kind, jpeg) in jpegs() {
         let whole = decode(&jpeg).unwrap_or_else(|e| panic!("{kind}: {e}"));
@@ -266,7 +266,7 @@ fn jpegs_cut_short_are_refused_by_name() {
 }
 
 #[test]
-fn pngs_cut_short_are_refused_by_name() {
+fn truncated_pngs_are_refused_by_name() {
     let mut png = Cursor::new(vec![]);
     noise(45, 37).write_to(&mut png, ImageFormat::Png).unwrap();
     let png = png.into_inner();

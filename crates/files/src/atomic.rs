@@ -55,8 +55,8 @@ pub fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
     write_atomically(path, |writer| writer.write_all(&json).map_err(Error::write(path)))
 }
 
-/// Replaces the folder at `path` by one that `fill` creates: it is filled under a temporary name and then renamed. `own_entries` lists the names
-/// of the entries that such a folder has; all other entries of the old folder are kept in the new one.
+/// Replaces the folder at `path` by one that `fill` creates: it is filled under a temporary name and then renamed. `own_entries` lists the
+/// names of the entries that such a folder has; all other entries of the old folder are kept in the new one.
 ///
 /// # Errors
 /// Returns the error of `fill`, or an error if something other than a folder is at `path` or the folder can't be written.
@@ -108,7 +108,8 @@ fn lock_parent(path: &Path) -> Option<File> {
     parent.lock().ok().map(|()| parent)
 }
 
-/// Removes the entries `own_entries`, which belong to the program, from the folder `retired`, after moving its other entries to the folder `replacement`.
+/// Removes the entries `own_entries`, which belong to the program, from the folder `retired`, after moving its other entries to the folder
+/// `replacement`.
 fn retire(retired: &Path, replacement: &Path, own_entries: &[&str]) -> Result<()> {
     if !retired.is_dir() {
         return Ok(());

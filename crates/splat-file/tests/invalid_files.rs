@@ -98,7 +98,7 @@ fn bad_splats() {
 
 /// Values that a format can't store are refused, and nothing is written.
 #[test]
-fn numbers_that_do_not_fit() {
+fn numbers_that_a_format_cannot_store_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     for ending in endings() {
         let path = folder.path().join(format!("a.{ending}"));
@@ -135,8 +135,8 @@ fn gaussians_without_a_rotation_are_left_out() {
     for path in &files_without_a_rotation(folder.path()) {
         let splat = read_splat(path).unwrap();
         assert_eq!(splat.len(), 2);
-        let told = "1 of 3 Gaussians are left out, whose rotations have length 0";
-        assert_eq!(splat.warnings, [format!("{}: {told}", path.display())]);
+        let message = "1 of 3 Gaussians are left out, whose rotations have length 0";
+        assert_eq!(splat.warnings, [format!("{}: {message}", path.display())]);
     }
 }
 
@@ -198,8 +198,8 @@ fn point_clouds_are_refused() {
     columns.retain(|(name, _)| name.len() == 1);
     columns.extend(["red", "green", "blue"].map(|name| (name, [200.; 3])));
     write_ply(&path, &columns, &["red", "green", "blue"].map(|name| (name, "uchar")));
-    let told = ["points.ply: the element vertex is a point cloud, without opacity, scale_* and rot_*"];
-    assert_says(&refused_file(&path), &told);
+    let message = ["points.ply: the element vertex is a point cloud, without opacity, scale_* and rot_*"];
+    assert_says(&refused_file(&path), &message);
     for absent in ["opacity", "scale_0", "rot_2", "f_dc_1"] {
         let mut columns = small_gaussians();
         columns.retain(|(name, _)| *name != absent);

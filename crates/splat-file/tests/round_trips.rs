@@ -125,7 +125,7 @@ fn plys_are_exact() {
     assert_eq!(splat.ply_bytes(), std::fs::metadata(&first).unwrap().len());
 }
 
-/// What a quantizing format has rounded once, it doesn't round again.
+/// A quantizing format doesn't change values that it has already rounded.
 #[test]
 fn second_round_trips_change_nothing() {
     let folder = tempfile::tempdir().unwrap();
@@ -206,10 +206,10 @@ fn files_are_recognized() {
     assert_eq!(find_splat(folder.path(), "b"), folder.path().join("b.ply"));
     assert!(is_splat_name(Path::new("A.Compressed.PLY")) && is_splat_name(Path::new("a.spz")));
     assert!(!is_splat_name(Path::new("a.obj")));
-    for (name, told) in [("a.obj", "the ending is .obj"), ("a", "the ending is missing")] {
+    for (name, message) in [("a.obj", "the ending is .obj"), ("a", "the ending is missing")] {
         let error = write_splat(&folder.path().join(name), &splat).unwrap_err();
         assert!(error.is_request());
-        assert_says(&error.to_string(), &[told, "expected .ply, .compressed.ply, .spz or .splat"]);
+        assert_says(&error.to_string(), &[message, "expected .ply, .compressed.ply, .spz or .splat"]);
     }
 }
 

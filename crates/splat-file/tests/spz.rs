@@ -166,7 +166,8 @@ fn bad_spzs_of_version_4() {
     assert_says(&plain(&|bytes| bytes[8..12].fill(255)), &["the number of Gaussians is 4294967295"]);
 }
 
-/// Positions that 24 bits can't hold are refused, and nothing is written. Values that nearly exceed the range are as exact as 24 bits allow.
+/// Positions that 24 bits can't hold are refused, and nothing is written. Values that nearly exceed the range are as exact as 24 bits
+/// allow.
 #[test]
 fn positions_have_24_bits() {
     let folder = tempfile::tempdir().unwrap();
@@ -186,8 +187,8 @@ fn positions_of_version_1_are_checked() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("half.spz");
     std::fs::write(&path, gzip(&half_precision())).unwrap();
-    let told = ["the position of Gaussian 1 is NaN", "`globalsplat convert` leaves out"];
-    assert_says(&refused_file(&path), &told);
+    let message = ["the position of Gaussian 1 is NaN", "`globalsplat convert` leaves out"];
+    assert_says(&refused_file(&path), &message);
     let repaired = read_splat_without_invalid(&path).unwrap();
     assert_eq!(repaired.len(), 2);
     assert_says(&repaired.warnings[0], &["1 of 3 Gaussians are left out", ": position"]);

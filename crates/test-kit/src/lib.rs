@@ -1,5 +1,5 @@
-//! What the tests of all crates share: captures written in the formats of other tools, real data where it is present, and skipped
-//! tests that are counted.
+//! Helpers for the tests of all crates: they write captures in the formats of other tools, find real data if it is present, and count
+//! skipped tests.
 
 pub mod formats;
 
@@ -56,8 +56,8 @@ fn run_alone(name: &str, configure: impl FnOnce(&mut Command) -> &mut Command) -
     output.status
 }
 
-/// Returns the folder that `variable` names, else `../shared/<name>` beside the repository; if it doesn't exist, skips the test because `what` is
-/// missing.
+/// Returns the folder that `variable` names, else `../shared/<name>` beside the repository; if it doesn't exist, skips the test because
+/// `what` is missing.
 fn find_external_folder(variable: &str, name: &str, what: &str) -> Option<PathBuf> {
     let path = match std::env::var_os(variable) {
         Some(path) => PathBuf::from(path),

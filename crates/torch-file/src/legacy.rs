@@ -1,34 +1,37 @@
-//! Reader for the format of torch.save before torch 1.6, which later versions still write on request
-//! (`_use_new_zipfile_serialization=False`): four pickles, which are a magic number, a version, the system, and the contents; a pickle with
-//! the keys of the storages; and the storages in that order, each preceded by its number of elements in eight bytes.
+//! Reader for the format that torch.save wrote before torch 1.6. Later versions write it if `_use_new_zipfile_serialization=False`.
+//!
+//! A file contains, in this order:
+//!
+//! 1. five pickles: a magic number, the version of the format, properties of the system, the saved object, and the keys of the storages;
+//! 2. the storages in the order of their keys, each preceded by its number of elements in eight bytes.
 
 use crate::pickle::{UnknownGlobals, unpickle};
 use crate::value::Value;
 use crate::{Storages, TorchFile};
 use std::collections::HashMap;
 
-/// Magic number of ten bytes, as a pickle of any protocol contains it.
+/// Pickle opcodes of the magic number, a LONG1 of ten bytes and a STOP. They are the same in every protocol from 2.
 const MAGIC: &[u8] = b"\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19.";
-/// Number of bytes at the start of a file that contain the magic number, which follows the protocol.
+/// Number of bytes at the start of a file in which to look for the magic number. Opcodes of the pickle's header precede it.
 const PREFIX_LENGTH: usize = 32;
-/// First byte of a pickle, the opcode that precedes the protocol.
+/// Opcode PROTO, the first byte of a pickle. The number of the protocol follows it.
 const PROTO: u8 = 0x80;
-/// Version of the format, not of torch.
+/// Supported version of the format.
 const VERSION: i64 = 1001;
 
-/// Returns `true` if `bytes` begin with the magic number.
+/// Returns `true` if `bytes` start with a pickle of the magic number.
 pub(crate) fn is_legacy_file(bytes: &[u8]) -> bool {
     let prefix = &bytes[..bytes.len().min(PREFIX_LENGTH)];
     prefix.first() == Some(&PROTO) && prefix.windows(MAGIC.len()).any(|window| window == MAGIC)
 }
 
-/// Parses `bytes`, the contents of a file.
+/// Parses the contents of a file.
 ///
 /// # Errors
-/// Returns a description of what is wrong with the file.
+/// Returns a phrase that describes the first fault of the file, such as "of an unknown version".
 pub(crate) fn parse(bytes: &[u8]) -> Result<TorchFile<'_>, String> {
     let mut rest = bytes;
-    unpickle(&mut rest, UnknownGlobals::Refuse)?;
+    unpickle(&mut rest, UnknownGlobals::Refuse)?; // the magic number
     let version = unpickle(&mut rest, UnknownGlobals::Refuse)?;
     if version.get(version.root) != &Value::Int(VERSION) {
         return Err("of an unknown version".into());
@@ -55,12 +58,12 @@ pub(crate) fn parse(bytes: &[u8]) -> Result<TorchFile<'_>, String> {
     for &id in ids {
         let &Value::Str(key) = keys.get(id) else { return Err("with a key that is no string".into()) };
         let dtype = dtypes.get(key).ok_or_else(|| format!("with a storage {key} of an unknown type"))?;
-        let cut = || format!("cut off in storage {key}");
-        let (length, behind) = rest.split_first_chunk().ok_or_else(cut)?;
-        let length = usize::try_from(i64::from_le_bytes(*length)).ok();
-        let length = length.and_then(|count| count.checked_mul(dtype.size()));
-        let start = bytes.len() - behind.len();
-        rest = length.and_then(|length| behind.get(length..)).ok_or_else(cut)?;
+        let truncated = || format!("cut off in storage {key}");
+        let (count, data) = rest.split_first_chunk().ok_or_else(truncated)?;
+        let count = usize::try_from(i64::from_le_bytes(*count)).ok();
+        let length = count.and_then(|count| count.checked_mul(dtype.size()));
+        let start = bytes.len() - data.len();
+        rest = length.and_then(|length| data.get(length..)).ok_or_else(truncated)?;
         storages.insert(key.into(), start..bytes.len() - rest.len());
     }
     Ok(TorchFile { values, storages })

@@ -164,7 +164,7 @@ impl<'a> Machine<'a> {
     /// Returns the storage of a persistent id: ("storage", its type, its key, the device, its number of elements). Files that are no
     /// archives have one more item, the storage that this one is a part of, which must be None.
     fn storage(&self, id: Id) -> Result<Value<'a>, String> {
-        let strange = || "a pickle with a persistent id that is no storage".to_string();
+        let unsupported = || "a pickle with a persistent id that is no storage".to_string();
         let of = |id: &Id| &self.values[*id];
         let (fields, whole) = match self.tuple(id) {
             [fields @ .., whole] if fields.len() == 5 && self.unknown_globals == UnknownGlobals::Keep => {
@@ -172,14 +172,14 @@ impl<'a> Machine<'a> {
             }
             fields => (fields, true),
         };
-        let [tag, dtype, key, device, length] = fields else { return Err(strange()) };
+        let [tag, dtype, key, device, length] = fields else { return Err(unsupported()) };
         match (of(tag), of(dtype), of(key), of(device), of(length)) {
             (Value::Str("storage"), &Value::Dtype(dtype), Value::Str(key), Value::Str(_), Value::Int(_))
                 if whole =>
             {
                 Ok(Value::Storage { dtype, key })
             }
-            _ => Err(strange()),
+            _ => Err(unsupported()),
         }
     }
 

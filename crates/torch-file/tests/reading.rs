@@ -88,7 +88,7 @@ fn files_of_torch_are_read() {
 }
 
 #[test]
-fn other_files_are_told_apart() {
+fn other_files_are_not_recognized() {
     assert!(!is_torch_file(b""));
     assert!(!is_torch_file(b"\x80\x02}."));
     assert!(!is_torch_file(b"ply\nformat binary_little_endian 1.0\n"));

@@ -151,7 +151,7 @@ fn tensors_stay_inside_their_storages() {
         ("0", 0, &[u32::MAX], &[1], "is no plain tensor"),
         ("0", 0, &[2], &[1, 1], "is no plain tensor"),
         ("0", 0, &[1; 9], &[1; 9], "is no plain tensor"),
-        // More elements than bytes, which a copy would have to store.
+        // A stride of 0 gives more elements than the storage has bytes, and a copy would have to store them all.
         ("0", 0, &[1 << 30], &[0], "is no plain tensor"),
     ] {
         assert_eq!(locate(key, offset, size, stride).unwrap_err(), found, "{offset} {size:?} {stride:?}");

@@ -1,8 +1,8 @@
-"""The cases, in one module per area: each case, followed by its reference function."""
+"""The cases of the comparison, one module per area. Each case is followed by its reference function."""
 
 from ..registry import CASES, REFERENCES
 
-# Imported in the order of the cases in the table.
+# The order of the imports is that of the cases in the table of results.
 from . import tokens, encoder, decoder, growth, normalization, rasterizer  # noqa: F401
 from . import losses, perceptual, photos, training, model  # noqa: F401
 

@@ -11,7 +11,7 @@ from .decoder import decoder_params, gaussians
 
 @case
 def model(rng):
-    """Small models, including ablations; at the start of a transition, in it and after it."""
+    """Small models and ablations, at the start of a curriculum transition (mix 0), within one (0.3) and after one (1)."""
     for stage, mix, fixed in [
         (0, 1.0, {}),
         (2, 0.3, {"candidates": 8, "sh_degree": 3}),
@@ -20,8 +20,8 @@ def model(rng):
     ]:
         config = draw.model_config(rng, **fixed)
         image, inputs = draw.pictures(rng, config, whole(rng, 1, 2), whole(rng, 1, 3))
-        kind = "" if config["camera_code"] else ", no camera code"
-        label = f"{by(*inputs['images'].shape)}, stage {stage}, λ {mix}, {config['streams']}{kind}"
+        suffix = "" if config["camera_code"] else ", no camera code"
+        label = f"{by(*inputs['images'].shape)}, stage {stage}, λ {mix}, {config['streams']}{suffix}"
         params = draw.parameters(rng, config)
         yield Draw(label, inputs, config | {"stage": stage, "mix": mix}, params, ("images",))
 

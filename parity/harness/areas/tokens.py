@@ -11,7 +11,7 @@ from ..registry import Draw, by, case, reference_for
 
 @case
 def patchify(rng):
-    """Patches of one pixel and more, for several numbers of channels, which are the last axis in the program."""
+    """Patches of one pixel and more, for several numbers of channels. The program takes channels as the last axis."""
     for shape, patch in [((1, 1, 4, 4, 3), 2), ((2, 3, 6, 15, 6), 3), ((1, 2, 5, 3, 2), 1)]:
         label = f"{by(*shape)}, patch {patch}"
         yield Draw(label, {"xs": normal(rng, *shape)}, {"patch_size": patch}, differentiate=("xs",))
@@ -24,7 +24,7 @@ def patchify_reference(config, params, inputs):
 
 @case
 def rgb_tokens(rng):
-    """The colour half of the tokens."""
+    """The RGB half of the tokens, which does not depend on the cameras."""
     for _ in range(3):
         config = draw.model_config(rng)
         image, inputs = draw.pictures(rng, config, whole(rng, 1, 3), whole(rng, 1, 4))
@@ -75,7 +75,7 @@ def rays_reference(config, params, inputs):
 
 @case
 def camera_code(rng):
-    """Camera codes of views. Intrinsics are normalized by the image size, so several sizes are tested."""
+    """Camera codes of views, for several image sizes, by which intrinsics are normalized."""
     for batch, count, image in [(1, 1, (8, 8)), (2, 5, (24, 40)), (3, 2, (256, 256))]:
         config = draw.model_config(rng)
         params = draw.parameters(rng, config, "view_pe.")

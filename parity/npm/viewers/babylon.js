@@ -1,4 +1,5 @@
-// Renders a splat with Babylon.js, as its documentation of Gaussian splatting shows, for tests/viewers/viewers.rs. spark.js documents `show`.
+// Renders a splat with Babylon.js, as its documentation of Gaussian splatting shows, for tests/viewers/viewers.rs. spark.js documents
+// `show`.
 
 import { TargetCamera } from "@babylonjs/core/Cameras/targetCamera.js";
 import { Engine } from "@babylonjs/core/Engines/engine.js";

@@ -90,17 +90,17 @@ mod tests {
         let path = folder.path().join("lines");
         let mut lines = NewLines::new(&path);
         let mut news = || {
-            let mut told = String::new();
+            let mut text = String::new();
             lines
                 .read(|news| match news {
-                    FileChange::Replaced => told.push('!'),
-                    FileChange::Line(line) => told += std::str::from_utf8(line).unwrap(),
+                    FileChange::Replaced => text.push('!'),
+                    FileChange::Line(line) => text += std::str::from_utf8(line).unwrap(),
                 })
                 .unwrap();
-            told.replace('\n', " ")
+            text.replace('\n', " ")
         };
         assert_eq!(news(), "");
-        for (text, told) in [
+        for (text, expected) in [
             ("1\n2\n3", "1 2 "),
             ("1\n2\n34\n", "34 "),
             ("1\n2\n34\n", ""),
@@ -109,7 +109,7 @@ mod tests {
             ("1\n9\n5\n6\n", "!1 9 5 6 "),
         ] {
             std::fs::write(&path, text).unwrap();
-            assert_eq!(news(), told, "{text:?}");
+            assert_eq!(news(), expected, "{text:?}");
         }
         std::fs::remove_file(&path).unwrap();
         assert_eq!((news(), news()), ("!".into(), "".into()));

@@ -56,7 +56,7 @@ mod tests {
     }
 
     #[test]
-    fn a_short_run_is_told_as_it_is() {
+    fn a_short_series_is_not_downsampled() {
         let mut series = Series::default();
         (0..9).for_each(|step| series.push(step, 0.5));
         assert_eq!(series.points(), (0..9).map(|step| (step, 0.5)).collect::<Vec<_>>());

@@ -1,7 +1,11 @@
 //! Camera paths to render: the cameras of any capture, without its photos, or a `camera_path.json` of nerfstudio's viewer.
 //!
-//! The latter is {"camera_path": [{"camera_to_world": 16 numbers, row by row, OpenGL axes, "fov": vertical, in degrees}, …],
-//! "render_height", "render_width", and optionally "camera_type": "perspective", and "fps" or "seconds"} (spec 10.17).
+//! A `camera_path.json` (spec 10.17) is an object with these keys:
+//!
+//! - `camera_path`: a list of cameras, each with `camera_to_world`, 16 numbers in row-major order with OpenGL axes, and `fov`, the vertical
+//!   field of view in degrees;
+//! - `render_height` and `render_width`, in pixels;
+//! - optionally `camera_type`, which must be `"perspective"`, and `fps` or `seconds`.
 
 use super::json::null_for_not_a_number;
 use super::transforms_json::{describe_value, from_opengl};
@@ -15,19 +19,21 @@ use std::path::Path;
 /// A sequence of cameras to render from.
 #[derive(Debug)]
 pub struct CameraPath {
-    /// Cameras in order, at least one.
+    /// Cameras in the order of the path, at least one.
     pub cameras: Vec<Camera>,
     /// Frame rate, if the file specifies one.
     pub frames_per_second: Option<u32>,
-    /// Warnings as returned by [`Capture::warnings`](crate::Capture::warnings).
+    /// Warnings of the capture, see [`Capture::warnings`](crate::Capture::warnings).
     pub warnings: Vec<String>,
-    /// Files that the cameras were read from, and the existing photos of the capture.
+    /// Files from which the cameras were read, and the existing photos of the capture.
     pub inputs: InputFiles,
 }
 
-/// Reads the cameras of a capture of any format that [`open_capture`](super::open_capture) finds, or of a JSON file of any name.
-/// The keys of the JSON file tell its format: `frames` for a `transforms.json`, `camera_path` for nerfstudio's viewer, otherwise a
-/// `cameras.json`. Photos may be missing. If only a missing photo could tell its size, `size` is assumed.
+/// Reads the cameras of a capture of any format that [`open_capture`](super::open_capture) supports, or of a JSON file with any name.
+///
+/// The keys of a JSON file determine its format: with `camera_path` it is a path of nerfstudio's viewer, with `frames` a
+/// `transforms.json`, and otherwise a `cameras.json`. Photos may be missing. `size` is the size of a missing photo if the capture doesn't
+/// specify it.
 ///
 /// # Errors
 /// Fails like [`open_capture`](super::open_capture).
@@ -38,14 +44,14 @@ pub fn read_camera_path(path: &Path, size: Option<ImageSize>) -> Result<CameraPa
             false => None,
             true => {
                 let text = read_text(path)?;
-                // The reader of the format reports invalid JSON.
+                // Invalid JSON is reported later, by the reader of the format.
                 Some(serde_json::from_str(&null_for_not_a_number(&text)).unwrap_or(Value::Null))
             }
         };
-    let has = |key: &str| json.as_ref().is_some_and(|json| json.get(key).is_some());
+    let has_key = |key: &str| json.as_ref().is_some_and(|json| json.get(key).is_some());
     let capture = match (&json, is_capture(path)) {
-        (Some(json), _) if has("camera_path") => return of_viewer(path, json),
-        (Some(_), false) if has("frames") => transforms_json::read(path, purpose)?,
+        (Some(json), _) if has_key("camera_path") => return read_nerfstudio_path(path, json),
+        (Some(_), false) if has_key("frames") => transforms_json::read(path, purpose)?,
         (Some(_), false) => cameras_json::read(path, purpose)?,
         _ => open_for(path, purpose)?,
     };
@@ -55,23 +61,25 @@ pub fn read_camera_path(path: &Path, size: Option<ImageSize>) -> Result<CameraPa
     Ok(CameraPath { cameras: capture.cameras(), frames_per_second: None, warnings, inputs })
 }
 
-fn of_viewer(file: &Path, json: &Value) -> Result<CameraPath> {
-    let refuse = |field: &str, found: Option<&Value>, expected: &str| {
+/// Converts `json`, the contents of a `camera_path.json` at `file`.
+fn read_nerfstudio_path(file: &Path, json: &Value) -> Result<CameraPath> {
+    let invalid = |field: &str, found: Option<&Value>, expected: &str| {
         Error::input(file, field, describe_value(found), expected)
     };
-    let number = |of: &Value, key: &str, field: &str, expected: &str, least: f64, most: f64| {
-        let value = of.get(key);
-        let number = value.and_then(Value::as_f64).filter(|number| *number > least && *number < most);
-        number.ok_or_else(|| refuse(field, value, expected))
+    // Returns the number at `key` of `object`, which must be above `min` and below `max`.
+    let number = |object: &Value, key: &str, field: &str, expected: &str, min: f64, max: f64| {
+        let value = object.get(key);
+        let number = value.and_then(Value::as_f64).filter(|number| *number > min && *number < max);
+        number.ok_or_else(|| invalid(field, value, expected))
     };
     if let Some(kind) = json.get("camera_type").filter(|kind| *kind != "perspective") {
-        return Err(refuse("camera_type", Some(kind), "\"perspective\""));
+        return Err(invalid("camera_type", Some(kind), "\"perspective\""));
     }
     let side = |key: &str| {
         let expected = "a number of pixels, 1 to 16384";
         let side = number(json, key, key, expected, 0., 16385.)?;
         if side < 1. || side.fract() != 0. {
-            Err(refuse(key, json.get(key), expected))
+            Err(invalid(key, json.get(key), expected))
         } else {
             Ok(side as u32)
         }
@@ -79,17 +87,17 @@ fn of_viewer(file: &Path, json: &Value) -> Result<CameraPath> {
     let (height, width) = (side("render_height")?, side("render_width")?);
     let entries = json.get("camera_path").and_then(Value::as_array).filter(|entries| !entries.is_empty());
     let entries =
-        entries.ok_or_else(|| refuse("camera_path", json.get("camera_path"), "a list of cameras"))?;
+        entries.ok_or_else(|| invalid("camera_path", json.get("camera_path"), "a list of cameras"))?;
     let camera = |(i, entry): (usize, &Value)| {
-        let named = |key: &str| format!("{key} of camera {i}");
+        let field = |key: &str| format!("{key} of camera {i}");
         let pose = entry.get("camera_to_world");
         let numbers = pose.and_then(Value::as_array).into_iter().flatten();
         let numbers: Vec<f64> = numbers.filter_map(Value::as_f64).collect();
-        let pose_refused = || refuse(&named("camera_to_world"), pose, "16 numbers");
-        let c2w = from_opengl(numbers.as_slice().try_into().map_err(|_| pose_refused())?);
+        let invalid_pose = || invalid(&field("camera_to_world"), pose, "16 numbers");
+        let c2w = from_opengl(numbers.as_slice().try_into().map_err(|_| invalid_pose())?);
         let (c2w, _) = nearest_rigid_of_scaled(&c2w)
-            .map_err(|(found, expected)| Error::input(file, named("camera_to_world"), found, expected))?;
-        let fov = number(entry, "fov", &named("fov"), "degrees between 0 and 180", 0., 180.)?;
+            .map_err(|(found, expected)| Error::input(file, field("camera_to_world"), found, expected))?;
+        let fov = number(entry, "fov", &field("fov"), "degrees between 0 and 180", 0., 180.)?;
         let (w, h) = (f64::from(width), f64::from(height));
         let focal = h / 2. / (fov.to_radians() / 2.).tan();
         let intrinsics = Intrinsics { fx: focal, fy: focal, cx: w / 2., cy: h / 2. };

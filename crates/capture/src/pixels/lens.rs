@@ -239,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn a_part_is_that_of_the_whole() {
+    fn a_window_has_the_same_pixels_as_the_full_image() {
         let photo = RgbImage::from_fn(64, 48, |x, y| Rgb([x as u8 * 4, y as u8 * 5, (x * y % 251) as u8]));
         let whole = undistort(photo.clone(), &LENS, &CAMERA, None);
         let window = Some([7..40, 0..29]);
@@ -248,7 +248,7 @@ mod tests {
             assert_eq!(part.get_pixel(x, y), whole.get_pixel(x, y), "({x}, {y})");
         }
         assert_ne!(part, whole);
-        // The same holds for a shared lens.
+        // A shared lens gives the same pixels.
         let lens = |window| Lens::new(LENS, CAMERA, window);
         assert_eq!(lens(None).undistort(photo.clone()), whole);
         assert_eq!(lens(window).undistort(photo), part);

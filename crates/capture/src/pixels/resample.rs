@@ -232,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn a_region_is_cut_out_of_what_the_whole_becomes() {
+    fn a_resampled_region_equals_a_crop_of_the_resampled_image() {
         let image = waves(64, 48);
         let half = resample(&image, whole(&image), [24, 32]);
         let region = Region { left: 10., top: 6., width: 40., height: 24. };

@@ -177,8 +177,8 @@ pub fn files_with_invalid_values(folder: &Path) -> Vec<(PathBuf, &'static str, &
     cases
 }
 
-/// Writes files as of other programs in which the second of three Gaussians has a rotation of length 0: values that underflow, in a PLY; the
-/// middle of the byte range, in a .splat.
+/// Writes files as of other programs in which the second of three Gaussians has a rotation of length 0: values that underflow, in a PLY;
+/// the middle of the byte range, in a .splat.
 pub fn files_without_a_rotation(folder: &Path) -> [PathBuf; 2] {
     let ply = folder.join("zero.ply");
     let mut columns = small_gaussians();

@@ -40,8 +40,8 @@ pub fn quality_by_size(rows: &[Row], setting: &str) -> Markup {
         }
         // Measured points come first in `shown`; draw them last, on top.
         @for ((row, (_, psnr)), (cx, cy)) in shown.iter().zip(&points).rev() {
-            @let told = format!("{}: {} dB with {}K Gaussians", row.name, decimal(*psnr, 2), short(row.kilo_gaussians.unwrap_or(0.)));
-            (mark(row, *cx, *cy, &told))
+            @let label = format!("{}: {} dB with {}K Gaussians", row.name, decimal(*psnr, 2), short(row.kilo_gaussians.unwrap_or(0.)));
+            (mark(row, *cx, *cy, &label))
         }
     };
     let published = |globalsplat: bool| {
@@ -54,12 +54,12 @@ pub fn quality_by_size(rows: &[Row], setting: &str) -> Markup {
     figure(&title, &about, drawing, legend)
 }
 
-fn mark(row: &Row, cx: f64, cy: f64, told: &str) -> Markup {
+fn mark(row: &Row, cx: f64, cy: f64, label: &str) -> Markup {
     html! {
         @match row.measured {
-            Some(entry) => circle.point.(entry.colour) cx=(px(cx)) cy=(px(cy)) r="6.5" { title { (told) } },
-            None if row.is_published_globalsplat() => circle.point.paper cx=(px(cx)) cy=(px(cy)) r="5" { title { (told) } },
-            None => circle.point.published cx=(px(cx)) cy=(px(cy)) r="4.5" { title { (told) } },
+            Some(entry) => circle.point.(entry.colour) cx=(px(cx)) cy=(px(cy)) r="6.5" { title { (label) } },
+            None if row.is_published_globalsplat() => circle.point.paper cx=(px(cx)) cy=(px(cy)) r="5" { title { (label) } },
+            None => circle.point.published cx=(px(cx)) cy=(px(cy)) r="4.5" { title { (label) } },
         }
     }
 }

@@ -122,8 +122,8 @@ impl Chunk {
         let sizes: Vec<_> =
             scene.images.iter().map(|image| encoded_image_size(&self.bytes[image.clone()])).collect();
         let undecodable = || Error::input(&named, "every image", "undecodable", "a JPEG or PNG");
-        let told = sizes.iter().flatten().next().copied().ok_or_else(undecodable);
-        let usual = purpose.size(&named, "the images", told)?;
+        let size = sizes.iter().flatten().next().copied().ok_or_else(undecodable);
+        let usual = purpose.size(&named, "the images", size)?;
         let cameras = scene.cameras(&self.bytes);
         let frames = scene
             .images
