@@ -128,7 +128,7 @@ fn main() {
         _ => kernels("portable", &[]),
     }
 
-    // After our own libraries, which need these: linkers drop libraries that nothing has referenced yet.
+    // libtorch must follow our own libraries, which need it, because linkers drop libraries that nothing has referenced yet.
     let lib = libtorch.join("lib");
     println!("cargo::rustc-link-search=native={}", lib.display());
     for library in ["torch_cpu", "c10", "torch"] {

@@ -1,14 +1,17 @@
 """Compares the program's data loader with a typical Python pipeline on the same chunks, in one run.
 
-    python parity/loader_baseline.py                      measures both alternately, and prints the speedup
-    python parity/loader_baseline.py --data ROOT          uses a dataset of chunks with an index.json
+    python parity/loader_baseline.py                      measures both alternately on synthetic chunks
+    python parity/loader_baseline.py --data ROOT          measures both on a dataset of chunks with an index.json
     python parity/loader_baseline.py --data ROOT --alone  measures only the Python pipeline
 
-The pipeline is a torch DataLoader with two workers, each with its own chunks, which torch.load reads. PIL decodes,
-crops and resizes with Lanczos in one call; ImageEnhance and HSV jitter colours as torchvision's ColorJitter does; numpy
-and torch convert to float tensors. Views and augmentation are sampled as in the program: 24 context and 12 target views
-from a window of 40 to 220 frames, where a frame in both sets is decoded once, and a crop around the principal point
-that is up to a tenth smaller than the largest one.
+The result is a JSON object. "ratio" is the median of the speedups that the rounds measure.
+
+The Python pipeline is a torch DataLoader with two workers. Each worker reads its own chunks with torch.load. PIL
+decodes photos; one of its calls crops them and resizes them with Lanczos. ImageEnhance and HSV jitter colours as
+torchvision's ColorJitter does. numpy and torch convert the result to float tensors. Views and augmentation are sampled
+as in the program. A sample has 24 context and 12 target views from a window of 40 to 220 frames. A frame that is in
+both sets is decoded once. The crop is around the principal point, and up to a tenth smaller than the largest possible
+one.
 """
 
 import argparse
@@ -33,26 +36,26 @@ EXTRA_CROP = 0.1
 BRIGHTNESS, CONTRAST, SATURATION, HUE = 0.3, 0.4, 0.3, 0.1
 
 
-def turn_hue(image, turn):
-    """Adds to the 8-bit hue with wraparound, as torchvision does for PIL images."""
+def shift_hue(image, shift):
+    """Adds `shift`, a fraction of the colour circle, to the hue. Hues of 8 bits wrap around, as in torchvision."""
     hue, saturation, value = image.convert("HSV").split()
-    shifted = np.array(hue, dtype=np.uint8) + np.array(turn * 255).astype(np.uint8)
+    shifted = np.array(hue, dtype=np.uint8) + np.array(shift * 255).astype(np.uint8)
     return Image.merge("HSV", (Image.fromarray(shifted), saturation, value)).convert("RGB")
 
 
 def draw_jitter():
-    """Samples the colour jitter: a list of functions image -> image, to be applied to all views of a sample."""
+    """Samples a colour jitter for all views of a sample. Returns functions image -> image, to be applied in order."""
 
     def enhance(enhancer, strength):
         factor = random.uniform(1 - strength, 1 + strength)
         return lambda image: enhancer(image).enhance(factor)
 
-    turn = random.uniform(-HUE, HUE)
+    shift = random.uniform(-HUE, HUE)
     adjustments = [
         enhance(ImageEnhance.Brightness, BRIGHTNESS),
         enhance(ImageEnhance.Contrast, CONTRAST),
         enhance(ImageEnhance.Color, SATURATION),
-        lambda image: turn_hue(image, turn),
+        lambda image: shift_hue(image, shift),
     ]
     random.shuffle(adjustments)
     return adjustments
@@ -61,7 +64,8 @@ def draw_jitter():
 def sample(scene):
     """Samples views of a scene. Returns a dict of tensors.
 
-    "context" and "target" are images [V, 3, H, W] in [0, 1]; "intrinsics" and "w2c" are of context, then target views.
+    "context" and "target" are images [V, 3, H, W] in [0, 1]. "intrinsics" [V, 4] and "w2c" [V, 3, 4] hold the context
+    views first, then the target views.
     """
     images, cameras = scene["images"], scene["cameras"]
     length = min(random.randint(*WINDOW), len(images))
@@ -72,31 +76,31 @@ def sample(scene):
     shift_x, shift_y = random.random(), random.random()
     jitter = draw_jitter()
 
-    pictures, intrinsics = {}, {}
+    tensors, intrinsics = {}, {}
     for frame in sorted({*context, *target}):
         image = Image.open(io.BytesIO(images[frame].numpy().tobytes())).convert("RGB")
         width, height = image.size
         fx, fy, cx, cy = (cameras[frame, :4] * torch.tensor([width, height, width, height])).tolist()
         side = 2 * min(cx, width - cx, cy, height - cy)
-        shown = side / zoom
-        left, top = cx - side / 2 + shift_x * (side - shown), cy - side / 2 + shift_y * (side - shown)
-        box = (left, top, left + shown, top + shown)
+        crop_side = side / zoom
+        left, top = cx - side / 2 + shift_x * (side - crop_side), cy - side / 2 + shift_y * (side - crop_side)
+        box = (left, top, left + crop_side, top + crop_side)
         image = image.resize((SIZE, SIZE), Image.LANCZOS, box=box)
         for adjust in jitter:
             image = adjust(image)
-        pictures[frame] = torch.from_numpy(np.array(image)).permute(2, 0, 1).contiguous().float().div(255)
-        scale = SIZE / shown
+        tensors[frame] = torch.from_numpy(np.array(image)).permute(2, 0, 1).contiguous().float().div(255)
+        scale = SIZE / crop_side
         intrinsics[frame] = torch.tensor([fx * scale, fy * scale, (cx - left) * scale, (cy - top) * scale])
     return {
-        "context": torch.stack([pictures[frame] for frame in context]),
-        "target": torch.stack([pictures[frame] for frame in target]),
+        "context": torch.stack([tensors[frame] for frame in context]),
+        "target": torch.stack([tensors[frame] for frame in target]),
         "intrinsics": torch.stack([intrinsics[frame] for frame in [*context, *target]]),
         "w2c": cameras[[*context, *target], 6:].reshape(-1, 3, 4),
     }
 
 
 class Chunks(IterableDataset):
-    """An endless dataset of samples: chunks in random order, every scene of a chunk once."""
+    """Endless dataset of samples. Each pass reads the chunks in random order, and every scene of a chunk once."""
 
     def __init__(self, root):
         self.paths = sorted(root / name for name in set(json.loads((root / "index.json").read_text()).values()))
@@ -116,33 +120,35 @@ class Chunks(IterableDataset):
 
 
 def python_views_per_second(root, workers, samples, warm_up=4):
+    """Measures the Python pipeline over `samples` samples after `warm_up` unmeasured ones."""
     torch.set_num_threads(1)
     loader = iter(DataLoader(Chunks(root), batch_size=None, num_workers=workers))
     views = 0
-    for turn in range(warm_up + samples):
-        if turn == warm_up:
+    for step in range(warm_up + samples):
+        if step == warm_up:
             start = time.perf_counter()
         batch = next(loader)
-        if turn >= warm_up:
+        if step >= warm_up:
             views += len(batch["context"]) + len(batch["target"])
     return views / (time.perf_counter() - start)
 
 
-def program(binary, *arguments):
-    done = subprocess.run([binary, "bench", "loader", "--json", *arguments], stdout=subprocess.PIPE, check=True)
-    return json.loads(done.stdout)
+def run_program(binary, *arguments):
+    """Runs `globalsplat bench loader` and returns its JSON report."""
+    completed = subprocess.run([binary, "bench", "loader", "--json", *arguments], stdout=subprocess.PIPE, check=True)
+    return json.loads(completed.stdout)
 
 
 def compare(options, root):
     """Measures both loaders alternately, so that other load on the machine affects both."""
     ours, theirs = [], []
     for _ in range(options.rounds):
-        threads = ["--data", str(root), "--threads", str(options.workers), "--samples", str(options.samples)]
-        ours.append(program(options.binary, *threads)["views_per_second"])
-        alone = [sys.executable, __file__, "--data", str(root), "--alone"]
-        alone += ["--workers", str(options.workers), "--samples", str(options.samples)]
-        done = subprocess.run(alone, stdout=subprocess.PIPE, check=True)
-        theirs.append(json.loads(done.stdout)["views_per_second"])
+        arguments = ["--data", str(root), "--threads", str(options.workers), "--samples", str(options.samples)]
+        ours.append(run_program(options.binary, *arguments)["views_per_second"])
+        command = [sys.executable, __file__, "--data", str(root), "--alone"]
+        command += ["--workers", str(options.workers), "--samples", str(options.samples)]
+        completed = subprocess.run(command, stdout=subprocess.PIPE, check=True)
+        theirs.append(json.loads(completed.stdout)["views_per_second"])
         print(f"program {ours[-1]:.0f} views/s, Python {theirs[-1]:.0f} views/s", file=sys.stderr)
     ratios = [a / b for a, b in zip(ours, theirs)]
     return {
@@ -172,7 +178,7 @@ def main():
         root = options.data
         if root is None:
             root = Path(folder)
-            program(options.binary, "--keep", folder, "--samples", "1")
+            run_program(options.binary, "--keep", folder, "--samples", "1")
         print(json.dumps(compare(options, root)))
 
 

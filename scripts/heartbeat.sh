@@ -1,19 +1,20 @@
 #!/usr/bin/env bash
-# Runs a command, and prints every 30 seconds that it is still running:
-#   heartbeat.sh building cargo build …              only if standard error is not a terminal, where cargo shows progress itself
-#   heartbeat.sh --always installing pip install …   in a terminal, too
+# Runs a command, and prints a line to standard error every 30 seconds while it runs:
+#   heartbeat.sh LABEL COMMAND …            prints nothing if standard error is a terminal, where commands like cargo show their progress
+#   heartbeat.sh --always LABEL COMMAND …   prints in a terminal, too
+# LABEL begins each line; for example: heartbeat.sh building cargo build
 set -uo pipefail
 always=false
 if [ "$1" = --always ]; then
     always=true
     shift
 fi
-what=$1
+label=$1
 shift
 [ ! -t 2 ] || $always || exec "$@"
 
-# Prints the crates and C++ files that this command's compilers are compiling now.
-compiled() {
+# Prints the names of the crates and C++ files that compilers in this process group are compiling.
+list_compiling() {
     ps -eo pgid=,args= | awk -v group="$(ps -o pgid= $$ | tr -d ' ')" '
         $1 != group { next }
         $2 ~ /rustc$/ && match($0, /--crate-name [^ ]+/) { name = substr($0, RSTART + 13, RLENGTH - 13) }
@@ -23,15 +24,16 @@ compiled() {
         END { print names }'
 }
 
-# Prints until the command ends: the command holds the other end of this function's standard input, and writes nothing to it.
-beat() {
-    local now
+# Prints a line every 30 seconds until the command ends. Standard input is a pipe whose other end the command holds open and never writes
+# to, so that `read` times out while the command runs and fails at once when it ends.
+print_heartbeats() {
+    local compiling
     while read -rt 30; [ $? -gt 128 ] && kill -0 $$ 2>/dev/null; do
-        now="$(compiled)"
-        echo "$what: $((SECONDS / 60)) min $((SECONDS % 60)) s so far${now:+, now $now}"
+        compiling="$(list_compiling)"
+        echo "$label: $((SECONDS / 60)) min $((SECONDS % 60)) s so far${compiling:+, now $compiling}"
     done
 }
 
-exec 9> >(beat >&2)
-# Replace this shell, so that the command receives signals itself and its exit code is returned.
+exec 9> >(print_heartbeats >&2)
+# The command replaces this shell, so that it receives signals directly and its exit code is this script's.
 exec "$@"

@@ -2,19 +2,19 @@
 
 use tch::Tensor;
 
-/// Calls `op` and returns the tensors that it hands over to its caller. `op` writes one address per tensor, that of tch's `C_tensor`, to
-/// the slice that it is given.
+/// Calls `op` and returns the tensors that it allocates. `op` writes the address of one `C_tensor` per tensor to the slice that it
+/// receives, and the caller takes ownership of them.
 ///
 /// # Safety
-/// If `op` succeeds, it must have written the address of a new tensor that nothing else owns to every element of the slice.
+/// If `op` returns `Ok`, every element of the slice must be the address of a different, new `C_tensor` that nothing else owns.
 ///
 /// # Errors
-/// Returns the exception of `op`.
+/// Returns the C++ exception that `op` throws.
 pub(crate) unsafe fn take_outputs<const N: usize>(
     op: impl FnOnce(&mut [usize]) -> Result<(), cxx::Exception>,
 ) -> Result<[Tensor; N], cxx::Exception> {
     let mut out = [0usize; N];
     op(&mut out)?;
-    // SAFETY: the caller guarantees that every address is that of a new tensor that nothing else owns.
+    // SAFETY: the caller guarantees that every element is the address of a new `C_tensor` that nothing else owns.
     Ok(out.map(|p| unsafe { Tensor::from_ptr(p as *mut torch_sys::C_tensor) }))
 }

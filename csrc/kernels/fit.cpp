@@ -11,19 +11,20 @@
 namespace globalsplat::raster {
 namespace {
 
-constexpr int kRows = 16;       // rows per task
-constexpr double kSigma = 1.5;  // standard deviation of SSIM's window, pixels
+constexpr int kRows = 16;       // rows of a task
+constexpr double kSigma = 1.5;  // standard deviation of SSIM's Gaussian window, in pixels
 
-// Returns Σ of body(plane, begin, end, scratch) over planes and blocks of their rows, summed in order.
+// Splits each plane into blocks of rows, calls body(plane, begin, end, scratch) for every block in parallel, and returns the sum of the
+// results. The sum is in the order of the blocks, so that it doesn't depend on the number of threads.
 template <class T, class Body>
 double sum_over_rows(int threads, int64_t planes, int rows, int width, const Body& body) {
-  const int64_t parts = (rows + kRows - 1) / kRows;
-  std::vector<double> sums(size_t(planes * parts));
-  parallel_for(threads, planes * parts, [&](int64_t task) {
-    const int begin = int(task % parts) * kRows;
+  const int64_t blocks = (rows + kRows - 1) / kRows;
+  std::vector<double> sums(size_t(planes * blocks));
+  parallel_for(threads, planes * blocks, [&](int64_t task) {
+    const int begin = int(task % blocks) * kRows;
     thread_local std::vector<T> scratch;
     scratch.resize(std::max(scratch.size(), size_t(fit_scratch_size(width))));
-    sums[size_t(task)] = body(task / parts, begin, std::min(begin + kRows, rows), scratch.data());
+    sums[size_t(task)] = body(task / blocks, begin, std::min(begin + kRows, rows), scratch.data());
   });
   double total = 0;
   for (const double sum : sums) total += sum;

@@ -1,5 +1,5 @@
-// Losses that fit rendered images to photos, with gradients: photometric distance and depth smoothness. Parallel over threads; results are
-// bit-identical for any number of threads.
+// Losses that fit rendered images to photos, with gradients: photometric distance and depth smoothness. They run in parallel, and their
+// results are bit-identical for any number of threads.
 #pragma once
 
 #include <cstdint>
@@ -8,7 +8,7 @@
 
 namespace globalsplat::raster {
 
-// Images and photos: planes [H, W], both sides at least 11.
+// Rendered images and the photos to compare them with: `planes` planes [H, W] each. Both sides have at least 11 pixels.
 template <class T>
 struct FitJob {
   const T* pictures;
@@ -27,8 +27,8 @@ double photometric(const FitJob<T>& job, double l1_weight, double ssim_weight, T
 template <class T>
 const T* ssim_window();
 
-// Computes `factor` · the mean unevenness of depths over all pairs of neighbouring pixels; see smooth.h. Writes the gradient with respect
-// to the depths, [views, H, W], if it isn't null.
+// Computes `factor` · the mean unevenness of depths (neighbours.h) over all pairs of neighbouring pixels. Writes the gradient with respect
+// to the depths, [views, H, W], if `gradient` isn't null.
 template <class T>
 double depth_smoothness(const DepthJob<T>& job, double factor, T* gradient, int threads);
 

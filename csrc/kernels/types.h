@@ -163,15 +163,16 @@ template <class T>
 struct FitPlane {
   const T* picture;  // [H, W]
   const T* photo;    // [H, W]
-  T* slopes;         // [3, H − 10, W − 10] of every window's SSIM to its means of x, x² and xy; null if not requested
+  T* slopes;         // [3, H − 10, W − 10], derivatives of each window's SSIM by its means of x, x² and xy; null if not requested
   T* gradient;       // [H, W]
-  const T* weights;  // [11] of the window, in each direction
+  const T* weights;  // [11], weights of the window in each direction
   int width, height;
 };
 
-// Rate at which a difference of the photo's grey values reduces the weight of a difference of depths; and an image's depths with its photo
-// and a buffer for the gradient; see smooth.h. Row-major.
+// Rate at which a difference of the photo's grey values reduces the weight of a difference of depths; see neighbours.h.
 inline constexpr double kEdge = 10;
+
+// Depths of an image, with its photo and a buffer for the gradient; see smooth.h. Row-major.
 template <class T>
 struct DepthPlane {
   const T* depth;  // [H, W]

@@ -4,21 +4,21 @@ pub use ffi::*;
 
 #[cxx::bridge(namespace = "globalsplat")]
 mod ffi {
-    /// Instructions for bf16 products.
+    /// CPU instructions for bf16 matrix products.
     #[derive(Debug)]
     enum Bf16Support {
         /// No instructions: bf16 products are slower than float32 products.
         None,
-        /// Vector instructions (avx512_bf16): products are about twice as fast as in float32.
+        /// Vector instructions (avx512_bf16): bf16 products are about twice as fast as float32 products.
         Vectors,
-        /// Tile instructions (AMX): products are many times as fast as in float32.
+        /// Tile instructions (AMX): bf16 products are many times as fast as float32 products.
         Tiles,
     }
 
     unsafe extern "C++" {
         include!("processor.h");
 
-        /// Returns the CPU's bf16 instructions, as libtorch sees them; `None` if `GLOBALSPLAT_SIMD` hides them.
+        /// Returns the CPU's bf16 instructions that libtorch detects, or `None` if `GLOBALSPLAT_SIMD` disables them.
         fn bf16_of_cpu() -> Bf16Support;
 
         /// Returns the instruction set of libtorch's own kernels, such as "AVX2".

@@ -1,4 +1,4 @@
-"""Registry of cases and of their reference functions (twins).
+"""Registry of cases and of their reference functions.
 
 A case is a generator of draws, each a configuration, parameters and inputs. Its name is that of the function; the
 program computes `module`, by default the same name.

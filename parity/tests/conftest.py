@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 
-def told(report):
-    """Records or fails a skipped test. The reason of a skip names the missing requirement before a colon."""
+def handle_skip(report):
+    """Records a skipped test, or makes it fail. The reason is the missing requirement, a colon and details."""
     if report.skipped and not hasattr(report, "wasxfail"):
         _, _, reason = report.longrepr
         reason = reason.removeprefix("Skipped: ")
@@ -21,9 +21,9 @@ def told(report):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport():
-    return told((yield))
+    return handle_skip((yield))
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_make_collect_report():
-    return told((yield))
+    return handle_skip((yield))

@@ -343,7 +343,7 @@ def test_the_document_has_results_but_no_paths(tmp_path, capsys):
     assert "| mse | 2 | " in written[0] and "## Tolerances" not in written[0] and "## Failures" not in written[0]
 
 
-def test_a_document_tells_what_is_wrong():
+def test_document_describes_failures():
     def spoiled(requests, answers, on_progress):
         answer_files(requests, answers)
         for path in answers.iterdir():

@@ -546,7 +546,7 @@ def smooth_scene(w2c, coefficients=16):
     return scene(in_camera, scales, [0.4, 0.55, 0.3, 0.6, 0.5], w2c, coefficients)
 
 
-def test_smooth_scene_is_what_it_says():
+def test_smooth_scene_meets_its_requirements():
     w2c, intrinsic = camera()
     means, scales, quaternions, opacities, sh = smooth_scene(w2c)
     p = splat.project(means, scales, quaternions, w2c, intrinsic, WIDTH, HEIGHT)

@@ -1,4 +1,4 @@
-"""Tests that skipped tests are counted by missing requirement, and fail if skips are not allowed."""
+"""Tests that skipped tests are counted by missing requirement, and that they fail if skips are not allowed."""
 
 import os
 import subprocess
@@ -25,9 +25,9 @@ def run(folder, *command, **variables):
     )
 
 
-def pytest_on(folder, *arguments, **variables):
-    words = ["-m", "pytest", "-q", "-p", "conftest", "-p", "no:cacheprovider", "--continue-on-collection-errors"]
-    return run(folder, sys.executable, *words, *arguments, **variables)
+def run_pytest(folder, *arguments, **variables):
+    options = ["-m", "pytest", "-q", "-p", "conftest", "-p", "no:cacheprovider", "--continue-on-collection-errors"]
+    return run(folder, sys.executable, *options, *arguments, **variables)
 
 
 @pytest.fixture
@@ -38,43 +38,43 @@ def tests(tmp_path):
 
 
 def test_skips_are_counted(tests):
-    counted = tests / "skipped"
-    told = pytest_on(tests, GLOBALSPLAT_SKIPPED=str(counted))
-    assert told.returncode == 0 and "1 passed, 3 skipped, 1 xfailed" in told.stdout, told.stdout
-    assert sorted(counted.read_text().splitlines()) == [
+    log = tests / "skipped"
+    result = run_pytest(tests, GLOBALSPLAT_SKIPPED=str(log))
+    assert result.returncode == 0 and "1 passed, 3 skipped, 1 xfailed" in result.stdout, result.stdout
+    assert sorted(log.read_text().splitlines()) == [
         "could not import 'no_such_module'",
         "golden tensors",
         "golden tensors",
     ]
-    assert pytest_on(tests).returncode == 0
+    assert run_pytest(tests).returncode == 0
 
 
-def test_skips_fail_where_none_may_be(tests):
-    told = pytest_on(tests, GLOBALSPLAT_NO_SKIPS="1")
-    assert told.returncode == 1 and "1 failed, 1 passed, 1 xfailed, 2 errors" in told.stdout, told.stdout
-    assert told.stdout.count("no test may be skipped, but this was: golden tensors: nowhere") >= 2
+def test_skips_fail_if_not_allowed(tests):
+    result = run_pytest(tests, GLOBALSPLAT_NO_SKIPS="1")
+    assert result.returncode == 1 and "1 failed, 1 passed, 1 xfailed, 2 errors" in result.stdout, result.stdout
+    assert result.stdout.count("no test may be skipped, but this was: golden tensors: nowhere") >= 2
 
 
-def test_a_folder_without_goldens_fails(tmp_path):
+def test_missing_goldens_fail_but_a_missing_folder_skips(tmp_path):
     encoder = [REPOSITORY / "parity" / "tests" / "test_reference.py", "-k", "test_encoder"]
-    told = pytest_on(tmp_path, *encoder, GLOBALSPLAT_GOLDEN=str(tmp_path))
-    assert told.returncode == 1 and "2 failed" in told.stdout, told.stdout
-    told = pytest_on(tmp_path, *encoder, GLOBALSPLAT_GOLDEN=str(tmp_path / "absent"))
-    assert told.returncode == 0 and "2 skipped" in told.stdout, told.stdout
+    result = run_pytest(tmp_path, *encoder, GLOBALSPLAT_GOLDEN=str(tmp_path))
+    assert result.returncode == 1 and "2 failed" in result.stdout, result.stdout
+    result = run_pytest(tmp_path, *encoder, GLOBALSPLAT_GOLDEN=str(tmp_path / "absent"))
+    assert result.returncode == 0 and "2 skipped" in result.stdout, result.stdout
 
 
 @pytest.mark.parametrize(
-    "lines, said",
+    "lines, summary",
     [
         ("", "0 tests skipped"),
         ("a browser\n", "1 test skipped: a browser (1)"),
         ("golden tensors\na browser\ngolden tensors\n", "3 tests skipped: a browser (1), golden tensors (2)"),
     ],
 )
-def test_the_last_line_counts(tmp_path, lines, said):
-    tell = "from os import environ as e; open(e['GLOBALSPLAT_SKIPPED'], 'a').write(e['LINES']); print('done')"
+def test_last_line_is_a_summary_of_skips(tmp_path, lines, summary):
+    program = "from os import environ as e; open(e['GLOBALSPLAT_SKIPPED'], 'a').write(e['LINES']); print('done')"
     script = REPOSITORY / "scripts" / "count_skips.sh"
-    told = run(tmp_path, str(script), sys.executable, "-c", tell, LINES=lines)
-    assert told.stdout.splitlines() == ["done", said]
-    failed = run(tmp_path, str(script), sys.executable, "-c", f"{tell}; exit(7)", LINES=lines)
-    assert failed.returncode == 7 and failed.stdout == told.stdout
+    result = run(tmp_path, str(script), sys.executable, "-c", program, LINES=lines)
+    assert result.stdout.splitlines() == ["done", summary]
+    failed = run(tmp_path, str(script), sys.executable, "-c", f"{program}; exit(7)", LINES=lines)
+    assert failed.returncode == 7 and failed.stdout == result.stdout

@@ -138,7 +138,7 @@ mod tests {
     use tracing::{trace, trace_span};
 
     #[test]
-    fn a_span_inside_of_another_is_part_of_it() {
+    fn nested_spans_are_part_of_the_outer_span() {
         let record = |flops: i64| trace!(flops, backward_flops = 3, bytes = 30);
         let pass = || {
             record(7);

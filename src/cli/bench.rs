@@ -105,7 +105,7 @@ impl Raster {
         if self.gaussians == 0 || self.cameras == 0 {
             return Err(Error::request("--gaussians and --cameras are expected to be 1 or more").into());
         }
-        // Before tensors are created, so that a missing device is reported immediately.
+        // The device is parsed before tensors are created, so that a missing one is reported immediately.
         let device = device::parse(&self.device)?;
         if self.scaling {
             return self.scaling(device);

@@ -67,7 +67,7 @@ impl Convert {
         inputs.check_file(&self.to)?;
         let original = read_splat_without_invalid(&self.from)?;
         warn(&original.warnings);
-        // Before the file is replaced, in case input and output are the same.
+        // The input is described before the output replaces it, in case they are the same file.
         let from = description(&self.from, &original)?;
         let degree = self.sh_degree.map_or(original.sh_degree, |degree| degree as usize);
         let limits = match self.for_viewers {

@@ -178,7 +178,7 @@ fn tell(message: &str, others_are_lost: bool) {
     if message.contains("DefaultCPUAllocator") || message.contains("std::bad_alloc") {
         eprintln!("globalsplat: out of memory");
     } else if let Some((_, why)) = message.split_once(PRINTING) {
-        // A reader that closes the pipe early, such as `head`, is no error.
+        // A reader that closes the pipe early, such as `head`, isn't an error.
         if !why.contains("Broken pipe") {
             eprintln!("globalsplat: standard output can't be written: {why}");
         }

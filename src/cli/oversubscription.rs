@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn others_take_what_this_process_does_not() {
+    fn load_of_other_processes_excludes_this_process() {
         let then = Times { at: Instant::now(), cores: 2, all: 10.0, own: 4.0 };
         let later = Times { at: then.at + Duration::from_secs(2), cores: 2, all: 13.0, own: 6.0 };
         assert_eq!(later.others_since(&then), 0.5);

@@ -112,7 +112,7 @@ impl Synth {
             },
         )?;
         let numbers: Vec<usize> = (made_before..self.scenes as usize).collect();
-        // This many scenes at once: most of generating one is work for a single thread.
+        // Scenes are generated in parallel, because most of the work on one scene runs on a single thread.
         let made = numbers.chunks(2 * rayon::current_num_threads()).map(|numbers| {
             let make = |&number| {
                 let capture = videos.capture(number)?;

@@ -16,7 +16,7 @@ pub struct Perceptual {
 }
 
 impl Perceptual {
-    /// Loads the networks from the folders of pretrained weights. Missing weights are no error.
+    /// Loads the networks from the folders of pretrained weights. Missing weights aren't an error.
     ///
     /// # Errors
     /// Fails if a file holds something else.

@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn near_is_bright_and_what_is_not_seen_black() {
+    fn near_pixels_are_bright_and_transparent_ones_black() {
         let depth = Tensor::from_slice(&[1f32, 2., 4., 0., 1.]).view([1, 5]);
         let alpha = Tensor::from_slice(&[1f32, 1., 1., 1., 0.01]).view([1, 5]);
         let image = colourize_depth(&depth, &alpha);

@@ -44,7 +44,7 @@ mod tests {
     use tch::Tensor;
 
     #[test]
-    fn sizes_are_those_of_libtorch() {
+    fn sizes_match_libtorch() {
         for (dtype, kind) in DTYPES {
             assert_eq!(dtype.size(), kind.elt_size_in_bytes(), "{dtype}");
             assert_eq!((to_kind(dtype), to_dtype(kind).unwrap()), (kind, dtype));

@@ -127,7 +127,7 @@ fn png(event: &[u8]) -> Option<&[u8]> {
         .filter(|bytes| bytes.starts_with(PNG))
 }
 
-/// Iterator over a protobuf message's fields with their numbers, which stops where the bytes are no valid message.
+/// Iterator over a protobuf message's fields with their numbers, which stops where the bytes aren't a valid message.
 struct Fields<'a>(&'a [u8]);
 
 enum Field<'a> {

@@ -141,7 +141,7 @@ struct TensorLocation {
 }
 
 impl WeightsFile {
-    /// Opens a safetensors file, an index of such files (`*.safetensors.index.json`), or a file of torch.save: a state dict, or a
+    /// Opens a safetensors file, an index of such files (`*.safetensors.index.json`), or a file that torch.save wrote: a state dict, or a
     /// checkpoint with one. Nothing in a checkpoint is executed.
     ///
     /// # Errors

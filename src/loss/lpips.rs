@@ -48,7 +48,7 @@ struct Layer {
 }
 
 impl LpipsNetwork {
-    /// All networks.
+    /// All networks that can compute LPIPS.
     pub const ALL: [LpipsNetwork; 2] = [LpipsNetwork::Vgg16, LpipsNetwork::AlexNet];
 
     /// Returns the name of the metric in reports.

@@ -362,7 +362,7 @@ mod tests {
     }];
 
     #[test]
-    fn steps_are_those_of_the_equations() {
+    fn steps_match_the_equations() {
         for step in WAYS {
             steps_follow_the_equations(step);
         }
@@ -454,7 +454,7 @@ mod tests {
         let mut adamw = Optimizer::new(vec![group(&[("a", &a), ("b", &b)], 0.1, 0.)]);
         (&a * 3. + &b * 0.).sum(Kind::Float).backward();
         for (name, mut gradient) in adamw.gradients() {
-            // In place, like an all-reduce.
+            // An all-reduce also changes gradients in place.
             let _ = if name == "a" { gradient.zero_() } else { gradient.fill_(2.) };
         }
         assert!((adamw.gradient_norm().unwrap().double_value(&[]) - 2.).abs() < 1e-6);

@@ -146,7 +146,7 @@ pub(crate) mod tests {
                 // A backward pass of an earlier slice: its gradients stay local until the end of the step.
                 pass(&leaves[0], factor);
                 buckets.begin();
-                // In a different order from that of the buckets.
+                // The order of these passes differs from that of the buckets.
                 pass(&leaves[1], 10. * factor);
                 pass(&leaves[0], factor);
                 pass(&leaves[2], 100. * factor);

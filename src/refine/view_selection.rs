@@ -224,7 +224,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_far_from_all_others_comes_first() {
+    fn views_far_from_all_others_come_first() {
         let rests = along(&[0., 0., 1e-3, 1., 0.5, 0.999]);
         assert_eq!(farthest_first(&rests, 3), [0, 3, 4]);
         assert_eq!(farthest_first(&rests, 9).len(), 6);

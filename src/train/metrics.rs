@@ -164,7 +164,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn curves_are_read_from_what_a_run_wrote() {
+    fn curves_are_read_from_the_files_of_a_run() {
         let run = tempfile::tempdir().unwrap();
         let step = |step: u64| format!("{{\"step\": {step}, \"psnr\": {}.0}}\n", 10 + step);
         let mut text: String = (0..5).map(step).collect();

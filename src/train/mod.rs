@@ -32,12 +32,12 @@ pub use trainer::Trainer;
 pub use validator::{Score, Validator};
 pub use watch::{RunCurves, RunState, WatchedRun};
 
-// For the parity checks, which run every function by itself.
+// The parity checks run each of these functions by itself.
 pub(crate) use curriculum::stage_at;
 pub(crate) use parameter_groups::parameter_groups;
 pub(crate) use schedule::learning_rate;
 pub(crate) use subsets::subsets;
-// For benchmarks.
+// Benchmarks read the time of this span.
 pub(crate) use trainer::COMMUNICATION;
 
 /// Returns `true` if an action that is taken every `every` steps (0: never) is due at `step`.

@@ -19,7 +19,7 @@ const STEPS: usize = 10;
 const NOT_TRAINED: &str = "gaussian_decoder.patch_center_bias";
 
 fn training(train: TrainConfig) -> Config {
-    // Without warm-up, so that the learning rate is about the same in all steps.
+    // There is no warm-up, so that the learning rate is about the same in all steps.
     config(small(), TrainConfig { steps: 100, warmup: 0., learning_rate: 3e-5, ..train })
 }
 

@@ -328,7 +328,7 @@ fn a_step_makes_only_expected_device_copies() {
             let is_fused = |op: &&String| {
                 op.starts_with("aten::_scaled_dot_product_flash_attention") || *op == "globalsplat::attention"
             };
-            // In every round of either stream: cross-attention to the memory, and self-attention among the slots.
+            // Every round of each stream has a cross-attention to the memory and a self-attention among the slots.
             assert_eq!(ops.iter().filter(is_fused).count(), 2 * 2 * 2, "attention");
             let cameras = sample.target.cameras();
             let (pictures, ops) = record_ops(|| render(&decoded.gaussians, &cameras, DEFAULT_EPS2D));

@@ -64,7 +64,7 @@ fn the_splat_that_shows_the_photos_best_is_kept() {
 }
 
 #[test]
-fn reconstruct_tells_where_the_scene_was_shown() {
+fn reconstruct_reports_the_placement() {
     let folder = tempfile::tempdir().unwrap();
     let (room, out) = (folder.path().join("room"), folder.path().join("room.ply"));
     let model = bundled_model(Device::Cpu).unwrap();

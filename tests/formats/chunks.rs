@@ -38,7 +38,7 @@ fn packed(folder: &Path) -> PathBuf {
 }
 
 #[test]
-fn a_packed_capture_comes_back() {
+fn packed_captures_round_trip() {
     let folder = tempfile::tempdir().unwrap();
     let chunks = packed(folder.path());
     let dataset = Dataset::open(&chunks, Split::Test).unwrap();
@@ -146,7 +146,7 @@ fn split_folders_contain_only_their_own_captures() {
 }
 
 #[test]
-fn pack_and_inspect_tell_what_they_did() {
+fn pack_and_inspect_report_their_results() {
     let folder = tempfile::tempdir().unwrap();
     write_room(&folder.path().join("room"), 1, 3, [24, 24].into()).unwrap();
     let (room, out) = (folder.path().join("room"), folder.path().join("out"));

@@ -101,7 +101,7 @@ fn endings_that_are_unknown() {
 
 /// `convert` reports both files and the loss, measured on an orbit or from a capture's cameras.
 #[test]
-fn convert_tells_what_is_lost() {
+fn convert_reports_the_loss() {
     let (folder, room) = room();
     let ground_truth = room.join("truth.ply");
     let convert = |to: &str, more: &[&str]| -> Value {
@@ -133,7 +133,7 @@ fn convert_tells_what_is_lost() {
 
 /// Coefficients beyond SPZ's range are clamped without a capture; with a capture the others are fitted to its cameras.
 #[test]
-fn convert_keeps_what_a_capture_sees() {
+fn convert_preserves_the_views_of_a_capture() {
     let (folder, room) = room();
     let strong = folder.path().join("strong.ply");
     let mut splat = read_splat(&room.join("truth.ply")).unwrap().with_sh_degree(3);
@@ -221,7 +221,7 @@ fn gaussians_without_a_rotation_are_left_out() {
 
 /// `convert` removes Gaussians with invalid values, and counts them; other commands refuse the file and name it.
 #[test]
-fn convert_repairs_what_others_refuse() {
+fn convert_repairs_invalid_gaussians() {
     let (folder, room) = room();
     let mut cases = files_with_invalid_values(folder.path());
     // SPZ's oldest version has half-precision floats.

@@ -196,7 +196,7 @@ fn prefetched_batches_are_the_same() {
 
 /// Errors in prefetched samples are reported when the samples are due, as without prefetching.
 #[test]
-fn errors_come_when_their_samples_would() {
+fn errors_are_returned_at_the_position_of_their_sample() {
     let folder = tempfile::tempdir().unwrap();
     let data = Arc::new(with_bad_data(folder.path()));
     let config = DataConfig { max_bad_share: 0.2, threads: 1, ..config() };

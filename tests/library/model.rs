@@ -81,7 +81,7 @@ fn plucker_only_has_no_camera_code() {
 }
 
 #[test]
-fn every_variant_decodes_as_many_gaussians_as_it_says() {
+fn every_variant_decodes_the_expected_number_of_gaussians() {
     let [images, c2w, intrinsics] = inputs(3, 16, 24);
     let variants = [
         (small(), 3, 12 * 8),
@@ -139,7 +139,7 @@ fn bf16_is_float32_but_for_its_rounding() {
     for streams in [Streams::Dual, Streams::Single] {
         let (vs, mut model) = build(&ModelConfig { streams, ..small() });
         let mut random = crate::common::Random::new(3);
-        // In the order of names: the map's own order differs between processes, and so would every weight.
+        // Variables are visited in the order of their names. The map's own order differs between processes, and so would the weights.
         for (name, variable) in &mut vs.variables().into_iter().collect::<BTreeMap<_, _>>() {
             // Large values, so that every layer matters: LayerScale is initialized to a thousandth.
             let is_norm = name.ends_with(".weight") && variable.dim() == 1;

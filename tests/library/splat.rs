@@ -149,7 +149,7 @@ fn gaussians_without_a_rotation_are_dropped() {
 }
 
 #[test]
-fn gradients_are_those_of_finite_differences() {
+fn gradients_match_finite_differences() {
     // Central differences in float64 along random directions, one input at a time and all of its elements at once. The image is
     // discontinuous where some α crosses 1/255: a direction whose difference quotient changes with the step met such a
     // discontinuity and is drawn again.
@@ -291,7 +291,7 @@ fn brute_force(g: &Gaussians, c: &Cameras) -> RenderOutput {
 }
 
 #[test]
-fn pictures_are_those_of_brute_force() {
+fn images_match_brute_force() {
     for (seed, width, height, count) in [(5, 1, 1, 30), (6, 17, 3, 60), (7, 64, 48, 300), (8, 131, 67, 800)] {
         let g = gaussians(2, count, 0, Kind::Double, seed);
         let c = cameras(2, 2, width, height, Kind::Double);

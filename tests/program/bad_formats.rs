@@ -286,7 +286,7 @@ fn colmap_binaries_with_any_byte_wrong_never_panic() {
 }
 
 #[test]
-fn the_program_says_in_a_line_what_it_leaves_out() {
+fn warnings_list_skipped_input_in_one_line() {
     let (folder, room) = room();
     rewrite(&room, Format::Transforms);
     std::fs::remove_file(room.join("images/004.png")).unwrap();

@@ -27,7 +27,7 @@ fn a_closed_stdout_ends_without_a_message() {
 }
 
 #[test]
-fn doctor_names_what_it_found() {
+fn doctor_reports_the_installation() {
     let report = json(&["doctor", "--json"]);
     assert_eq!(report["devices"][0], "cpu");
     assert!(["avx512", "avx2", "neon", "portable"].contains(&report["simd"].as_str().unwrap()));
@@ -44,7 +44,7 @@ fn every_simd_level_renders_alike() {
         let splat = room.join("truth.ply");
         let output = command(&["eval", "--splat", arg(&splat), "--scene", arg(&room), "--json"])
             .env("GLOBALSPLAT_SIMD", level)
-            // Without LPIPS, which is independent of the rasterizer.
+            // LPIPS is left out, because it doesn't depend on the rasterizer.
             .env("GLOBALSPLAT_WEIGHTS", folder.path())
             .output()
             .expect("a program that starts");
@@ -126,7 +126,7 @@ fn a_million_gaussians_fit_into_a_gigabyte() {
 }
 
 #[test]
-fn bench_train_tells_where_a_step_goes() {
+fn bench_train_reports_the_parts_of_a_step() {
     let (folder, capture) = room();
     let config = tiny_config(folder.path(), &capture);
     let bench = |options: &[&str]| {
@@ -158,7 +158,7 @@ fn bench_train_tells_where_a_step_goes() {
 }
 
 #[test]
-fn bench_tells_where_time_goes() {
+fn bench_raster_reports_the_time_of_stages() {
     let report =
         json(&["bench", "raster", "--gaussians", "500", "--cameras", "2", "--repeats", "3", "--json"]);
     let stages: Vec<&str> =
@@ -177,7 +177,7 @@ fn bench_tells_where_time_goes() {
 }
 
 #[test]
-fn bench_model_tells_where_a_pass_goes() {
+fn bench_model_reports_the_parts_of_a_pass() {
     let bench = |options: &[&str]| {
         let shape = ["model.latents=16", "model.width=32", "data.image_size=[32,32]", "model.patch_size=16"];
         let shape: Vec<&str> = shape.iter().flat_map(|key| ["--set", key]).collect();
@@ -317,7 +317,7 @@ fn anybody_s_pictures_are_scored() {
 }
 
 #[test]
-fn render_writes_what_is_asked_for() {
+fn render_writes_the_requested_files() {
     let (folder, room) = room();
     let splat = room.join("truth.ply");
     let out = folder.path().join("views");
@@ -362,7 +362,7 @@ fn render_writes_what_is_asked_for() {
 }
 
 #[test]
-fn inspect_tells_what_is_there() {
+fn inspect_describes_splats_captures_and_weights() {
     let (folder, room) = room();
     let weights = tiny_weights(folder.path(), &room);
     let splat = json(&["inspect", arg(&room.join("truth.ply")), "--json"]);
@@ -414,7 +414,7 @@ fn a_run_goes_from_photos_to_a_splat() {
     }
     let curves = std::fs::read_to_string(run.join("curves.svg")).unwrap();
     assert!(curves.matches("<polyline").count() == 3 && curves.contains("held out"), "{curves}");
-    // With the embedded weights; one line reports how the photos were selected and resized.
+    // Without --weights, the embedded weights are used. One line reports how the photos were selected and resized.
     let output =
         globalsplat(&["reconstruct", "--scene", arg(&room), "--views", "5", "--out", arg(&splat), "--json"]);
     let report: Value = serde_json::from_slice(&output.stdout).expect("JSON");
@@ -437,7 +437,7 @@ fn a_run_goes_from_photos_to_a_splat() {
         "--out",
         arg(&splat),
     ]);
-    // In the capture's world coordinates: renders from the capture's cameras match the model's own.
+    // The splat is in the capture's world coordinates, so that renders from the capture's cameras match the model's own.
     let by_model = json(&["eval", "--weights", arg(&weights), "--scene", arg(&room), "--json"]);
     assert_eq!(by_model["views"].as_array().unwrap().len(), 3);
     assert!(by_model["baselines"]["nearest_photo"]["psnr"].is_f64());
@@ -614,7 +614,7 @@ fn training_on_chunks_reports_skipped_scenes() {
 }
 
 #[test]
-fn bench_loader_tells_where_time_goes() {
+fn bench_loader_reports_the_time_of_stages() {
     let report = json(&["bench", "loader", "--samples", "10", "--json"]);
     assert!(report["views_per_second"].as_f64().unwrap() > 1.);
     assert_eq!(report["resident_by_tenth"].as_array().unwrap().len(), 10);

@@ -120,7 +120,7 @@ fn kernels_are_compiled_once() {
 }
 
 #[test]
-fn doctor_says_what_is_missing() {
+fn doctor_reports_missing_libraries() {
     let driver = fake_driver();
     let doctor = |error: &str| {
         let output = Command::new(env!("CARGO_BIN_EXE_globalsplat"))

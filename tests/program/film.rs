@@ -274,7 +274,7 @@ fn ctrl_c_leaves_no_half_film() {
 }
 
 #[test]
-fn a_gif_lasts_as_long_as_it_should() {
+fn gifs_have_the_requested_duration() {
     let (folder, room) = room();
     let (splat, film) = (room.join("truth.ply"), folder.path().join("film.gif"));
     let orbit = ["--orbit", "--frames", "12", "--size", "20x16", "--alpha"];
@@ -469,7 +469,7 @@ fn a_path_of_nerfstudio_s_viewer_is_flown() {
         }
     }
     assert!(!out.exists());
-    // Files that are no camera paths.
+    // These files aren't camera paths.
     for (text, part) in [
         ("{", "not a description of cameras"),
         ("{\"frames\": 3}", "frames is 3"),

@@ -251,7 +251,7 @@ fn folders_of_outputs_replace_nothing_that_is_read() {
 }
 
 #[test]
-fn links_are_followed_and_what_is_no_file_is_refused() {
+fn links_are_followed_and_special_files_refused() {
     let files = Captured::new();
     let [room, splat] = [&files.room, &files.splat].map(|path| arg(path));
     let (config, fifo) = (tiny_config(files.folder.path(), &files.room), files.at("fifo"));
@@ -299,7 +299,7 @@ fn links_are_followed_and_what_is_no_file_is_refused() {
         fs::remove_file(link).unwrap();
     }
     assert_eq!(names(&files.at("below")), ["new.spz", "there.spz"]);
-    // In a folder of images, this is checked before the first is rendered.
+    // If the output is a folder of images, this is checked before the first image is rendered.
     let views = files.at("views");
     fs::create_dir(&views).unwrap();
     symlink(&fifo, views.join("008.png")).unwrap();
@@ -337,7 +337,7 @@ fn two_processes_may_write_the_same() {
 }
 
 #[test]
-fn long_names_and_what_a_killed_process_left_hinder_nothing() {
+fn long_names_and_files_of_killed_processes_cause_no_errors() {
     let files = Captured::new();
     let [room, splat] = [&files.room, &files.splat].map(|path| arg(path));
     let long = |ending: &str| files.at("out").join(format!("{}{ending}", "x".repeat(255 - ending.len())));
@@ -428,7 +428,7 @@ fn shards_are_replaced_together_or_not_at_all() {
 }
 
 #[test]
-fn synth_finishes_what_was_interrupted_before_its_indices() {
+fn synth_finishes_after_an_interruption_before_its_indices() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("worlds");
     let synth =

@@ -29,7 +29,7 @@ impl Folder {
             Some(name) => self.path(name),
             None => argument.into(),
         }));
-        // Without networks for LPIPS, without a browser, and with temporary files here as well.
+        // The command finds no networks for LPIPS and no browser, and its temporary files are in this folder.
         command
             .current_dir(&self.0)
             .env("ROOMS", self.path("rooms"))

@@ -48,7 +48,7 @@ fn steps_fit_into_the_memory_of_a_large_gpu() {
 }
 
 #[test]
-fn the_weights_that_come_with_the_program_are_those_of_tiny() {
+fn bundled_weights_match_the_configuration_tiny() {
     let shipped = bundled_model(Device::Cpu).expect("a model");
     let tiny = read("tiny");
     assert_eq!(shipped.config.model, tiny.model);

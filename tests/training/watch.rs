@@ -331,7 +331,7 @@ fn listening(port: u16) -> Vec<String> {
 
 #[test]
 #[cfg(unix)]
-fn the_run_stays_as_it_is() {
+fn watch_does_not_change_the_run() {
     let (_folder, run) = copy();
     let before = files(&run);
     let watch = Watch::start(&run);

@@ -110,7 +110,7 @@ fn captures_of_all_formats_are_found() {
 }
 
 #[test]
-fn views_and_captures_come_in_the_order_of_their_numbers() {
+fn views_and_captures_are_in_numeric_order() {
     let names: Vec<String> = (1..=12).map(|i| format!("r_{i}.png")).collect();
     let shuffled: Vec<&String> = [6, 1, 9, 0, 11, 4, 2, 10, 8, 3, 7, 5].map(|i| &names[i]).to_vec();
     let poses: Vec<_> = cameras().into_iter().cycle().take(names.len()).collect();
@@ -224,7 +224,7 @@ fn rounded_poses_become_rigid() {
 }
 
 #[test]
-fn colmaps_camera_models_mean_what_they_say() {
+fn parameters_of_colmap_camera_models_are_read() {
     let folder = original();
     let path = folder.path();
     let open = |lens: &str| {

@@ -10,7 +10,7 @@ use image::{DynamicImage, GrayImage, ImageFormat, Luma, Rgb, RgbImage};
 use serde_json::json;
 use std::io::Cursor;
 
-/// Returns the point at which the ray (x, y, 1) is seen, in the notation of OpenCV's documentation.
+/// Returns the distorted image coordinates of the ray (x, y, 1), by OpenCV's rational model and in the notation of its documentation.
 fn distort([k1, k2, p1, p2, k3, k4, k5, k6]: [f64; 8], x: f64, y: f64) -> (f64, f64) {
     let r2 = x.powi(2) + y.powi(2);
     let radial = (1. + k1 * r2 + k2 * r2.powi(2) + k3 * r2.powi(3))
@@ -21,7 +21,7 @@ fn distort([k1, k2, p1, p2, k3, k4, k5, k6]: [f64; 8], x: f64, y: f64) -> (f64, 
     )
 }
 
-/// Returns the ray that is seen at (u, v), by fixed-point iteration.
+/// Returns the x and y of the ray (x, y, 1) whose distorted image coordinates are (u, v), by fixed-point iteration.
 fn undistort(lens: [f64; 8], u: f64, v: f64) -> (f64, f64) {
     let (mut x, mut y) = (u, v);
     for _ in 0..200 {
@@ -33,13 +33,13 @@ fn undistort(lens: [f64; 8], u: f64, v: f64) -> (f64, f64) {
     (x, y)
 }
 
-/// Returns the largest difference of two levels of a pixel.
+/// Returns the largest absolute difference between the bytes of two images of the same size.
 fn largest_difference(a: &RgbImage, b: &RgbImage) -> u8 {
     assert_eq!(a.dimensions(), b.dimensions());
     a.as_raw().iter().zip(b.as_raw()).map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0)
 }
 
-/// Returns the colour of the scene along the ray (x, y, 1).
+/// Returns the colour that the ray (x, y, 1) sees, three levels from 7.5 to 247.5.
 fn scene(x: f64, y: f64) -> [f64; 3] {
     let wave = |t: f64| 127.5 + 120. * t.sin();
     [wave(6. * x + 2. * y), wave(7. * y - x), wave(4. * x - 5. * y)]
@@ -57,19 +57,19 @@ fn check_lens(lens: [f64; 8]) {
     let camera = Camera { intrinsics: k, c2w: DMat4::IDENTITY, width, height };
     let cameras = [camera, Camera { c2w: DMat4::from_translation(DVec3::X), ..camera }];
     let ray = |x: u32, y: u32| ((f64::from(x) + 0.5 - k.cx) / k.fx, (f64::from(y) + 0.5 - k.cy) / k.fy);
-    let picture = |through: &dyn Fn(f64, f64) -> (f64, f64)| {
+    let render = |ray_of: &dyn Fn(f64, f64) -> (f64, f64)| {
         RgbImage::from_fn(width, height, |x, y| {
             let (x, y) = ray(x, y);
-            let (x, y) = through(x, y);
+            let (x, y) = ray_of(x, y);
             Rgb(scene(x, y).map(|value| value.round() as u8))
         })
     };
-    let (seen, pinhole) = (picture(&|x, y| undistort(lens, x, y)), picture(&|x, y| (x, y)));
+    let (distorted, pinhole) = (render(&|x, y| undistort(lens, x, y)), render(&|x, y| (x, y)));
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path();
     std::fs::create_dir(path.join("images")).unwrap();
     let names = ["a.png".to_string(), "b.png".to_string()];
-    names.iter().for_each(|name| seen.save(path.join("images").join(name)).unwrap());
+    names.iter().for_each(|name| distorted.save(path.join("images").join(name)).unwrap());
     let (model, count) = if lens[4..] == [0.; 4] { ("OPENCV", 4) } else { ("FULL_OPENCV", 8) };
     let coefficients = lens[..count].iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
     let opencv = format!("{model} {} {} {} {} {coefficients}", k.fx, k.fy, k.cx, k.cy);
@@ -81,11 +81,11 @@ fn check_lens(lens: [f64; 8]) {
     write_colmap_text(&path.join("colmap/sparse/0"), &names, &cameras, &opencv);
     std::os::unix::fs::symlink(path.join("images"), path.join("colmap/images")).unwrap();
     std::fs::write(path.join("transforms.json"), contents.to_string()).unwrap();
-    assert!(largest_difference(&seen, &pinhole) > 50, "a lens that shows");
+    assert!(largest_difference(&distorted, &pinhole) > 50, "the lens hardly distorts");
     for capture in [open_capture(path).unwrap(), open_capture(&path.join("colmap")).unwrap()] {
         assert_same_cameras(&capture, &cameras);
         let found = capture.load(&[1], None).unwrap()[0].image.to_rgb();
-        // Pixels where the photo shows what the pinhole camera sees.
+        // Number of pixels whose ray falls inside the distorted photo. Other pixels aren't compared.
         let mut checked = 0;
         for y in 0..height {
             for x in 0..width {
@@ -97,7 +97,7 @@ fn check_lens(lens: [f64; 8]) {
                 }
                 checked += 1;
                 let (a, b) = (found.get_pixel(x, y), pinhole.get_pixel(x, y));
-                // The values are rounded twice, and interpolated linearly over a pixel.
+                // Levels are rounded twice, and interpolated linearly between the photo's pixels.
                 assert!(a.0.iter().zip(b.0).all(|(a, b)| a.abs_diff(b) <= 2), "({x}, {y}): {a:?} {b:?}");
             }
         }
@@ -137,7 +137,7 @@ fn exif_orientation_is_applied_if_the_declared_size_matches() {
     let load = |orientation: u8, width, height| {
         load_photo(&jpeg_with_orientation(&photo, orientation), "jpg", width, height)
     };
-    // Orientation 6: the stored top row is the right column; 8: the left one; 5 mirrors across the diagonal.
+    // The top row as stored is the right column with orientation 6, and the left column with 8. Orientation 5 transposes the photo.
     assert!(load(6, 16, 24).unwrap() == rotate90(&stored));
     assert!(load(8, 16, 24).unwrap() == rotate270(&stored));
     assert!(load(5, 16, 24).unwrap() == flip_horizontal(&rotate90(&stored)));
@@ -152,7 +152,7 @@ fn exif_orientation_is_applied_if_the_declared_size_matches() {
 }
 
 #[test]
-fn photos_of_every_kind_load() {
+fn photos_of_every_color_type_load() {
     let at = |x: u32, y: u32| (x * 10 + y) as u8;
     let grey = GrayImage::from_fn(WIDTH, HEIGHT, |x, y| Luma([at(x, y)]));
     let alpha = |y: u32| [0, 255, 128][y as usize % 3];
@@ -164,7 +164,7 @@ fn photos_of_every_kind_load() {
     let deep_grey =
         image::ImageBuffer::<Luma<u16>, _>::from_fn(WIDTH, HEIGHT, |x, y| Luma([u16::from(at(x, y)) * 257]));
     let over_black = |value: u8, y: u32| (f64::from(value) * f64::from(alpha(y)) / 255.).round() as u8;
-    let expect = |of: &dyn Fn(u32, u32) -> [u8; 3]| RgbImage::from_fn(WIDTH, HEIGHT, |x, y| Rgb(of(x, y)));
+    let expect = |rgb: &dyn Fn(u32, u32) -> [u8; 3]| RgbImage::from_fn(WIDTH, HEIGHT, |x, y| Rgb(rgb(x, y)));
     let repeated = expect(&|x, y| [at(x, y); 3]);
     let kinds: [(DynamicImage, RgbImage); 5] = [
         (grey.clone().into(), repeated.clone()),
@@ -187,7 +187,7 @@ fn photos_of_every_kind_load() {
     );
 }
 
-/// Returns an image of levels that compress badly, so that the data of every block take many bytes.
+/// Returns an image of pseudorandom levels. They compress badly, so that every block of a JPEG takes many bytes.
 fn noise(width: u32, height: u32) -> RgbImage {
     RgbImage::from_fn(width, height, |x, y| {
         Rgb([1, 2, 3]
@@ -196,18 +196,18 @@ fn noise(width: u32, height: u32) -> RgbImage {
 }
 
 /// Returns JPEGs of every supported kind: sequential and progressive, with one, three and four components, with and without
-/// chroma subsampling, with and without restart markers.
+/// chroma subsampling, with and without restart markers. The description of each begins with its number of components.
 fn jpegs() -> Vec<(String, Vec<u8>)> {
     use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
     let pixels = noise(45, 37).into_raw();
-    let mut made = vec![];
+    let mut jpegs = vec![];
     for (progressive, colours) in
         [false, true].into_iter().flat_map(|p| [1, 3, 4].map(|colours| (p, colours)))
     {
         for sampling in
             [SamplingFactor::F_1_1, SamplingFactor::F_2_1, SamplingFactor::F_2_2, SamplingFactor::F_4_1]
         {
-            // The decoder refuses subsampling with four components.
+            // The decoder doesn't support subsampling with four components.
             if colours == 4 && !matches!(sampling, SamplingFactor::F_1_1) {
                 continue;
             }
@@ -226,11 +226,11 @@ fn jpegs() -> Vec<(String, Vec<u8>)> {
                 }
                 encoder.set_optimized_huffman_tables(restart == 0);
                 encoder.encode(&bytes, 45, 37, kind).unwrap();
-                made.push((format!("{colours} {sampling:?} {restart} progressive {progressive}"), jpeg));
+                jpegs.push((format!("{colours} {sampling:?} {restart} progressive {progressive}"), jpeg));
             }
         }
     }
-    made
+    jpegs
 }
 
 #[test]
@@ -249,7 +249,7 @@ fn truncated_jpegs_are_refused_by_name() {
             );
         }
         for cut in (jpeg.len() / 16..data.len() - 1).step_by(41).chain([data.len() - 2]) {
-            // A progressive file may end after any of its scans if a marker follows.
+            // A progressive JPEG is complete after any of its scans, if a marker follows.
             if (cut - 1..=cut).any(|at| matches!(data[at..], [0xff, 0xc4 | 0xda, ..])) {
                 continue;
             }
@@ -257,7 +257,9 @@ fn truncated_jpegs_are_refused_by_name() {
                 let error = decode(&[&data[..cut], end].concat());
                 let error = match error {
                     Err(error) => error.to_string(),
-                    Ok(_) => panic!("{kind} of {} bytes was taken with {cut} and {end:?}", jpeg.len()),
+                    Ok(_) => {
+                        panic!("{kind} of {} bytes was accepted after {cut} bytes and {end:?}", jpeg.len())
+                    }
                 };
                 assert!(error.starts_with("cut.jpg: the image is "), "{error}");
             }
@@ -272,20 +274,20 @@ fn truncated_pngs_are_refused_by_name() {
     let png = png.into_inner();
     let decode = |bytes: &[u8]| decode_photo(bytes, "cut.png".as_ref(), (45, 37));
     decode(&png).unwrap();
-    // The last chunk, of 12 bytes, and two checksums of 4 carry no image data.
+    // The last 20 bytes carry no image data: two checksums of 4 bytes each, and the last chunk of 12 bytes.
     for cut in (0..png.len() - 20).step_by(37) {
-        let error = decode(&png[..cut]).expect_err("a part of it").to_string();
+        let error = decode(&png[..cut]).expect_err("the file is truncated").to_string();
         assert!(error.starts_with("cut.png: the image is "), "{error}");
     }
 }
 
-/// PNG with 24×16 pixels of 16 colours in a palette, as hexadecimal.
+/// PNG with 24×16 pixels and a palette of 16 colours, in hexadecimal.
 const PALETTE_PNG: &str = "89504e470d0a1a0a0000000d4948445200000018000000100403000000fe0aa2a600000030504c5445b4d20078d2003cd200\
     b48c00788c003c8c0000d200008c00b446007846003c4600004600b400007800003c0000000000c5d2909e0000002349444154789c63fccfc0f01e8698\
     1890006e0ecb1ef2f4dc2355cf7b0686b324ea010020e70e8d4441c80f0000000049454e44ae426082";
 
 #[test]
-fn only_photos_of_plain_colours_are_as_stored() {
+fn as_stored_is_true_only_for_8_bit_rgb() {
     let palette: Vec<u8> = (0..PALETTE_PNG.len())
         .step_by(2)
         .map(|i| u8::from_str_radix(&PALETTE_PNG[i..i + 2], 16).unwrap())

@@ -193,7 +193,7 @@ pub struct PartialFile {
     pub place: PathBuf,
     /// Open file at `place`, initially empty.
     pub file: File,
-    /// `true` if there is no file at `place` any more.
+    /// `true` if the file at `place` no longer exists.
     is_gone: bool,
 }
 
@@ -306,7 +306,7 @@ fn target_of(path: &Path, is_expected: fn(&Metadata) -> bool, expected: &str) ->
     }
     let mut target = path.to_owned();
     while let Ok(link) = fs::read_link(&target) {
-        // For example /dev/stdout and /dev/fd/1.
+        // /dev/stdout and /dev/fd/1 are such links.
         if parent_of(&target).canonicalize().is_ok_and(|folder| folder.starts_with("/proc")) {
             return refuse("an open file of a process");
         }

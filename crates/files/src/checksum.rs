@@ -37,7 +37,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn files_are_read_to_their_end_in_order() {
+    fn checksum_covers_all_files_in_order() {
         let folder = tempfile::tempdir().unwrap();
         let [a, b] = ["a", "b"].map(|name| folder.path().join(name));
         let bytes: Vec<u8> = (0..2 * BUFFER + 3).map(|i| (i % 251) as u8).collect();

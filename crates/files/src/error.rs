@@ -36,7 +36,7 @@ pub enum Error {
     /// Invalid argument, or invalid combination of arguments, that isn't a single setting.
     #[error("{message}")]
     Request {
-        /// What is wrong, in one sentence.
+        /// Description of the mistake, in one sentence.
         message: String,
     },
     /// Failed read of a file or folder.
@@ -58,7 +58,7 @@ pub enum Error {
     /// Failure of work after it had started.
     #[error("{message}")]
     Failed {
-        /// What failed and why, in one sentence.
+        /// Description of the failed work and the reason, in one sentence.
         message: String,
         /// Error that caused the failure, if another library reported one. The message includes its text.
         source: Option<Box<dyn StdError + Send + Sync>>,

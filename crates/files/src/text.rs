@@ -1,9 +1,9 @@
-//! Text files of other programs.
+//! Reading of text files that other programs wrote.
 
 use crate::{Error, Result};
 use std::path::Path;
 
-/// Reads a UTF-8 file without the byte order mark that Windows programs put at its start.
+/// Reads a UTF-8 file. A byte order mark at its start, which Windows programs may write, is left out.
 ///
 /// # Errors
 /// Returns an error if the file can't be read or isn't UTF-8.

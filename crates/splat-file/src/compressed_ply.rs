@@ -1,5 +1,5 @@
-//! PlayCanvas' compressed PLY (spec 10.12): four words of 32 bits per Gaussian, with values between the bounds of a chunk of 256 Gaussians,
-//! and a byte for each spherical harmonic above degree 0.
+//! PlayCanvas' compressed PLY (spec 10.12). Each Gaussian has four words of 32 bits, and a byte for each SH coefficient above degree 0.
+//! Positions, scales and colours are quantized between the bounds of a chunk of 256 Gaussians.
 
 use crate::formats::Contents;
 use crate::invalid::InvalidGaussians;
@@ -14,19 +14,21 @@ use globalsplat_files::write_atomically;
 use std::f64::consts::SQRT_2;
 use std::path::Path;
 
-/// Number of Gaussians that share their bounds.
+/// Number of Gaussians in a chunk, which share their bounds.
 const CHUNK: usize = 256;
-/// Names of the bounded values: position, logarithm of the scale, colour.
+/// Names of the values that are quantized between bounds: position, logarithm of the scale, colour.
 const BOUNDED: [[&str; 3]; 3] = [["x", "y", "z"], ["scale_x", "scale_y", "scale_z"], ["r", "g", "b"]];
-/// Names of the words of a Gaussian.
+/// Names of a Gaussian's four words.
 const WORDS: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
-/// Numbers of bits of the three components of a position or scale, the three of a rotation and the four of a colour.
+/// Numbers of bits of the three components of a position or scale.
 const WIDE: [u32; 3] = [11, 10, 11];
+/// Numbers of bits of the three smaller components of a quaternion.
 const ROTATION: [u32; 3] = [10, 10, 10];
+/// Numbers of bits of red, green, blue and opacity.
 const COLOUR: [u32; 4] = [8, 8, 8, 8];
-/// Largest magnitude of the logarithm of a scale. Larger ones would widen the bounds of their chunk without a visible effect.
+/// Largest magnitude of a log scale. Larger ones are clamped: they have no visible effect, but would widen the bounds of their chunk.
 const MAX_LOG_SCALE: f32 = 20.;
-/// Width of the range of spherical harmonics, which is centred on 0.
+/// Width of the range of SH coefficients, which is centred on 0.
 const SH_RANGE: f64 = 8.;
 
 /// Returns `true` if `bytes` are a compressed PLY.
@@ -35,10 +37,10 @@ pub(crate) fn recognizes(bytes: &[u8]) -> bool {
     header.is_some_and(|header| header.element("vertex").is_some_and(|vertex| vertex.has(WORDS[0])))
 }
 
-/// Reads a compressed PLY of any SH degree; older files have no bounds of colours.
+/// Reads a compressed PLY of any SH degree. In older files, which have no bounds of colours, the bounds are 0 and 1.
 ///
 /// # Errors
-/// Returns an error if anything is missing or of another type, or if the file is truncated.
+/// Returns an error if an element or property is missing or has another type, or if the file is truncated.
 pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let header = Header::parse(path, bytes)?;
     let owned = |names: &[&str]| names.iter().map(|name| name.to_string()).collect::<Vec<_>>();
@@ -46,8 +48,8 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let words = columns(path, bytes, &header, "vertex", &owned(&WORDS), |number| number as u32)?;
     let (words, _) = words.as_chunks::<{ WORDS.len() }>();
 
-    let colours = header.element("chunk").is_some_and(|chunk| chunk.has("min_r"));
-    let bounded = if colours { &BOUNDED[..] } else { &BOUNDED[..2] };
+    let has_colour_bounds = header.element("chunk").is_some_and(|chunk| chunk.has("min_r"));
+    let bounded = if has_colour_bounds { &BOUNDED[..] } else { &BOUNDED[..2] };
     let names = bounded.iter().flat_map(bound_names).collect::<Vec<_>>();
     let bounds = columns(path, bytes, &header, "chunk", &names, |number| number as f32)?;
     let mut invalid = InvalidGaussians::default();
@@ -70,10 +72,10 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let bases = splat.bases();
     for (index, &[position, rotation, scale, colour]) in words.iter().enumerate() {
         let bounds = chunks[index / CHUNK];
-        let between = |bounds: &[f32], parts: [f64; 3]| -> [f32; 3] {
+        let between = |bounds: &[f32], fractions: [f64; 3]| -> [f32; 3] {
             std::array::from_fn(|axis| {
                 let (low, high) = (f64::from(bounds[axis]), f64::from(bounds[3 + axis]));
-                (low * (1. - parts[axis]) + high * parts[axis]) as f32
+                (low * (1. - fractions[axis]) + high * fractions[axis]) as f32
             })
         };
         splat.means.push(between(&bounds[..6], unpack(position, WIDE)));
@@ -94,7 +96,7 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     Ok(Contents { splat, invalid })
 }
 
-/// Returns the bytes of the spherical harmonics above degree 0, Gaussian by Gaussian and channel-major, and the degree.
+/// Returns the bytes of the SH coefficients above degree 0, `[count, 3, bases - 1]`, and the degree.
 fn read_rest(path: &Path, bytes: &[u8], header: &Header, count: usize) -> Result<(Vec<u8>, usize)> {
     let Some(element) = header.element("sh") else { return Ok((vec![], 0)) };
     let names: Vec<String> =
@@ -108,7 +110,7 @@ fn read_rest(path: &Path, bytes: &[u8], header: &Header, count: usize) -> Result
     Ok((columns(path, bytes, header, "sh", &names, |number| number as u8)?, degree))
 }
 
-/// Checks that the packed properties have the type `scalar`.
+/// Checks that the properties `names` of `element` have the type `scalar`, if they exist.
 fn expect_type(path: &Path, header: &Header, element: &str, names: &[String], scalar: Scalar) -> Result<()> {
     let properties = header.element(element).into_iter().flat_map(|element| &element.properties);
     for property in properties.filter(|property| names.contains(&property.name)) {
@@ -120,16 +122,17 @@ fn expect_type(path: &Path, header: &Header, element: &str, names: &[String], sc
     Ok(())
 }
 
-fn bound_names(of: &[&str; 3]) -> Vec<String> {
-    ["min", "max"].iter().flat_map(|end| of.map(|name| format!("{end}_{name}"))).collect()
+/// Returns the names of the lower bounds of three values, followed by those of the upper bounds.
+fn bound_names(names: &[&str; 3]) -> Vec<String> {
+    ["min", "max"].iter().flat_map(|end| names.map(|name| format!("{end}_{name}"))).collect()
 }
 
-/// Returns the limits of coefficients. Degree 0 has none, because each chunk has its own bounds of colours.
+/// Returns the range of SH coefficients that the format can store. Degree 0 is unlimited, because each chunk has its own bounds of colours.
 pub(crate) fn limits() -> ShLimits {
     ShLimits { rest: -SH_RANGE / 2. ..=SH_RANGE / 2., ..ShLimits::up_to(3) }
 }
 
-/// Writes a compressed PLY, with Gaussians in Morton order, so that those of a chunk are near each other.
+/// Writes a compressed PLY. The Gaussians are in Morton order, so that those of a chunk are close together and the bounds are narrow.
 ///
 /// # Errors
 /// Returns an error if the file can't be written.
@@ -137,8 +140,8 @@ pub(crate) fn write(path: &Path, splat: &Splat) -> Result<()> {
     let order = morton_order(&splat.means);
     let (mut bounds, mut words) = (vec![], vec![]);
     for chunk in order.chunks(CHUNK) {
-        let of_chunk = |number: &dyn Fn(usize) -> [f32; 3]| -> Vec<[f32; 3]> {
-            chunk.iter().map(|&index| number(index)).collect()
+        let of_chunk = |value_of: &dyn Fn(usize) -> [f32; 3]| -> Vec<[f32; 3]> {
+            chunk.iter().map(|&index| value_of(index)).collect()
         };
         let means = Bounded::of(of_chunk(&|index| splat.means[index]));
         let log_scales = Bounded::of(of_chunk(&|index| {
@@ -151,12 +154,12 @@ pub(crate) fn write(path: &Path, splat: &Splat) -> Result<()> {
             bounds.extend(bounded.low.iter().chain(&bounded.high).flat_map(|bound| bound.to_le_bytes()));
         }
         for (row, &index) in chunk.iter().enumerate() {
-            let [red, green, blue] = colours.parts(row);
+            let [red, green, blue] = colours.fractions(row);
             let colour = [red, green, blue, f64::from(splat.opacity(index))];
             let packed = [
-                pack(means.parts(row), WIDE),
+                pack(means.fractions(row), WIDE),
                 pack_rotation(splat.unit_quaternion(index)),
-                pack(log_scales.parts(row), WIDE),
+                pack(log_scales.fractions(row), WIDE),
                 pack(colour, COLOUR),
             ];
             words.extend(packed.iter().flat_map(|word| word.to_le_bytes()));
@@ -164,7 +167,7 @@ pub(crate) fn write(path: &Path, splat: &Splat) -> Result<()> {
     }
     let rest = order.iter().flat_map(|&index| {
         let rest = &splat.sh_of(index)[1..];
-        (0..3).flat_map(move |channel| rest.iter().map(move |of_basis| pack_sh(of_basis[channel])))
+        (0..3).flat_map(move |channel| rest.iter().map(move |coefficients| pack_sh(coefficients[channel])))
     });
     let rest: Vec<u8> = rest.collect();
     let header = header(splat.len(), splat.bases());
@@ -188,82 +191,85 @@ fn header(count: usize, bases: usize) -> String {
     lines.join("\n")
 }
 
-/// Values of a chunk, and their bounds.
+/// Vectors of a chunk's Gaussians, and the bounds of each component.
 struct Bounded {
-    numbers: Vec<[f32; 3]>,
+    values: Vec<[f32; 3]>,
     low: [f32; 3],
     high: [f32; 3],
 }
 
 impl Bounded {
-    fn of(numbers: Vec<[f32; 3]>) -> Self {
+    fn of(values: Vec<[f32; 3]>) -> Self {
         let extreme = |choose: fn(f32, f32) -> f32| -> [f32; 3] {
             std::array::from_fn(|axis| {
-                numbers.iter().map(|of_one| of_one[axis]).reduce(choose).expect("a chunk has a Gaussian")
+                values.iter().map(|value| value[axis]).reduce(choose).expect("a chunk has a Gaussian")
             })
         };
-        Bounded { low: extreme(f32::min), high: extreme(f32::max), numbers }
+        Bounded { low: extreme(f32::min), high: extreme(f32::max), values }
     }
 
-    /// Returns the fraction of the way from the lower bound to the upper one, in [0, 1].
-    fn parts(&self, row: usize) -> [f64; 3] {
+    /// Returns the position of each component of vector `row` between its bounds: 0 at the lower bound, 1 at the upper bound.
+    fn fractions(&self, row: usize) -> [f64; 3] {
         std::array::from_fn(|axis| {
             let (low, high) = (f64::from(self.low[axis]), f64::from(self.high[axis]));
-            if high > low { (f64::from(self.numbers[row][axis]) - low) / (high - low) } else { 0. }
+            if high > low { (f64::from(self.values[row][axis]) - low) / (high - low) } else { 0. }
         })
     }
 }
 
-/// Packs values in [0, 1] into a word, each in its number of `bits`, the first in the highest bits.
-fn pack<const N: usize>(parts: [f64; N], bits: [u32; N]) -> u32 {
-    parts.iter().zip(bits).fold(0, |word, (part, bits)| {
+/// Packs values in [0, 1] into a word. The first value is in the highest bits, and each value has as many bits as `bits` says.
+fn pack<const N: usize>(fractions: [f64; N], bits: [u32; N]) -> u32 {
+    fractions.iter().zip(bits).fold(0, |word, (fraction, bits)| {
         let largest = (1u32 << bits) - 1;
-        (word << bits) | ((part * f64::from(largest)).round() as u32).min(largest)
+        (word << bits) | ((fraction * f64::from(largest)).round() as u32).min(largest)
     })
 }
 
+/// Unpacks the values in [0, 1] that [`pack`] packed.
 fn unpack<const N: usize>(mut word: u32, bits: [u32; N]) -> [f64; N] {
-    let mut parts = [0.; N];
-    for (part, bits) in parts.iter_mut().zip(bits).rev() {
+    let mut fractions = [0.; N];
+    for (fraction, bits) in fractions.iter_mut().zip(bits).rev() {
         let largest = u32::MAX >> (32 - bits);
-        *part = f64::from(word & largest) / f64::from(largest);
+        *fraction = f64::from(word & largest) / f64::from(largest);
         word >>= bits;
     }
-    parts
+    fractions
 }
 
-/// Packs the index of the largest component, in two bits, and the other three of the quaternion or its negative, whichever has a positive
-/// largest component.
+/// Packs a unit quaternion by the "smallest three" method: the index of the component with the largest magnitude in two bits, then the
+/// other three components. If the largest component is negative, the negative of the quaternion is packed, which is the same rotation.
 fn pack_rotation(quaternion: [f32; 4]) -> u32 {
     let larger = |a: &usize, b: &usize| quaternion[*a].abs().total_cmp(&quaternion[*b].abs());
-    let largest = (0..4).rev().max_by(larger).expect("four parts");
+    let largest = (0..4).rev().max_by(larger).expect("four components");
     let sign = f64::from(quaternion[largest].signum());
-    let mut others = (0..4).filter(|&part| part != largest);
-    let parts = ROTATION.map(|_| {
-        let part = others.next().expect("three others");
-        sign * f64::from(quaternion[part]) / SQRT_2 + 0.5
+    let mut others = (0..4).filter(|&index| index != largest);
+    let fractions = ROTATION.map(|_| {
+        let index = others.next().expect("three others");
+        sign * f64::from(quaternion[index]) / SQRT_2 + 0.5
     });
-    (largest as u32) << 30 | pack(parts, ROTATION)
+    (largest as u32) << 30 | pack(fractions, ROTATION)
 }
 
+/// Unpacks the unit quaternion that [`pack_rotation`] packed.
 fn unpack_rotation(word: u32) -> [f32; 4] {
-    let others = unpack(word, ROTATION).map(|part| (part - 0.5) * SQRT_2);
-    let rest = 1. - others.iter().map(|part| part * part).sum::<f64>();
+    let others = unpack(word, ROTATION).map(|fraction| (fraction - 0.5) * SQRT_2);
+    let rest = 1. - others.iter().map(|other| other * other).sum::<f64>();
     let mut quaternion = others.to_vec();
     quaternion.insert((word >> 30) as usize, rest.max(0.).sqrt());
-    normalized(std::array::from_fn(|part| quaternion[part] as f32))
+    normalized(std::array::from_fn(|index| quaternion[index] as f32))
 }
 
+/// Quantizes an SH coefficient to a byte. Values out of range are clamped.
 fn pack_sh(value: f32) -> u8 {
     ((f64::from(value) / SH_RANGE + 0.5) * 256.) as u8
 }
 
-/// Returns the middle of the values that pack to `byte`, or the end of the range for the first and the last byte.
+/// Returns the SH coefficient for `byte`: the middle of the values that [`pack_sh`] maps to it, or an end of the range for 0 and 255.
 fn unpack_sh(byte: u8) -> f32 {
-    let part = match byte {
+    let fraction = match byte {
         0 => 0.,
         255 => 1.,
         _ => (f64::from(byte) + 0.5) / 256.,
     };
-    ((part - 0.5) * SH_RANGE) as f32
+    ((fraction - 0.5) * SH_RANGE) as f32
 }

@@ -31,7 +31,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn halves_come_one_after_the_other() {
+    fn corners_of_a_cube_are_in_morton_order() {
         // The corners of a cube, the first axis changing fastest.
         let corners: Vec<[f32; 3]> =
             (0..8).map(|corner| [0, 1, 2].map(|axis| (corner >> axis & 1) as f32 * 9. - 4.)).collect();

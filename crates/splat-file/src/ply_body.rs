@@ -8,8 +8,8 @@ use std::path::Path;
 /// skipped.
 ///
 /// # Errors
-/// Returns an error if an element or a property is missing, a property is a list instead of a number, the file is truncated, or a text is
-/// no number.
+/// Returns an error if an element or a property is missing, a property is a list instead of a number, the file is truncated, or a text
+/// isn't a number.
 pub fn columns<T>(
     path: &Path,
     bytes: &[u8],

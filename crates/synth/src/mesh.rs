@@ -13,15 +13,15 @@ pub(super) struct Mesh {
 }
 
 impl Mesh {
-    /// Creates the surface `at(u, v)` over the unit square, in `columns` × `rows` cells. The texture is `size` metres wide and
-    /// high. The outside is in the direction of ∂at/∂u × ∂at/∂v.
-    pub fn grid(columns: usize, rows: usize, size: Vec2, at: impl Fn(f32, f32) -> Vec3) -> Mesh {
+    /// Creates a grid of `columns` × `rows` cells on the parametric surface `surface(u, v)`, with u and v in [0, 1]. `size` is the
+    /// width and height of its texture in metres. The outside is in the direction of ∂surface/∂u × ∂surface/∂v.
+    pub fn grid(columns: usize, rows: usize, size: Vec2, surface: impl Fn(f32, f32) -> Vec3) -> Mesh {
         let mut mesh = Mesh::default();
         for row in 0..=rows {
             for column in 0..=columns {
-                let place = Vec2::new(column as f32 / columns as f32, row as f32 / rows as f32);
-                mesh.positions.push(at(place.x, place.y));
-                mesh.uvs.push(place * size);
+                let uv = Vec2::new(column as f32 / columns as f32, row as f32 / rows as f32);
+                mesh.positions.push(surface(uv.x, uv.y));
+                mesh.uvs.push(uv * size);
             }
         }
         let vertex = |column: usize, row: usize| (row * (columns + 1) + column) as u32;
@@ -35,14 +35,15 @@ impl Mesh {
         mesh
     }
 
-    /// Creates the rectangle at `corner` along two sides, in cells of at most `cell` metres. The outside is in the direction of
-    /// `along` × `up`.
+    /// Creates the rectangle that has a corner at `corner` and the sides `along` and `up`. Its cells are at most `cell` metres wide
+    /// and high, unless that takes more than 64 cells per side. The outside is in the direction of `along` × `up`.
     pub fn rectangle(corner: Vec3, along: Vec3, up: Vec3, cell: f32) -> Mesh {
         let size = Vec2::new(along.length(), up.length());
         let cells = (size / cell).ceil().clamp(Vec2::ONE, Vec2::splat(64.));
         Mesh::grid(cells.x as usize, cells.y as usize, size, |u, v| corner + u * along + v * up)
     }
 
+    /// Appends the vertices and triangles of `other`.
     pub fn join(&mut self, other: Mesh) {
         let first = self.positions.len() as u32;
         self.positions.extend(other.positions);
@@ -50,40 +51,41 @@ impl Mesh {
         self.triangles.extend(other.triangles.iter().map(|corners| corners.map(|vertex| first + vertex)));
     }
 
-    /// Returns the mesh transformed by `by`. The texture keeps its size.
-    pub fn moved(self, by: Affine3A) -> Mesh {
-        self.warped(|position| by.transform_point3(position))
+    /// Returns the mesh transformed by `transform`. The texture coordinates don't change.
+    pub fn moved(self, transform: Affine3A) -> Mesh {
+        self.warped(|position| transform.transform_point3(position))
     }
 
-    /// Returns the mesh with every vertex mapped by `to`.
-    pub fn warped(mut self, to: impl Fn(Vec3) -> Vec3) -> Mesh {
-        self.positions.iter_mut().for_each(|position| *position = to(*position));
+    /// Returns the mesh with every vertex position mapped by `map`. The texture coordinates don't change.
+    pub fn warped(mut self, map: impl Fn(Vec3) -> Vec3) -> Mesh {
+        self.positions.iter_mut().for_each(|position| *position = map(*position));
         self
     }
 
     /// Returns the bounding box: its minimum and maximum corners.
     pub fn bounds(&self) -> (Vec3, Vec3) {
-        let none = (Vec3::INFINITY, Vec3::NEG_INFINITY);
-        self.positions.iter().fold(none, |(least, most), &p| (least.min(p), most.max(p)))
+        let empty = (Vec3::INFINITY, Vec3::NEG_INFINITY);
+        self.positions.iter().fold(empty, |(low, high), &p| (low.min(p), high.max(p)))
     }
 
-    /// Returns for every vertex a point on its triangles, a fifth of the way to their centres. A vertex itself may lie on the edge
-    /// where another surface begins, with anything behind it.
+    /// Returns one point per vertex: the vertex, moved a fifth of the way to the mean of its triangles' centres. Unlike the vertices
+    /// themselves, these points don't lie on an edge where another surface begins.
     pub fn insides(&self) -> Vec<Vec3> {
         let mut sums = vec![(Vec3::ZERO, 0.); self.positions.len()];
         for corners in &self.triangles {
-            let middle = corners.map(|vertex| self.positions[vertex as usize]).iter().sum::<Vec3>() / 3.;
+            let centre = corners.map(|vertex| self.positions[vertex as usize]).iter().sum::<Vec3>() / 3.;
             for &vertex in corners {
                 let (sum, count) = &mut sums[vertex as usize];
-                (*sum, *count) = (*sum + middle, *count + 1.);
+                (*sum, *count) = (*sum + centre, *count + 1.);
             }
         }
-        let inside = |(&at, &(sum, count)): (&Vec3, &(Vec3, f32))| at.lerp(sum / f32::max(count, 1.), 0.2);
+        let inside =
+            |(&vertex, &(sum, count)): (&Vec3, &(Vec3, f32))| vertex.lerp(sum / f32::max(count, 1.), 0.2);
         self.positions.iter().zip(&sums).map(inside).collect()
     }
 
-    /// Returns a unit normal per vertex, the area-weighted mean of its triangles' normals: smooth within a grid, sharp between
-    /// grids.
+    /// Returns a unit normal per vertex: the area-weighted mean of its triangles' normals. Shading is smooth within a grid and has
+    /// sharp edges between joined grids, because those don't share vertices.
     pub fn normals(&self) -> Vec<Vec3> {
         let mut normals = vec![Vec3::ZERO; self.positions.len()];
         for corners in &self.triangles {

@@ -27,19 +27,21 @@ impl Noise {
         face(0) + weight.z * (face(1) - face(0))
     }
 
-    /// Returns the sum of `octaves`, each with twice the frequency and half the amplitude of the previous one, in [-1, 1].
+    /// Returns the weighted mean of `octaves` octaves of noise at `place`, in [-1, 1]. Each octave has twice the frequency and half the
+    /// weight of the previous one.
     pub fn fractal(&self, place: Vec3, octaves: u32) -> f32 {
         let terms = (0..octaves).map(|octave| {
             let scale = (1 << octave) as f32;
             (self.at(place * scale + 17.1 * octave as f32) / scale, 1. / scale)
         });
-        let (sum, most) = terms.fold((0., 0.), |(sum, most), (term, share)| (sum + term, most + share));
-        sum / most
+        let (sum, total) = terms.fold((0., 0.), |(sum, total), (term, weight)| (sum + term, total + weight));
+        sum / total
     }
 
+    /// Returns the random value of the lattice point `cell`, in [-1, 1].
     fn corner(&self, cell: IVec3) -> f32 {
         let [x, y, z] = cell.to_array().map(|i| i as u32);
-        // Multiply and fold until every bit of the cell affects every bit of the result.
+        // Hash the coordinates: every bit of them affects every bit of the result.
         let mut bits = self.seed
             ^ x.wrapping_mul(0x8da6_b343)
             ^ y.wrapping_mul(0xd816_3841)

@@ -332,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn mirrors_show_what_stands_before_them() {
+    fn mirrors_reflect_the_scene() {
         let tracer = world(186, |parts, material| {
             parts.lamps.push(Lamp::Sun { towards: Vec3::Y, spread: 0., colour: Vec3::splat(2.) });
             let mirror = Mesh::rectangle(Vec3::new(2., 0., -1.), 2. * Vec3::Z, 2. * Vec3::Y, 1.);
@@ -394,7 +394,7 @@ mod tests {
     }
 
     #[test]
-    fn distances_are_those_of_the_surfaces() {
+    fn free_distance_ends_at_surfaces() {
         let tracer = world(128, |_, _| {});
         assert!((tracer.free_distance(Vec3::new(0.2, 3., 0.1), Vec3::NEG_Y, 10.) - 3.).abs() < 1e-5);
         assert_eq!(tracer.free_distance(Vec3::Y, Vec3::Y, 7.), 7.);

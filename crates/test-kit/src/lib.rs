@@ -16,7 +16,7 @@ pub fn skip(what: &str, why: &str) {
     skip_on_this_processor(what, why);
 }
 
-/// Reports a skipped test like [`skip`], but for a requirement that can't be installed: it is no failure with `GLOBALSPLAT_NO_SKIPS`.
+/// Reports a skipped test like [`skip`], but for a requirement that can't be installed. It doesn't fail if `GLOBALSPLAT_NO_SKIPS` is set.
 pub fn skip_on_this_processor(what: &str, why: &str) {
     println!("skipped: {why}");
     if let Some(file) = variable("GLOBALSPLAT_SKIPPED") {

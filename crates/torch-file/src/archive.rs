@@ -35,7 +35,7 @@ impl Archive {
     /// that share bytes.
     ///
     /// # Errors
-    /// Returns an error if the file is no such archive, is truncated, or has changed since it was written.
+    /// Returns an error if the file isn't such an archive, is truncated, or has changed since it was written.
     pub fn parse(file: &Path, bytes: &[u8]) -> Result<Self> {
         let refuse = |field: &str, found: &dyn Display, expected: &str| {
             Err(Error::input(file, field, found, expected))

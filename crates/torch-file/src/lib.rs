@@ -24,7 +24,7 @@ use std::path::Path;
 /// Byte ranges of tensors' storages in a file, by the keys under which its pickle refers to them.
 pub type Storages = HashMap<String, Range<usize>>;
 
-/// Contents of a file of torch.save in either format. Values of unknown types beside the tensors are kept.
+/// Contents of a file that `torch.save` wrote, in the zip format or the legacy one. Values of unknown types are kept as [`Value`]s.
 #[derive(Debug)]
 pub struct TorchFile<'a> {
     /// Values of the pickle.
@@ -33,19 +33,19 @@ pub struct TorchFile<'a> {
     pub storages: Storages,
 }
 
-/// Returns `true` if `bytes`, the contents of a file, begin like a file of torch.save, in the current format or in that before torch 1.6.
-/// Any zip archive does.
+/// Returns `true` if `bytes`, the contents of a file, begin like a file that `torch.save` wrote, in the zip format or in the format before
+/// torch 1.6. The result is `true` for any zip archive, because only the first bytes are examined.
 pub fn is_torch_file(bytes: &[u8]) -> bool {
     bytes.starts_with(archive::MAGIC) || legacy::is_legacy_file(bytes)
 }
 
 impl<'a> TorchFile<'a> {
-    /// Parses `bytes`, the contents of `file`, which is only named in errors. Nothing that the file contains is executed, and none of its
-    /// sizes is trusted.
+    /// Parses `bytes`, the contents of `file`; the path only serves for error messages. Nothing in the file is executed, and no size that
+    /// it states is trusted.
     ///
     /// # Errors
-    /// Returns an error if the file is damaged or no file of torch.save, or if it would call a function in Python that isn't known to only
-    /// assemble data.
+    /// Returns an error if `torch.save` didn't write the file, if the file is damaged, or if Python would call a function to load it that
+    /// isn't known to only assemble data.
     pub fn parse(file: &Path, bytes: &'a [u8]) -> Result<Self> {
         let expected = "numbers, strings and tensors, as in a checkpoint that runs nothing; nothing was run";
         let refuse = |found: String| Error::input(file, "the pickle", found, expected);

@@ -11,10 +11,10 @@ use crate::value::{Id, Rebuild, Value, Values};
 /// Treatment of values that aren't tensors, lists, dicts, strings or numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum UnknownGlobals {
-    /// They are errors, for files that need no such values.
+    /// Returns an error for such values. This is for files that don't need them.
     Refuse,
-    /// They are kept as data of an unknown type. A pickle that would make Python call a function is still refused, unless the function is
-    /// known to only assemble data.
+    /// Keeps such values as data of an unknown type. A pickle that would make Python call a function is still refused, unless the function
+    /// is known to only assemble data.
     Keep,
 }
 

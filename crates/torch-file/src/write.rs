@@ -1,5 +1,5 @@
-//! Writer for checkpoints in the format of torch.save, which `torch.load` reads without any of our code: pickle protocol 2, and the bytes
-//! of each tensor in a stored entry of a zip archive.
+//! Writer for checkpoints in the zip format of `torch.save`, which `torch.load` reads without any code of this project. The archive has an
+//! entry with a pickle of protocol 2, and an uncompressed entry with the bytes of each tensor.
 
 use crate::array::row_major;
 use crate::{Dtype, Error, Result};
@@ -11,14 +11,16 @@ use zip::CompressionMethod;
 use zip::result::ZipError;
 use zip::write::{FileOptions, ZipWriter};
 
-/// Alignment of tensors' bytes in the file, as in torch's own files.
+/// Alignment of each tensor's bytes in the file. Files that torch writes have the same.
 const ALIGNMENT: u16 = 64;
-/// Version of the archive's layout.
+/// Contents of the entry `version`: the version of the archive's layout.
 const VERSION: &[u8] = b"3\n";
 
-/// Entries that Lightning requires. With them it accepts the file as a checkpoint of its own.
+/// Key of Lightning's version, without which Lightning doesn't accept a checkpoint as its own.
 const LIGHTNING_VERSION_KEY: &str = "pytorch-lightning_version";
+/// Version of Lightning that the checkpoint states.
 const LIGHTNING_VERSION: &str = "2.0.0";
+/// Other keys that Lightning requires. Their values are 0.
 const COUNTERS: [&str; 2] = ["epoch", "global_step"];
 
 /// A tensor to be written.
@@ -26,7 +28,7 @@ const COUNTERS: [&str; 2] = ["epoch", "global_step"];
 pub struct TensorView<'a> {
     /// Name in the state dict.
     pub name: &'a str,
-    /// Type of the elements; not a quantized one.
+    /// Type of the elements. Quantized types aren't supported.
     pub dtype: Dtype,
     /// Size of each dimension.
     pub shape: &'a [usize],
@@ -51,8 +53,8 @@ impl TensorView<'_> {
     }
 }
 
-/// Writes a checkpoint to `path` atomically: the dict {"state_dict": `tensors` by name, and the strings of `metadata` by their keys}. It
-/// also has the entries with which Lightning accepts it: "pytorch-lightning_version", "epoch" and "global_step".
+/// Writes a checkpoint to `path` atomically. It is a dict: "state_dict" maps names to `tensors`, and every other key maps to a string of
+/// `metadata`. The keys that Lightning requires are added: "pytorch-lightning_version", "epoch" and "global_step".
 ///
 /// # Errors
 /// Returns an error if a tensor is quantized or its bytes don't fit its shape, or if the file can't be written.
@@ -95,7 +97,7 @@ fn pickle(tensors: &[TensorView], metadata: &HashMap<String, String>) -> Vec<u8>
         p.text(name);
         p.global("torch._utils", "_rebuild_tensor_v2");
         p.0.push(b'(');
-        // The persistent id of a storage, BINPERSID.
+        // BINPERSID: the persistent id that refers to a storage.
         p.0.push(b'(');
         p.text("storage");
         p.global("torch", dtype.storage_class());
@@ -103,7 +105,7 @@ fn pickle(tensors: &[TensorView], metadata: &HashMap<String, String>) -> Vec<u8>
         p.text("cpu");
         p.integer(shape.iter().product());
         p.0.extend(b"tQ");
-        // The offset, size and stride, requires_grad (NEWFALSE), and no hooks.
+        // Arguments of the call: storage offset, size, stride, requires_grad (NEWFALSE), and an empty dict of backward hooks.
         p.integer(0);
         p.tuple(shape);
         p.tuple(&row_major(shape));
@@ -130,7 +132,7 @@ fn pickle(tensors: &[TensorView], metadata: &HashMap<String, String>) -> Vec<u8>
     p.0
 }
 
-/// A program for Python's stack machine, built instruction by instruction.
+/// Pickle under construction: instructions for the stack machine of Python's unpickler.
 struct Pickle(Vec<u8>);
 
 impl Pickle {
@@ -147,14 +149,14 @@ impl Pickle {
         self.0.extend((number as u64).to_le_bytes());
     }
 
-    /// Appends a tuple of integers: MARK and TUPLE.
+    /// Appends a tuple of integers, between MARK and TUPLE.
     fn tuple(&mut self, numbers: &[usize]) {
         self.0.push(b'(');
         numbers.iter().for_each(|&number| self.integer(number));
         self.0.push(b't');
     }
 
-    /// Appends a global name: GLOBAL.
+    /// Appends a reference to `module.name`: GLOBAL.
     fn global(&mut self, module: &str, name: &str) {
         self.0.extend(format!("c{module}\n{name}\n").as_bytes());
     }

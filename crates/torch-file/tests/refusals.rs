@@ -173,7 +173,7 @@ fn archives_that_inflate_are_refused() {
     let entry = bytes.windows(4).rposition(|window| window == b"PK\x01\x02").unwrap();
     bytes[entry + 20..entry + 28].copy_from_slice(&[0xff, 0xff, 0xff, 0xf0, 0xff, 0xff, 0xff, 0xf0]);
     assert!(refusal(&bytes).contains("expected inside the file"));
-    // Both entries at the same offset: their checksums would be computed repeatedly.
+    // Two entries at the same offset are refused, because entries that share bytes could make the reader compute many checksums.
     let mut bytes = archive(pickle, pickle, CompressionMethod::Stored);
     let entry = bytes.windows(4).rposition(|window| window == b"PK\x01\x02").unwrap();
     bytes[entry + 42..entry + 46].copy_from_slice(&[0; 4]);

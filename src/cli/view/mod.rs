@@ -1,3 +1,5 @@
+//! `globalsplat view`: shows a splat in a browser.
+
 mod contents;
 mod page;
 
@@ -15,9 +17,9 @@ use std::path::{Path, PathBuf};
 
 /// Explore a splat interactively: writes a page for a browser, with everything in one file, and opens it.
 ///
-/// With --scene the page includes the capture's photos: to jump to, to see at their camera positions, and to compare with. The
-/// page is in the temporary folder, readable only by the current user, until the next `view` removes it; `render --html` writes
-/// a permanent one.
+/// With --scene the page includes the capture's photos: it shows them at their camera positions, jumps to them, and compares
+/// them with the splat. The page is in the temporary folder, readable only by the current user, until the next `view` removes it;
+/// `render --html` writes a permanent one.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat view room.ply --scene captures/room\n  \
     globalsplat render --splat room.ply --scene captures/room --html room.html")]
@@ -41,7 +43,7 @@ impl View {
         warn(&splat.warnings);
         let name = name_of(&self.splat);
         remove_pages(&std::env::temp_dir());
-        // Only its owner can read the file. It must remain after this program exits, since the browser reads it then.
+        // `tempfile` makes the page readable only by its owner. The page is kept, because the browser may read it after this program exits.
         let page = tempfile::Builder::new().prefix("page-").suffix(PAGE_ENDING).tempfile()?;
         write_page(page.path(), &name, &Gaussians::from_splat(&splat), splat.origin, capture.as_ref())?;
         let page = page.into_temp_path().keep().map_err(|e| Error::write(e.path.to_path_buf())(e.error))?;
@@ -60,10 +62,10 @@ impl View {
     }
 }
 
-/// End of a page's file name, by which the next `view` recognizes it.
+/// Suffix of a page's file name, by which a later `view` recognizes the page.
 const PAGE_ENDING: &str = ".globalsplat-view.html";
 
-/// Removes the pages that earlier `view`s of this user left in `folder`.
+/// Removes the pages that earlier runs of `view` by the current user left in `folder`. Errors are ignored.
 fn remove_pages(folder: &Path) {
     for file in folder.read_dir().into_iter().flatten().flatten() {
         if file.file_name().to_string_lossy().ends_with(PAGE_ENDING) && is_own(&file) {
@@ -72,7 +74,7 @@ fn remove_pages(folder: &Path) {
     }
 }
 
-/// Returns `true` if the file belongs to this user.
+/// Returns `true` if `file` is a regular file that belongs to the current user.
 #[cfg(unix)]
 fn is_own(file: &DirEntry) -> bool {
     use std::os::unix::fs::MetadataExt;
@@ -80,12 +82,13 @@ fn is_own(file: &DirEntry) -> bool {
     file.metadata().is_ok_and(|file| file.is_file() && file.uid() == unsafe { libc::geteuid() })
 }
 
+/// Returns `true` if `file` is a regular file. The temporary folder belongs to one user.
 #[cfg(not(unix))]
 fn is_own(file: &DirEntry) -> bool {
     file.metadata().is_ok_and(|file| file.is_file())
 }
 
-/// Returns the name of a page about the file at `path`.
+/// Returns the title of a page for the file at `path`: the file's name without its extension.
 pub fn name_of(path: &Path) -> String {
     path.file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }

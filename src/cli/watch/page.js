@@ -139,7 +139,7 @@ function ticks(low, high, count) {
   return Array.from({ length: last - first + 1 }, (_, index) => (first + index) * step);
 }
 
-/** Curves over the steps; what is under the pointer is told in numbers. */
+/** Plot of curves over the steps. A label shows the values under the pointer. */
 class Plot {
   constructor(title, unit, lines) {
     Object.assign(this, { unit, lines, curves: [] });
@@ -252,7 +252,7 @@ function show(state) {
   at("footer").textContent = `${state.run}, read every ${PAUSE / 1000} s by globalsplat watch.`;
 }
 
-/** What is told now, or that nothing is. */
+/** Returns the run's current state, or an error if globalsplat watch doesn't answer. */
 async function ask() {
   try {
     return await (await fetch("/state", { cache: "no-store" })).json();
@@ -263,7 +263,7 @@ async function ask() {
 
 async function look() {
   const state = await ask();
-  // Before anything is shown: what can't be is an error in the console, and no reason to ask no more.
+  // The next request is scheduled before the state is shown, so that an exception in showing it doesn't end the updates.
   setTimeout(look, PAUSE);
   if (state.error) showNotices([state.error]);
   else show(state);

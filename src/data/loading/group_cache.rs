@@ -5,41 +5,43 @@ use crate::error::Result;
 use globalsplat_capture::Capture;
 use std::sync::{Arc, Mutex, OnceLock};
 
-/// Number of groups that stay open while no thread uses them: two for a transition from one group to the next, and one more.
-const KEPT: usize = 3;
+/// Number of groups that stay open while no thread uses them: two during the transition from one group to the next, and a spare one.
+const CAPACITY: usize = 3;
 
-/// A group, or the reason why it can't be opened.
+/// Scenes of a group, or the reason why the group can't be opened.
 #[derive(Debug)]
 pub(super) enum CachedGroup {
     Scenes(Vec<Result<Capture>>),
     Broken(String),
 }
 
-/// Holds the most recently used groups.
+/// Least-recently-used cache of [`CAPACITY`] groups.
 #[derive(Debug)]
 pub(super) struct GroupCache {
     source: Arc<dyn SceneGroups>,
     /// Groups ordered by last use, the most recent one last.
-    kept: Mutex<Vec<(usize, Slot)>>,
+    entries: Mutex<Vec<(usize, Slot)>>,
 }
 
-/// Slot that the first thread fills while the others wait.
+/// Slot for a group. The first thread that needs the group fills the slot while other threads wait.
 type Slot = Arc<OnceLock<Arc<CachedGroup>>>;
 
 impl GroupCache {
     pub fn new(source: Arc<dyn SceneGroups>) -> Self {
-        GroupCache { source, kept: Mutex::default() }
+        GroupCache { source, entries: Mutex::default() }
     }
 
+    /// Returns the group with index `group`, which it opens first if the group isn't in the cache.
     pub fn open(&self, group: usize) -> Arc<CachedGroup> {
         let slot = {
-            let mut kept = self.kept.lock().expect("no thread panics here");
-            let position = kept.iter().position(|(kept, _)| *kept == group);
-            let entry = position.map_or_else(|| (group, Slot::default()), |position| kept.remove(position));
+            let mut entries = self.entries.lock().expect("no thread panics here");
+            let position = entries.iter().position(|(cached, _)| *cached == group);
+            let entry =
+                position.map_or_else(|| (group, Slot::default()), |position| entries.remove(position));
             let slot = entry.1.clone();
-            kept.push(entry);
-            let surplus = kept.len().saturating_sub(KEPT);
-            kept.drain(..surplus);
+            entries.push(entry);
+            let surplus = entries.len().saturating_sub(CAPACITY);
+            entries.drain(..surplus);
             slot
         };
         let opened = slot.get_or_init(|| {

@@ -90,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn the_groups_after_a_turn_are_those_of_the_epoch() {
+    fn turn_lists_the_groups_that_follow() {
         let order = Order::new(vec![2, 2, 2], 3);
         let (first, groups) = order.turn(0);
         assert_eq!(groups[0], first.group);

@@ -95,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn windows_are_as_long_as_they_may_be() {
+    fn windows_use_the_whole_range_of_lengths() {
         let mut random = ChaCha8Rng::seed_from_u64(0);
         for sampling in [Sampling::Uniform, Sampling::Farthest] {
             let (mut shortest, mut longest, mut last) = (usize::MAX, 0, 0);

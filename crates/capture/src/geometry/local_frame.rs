@@ -169,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn a_similarity_to_the_world_becomes_one_to_the_frame() {
+    fn similarity_to_local_maps_points_like_the_frame() {
         let frame = LocalFrame::from_cameras(&cameras(3., DVec3::new(9., 8., 7.)));
         let to_world = Similarity {
             rotation: DMat3::from_rotation_x(0.4),

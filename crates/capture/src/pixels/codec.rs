@@ -77,7 +77,7 @@ pub fn encode_photo(pixels: &RgbImage, as_jpeg: bool) -> Result<Vec<u8>> {
     Ok(bytes.into_inner())
 }
 
-/// Returns (width, height) like [`read_image_size`], for an image in memory, or `None` if it is no image.
+/// Returns (width, height) like [`read_image_size`], for an image in memory, or `None` if it isn't an image.
 pub fn encoded_image_size(encoded: &[u8]) -> Option<(u32, u32)> {
     let dimensions =
         || ImageReader::new(Cursor::new(encoded)).with_guessed_format().ok()?.into_dimensions().ok();
@@ -87,7 +87,7 @@ pub fn encoded_image_size(encoded: &[u8]) -> Option<(u32, u32)> {
 /// Returns (width, height) of the pixels as stored, from the image's header alone.
 ///
 /// # Errors
-/// Returns an error if the file is missing or is no image.
+/// Returns an error if the file is missing or isn't an image.
 pub fn read_image_size(path: &Path) -> Result<(u32, u32)> {
     let file = std::fs::File::open(path).map_err(Error::read(path))?;
     let mut reader = BufReader::new(file);
@@ -140,7 +140,7 @@ fn decode(encoded: &[u8], file: &Path) -> Result<Decoded> {
         Some(ImageFormat::Png) => encoded.get(PNG_COLOUR_TYPE) == Some(&PNG_RGB),
         _ => false,
     };
-    // Unreadable EXIF is no reason to refuse the pixels.
+    // Unreadable EXIF data isn't an error, because the pixels may still be usable.
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     // The decoders of some rare formats panic.
     let image = panic::catch_unwind(AssertUnwindSafe(|| DynamicImage::from_decoder(decoder)));

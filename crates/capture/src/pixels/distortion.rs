@@ -142,7 +142,7 @@ mod tests {
     }
 
     #[test]
-    fn the_jacobian_is_that_of_the_equations() {
+    fn jacobian_matches_finite_differences() {
         let h = 1e-6;
         let points = [(0.3, -0.5), (-0.7, 0.2), (0.6, 0.6)];
         for (lens, (x, y)) in [LENS, RATIONAL].iter().flat_map(|lens| points.map(|point| (lens, point))) {

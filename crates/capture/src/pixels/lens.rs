@@ -255,7 +255,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lens_knows_its_cameras() {
+    fn matches_camera_compares_distortion_intrinsics_and_size() {
         let lens = Lens::new(LENS, CAMERA, None);
         let elsewhere = Camera { c2w: DMat4::from_translation(DVec3::ONE), ..CAMERA };
         assert!(lens.matches_camera(&LENS, &CAMERA) && lens.matches_camera(&LENS, &elsewhere));

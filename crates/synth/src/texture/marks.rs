@@ -1,4 +1,4 @@
-//! Meaningless writing, and scribbles.
+//! Textures of invented writing and of scribbles.
 
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
@@ -8,7 +8,7 @@ use super::palette::{self, Palette, luminance};
 use super::shape;
 use super::{Canvas, Purpose, SIZE, Surface};
 
-/// Glyphs of one invented script: strokes between points of a grid in a box of height 1.
+/// Glyphs of an invented script. A glyph consists of strokes between points of a 3 × 3 grid, in a box of height 1.
 pub(super) struct Script {
     glyphs: Vec<Vec<(Vec2, Vec2)>>,
     /// Width of a glyph's box.
@@ -33,8 +33,8 @@ impl Script {
                     Vec2::new(random.count(0, 2) as f32 / 2. * aspect, random.count(0, 2) as f32 / 2. - 0.5)
                 };
                 let (from, to) = (point(random), point(random));
-                let bow = if rounded { (to - from).perp() * random.between(-0.4, 0.4) } else { Vec2::ZERO };
-                let middle = 0.5 * (from + to) + bow;
+                let bend = if rounded { (to - from).perp() * random.between(-0.4, 0.4) } else { Vec2::ZERO };
+                let middle = 0.5 * (from + to) + bend;
                 strokes.extend([(from, middle), (middle, to)]);
             }
             strokes
@@ -43,7 +43,8 @@ impl Script {
         Script { glyphs, aspect, weight: random.between(0.05, 0.14) }
     }
 
-    /// Writes words of `height` over `length` from `start`, the left end of the line's centre; all in repeats.
+    /// Writes a line of random words. The line is `length` long and `height` high, and `start` is the middle of its left edge, all in
+    /// repeats of the texture.
     pub fn write(
         &self,
         random: &mut ChaCha8Rng,
@@ -53,24 +54,24 @@ impl Script {
         height: f32,
         colour: Vec3,
     ) {
-        let pace = (self.aspect + 0.3) * height;
+        let advance = (self.aspect + 0.3) * height;
         let weight = (self.weight * height).max(0.35 / canvas.size as f32);
         let mut x = 0.;
         let mut letters = random.count(2, 9);
-        while x + pace <= length {
+        while x + advance <= length {
             if letters == 0 {
                 letters = random.count(1, 9);
-                x += 0.6 * pace;
+                x += 0.6 * advance;
                 continue;
             }
             letters -= 1;
             let glyph = random.count(0, self.glyphs.len() - 1);
-            // Lowercase letters are shorter.
-            let small = if glyph.is_multiple_of(3) { 1. } else { 0.65 };
+            // A third of the glyphs are capitals; the others are shorter.
+            let scale = if glyph.is_multiple_of(3) { 1. } else { 0.65 };
             for &(from, to) in &self.glyphs[glyph] {
                 let place = |point: Vec2| {
                     Vec2::new(x, 0.)
-                        + (point * Vec2::new(1., small) + Vec2::new(0., 0.5 - 0.5 * small)) * height
+                        + (point * Vec2::new(1., scale) + Vec2::new(0., 0.5 - 0.5 * scale)) * height
                 };
                 let (from, to) = (place(from), place(to));
                 let middle = 0.5 * (from + to);
@@ -79,11 +80,12 @@ impl Script {
                     shape::stroke(offset, from - middle, to - middle, weight)
                 });
             }
-            x += pace;
+            x += advance;
         }
     }
 
-    /// Fills a rectangle with lines of letters of `height`.
+    /// Fills the rectangle with its upper left corner at `corner` and the size `extent` with lines of writing, whose letters are `height`
+    /// high.
     pub fn paragraph(
         &self,
         random: &mut ChaCha8Rng,
@@ -93,15 +95,16 @@ impl Script {
         height: f32,
         colour: Vec3,
     ) {
-        let pace = height * random.between(1.5, 2.2);
-        let lines = (extent.y / pace) as usize;
+        let line_spacing = height * random.between(1.5, 2.2);
+        let lines = (extent.y / line_spacing) as usize;
         for line in 0..lines {
-            let last = line + 1 == lines || random.happens(0.1);
-            let length = extent.x * if last { random.between(0.2, 0.9) } else { random.between(0.93, 1.) };
+            let ends_paragraph = line + 1 == lines || random.happens(0.1);
+            let length =
+                extent.x * if ends_paragraph { random.between(0.2, 0.9) } else { random.between(0.93, 1.) };
             self.write(
                 random,
                 canvas,
-                corner + Vec2::new(0., (line as f32 + 0.5) * pace),
+                corner + Vec2::new(0., (line as f32 + 0.5) * line_spacing),
                 length,
                 height,
                 colour,
@@ -117,7 +120,7 @@ pub(super) fn ink_for(random: &mut ChaCha8Rng, paper: Vec3) -> Vec3 {
     if luminance(paper) > 0.3 { ink * 0.35 } else { Vec3::splat(0.75).lerp(ink, 0.3) }
 }
 
-/// Draws a texture of lines of writing, like newspapers, labels and notices.
+/// Draws a texture of columns of writing, like newspapers, labels and notices.
 pub(super) fn writing(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let paper = if random.happens(0.6) {
         palette::colour_of(random, palette::WHITES)
@@ -131,10 +134,10 @@ pub(super) fn writing(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let script = Script::draw(random);
     let margin = 0.03;
     for column in 0..columns {
-        let wide = 1. / columns as f32;
-        let mut corner = Vec2::new(column as f32 * wide + margin, margin);
+        let width = 1. / columns as f32;
+        let mut corner = Vec2::new(column as f32 * width + margin, margin);
         while corner.y < 0.9 {
-            let extent = Vec2::new(wide - 2. * margin, (0.97 - corner.y).min(random.between(0.15, 0.8)));
+            let extent = Vec2::new(width - 2. * margin, (0.97 - corner.y).min(random.between(0.15, 0.8)));
             match random.count(0, 5) {
                 0 => script.write(random, &mut canvas, corner + Vec2::new(0., 0.05), extent.x, 0.05, ink),
                 1 => {
@@ -151,7 +154,7 @@ pub(super) fn writing(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.leaning_low(0.2, 1.5) }
 }
 
-/// Draws a texture of curly hand-drawn lines, like chalk, crayons and graffiti.
+/// Draws a texture of curly lines drawn by hand, as with chalk, crayons or spray paint.
 pub(super) fn scribbles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(2, 5);
     let palette = Palette::draw(random, purpose, count);
@@ -161,11 +164,11 @@ pub(super) fn scribbles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let width = random.leaning_low(0.8, 5.) / SIZE as f32;
         let mut at = random.spot();
         let (mut angle, mut curl) = (random.between(0., 6.), 0.);
-        let pace = random.between(0.01, 0.04);
+        let step_length = random.between(0.01, 0.04);
         for _ in 0..random.count(10, 120) {
             curl = 0.8 * curl + 0.3 * random.bell();
             angle += curl;
-            let step = Vec2::from_angle(angle) * pace;
+            let step = Vec2::from_angle(angle) * step_length;
             canvas.fill(at + 0.5 * step, 0.5 * step.abs() + width + 1. / SIZE as f32, colour, |offset| {
                 shape::stroke(offset, -0.5 * step, 0.5 * step, width)
             });

@@ -72,7 +72,7 @@ fn reflectance_stays_in_range() {
 }
 
 #[test]
-fn the_mean_is_what_a_wide_footprint_sees() {
+fn mean_equals_a_sample_with_a_wide_footprint() {
     let mut random = ChaCha8Rng::seed_from_u64(7);
     for purpose in Purpose::ALL {
         let texture = Texture::draw(&mut random, purpose);
