@@ -67,6 +67,19 @@ pub fn reset_peak_memory(device: Device) {
 
 /// Returns the peak resident memory of the process so far, in bytes.
 pub fn peak_memory_bytes() -> u64 {
+    // On Linux, getrusage also counts the memory that the parent process had before this program replaced its copy.
+    peak_from_status(&std::fs::read_to_string("/proc/self/status").unwrap_or_default())
+        .unwrap_or_else(peak_from_usage)
+}
+
+/// Returns the peak resident memory in bytes from the contents of `/proc/PID/status` (proc(5)).
+fn peak_from_status(status: &str) -> Option<u64> {
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+    let kibibytes: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    Some(1024 * kibibytes)
+}
+
+fn peak_from_usage() -> u64 {
     // SAFETY: `rusage` consists of plain numbers, for which zero is valid, and `getrusage` only writes into it.
     let usage = unsafe {
         let mut usage: libc::rusage = std::mem::zeroed();
@@ -76,4 +89,32 @@ pub fn peak_memory_bytes() -> u64 {
     // Linux reports KiB, and macOS reports bytes.
     let unit = if cfg!(target_os = "macos") { 1 } else { 1024 };
     usage.ru_maxrss as u64 * unit
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use globalsplat_test_kit::rerun_test;
+
+    const TEST: &str = "device::memory::tests::the_peak_excludes_the_parent_process";
+    const PARENT_PEAK: &str = "GLOBALSPLAT_TEST_PARENT_PEAK";
+
+    #[test]
+    fn the_peak_excludes_the_parent_process() {
+        if let Some(parent) = std::env::var_os(PARENT_PEAK) {
+            let parent: u64 = parent.to_str().unwrap().parse().unwrap();
+            assert!(peak_memory_bytes() < parent / 2, "{} of {parent}", peak_memory_bytes());
+            return;
+        }
+        if !cfg!(target_os = "linux") {
+            return;
+        }
+        let bytes = std::hint::black_box(vec![1u8; 1 << 30]);
+        let peak = peak_memory_bytes().to_string();
+        assert!(peak_memory_bytes() > bytes.len() as u64);
+        assert!(
+            rerun_test(TEST, &[(PARENT_PEAK, Path::new(&peak))]).0,
+            "the child counts its parent's memory"
+        );
+    }
 }
