@@ -3,11 +3,13 @@
 mod codec;
 mod distortion;
 mod fit;
+mod heif;
 mod jpeg;
 mod lens;
 mod planes;
 mod resample;
 
+pub(crate) use codec::SUPPORTED_IMAGES;
 pub use codec::{
     DecodedPhoto, PHOTO_EXTENSIONS, decode_photo, encode_photo, encoded_image_size, read_image,
     read_image_size,
