@@ -19,6 +19,7 @@ pub use colmap::{Point, read_points};
 use crate::capture::{Capture, Purpose};
 use globalsplat_files::{Error, Result};
 use natural::natural_order;
+pub(crate) use photos::find_masks;
 use std::path::{Path, PathBuf};
 
 /// Function that looks for a capture of one format at a path: a folder, or the file that describes the capture.

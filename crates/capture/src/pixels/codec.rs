@@ -115,6 +115,23 @@ pub fn read_image_size(path: &Path) -> Result<(u32, u32)> {
     reader.into_dimensions().map_err(undecodable(path))
 }
 
+/// Returns `true` if the image's header declares an alpha channel, or a transparent colour.
+///
+/// # Errors
+/// Returns an error if the file is missing or is no image.
+pub(crate) fn has_alpha_channel(path: &Path) -> Result<bool> {
+    let mut reader = BufReader::new(File::open(path).map_err(Error::read(path))?);
+    if heif_header(&mut reader, path)?.is_some() {
+        return Ok(false);
+    }
+    let reader = ImageReader::new(reader).with_guessed_format().map_err(Error::read(path))?;
+    // The decoder of JPEGs would read the whole file.
+    if reader.format() == Some(ImageFormat::Jpeg) {
+        return Ok(false);
+    }
+    Ok(reader.into_decoder().map_err(undecodable(path))?.color_type().has_alpha())
+}
+
 /// Reads the header of a HEIC or an AVIF, or returns `None` and rewinds `reader` if the file is neither.
 fn heif_header(reader: &mut BufReader<File>, path: &Path) -> Result<Option<HeifHeader>> {
     let mut start = vec![];

@@ -136,7 +136,7 @@ impl Chunk {
                 let name = format!("{index:06}");
                 let camera = camera(numbers, size.unwrap_or(usual));
                 let photo = ImageLocation::Bytes { file: self.bytes.clone(), bytes, name: named.join(&name) };
-                Frame { image: photo, name, camera, distortion: Distortion::default() }
+                Frame { image: photo, name, camera, distortion: Distortion::default(), mask: None }
             });
         Capture::new(scene.key.clone(), named.clone(), frames.collect(), Changes::default(), purpose)
     }
