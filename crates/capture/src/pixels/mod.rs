@@ -7,6 +7,7 @@ mod heif;
 mod jpeg;
 mod lens;
 mod mask;
+mod metadata;
 mod planes;
 mod resample;
 
@@ -16,6 +17,7 @@ pub use codec::{
 };
 pub(crate) use codec::{SUPPORTED_IMAGES, has_alpha_channel};
 pub use fit::{fit, source_region};
+pub use metadata::{exif_focal, is_equirectangular};
 pub use planes::{CHANNELS, Planes};
 pub use resample::{Region, Resampler};
 

@@ -8,7 +8,7 @@ pub use points::{Point, read_points};
 
 use super::natural::natural_order;
 use super::photos::{find_masks, find_photos, portable};
-use super::{CaptureOpener, folder_name};
+use super::{CaptureOpener, MASKS, folder_name};
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose, format_names};
 use crate::geometry::{Camera, Intrinsics};
 use crate::pixels::Distortion;
@@ -28,9 +28,6 @@ const DENSE: (&str, &str) = ("dense", "sparse");
 
 /// Name of the folder of photos.
 const PHOTOS: &str = "images";
-
-/// Name of the folder of masks beside it.
-const MASKS: &str = "masks";
 
 /// Camera models in COLMAP's numbering, each with its number of parameters.
 const MODELS: [(&str, usize); 18] = [
