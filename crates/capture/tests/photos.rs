@@ -375,6 +375,9 @@ fn only_photos_of_plain_colours_are_as_stored() {
     let palette = bytes_of_hex(PALETTE_PNG);
     let as_stored = |bytes: &[u8], size| decode_photo(bytes, "photo".as_ref(), size).unwrap().as_stored;
     assert!(!as_stored(&palette, (WIDTH, HEIGHT)));
+    let mut opaque = Cursor::new(vec![]);
+    DynamicImage::from(noise(9, 9)).to_rgba8().write_to(&mut opaque, ImageFormat::Png).unwrap();
+    assert!(decode_photo(opaque.get_ref(), "photo".as_ref(), (9, 9)).unwrap().alpha.is_none());
     for (kind, jpeg) in jpegs() {
         assert_eq!(as_stored(&jpeg, (45, 37)), kind.starts_with('3'), "{kind}");
     }
