@@ -151,6 +151,7 @@ fn capture(path: &Path) -> Result<Value> {
         "name": capture.name,
         "views": capture.len(),
         "test_views": capture.has_test_part().then(|| capture.scored_views().len()),
+        "masks": Some(capture.mask_count()).filter(|&count| count > 0),
         "image_size": [first.height, first.width],
         "focal_lengths": [first.intrinsics.fx, first.intrinsics.fy],
         "extent": globalsplat::scene::normalize(&poses)?.world_from_normalized.scale,

@@ -48,6 +48,13 @@ impl Pack {
                     capture.file().display()
                 ));
             }
+            let masks = capture.mask_count();
+            if masks > 0 {
+                lines.push(format!(
+                    "{}: the masks or alpha channels of {masks} photos are left out, as chunks have no place for them",
+                    capture.file().display()
+                ));
+            }
         }
         warn_of_many(lines.iter());
         check_writable_dir(&self.out)?;

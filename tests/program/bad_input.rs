@@ -43,7 +43,7 @@ fn all_images_but_one_missing() {
 fn an_undecodable_image() {
     let (_folder, room) = room();
     std::fs::write(room.join("images/003.png"), b"no picture").unwrap();
-    assert_says(&refuse_room(&room), &["003.png", "undecodable", "PNG or JPEG"]);
+    assert_says(&refuse_room(&room), &["003.png", "undecodable", "a JPEG, PNG"]);
 }
 
 #[test]

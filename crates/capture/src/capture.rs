@@ -1,15 +1,16 @@
 //! The in-memory representation of a capture, common to all file formats.
 
+use crate::formats::find_masks;
 use crate::geometry::{Camera, ImageSize, check_pose, nearest_rigid_of_scaled};
 use crate::holdout::Holdout;
 use crate::image_source::ImageSource;
 use crate::pixels::{
-    DecodedPhoto, Distortion, Lens, Planes, decode_photo, encode_photo, fit, read_image_size, source_region,
-    undistort,
+    DecodedPhoto, Distortion, Lens, Planes, decode_photo, encode_photo, fit, grey_to_rgb, has_alpha_channel,
+    multiply, read_image_size, read_mask, source_region, undistort,
 };
 use glam::DMat4;
 use globalsplat_files::{Error, InputFiles, Result, split_keyed_path};
-use image::RgbImage;
+use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 use std::borrow::Cow;
 use std::collections::BTreeSet;
@@ -27,6 +28,8 @@ pub(crate) struct Frame {
     pub camera: Camera,
     /// Distortion of the lens that took the image in the file.
     pub distortion: Distortion,
+    /// File of the image's mask.
+    pub mask: Option<PathBuf>,
 }
 
 /// Location of a view's image.
@@ -43,6 +46,30 @@ pub(crate) enum ImageLocation {
     },
     /// Image `index` of a source that computes images on request.
     Source { source: Arc<dyn ImageSource>, index: usize },
+}
+
+impl Frame {
+    /// Removes lens distortion from an image that the lens took, at least in the part that fitting to `size` reads. Uses `lens` if it
+    /// matches the frame.
+    fn undistort(&self, pixels: RgbImage, size: Option<ImageSize>, lens: Option<&Lens>) -> RgbImage {
+        if let Some(lens) = lens.filter(|lens| lens.matches_camera(&self.distortion, &self.camera)) {
+            return lens.undistort(pixels);
+        }
+        let window = size.map(|size| source_region(&self.camera, size));
+        undistort(pixels, &self.distortion, &self.camera, window)
+    }
+
+    /// Returns the weights of the photo's pixels as its lens took them, in equal channels: the mask's, multiplied by the photo's
+    /// opacity `alpha`. Returns `None` if there is neither.
+    fn read_mask(&self, alpha: Option<GrayImage>) -> Result<Option<RgbImage>> {
+        let alpha = alpha.map(|alpha| grey_to_rgb(&alpha));
+        let Some(file) = &self.mask else { return Ok(alpha) };
+        let mut mask = read_mask(file, (self.camera.width, self.camera.height))?;
+        if let Some(alpha) = alpha {
+            multiply(&mut mask, &alpha);
+        }
+        Ok(Some(mask))
+    }
 }
 
 impl ImageLocation {
@@ -165,6 +192,13 @@ pub struct Photo {
     pub camera: Camera,
 }
 
+impl Photo {
+    /// Returns `true` if no pixel counts.
+    pub fn is_masked_out(&self) -> bool {
+        self.mask.as_ref().is_some_and(|mask| mask.iter().all(|&weight| weight == 0))
+    }
+}
+
 /// Purpose for which a capture is read.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Purpose {
@@ -232,6 +266,7 @@ impl Capture {
             name: format!("{index:06}"),
             camera,
             distortion: Distortion::default(),
+            mask: None,
         };
         let frames = cameras.iter().enumerate().map(frame).collect();
         Capture::new(name, file, frames, Changes::default(), Purpose::Photos)
@@ -248,6 +283,37 @@ impl Capture {
         self.is_complete &= changes.missing.is_empty();
         self.warnings.extend(check_frames(file, &mut frames, changes, purpose)?);
         self.frames.append(&mut frames);
+        Ok(self)
+    }
+
+    /// Uses the masks in `folder` in place of those that the capture itself has. The mask of a photo has the photo's name, with the
+    /// extension of an image added or in place of its own, as in `images/1.jpg.png` or `1.png` for `images/1.jpg`.
+    ///
+    /// # Errors
+    /// Fails if the folder can't be read or has no mask for any photo, or if a mask has another aspect ratio than its photo.
+    pub fn with_masks(mut self, folder: &Path) -> Result<Self> {
+        std::fs::read_dir(folder).map_err(Error::read(folder))?;
+        let names: Vec<&str> = self.names().collect();
+        let masks = find_masks(&[folder.to_owned()], &names);
+        let without: Vec<&str> =
+            names.iter().zip(&masks).filter(|(_, mask)| mask.is_none()).map(|(name, _)| *name).collect();
+        if without.len() == self.len() {
+            let expected = format!("{}.png", names[0]);
+            return Err(Error::input(folder, "the folder", "without a mask for any photo", expected));
+        }
+        let line = (!without.is_empty()).then(|| {
+            let (count, names) = (without.len(), format_names(without.iter().copied()));
+            format!(
+                "{}: {count} of {} photos have no mask and count whole: {names}",
+                folder.display(),
+                self.len()
+            )
+        });
+        for (frame, mask) in self.frames.iter_mut().zip(masks) {
+            frame.mask = mask;
+        }
+        self.warnings.extend(line);
+        self.warnings.extend(check_masks(folder, &self.frames)?);
         Ok(self)
     }
 
@@ -319,6 +385,16 @@ impl Capture {
         self.frames.iter().map(|frame| frame.name.as_str())
     }
 
+    /// Returns the number of photos with a mask: a file, or an alpha channel by their header.
+    pub fn mask_count(&self) -> usize {
+        let has_mask = |frame: &&Frame| match &frame.image {
+            _ if frame.mask.is_some() => true,
+            ImageLocation::File(photo) => has_alpha_channel(photo).unwrap_or(false),
+            ImageLocation::Bytes { .. } | ImageLocation::Source { .. } => false,
+        };
+        self.frames.par_iter().filter(has_mask).count()
+    }
+
     /// Returns a unique file name without extension for the rendered image of each view. The names are those of the photos,
     /// relative to the deepest folder that contains all of them. If the names differ only in their extensions, the extensions
     /// become part of the names. If they aren't unique even then, numbers replace them.
@@ -348,13 +424,15 @@ impl Capture {
             if let ImageLocation::File(photo) = &frame.image {
                 inputs.add_photo(photo);
             }
+            frame.mask.iter().for_each(|mask| inputs.add_photo(mask));
         }
     }
 
     /// Reads the views `indices`, fitted to `size`, or at their own size if it is `None`.
     ///
     /// # Errors
-    /// Fails if an image is missing, can't be decoded, or has another size than the capture declares.
+    /// Fails if an image or a mask is missing or can't be decoded, if an image has another size than the capture declares, or if there
+    /// are several and each is wholly masked out.
     pub fn load(&self, indices: &[usize], size: Option<ImageSize>) -> Result<Vec<Photo>> {
         let lens = self.shared_lens(indices, size);
         let pixels = |&index: &usize| {
@@ -372,7 +450,13 @@ impl Capture {
                 views.push(view?);
             }
         }
-        Ok(views)
+        match views.as_slice() {
+            [first, _, ..] if views.iter().all(Photo::is_masked_out) => {
+                let field = format!("the mask of {:?} and of {} other photos", first.name, views.len() - 1);
+                Err(Error::input(&self.file, field, "black all over", "white where a photo counts"))
+            }
+            _ => Ok(views),
+        }
     }
 
     /// Reads every view like [`Capture::load`].
@@ -395,30 +479,39 @@ impl Capture {
         is_shared.then(|| Lens::new(*distortion, *camera, size.map(|size| source_region(camera, size))))
     }
 
-    /// Computes the CRC-32 of the views `indices`: the bytes of their photo files, and their cameras. Images that are computed
-    /// contribute their cameras alone.
+    /// Computes the CRC-32 of the views `indices`: the bytes of their photo files and masks, and their cameras. Images that are
+    /// computed contribute their cameras alone.
     ///
     /// # Errors
-    /// Fails if a photo can't be read.
+    /// Fails if a photo or a mask can't be read.
     pub fn checksum(&self, indices: impl IntoIterator<Item = usize>) -> Result<u32> {
         let mut hasher = crc32fast::Hasher::new();
         for index in indices {
-            let Frame { image, camera, distortion, .. } = &self.frames[index];
+            let Frame { image, camera, distortion, mask, .. } = &self.frames[index];
             hasher.update(format!("{camera:?}{distortion:?}").as_bytes());
             if !matches!(image, ImageLocation::Source { .. }) {
                 hasher.update(&image.read()?);
+            }
+            if let Some(mask) = mask {
+                hasher.update(&std::fs::read(mask).map_err(Error::read(mask))?);
             }
         }
         Ok(hasher.finalize())
     }
 
     fn load_view(&self, frame: &Frame, size: Option<ImageSize>, lens: Option<&Lens>) -> Result<Photo> {
-        let image = self.read_photo(frame, size, lens)?;
-        let (planes, camera) = match size {
-            Some(size) => fit(&image, &frame.camera, size),
-            None => (Planes::from_rgb(&image), frame.camera),
+        let (pixels, alpha) = self.read_photo(frame)?;
+        let fit_pixels = |pixels: RgbImage| {
+            let image = frame.undistort(pixels, size, lens);
+            match size {
+                Some(size) => fit(&image, &frame.camera, size),
+                None => (Planes::from_rgb(&image), frame.camera),
+            }
         };
-        Ok(Photo { name: frame.name.clone(), image: planes, mask: None, camera })
+        let (image, camera) = fit_pixels(pixels);
+        let mask = frame.read_mask(alpha)?.map(|mask| fit_pixels(mask).0.into_first_channel());
+        let mask = mask.filter(|mask| mask.iter().any(|&weight| weight < u8::MAX));
+        Ok(Photo { name: frame.name.clone(), image, mask, camera })
     }
 
     /// Returns the depths of view `index` along its camera's axis at the pixel centres, row by row, in the capture's unit. They are
@@ -435,21 +528,17 @@ impl Capture {
     /// # Errors
     /// Fails like [`Capture::load`].
     pub fn photo(&self, index: usize) -> Result<RgbImage> {
-        self.read_photo(&self.frames[index], None, None)
+        let frame = &self.frames[index];
+        Ok(frame.undistort(self.read_photo(frame)?.0, None, None))
     }
 
-    /// Reads the photo and removes lens distortion, at least in the part that fitting to `size` reads. Uses `lens` if it matches
-    /// the frame.
-    fn read_photo(&self, frame: &Frame, size: Option<ImageSize>, lens: Option<&Lens>) -> Result<RgbImage> {
+    /// Reads the photo as its lens took it, and its opacity if it isn't opaque.
+    fn read_photo(&self, frame: &Frame) -> Result<(RgbImage, Option<GrayImage>)> {
         if let ImageLocation::Source { source, index } = &frame.image {
-            return Ok(source.image(*index));
+            return Ok((source.image(*index), None));
         }
         let photo = self.decode(frame, &frame.image.read()?)?;
-        if let Some(lens) = lens.filter(|lens| lens.matches_camera(&frame.distortion, &frame.camera)) {
-            return Ok(lens.undistort(photo.pixels));
-        }
-        let window = size.map(|size| source_region(&frame.camera, size));
-        Ok(undistort(photo.pixels, &frame.distortion, &frame.camera, window))
+        Ok((photo.pixels, photo.alpha))
     }
 
     fn decode(&self, frame: &Frame, encoded: &[u8]) -> Result<DecodedPhoto> {
@@ -497,6 +586,7 @@ fn check_frames(
     let mut lines = changes.into_lines(file, frames.len());
     if matches!(purpose, Purpose::Photos) {
         lines.extend(fit_cameras_to_photos(file, frames));
+        lines.extend(check_masks(file, frames)?);
     }
     Ok(lines)
 }
@@ -530,6 +620,38 @@ fn fit_cameras_to_photos(file: &Path, frames: &mut [Frame]) -> Option<String> {
         said.height,
         format_names(names.into_iter())
     ))
+}
+
+/// Checks that the masks of `frames` have the sizes of their photos up to a factor. Returns a line about those that have another size.
+fn check_masks(file: &Path, frames: &[Frame]) -> Result<Option<String>> {
+    let is_resized = |frame: &Frame| -> Result<bool> {
+        let Some(mask) = &frame.mask else { return Ok(false) };
+        let Camera { width, height, .. } = frame.camera;
+        let size = read_image_size(mask)?;
+        let has_size = |camera: Camera| (camera.width, camera.height) == size;
+        if has_size(frame.camera) {
+            return Ok(false);
+        }
+        if scaled_to(&frame.camera, size).is_some_and(has_size) {
+            return Ok(true);
+        }
+        let found = format!("{}×{} pixels", size.0, size.1);
+        let expected = format!("{width}×{height} pixels as {}, or both by one factor", frame.name);
+        Err(Error::input(mask, "the mask", found, expected))
+    };
+    // If several masks are wrong, the error is that of the first one.
+    let resized: Vec<Result<bool>> = frames.par_iter().map(is_resized).collect();
+    let mut names = vec![];
+    for (frame, is_resized) in frames.iter().zip(resized) {
+        if is_resized? {
+            names.push(frame.name.as_str());
+        }
+    }
+    Ok((!names.is_empty()).then(|| {
+        let (file, count, all) = (file.display(), names.len(), frames.len());
+        let names = format_names(names.into_iter());
+        format!("{file}: the masks of {count} of {all} photos have another size and are resized: {names}")
+    }))
 }
 
 /// Returns `camera` scaled to a photo of size (width, height) if that size differs from the camera's and the aspect ratios agree to

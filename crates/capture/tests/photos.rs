@@ -1,14 +1,18 @@
 //! Photos of a capture: undistortion, EXIF orientation, and pixel formats.
 
 use glam::{DMat4, DVec3};
-use globalsplat_capture::{Camera, Intrinsics, Result, decode_photo, open_capture};
+use globalsplat_capture::{Camera, Intrinsics, Result, decode_photo, open_capture, read_image_size};
 use globalsplat_test_kit::formats::{
     HEIGHT, WIDTH, assert_same_cameras, cameras, in_images, transforms, write_colmap_text,
 };
+use image::codecs::jpeg::JpegEncoder;
+use image::codecs::png::PngEncoder;
+use image::codecs::webp::WebPEncoder;
 use image::imageops::{flip_horizontal, rotate90, rotate270};
-use image::{DynamicImage, GrayImage, ImageFormat, Luma, Rgb, RgbImage};
+use image::{ColorType, DynamicImage, GrayImage, ImageEncoder, ImageFormat, Luma, Rgb, RgbImage};
 use serde_json::json;
 use std::io::Cursor;
+use std::process::Command;
 
 /// Returns the distorted image coordinates of the ray (x, y, 1), by OpenCV's rational model and in the notation of its documentation.
 fn distort([k1, k2, p1, p2, k3, k4, k5, k6]: [f64; 8], x: f64, y: f64) -> (f64, f64) {
@@ -105,18 +109,48 @@ fn check_lens(lens: [f64; 8]) {
     }
 }
 
-/// Returns a JPEG whose EXIF data has `orientation`.
-fn jpeg_with_orientation(photo: &RgbImage, orientation: u8) -> Vec<u8> {
-    let mut jpeg = Cursor::new(vec![]);
-    photo.write_to(&mut jpeg, ImageFormat::Jpeg).unwrap();
-    let mut exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".to_vec();
+/// Returns files of `photo` in every format that has an EXIF orientation, each with its extension.
+fn encode_with_orientation(photo: &GrayImage, orientation: u8) -> [(&'static str, Vec<u8>); 4] {
+    let mut exif = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".to_vec();
     exif.extend([orientation, 0, 0, 0, 0, 0, 0, 0]);
-    let mut segment = vec![0xff, 0xe1];
-    segment.extend((exif.len() as u16 + 2).to_be_bytes());
-    segment.extend(exif);
-    let mut bytes = jpeg.into_inner();
-    bytes.splice(2..2, segment);
-    bytes
+    let [mut jpeg, mut png, mut webp] = [vec![], vec![], vec![]];
+    let mut encoder = JpegEncoder::new(&mut jpeg);
+    encoder.set_exif_metadata(exif.clone()).unwrap();
+    photo.write_with_encoder(encoder).unwrap();
+    let mut encoder = PngEncoder::new(&mut png);
+    encoder.set_exif_metadata(exif.clone()).unwrap();
+    photo.write_with_encoder(encoder).unwrap();
+    let mut encoder = WebPEncoder::new_lossless(&mut webp);
+    encoder.set_exif_metadata(exif).unwrap();
+    photo.write_with_encoder(encoder).unwrap();
+    [("jpg", jpeg), ("png", png), ("webp", webp), ("tiff", grey_tiff(photo, orientation))]
+}
+
+/// Returns an uncompressed grey TIFF with `orientation`.
+fn grey_tiff(photo: &GrayImage, orientation: u8) -> Vec<u8> {
+    let (width, height, length) = (photo.width(), photo.height(), photo.len() as u32);
+    let entries: [(u16, u32); 9] = [
+        (256, width),
+        (257, height),
+        (258, 8),                  // bits per sample
+        (262, 1),                  // black is 0
+        (273, 8 + 2 + 9 * 12 + 4), // where the pixels begin
+        (274, u32::from(orientation)),
+        (277, 1), // samples per pixel
+        (278, height),
+        (279, length),
+    ];
+    let mut tiff = b"II*\0\x08\0\0\0".to_vec();
+    tiff.extend((entries.len() as u16).to_le_bytes());
+    for (tag, value) in entries {
+        tiff.extend(tag.to_le_bytes());
+        // One number of 32 bits.
+        tiff.extend([4, 0, 1, 0, 0, 0]);
+        tiff.extend(value.to_le_bytes());
+    }
+    tiff.extend([0; 4]);
+    tiff.extend(photo.as_raw());
+    tiff
 }
 
 /// Loads the first view of a capture whose photos are all `bytes`, declared to be `width` × `height`.
@@ -132,22 +166,30 @@ fn load_photo(bytes: &[u8], extension: &str, width: u32, height: u32) -> Result<
 
 #[test]
 fn exif_orientation_is_applied_if_the_declared_size_matches() {
-    let photo = RgbImage::from_fn(24, 16, |x, y| Rgb([x as u8 * 10, y as u8 * 15, 90]));
-    let stored = image::load_from_memory(&jpeg_with_orientation(&photo, 1)).unwrap().to_rgb8();
-    let load = |orientation: u8, width, height| {
-        load_photo(&jpeg_with_orientation(&photo, orientation), "jpg", width, height)
-    };
-    // The top row as stored is the right column with orientation 6, and the left column with 8. Orientation 5 transposes the photo.
-    assert!(load(6, 16, 24).unwrap() == rotate90(&stored));
-    assert!(load(8, 16, 24).unwrap() == rotate270(&stored));
-    assert!(load(5, 16, 24).unwrap() == flip_horizontal(&rotate90(&stored)));
-    // If the size is declared as stored, the capture's cameras fit the unrotated photo.
-    for orientation in [1, 3, 6, 8] {
-        assert!(load(orientation, 24, 16).unwrap() == stored, "{orientation}");
-    }
-    for (orientation, width, height) in [(1, 16, 24), (3, 16, 24), (6, 20, 24)] {
-        let error = load(orientation, width, height).unwrap_err().to_string();
-        assert!(error.contains("24×16 pixels") && error.contains(&format!("{width}×{height}")), "{error}");
+    let photo = GrayImage::from_fn(24, 16, |x, y| Luma([x as u8 * 5 + y as u8 * 8]));
+    let [stored, all @ ..] = [1, 3, 5, 6, 8].map(|orientation| encode_with_orientation(&photo, orientation));
+    for (format, (extension, stored)) in stored.iter().enumerate() {
+        let stored = load_photo(stored, extension, 24, 16).unwrap();
+        let load = |orientation: usize, width, height| {
+            let (extension, bytes) = &all[orientation][format];
+            load_photo(bytes, extension, width, height)
+        };
+        // Orientation 6: the stored top row is the right column; 8: the left one; 5 mirrors across the diagonal.
+        let [half, mirrored, right, left] = [0, 1, 2, 3];
+        assert!(load(right, 16, 24).unwrap() == rotate90(&stored), "{extension}");
+        assert!(load(left, 16, 24).unwrap() == rotate270(&stored), "{extension}");
+        assert!(load(mirrored, 16, 24).unwrap() == flip_horizontal(&rotate90(&stored)), "{extension}");
+        // If the size is declared as stored, the capture's cameras fit the unrotated photo.
+        for orientation in [half, mirrored, right, left] {
+            assert!(load(orientation, 24, 16).unwrap() == stored, "{extension} {orientation}");
+        }
+        for (orientation, width, height) in [(half, 16, 24), (right, 20, 24)] {
+            let error = load(orientation, width, height).unwrap_err().to_string();
+            assert!(
+                error.contains("24×16 pixels") && error.contains(&format!("{width}×{height}")),
+                "{error}"
+            );
+        }
     }
 }
 
@@ -174,10 +216,17 @@ fn photos_of_every_color_type_load() {
         (deep_grey.into(), repeated.clone()),
     ];
     for (photo, expected) in kinds {
-        let mut png = Cursor::new(vec![]);
-        photo.write_to(&mut png, ImageFormat::Png).unwrap();
-        let found = load_photo(png.get_ref(), "png", WIDTH, HEIGHT).unwrap();
-        assert!(found == expected, "{:?} is {} off", photo.color(), largest_difference(&found, &expected));
+        for (extension, format) in LOSSLESS {
+            let mut bytes = Cursor::new(vec![]);
+            // The encoder of TIFFs refuses opacity of grey pixels, and that of BMPs drops it.
+            if ["bmp", "tif"].contains(&extension) && photo.color() == ColorType::La8 {
+                continue;
+            }
+            photo.write_to(&mut bytes, format).unwrap();
+            let found = load_photo(bytes.get_ref(), extension, WIDTH, HEIGHT).unwrap();
+            let off = largest_difference(&found, &expected);
+            assert!(found == expected, "{extension}, {:?} is {off} off", photo.color());
+        }
     }
     let mut jpeg = Cursor::new(vec![]);
     grey.write_to(&mut jpeg, ImageFormat::Jpeg).unwrap();
@@ -281,19 +330,56 @@ fn truncated_pngs_are_refused_by_name() {
     }
 }
 
-/// PNG with 24×16 pixels and a palette of 16 colours, in hexadecimal.
+/// Formats that keep every pixel, with their extensions.
+const LOSSLESS: [(&str, ImageFormat); 4] = [
+    ("png", ImageFormat::Png),
+    ("tif", ImageFormat::Tiff),
+    ("webp", ImageFormat::WebP),
+    ("bmp", ImageFormat::Bmp),
+];
+
+#[test]
+fn photos_of_other_formats_cut_short_are_refused_by_name() {
+    let mut files = vec![("lossy.webp", bytes_of_hex(LOSSY_WEBP))];
+    for (extension, format) in LOSSLESS {
+        let mut bytes = Cursor::new(vec![]);
+        noise(24, 16).write_to(&mut bytes, format).unwrap();
+        files.push((extension, bytes.into_inner()));
+    }
+    for (name, bytes) in files {
+        let decode = |bytes: &[u8]| decode_photo(bytes, name.as_ref(), (24, 16));
+        decode(&bytes).unwrap();
+        for cut in (bytes.len() / 8..bytes.len() - 20).step_by(7).chain([bytes.len() / 2]) {
+            let Err(error) = decode(&bytes[..cut]) else {
+                panic!("{cut} of {} bytes of {name}", bytes.len())
+            };
+            assert!(error.to_string().starts_with(&format!("{name}: the image is ")), "{error}");
+        }
+    }
+}
+
+/// PNG with 24×16 pixels of 16 colours in a palette, as hexadecimal.
 const PALETTE_PNG: &str = "89504e470d0a1a0a0000000d4948445200000018000000100403000000fe0aa2a600000030504c5445b4d20078d2003cd200\
     b48c00788c003c8c0000d200008c00b446007846003c4600004600b400007800003c0000000000c5d2909e0000002349444154789c63fccfc0f01e8698\
     1890006e0ecb1ef2f4dc2355cf7b0686b324ea010020e70e8d4441c80f0000000049454e44ae426082";
 
+/// Lossy WebP with 24×16 pixels, the left half transparent, as hexadecimal.
+const LOSSY_WEBP: &str = "52494646a200000057454250565038580a000000100000001700000f0000414c504814000000010f30ff1111424840f8bfd603dd82\
+    88fe0736035650382068000000d003009d012a180010003e6d2c9345a422a19804004006c4b6004e99423b9bc9409639f831f70000feffd1ccd13fe8b966\
+    3b7ab8479282ee615374978fffec95afb239ef25d35e1db971e4cfe0cee79dfbbfead0c3ce4254a821ee87a9c0d95a62e5195df9f40000";
+
+fn bytes_of_hex(digits: &str) -> Vec<u8> {
+    (0..digits.len()).step_by(2).map(|i| u8::from_str_radix(&digits[i..i + 2], 16).unwrap()).collect()
+}
+
 #[test]
-fn as_stored_is_true_only_for_8_bit_rgb() {
-    let palette: Vec<u8> = (0..PALETTE_PNG.len())
-        .step_by(2)
-        .map(|i| u8::from_str_radix(&PALETTE_PNG[i..i + 2], 16).unwrap())
-        .collect();
+fn only_photos_of_plain_colours_are_as_stored() {
+    let palette = bytes_of_hex(PALETTE_PNG);
     let as_stored = |bytes: &[u8], size| decode_photo(bytes, "photo".as_ref(), size).unwrap().as_stored;
     assert!(!as_stored(&palette, (WIDTH, HEIGHT)));
+    let mut opaque = Cursor::new(vec![]);
+    DynamicImage::from(noise(9, 9)).to_rgba8().write_to(&mut opaque, ImageFormat::Png).unwrap();
+    assert!(decode_photo(opaque.get_ref(), "photo".as_ref(), (9, 9)).unwrap().alpha.is_none());
     for (kind, jpeg) in jpegs() {
         assert_eq!(as_stored(&jpeg, (45, 37)), kind.starts_with('3'), "{kind}");
     }
@@ -307,4 +393,105 @@ fn as_stored_is_true_only_for_8_bit_rgb() {
         image.write_to(&mut png, ImageFormat::Png).unwrap();
         assert_eq!(as_stored(png.get_ref(), (9, 9)), expected, "{:?}", image.color());
     }
+}
+
+#[test]
+fn lossy_webp_has_colours_and_opacity() {
+    let webp = bytes_of_hex(LOSSY_WEBP);
+    let photo = decode_photo(&webp, "lossy.webp".as_ref(), (24, 16)).unwrap();
+    let alpha = photo.alpha.unwrap();
+    assert!(alpha.enumerate_pixels().all(|(x, _, alpha)| alpha[0] == if x < 12 { 0 } else { 255 }));
+    // By another decoder, up to rounding: the colour where the photo is opaque, black where it isn't.
+    for (x, expected) in [(0, [0; 3]), (13, [135, 121, 96]), (23, [228, 124, 93])] {
+        let found = photo.pixels.get_pixel(x, 8).0;
+        assert!(found.iter().zip(expected).all(|(a, b)| a.abs_diff(b) < 6), "{x}: {found:?}");
+    }
+    assert!(!photo.as_stored);
+}
+
+#[test]
+fn floating_point_pixels_are_refused() {
+    let mut tiff = Cursor::new(vec![]);
+    DynamicImage::from(noise(9, 9)).to_rgb32f().write_to(&mut tiff, ImageFormat::Tiff).unwrap();
+    let error = decode_photo(tiff.get_ref(), "deep.tif".as_ref(), (9, 9)).unwrap_err().to_string();
+    assert!(
+        error.contains("deep.tif: the image is with floating-point pixels, expected 8 or 16 bits"),
+        "{error}"
+    );
+}
+
+/// Encodes an AVIF of 64×48 pixels, the left half red and the right half blue. Skips the test and returns `None` where ffmpeg can't.
+fn encode_avif() -> Option<Vec<u8>> {
+    let folder = tempfile::tempdir().unwrap();
+    let [png, avif] = ["photo.png", "photo.avif"].map(|name| folder.path().join(name));
+    RgbImage::from_fn(64, 48, |x, _| Rgb(if x < 32 { [220, 30, 20] } else { [20, 40, 230] }))
+        .save(&png)
+        .unwrap();
+    let mut ffmpeg = Command::new("ffmpeg");
+    ffmpeg.args(["-v", "error", "-i"]).arg(png);
+    ffmpeg
+        .args(["-c:v", "libaom-av1", "-still-picture", "1", "-crf", "10", "-pix_fmt", "yuv444p"])
+        .arg(&avif);
+    let is_encoded = ffmpeg.status().is_ok_and(|status| status.success());
+    if !is_encoded {
+        globalsplat_test_kit::skip("ffmpeg", "no ffmpeg that encodes AVIF is on the PATH");
+        return None;
+    }
+    Some(std::fs::read(avif).unwrap())
+}
+
+#[test]
+fn avif_is_decoded_by_ffmpeg() {
+    let Some(avif) = encode_avif() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("photo.avif");
+    std::fs::write(&file, &avif).unwrap();
+    assert_eq!(read_image_size(&file).unwrap(), (64, 48));
+    let is_close = |a: &Rgb<u8>, b: [u8; 3]| a.0.iter().zip(b).all(|(a, b)| a.abs_diff(b) < 12);
+    let image = load_photo(&avif, "avif", 64, 48).unwrap();
+    assert!(
+        is_close(image.get_pixel(5, 20), [220, 30, 20]) && is_close(image.get_pixel(60, 20), [20, 40, 230])
+    );
+    for cut in (24..avif.len()).step_by(130) {
+        let error = decode_photo(&avif[..cut], "cut.avif".as_ref(), (64, 48)).unwrap_err().to_string();
+        assert!(error.starts_with("cut.avif: the image is undecodable ("), "{error}");
+    }
+    // A rotation by a quarter turn in place of a description of the channels, both of which have a box of 16 bytes.
+    let mut turned = avif.clone();
+    let at = turned.windows(4).position(|kind| kind == b"pixi").unwrap();
+    turned[at..at + 8].copy_from_slice(b"irot\x01\0\0\0");
+    std::fs::write(&file, &turned).unwrap();
+    assert_eq!(read_image_size(&file).unwrap(), (48, 64));
+    let image = load_photo(&turned, "avif", 48, 64).unwrap();
+    // Counterclockwise: the left half comes to the bottom.
+    assert!(
+        is_close(image.get_pixel(20, 60), [220, 30, 20]) && is_close(image.get_pixel(20, 5), [20, 40, 230])
+    );
+}
+
+#[test]
+fn part_of_a_heic_is_not_taken_for_the_whole() {
+    let Some(mut avif) = encode_avif() else { return };
+    // As in a file of tiles, the image is larger than what ffmpeg decodes.
+    let at = avif.windows(4).position(|kind| kind == b"ispe").unwrap();
+    avif[at + 8..at + 16].copy_from_slice(&[0, 0, 16, 0, 0, 0, 12, 0]);
+    let error = decode_photo(&avif, "tiles.heic".as_ref(), (4096, 3072)).unwrap_err().to_string();
+    assert!(
+        error.contains("ffmpeg decodes 64×48 of its 4096×3072 pixels") && error.contains("heif-convert"),
+        "{error}"
+    );
+}
+
+#[test]
+fn a_heic_without_pixels_is_refused_in_a_sentence() {
+    // A header of 64×48 pixels and no data.
+    let part =
+        |kind: &[u8], contents: &[u8]| [&(contents.len() as u32 + 8).to_be_bytes(), kind, contents].concat();
+    let size = part(b"ispe", &[0, 0, 0, 0, 0, 0, 0, 64, 0, 0, 0, 48]);
+    let properties = part(b"iprp", &part(b"ipco", &size));
+    let heic =
+        [part(b"ftyp", b"heic\0\0\0\0mif1"), part(b"meta", &[&[0; 4], &properties[..]].concat())].concat();
+    let error = decode_photo(&heic, "photo.heic".as_ref(), (64, 48)).unwrap_err().to_string();
+    assert!(error.starts_with("photo.heic: the image is undecodable (ffmpeg"), "{error}");
+    assert!(error.contains("expected a JPEG or PNG, to which heif-convert or sips converts it"), "{error}");
 }

@@ -159,7 +159,7 @@ fn picture_files(folder: &Path) -> Result<Vec<PathBuf>> {
         }
     }
     if files.is_empty() {
-        return Err(Error::input(folder, "the pictures", "none", "PNG or JPEG files"));
+        return Err(Error::input(folder, "the pictures", "none", "files of photos, such as PNG or JPEG"));
     }
     files.sort();
     Ok(files)

@@ -65,6 +65,7 @@ pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
             name,
             camera,
             distortion: Distortion::default(),
+            mask: None,
         });
     }
     Capture::new(folder_name(root), file.to_owned(), frames, changes, purpose)

@@ -7,6 +7,7 @@ mod chunk;
 mod colmap;
 mod json;
 mod natural;
+mod photo_folder;
 mod photos;
 mod transforms_json;
 
@@ -15,10 +16,12 @@ pub use cameras_json::write_cameras_json;
 #[cfg(feature = "chunks")]
 pub use chunk::{CHUNK_EXTENSION, CHUNK_INDEX_FILE, Chunk, camera_numbers};
 pub use colmap::{Point, read_points};
+pub use photo_folder::{PhotoList, list_photos};
 
 use crate::capture::{Capture, Purpose};
 use globalsplat_files::{Error, Result};
 use natural::natural_order;
+pub(crate) use photos::find_masks;
 use std::path::{Path, PathBuf};
 
 /// Function that looks for a capture of one format at a path: a folder, or the file that describes the capture.
@@ -35,6 +38,9 @@ const FORMATS: &[Format] = &[
     transforms_json::find,
     colmap::find,
 ];
+
+/// Name of the folder of masks, beside or in the folder of photos.
+const MASKS: &str = "masks";
 
 /// Description of the supported formats for error messages.
 const SUPPORTED_FORMATS: &str = "a cameras.json, a transforms.json or a transforms_train.json in it, a COLMAP model (cameras and images, both \

@@ -50,6 +50,19 @@ pub(super) fn find_photos(bases: &[PathBuf], names: &[&str]) -> Vec<Option<PathB
     best.1
 }
 
+/// Looks for the masks of the photos `names` in `folders`: files with the name of the photo, with the extension of an image added or
+/// in place of its own. Photos of the same name but for the extension share a mask.
+pub(crate) fn find_masks(folders: &[PathBuf], names: &[&str]) -> Vec<Option<PathBuf>> {
+    if !folders.iter().any(|folder| folder.is_dir()) {
+        return vec![None; names.len()];
+    }
+    let names: Vec<String> = names.iter().map(|name| portable(name)).collect();
+    let stem = |name: &String| Path::new(name).with_extension("").to_string_lossy().into_owned();
+    let stems: Vec<String> = names.iter().map(stem).collect();
+    let find = |names: &[String]| find_photos(folders, &names.iter().map(String::as_str).collect::<Vec<_>>());
+    find(&names).into_iter().zip(find(&stems)).map(|(mask, by_stem)| mask.or(by_stem)).collect()
+}
+
 /// Returns the name with `/` as the separator.
 pub(super) fn portable(name: &str) -> String {
     name.replace('\\', "/")

@@ -155,10 +155,16 @@ fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Li
     let mut bases = vec![root(file).to_owned()];
     bases.extend(root(file).canonicalize().ok().and_then(|root| Some(root.parent()?.to_owned())));
     let photos = find_photos(&bases, &names);
+    let masks = match purpose {
+        Purpose::Photos => find_named_masks(&bases, &fields, &photos)?,
+        Purpose::Cameras(_) => vec![None; fields.len()],
+    };
     let (mut frames, mut changes) = (vec![], Changes::default());
-    for ((fields, name), photo) in fields.iter().zip(names).zip(photos) {
+    for (((fields, name), photo), mask) in fields.iter().zip(names).zip(photos).zip(masks) {
         match (photo, purpose) {
-            (Some(photo), _) => frames.push(fields.frame(photo, name, &mut changes)?),
+            (Some(photo), _) => {
+                frames.push(Frame { mask, ..fields.frame(photo, name, &mut changes)? });
+            }
             (None, Purpose::Cameras(_)) => {
                 frames.push(fields.frame(root(file).join(name), name, &mut changes)?)
             }
@@ -167,6 +173,33 @@ fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Li
     }
     frames.sort_by(|a, b| natural_order(&a.name, &b.name));
     Ok((frames, changes, Lists::read(file, &json)?))
+}
+
+/// Looks for the masks that `fields` name below `bases`. Frames whose photo is missing have none.
+///
+/// # Errors
+/// Fails if a mask is missing: what the user meant to leave out would count.
+fn find_named_masks(
+    bases: &[PathBuf],
+    fields: &[Fields],
+    photos: &[Option<PathBuf>],
+) -> Result<Vec<Option<PathBuf>>> {
+    let names = fields.iter().map(Fields::mask_path).collect::<Result<Vec<_>>>()?;
+    if names.iter().all(Option::is_none) {
+        return Ok(vec![None; fields.len()]);
+    }
+    let mut masks =
+        find_photos(bases, &names.iter().map(|name| name.unwrap_or_default()).collect::<Vec<_>>());
+    for (((fields, name), photo), mask) in fields.iter().zip(names).zip(photos).zip(&mut masks) {
+        // Without its folder, the name of a missing mask may be that of the photo.
+        *mask = mask.take().filter(|mask| photo.as_ref().is_some_and(|photo| photo != mask));
+        if let (Some(name), Some(_), None) = (name, photo, mask) {
+            let found = format!("{name:?}, which is missing");
+            let expected = "an image, or no mask_path";
+            return Err(Error::input(fields.file, fields.name("mask_path"), found, expected));
+        }
+    }
+    Ok(masks)
 }
 
 /// Describes a value of the file for an error message.
@@ -263,6 +296,17 @@ impl<'a> Fields<'a> {
         }
     }
 
+    fn mask_path(&self) -> Result<Option<&'a str>> {
+        match self.frame.get("mask_path") {
+            None | Some(Value::Null) => Ok(None),
+            Some(Value::String(path)) => Ok(Some(path.as_str()).filter(|path| !path.is_empty())),
+            other => {
+                let expected = "the path of an image";
+                Err(Error::input(self.file, self.name("mask_path"), describe_value(other), expected))
+            }
+        }
+    }
+
     fn frame(&self, image: PathBuf, name: &str, changes: &mut Changes) -> Result<Frame> {
         self.check_camera_model()?;
         let (width, height) = match (self.size("w")?, self.size("h")?) {
@@ -280,7 +324,7 @@ impl<'a> Fields<'a> {
         let intrinsics = camera.intrinsics.check(width, height);
         intrinsics.map_err(|(name, found, expected)| refuse(&name, (found, expected)))?;
         distortion.check(&camera).map_err(|e| refuse("the distortion", e))?;
-        Ok(Frame { image: ImageLocation::File(image), name: portable(name), camera, distortion })
+        Ok(Frame { image: ImageLocation::File(image), name: portable(name), camera, distortion, mask: None })
     }
 
     /// Returns the intrinsics. A missing focal length is computed from the angle of view if possible, otherwise it equals that of

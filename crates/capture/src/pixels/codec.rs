@@ -1,26 +1,35 @@
 //! Decoding and encoding of photos.
 
+use super::heif::{HEADER_BYTES, HeifHeader};
 use super::jpeg::{END_MARKER, check_jpeg, jpeg_size};
 use globalsplat_files::{Error, Result, panic_message};
 use image::codecs::jpeg::JpegEncoder;
 use image::metadata::Orientation;
-use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Limits, Rgb, RgbImage};
+use image::{
+    ColorType, DynamicImage, GrayImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Limits, Luma,
+    Rgb, RgbImage,
+};
 use std::any::Any;
-use std::io::{BufReader, Cursor, Seek};
+use std::fs::File;
+use std::io::{BufReader, Cursor, Read, Seek};
 use std::panic::{self, AssertUnwindSafe};
 use std::path::Path;
 
-/// File extensions of photos.
-pub const PHOTO_EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
+/// File extensions of photos, in lower case.
+pub const PHOTO_EXTENSIONS: [&str; 10] =
+    ["png", "jpg", "jpeg", "webp", "tif", "tiff", "bmp", "heic", "heif", "avif"];
+
+/// Description of the supported formats for error messages.
+pub(crate) const SUPPORTED_IMAGES: &str = "a JPEG, PNG, WebP, TIFF, BMP, HEIC or AVIF";
 
 /// Reads any image as 8-bit RGB, with pixels as they are stored: grey is repeated, transparent pixels are composited over black, 16 bits
-/// are rounded to 8.
+/// are rounded to 8. HEIC and AVIF are decoded by the ffmpeg on the PATH.
 ///
 /// # Errors
 /// Returns an error if the file is missing, can't be decoded, or is truncated.
 pub fn read_image(path: &Path) -> Result<RgbImage> {
     let bytes = std::fs::read(path).map_err(Error::read(path))?;
-    Ok(rgb_over_black(decode(&bytes, path)?.image))
+    Ok(split_alpha(decode(&bytes, path)?.image).0)
 }
 
 /// Pixels of a decoded photo.
@@ -28,6 +37,8 @@ pub fn read_image(path: &Path) -> Result<RgbImage> {
 pub struct DecodedPhoto {
     /// Pixels in 8-bit RGB.
     pub pixels: RgbImage,
+    /// Opacity of each pixel, 255 where it is opaque; `None` if every pixel is.
+    pub alpha: Option<GrayImage>,
     /// `true` if the file holds exactly these pixels in 8-bit RGB: no palette, grey, CMYK or opacity, not rotated and not converted.
     pub as_stored: bool,
     /// `true` if the file is a JPEG.
@@ -59,7 +70,8 @@ pub fn decode_photo(encoded: &[u8], file: &Path, size: (u32, u32)) -> Result<Dec
         image.apply_orientation(orientation);
     }
     let as_stored = !turn && is_rgb && matches!(image, DynamicImage::ImageRgb8(_));
-    Ok(DecodedPhoto { pixels: rgb_over_black(image), as_stored, is_jpeg: format == Some(ImageFormat::Jpeg) })
+    let (pixels, alpha) = split_alpha(image);
+    Ok(DecodedPhoto { pixels, alpha, as_stored, is_jpeg: format == Some(ImageFormat::Jpeg) })
 }
 
 /// Encodes a photo as a JPEG of high quality, or as a PNG.
@@ -79,9 +91,10 @@ pub fn encode_photo(pixels: &RgbImage, as_jpeg: bool) -> Result<Vec<u8>> {
 
 /// Returns (width, height) like [`read_image_size`], for an image in memory, or `None` if it isn't an image.
 pub fn encoded_image_size(encoded: &[u8]) -> Option<(u32, u32)> {
+    let heif_size = || HeifHeader::parse(encoded).map(|header| header.rotated_size());
     let dimensions =
         || ImageReader::new(Cursor::new(encoded)).with_guessed_format().ok()?.into_dimensions().ok();
-    jpeg_size(Cursor::new(encoded)).or_else(dimensions)
+    jpeg_size(Cursor::new(encoded)).or_else(heif_size).or_else(dimensions)
 }
 
 /// Returns (width, height) of the pixels as stored, from the image's header alone.
@@ -89,15 +102,42 @@ pub fn encoded_image_size(encoded: &[u8]) -> Option<(u32, u32)> {
 /// # Errors
 /// Returns an error if the file is missing or isn't an image.
 pub fn read_image_size(path: &Path) -> Result<(u32, u32)> {
-    let file = std::fs::File::open(path).map_err(Error::read(path))?;
-    let mut reader = BufReader::new(file);
+    let mut reader = BufReader::new(File::open(path).map_err(Error::read(path))?);
     // The decoder would read the whole file.
     if let Some(size) = jpeg_size(&mut reader) {
         return Ok(size);
     }
     reader.rewind().map_err(Error::read(path))?;
+    if let Some(header) = heif_header(&mut reader, path)? {
+        return Ok(header.rotated_size());
+    }
     let reader = ImageReader::new(reader).with_guessed_format().map_err(Error::read(path))?;
     reader.into_dimensions().map_err(undecodable(path))
+}
+
+/// Returns `true` if the image's header declares an alpha channel, or a transparent colour.
+///
+/// # Errors
+/// Returns an error if the file is missing or is no image.
+pub(crate) fn has_alpha_channel(path: &Path) -> Result<bool> {
+    let mut reader = BufReader::new(File::open(path).map_err(Error::read(path))?);
+    if heif_header(&mut reader, path)?.is_some() {
+        return Ok(false);
+    }
+    let reader = ImageReader::new(reader).with_guessed_format().map_err(Error::read(path))?;
+    // The decoder of JPEGs would read the whole file.
+    if reader.format() == Some(ImageFormat::Jpeg) {
+        return Ok(false);
+    }
+    Ok(reader.into_decoder().map_err(undecodable(path))?.color_type().has_alpha())
+}
+
+/// Reads the header of a HEIC or an AVIF, or returns `None` and rewinds `reader` if the file is neither.
+fn heif_header(reader: &mut BufReader<File>, path: &Path) -> Result<Option<HeifHeader>> {
+    let mut start = vec![];
+    reader.take(HEADER_BYTES).read_to_end(&mut start).map_err(Error::read(path))?;
+    reader.rewind().map_err(Error::read(path))?;
+    Ok(HeifHeader::parse(&start))
 }
 
 struct Decoded {
@@ -114,6 +154,10 @@ const PNG_COLOUR_TYPE: usize = 25;
 const PNG_RGB: u8 = 2;
 
 fn decode(encoded: &[u8], file: &Path) -> Result<Decoded> {
+    if let Some(header) = HeifHeader::parse(encoded) {
+        let (image, orientation) = (header.decode(encoded, file)?, Orientation::NoTransforms);
+        return Ok(Decoded { image, orientation, format: None, is_rgb: false });
+    }
     let reader = ImageReader::new(Cursor::new(encoded)).with_guessed_format().map_err(Error::read(file))?;
     let format = reader.format();
     let mut decoder = reader.into_decoder().map_err(undecodable(file))?;
@@ -124,11 +168,16 @@ fn decode(encoded: &[u8], file: &Path) -> Result<Decoded> {
         let (width, height) = decoder.dimensions();
         return Err(Error::input(file, "the image", format!("{width}×{height} pixels"), "a photo's size"));
     }
+    if matches!(decoder.color_type(), ColorType::Rgb32F | ColorType::Rgba32F) {
+        // Their range and brightness are up to the program that wrote them.
+        let found = "with floating-point pixels";
+        return Err(Error::input(file, "the image", found, "8 or 16 bits for each of its colours"));
+    }
     decoder.set_limits(limits).map_err(undecodable(file))?;
     let is_rgb = match format {
         Some(ImageFormat::Jpeg) => {
             let damaged =
-                |why| Error::input(file, "the image", format!("undecodable ({why})"), "a PNG or JPEG");
+                |why| Error::input(file, "the image", format!("undecodable ({why})"), SUPPORTED_IMAGES);
             let checked = check_jpeg(encoded).map_err(damaged)?;
             if !checked.is_marked {
                 // Without the marker the decoder leaves the last rows grey, though none of their data is missing.
@@ -146,24 +195,33 @@ fn decode(encoded: &[u8], file: &Path) -> Result<Decoded> {
     let image = panic::catch_unwind(AssertUnwindSafe(|| DynamicImage::from_decoder(decoder)));
     let panicked = |why: Box<dyn Any + Send>| {
         let found = format!("undecodable (the decoder failed: {})", panic_message(&*why));
-        Error::input(file, "the image", found, "a PNG or JPEG")
+        Error::input(file, "the image", found, SUPPORTED_IMAGES)
     };
     let image = image.map_err(panicked)?.map_err(undecodable(file))?;
     Ok(Decoded { image, orientation, format, is_rgb })
 }
 
 fn undecodable(path: &Path) -> impl FnOnce(ImageError) -> Error {
-    move |e| Error::input(path, "the image", format!("undecodable ({e})"), "a PNG or JPEG")
+    move |e| Error::input(path, "the image", format!("undecodable ({e})"), SUPPORTED_IMAGES)
 }
 
-fn rgb_over_black(image: DynamicImage) -> RgbImage {
+/// Returns the pixels, composited over black, and their opacity unless all of them are opaque.
+fn split_alpha(image: DynamicImage) -> (RgbImage, Option<GrayImage>) {
     if !image.color().has_alpha() {
-        return image.into_rgb8();
+        return (image.into_rgb8(), None);
     }
-    let image = image.to_rgba8();
-    RgbImage::from_fn(image.width(), image.height(), |x, y| {
+    let image = image.into_rgba8();
+    let (width, height) = image.dimensions();
+    let pixels = RgbImage::from_fn(width, height, |x, y| {
         let [red, green, blue, alpha] = image.get_pixel(x, y).0;
-        let covered = |value: u8| ((u32::from(value) * u32::from(alpha) + 127) / 255) as u8;
-        Rgb([red, green, blue].map(covered))
-    })
+        Rgb([red, green, blue].map(|value| multiply_levels(value, alpha)))
+    });
+    let is_opaque = image.pixels().all(|pixel| pixel[3] == u8::MAX);
+    let alpha = || GrayImage::from_fn(width, height, |x, y| Luma([image.get_pixel(x, y)[3]]));
+    (pixels, (!is_opaque).then(alpha))
+}
+
+/// Returns the product of two levels, 255 of which stand for 1, rounded to the nearest level.
+pub(super) fn multiply_levels(a: u8, b: u8) -> u8 {
+    ((u32::from(a) * u32::from(b) + 127) / 255) as u8
 }

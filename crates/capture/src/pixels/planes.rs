@@ -46,6 +46,13 @@ impl Planes {
         (self.height, self.width)
     }
 
+    /// Returns the first channel, `[H, W]`, row by row.
+    pub(crate) fn into_first_channel(mut self) -> Vec<u8> {
+        self.bytes.truncate(self.width * self.height);
+        self.bytes.shrink_to_fit();
+        self.bytes
+    }
+
     /// Returns the pixels, `[3, H, W]`, row by row.
     pub fn as_bytes(&self) -> &[u8] {
         &self.bytes

@@ -6,7 +6,7 @@ mod scenes;
 use super::CaptureOpener;
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
 use crate::geometry::{Camera, Intrinsics};
-use crate::pixels::{Distortion, encoded_image_size};
+use crate::pixels::{Distortion, SUPPORTED_IMAGES, encoded_image_size};
 use glam::{DMat4, DVec4};
 use globalsplat_files::{Error, Result, split_keyed_path};
 use globalsplat_torch_file::Archive;
@@ -121,7 +121,7 @@ impl Chunk {
         // A damaged frame is detected when it is loaded. Until then, assume the size of the other frames.
         let sizes: Vec<_> =
             scene.images.iter().map(|image| encoded_image_size(&self.bytes[image.clone()])).collect();
-        let undecodable = || Error::input(&named, "every image", "undecodable", "a JPEG or PNG");
+        let undecodable = || Error::input(&named, "every image", "undecodable", SUPPORTED_IMAGES);
         let size = sizes.iter().flatten().next().copied().ok_or_else(undecodable);
         let usual = purpose.size(&named, "the images", size)?;
         let cameras = scene.cameras(&self.bytes);
@@ -136,7 +136,7 @@ impl Chunk {
                 let name = format!("{index:06}");
                 let camera = camera(numbers, size.unwrap_or(usual));
                 let photo = ImageLocation::Bytes { file: self.bytes.clone(), bytes, name: named.join(&name) };
-                Frame { image: photo, name, camera, distortion: Distortion::default() }
+                Frame { image: photo, name, camera, distortion: Distortion::default(), mask: None }
             });
         Capture::new(scene.key.clone(), named.clone(), frames.collect(), Changes::default(), purpose)
     }

@@ -7,8 +7,8 @@ mod points;
 pub use points::{Point, read_points};
 
 use super::natural::natural_order;
-use super::photos::{find_photos, portable};
-use super::{CaptureOpener, folder_name};
+use super::photos::{find_masks, find_photos, portable};
+use super::{CaptureOpener, MASKS, folder_name};
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose, format_names};
 use crate::geometry::{Camera, Intrinsics};
 use crate::pixels::Distortion;
@@ -205,9 +205,16 @@ fn read(
     };
     let paths: Vec<String> = images.iter().map(|image| path(&image.name)).collect();
     let photos = find_photos(&model.bases, &paths.iter().map(String::as_str).collect::<Vec<_>>());
+    let masks = match purpose {
+        Purpose::Photos => {
+            let folders: Vec<_> = model.bases.iter().map(|base| base.join(MASKS)).collect();
+            find_masks(&folders, &images.iter().map(|image| image.name.as_str()).collect::<Vec<_>>())
+        }
+        Purpose::Cameras(_) => vec![None; images.len()],
+    };
     let mut lenses = BTreeMap::new();
     let (mut frames, mut changes) = (vec![], Changes { lines, ..Changes::default() });
-    for (image, photo) in images.into_iter().zip(photos) {
+    for ((image, photo), mask) in images.into_iter().zip(photos).zip(masks) {
         let photo = match (photo.filter(|_| !image.name.is_empty()), purpose) {
             (Some(photo), _) => photo,
             (None, Purpose::Cameras(_)) => model.bases[0].join(PHOTOS).join(&image.name),
@@ -251,6 +258,7 @@ fn read(
             name: portable(&image.name),
             camera,
             distortion,
+            mask,
         });
     }
     frames.sort_by(|a, b| natural_order(&a.name, &b.name));

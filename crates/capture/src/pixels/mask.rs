@@ -1,0 +1,45 @@
+//! Masks: which pixels of a photo count (spec 10.6). They are RGB images with equal channels, so that they go through the same steps
+//! as their photos.
+
+use super::codec::{decode_photo, multiply_levels};
+use super::planes::Planes;
+use super::resample::{Region, Resampler};
+use crate::geometry::ImageSize;
+use globalsplat_files::{Error, Result};
+use image::{GrayImage, Rgb, RgbImage};
+use std::path::Path;
+
+/// Reads the mask `file` at `size` = (width, height), resized if it has another size. The level of its grey is the weight; a colour
+/// counts by its luminance, and what is transparent is black. A mask without a level above 1 has levels 0 and 1.
+///
+/// # Errors
+/// Fails if the file can't be read or decoded.
+pub(crate) fn read_mask(file: &Path, size: (u32, u32)) -> Result<RgbImage> {
+    let encoded = std::fs::read(file).map_err(Error::read(file))?;
+    let mut mask = image::DynamicImage::from(decode_photo(&encoded, file, size)?.pixels).into_luma8();
+    if mask.pixels().all(|level| level[0] <= 1) {
+        mask.pixels_mut().for_each(|level| level[0] *= u8::MAX);
+    }
+    let mask = grey_to_rgb(&mask);
+    if mask.dimensions() == size {
+        return Ok(mask);
+    }
+    let mut resized = Planes::new(size.0, size.1);
+    let (width, height) = (f64::from(mask.width()), f64::from(mask.height()));
+    let whole = Region { left: 0., top: 0., width, height };
+    let size = ImageSize { height: size.1, width: size.0 };
+    Resampler::default().resample(&mask, whole, size, resized.bytes_mut());
+    Ok(resized.to_rgb())
+}
+
+/// Returns the image whose channels all are `image`.
+pub(crate) fn grey_to_rgb(image: &GrayImage) -> RgbImage {
+    RgbImage::from_fn(image.width(), image.height(), |x, y| Rgb([image.get_pixel(x, y)[0]; 3]))
+}
+
+/// Multiplies the levels of `mask` by those of `other`, an image of the same size.
+pub(crate) fn multiply(mask: &mut RgbImage, other: &RgbImage) {
+    for (level, other) in mask.iter_mut().zip(other.iter()) {
+        *level = multiply_levels(*level, *other);
+    }
+}

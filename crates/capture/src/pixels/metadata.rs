@@ -1,0 +1,56 @@
+//! What a photo's metadata say about its camera.
+
+use super::codec::read_image_size;
+use exif::{In, Reader, Tag, Value};
+use image::{ImageDecoder, ImageReader};
+use std::fs::File;
+use std::io::BufReader;
+use std::path::Path;
+
+/// Diagonal of 35 mm film, 36 mm × 24 mm.
+const FILM_DIAGONAL: f64 = 43.266_615;
+
+/// Returns the focal length in pixels that a photo's EXIF data tell, at the size of the file, or `None` if they tell none.
+///
+/// The 35 mm equivalent f₃₅ comes first, since a photo may have been reduced after its EXIF data were written: f = f₃₅·√(W² + H²) /
+/// 43.27 mm (CIPA DCG-001). Otherwise f is the focal length times the sensor's pixels per millimetre (`FocalPlaneXResolution`), times
+/// the factor by which the longer side was reduced.
+pub fn exif_focal(path: &Path) -> Option<f64> {
+    let (width, height) = read_image_size(path).ok()?;
+    let (width, height) = (f64::from(width), f64::from(height));
+    let exif = Reader::new().read_from_container(&mut BufReader::new(File::open(path).ok()?)).ok()?;
+    let number = |tag| {
+        let number = match &exif.get_field(tag, In::PRIMARY)?.value {
+            Value::Rational(numbers) => numbers.first()?.to_f64(),
+            value => f64::from(value.get_uint(0)?),
+        };
+        // 0 stands for an unknown number.
+        (number > 0. && number.is_finite()).then_some(number)
+    };
+    if let Some(equivalent) = number(Tag::FocalLengthIn35mmFilm) {
+        return Some(equivalent * width.hypot(height) / FILM_DIAGONAL);
+    }
+    let millimetres = match number(Tag::FocalPlaneResolutionUnit) {
+        Some(3.) => 10.,
+        Some(4.) => 1.,
+        Some(5.) => 1e-3,
+        _ => 25.4,
+    };
+    let stored = number(Tag::PixelXDimension).zip(number(Tag::PixelYDimension));
+    let reduction = stored.map_or(1., |(x, y)| width.max(height) / x.max(y));
+    Some(number(Tag::FocalLength)? * number(Tag::FocalPlaneXResolution)? / millimetres * reduction)
+}
+
+/// Returns `true` if a photo's XMP data declare a panorama of 360°: `GPano:ProjectionType` is `equirectangular`.
+pub fn is_equirectangular(path: &Path) -> bool {
+    let xmp = || {
+        let reader = ImageReader::open(path).ok()?.with_guessed_format().ok()?;
+        reader.into_decoder().ok()?.xmp_metadata().ok()?
+    };
+    let xmp = xmp().unwrap_or_default();
+    // Either an attribute, `GPano:ProjectionType="equirectangular"`, or an element of this name.
+    let text = String::from_utf8_lossy(&xmp);
+    text.split("GPano:ProjectionType").skip(1).any(|value| {
+        value.trim_start_matches([' ', '\t', '\r', '\n', '=', '"', '\'', '>']).starts_with("equirectangular")
+    })
+}

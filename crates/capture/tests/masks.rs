@@ -1,0 +1,261 @@
+//! Masks of photos: where they are found, and what becomes of them.
+
+use globalsplat_capture::{Capture, Photo, open_capture};
+use globalsplat_test_kit::formats::{
+    HEIGHT, WIDTH, cameras, in_images, names, pinhole, transforms, write_colmap_text,
+};
+use image::{DynamicImage, GrayImage, Luma, Rgb, RgbImage, Rgba, RgbaImage};
+use serde_json::{Value, json};
+use std::path::Path;
+use tempfile::TempDir;
+
+/// Returns a mask of many levels.
+fn levels() -> GrayImage {
+    GrayImage::from_fn(WIDTH, HEIGHT, |x, y| Luma([(x * 11 + y * y) as u8]))
+}
+
+fn save(image: impl Into<DynamicImage>, path: &Path) {
+    std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+    image.into().save(path).unwrap();
+}
+
+/// Writes five photos to `images`, all of them [`levels`] in colours.
+fn folder_of_photos(names: &[String]) -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let photo = DynamicImage::from(levels()).into_rgb8();
+    names.iter().for_each(|name| save(photo.clone(), &folder.path().join("images").join(name)));
+    folder
+}
+
+/// Writes a `transforms.json` of the photos after `change` of its contents.
+fn write_transforms(folder: &Path, change: impl FnOnce(&mut Value)) {
+    let mut contents = transforms(&in_images(&names()), &cameras());
+    change(&mut contents);
+    std::fs::write(folder.join("transforms.json"), contents.to_string()).unwrap();
+}
+
+fn mask_of(capture: &Capture, view: usize) -> Option<Vec<u8>> {
+    capture.load(&[view], None).unwrap().remove(0).mask
+}
+
+fn error_of<T>(result: globalsplat_capture::Result<T>) -> String {
+    result.err().expect("an error").to_string()
+}
+
+#[test]
+fn masks_are_found_where_tools_put_them() {
+    // nerfstudio names them, for any of its frames.
+    let nerfstudio = folder_of_photos(&names());
+    save(levels(), &nerfstudio.path().join("masks/some.png"));
+    write_transforms(nerfstudio.path(), |contents| {
+        contents["frames"][1]["mask_path"] = json!("masks/some.png")
+    });
+    // COLMAP adds an extension to the name of the photo, or the name has the same one.
+    let names = ["left/0.jpg", "left/1.png", "right/0.jpg", "right/1.png", "2.png"].map(String::from);
+    let colmap = folder_of_photos(&names);
+    write_colmap_text(&colmap.path().join("sparse/0"), &names, &cameras(), &pinhole(&cameras()[0]));
+    for mask in ["left/0.jpg.png", "left/1.png.png", "right/0.png", "right/1.png"] {
+        save(levels(), &colmap.path().join("masks").join(mask));
+    }
+    for (folder, expected) in [(nerfstudio, [1].as_slice()), (colmap, &[1, 2, 3, 4])] {
+        let capture = open_capture(folder.path()).unwrap();
+        let masked: Vec<usize> = (0..5).filter(|&view| mask_of(&capture, view).is_some()).collect();
+        assert_eq!((masked.as_slice(), capture.mask_count()), (expected, expected.len()));
+        assert_eq!(mask_of(&capture, masked[0]).unwrap(), levels().into_raw());
+        assert!(capture.warnings().is_empty(), "{:?}", capture.warnings());
+    }
+}
+
+#[test]
+fn a_folder_of_masks_replaces_those_of_the_capture() {
+    let folder = folder_of_photos(&names());
+    let [own, given] = ["own", "given"].map(|name| folder.path().join(name));
+    save(GrayImage::from_pixel(WIDTH, HEIGHT, Luma([9])), &own.join("000.png"));
+    write_transforms(folder.path(), |contents| contents["frames"][0]["mask_path"] = json!("own/000.png"));
+    let capture = || open_capture(folder.path()).unwrap();
+    assert_eq!(mask_of(&capture(), 0).unwrap()[0], 9);
+    assert!(error_of(capture().with_masks(&given)).contains("given"));
+    std::fs::create_dir(&given).unwrap();
+    let error = error_of(capture().with_masks(&given));
+    assert!(
+        error.contains("the folder is without a mask for any photo, expected images/000.png.png"),
+        "{error}"
+    );
+    // With or without the folders of the photos' names.
+    for names in [["images/001.png.png", "images/002.tif"], ["001.png", "002.png.bmp"]] {
+        names.iter().for_each(|name| save(levels(), &given.join(name)));
+        let capture = capture().with_masks(&given).unwrap();
+        let masked = [0, 1, 2, 3, 4].map(|view| mask_of(&capture, view).is_some());
+        assert_eq!(masked, [false, true, true, false, false], "{names:?}");
+        let line = "given: 3 of 5 photos have no mask and count whole: images/000.png, images/003.png, images/004.png";
+        assert!(capture.warnings().iter().any(|warning| warning.ends_with(line)), "{:?}", capture.warnings());
+        std::fs::remove_dir_all(&given).unwrap();
+    }
+}
+
+/// The photo is its own mask, so that both must become the same.
+#[test]
+fn masks_lose_distortion_and_are_fitted_as_their_photos() {
+    let folder = folder_of_photos(&names());
+    names().iter().for_each(|name| save(levels(), &folder.path().join("masks").join(name)));
+    let (lens, plain) = ("OPENCV 21.5 20.25 11.75 8.5 -0.1 0.02 0.01 -0.01", pinhole(&cameras()[0]));
+    for lens in [lens, &plain] {
+        write_colmap_text(&folder.path().join("sparse/0"), &names(), &cameras(), lens);
+        let capture = open_capture(folder.path()).unwrap();
+        for size in [None, Some([10, 12].into()), Some([32, 20].into()), Some([16, 24].into())] {
+            // A lens that several photos share, and that of a single one.
+            for photos in [capture.load_all(size).unwrap(), capture.load(&[2], size).unwrap()] {
+                for Photo { image, mask, .. } in photos {
+                    let pixels = image.size().0 * image.size().1;
+                    assert!(mask.as_deref() == Some(&image.as_bytes()[..pixels]), "{lens} {size:?}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn opacity_is_a_mask_and_multiplies_another() {
+    let folder = folder_of_photos(&names());
+    let photo =
+        |alpha: fn(u32) -> u8| RgbaImage::from_fn(WIDTH, HEIGHT, |x, _| Rgba([200, 100, 50, alpha(x)]));
+    let images = folder.path().join("images");
+    save(photo(|x| if x < 12 { 0 } else { 255 }), &images.join("000.png"));
+    save(photo(|_| 255), &images.join("001.png"));
+    save(photo(|x| x as u8 * 10), &images.join("002.png"));
+    save(levels(), &folder.path().join("masks/2.png"));
+    save(GrayImage::from_pixel(WIDTH, HEIGHT, Luma([255])), &folder.path().join("masks/3.png"));
+    write_transforms(folder.path(), |contents| {
+        contents["frames"][2]["mask_path"] = json!("masks/2.png");
+        contents["frames"][3]["mask_path"] = json!("masks/3.png");
+    });
+    let capture = open_capture(folder.path()).unwrap();
+    let half: Vec<u8> = (0..WIDTH * HEIGHT).map(|i| if i % WIDTH < 12 { 0 } else { 255 }).collect();
+    assert_eq!(mask_of(&capture, 0).unwrap(), half);
+    let product = |(x, _, level): (u32, u32, &Luma<u8>)| {
+        (f64::from(level[0]) * f64::from(x as u8 * 10) / 255.).round() as u8
+    };
+    assert_eq!(mask_of(&capture, 2).unwrap(), levels().enumerate_pixels().map(product).collect::<Vec<_>>());
+    // If every pixel counts, there is no mask.
+    assert!([1, 3, 4].iter().all(|&view| mask_of(&capture, view).is_none()));
+    // Two alpha channels with and without effect, an alpha channel with a mask, and a mask.
+    assert_eq!(capture.mask_count(), 4);
+    // The colour of transparent pixels is composited over black.
+    let photo = capture.load(&[0], None).unwrap().remove(0).image.to_rgb();
+    assert_eq!((photo.get_pixel(3, 3), photo.get_pixel(20, 3)), (&Rgb([0, 0, 0]), &Rgb([200, 100, 50])));
+}
+
+#[test]
+fn masks_of_another_size_are_resized_if_the_aspect_agrees() {
+    let folder = folder_of_photos(&names());
+    let mask = folder.path().join("masks/1.png");
+    write_transforms(folder.path(), |contents| contents["frames"][1]["mask_path"] = json!("masks/1.png"));
+    // White to the left of column 6 of 12.
+    save(GrayImage::from_fn(12, 8, |x, _| Luma([if x < 6 { 255 } else { 0 }])), &mask);
+    let capture = open_capture(folder.path()).unwrap();
+    let line = "the masks of 1 of 5 photos have another size and are resized: images/001.png";
+    assert!(matches!(capture.warnings(), [warning] if warning.ends_with(line)), "{:?}", capture.warnings());
+    let resized = mask_of(&capture, 1).unwrap();
+    for x in [0, 8, 15, 23] {
+        // The filter overshoots near the edge.
+        let (found, expected) = (resized[5 * WIDTH as usize + x], if x < 12 { 255u8 } else { 0 });
+        assert!(found.abs_diff(expected) < 10, "{x}: {found}");
+    }
+    for (width, height) in [(16, 24), (24, 20), (12, 16)] {
+        save(GrayImage::new(width, height), &mask);
+        let error = error_of(open_capture(folder.path()));
+        let found =
+            format!("1.png: the mask is {width}×{height} pixels, expected 24×16 pixels as images/001.png");
+        assert!(error.contains(&found), "{error}");
+    }
+}
+
+#[test]
+fn a_missing_or_damaged_mask_is_refused_by_name() {
+    let folder = folder_of_photos(&names());
+    let write =
+        |path: Value| write_transforms(folder.path(), |contents| contents["frames"][3]["mask_path"] = path);
+    // The last one is the name of the photo if the folder is left out, as it may be for photos.
+    for path in ["masks/3.png", "masks/images/003.png"] {
+        write(json!(path));
+        let error = error_of(open_capture(folder.path()));
+        assert!(
+            error.contains(&format!("mask_path of frame 3 is {path:?}, which is missing, expected an image")),
+            "{error}"
+        );
+    }
+    write(json!(7));
+    assert!(
+        error_of(open_capture(folder.path()))
+            .contains("mask_path of frame 3 is 7, expected the path of an image")
+    );
+    write(json!("masks/3.png"));
+    std::fs::create_dir(folder.path().join("masks")).unwrap();
+    std::fs::write(folder.path().join("masks/3.png"), "no image").unwrap();
+    assert!(error_of(open_capture(folder.path())).contains("masks/3.png: the image is undecodable"));
+    // A photo that is missing, too, is left out.
+    std::fs::remove_file(folder.path().join("images/003.png")).unwrap();
+    assert_eq!(open_capture(folder.path()).unwrap().len(), 4);
+    write(json!(null));
+    assert_eq!(open_capture(folder.path()).unwrap().mask_count(), 0);
+}
+
+#[test]
+fn masks_are_read_however_they_are_written() {
+    let folder = folder_of_photos(&names());
+    let is_white = |x: u32| x > 6;
+    let level = |x: u32, white: u8| if is_white(x) { white } else { 0 };
+    let of = |level: &dyn Fn(u32) -> Rgba<u8>| RgbaImage::from_fn(WIDTH, HEIGHT, |x, _| level(x));
+    let masks: [DynamicImage; 5] = [
+        GrayImage::from_fn(WIDTH, HEIGHT, |x, _| Luma([level(x, 255)])).into(),
+        // As programs write arrays of booleans.
+        GrayImage::from_fn(WIDTH, HEIGHT, |x, _| Luma([level(x, 1)])).into(),
+        RgbImage::from_fn(WIDTH, HEIGHT, |x, _| Rgb([level(x, 255); 3])).into(),
+        // White cut out of something transparent.
+        of(&|x| Rgba([255, 255, 255, level(x, 255)])).into(),
+        of(&|x| Rgba([level(x, 255), level(x, 255), level(x, 255), 255])).into(),
+    ];
+    for (mask, name) in masks.into_iter().zip(names()) {
+        save(mask, &folder.path().join("masks").join(name));
+    }
+    write_transforms(folder.path(), |_| {});
+    let capture = open_capture(folder.path()).unwrap().with_masks(&folder.path().join("masks")).unwrap();
+    let expected: Vec<u8> = (0..WIDTH * HEIGHT).map(|i| level(i % WIDTH, 255)).collect();
+    for view in 0..5 {
+        assert!(mask_of(&capture, view) == Some(expected.clone()), "{view}");
+    }
+}
+
+#[test]
+fn masks_that_leave_no_pixel_are_refused_if_all_do() {
+    let folder = folder_of_photos(&names());
+    let masks = folder.path().join("masks");
+    write_transforms(folder.path(), |_| {});
+    names()[..4].iter().for_each(|name| save(GrayImage::new(WIDTH, HEIGHT), &masks.join(name)));
+    let capture = open_capture(folder.path()).unwrap().with_masks(&masks).unwrap();
+    let photos = capture.load_all(None).unwrap();
+    assert_eq!(photos.iter().filter(|photo| photo.is_masked_out()).count(), 4);
+    // A photo alone may be masked out; several may not.
+    assert!(capture.load(&[0], None).unwrap()[0].is_masked_out());
+    let error = error_of(capture.load(&[0, 1, 2], None));
+    assert!(
+        error.contains("the mask of \"images/000.png\" and of 2 other photos is black all over"),
+        "{error}"
+    );
+}
+
+#[test]
+fn masks_are_part_of_the_checksum() {
+    let folder = folder_of_photos(&names());
+    let masks = folder.path().join("masks");
+    write_transforms(folder.path(), |_| {});
+    let checksum = |capture: &Capture| capture.checksum(0..5).unwrap();
+    let plain = open_capture(folder.path()).unwrap();
+    let mut checksums = vec![checksum(&plain)];
+    for level in [10, 20] {
+        save(GrayImage::from_pixel(WIDTH, HEIGHT, Luma([level])), &masks.join("002.png"));
+        checksums.push(checksum(&plain.clone().with_masks(&masks).unwrap()));
+    }
+    assert_eq!(checksums[0], checksum(&plain));
+    assert!(checksums[0] != checksums[1] && checksums[1] != checksums[2] && checksums[0] != checksums[2]);
+}

@@ -1,0 +1,153 @@
+//! Folders of photos without poses, and what the photos' metadata say.
+
+use exif::experimental::Writer;
+use exif::{Field, In, Rational, Tag, Value};
+use globalsplat_capture::{exif_focal, is_equirectangular, list_photos};
+use image::codecs::jpeg::JpegEncoder;
+use image::codecs::webp::WebPEncoder;
+use image::{ImageEncoder, ImageFormat, RgbImage};
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
+
+fn encode(format: ImageFormat) -> Vec<u8> {
+    let mut bytes = Cursor::new(vec![]);
+    RgbImage::new(24, 16).write_to(&mut bytes, format).unwrap();
+    bytes.into_inner()
+}
+
+#[test]
+fn photos_are_told_from_other_files_by_their_contents() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    let write = |name: &str, contents: &[u8]| {
+        std::fs::create_dir_all(root.join(name).parent().unwrap()).unwrap();
+        std::fs::write(root.join(name), contents).unwrap();
+    };
+    let (jpeg, png, tiff) = (encode(ImageFormat::Jpeg), encode(ImageFormat::Png), encode(ImageFormat::Tiff));
+    let photos = ["10.JPG", "9.jpeg", "b/2.png", "b/c/1.tif", "no_extension", "png_named.jpg"];
+    for (photo, contents) in photos.iter().zip([&jpeg, &jpeg, &png, &tiff, &jpeg, &png]) {
+        write(photo, contents);
+    }
+    // Text, a film, a backup, a raw file, and a file that is cut short before its size.
+    let others: [(&str, &[u8]); 5] = [
+        ("b/notes.jpg", b"text"),
+        ("film.mov", b"text"),
+        ("9.jpeg_original", &jpeg),
+        ("raw.dng", &tiff),
+        ("cut.png", &png[..20]),
+    ];
+    others.iter().for_each(|(name, contents)| write(name, contents));
+    for ignored in [".hidden.jpg", ".thumbnails/1.jpg", "b/Thumbs.db", "masks/10.png", "desktop.ini"] {
+        write(ignored, &jpeg);
+    }
+    std::os::unix::fs::symlink(root.join("b"), root.join("link")).unwrap();
+    let list = list_photos(root).unwrap();
+    let below = |paths: &[PathBuf]| -> Vec<String> {
+        paths.iter().map(|path| path.strip_prefix(root).unwrap().display().to_string()).collect()
+    };
+    let expected = ["9.jpeg", "10.JPG", "b/2.png", "b/c/1.tif", "no_extension", "png_named.jpg"];
+    assert_eq!(below(&list.photos), expected);
+    assert_eq!(
+        below(&list.others),
+        ["9.jpeg_original", "b/notes.jpg", "cut.png", "film.mov", "link", "raw.dng"]
+    );
+    let line = ": 6 of 12 files are no photos and left out: 9.jpeg_original, b/notes.jpg, cut.png and 3 more";
+    assert!(list.warning().unwrap().ends_with(line), "{:?}", list.warning());
+    assert!(list_photos(&root.join("b/c")).unwrap().warning().is_none());
+    let empty = root.join("none");
+    assert!(list_photos(&empty).unwrap_err().to_string().contains("none"));
+    std::fs::create_dir(&empty).unwrap();
+    let error = list_photos(&empty).unwrap_err().to_string();
+    assert!(
+        error.contains("none: the folder is without photos, of 0 files, expected photos, each a JPEG, PNG"),
+        "{error}"
+    );
+}
+
+/// Writes a photo of 400×300 pixels with the EXIF data `fields`.
+fn write_with_exif(path: &Path, fields: &[(Tag, Value)]) {
+    let fields: Vec<Field> = fields
+        .iter()
+        .map(|(tag, value)| Field { tag: *tag, ifd_num: In::PRIMARY, value: value.clone() })
+        .collect();
+    let mut writer = Writer::new();
+    fields.iter().for_each(|field| writer.push_field(field));
+    let mut exif = Cursor::new(vec![]);
+    writer.write(&mut exif, true).unwrap();
+    let (photo, mut bytes) = (RgbImage::new(400, 300), vec![]);
+    if path.extension().unwrap() == "webp" {
+        let mut encoder = WebPEncoder::new_lossless(&mut bytes);
+        encoder.set_exif_metadata(exif.into_inner()).unwrap();
+        photo.write_with_encoder(encoder).unwrap();
+    } else {
+        let mut encoder = JpegEncoder::new(&mut bytes);
+        encoder.set_exif_metadata(exif.into_inner()).unwrap();
+        photo.write_with_encoder(encoder).unwrap();
+    }
+    std::fs::write(path, bytes).unwrap();
+}
+
+#[test]
+fn exif_data_tell_the_focal_length() {
+    let folder = tempfile::tempdir().unwrap();
+    let ratio = |num, denom| Value::Rational(vec![Rational { num, denom }]);
+    let short = |number| Value::Short(vec![number]);
+    let equivalent = (Tag::FocalLengthIn35mmFilm, short(26));
+    let length = (Tag::FocalLength, ratio(425, 100));
+    let unknown = (Tag::FocalLengthIn35mmFilm, short(0));
+    // 4000×3000 pixels of 1.5 µm, reduced to a tenth in the file.
+    let sensor = [
+        (Tag::FocalPlaneXResolution, ratio(20_000, 3)),
+        (Tag::FocalPlaneResolutionUnit, short(3)),
+        (Tag::PixelXDimension, Value::Long(vec![4000])),
+        (Tag::PixelYDimension, Value::Long(vec![3000])),
+    ];
+    let inches = (Tag::FocalPlaneResolutionUnit, short(2));
+    let by_sensor = [&[unknown.clone(), length.clone()][..], &sensor].concat();
+    let by_inches = [length.clone(), (Tag::FocalPlaneXResolution, ratio(2540, 1)), inches];
+    let cases = [
+        // The diagonal has 500 pixels, and that of the film 43.27 mm.
+        (vec![equivalent.clone(), length.clone()], Some(26. * 500. / (36f64 * 36. + 24. * 24.).sqrt())),
+        (by_sensor, Some(4.25 / 1.5e-3 / 10.)),
+        (by_inches.to_vec(), Some(425.)),
+        (vec![length.clone()], None),
+        (vec![length, unknown], None),
+        (vec![(Tag::Orientation, short(1))], None),
+    ];
+    for name in ["photo.jpg", "photo.webp"] {
+        let file = folder.path().join(name);
+        for (fields, expected) in &cases {
+            write_with_exif(&file, fields);
+            let found = exif_focal(&file);
+            let is_close = found.zip(*expected).is_some_and(|(a, b)| (a / b - 1.).abs() < 1e-6);
+            assert!(
+                is_close || (found, *expected) == (None, None),
+                "{name} {fields:?}: {found:?} {expected:?}"
+            );
+        }
+    }
+    std::fs::write(folder.path().join("text.jpg"), "text").unwrap();
+    assert_eq!(exif_focal(&folder.path().join("text.jpg")), None);
+}
+
+#[test]
+fn panoramas_are_known_by_their_xmp_data() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("photo.jpg");
+    let is_panorama = |xmp: &str| {
+        let mut jpeg = encode(ImageFormat::Jpeg);
+        let packet = format!("http://ns.adobe.com/xap/1.0/\0<x:xmpmeta><rdf:Description {xmp}</x:xmpmeta>");
+        let mut segment = vec![0xff, 0xe1];
+        segment.extend((packet.len() as u16 + 2).to_be_bytes());
+        segment.extend(packet.as_bytes());
+        jpeg.splice(2..2, segment);
+        std::fs::write(&file, jpeg).unwrap();
+        is_equirectangular(&file)
+    };
+    assert!(is_panorama("GPano:UsePanoramaViewer=\"True\" GPano:ProjectionType=\"equirectangular\"/>"));
+    assert!(is_panorama("><GPano:ProjectionType> equirectangular</GPano:ProjectionType>"));
+    assert!(!is_panorama("GPano:ProjectionType=\"cylindrical\" other=\"equirectangular\"/>"));
+    assert!(!is_panorama("/>"));
+    std::fs::write(&file, encode(ImageFormat::Png)).unwrap();
+    assert!(!is_equirectangular(&file) && !is_equirectangular(folder.path()));
+}
