@@ -160,8 +160,7 @@ impl<'a> Converter<'a> {
 
     /// Starts the second pass: the frames `chosen` as `frame_00001.jpg`, … in `folder`.
     pub(super) fn write(&self, chosen: &[usize], folder: &Path) -> Result<Pass<'_>> {
-        let terms: Vec<String> = chosen.iter().map(|frame| format!("eq(n,{frame})")).collect();
-        let select = format!("select='{}'", terms.join("+"));
+        let select = format!("select='{}'", expression_of(chosen));
         let filter = format!("{}{select},{},showinfo", self.deinterlace, self.to_jpeg);
         let count = chosen.len().to_string();
         let output = ["-frames:v", &count, "-c:v", "mjpeg", "-q:v", "2", "-f", "image2", "frame_%05d.jpg"];
@@ -227,7 +226,7 @@ impl Shown {
     /// Parses a line of the filter showinfo: "… pts_time:1.5 … s:1920x1080 …".
     fn parse(line: &str) -> Option<Self> {
         let value = |key: &str| Some(line.split_once(key)?.1.split_whitespace().next().unwrap_or_default());
-        let time = line.contains("_showinfo_").then(|| value(" pts_time:"))??;
+        let time = line.contains("showinfo").then(|| value(" pts_time:"))??;
         let (width, height) = value(" s:")?.split_once('x')?;
         Some(Shown { time: time.parse().ok(), size: (width.parse().ok()?, height.parse().ok()?) })
     }
@@ -293,6 +292,18 @@ fn command(program: &str) -> Command {
     command
 }
 
+/// Returns the expression that is true for the frames `chosen`, of which there must be at least one: a sum in parentheses, because ffmpeg
+/// takes no more than 100 terms in a row.
+fn expression_of(chosen: &[usize]) -> String {
+    match chosen {
+        [frame] => format!("eq(n,{frame})"),
+        _ => {
+            let (first, second) = chosen.split_at(chosen.len() / 2);
+            format!("({}+{})", expression_of(first), expression_of(second))
+        }
+    }
+}
+
 /// Runs a command for `video` to its end.
 fn run(video: &Path, mut command: Command) -> Result<Output> {
     let program = command.get_program().to_string_lossy().into_owned();
@@ -333,4 +344,27 @@ fn is_before_5_1(banner: &str) -> bool {
     let version = banner.split_whitespace().nth(2).unwrap_or_default().trim_start_matches('n');
     let mut numbers = version.split(|c: char| !c.is_ascii_digit()).map_while(|part| part.parse::<u32>().ok());
     numbers.next().is_some_and(|major| (major, numbers.next().unwrap_or(0)) < (5, 1))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn versions_are_told_apart() {
+        for (version, is_before) in [
+            ("4.4.2-0ubuntu0.22.04.1", true),
+            ("5.0.1", true),
+            ("n4.4", true),
+            ("5.1.9-0+deb12u1", false),
+            ("n7.1", false),
+            ("8.0", false),
+            ("10", false),
+            ("N-118193-g5f38c82536", false),
+            ("git-2024-01-01", false),
+        ] {
+            let banner = format!("ffmpeg version {version} Copyright (c) 2000-2025 the FFmpeg developers");
+            assert_eq!(is_before_5_1(&banner), is_before, "{version}");
+        }
+    }
 }

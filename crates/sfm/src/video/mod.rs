@@ -82,7 +82,7 @@ pub fn is_video(path: &Path) -> Result<bool> {
 
 /// Writes frames of `video` as JPEGs `frame_00001.jpg`, `frame_00002.jpg`, … to `folder`. The video is divided into stretches in which the
 /// picture moves equally far, and the sharpest frame of each is chosen; a camera at rest adds no frames. A cut starts a new stretch.
-/// Frames are upright, progressive and with square pixels; HDR is converted to SDR. Replaces the frames of an earlier call in `folder`; its
+/// Frames are upright, progressive and with square pixels; HDR becomes SDR. Replaces the frames of an earlier call in `folder`; its
 /// other files stay. The folder changes only when all frames are written.
 ///
 /// `on_progress` is called for every frame, and at least every 0.1 s in the second pass. If it returns `false`, the function ends with
