@@ -337,7 +337,7 @@ fn hdr_is_converted() {
     let (video, folder) = (root.path().join("video.mkv"), root.path().join("frames"));
     // White of 100 cd/m², the diffuse white of SDR, is 51 % in PQ, a medium grey if it is taken for SDR.
     let input = ["-f", "lavfi", "-i", "color=c=0x828282:s=320x180:d=0.2:r=25", "-pix_fmt", "yuv420p10le"];
-    let colours = ["-color_primaries", "bt2020", "-color_trc", "smpte2084", "-colorspace", "bt2020nc"];
+    let colours = ["-vf", "setparams=color_primaries=bt2020:color_trc=smpte2084:colorspace=bt2020nc"];
     let arguments = [&input[..], &colours, &["-c:v", "ffv1", text(&video)]].concat();
     assert!(run_ffmpeg(root.path(), &arguments, &[]));
     let frames = extract(&video, &folder, Some(1)).unwrap();
