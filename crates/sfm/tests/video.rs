@@ -147,9 +147,15 @@ fn frames_are_equally_far_apart_and_a_pause_adds_none() {
 
     // 1.3 widths would be 22 frames at the usual distance.
     assert_eq!(extract(&video, &folder, None).unwrap().files.len(), 30);
-    // A frame for each motion, and all others of the larger number are removed.
+    // The others of the larger number are removed.
     assert_eq!(extract(&video, &folder, Some(1)).unwrap().files.len(), 1);
     assert_eq!(names(&folder).len(), 1);
+
+    // A relative path, which leads elsewhere from the folder of the frames.
+    let depth = std::env::current_dir().unwrap().components().skip(1).count();
+    let relative = Path::new(&"../".repeat(depth)).join(video.strip_prefix("/").unwrap_or(&video));
+    let deep = root.path().join("deep/".repeat(depth));
+    assert_eq!(extract(&relative, &deep, Some(1)).unwrap().files.len(), 1);
 }
 
 #[test]
@@ -204,13 +210,18 @@ fn exposure_is_no_motion_and_a_cut_is_one_stretch() {
         assert_eq!(frames.warnings, ["nothing moves in the video"]);
     }
 
-    // Two scenes of equal motion.
-    let cut = (0..100).map(|frame| view(if frame < 50 { &first } else { &second }, 4 * (frame % 50)));
+    // Two scenes of equal motion, and one at rest between them.
+    let cut = (0..120).map(|frame| match frame {
+        0..50 => view(&first, 4 * frame),
+        50..70 => view(&second, 600),
+        _ => view(&second, 4 * (frame - 70)),
+    });
     write_video(&video, &cut.collect::<Vec<_>>(), &[]);
-    let chosen = indices(&extract(&video, &folder, Some(16)).unwrap());
-    assert_eq!(chosen.len(), 16);
-    let before = chosen.iter().filter(|frame| **frame < 50).count();
-    assert!((7..=9).contains(&before), "{chosen:?}");
+    let chosen = indices(&extract(&video, &folder, Some(17)).unwrap());
+    assert_eq!(chosen.len(), 17);
+    let count = |from: usize, to: usize| chosen.iter().filter(|frame| (from..to).contains(*frame)).count();
+    assert_eq!(count(50, 70), 1, "{chosen:?}");
+    assert!((7..=9).contains(&count(0, 50)), "{chosen:?}");
 }
 
 #[test]

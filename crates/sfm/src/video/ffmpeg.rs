@@ -5,7 +5,7 @@ use globalsplat_files::{Error, Result};
 use serde_json::Value;
 use std::ffi::OsString;
 use std::io::{BufRead, BufReader, ErrorKind};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Command, Output, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::thread::JoinHandle;
@@ -42,7 +42,7 @@ impl Probe {
 /// Returns an error if there is no ffprobe.
 pub(super) fn probe(path: &Path) -> Result<Result<Probe>> {
     let mut command = command("ffprobe");
-    command.args(["-v", "error", "-of", "json", "-show_streams", "-show_format"]).arg(url(path)?);
+    command.args(["-v", "error", "-of", "json", "-show_streams", "-show_format"]).arg(absolute(path)?);
     let output = run(path, command)?;
     let no_video = |found: &str| Ok(Err(Error::input(path, "the content", found, "a video")));
     if !output.status.success() {
@@ -172,7 +172,7 @@ impl<'a> Converter<'a> {
         let mut command = command("ffmpeg");
         command
             .args(["-hide_banner", "-nostdin", "-nostats", "-v", "level+info", "-y", "-i"])
-            .arg(url(self.video)?);
+            .arg(absolute(self.video)?);
         command
             .args(["-map", &format!("0:{}", self.stream), "-vf", filter])
             .args(self.every_frame)
@@ -320,12 +320,9 @@ fn not_started(video: &Path, program: &str) -> impl FnOnce(std::io::Error) -> Er
     }
 }
 
-/// Returns the URL by which ffmpeg reads a file, whatever its name looks like.
-fn url(path: &Path) -> Result<OsString> {
-    let path = std::path::absolute(path).map_err(Error::read(path))?;
-    let mut url = OsString::from("file:");
-    url.push(path);
-    Ok(url)
+/// Returns the path by which ffmpeg reads a file: an absolute one, which it takes neither for an option nor for a URL.
+fn absolute(path: &Path) -> Result<PathBuf> {
+    std::path::absolute(path).map_err(Error::read(path))
 }
 
 /// Returns a line of ffmpeg without its prefixes: the module, such as "[mov @ 0x55aa]", the level, and the path of the video.
@@ -334,8 +331,8 @@ fn message_of(line: &str, video: &Path) -> String {
     while let Some((_, after)) = rest.strip_prefix('[').and_then(|prefix| prefix.split_once("] ")) {
         rest = after;
     }
-    let url = url(video).unwrap_or_default();
-    rest.strip_prefix(&format!("{}: ", url.to_string_lossy())).unwrap_or(rest).into()
+    let video = absolute(video).unwrap_or_default();
+    rest.strip_prefix(&format!("{}: ", video.display())).unwrap_or(rest).into()
 }
 
 /// Returns `true` if ffmpeg introduces itself as a version before 5.1, which has no -fps_mode. Later versions have no -vsync.
