@@ -215,8 +215,8 @@ pub fn estimate_poses(
         if estimate.record.report.is_none() {
             *estimate.record.seconds.entry(step).or_default() += start.elapsed().as_secs_f64();
         }
+        estimate.record.write(out)?;
         if outcome? == Outcome::Stopped {
-            estimate.record.write(out)?;
             return Ok(None);
         }
     }

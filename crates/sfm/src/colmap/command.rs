@@ -97,7 +97,7 @@ impl Command {
         let (sender, lines) = channel();
         send_lines(child.0.stdout.take().expect("a pipe was requested"), sender.clone());
         send_lines(child.0.stderr.take().expect("a pipe was requested"), sender);
-        let mut last_words = String::new();
+        let mut last_words = "without a message".to_string();
         loop {
             let is_wanted = match lines.recv_timeout(PAUSE) {
                 Ok(line) => {
@@ -123,7 +123,7 @@ impl Command {
             return Ok(Outcome::Stopped);
         }
         Err(Error::failed(format!(
-            "COLMAP's {} failed ({status}): {last_words}; see {}",
+            "COLMAP's {} failed: {last_words} ({status}); see {}",
             self.name,
             log.display()
         )))

@@ -11,7 +11,7 @@ import pycolmap  # noqa: E402
 
 def exit_with_parent():
     """Ends this process when standard input closes, as it does when the process that started it ends."""
-    sys.stdin.buffer.read()
+    os.read(0, 1)
     os._exit(1)
 
 
