@@ -7,7 +7,7 @@ export PYTHONUTF8 := 1
 .NOTPARALLEL:
 CARGO ?= cargo
 
-.PHONY: all setup venv weights build demo demo-training gpu-bundle test checks parity bench docker clean
+.PHONY: all setup venv weights poses build demo demo-training gpu-bundle test checks parity bench docker clean
 .DEFAULT_GOAL := build
 
 # Checks the build requirements and reports what is missing; creates .venv with libtorch unless LIBTORCH names another libtorch.
@@ -21,6 +21,10 @@ venv:
 # without the weights if it fails.
 weights:
 	@scripts/setup.sh weights
+
+# Installs pycolmap into .venv, for `globalsplat capture`.
+poses:
+	@scripts/setup.sh poses
 
 build: setup
 	@scripts/heartbeat.sh building $(CARGO) build --release --locked
@@ -58,7 +62,7 @@ checks: $(CHECKS) parity
 $(filter-out check-crates,$(CHECKS)): venv
 
 # Tests the crates that need neither libtorch nor Python. They run without LIBTORCH, so that none comes to need it.
-CRATES := $(addprefix -p globalsplat-,files torch-file capture splat-file synth)
+CRATES := $(addprefix -p globalsplat-,files torch-file capture splat-file synth sfm)
 check-crates:
 	env -u LIBTORCH $(CARGO) test --locked $(CRATES)
 	env -u LIBTORCH $(CARGO) test --locked -p globalsplat-splat-file --no-default-features

@@ -3,6 +3,7 @@
 # possible; without them, evaluation omits LPIPS.
 #   setup.sh           prepares the build: installs libtorch in .venv, unless LIBTORCH names one already
 #   setup.sh venv      always creates .venv, in which the parity checks run, and installs Node.js packages if Node.js is installed
+#   setup.sh poses     installs pycolmap in .venv, which finds the poses of photos
 #   setup.sh weights   downloads the LPIPS weights, or fails
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -21,6 +22,16 @@ weights() {
         return 0
     fi
     scripts/heartbeat.sh --always weights "$python" scripts/lpips_weights.py "$@"
+}
+
+# Makes .venv, unless it is there, and checks the version of the Python that it needs.
+make_venv() {
+    local python="${PYTHON:-python3}"
+    if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null; then
+        missing "no Python 3.10 or newer found; install one or name it with PYTHON=... (it brings libtorch and runs the parity checks)"
+    fi
+    [ -x .venv/bin/python ] || "$python" -m venv .venv \
+        || missing "$python can't make a virtual environment; install its venv module (Debian: apt install python3-venv)"
 }
 
 npm_ci=(npm ci --ignore-scripts --no-audit --no-fund --loglevel=error --no-update-notifier)
@@ -44,6 +55,12 @@ if [ "${1:-}" = weights ]; then
     weights
     exit
 fi
+if [ "${1:-}" = poses ]; then
+    make_venv
+    .venv/bin/python -m pip install --quiet --disable-pip-version-check -r requirements-poses.txt \
+        || missing "requirements-poses.txt can't be installed; see pip's message above"
+    exit
+fi
 
 command -v "${CARGO:-cargo}" >/dev/null || missing "no Rust found; install it with rustup, version 1.89 or newer"
 command -v "${CXX:-c++}" >/dev/null || missing "no C++ compiler found; install g++ or clang (Debian: apt install g++; macOS: xcode-select --install)"
@@ -57,13 +74,7 @@ if [ -n "${LIBTORCH:-}" ]; then
     fi
 fi
 
-python="${PYTHON:-python3}"
-if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null; then
-    missing "no Python 3.10 or newer found; install one or name it with PYTHON=... (it brings libtorch and runs the parity checks)"
-fi
-if [ ! -x .venv/bin/python ]; then
-    "$python" -m venv .venv || missing "$python can't make a virtual environment; install its venv module (Debian: apt install python3-venv)"
-fi
+make_venv
 if ! cmp -s requirements.txt .venv/requirements.txt; then
     echo "setup: installing what requirements.txt pins into .venv (libtorch is most of it)" >&2
     if [ ! -e .venv/libtorch ]; then

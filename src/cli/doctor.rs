@@ -12,13 +12,14 @@ use globalsplat::reconstruct::BUNDLED_MODEL;
 use globalsplat::render::cpu::{libtorch_simd_level, simd_level};
 use globalsplat::render::cuda::{Driver, Form, KernelUse, Nvrtc, Prepared, cache_folder, prepare, usage};
 use globalsplat::train::MemoryEstimate;
+use globalsplat_sfm::Colmap;
 use serde_json::{Value, json};
 use std::fmt::Display;
 use std::path::PathBuf;
 use tch::Device;
 
-/// Report what this machine offers: libtorch, devices, SIMD level, threads, GPUs and their requirements, and the weights and
-/// the ffmpeg found.
+/// Report what this machine offers: libtorch, devices, SIMD level, threads, GPUs and their requirements, and the weights,
+/// the ffmpeg and the COLMAP found.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat doctor\n  globalsplat doctor --kernels\n  \
     globalsplat doctor --config configs/re10k_16k.toml --set train.precision=bf16")]
@@ -57,6 +58,7 @@ impl Doctor {
         let prepared: Vec<Result<Prepared, String>> = (0..usable as i32).map(prepare).collect();
         let cache = cache_folder().map(|folder| folder.display().to_string());
         let (together, ffmpeg) = (Backends::built_in(), find_ffmpeg());
+        let colmap = Colmap::find().map(|colmap| colmap.to_string()).map_err(|why| why.to_string());
         let precision = Precision::fastest_on(Device::Cpu);
         let denormals = if are_denormals_flushed() { "taken for 0" } else { "kept" };
         if self.json {
@@ -84,6 +86,7 @@ impl Doctor {
                 "model": BUNDLED_MODEL,
                 "weights": found,
                 "ffmpeg": or_error(&ffmpeg, |version| json!(version)),
+                "colmap": or_error(&colmap, |found| json!(found)),
                 "viewer": view::has_viewer(),
                 "together": { "gloo": together.gloo, "nccl": together.nccl },
             }));
@@ -164,6 +167,10 @@ impl Doctor {
         match &ffmpeg {
             Err(why) => line("ffmpeg", &format!("absent, so films are GIFs: {why}")),
             Ok(version) => line("ffmpeg", &format!("{version}, for films in MP4")),
+        }
+        match &colmap {
+            Err(why) => line("colmap", &format!("absent, so photos need poses: {why}")),
+            Ok(found) => line("colmap", &format!("{found}, for the poses of photos")),
         }
         Ok(())
     }

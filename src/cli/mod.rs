@@ -9,6 +9,7 @@ mod bench_common;
 mod bench_model;
 mod bench_refine;
 mod bench_train;
+mod capture;
 mod convert;
 mod device;
 mod doctor;
@@ -64,6 +65,7 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
+    Capture(capture::Capture),
     Train(train::Train),
     Watch(watch::Watch),
     Eval(eval::Eval),
@@ -87,6 +89,7 @@ enum Command {
 impl Command {
     fn run(self) -> anyhow::Result<()> {
         match self {
+            Command::Capture(command) => command.run(),
             Command::Train(command) => command.run(),
             Command::Watch(command) => command.run(),
             Command::Eval(command) => command.run(),

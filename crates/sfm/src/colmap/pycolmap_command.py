@@ -1,0 +1,62 @@
+# Runs a command of COLMAP by pycolmap, with the options of COLMAP's own program.
+# Arguments: COMMAND, and a JSON object of options: {"database_path": "…", "FeatureExtraction.use_gpu": false, …}.
+import json
+import os
+import sys
+import threading
+
+sys.path = [path for path in sys.path if path]
+import pycolmap  # noqa: E402
+
+
+def exit_with_parent():
+    """Ends this process when standard input closes, as it does when the process that started it ends."""
+    os.read(0, 1)
+    os._exit(1)
+
+
+threading.Thread(target=exit_with_parent, daemon=True).start()
+pycolmap.logging.logtostderr = True
+options = json.loads(sys.argv[2])
+extraction, matching = pycolmap.FeatureExtractionOptions(), pycolmap.FeatureMatchingOptions()
+sections = {
+    "ImageReader": pycolmap.ImageReaderOptions(),
+    "FeatureExtraction": extraction,
+    "SiftExtraction": extraction.sift,
+    "FeatureMatching": matching,
+    "Mapper": pycolmap.IncrementalPipelineOptions(),
+}
+camera_mode = pycolmap.CameraMode.AUTO
+for name in list(options):
+    section, _, key = name.partition(".")
+    if key == "single_camera_per_image":
+        camera_mode = pycolmap.CameraMode.PER_IMAGE
+    elif key:
+        setattr(sections[section], key, options[name])
+
+database = options["database_path"]
+if sys.argv[1] == "feature_extractor":
+    with open(options["image_list_path"], encoding="utf-8") as file:
+        names = file.read().splitlines()
+    pycolmap.extract_features(
+        database,
+        options["image_path"],
+        image_names=names,
+        camera_mode=camera_mode,
+        reader_options=sections["ImageReader"],
+        extraction_options=extraction,
+        device=pycolmap.Device.cpu,
+    )
+elif sys.argv[1] == "matches_importer":
+    pairing = pycolmap.ImportedPairingOptions(match_list_path=options["match_list_path"])
+    pycolmap.match_image_pairs(
+        database, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu
+    )
+elif sys.argv[1] == "spatial_matcher":
+    pycolmap.match_spatial(database, matching_options=matching, device=pycolmap.Device.cpu)
+elif sys.argv[1] == "mapper":
+    pycolmap.incremental_mapping(
+        database, options["image_path"], options["output_path"], options=sections["Mapper"]
+    )
+else:
+    sys.exit(f"unknown command {sys.argv[1]}")

@@ -1,0 +1,561 @@
+//! Estimates the poses of the photos in a folder, step by step.
+
+use crate::colmap::{
+    CAMERA_MODELS, Colmap, Command, ModelSummary, Outcome, exhaustive_pairs, read_models, sequential_pairs,
+};
+use crate::photos::{FoundPhoto, Photo, SkippedPhoto, import_photos, list_photos};
+use crate::record::{FILE, Record};
+use globalsplat_files::{Error, Result, write_atomically};
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+use std::time::Instant;
+
+/// Maximum number of photos of which every pair is matched by default.
+const EXHAUSTIVE_PHOTOS: usize = 200;
+/// Distance up to which photos in shooting order are matched.
+const OVERLAP: usize = 10;
+/// Number of pairs that one call of COLMAP matches.
+const PAIRS_PER_CALL: usize = 256;
+
+/// Side in pixels to which larger photos are reduced before features are detected.
+const MAX_SIDE: u32 = 1600;
+/// Side from which the photo isn't enlarged twofold before features are detected.
+const UPSAMPLED_SIDE: u32 = 1000;
+/// Number of features per photo.
+const FEATURES: u32 = 2048;
+
+/// Minimum number of photos with one camera for which the camera has separate focal lengths and tangential distortion.
+const OPENCV_PHOTOS: usize = 10;
+/// Focal length of photos without EXIF, relative to their longer side: that of a phone's or a camera's wide lens. The estimate may fail if
+/// it is far off.
+const FOCAL: f64 = 0.85;
+/// [`FOCAL`] of a fisheye lens.
+const FISHEYE_FOCAL: f64 = 0.4;
+
+/// Share of the photos below which a report says what to try.
+const FEW_PLACED: f64 = 0.8;
+
+/// How pairs of photos to match are chosen.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Matching {
+    /// [`Matching::Exhaustive`] for up to 200 photos, otherwise [`Matching::Sequential`].
+    #[default]
+    Auto,
+    /// Every pair.
+    Exhaustive,
+    /// Each photo with the 10 next ones in order of their names, with those 16, 32, 64, … later, and with those taken nearby if the
+    /// photos have GPS positions.
+    Sequential,
+}
+
+impl FromStr for Matching {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "auto" => Ok(Matching::Auto),
+            "exhaustive" => Ok(Matching::Exhaustive),
+            "sequential" => Ok(Matching::Sequential),
+            _ => Err("expected auto, exhaustive or sequential".into()),
+        }
+    }
+}
+
+/// Settings of [`estimate_poses`].
+#[derive(Debug, Clone, Default)]
+pub struct PoseOptions {
+    /// One of [`CAMERA_MODELS`]. By default OPENCV for 10 or more photos of the same size, and SIMPLE_RADIAL for fewer.
+    pub camera_model: Option<String>,
+    /// Choice of pairs.
+    pub matching: Matching,
+}
+
+/// Steps of [`estimate_poses`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Step {
+    /// Photos are checked and linked.
+    Photos,
+    /// Features are detected in photos.
+    Features,
+    /// Features of pairs of photos are matched.
+    Pairs,
+    /// Photos are placed.
+    Poses,
+}
+
+impl Step {
+    /// Returns what the step counts.
+    pub fn unit(self) -> &'static str {
+        match self {
+            Step::Photos => "photos checked",
+            Step::Features => "photos with features",
+            Step::Pairs => "pairs matched",
+            Step::Poses => "photos placed",
+        }
+    }
+}
+
+/// Progress of [`estimate_poses`].
+#[derive(Debug, Clone, Copy)]
+pub struct PoseProgress {
+    /// Current step.
+    pub step: Step,
+    /// Number of photos or pairs that the step is finished with.
+    pub done: usize,
+    /// Number of photos or pairs in all.
+    pub total: usize,
+}
+
+/// Result of [`estimate_poses`].
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct PoseReport {
+    /// Version of COLMAP, as `pycolmap 4.2.1`.
+    pub colmap: String,
+    /// Number of photos found.
+    pub photos: usize,
+    /// Number of photos in the largest model.
+    pub placed: usize,
+    /// Number of photos of each model, the largest first. Readers of captures use the largest.
+    pub models: Vec<usize>,
+    /// Mean reprojection error of the largest model in pixels.
+    pub reprojection_error: f64,
+    /// Number of points of the largest model.
+    pub points: usize,
+    /// Photos that are damaged, show nothing, or are identical to another.
+    pub skipped: Vec<SkippedPhoto>,
+    /// Names of the other photos that aren't in the largest model.
+    pub unplaced: Vec<String>,
+    /// Sentences on what to try if few photos were placed.
+    pub advice: Vec<String>,
+    /// Seconds that each step took.
+    pub seconds: BTreeMap<Step, f64>,
+}
+
+/// Formats the result in sentences, one per line.
+impl fmt::Display for PoseReport {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        let PoseReport { photos, placed, points, reprojection_error, .. } = self;
+        write!(
+            f,
+            "{placed} of {photos} photos placed, {points} points, reprojection error {reprojection_error:.2} pixels"
+        )?;
+        if self.models.len() > 1 {
+            write!(f, "\n{} separate models, of which the largest is used", self.models.len())?;
+        }
+        if !self.skipped.is_empty() {
+            let skipped = self.skipped.iter().map(|photo| format!("{} ({})", photo.name, photo.reason));
+            write!(f, "\nnot used: {}", format_first(skipped))?;
+        }
+        if !self.unplaced.is_empty() {
+            write!(f, "\nnot placed: {}", format_first(self.unplaced.iter().cloned()))?;
+        }
+        self.advice.iter().try_for_each(|sentence| write!(f, "\n{sentence}"))
+    }
+}
+
+/// Joins the first few of `items`, and the number of the others.
+fn format_first(items: impl ExactSizeIterator<Item = String>) -> String {
+    const SHOWN: usize = 5;
+    let others = items.len().saturating_sub(SHOWN);
+    let shown = items.take(SHOWN).collect::<Vec<_>>().join(", ");
+    if others > 0 { format!("{shown} and {others} more") } else { shown }
+}
+
+/// Estimates the poses of the photos in the folder `photos` by `colmap`, on all cores, and writes a capture to the folder `out`: the photos
+/// in `images`, and COLMAP's models in `sparse/0`, `sparse/1`, …
+///
+/// `on_progress` is called several times a second. If it returns `false`, COLMAP is stopped and the result is `None`; the same call
+/// continues where it was stopped. `capture.json` records how far the estimate is. A call with other settings repeats what depends on
+/// them.
+///
+/// Photos that are damaged, of a single colour or identical to another are left out and reported.
+///
+/// # Errors
+/// Returns an error if there are fewer than two different photos; if `out` contains something else, or the capture of other photos; if
+/// COLMAP fails; or if it places no photo.
+pub fn estimate_poses(
+    photos: &Path,
+    out: &Path,
+    options: &PoseOptions,
+    colmap: &Colmap,
+    on_progress: &mut dyn FnMut(PoseProgress) -> bool,
+) -> Result<Option<PoseReport>> {
+    if let Some(model) = options.camera_model.as_deref().filter(|model| !CAMERA_MODELS.contains(model)) {
+        return Err(Error::setting(
+            "the camera model",
+            model,
+            format!("one of {}", CAMERA_MODELS.join(", ")),
+        ));
+    }
+    check_folders(photos, out)?;
+    let found = list_photos(photos)?;
+    if found.len() < 2 {
+        return Err(Error::input(photos, "the number of photos", found.len(), "2 or more JPEG or PNG files"));
+    }
+    let images = out.join("images");
+    let record = prepare_record(photos, out, options, colmap, found)?;
+    fs::create_dir_all(&images).map_err(Error::write(&images))?;
+    record.write(out)?;
+    let mut estimate = Estimate { out, images, colmap, record, on_progress };
+    let steps: [(Step, fn(&mut Estimate, &Path) -> Result<Outcome>); 4] = [
+        (Step::Photos, |estimate, photos| estimate.import(photos)),
+        (Step::Features, |estimate, _| estimate.extract_features()),
+        (Step::Pairs, |estimate, _| estimate.match_pairs()),
+        (Step::Poses, |estimate, _| estimate.place_photos()),
+    ];
+    for (step, run) in steps {
+        let start = Instant::now();
+        let outcome = run(&mut estimate, photos);
+        if estimate.record.report.is_none() {
+            *estimate.record.seconds.entry(step).or_default() += start.elapsed().as_secs_f64();
+        }
+        estimate.record.write(out)?;
+        if outcome? == Outcome::Stopped {
+            return Ok(None);
+        }
+    }
+    if estimate.record.report.is_none() {
+        estimate.record.report = Some(estimate.report()?);
+        estimate.record.write(out)?;
+    }
+    Ok(estimate.record.report)
+}
+
+/// Checks that a capture of the photos in `photos` may be written to `out`: the photos may be the capture's own images, but no other folder
+/// of photos may contain the capture, which would then be found among the photos.
+fn check_folders(photos: &Path, out: &Path) -> Result<()> {
+    let canonical = photos.canonicalize().map_err(Error::read(photos))?;
+    let existing = out.ancestors().find_map(|folder| {
+        let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
+        folder.canonicalize().ok()
+    });
+    if existing.is_some_and(|out| out.starts_with(&canonical)) {
+        let expected = format!("a folder outside of {}", photos.display());
+        return Err(Error::input(out, "the output", "inside the folder of photos", expected));
+    }
+    Ok(())
+}
+
+/// Returns the record of the estimate: the one in `out`, without what depends on settings that have changed, or a new one.
+fn prepare_record(
+    photos: &Path,
+    out: &Path,
+    options: &PoseOptions,
+    colmap: &Colmap,
+    found: Vec<FoundPhoto>,
+) -> Result<Record> {
+    let PoseOptions { camera_model, matching } = options.clone();
+    let new = Record {
+        colmap: colmap.name_and_version(),
+        camera_model,
+        matching,
+        found,
+        photos: None,
+        skipped: vec![],
+        has_cameras: false,
+        has_features: false,
+        matched_pairs: 0,
+        seconds: BTreeMap::new(),
+        report: None,
+    };
+    let Some(old) = Record::read(out)? else {
+        check_new_folder(photos, out)?;
+        return Ok(new);
+    };
+    if old.found != new.found {
+        return Err(Error::input(
+            out.join(FILE),
+            "the list of photos",
+            format!("that of {} other or changed photos", old.found.len()),
+            format!("the {} photos of {}, or a folder without a capture", new.found.len(), photos.display()),
+        ));
+    }
+    let mut record = Record { colmap: new.colmap, camera_model: new.camera_model, matching, ..old.clone() };
+    if (&record.colmap, &record.camera_model) != (&old.colmap, &old.camera_model) {
+        record.has_cameras = false;
+        record.has_features = false;
+        record.matched_pairs = 0;
+        record.seconds.retain(|step, _| *step == Step::Photos);
+        record.report = None;
+    } else if record.matching != old.matching {
+        record.matched_pairs = 0;
+        record.seconds.remove(&Step::Poses);
+        record.report = None;
+    }
+    Ok(record)
+}
+
+/// Checks that the folder `out` is missing, empty, or has nothing but the photos.
+fn check_new_folder(photos: &Path, out: &Path) -> Result<()> {
+    let photos = photos.canonicalize().map_err(Error::read(photos))?;
+    for entry in fs::read_dir(out).into_iter().flatten().flatten() {
+        if entry.path().canonicalize().ok().as_ref() != Some(&photos) {
+            let found = format!("a folder with {}", entry.file_name().display());
+            return Err(Error::input(out, "the output", found, "a new folder, or one with such a capture"));
+        }
+    }
+    Ok(())
+}
+
+/// An estimate at work.
+struct Estimate<'a> {
+    out: &'a Path,
+    /// Folder of the photos that COLMAP reads.
+    images: PathBuf,
+    colmap: &'a Colmap,
+    record: Record,
+    on_progress: &'a mut dyn FnMut(PoseProgress) -> bool,
+}
+
+impl Estimate<'_> {
+    fn import(&mut self, source: &Path) -> Result<Outcome> {
+        if self.record.photos.is_none() {
+            let total = self.record.found.len();
+            let mut report = |done| (self.on_progress)(PoseProgress { step: Step::Photos, done, total });
+            let imported = import_photos(source, &self.record.found, &self.images, &mut report)?;
+            let Some(imported) = imported else { return Ok(Outcome::Stopped) };
+            if imported.photos.len() < 2 {
+                return Err(too_few(source, total, &imported.skipped));
+            }
+            self.record.photos = Some(imported.photos);
+            self.record.skipped = imported.skipped;
+            self.record.write(self.out)?;
+        }
+        Ok(Outcome::Finished)
+    }
+
+    fn photos(&self) -> &[Photo] {
+        self.record.photos.as_deref().unwrap_or_default()
+    }
+
+    fn database(&self) -> PathBuf {
+        self.out.join("database.db")
+    }
+
+    /// Runs a command on the database. `count` is added to the counts that it reports of `step`.
+    fn run(&mut self, command: Command, step: Step, before: usize, total: usize) -> Result<Outcome> {
+        let command = command.path("database_path", &self.database());
+        let mut done = before;
+        command.run(self.colmap, &self.out.join("colmap.log"), &mut |count| {
+            done = count.map_or(done, |count| (before + count).min(total));
+            (self.on_progress)(PoseProgress { step, done, total })
+        })
+    }
+
+    /// Detects features. Photos of one size share a camera, whose number is that of their group.
+    fn extract_features(&mut self) -> Result<Outcome> {
+        if self.record.has_features {
+            return Ok(Outcome::Finished);
+        }
+        let groups = group_by_size(self.photos());
+        let total = self.photos().len();
+        if !self.record.has_cameras {
+            // COLMAP would give photos a second camera if it was stopped between writing the first one and its photo.
+            for suffix in ["", "-wal", "-shm"] {
+                let _ = fs::remove_file(self.out.join(format!("database.db{suffix}")));
+            }
+            for (number, group) in groups.shared.iter().enumerate() {
+                let first = self.extraction(&group[..1], group.len())?;
+                if self.run(first, Step::Features, number, total)? == Outcome::Stopped {
+                    return Ok(Outcome::Stopped);
+                }
+            }
+            self.record.has_cameras = true;
+            self.record.write(self.out)?;
+        }
+        let mut before = 0;
+        for (number, group) in groups.shared.iter().enumerate() {
+            let rest =
+                self.extraction(group, group.len())?.option("ImageReader.existing_camera_id", number + 1);
+            if self.run(rest, Step::Features, before, total)? == Outcome::Stopped {
+                return Ok(Outcome::Stopped);
+            }
+            before += group.len();
+        }
+        if !groups.single.is_empty() {
+            let singles =
+                self.extraction(&groups.single, 1)?.option("ImageReader.single_camera_per_image", true);
+            if self.run(singles, Step::Features, before, total)? == Outcome::Stopped {
+                return Ok(Outcome::Stopped);
+            }
+        }
+        self.record.has_features = true;
+        self.record.write(self.out)?;
+        Ok(Outcome::Finished)
+    }
+
+    /// Returns the command that extracts the features of `photos`, whose camera has `sharing` photos.
+    fn extraction(&self, photos: &[Photo], sharing: usize) -> Result<Command> {
+        let default = if sharing >= OPENCV_PHOTOS { "OPENCV" } else { "SIMPLE_RADIAL" };
+        let model = self.record.camera_model.as_deref().unwrap_or(default);
+        let focal = if model.contains("FISHEYE") { FISHEYE_FOCAL } else { FOCAL };
+        let side = photos.iter().map(|photo| photo.width.max(photo.height)).max().unwrap_or(0);
+        let list = self.write_list("photos.txt", photos.iter().map(|photo| photo.name.clone()))?;
+        Ok(Command::new("feature_extractor")
+            .path("image_path", &self.images)
+            .path("image_list_path", &list)
+            .option("ImageReader.camera_model", model)
+            .option("ImageReader.default_focal_length_factor", focal)
+            .option("FeatureExtraction.use_gpu", false)
+            .option("FeatureExtraction.max_image_size", MAX_SIDE)
+            .option("SiftExtraction.max_num_features", FEATURES)
+            .option("SiftExtraction.first_octave", if side < UPSAMPLED_SIDE { -1 } else { 0 }))
+    }
+
+    fn write_list(&self, name: &str, lines: impl Iterator<Item = String>) -> Result<PathBuf> {
+        let path = self.out.join(name);
+        write_atomically(&path, |writer| {
+            lines.into_iter().try_for_each(|line| writeln!(writer, "{line}").map_err(Error::write(&path)))
+        })?;
+        Ok(path)
+    }
+
+    fn match_pairs(&mut self) -> Result<Outcome> {
+        let count = self.photos().len();
+        let is_exhaustive = match self.record.matching {
+            Matching::Auto => count <= EXHAUSTIVE_PHOTOS,
+            matching => matching == Matching::Exhaustive,
+        };
+        let pairs = if is_exhaustive { exhaustive_pairs(count) } else { sequential_pairs(count, OVERLAP) };
+        while self.record.matched_pairs < pairs.len() {
+            let done = self.record.matched_pairs;
+            let next = &pairs[done..pairs.len().min(done + PAIRS_PER_CALL)];
+            let names: Vec<&str> = self.photos().iter().map(|photo| photo.name.as_str()).collect();
+            let lines = next.iter().map(|&(a, b)| format!("{} {}", names[a], names[b]));
+            let list = self.write_list("pairs.txt", lines)?;
+            let command = Command::new("matches_importer")
+                .path("match_list_path", &list)
+                .option("FeatureMatching.use_gpu", false);
+            if self.run(command, Step::Pairs, done, pairs.len())? == Outcome::Stopped {
+                return Ok(Outcome::Stopped);
+            }
+            if done + next.len() == pairs.len() && !is_exhaustive {
+                // Does nothing if no photo has a position.
+                let nearby = Command::new("spatial_matcher").option("FeatureMatching.use_gpu", false);
+                if self.run(nearby, Step::Pairs, pairs.len(), pairs.len())? == Outcome::Stopped {
+                    return Ok(Outcome::Stopped);
+                }
+            }
+            self.record.matched_pairs += next.len();
+            self.record.write(self.out)?;
+        }
+        Ok(Outcome::Finished)
+    }
+
+    fn place_photos(&mut self) -> Result<Outcome> {
+        if self.record.report.is_some() {
+            return Ok(Outcome::Finished);
+        }
+        let [sparse, partial] = ["sparse", "sparse.partial"].map(|name| self.out.join(name));
+        let remove = |folder: &Path| match folder.is_dir() {
+            true => fs::remove_dir_all(folder).map_err(Error::write(folder)),
+            false => Ok(()),
+        };
+        remove(&partial)?;
+        fs::create_dir(&partial).map_err(Error::write(&partial))?;
+        let mapper = Command::new("mapper").path("image_path", &self.images).path("output_path", &partial);
+        let outcome = self.run(mapper, Step::Poses, 0, self.photos().len());
+        // COLMAP's program fails if it places no photo, which is reported in other words.
+        let is_empty = fs::read_dir(&partial).map_err(Error::read(&partial))?.next().is_none();
+        match outcome {
+            Ok(Outcome::Stopped) => return Ok(Outcome::Stopped),
+            Err(_) | Ok(_) if is_empty => return Err(none_placed(self.photos().len(), self.out)),
+            outcome => outcome?,
+        };
+        remove(&sparse)?;
+        fs::rename(&partial, &sparse).map_err(Error::write(&sparse))?;
+        Ok(Outcome::Finished)
+    }
+
+    fn report(&self) -> Result<PoseReport> {
+        let mut models = read_models(&self.out.join("sparse"))?.into_iter();
+        let Some(largest) = models.next().filter(|model| model.names.len() >= 2) else {
+            return Err(none_placed(self.photos().len(), self.out));
+        };
+        let ModelSummary { names, points, error } = largest;
+        let placed: BTreeSet<&str> = names.iter().map(String::as_str).collect();
+        let unplaced = self.photos().iter().filter(|photo| !placed.contains(photo.name.as_str()));
+        let unplaced: Vec<String> = unplaced.map(|photo| photo.name.clone()).collect();
+        let models: Vec<usize> =
+            [names.len()].into_iter().chain(models.map(|model| model.names.len())).collect();
+        Ok(PoseReport {
+            colmap: self.record.colmap.clone(),
+            photos: self.record.found.len(),
+            placed: names.len(),
+            reprojection_error: error,
+            points,
+            skipped: self.record.skipped.clone(),
+            advice: self.advice(&models),
+            unplaced,
+            models,
+            seconds: self.record.seconds.clone(),
+        })
+    }
+
+    /// Returns what to try if the largest of `models` has few of the photos.
+    fn advice(&self, models: &[usize]) -> Vec<String> {
+        let mut advice = vec![];
+        if models[0] as f64 >= FEW_PLACED * self.photos().len() as f64 {
+            return advice;
+        }
+        if models.len() > 1 {
+            advice.push(
+                "The models have no photo that connects them: take photos in between, unless they show different places."
+                    .to_string(),
+            );
+        }
+        advice.push(
+            "Photos are placed if they overlap others by two thirds, are sharp, and show surfaces with texture.".into(),
+        );
+        if self.record.camera_model.is_none() {
+            advice.push(
+                "Photos of a fisheye or wide lens may need another camera model, such as OPENCV_FISHEYE."
+                    .into(),
+            );
+        }
+        if self.record.matching != Matching::Exhaustive && self.photos().len() > EXHAUSTIVE_PHOTOS {
+            advice
+                .push("Photos whose names aren't in the order of shooting need exhaustive matching.".into());
+        }
+        advice
+    }
+}
+
+/// Photos by their cameras.
+struct CameraGroups {
+    /// Photos of one size each, two or more.
+    shared: Vec<Vec<Photo>>,
+    /// Photos whose size no other has.
+    single: Vec<Photo>,
+}
+
+fn group_by_size(photos: &[Photo]) -> CameraGroups {
+    let mut groups = BTreeMap::<_, Vec<Photo>>::new();
+    for photo in photos {
+        groups.entry((photo.width, photo.height)).or_default().push(photo.clone());
+    }
+    let (single, shared): (Vec<_>, Vec<_>) = groups.into_values().partition(|group| group.len() == 1);
+    CameraGroups { shared, single: single.into_iter().flatten().collect() }
+}
+
+/// Returns the error for a folder of `total` photos of which fewer than two aren't `skipped`.
+fn too_few(folder: &Path, total: usize, skipped: &[SkippedPhoto]) -> Error {
+    let reasons = skipped.iter().map(|photo| format!("{} is {}", photo.name, photo.reason));
+    let found = format!("{total}, of which {} can't be used ({})", skipped.len(), format_first(reasons));
+    Error::input(folder, "the number of photos", found, "2 or more different ones")
+}
+
+/// Returns the error if none of `count` photos was placed.
+fn none_placed(count: usize, out: &Path) -> Error {
+    Error::failed(format!(
+        "COLMAP placed none of the {count} photos: they may overlap too little, be blurred, lack texture, show different places, or be \
+         taken from a single point; see {}",
+        out.join("colmap.log").display()
+    ))
+}

@@ -1,0 +1,258 @@
+//! Photos of a folder, checked and brought into a capture's folder of images.
+
+use globalsplat_capture::{PHOTO_EXTENSIONS, decode_photo, encode_photo, read_image_size};
+use globalsplat_files::{Error, Result, checksum, write_atomically};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use std::collections::{HashMap, HashSet};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// Maximum difference between values of a photo that shows nothing, such as one taken with the lens cap on.
+const BLANK: u8 = 8;
+
+/// A photo of the given folder, as it was found.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct FoundPhoto {
+    /// Path relative to the folder, with `/` as the separator.
+    pub name: String,
+    /// Size of the file.
+    pub bytes: u64,
+    /// CRC-32 of its contents.
+    pub checksum: u32,
+}
+
+/// A photo in the folder of images that COLMAP reads.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(crate) struct Photo {
+    /// Path relative to the folder of images. It has no spaces, which separate names in COLMAP's lists.
+    pub name: String,
+    /// Width in pixels.
+    pub width: u32,
+    /// Height in pixels.
+    pub height: u32,
+}
+
+/// A photo that isn't used.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct SkippedPhoto {
+    /// Path relative to the folder of photos.
+    pub name: String,
+    /// Why the photo isn't used, in a few words.
+    pub reason: String,
+}
+
+/// Returns the photos in `folder` and its subfolders, in order of their names. Hidden files and folders are ignored.
+///
+/// # Errors
+/// Returns an error if a folder or a photo can't be read, or if there is no photo.
+pub(crate) fn list_photos(folder: &Path) -> Result<Vec<FoundPhoto>> {
+    let mut paths = vec![];
+    collect_photos(folder, &mut paths)?;
+    paths.sort();
+    let describe = |path: &PathBuf| {
+        let bytes = fs::metadata(path).map_err(Error::read(path))?.len();
+        let name = path.strip_prefix(folder).unwrap_or(path).to_string_lossy().replace('\\', "/");
+        Ok(FoundPhoto { name, bytes, checksum: checksum([path])? })
+    };
+    paths.par_iter().map(describe).collect()
+}
+
+fn collect_photos(folder: &Path, paths: &mut Vec<PathBuf>) -> Result<()> {
+    for entry in fs::read_dir(folder).map_err(Error::read(folder))? {
+        let entry = entry.map_err(Error::read(folder))?;
+        let path = entry.path();
+        let extension = path.extension().unwrap_or_default().to_ascii_lowercase();
+        if entry.file_name().as_encoded_bytes().starts_with(b".") {
+        } else if path.is_dir() {
+            collect_photos(&path, paths)?;
+        } else if PHOTO_EXTENSIONS.iter().any(|known| extension == *known) {
+            paths.push(path);
+        }
+    }
+    Ok(())
+}
+
+/// Photos of a folder after [`import_photos`].
+#[derive(Debug, Default)]
+pub(crate) struct ImportedPhotos {
+    /// Photos in the folder of images, in the order in which they were found.
+    pub photos: Vec<Photo>,
+    /// Photos that are damaged, show nothing, or are identical to another.
+    pub skipped: Vec<SkippedPhoto>,
+}
+
+/// Brings the photos `found` in `source` into the folder `images`, by a hard link where the file system allows it. Photos that EXIF
+/// says to rotate are written upright, since COLMAP reads pixels as they are stored. Returns `None` if `on_photo`, which gets the number of
+/// photos that were looked at, returns `false`.
+///
+/// # Errors
+/// Returns an error if a file can't be written.
+pub(crate) fn import_photos(
+    source: &Path,
+    found: &[FoundPhoto],
+    images: &Path,
+    on_photo: &mut dyn FnMut(usize) -> bool,
+) -> Result<Option<ImportedPhotos>> {
+    let mut imported = ImportedPhotos::default();
+    let mut first_of = HashMap::new();
+    let mut distinct = vec![];
+    for photo in found {
+        let first = *first_of.entry((photo.bytes, photo.checksum)).or_insert(&photo.name);
+        if *first == photo.name {
+            distinct.push(photo);
+        } else {
+            let reason = format!("identical to {first}");
+            imported.skipped.push(SkippedPhoto { name: photo.name.clone(), reason });
+        }
+    }
+    let mut names = HashSet::new();
+    let mut done = imported.skipped.len();
+    // Few photos at a time, for progress and memory.
+    for few in distinct.chunks(2 * rayon::current_num_threads()) {
+        let read = |photo: &&FoundPhoto| inspect(&source.join(&photo.name));
+        let read: Vec<_> = few.par_iter().map(read).collect();
+        for (photo, inspected) in few.iter().zip(read) {
+            match inspected {
+                Ok(inspected) => {
+                    let name = list_name(&photo.name, &mut names);
+                    place(&source.join(&photo.name), inspected.upright, &images.join(&name))?;
+                    imported.photos.push(Photo { name, width: inspected.width, height: inspected.height });
+                }
+                Err(reason) => imported.skipped.push(SkippedPhoto { name: photo.name.clone(), reason }),
+            }
+        }
+        done += few.len();
+        if !on_photo(done) {
+            return Ok(None);
+        }
+    }
+    Ok(Some(imported))
+}
+
+/// Returns a name that COLMAP's lists can hold, and that differs from `taken`, to which it is added.
+fn list_name(name: &str, taken: &mut HashSet<String>) -> String {
+    let is_separator = |c: char| c.is_whitespace() || c.is_control();
+    let mut safe: String = name.chars().map(|c| if is_separator(c) { '_' } else { c }).collect();
+    while !taken.insert(safe.clone()) {
+        let (folder, file) =
+            safe.rsplit_once('/').map_or(("", safe.as_str()), |(folder, file)| (folder, file));
+        safe = if folder.is_empty() { format!("_{file}") } else { format!("{folder}/_{file}") };
+    }
+    safe
+}
+
+/// A photo that was decoded: the size of its upright pixels, and the upright photo's contents if they differ from the file.
+struct Inspected {
+    width: u32,
+    height: u32,
+    upright: Option<Vec<u8>>,
+}
+
+/// Decodes the photo at `path`; returns why it can't be used if it is damaged or shows nothing.
+fn inspect(path: &Path) -> Result<Inspected, String> {
+    let refuse = |why: Error| match why {
+        Error::Input { found, .. } => found,
+        other => other.to_string(),
+    };
+    let encoded = fs::read(path).map_err(|why| format!("unreadable ({why})"))?;
+    let (width, height) = read_image_size(path).map_err(refuse)?;
+    // Declaring the sides in the other order has the photo rotated if its EXIF says so.
+    let decoded = decode_photo(&encoded, path, (height, width)).map_err(refuse)?;
+    let pixels = decoded.pixels;
+    let (darkest, brightest) =
+        pixels.iter().fold((u8::MAX, u8::MIN), |(low, high), &value| (low.min(value), high.max(value)));
+    if brightest - darkest <= BLANK {
+        return Err("of a single colour".into());
+    }
+    let is_rotated = pixels.dimensions() != (width, height);
+    let upright = is_rotated.then(|| encode_photo(&pixels, decoded.is_jpeg)).transpose().map_err(refuse)?;
+    Ok(Inspected { width: pixels.width(), height: pixels.height(), upright })
+}
+
+/// Writes `contents` to `target`, or links `target` to the file `source`, copying it if it can't be linked.
+fn place(source: &Path, contents: Option<Vec<u8>>, target: &Path) -> Result<()> {
+    let source = source.canonicalize().map_err(Error::read(source))?;
+    if target.canonicalize().is_ok_and(|target| target == source) {
+        return match contents {
+            None => Ok(()),
+            Some(_) => Err(Error::input(
+                target,
+                "the orientation",
+                "a rotation in EXIF, which needs an upright copy",
+                "an output whose images aren't the photos themselves",
+            )),
+        };
+    }
+    let folder = target.parent().unwrap_or(target);
+    fs::create_dir_all(folder).map_err(Error::write(folder))?;
+    if let Some(contents) = contents {
+        return write_atomically(target, |writer| writer.write_all(&contents).map_err(Error::write(target)));
+    }
+    // A link that an earlier run left may be to another file.
+    let _ = fs::remove_file(target);
+    if fs::hard_link(&source, target).is_err() {
+        fs::copy(&source, target).map_err(Error::write(target))?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use image::{ImageFormat, RgbImage};
+
+    fn write_photo(path: &Path, seed: u8) {
+        let photo = RgbImage::from_fn(16, 8, |x, y| image::Rgb([x as u8 * 9, y as u8 * 9, seed]));
+        photo.save_with_format(path, ImageFormat::Png).unwrap();
+    }
+
+    fn import(source: &Path, images: &Path) -> ImportedPhotos {
+        import_photos(source, &list_photos(source).unwrap(), images, &mut |_| true).unwrap().unwrap()
+    }
+
+    #[test]
+    fn useless_photos_are_skipped_and_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let (source, images) = (folder.path().join("photos"), folder.path().join("images"));
+        fs::create_dir_all(source.join("b")).unwrap();
+        write_photo(&source.join("a 1.png"), 1);
+        write_photo(&source.join("a_1.png"), 2);
+        write_photo(&source.join("b/2.png"), 3);
+        fs::copy(source.join("b/2.png"), source.join("b/3.png")).unwrap();
+        RgbImage::from_pixel(16, 8, image::Rgb([3, 3, 3])).save(source.join("black.png")).unwrap();
+        fs::write(source.join("cut.png"), &fs::read(source.join("a 1.png")).unwrap()[..60]).unwrap();
+        fs::write(source.join("notes.txt"), "no photo").unwrap();
+        fs::write(source.join(".hidden.png"), "no photo").unwrap();
+        let ImportedPhotos { photos, skipped } = import(&source, &images);
+        let names: Vec<&str> = photos.iter().map(|photo| photo.name.as_str()).collect();
+        assert_eq!(names, ["a_1.png", "_a_1.png", "b/2.png"]);
+        assert_eq!((photos[0].width, photos[0].height), (16, 8));
+        assert_eq!(fs::read(images.join("_a_1.png")).unwrap(), fs::read(source.join("a_1.png")).unwrap());
+        let skipped: Vec<_> =
+            skipped.iter().map(|photo| (photo.name.as_str(), photo.reason.as_str())).collect();
+        assert_eq!(skipped[..2], [("b/3.png", "identical to b/2.png"), ("black.png", "of a single colour")]);
+        assert_eq!((skipped.len(), skipped[2].0), (3, "cut.png"));
+        assert!(skipped[2].1.starts_with("undecodable ("), "{}", skipped[2].1);
+    }
+
+    #[test]
+    fn rotated_photos_are_written_upright() {
+        // EXIF with one entry: orientation (0x0112), a SHORT, is 6, a clockwise turn by 90°.
+        let exif = b"Exif\0\0MM\0\x2a\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0";
+        let folder = tempfile::tempdir().unwrap();
+        let (source, images) = (folder.path().join("photos"), folder.path().join("images"));
+        fs::create_dir_all(&source).unwrap();
+        let photo = RgbImage::from_fn(16, 8, |x, _| image::Rgb([if x < 8 { 0 } else { 250 }; 3]));
+        let jpeg = encode_photo(&photo, true).unwrap();
+        let length = (exif.len() as u16 + 2).to_be_bytes();
+        let rotated = [&jpeg[..2], &[0xff, 0xe1], &length, exif, &jpeg[2..]].concat();
+        fs::write(source.join("a.jpg"), rotated).unwrap();
+        let ImportedPhotos { photos, skipped } = import(&source, &images);
+        assert!(skipped.is_empty(), "{skipped:?}");
+        assert_eq!((photos[0].width, photos[0].height), (8, 16));
+        let upright = globalsplat_capture::read_image(&images.join("a.jpg")).unwrap();
+        assert_eq!(upright.dimensions(), (8, 16));
+        assert!(upright.get_pixel(4, 2).0[0] < 50 && upright.get_pixel(4, 13).0[0] > 200);
+    }
+}

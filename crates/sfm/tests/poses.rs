@@ -1,0 +1,200 @@
+//! Poses that COLMAP finds for the photos of a synthetic scene, whose poses are known.
+
+use glam::{DMat3, DMat4, DVec3};
+use globalsplat_capture::{Camera, open_capture};
+use globalsplat_sfm::{Colmap, Matching, PoseOptions, PoseReport, Step, estimate_poses};
+use globalsplat_synth::{Video, VideoSettings};
+use globalsplat_test_kit::skip;
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+/// Returns COLMAP, or skips the test.
+fn find_colmap() -> Option<Colmap> {
+    Colmap::find().map_err(|why| skip("pycolmap", &why.to_string())).ok()
+}
+
+/// Writes photos of a synthetic scene to `folder`, and returns their cameras.
+fn write_photos(folder: &Path) -> Vec<Camera> {
+    let settings = VideoSettings { frames: 10, size: [360, 480].into(), pictures: vec![] };
+    let video = Video::new(1, 3, &settings);
+    std::fs::create_dir_all(folder).unwrap();
+    for index in 0..settings.frames {
+        video.photo(index).save(folder.join(format!("{index:02}.png"))).unwrap();
+    }
+    video.cameras().to_vec()
+}
+
+/// Estimates the poses without stopping.
+fn estimate(
+    photos: &Path,
+    out: &Path,
+    options: &PoseOptions,
+    colmap: &Colmap,
+) -> (PoseReport, BTreeSet<Step>) {
+    let mut steps = BTreeSet::new();
+    let report = estimate_poses(photos, out, options, colmap, &mut |progress| {
+        assert!(progress.done <= progress.total, "{progress:?}");
+        steps.insert(progress.step);
+        true
+    });
+    (report.unwrap().expect("nothing stops it"), steps)
+}
+
+fn rotation(pose: &DMat4) -> DMat3 {
+    DMat3::from_mat4(*pose)
+}
+
+/// Returns the nearest rotation, by Newton's iteration for the polar decomposition.
+fn nearest_rotation(sum: DMat3) -> DMat3 {
+    (0..30).fold(sum, |x, _| (x + x.inverse().transpose()) * 0.5)
+}
+
+/// Returns the largest errors of `found` after the similarity that fits it to `truth`: of positions, relative to the largest distance of two
+/// cameras, and of rotations, in degrees.
+fn largest_errors(found: &[DMat4], truth: &[DMat4]) -> (f64, f64) {
+    let turns = truth.iter().zip(found).map(|(truth, found)| rotation(truth) * rotation(found).transpose());
+    let turn = nearest_rotation(turns.fold(DMat3::ZERO, |sum, turn| sum + turn) * (1. / found.len() as f64));
+    let centres = |poses: &[DMat4]| poses.iter().map(|pose| pose.w_axis.truncate()).collect::<Vec<DVec3>>();
+    let (truths, founds) = (centres(truth), centres(found));
+    let mean = |centres: &[DVec3]| centres.iter().sum::<DVec3>() / centres.len() as f64;
+    let (mean_truth, mean_found) = (mean(&truths), mean(&founds));
+    let turned: Vec<DVec3> = founds.iter().map(|centre| turn * (*centre - mean_found)).collect();
+    let products =
+        turned.iter().zip(&truths).map(|(found, truth)| found.dot(*truth - mean_truth)).sum::<f64>();
+    let scale = products / turned.iter().map(|found| found.length_squared()).sum::<f64>();
+    let size = truths.iter().flat_map(|a| truths.iter().map(move |b| a.distance(*b))).fold(0., f64::max);
+    let offsets =
+        turned.iter().zip(&truths).map(|(found, truth)| (scale * *found + mean_truth).distance(*truth));
+    let angles = truth.iter().zip(found).map(|(truth, found)| {
+        let rest = rotation(truth).transpose() * turn * rotation(found);
+        (((rest.x_axis.x + rest.y_axis.y + rest.z_axis.z - 1.) / 2.).clamp(-1., 1.)).acos().to_degrees()
+    });
+    (offsets.fold(0., f64::max) / size, angles.fold(0., f64::max))
+}
+
+#[test]
+fn poses_are_those_of_the_scene_and_a_stopped_estimate_continues() {
+    let Some(colmap) = find_colmap() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let (photos, out) = (folder.path().join("photos"), folder.path().join("out"));
+    let truth: Vec<DMat4> = write_photos(&photos).iter().map(|camera| camera.c2w).collect();
+    std::fs::copy(photos.join("00.png"), photos.join("copy.png")).unwrap();
+    std::fs::write(photos.join("damaged.png"), b"no photo").unwrap();
+    let options = PoseOptions::default();
+
+    // Stopped among the features, then after them.
+    let stop_at = |step: Step, done: usize| {
+        let report = estimate_poses(&photos, &out, &options, &colmap, &mut |progress| {
+            progress.step < step || progress.step == step && progress.done < done
+        });
+        assert!(report.unwrap().is_none());
+    };
+    stop_at(Step::Features, 4);
+    stop_at(Step::Pairs, 0);
+    let (report, steps) = estimate(&photos, &out, &options, &colmap);
+    assert_eq!(steps, [Step::Pairs, Step::Poses].into(), "features are detected once");
+    assert_eq!((report.photos, report.placed, report.unplaced.len()), (12, 10, 0), "{report}");
+    let skipped: Vec<&str> = report.skipped.iter().map(|photo| photo.name.as_str()).collect();
+    assert_eq!(skipped, ["copy.png", "damaged.png"]);
+    assert!(report.points > 500 && report.reprojection_error < 1., "{report}");
+
+    let capture = open_capture(&out).unwrap();
+    let names: Vec<&str> = capture.names().collect();
+    assert_eq!((names.len(), names[0], names[9]), (10, "00.png", "09.png"));
+    let cameras = capture.cameras();
+    // All photos have one camera, though the first ones were read before the estimate was stopped.
+    assert!(cameras.iter().all(|camera| camera.intrinsics == cameras[0].intrinsics));
+    let found: Vec<DMat4> = cameras.iter().map(|camera| camera.c2w).collect();
+    let (position, angle) = largest_errors(&found, &truth);
+    assert!(position < 0.005 && angle < 0.3, "{position} of the scene, {angle}°");
+
+    // A finished estimate is reported again, and other pairs leave the features.
+    let (again, steps) = estimate(&photos, &out, &options, &colmap);
+    assert!(steps.is_empty() && again.points == report.points);
+    let sequential = PoseOptions { matching: Matching::Sequential, ..options };
+    let (again, steps) = estimate(&photos, &out, &sequential, &colmap);
+    assert_eq!((again.placed, steps), (10, [Step::Pairs, Step::Poses].into()));
+
+    // Other photos don't replace a capture.
+    std::fs::remove_file(photos.join("05.png")).unwrap();
+    let error = estimate_poses(&photos, &out, &sequential, &colmap, &mut |_| true).unwrap_err();
+    assert!(error.is_request() && error.to_string().contains("other or changed photos"), "{error}");
+}
+
+/// Writes 4 photos that share nothing.
+fn write_noise(folder: &Path) {
+    std::fs::create_dir_all(folder).unwrap();
+    for index in 0..4u32 {
+        let noise = image::RgbImage::from_fn(200, 200, |x, y| {
+            let mut state = (index << 20 | x << 10 | y).wrapping_mul(2_654_435_761);
+            state ^= state >> 15;
+            state = state.wrapping_mul(2_246_822_519);
+            image::Rgb([(state >> 24) as u8; 3])
+        });
+        noise.save(folder.join(format!("{index}.png"))).unwrap();
+    }
+}
+
+#[test]
+fn photos_that_share_nothing_are_an_error() {
+    let Some(colmap) = find_colmap() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let (photos, out) = (folder.path().join("photos"), folder.path().join("out"));
+    write_noise(&photos);
+    let error = estimate_poses(&photos, &out, &PoseOptions::default(), &colmap, &mut |_| true).unwrap_err();
+    assert!(!error.is_request(), "{error}");
+    assert!(error.to_string().starts_with("COLMAP placed none of the 4 photos: "), "{error}");
+}
+
+/// Returns a COLMAP for calls that fail before they start it.
+#[cfg(unix)]
+fn stand_in(folder: &Path) -> (PathBuf, Colmap) {
+    use std::os::unix::fs::PermissionsExt;
+    let program = folder.join("colmap");
+    std::fs::write(&program, "#!/bin/sh\necho 'COLMAP 3.9 -- Structure-from-Motion'\n").unwrap();
+    std::fs::set_permissions(&program, PermissionsExt::from_mode(0o755)).unwrap();
+    let colmap = Colmap::at(&program).unwrap();
+    (program, colmap)
+}
+
+#[test]
+#[cfg(unix)]
+fn bad_requests_are_refused_in_one_sentence() {
+    let folder = tempfile::tempdir().unwrap();
+    let (_, colmap) = stand_in(folder.path());
+    let at = |name: &str| folder.path().join(name);
+    let refusal = |photos: &str, out: &str, options: PoseOptions| {
+        let error = estimate_poses(&at(photos), &at(out), &options, &colmap, &mut |_| true).unwrap_err();
+        assert!(error.is_request(), "{error}");
+        error.to_string().replace(&format!("{}/", folder.path().display()), "")
+    };
+    let plain = PoseOptions::default;
+    std::fs::create_dir_all(at("empty")).unwrap();
+    assert_eq!(
+        refusal("empty", "out", plain()),
+        "empty: the number of photos is 0, expected 2 or more JPEG or PNG files"
+    );
+    write_noise(&at("same"));
+    for index in 1..4 {
+        std::fs::copy(at("same/0.png"), at(&format!("same/{index}.png"))).unwrap();
+    }
+    assert_eq!(
+        refusal("same", "out", plain()),
+        "same: the number of photos is 4, of which 3 can't be used (1.png is identical to 0.png, 2.png is identical to 0.png, 3.png is \
+         identical to 0.png), expected 2 or more different ones"
+    );
+    write_noise(&at("photos"));
+    std::fs::create_dir_all(at("full")).unwrap();
+    std::fs::write(at("full/thesis.tex"), "").unwrap();
+    assert_eq!(
+        refusal("photos", "full", plain()),
+        "full: the output is a folder with thesis.tex, expected a new folder, or one with such a capture"
+    );
+    assert_eq!(
+        refusal("photos", "photos/out", plain()),
+        "photos/out: the output is inside the folder of photos, expected a folder outside of photos"
+    );
+    let unknown = PoseOptions { camera_model: Some("FISH".into()), ..plain() };
+    let refused = refusal("photos", "out", unknown);
+    assert!(refused.starts_with("the camera model is FISH, expected one of SIMPLE_PINHOLE, "), "{refused}");
+}
