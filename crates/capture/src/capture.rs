@@ -438,6 +438,22 @@ impl Capture {
         self.read_photo(&self.frames[index], None, None)
     }
 
+    /// Returns the capture with the masks in `folder`, which are named like the photos.
+    ///
+    /// # Errors
+    /// Fails if the folder can't be read.
+    pub fn with_masks(self, folder: &Path) -> Result<Self> {
+        Err(Error::input(folder, "the masks", "a folder", "none: masks aren't read from folders yet"))
+    }
+
+    /// Returns the photo of view `index` like [`Capture::photo`], and the weights of its pixels, as in [`Photo::mask`], in equal channels.
+    ///
+    /// # Errors
+    /// Fails like [`Capture::load`].
+    pub fn photo_with_mask(&self, index: usize) -> Result<(RgbImage, Option<RgbImage>)> {
+        Ok((self.photo(index)?, None))
+    }
+
     /// Reads the photo and removes lens distortion, at least in the part that fitting to `size` reads. Uses `lens` if it matches
     /// the frame.
     fn read_photo(&self, frame: &Frame, size: Option<ImageSize>, lens: Option<&Lens>) -> Result<RgbImage> {
