@@ -57,13 +57,21 @@ pub fn bench_refine(
     let c2w = cameras.w2c.inverse();
     let photos = Photos::from_batch(ViewBatch {
         images: pictures.rgb,
+        masks: None,
         c2w,
         w2c: cameras.w2c,
         intrinsics: cameras.intrinsics,
     });
     let mut optimizer = GaussianOptimizer::new(&RawGaussians::from_gaussians(&gaussians), 1., config);
     let mut none = Corrections::none();
-    let task = |steps| Task { photos: &photos, depth: 1., config, budget: Budget::Steps(steps), seed: 0 };
+    let task = |steps| Task {
+        photos: &photos,
+        depth: 1.,
+        config,
+        budget: Budget::Steps(steps),
+        seed: 0,
+        background: None,
+    };
     refine_timed(&mut optimizer, &mut none, &task(WARM_UP), &mut Stopwatch::default(), |_| true)?;
 
     let mut stopwatch = Stopwatch::new(device);

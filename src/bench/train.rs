@@ -224,6 +224,7 @@ pub(super) fn synthetic_scene(config: &Config, seed: u64) -> LoadedScene {
     LoadedScene {
         name: String::new(),
         images,
+        masks: None,
         size,
         cameras: (0..views).map(camera).collect(),
         context,

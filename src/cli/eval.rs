@@ -1,5 +1,5 @@
 use super::{
-    check_former_option, check_views, device, model, open_capture, print_json, progress, ranks,
+    check_former_option, check_views, device, model, open_masked_capture, print_json, progress, ranks,
     report_downscaling, stop_flag, warn, warn_of_many,
 };
 use anyhow::Result;
@@ -52,6 +52,10 @@ pub struct Eval {
     /// Capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
     #[arg(long, value_name = "PATH", group = "photos")]
     scene: Option<PathBuf>,
+    /// Folder of masks named like the photos, as in photo.jpg.png or photo.png: black pixels are not scored, nor seen by a model; by
+    /// default the masks and transparency of the capture itself
+    #[arg(long, value_name = "DIR", conflicts_with = "data")]
+    masks: Option<PathBuf>,
     /// Dataset: a folder of chunks with an index.json, one with such a folder named test, or one of captures
     #[arg(long, value_name = "ROOT", group = "photos", requires_all = ["index", "out"])]
     data: Option<PathBuf>,
@@ -120,7 +124,7 @@ impl Eval {
         if let Some(sheet) = &self.sheet {
             check_writable_png(sheet)?;
         }
-        let capture = open_capture(scene)?;
+        let capture = open_masked_capture(scene, self.masks.as_deref())?;
         if let Some(sheet) = &self.sheet {
             let mut inputs = self.inputs(std::iter::once(self.method(None)));
             capture.add_input_files(&mut inputs);
@@ -411,8 +415,11 @@ impl Eval {
         } else {
             for (_, e) in evaluations {
                 let shown = |value: Option<f64>| value.map_or("absent".into(), |value| format!("{value:.4}"));
+                let masked = e.summary.pixel_fraction.map(|fraction| 100. * fraction);
+                let masked =
+                    masked.map_or(String::new(), |percent| format!(", over {percent:.1} % of the pixels"));
                 println!(
-                    "{}, {} of {} scenes: PSNR {:.2}, SSIM {:.4}, LPIPS-VGG {}, LPIPS-Alex {}",
+                    "{}, {} of {} scenes: PSNR {:.2}, SSIM {:.4}, LPIPS-VGG {}, LPIPS-Alex {}{masked}",
                     e.index,
                     e.scenes.len(),
                     e.indexed_scenes,
@@ -483,4 +490,7 @@ fn print_table(scores: &CaptureScores) {
     }
     let lpips = lpips([scores.lpips_vgg, scores.lpips_alex]);
     println!("{:<24} {:>8.2} {:>8.4}{lpips}", "mean", scores.psnr, scores.ssim);
+    if let Some(fraction) = scores.pixel_fraction {
+        println!("scored over {:.1} % of the pixels: the others are masked out", 100. * fraction);
+    }
 }

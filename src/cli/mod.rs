@@ -225,7 +225,15 @@ fn check_former_option(name: &str, value: Option<&str>, left: &str, why: &str) -
 
 /// Opens a capture and prints warnings about what is ignored or changed in it.
 fn open_capture(path: &Path) -> globalsplat::Result<Capture> {
-    let capture = globalsplat::data::open_capture(path)?;
+    open_masked_capture(path, None)
+}
+
+/// Opens a capture like [`open_capture`], with the masks in the folder `masks` if it is given.
+fn open_masked_capture(path: &Path, masks: Option<&Path>) -> globalsplat::Result<Capture> {
+    let mut capture = globalsplat::data::open_capture(path)?;
+    if let Some(masks) = masks {
+        capture = capture.with_masks(masks)?;
+    }
     warn(capture.warnings());
     Ok(capture)
 }

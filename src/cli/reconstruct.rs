@@ -1,6 +1,6 @@
 use super::memory::keep_during;
 use super::refine::{InitialFile, RefineJob, parse_time};
-use super::{check_views, device, model, open_capture, print_json, splat_out};
+use super::{check_views, device, model, open_masked_capture, print_json, splat_out};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::data::{Capture, Holdout};
@@ -31,6 +31,10 @@ pub struct Reconstruct {
     /// Capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
     #[arg(long, value_name = "PATH")]
     scene: PathBuf,
+    /// Folder of masks named like the photos, as in photo.jpg.png or photo.png: the model doesn't see black pixels; by default the
+    /// masks and transparency of the capture itself
+    #[arg(long, value_name = "DIR")]
+    masks: Option<PathBuf>,
     /// Output splat: .ply, .compressed.ply, .spz or .splat
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
@@ -71,8 +75,8 @@ impl Reconstruct {
         let device = device::parse(&self.device)?;
         let options = RefineOptions { budget, holdout, views: self.views, device, ..Default::default() };
         let initial = InitialFile::Model(self.weights);
-        let Reconstruct { scene, out, local_origin, json, .. } = self;
-        RefineJob { scene, out, initial, options, local_origin, sheet: None, lpips: false, json }.run()
+        let Reconstruct { scene, masks, out, local_origin, json, .. } = self;
+        RefineJob { scene, masks, out, initial, options, local_origin, sheet: None, lpips: false, json }.run()
     }
 
     pub fn run(self) -> Result<()> {
@@ -88,7 +92,7 @@ impl Reconstruct {
         let started = process_age();
         let mut stopwatch = Stopwatch::default();
         let loaded = stopwatch.time("weights", || model::load(self.weights.as_deref(), asked, device))?;
-        let capture = stopwatch.time("photos", || open_capture(&self.scene))?;
+        let capture = stopwatch.time("photos", || open_masked_capture(&self.scene, self.masks.as_deref()))?;
         let mut inputs = InputFiles::default();
         capture.add_input_files(&mut inputs);
         self.weights.iter().for_each(|path| inputs.add_all(weights_files(path)));

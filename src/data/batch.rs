@@ -1,6 +1,7 @@
 //! Batches of views: images and cameras as the tensors that the model and the renderer take.
 
 use super::view::View;
+use crate::model::IMAGENET_MEAN;
 use crate::render::Cameras;
 use crate::scene::{Camera, pose_to_rows};
 use glam::DMat4;
@@ -12,6 +13,8 @@ use tch::{Device, Kind, Tensor};
 pub struct ViewBatch {
     /// Images, `[B, V, 3, H, W]`, values in [0, 1].
     pub images: Tensor,
+    /// Weight of each pixel, `[B, V, 1, H, W]`: 1 where the pixel counts, 0 where it is masked out. `None` if every pixel counts.
+    pub masks: Option<Tensor>,
     /// Camera-to-world matrices, `[B, V, 4, 4]`.
     pub c2w: Tensor,
     /// World-to-camera matrices, `[B, V, 4, 4]`.
@@ -25,8 +28,21 @@ pub struct ViewBatch {
 /// `poses` (camera-to-world) replace the views' own poses, for example with normalized ones.
 pub fn view_batch<V: Borrow<View>>(views: &[V], poses: &[DMat4], device: Device) -> ViewBatch {
     let images: Vec<&Tensor> = views.iter().map(|view| &view.borrow().image).collect();
-    let images = Tensor::stack(&images, 0).unsqueeze(0).to_device(device);
-    ViewBatch::with_images(images, &[view_matrices(&cameras_at(views, poses), device)])
+    let stack = |planes: &[&Tensor]| Tensor::stack(planes, 0).unsqueeze(0).to_device(device);
+    let masks = views.iter().any(|view| view.borrow().mask.is_some()).then(|| {
+        let mask = |view: &V| match &view.borrow().mask {
+            Some(mask) => mask.shallow_clone(),
+            None => ones_like_mask(&view.borrow().image),
+        };
+        let masks: Vec<Tensor> = views.iter().map(mask).collect();
+        stack(&masks.iter().collect::<Vec<_>>())
+    });
+    ViewBatch::with_images(stack(&images), masks, &[view_matrices(&cameras_at(views, poses), device)])
+}
+
+/// Returns the mask of `images` [.., 3, H, W] whose every pixel counts, [.., 1, H, W].
+fn ones_like_mask(images: &Tensor) -> Tensor {
+    images.narrow(-3, 0, 1).ones_like()
 }
 
 /// Returns the cameras of `views` with `poses` in place of their own poses.
@@ -48,21 +64,34 @@ pub(super) fn view_matrices(cameras: &[Camera], device: Device) -> [Tensor; 3] {
 }
 
 impl ViewBatch {
-    /// Builds a batch from `images` `[B, V, 3, H, W]` and the `matrices` of B scenes, one result of [`view_matrices`] per scene.
-    pub(super) fn with_images(images: Tensor, matrices: &[[Tensor; 3]]) -> Self {
+    /// Builds a batch from `images` `[B, V, 3, H, W]`, their `masks` `[B, V, 1, H, W]` and the `matrices` of B scenes, one result of
+    /// [`view_matrices`] per scene.
+    pub(super) fn with_images(images: Tensor, masks: Option<Tensor>, matrices: &[[Tensor; 3]]) -> Self {
         let cat =
             |which: usize| Tensor::cat(&matrices.iter().map(|scene| &scene[which]).collect::<Vec<_>>(), 0);
-        ViewBatch { images, c2w: cat(0), w2c: cat(1), intrinsics: cat(2) }
+        ViewBatch { images, masks, c2w: cat(0), w2c: cat(1), intrinsics: cat(2) }
     }
 
-    /// Returns the four tensors in the order that [`ViewBatch::from_tensors`] takes.
+    /// Returns the four tensors besides the masks in the order that [`ViewBatch::from_tensors`] takes.
     pub(super) fn tensors(&self) -> [&Tensor; 4] {
         [&self.images, &self.c2w, &self.w2c, &self.intrinsics]
     }
 
-    /// Builds a batch from tensors in the order of [`ViewBatch::tensors`].
-    pub(super) fn from_tensors([images, c2w, w2c, intrinsics]: [Tensor; 4]) -> Self {
-        ViewBatch { images, c2w, w2c, intrinsics }
+    /// Builds a batch from tensors in the order of [`ViewBatch::tensors`], and the masks.
+    pub(super) fn from_tensors([images, c2w, w2c, intrinsics]: [Tensor; 4], masks: Option<Tensor>) -> Self {
+        ViewBatch { images, masks, c2w, w2c, intrinsics }
+    }
+
+    /// Returns the images as a model sees them: masked pixels have the colour that its normalization (spec 3.1) makes 0.
+    pub fn input_images(&self) -> Tensor {
+        match &self.masks {
+            Some(masks) => {
+                let neutral =
+                    Tensor::from_slice(&IMAGENET_MEAN).view([3, 1, 1]).to_device(self.images.device());
+                neutral.lerp_tensor(&self.images, masks)
+            }
+            None => self.images.shallow_clone(),
+        }
     }
 
     /// Returns the cameras of the views.
@@ -84,6 +113,7 @@ impl ViewBatch {
         };
         ViewBatch {
             images: select(&self.images),
+            masks: self.masks.as_ref().map(select),
             c2w: select(&self.c2w),
             w2c: select(&self.w2c),
             intrinsics: select(&self.intrinsics),
@@ -95,6 +125,7 @@ impl ViewBatch {
         let narrow = |t: &Tensor| t.narrow(0, first, count);
         ViewBatch {
             images: narrow(&self.images),
+            masks: self.masks.as_ref().map(narrow),
             c2w: narrow(&self.c2w),
             w2c: narrow(&self.w2c),
             intrinsics: narrow(&self.intrinsics),
@@ -106,8 +137,16 @@ impl ViewBatch {
         let cat = |field: fn(&ViewBatch) -> &Tensor| {
             Tensor::cat(&scenes.iter().map(|scene| field(scene.borrow())).collect::<Vec<_>>(), 0)
         };
+        let masks = scenes.iter().any(|scene| scene.borrow().masks.is_some()).then(|| {
+            let masks = |scene: &ViewBatch| match &scene.masks {
+                Some(masks) => masks.shallow_clone(),
+                None => ones_like_mask(&scene.images),
+            };
+            Tensor::cat(&scenes.iter().map(|scene| masks(scene.borrow())).collect::<Vec<_>>(), 0)
+        });
         ViewBatch {
             images: cat(|s| &s.images),
+            masks,
             c2w: cat(|s| &s.c2w),
             w2c: cat(|s| &s.w2c),
             intrinsics: cat(|s| &s.intrinsics),

@@ -37,6 +37,16 @@ impl View {
         View { name: self.name.clone(), image: self.image.shallow_clone(), mask, camera: self.camera }
     }
 
+    /// Returns the fraction of the pixels that count, the mean weight of the mask; `None` if every pixel counts.
+    pub fn pixel_fraction(&self) -> Option<f64> {
+        self.mask.as_ref().map(|mask| mask.mean(Kind::Double).double_value(&[]))
+    }
+
+    /// Returns `true` if no pixel counts.
+    pub fn is_masked_out(&self) -> bool {
+        self.pixel_fraction() == Some(0.)
+    }
+
     /// Returns the view fitted to `size` as [`load_views`] does, without reading the photo again.
     ///
     /// # Errors

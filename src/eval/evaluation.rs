@@ -62,6 +62,9 @@ pub struct Summary {
     /// Mean LPIPS with AlexNet; `None` if a scene lacks it, for example because the network's weights are missing.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips_alex: Option<f64>,
+    /// Mean fraction of the pixels that were scored; `None` if all were.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pixel_fraction: Option<f64>,
     /// Mean number of Gaussians per scene; `None` if no splats were scored.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gaussians: Option<f64>,
@@ -135,11 +138,13 @@ impl Summary {
             let values: Option<Vec<f64>> = scenes.iter().map(|scene| value(&scene.scores)).collect();
             values.map(|values| values.iter().sum::<f64>() / values.len() as f64)
         };
+        let has_masks = scenes.iter().any(|scene| scene.scores.pixel_fraction.is_some());
         Summary {
             psnr: mean(&|s| Some(s.psnr)).unwrap_or(f64::NAN),
             ssim: mean(&|s| Some(s.ssim)).unwrap_or(f64::NAN),
             lpips_vgg: mean(&|s| s.lpips_vgg),
             lpips_alex: mean(&|s| s.lpips_alex),
+            pixel_fraction: mean(&|s| Some(s.pixel_fraction.unwrap_or(1.))).filter(|_| has_masks),
             gaussians: mean(&|s| s.gaussians.map(|n| n as f64)),
         }
     }

@@ -23,7 +23,7 @@ pub fn psnr_between(original: &Splat, copy: &Splat, cameras: &[Camera]) -> Resul
             Ok(splat.render(std::slice::from_ref(camera))?.remove(0).rgb)
         };
         let original = seen(&original)?;
-        sum += squared_error(&original, &seen(&copy)?);
+        sum += squared_error(&original, &seen(&copy)?, None);
         numbers += original.numel();
     }
     Ok((sum != 0.).then(|| psnr_of_mse(sum / numbers as f64)))

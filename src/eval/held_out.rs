@@ -134,11 +134,17 @@ impl HeldOutScene {
                 (capture, split)
             }
         };
-        Ok((
-            capture.name.clone(),
-            load_views(&capture, &context, size)?,
-            load_views(&capture, &target, size)?,
-        ))
+        let mut targets = load_views(&capture, &target, size)?;
+        targets.retain(|view| !view.is_masked_out());
+        if targets.is_empty() {
+            return Err(Error::input(
+                capture.file(),
+                "the masks of the held-out views",
+                "no pixel that counts",
+                "some",
+            ));
+        }
+        Ok((capture.name.clone(), load_views(&capture, &context, size)?, targets))
     }
 }
 

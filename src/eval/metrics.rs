@@ -1,6 +1,6 @@
 //! Image metrics (spec 9.4), in float64 on values clamped to [0, 1].
 
-use crate::loss::{self, psnr_of_mse};
+use crate::loss::{self, fill_masked, psnr_of_mse};
 use tch::{Kind, Tensor};
 
 /// Approximate number of pixels of a band of rows. Images are compared band by band, so that a large one is never held in float64 as a
@@ -11,7 +11,7 @@ pub(super) const SSIM_WINDOW: i64 = 11;
 /// Number of rows that a band shares with the next one, so that every window lies inside a band.
 const SSIM_OVERLAP: i64 = SSIM_WINDOW - 1;
 
-/// Returns rows `first` to `first + count` of an image `[3, H, W]` in float64, clamped to [0, 1], on the CPU.
+/// Returns rows `first` to `first + count` of an image `[3, H, W]` or of a mask `[1, H, W]` in float64, clamped to [0, 1], on the CPU.
 fn band(image: &Tensor, first: i64, count: i64) -> Tensor {
     let rows = image.detach().narrow(-2, first, count);
     rows.to_device(tch::Device::Cpu).to_kind(Kind::Double).clamp(0., 1.)
@@ -23,33 +23,61 @@ fn bands(rows: i64, width: i64) -> impl Iterator<Item = (i64, i64)> {
     (0..rows).step_by(height as usize).map(move |first| (first, height.min(rows - first)))
 }
 
-/// Returns the sum of squared differences of two images `[3, H, W]`, with values clamped to [0, 1].
-pub(super) fn squared_error(image: &Tensor, ground_truth: &Tensor) -> f64 {
+/// Returns the sum of squared differences of two images `[3, H, W]`, with values clamped to [0, 1], weighted by `mask` `[1, H, W]`.
+pub(super) fn squared_error(image: &Tensor, ground_truth: &Tensor, mask: Option<&Tensor>) -> f64 {
     let size = image.size();
     let error = |(first, count)| {
-        (band(image, first, count) - band(ground_truth, first, count))
-            .square()
-            .sum(Kind::Double)
-            .double_value(&[])
+        let error = (band(image, first, count) - band(ground_truth, first, count)).square();
+        let error = match mask {
+            Some(mask) => error * band(mask, first, count),
+            None => error,
+        };
+        error.sum(Kind::Double).double_value(&[])
     };
     bands(size[1], size[2]).map(error).sum()
 }
 
 /// Returns the peak signal-to-noise ratio in dB of two images of the same shape, `[3, H, W]`.
 pub fn psnr(image: &Tensor, ground_truth: &Tensor) -> f64 {
-    psnr_of_mse(squared_error(image, ground_truth) / image.numel() as f64)
+    masked_psnr(image, ground_truth, None)
+}
+
+/// Returns the peak signal-to-noise ratio in dB of two images of the same shape, `[3, H, W]`, over the pixels that count: their errors are
+/// weighted by `mask` `[1, H, W]` (spec 7.9). NaN if no pixel counts.
+pub fn masked_psnr(image: &Tensor, ground_truth: &Tensor, mask: Option<&Tensor>) -> f64 {
+    let mean = squared_error(image, ground_truth, mask) / image.numel() as f64;
+    psnr_of_mse(mean / mask.map_or(1., mean_weight))
 }
 
 /// Returns the structural similarity of two images `[3, H, W]`. H and W are at least 11.
 pub fn ssim(image: &Tensor, ground_truth: &Tensor) -> f64 {
+    masked_ssim(image, ground_truth, None)
+}
+
+/// Returns the structural similarity of two images `[3, H, W]` over the pixels that count by `mask` `[1, H, W]` (spec 7.9): 1 − (1 − SSIM) /
+/// mean weight, where the images are equal where they are masked out. H and W are at least 11. NaN if no pixel counts.
+pub fn masked_ssim(image: &Tensor, ground_truth: &Tensor, mask: Option<&Tensor>) -> f64 {
     let size = image.size();
     // Number of rows of windows that lie inside the image.
     let rows = size[1] - SSIM_OVERLAP;
     let weighted = |(first, count)| {
         let band = |image| band(image, first, count + SSIM_OVERLAP);
-        loss::ssim(&band(image), &band(ground_truth)).double_value(&[]) * count as f64
+        let (image, ground_truth) = (band(image), band(ground_truth));
+        let image = match mask {
+            Some(mask) => fill_masked(&image, &ground_truth, &band(mask)),
+            None => image,
+        };
+        loss::ssim(&image, &ground_truth).double_value(&[]) * count as f64
     };
-    bands(rows, size[2]).map(weighted).sum::<f64>() / rows as f64
+    let whole = bands(rows, size[2]).map(weighted).sum::<f64>() / rows as f64;
+    mask.map_or(whole, |mask| 1. - (1. - whole) / mean_weight(mask))
+}
+
+/// Returns the mean weight of a mask `[1, H, W]`, with values clamped to [0, 1].
+pub(super) fn mean_weight(mask: &Tensor) -> f64 {
+    let size = mask.size();
+    let sum = |(first, count)| band(mask, first, count).sum(Kind::Double).double_value(&[]);
+    bands(size[1], size[2]).map(sum).sum::<f64>() / mask.numel() as f64
 }
 
 #[cfg(test)]
@@ -64,6 +92,34 @@ mod tests {
         assert_eq!(psnr(&a, &a), 100.);
         assert!((psnr(&(&a - 3.), &(&a + 0.1)) - 20.).abs() < 1e-5); // clamped
         assert!(psnr(&(&a * f64::NAN), &a).is_nan());
+    }
+
+    /// Half of the pixels are masked out, and their error is large; others have a weight of ½.
+    #[test]
+    fn masked_pixels_are_not_scored() {
+        tch::manual_seed(1);
+        let options = (Kind::Float, Device::Cpu);
+        let (truth, mask) = (Tensor::rand([3, 32, 24], options) * 0.5, Tensor::ones([1, 32, 24], options));
+        let image = &truth + 0.1;
+        let _ = image.narrow(1, 0, 16).fill_(1.);
+        let _ = mask.narrow(1, 0, 16).zero_();
+        assert!((masked_psnr(&image, &truth, Some(&mask)) - 20.).abs() < 1e-5);
+        // A quarter of the weight has an error of 0.2: (3 · 0.01 + 0.04) / 4.
+        let _ = mask.narrow(1, 16, 8).fill_(1. / 3.);
+        let _ = image.narrow(1, 16, 8).g_add_scalar_(0.1);
+        let expected = -10. * (0.07f64 / 4.).log10();
+        assert!((masked_psnr(&image, &truth, Some(&mask)) - expected).abs() < 1e-5);
+        let ssim_of = |image: &Tensor| masked_ssim(image, &truth, Some(&mask));
+        let (before, filled) = (ssim_of(&image), fill_masked(&image, &truth, &mask));
+        let expected = 1. - (1. - ssim(&filled, &truth)) / (2. / 3. / 2.);
+        assert!((before - expected).abs() < 1e-6, "{before}, expected {expected}");
+        let _ = image.narrow(1, 0, 16).zero_();
+        assert_eq!(ssim_of(&image), before);
+        assert!((ssim_of(&truth) - 1.).abs() < 1e-9);
+        let all = Some(&mask.ones_like());
+        let [all, plain] = [masked_ssim(&image, &truth, all), ssim(&image, &truth)];
+        assert!((all - plain).abs() < 1e-12);
+        assert!(masked_psnr(&image, &truth, Some(&mask.zeros_like())).is_nan());
     }
 
     #[test]

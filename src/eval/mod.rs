@@ -31,7 +31,7 @@ pub use index::{EvaluationIndex, SceneFrames};
 pub use journal::evaluation_files;
 pub use machine::machine;
 pub use method::{EvalImage, Method, MethodOutput, score_output, score_with_lpips};
-pub use metrics::{psnr, ssim};
+pub use metrics::{masked_psnr, masked_ssim, psnr, ssim};
 pub use perceptual::Perceptual;
 pub use photo_source::LazyPhotos;
 pub use published::{

@@ -1,10 +1,11 @@
 //! LPIPS in evaluation, with the networks whose weights are installed.
 
+use super::metrics::mean_weight;
 use super::scores::{CaptureScores, ViewScore};
 use crate::data::View;
 use crate::error::Result;
 use crate::io::{WEIGHTS_VARIABLE, find_pretrained, pretrained_folders};
-use crate::loss::{Lpips, LpipsNetwork};
+use crate::loss::{Lpips, LpipsNetwork, fill_masked};
 use crate::scene::ImageSize;
 use tch::{Device, Tensor};
 
@@ -27,12 +28,12 @@ impl Perceptual {
         Ok(Perceptual { vgg: load(LpipsNetwork::Vgg16)?, alex: load(LpipsNetwork::AlexNet)? })
     }
 
-    /// Returns `score` with the LPIPS distances between an image `[3, H, W]`, clamped to [0, 1], and the photo `ground_truth`. A distance
-    /// is `None` if its network is missing or the view is too small for it.
+    /// Returns `score` with the LPIPS distances between an image `[3, H, W]`, clamped to [0, 1], and the photo `ground_truth`, over the
+    /// pixels that count (spec 7.9). A distance is `None` if its network is missing or the view is too small for it.
     pub(super) fn add_to(&self, score: ViewScore, image: &Tensor, ground_truth: &View) -> ViewScore {
         ViewScore {
-            lpips_vgg: distance(self.vgg.as_ref(), image, &ground_truth.image),
-            lpips_alex: distance(self.alex.as_ref(), image, &ground_truth.image),
+            lpips_vgg: distance(self.vgg.as_ref(), image, ground_truth),
+            lpips_alex: distance(self.alex.as_ref(), image, ground_truth),
             ..score
         }
     }
@@ -72,7 +73,7 @@ impl Perceptual {
     }
 }
 
-fn distance(lpips: Option<&Lpips>, image: &Tensor, ground_truth: &Tensor) -> Option<f64> {
+fn distance(lpips: Option<&Lpips>, image: &Tensor, ground_truth: &View) -> Option<f64> {
     let lpips = lpips?;
     let size = image.size();
     let smallest = lpips.network().smallest_side();
@@ -80,5 +81,10 @@ fn distance(lpips: Option<&Lpips>, image: &Tensor, ground_truth: &Tensor) -> Opt
         return None;
     }
     let prepare = |image: &Tensor| image.to_device(lpips.device()).clamp(0., 1.);
-    Some(tch::no_grad(|| lpips.distance(&prepare(image), &prepare(ground_truth))).double_value(&[]))
+    let (image, photo) = (prepare(image), prepare(&ground_truth.image));
+    let distance = |image: &Tensor| tch::no_grad(|| lpips.distance(image, &photo)).double_value(&[]);
+    Some(match &ground_truth.mask {
+        Some(mask) => distance(&fill_masked(&image, &photo, &prepare(mask))) / mean_weight(mask),
+        None => distance(&image),
+    })
 }

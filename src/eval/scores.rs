@@ -1,6 +1,6 @@
 //! Scores of rendered images against photos, view by view.
 
-use super::metrics::{SSIM_WINDOW, psnr, ssim};
+use super::metrics::{SSIM_WINDOW, masked_psnr, masked_ssim, mean_weight};
 use super::photo_source::LazyPhotos;
 use crate::data::View;
 use crate::error::{Error, Result};
@@ -23,6 +23,9 @@ pub struct ViewScore {
     /// LPIPS with AlexNet; `None` if the network's weights are missing or the view is too small.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips_alex: Option<f64>,
+    /// Fraction of the pixels that were scored, by the weights of the photo's mask; `None` if all were.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pixel_fraction: Option<f64>,
 }
 
 /// Scores of a capture: means over its views, and the scores of each view.
@@ -40,6 +43,9 @@ pub struct CaptureScores {
     /// Mean LPIPS with AlexNet over the views; `None` if a view lacks it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips_alex: Option<f64>,
+    /// Mean fraction of the pixels of a view that were scored; `None` if all were.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub pixel_fraction: Option<f64>,
     /// Number of Gaussians; `None` if no splat was scored.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gaussians: Option<i64>,
@@ -61,10 +67,10 @@ pub fn score(
     Ok(CaptureScores::from_views(scene, scores.collect::<Result<_>>()?, gaussians))
 }
 
-/// Scores an image `[3, H, W]` against a view of the same size, without LPIPS.
+/// Scores an image `[3, H, W]` against the pixels of a view of the same size that count, without LPIPS.
 ///
 /// # Errors
-/// Fails if the image differs in size from the view or is too small for SSIM.
+/// Fails if the image differs in size from the view or is too small for SSIM, or if no pixel of the view counts.
 pub(super) fn score_view(image: &Tensor, view: &View) -> Result<ViewScore> {
     let (found, expected) = (image.size(), view.image.size());
     if found != expected {
@@ -78,8 +84,15 @@ pub(super) fn score_view(image: &Tensor, view: &View) -> Result<ViewScore> {
             view.name
         )));
     }
-    let (psnr, ssim) = (psnr(image, &view.image), ssim(image, &view.image));
-    Ok(ViewScore { image: view.name.clone(), psnr, ssim, lpips_vgg: None, lpips_alex: None })
+    let pixel_fraction = view.mask.as_ref().map(mean_weight);
+    if pixel_fraction == Some(0.) {
+        let why = format!("{} is masked out as a whole, expected pixels that can be scored", view.name);
+        return Err(Error::request(why));
+    }
+    let psnr = masked_psnr(image, &view.image, view.mask.as_ref());
+    let ssim = masked_ssim(image, &view.image, view.mask.as_ref());
+    let image = view.name.clone();
+    Ok(ViewScore { image, psnr, ssim, lpips_vgg: None, lpips_alex: None, pixel_fraction })
 }
 
 impl CaptureScores {
@@ -89,12 +102,14 @@ impl CaptureScores {
             let values: Option<Vec<f64>> = views.iter().map(value).collect();
             values.map(|values| values.iter().sum::<f64>() / values.len() as f64)
         };
+        let has_masks = views.iter().any(|view| view.pixel_fraction.is_some());
         CaptureScores {
             scene: scene.to_string(),
             psnr: mean(|view| Some(view.psnr)).unwrap_or(f64::NAN),
             ssim: mean(|view| Some(view.ssim)).unwrap_or(f64::NAN),
             lpips_vgg: mean(|view| view.lpips_vgg),
             lpips_alex: mean(|view| view.lpips_alex),
+            pixel_fraction: mean(|view| Some(view.pixel_fraction.unwrap_or(1.))).filter(|_| has_masks),
             gaussians,
             views,
         }

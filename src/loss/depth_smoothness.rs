@@ -1,5 +1,6 @@
 //! Edge-aware depth smoothness, which regularizes geometry if there are few photos (Godard et al. 2017, eq. 3).
 
+use super::mask::mean_weight;
 use crate::ffi::take_outputs;
 use globalsplat_csrc::fit;
 use tch::Tensor;
@@ -17,4 +18,17 @@ pub fn depth_smoothness(depths: &Tensor, photos: &Tensor, factor: f64) -> Tensor
     let done = unsafe { take_outputs(|out| fit::depth_smoothness(depths, photos, factor, out)) };
     let [loss] = done.unwrap_or_else(|error| panic!("{error}"));
     loss
+}
+
+/// Minimum weight of a pixel whose depth is compared.
+const MIN_WEIGHT: f64 = 0.5;
+
+/// Computes [`depth_smoothness`] over the pairs of pixels that both count: those with a weight of ½ or more in `mask` [.., H, W] (spec 7.9).
+/// The mean over all pairs is divided by the fraction of these pixels.
+///
+/// # Panics
+/// Panics if the shapes don't fit.
+pub fn masked_depth_smoothness(depths: &Tensor, photos: &Tensor, mask: &Tensor, factor: f64) -> Tensor {
+    let counts = mask.ge(MIN_WEIGHT).to_kind(depths.kind());
+    depth_smoothness(&(depths * &counts), photos, factor) / mean_weight(&counts)
 }

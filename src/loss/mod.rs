@@ -6,6 +6,7 @@ mod decoder_regularization;
 mod depth_smoothness;
 mod frustum;
 mod lpips;
+mod mask;
 mod mse;
 mod perceptual;
 mod photometric;
@@ -14,12 +15,13 @@ mod vgg19;
 
 pub use config::{LossConfig, PerceptualKind};
 pub use decoder_regularization::{DecoderRegularization, decoder_regularization, sh_soft_cap};
-pub use depth_smoothness::depth_smoothness;
+pub use depth_smoothness::{depth_smoothness, masked_depth_smoothness};
 pub use frustum::frustum;
 pub use lpips::{Lpips, LpipsNetwork};
-pub use mse::{mse, psnr_of_mse};
+pub use mask::{fill_masked, mean_weight};
+pub use mse::{masked_mse, mse, psnr_of_mse};
 pub use perceptual::PerceptualLoss;
-pub use photometric::{photometric, ssim};
+pub use photometric::{masked_photometric, photometric, ssim};
 pub use terms::{Losses, Term};
 pub use vgg19::Vgg19;
 
@@ -42,20 +44,26 @@ pub(crate) fn losses(
     share: &StepFraction,
 ) -> Losses<Tensor> {
     let ground_truth = &batch.target.images;
-    let mse = mse(&rendered.rgb, ground_truth) * share.scenes;
-    let perceptual = match perceptual {
-        Some(network) => {
-            // Both halves of a paired sample have the same targets.
-            let halves = ground_truth.chunk(if batch.paired { 2 } else { 1 }, 0);
-            network.loss(&rendered.rgb, &halves[0]) * share.scenes
+    let masks = batch.target_masks();
+    let mse = match &masks {
+        Some(masks) => mean_over_scenes(&rendered.rgb, &batch.once(ground_truth), masks, masked_mse),
+        None => mse(&rendered.rgb, ground_truth),
+    } * share.scenes;
+    let perceptual = match (perceptual, &masks) {
+        (Some(network), Some(masks)) => {
+            let loss = |image: &Tensor, ground_truth: &Tensor, mask: &Tensor| {
+                network.loss(&fill_masked(image, ground_truth, mask), ground_truth) / mean_weight(mask)
+            };
+            mean_over_scenes(&rendered.rgb, &batch.once(ground_truth), masks, loss) * share.scenes
         }
-        None => mse.zeros_like(),
+        (Some(network), None) => network.loss(&rendered.rgb, &batch.once(ground_truth)) * share.scenes,
+        (None, _) => mse.zeros_like(),
     };
     let consistency = match batch.paired {
         true => {
             let (alpha, depth) = (rendered.alpha.chunk(2, 0), rendered.depth.chunk(2, 0));
             let factors = (config.consistency_alpha, config.consistency_depth);
-            consistency([&alpha[0], &alpha[1]], [&depth[0], &depth[1]], factors.0, factors.1, share)
+            consistency([&alpha[0], &alpha[1]], [&depth[0], &depth[1]], masks.as_ref(), factors, share)
         }
         false => mse.zeros_like(),
     };
@@ -72,4 +80,22 @@ pub(crate) fn losses(
         Term::DecoderRotation => &decoder.rotation * share.scenes,
         Term::DecoderSh => &decoder.sh * share.scenes,
     })
+}
+
+/// Computes the mean of `loss` over the B scenes of `ground_truth` [B, C, 3, H, W] with `masks` [B, C, 1, H, W]. Each scene's mean is over its
+/// own pixels that count, so that the slices of a step add up. `rendered` [R·B, C, 3, H, W] holds R renderings of the ground truth along the
+/// batch.
+fn mean_over_scenes(
+    rendered: &Tensor,
+    ground_truth: &Tensor,
+    masks: &Tensor,
+    loss: impl Fn(&Tensor, &Tensor, &Tensor) -> Tensor,
+) -> Tensor {
+    let (size, count) = (ground_truth.size(), ground_truth.size()[0]);
+    let repeated = rendered.reshape([&[-1], size.as_slice()].concat());
+    let of_scene = |scene: i64| {
+        let [ground_truth, mask] = [ground_truth, masks].map(|t| t.narrow(0, scene, 1));
+        loss(&repeated.select(1, scene), &ground_truth, &mask)
+    };
+    (0..count).map(of_scene).reduce(|sum, loss| sum + loss).expect("a scene") / count as f64
 }

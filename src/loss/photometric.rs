@@ -1,6 +1,7 @@
 //! Photometric loss: absolute differences and structural similarity (SSIM, Wang et al. 2004), computed as by scikit-image's
 //! `structural_similarity` with Gaussian weights. (Spec 9.4.)
 
+use super::mask::{fill_masked, mean_weight};
 use crate::ffi::take_outputs;
 use globalsplat_csrc::fit;
 use tch::Tensor;
@@ -19,6 +20,24 @@ pub fn photometric(image: &Tensor, ground_truth: &Tensor, l1_weight: f64, ssim_w
         unsafe { take_outputs(|out| fit::photometric(image, ground_truth, l1_weight, ssim_weight, out)) };
     let [loss] = done.unwrap_or_else(|error| panic!("{error}"));
     loss
+}
+
+/// Computes [`photometric`] over the pixels that count (spec 7.9): `l1_weight` times the mean absolute difference weighted by `mask`, plus
+/// `ssim_weight` times 1 − (1 − SSIM) / mean weight, where SSIM compares images that are equal where they are masked out. Images are [.., C, H, W]; masks are
+/// [.., 1, H, W].
+///
+/// # Panics
+/// Panics like [`photometric`].
+pub fn masked_photometric(
+    image: &Tensor,
+    ground_truth: &Tensor,
+    mask: &Tensor,
+    l1_weight: f64,
+    ssim_weight: f64,
+) -> Tensor {
+    let filled = fill_masked(image, ground_truth, mask);
+    (photometric(&filled, ground_truth, l1_weight, ssim_weight) - ssim_weight) / mean_weight(mask)
+        + ssim_weight
 }
 
 /// Computes the mean SSIM, with sample covariances; 1 for equal images. The requirements on the images are those of [`photometric`].

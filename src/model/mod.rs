@@ -48,7 +48,7 @@ pub(crate) use merge::Candidates;
 pub(crate) use mixer::Mixer;
 pub(crate) use rotation::{quaternion_from_6d, rotation_matrix_from_6d};
 pub(crate) use stream::{SelfAttentionBlock, StreamRound};
-pub(crate) use tokens::{RayTokens, RgbTokens, Tokenizer, patchify};
+pub(crate) use tokens::{IMAGENET_MEAN, RayTokens, RgbTokens, Tokenizer, patchify};
 
 use crate::error::Result;
 use layers::{ENCODER_STD, init_or_zeros, randn, without_random_init};

@@ -7,7 +7,8 @@ use super::precision::Precision;
 use crate::scene::plucker_rays;
 use tch::{Tensor, nn};
 
-const IMAGENET_MEAN: [f32; 3] = [0.485, 0.456, 0.406];
+/// Mean of ImageNet by channel: the colour that RGB tokens have as 0.
+pub const IMAGENET_MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 const IMAGENET_STD: [f32; 3] = [0.229, 0.224, 0.225];
 /// Number of values per ray: moment and direction.
 const RAY_CHANNELS: i64 = 6;

@@ -52,6 +52,21 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
             request.number("absolute")?,
             request.number("similar")?,
         )),
+        "masked_mse" => {
+            let [rendered, truth, mask] = request.images("rendered")?;
+            loss_of(loss::masked_mse(rendered, truth, mask))
+        }
+        "masked_photometric" => {
+            let [picture, truth, mask] = request.images("picture")?;
+            let (absolute, similar) = (request.number("absolute")?, request.number("similar")?);
+            loss_of(loss::masked_photometric(picture, truth, mask, absolute, similar))
+        }
+        "masked_depth_smoothness" => loss_of(loss::masked_depth_smoothness(
+            request.input("depth")?,
+            request.input("photo")?,
+            request.input("mask")?,
+            request.number("factor")?,
+        )),
         "depth_smoothness" => loss_of(loss::depth_smoothness(
             request.input("depth")?,
             request.input("photo")?,
@@ -78,6 +93,11 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
 impl Request {
     fn input(&self, name: &str) -> Result<&Tensor> {
         self.inputs.get(name).ok_or_else(|| Error::request(format!("{}: no input {name}", self.case)))
+    }
+
+    /// Returns the rendered image called `name`, the photo that it has to match, and the photo's mask.
+    fn images(&self, name: &str) -> Result<[&Tensor; 3]> {
+        Ok([self.input(name)?, self.input("truth")?, self.input("mask")?])
     }
 
     /// Returns the value of `key` in the case's configuration, such as a number or a list.
@@ -362,6 +382,7 @@ fn frustum(request: &Request) -> Result<Answer> {
     let (w2c, intrinsics) = (request.input("w2c")?, request.input("intrinsics")?);
     let views = ViewBatch {
         images: Tensor::zeros([1, 1, 3, height, width], (Kind::Float, request.device)),
+        masks: None,
         c2w: w2c.inverse(),
         w2c: w2c.shallow_clone(),
         intrinsics: intrinsics.shallow_clone(),
@@ -383,7 +404,7 @@ fn consistency(request: &Request) -> Result<Answer> {
     let alpha = [request.input("alpha_a")?, request.input("alpha_b")?];
     let depth = [request.input("depth_a")?, request.input("depth_b")?];
     let factors = (request.number("alpha_factor")?, request.number("depth_factor")?);
-    loss_of(loss::consistency(alpha, depth, factors.0, factors.1, &loss::StepFraction::WHOLE))
+    loss_of(loss::consistency(alpha, depth, None, factors, &loss::StepFraction::WHOLE))
 }
 
 fn subsets(request: &Request) -> Result<Answer> {

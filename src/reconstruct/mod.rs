@@ -18,7 +18,7 @@ pub use model_file::{
 pub use spread::spread_over_path;
 
 use crate::config::Config;
-use crate::data::{View, ViewBatch, view_batch};
+use crate::data::{View, view_batch};
 use crate::error::{Error, Result};
 use crate::io::{MappedWeights, Splat};
 use crate::model::{GlobalSplat, Stage};
@@ -142,7 +142,10 @@ fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4]) -> Result<Gaussians>
     let posed =
         views.iter().zip(poses).flat_map(|(of_photo, &pose)| of_photo.iter().map(move |view| (view, pose)));
     let (views, poses): (Vec<&View>, Vec<DMat4>) = posed.unzip();
-    let ViewBatch { images, c2w, intrinsics, .. } = view_batch(&views, &poses, device);
+    let batch = view_batch(&views, &poses, device);
+    let images = batch.input_images();
+    drop(batch.images);
+    let [c2w, intrinsics] = [batch.c2w, batch.intrinsics];
     config.model.check_image(images.size()[3], images.size()[4])?;
     // A pass reads nearly every weight exactly once, so pages of weights can be released as soon as their layers are done.
     let release_pages = || {

@@ -3,12 +3,12 @@
 use super::{Model, Reconstruction, pass};
 use crate::data::{View, cameras_at};
 use crate::error::Result;
-use crate::loss::mse;
+use crate::loss::{masked_mse, mse};
 use crate::render::{RenderedView, render_views};
 use crate::scene::{Gaussians, Normalization, Placement};
 use glam::DMat4;
 use std::time::Instant;
-use tch::Device;
+use tch::{Device, Tensor};
 
 /// Changes of a placement that the search tries: forward shift of the cameras, and the logarithm of the factor that enlarges the scene.
 const SEARCH_OFFSETS: [[f64; 2]; 2] = [[0.15, 0.], [0., 0.1]];
@@ -79,11 +79,16 @@ impl Attempt {
     }
 }
 
-/// Returns the mean squared error of `gaussians`, rendered from the photos' `poses`, against the photos.
+/// Returns the mean squared error of `gaussians`, rendered from the photos' `poses`, against the pixels of the photos that count.
 fn error_of(gaussians: &Gaussians, photos: &[View], poses: &[DMat4]) -> Result<f64> {
     let rendered = render_views(gaussians, &cameras_at(photos, poses))?;
     let error = |(made, photo): (&RenderedView, &View)| {
-        mse(&made.rgb, &photo.image.to_device(made.rgb.device())).double_value(&[])
+        let there = |t: &Tensor| t.to_device(made.rgb.device());
+        let error = match &photo.mask {
+            Some(mask) => masked_mse(&made.rgb, &there(&photo.image), &there(mask)),
+            None => mse(&made.rgb, &there(&photo.image)),
+        };
+        error.double_value(&[])
     };
     let errors = rendered.iter().zip(photos).map(error);
     Ok(errors.sum::<f64>() / photos.len() as f64)

@@ -60,14 +60,17 @@ fn supported(raw: &RawGaussians, depth_maps: &[DepthMap]) -> Vec<i64> {
     let map = |of: &DepthMap| {
         let depth = Vec::<f32>::try_from(of.depth.contiguous().view([-1])).expect("numbers");
         let sure = Vec::<bool>::try_from(of.sure.contiguous().view([-1])).expect("truths");
-        (projection(&of.camera), of.camera.width as usize, depth, sure)
+        (projection(&of.camera), of.camera.width as usize, depth, sure, counted(of))
     };
     let maps: Vec<_> = depth_maps.iter().map(map).collect();
     let holds = |mean: DVec3| {
         let mut shown = false;
-        for (seen, width, depth, sure) in &maps {
+        for (seen, width, depth, sure, counted) in &maps {
             let Some([u, v, z]) = seen(mean) else { continue };
             let pixel = v as usize * width + u as usize;
+            if counted.as_ref().is_some_and(|counted| !counted[pixel]) {
+                continue;
+            }
             let nearness = z / f64::from(depth[pixel]);
             if sure[pixel] && nearness < 1. - NEAR {
                 return false;
@@ -79,17 +82,45 @@ fn supported(raw: &RawGaussians, depth_maps: &[DepthMap]) -> Vec<i64> {
     (0..means.len() / 3).filter(|&i| holds(DVec3::from_slice(&means[3 * i..]))).map(|i| i as i64).collect()
 }
 
+/// Returns for every pixel whether it counts; `None` if all do.
+fn counted(of: &DepthMap) -> Option<Vec<bool>> {
+    let counted = of.counted.as_ref()?;
+    Some(Vec::<bool>::try_from(counted.contiguous().view([-1])).expect("truths"))
+}
+
+/// Returns `points` without those that photos show only where they are masked out.
+fn points_that_count<'a>(points: &'a [Point], depth_maps: &[DepthMap]) -> Vec<&'a Point> {
+    let maps: Vec<_> =
+        depth_maps.iter().map(|of| (projection(&of.camera), of.camera.width as usize, counted(of))).collect();
+    let counts = |point: &&Point| {
+        let mut places = maps.iter().filter_map(|(seen, width, counted)| {
+            let [u, v, _] = seen(point.position)?;
+            Some(counted.as_ref().is_none_or(|counted| counted[v as usize * width + u as usize]))
+        });
+        places.next().is_none_or(|first| first || places.any(|counts| counts))
+    };
+    points.iter().filter(counts).collect()
+}
+
 fn sample_gaussians(depth_maps: &[DepthMap], points: &[Point], count: usize, seed: u64) -> RawGaussians {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let pixels: f64 = depth_maps.iter().map(|s| f64::from(s.camera.width * s.camera.height)).sum();
+    let points = points_that_count(points, depth_maps);
+    // Cumulative numbers of pixels that count, and of depth maps' worth of them.
+    let (mut pixels, mut shares) = (0., vec![0.]);
+    for of in depth_maps {
+        let all = f64::from(of.camera.width * of.camera.height);
+        let counted = of.counted.as_ref().map_or(all, |counted| counted.sum(Kind::Int64).double_value(&[]));
+        pixels += counted;
+        shares.push(shares[shares.len() - 1] + counted / all);
+    }
     let spacing = (pixels / count.max(1) as f64).sqrt(); // in pixels of the downscaled images
     let chosen = sample(&mut random, points.len(), points.len().min(count / POINTS_SHARE));
     let mut balls: Vec<IsotropicGaussian> =
-        chosen.iter().map(|i| at_point(&points[i], depth_maps, spacing)).collect();
+        chosen.iter().map(|i| at_point(points[i], depth_maps, spacing)).collect();
     let left = count - balls.len();
     for (index, of) in depth_maps.iter().enumerate() {
         // Cumulative shares, so that the counts add up to `left`.
-        let share = |i: usize| left * i / depth_maps.len();
+        let share = |i: usize| (left as f64 * shares[i] / shares[depth_maps.len()]) as usize;
         sample_pixels(of, share(index + 1) - share(index), spacing, &mut random, &mut balls);
     }
     raw(&balls)
@@ -103,7 +134,7 @@ fn at_point(point: &Point, depth_maps: &[DepthMap], spacing: f64) -> IsotropicGa
     IsotropicGaussian { mean: point.position, scale: EXTENT * spacing * least, colour: point.colour }
 }
 
-/// Appends `count` Gaussians at random pixels of `of` to `balls`.
+/// Appends `count` Gaussians at random pixels of `of` that count to `balls`.
 fn sample_pixels(
     of: &DepthMap,
     count: usize,
@@ -114,8 +145,16 @@ fn sample_pixels(
     let (width, height) = (of.camera.width as usize, of.camera.height as usize);
     let numbers = |t: &Tensor| Vec::<f32>::try_from(t.contiguous().view([-1])).expect("numbers");
     let (depth, image, k) = (numbers(&of.depth), numbers(&of.image), of.camera.intrinsics);
+    let counted = counted(of).map(|counted| (0..counted.len()).filter(|&i| counted[i]).collect::<Vec<_>>());
     for _ in 0..count {
-        let (u, v) = (random.random_range(0. ..width as f64), random.random_range(0. ..height as f64));
+        let (u, v) = match &counted {
+            Some(counted) => {
+                let pixel = counted[random.random_range(0..counted.len())];
+                let (x, y) = ((pixel % width) as f64, (pixel / width) as f64);
+                (x + random.random::<f64>(), y + random.random::<f64>())
+            }
+            None => (random.random_range(0. ..width as f64), random.random_range(0. ..height as f64)),
+        };
         let pixel = v as usize * width + u as usize;
         let z = f64::from(depth[pixel]);
         let seen = DVec3::new((u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z);
@@ -162,6 +201,7 @@ mod tests {
             image: Tensor::zeros([3, 16, 16], options),
             depth: Tensor::full([16, 16], 4., options),
             sure: Tensor::arange(16, options).lt(sure_columns as f64).expand([16, 16], false).contiguous(),
+            counted: None,
         };
         let depth_maps = [wall(0., 16), wall(0.5, 8)];
         let kept = |means: &[[f64; 3]]| {
@@ -180,6 +220,40 @@ mod tests {
         assert_eq!(kept(&[[0., 0., 4.1], [0., 0., 2.], [0., 0., 9.], [30., 0., 4.]]), [0]);
         // The first is behind the wall in one image, but the other camera isn't sure there, so it stays.
         assert_eq!(kept(&[[3., 0., 9.], [3., 0., 2.]]), [0]);
+    }
+
+    /// No Gaussian starts at a masked pixel, and points that photos show only there are left out.
+    #[test]
+    fn masked_pixels_start_no_gaussians() {
+        let options = (Kind::Float, Device::Cpu);
+        let map = |counted: Option<Tensor>| DepthMap {
+            camera: Camera {
+                intrinsics: Intrinsics { fx: 8., fy: 8., cx: 8., cy: 8. },
+                c2w: DMat4::IDENTITY,
+                width: 16,
+                height: 16,
+            },
+            image: Tensor::zeros([3, 16, 16], options),
+            depth: Tensor::full([16, 16], 4., options),
+            sure: Tensor::zeros([16, 16], (Kind::Bool, Device::Cpu)),
+            counted,
+        };
+        let right = Tensor::arange(16, options).ge(8.).expand([16, 16], false).contiguous();
+        let point = |x: f64| Point { position: DVec3::new(x, 0., 4.), colour: [0.5; 3] };
+        let points = [point(-1.), point(1.), point(-9.)];
+        let xs = |maps: &[DepthMap]| -> Vec<f64> {
+            let raw = sample_gaussians(maps, &points, 200, 0);
+            Vec::try_from(raw.means.select(2, 0).view([-1]).to_kind(Kind::Double)).expect("numbers")
+        };
+        let masked = xs(&[map(Some(right.shallow_clone()))]);
+        assert_eq!(masked.len(), 200);
+        // The point that no photo shows stays.
+        assert_eq!(masked.iter().filter(|x| **x < 0.).copied().collect::<Vec<_>>(), [-9.]);
+        // Another photo shows the first point, and gets two thirds of the Gaussians.
+        let both = xs(&[map(Some(right)), map(None)]);
+        assert!(both.contains(&-1.));
+        let left = both.iter().filter(|x| **x < 0.).count();
+        assert!((50..85).contains(&left), "{left}");
     }
 
     /// Known Gaussians are filled up to the requested count. Those that are kept come first, and none is dropped below that count.

@@ -19,15 +19,15 @@ pub use begin::gaussians_from_photos;
 pub use config::RefineConfig;
 pub use corrections::{Correction, Corrections};
 pub use gaussian_optimizer::GaussianOptimizer;
-pub use options::{Budget, RefineOptions};
+pub use options::{Budget, MaskBackground, RefineOptions};
 pub use patches::{PatchScores, Patches};
 pub use photos::{MIN_SIDE, Photos, load_photos};
 pub use session::{EvalPoint, Initial, RefineEvent, RefineResult, RefineSession};
 
-use crate::data::View;
+use crate::data::{View, ViewBatch};
 use crate::device::Stopwatch;
 use crate::error::{Error, Result};
-use crate::loss::{depth_smoothness, photometric};
+use crate::loss::{depth_smoothness, fill_masked, masked_depth_smoothness, masked_photometric, photometric};
 use crate::render::cpu::KernelThreads;
 use crate::render::{Cameras, DEFAULT_EPS2D, RenderOutput, render, render_views};
 use crate::scene::{Camera, Gaussians};
@@ -67,6 +67,8 @@ pub struct Task<'a> {
     pub budget: Budget,
     /// Seed of the random numbers.
     pub seed: u64,
+    /// Background of masked pixels; `None` ignores them.
+    pub background: Option<MaskBackground>,
 }
 
 /// Optimizes the Gaussians of `optimizer` and the `corrections` of the photos. `on_step` is called after every step and ends the work if it
@@ -91,7 +93,7 @@ pub(crate) fn refine_timed(
     stopwatch: &mut Stopwatch,
     mut on_step: impl FnMut(&RefineStep) -> bool,
 ) -> Result<Gaussians> {
-    let Task { photos, depth, config, budget, seed } = *task;
+    let Task { photos, depth, config, budget, seed, background } = *task;
     let _threads = KernelThreads::take();
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let (begun, mut elapsed, mut last) = (Instant::now(), Duration::ZERO, Duration::ZERO);
@@ -114,7 +116,8 @@ pub(crate) fn refine_timed(
         let cameras = Cameras { w2c: corrections.w2c(&batch, &which), ..batch.cameras() };
         let mut pictures = stopwatch.time("render", || render(&gaussians, &cameras, DEFAULT_EPS2D))?;
         pictures.rgb = corrections.apply_exposures(pictures.rgb, &which);
-        let loss = stopwatch.time("loss", || loss(&gaussians, &pictures, &batch.images, config, depth));
+        let background = background.map(|background| background.colour(&mut random));
+        let loss = stopwatch.time("loss", || loss(&gaussians, &pictures, &batch, background, config, depth));
         stopwatch.time("backward", || {
             optimizer.zero_grad();
             corrections.zero_grad();
@@ -133,16 +136,34 @@ pub(crate) fn refine_timed(
     Ok(tch::no_grad(|| optimizer.gaussians(1.)))
 }
 
-/// Returns the loss: the difference between rendered images and photos, plus the regularization of the Gaussians.
+/// Returns the loss: the difference between rendered images and photos, plus the regularization of the Gaussians. Masked pixels of the
+/// photos are left out, or have the colour `background`, over which the splat is seen.
 fn loss(
     gaussians: &Gaussians,
     pictures: &RenderOutput,
-    photos: &Tensor,
+    photos: &ViewBatch,
+    background: Option<[f32; 3]>,
     config: &RefineConfig,
     depth: f64,
 ) -> Tensor {
-    let mut loss =
-        photometric(&pictures.rgb, photos, 1. - config.ssim_weight, -config.ssim_weight) + config.ssim_weight;
+    let (l1_weight, ssim_weight) = (1. - config.ssim_weight, -config.ssim_weight);
+    let difference = match (&photos.masks, background) {
+        (masks, Some(colour)) => {
+            let colour = Tensor::from_slice(&colour).view([3, 1, 1]).to_device(photos.images.device());
+            let rgb = &pictures.rgb + (1. - pictures.alpha.unsqueeze(2)) * &colour;
+            match masks {
+                Some(masks) => {
+                    photometric(&rgb, &fill_masked(&photos.images, &colour, masks), l1_weight, ssim_weight)
+                }
+                None => photometric(&rgb, &photos.images, l1_weight, ssim_weight),
+            }
+        }
+        (Some(masks), None) => {
+            masked_photometric(&pictures.rgb, &photos.images, masks, l1_weight, ssim_weight)
+        }
+        (None, None) => photometric(&pictures.rgb, &photos.images, l1_weight, ssim_weight),
+    };
+    let mut loss = difference + config.ssim_weight;
     if config.opacity > 0. {
         loss += gaussians.opacities.mean(Kind::Float) * config.opacity;
     }
@@ -150,7 +171,13 @@ fn loss(
         loss += gaussians.scales.mean(Kind::Float) * (config.scale / depth);
     }
     if config.depth_smoothness_weight > 0. {
-        loss += depth_smoothness(&pictures.depth, photos, config.depth_smoothness_weight);
+        let weight = config.depth_smoothness_weight;
+        loss += match &photos.masks {
+            Some(masks) => {
+                masked_depth_smoothness(&pictures.depth, &photos.images, &masks.squeeze_dim(2), weight)
+            }
+            None => depth_smoothness(&pictures.depth, &photos.images, weight),
+        };
     }
     loss
 }
@@ -181,10 +208,119 @@ pub fn scene_depth(gaussians: &Gaussians, views: &[View]) -> Result<f64> {
 mod tests {
     use super::*;
     use crate::bench::synthetic_scene;
-    use crate::data::ViewBatch;
-    use crate::scene::{ImageSize, RawGaussians};
+    use crate::eval::score_views;
+    use crate::scene::{ImageSize, Intrinsics, RawGaussians};
+    use glam::{DMat4, DVec3};
     use globalsplat_csrc::ops::{WAITING, computing, record_ops, record_outermost_ops};
     use tch::Device;
+
+    const SIDE: i64 = 64;
+
+    /// Returns the views of a wall with a wave pattern at depth 4, and the same with a bright square that moves in front of it, which a mask
+    /// leaves out if `is_masked`.
+    fn wall(is_masked: bool) -> [Vec<View>; 2] {
+        let options = (Kind::Float, Device::Cpu);
+        let side = SIDE as f64;
+        let intrinsics = Intrinsics { fx: side, fy: side, cx: side / 2., cy: side / 2. };
+        let view = |index: i64| {
+            let at = 0.25 * index as f64 - 0.75;
+            let axis = |offset: f64| (Tensor::arange(SIDE, options) + 0.5 - side / 2.) / side * 4. + offset;
+            let (x, y) = (axis(at).view([1, SIDE]), axis(0.).view([SIDE, 1]));
+            let wave = ((&x * 5.).sin() * (&y * 4.).cos() + (&x * 11. + &y * 7.).sin()) * 0.2 + 0.4;
+            let c2w = DMat4::from_translation(DVec3::X * at);
+            let camera = Camera { intrinsics, c2w, width: SIDE as u32, height: SIDE as u32 };
+            let image = wave.expand([3, SIDE, SIDE], false).contiguous();
+            View { name: index.to_string(), image, mask: None, camera }
+        };
+        let clean: Vec<View> = (0..7).map(view).collect();
+        let blobs = clean.iter().enumerate().map(|(index, view)| {
+            let square = |t: &Tensor| {
+                let (row, column) = (7 * index as i64, 23 * index as i64 % 48);
+                t.narrow(1, row, 16).narrow(2, column, 16)
+            };
+            let (image, mask) = (view.image.copy(), Tensor::ones([1, SIDE, SIDE], options));
+            let _ = square(&image).fill_(1.);
+            let _ = square(&mask).fill_(0.);
+            View { image, mask: is_masked.then_some(mask), ..view.shallow_clone() }
+        });
+        [blobs.collect(), clean]
+    }
+
+    /// Refines a splat on `views`, which starts from the depths of `start`, and returns it.
+    fn refined(start: &[View], views: &[View], background: Option<MaskBackground>) -> Gaussians {
+        let config = RefineConfig::default();
+        let raw = gaussians_from_photos(start, &[], None, 400, 0, Device::Cpu, |_| true).expect("depths");
+        let depth = scene_depth(&raw.activate(), views).unwrap();
+        let mut optimizer = GaussianOptimizer::new(&raw, depth, &config);
+        let photos = Photos::new(views, config.levels(), Device::Cpu);
+        let budget = Budget::Steps(400);
+        let task = Task { photos: &photos, depth, config: &config, budget, seed: 0, background };
+        refine(&mut optimizer, &mut Corrections::none(), &task, |_| true).unwrap()
+    }
+
+    /// A bright thing that moves through the photos costs a lot of quality on a view that isn't among them, and hardly any if it is masked
+    /// out.
+    #[test]
+    fn a_mask_leaves_out_what_moves() {
+        let psnr = |mut views: Vec<View>, truth: &View| {
+            views.remove(3);
+            let splat = refined(&views, &views, None);
+            let scores = score_views("wall", &splat, std::slice::from_ref(truth), None, |_| true).unwrap();
+            scores.unwrap().psnr
+        };
+        let ([masked, clean], [unmasked, _]) = (wall(true), wall(false));
+        let truth = clean[3].shallow_clone();
+        let [of_clean, of_masked, of_unmasked] = [clean, masked, unmasked].map(|views| psnr(views, &truth));
+        assert!(of_masked > of_clean - 0.3, "{of_masked} dB, {of_clean} dB without the square");
+        assert!(of_unmasked < of_clean - 1., "{of_unmasked} dB, {of_clean} dB without the square");
+    }
+
+    /// A random background removes what is under a mask; without a background, it stays.
+    #[test]
+    fn a_random_mask_background_leaves_emptiness() {
+        let [_, whole] = wall(false);
+        let mut views: Vec<View> = whole.iter().map(View::shallow_clone).collect();
+        for (index, view) in views.iter_mut().enumerate() {
+            let end = SIDE / 2 - (index as i64 - 3) * 4;
+            let mask = Tensor::ones([1, SIDE, SIDE], (Kind::Float, Device::Cpu));
+            let _ = mask.narrow(2, end, SIDE - end).zero_();
+            view.mask = Some(mask);
+        }
+        let middle = [views[3].camera];
+        let [ignored, random] = [None, Some(MaskBackground::Random)].map(|background| {
+            let alpha = render_views(&refined(&whole, &views, background), &middle).unwrap().remove(0).alpha;
+            let mean = |first: i64| alpha.narrow(1, first, SIDE / 2 - 4).mean(Kind::Double).double_value(&[]);
+            [mean(0), mean(SIDE / 2 + 4)]
+        });
+        assert!(random[0] > 0.9 && random[1] < 0.1 && ignored[1] > 0.3, "{random:?}, {ignored:?}");
+    }
+
+    /// The splat is compared over the background: one that is empty matches a photo that is masked out.
+    #[test]
+    fn masked_pixels_have_the_background_s_colour() {
+        let (gaussians, cameras) = synthetic_scene(40, 1, ImageSize { width: 32, height: 24 });
+        let pictures = render(&gaussians, &cameras, DEFAULT_EPS2D).unwrap();
+        let config = RefineConfig { opacity: 0., ..RefineConfig::default() };
+        let loss_of = |alpha: f64, masked: bool, background: [f32; 3]| {
+            let (rgb, full) = (pictures.rgb.zeros_like(), pictures.alpha.ones_like());
+            let rendered = RenderOutput { rgb, alpha: &full * alpha, depth: full.zeros_like() };
+            let views = ViewBatch {
+                images: pictures.rgb.ones_like() * 0.3,
+                masks: masked.then(|| full.zeros_like().unsqueeze(2)),
+                c2w: cameras.w2c.inverse(),
+                w2c: cameras.w2c.shallow_clone(),
+                intrinsics: cameras.intrinsics.shallow_clone(),
+            };
+            loss(&gaussians, &rendered, &views, Some(background), &config, 1.).double_value(&[])
+        };
+        for colour in [[0.; 3], [1.; 3], [0.2, 0.9, 0.4]] {
+            let found = loss_of(0., true, colour);
+            assert!(found.abs() < 1e-4, "{colour:?}: {found}");
+        }
+        assert!(loss_of(1., true, [1.; 3]) > 0.5 && loss_of(1., true, [0.; 3]).abs() < 1e-4);
+        // Photos without a mask are compared over the background, too.
+        assert!(loss_of(0., false, [0.3; 3]).abs() < 1e-4 && loss_of(1., false, [0.3; 3]) > 0.1);
+    }
 
     /// A step copies nothing between devices beyond what is counted here: photos, Gaussians and corrections are on the device. It waits for
     /// the device only where memory for (splat, tile) pairs is allocated.
@@ -194,7 +330,13 @@ mod tests {
         let pictures = render(&gaussians, &cameras, DEFAULT_EPS2D).unwrap();
         let c2w = cameras.w2c.inverse();
         let intrinsics = cameras.intrinsics.shallow_clone();
-        let views = ViewBatch { images: pictures.rgb, c2w, w2c: cameras.w2c.shallow_clone(), intrinsics };
+        let views = ViewBatch {
+            images: pictures.rgb,
+            masks: None,
+            c2w,
+            w2c: cameras.w2c.shallow_clone(),
+            intrinsics,
+        };
         let settings = ["relocate_every=0", "opacity=0.01", "scale=0.01", "depth_smoothness_weight=0.1"]
             .map(String::from);
         let config = RefineConfig::with(&settings, false).unwrap();
@@ -205,6 +347,7 @@ mod tests {
             config: &config,
             budget: Budget::Steps(steps),
             seed: 0,
+            background: None,
         };
         let steps = |count| {
             let mut optimizer =

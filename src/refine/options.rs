@@ -5,6 +5,7 @@ use crate::data::{Capture, Holdout};
 use crate::error::{Error, Result};
 use crate::reconstruct::spread_over_path;
 use crate::scene::ImageSize;
+use rand::Rng;
 use std::time::{Duration, Instant};
 use tch::Device;
 
@@ -15,6 +16,28 @@ pub enum Budget {
     Steps(u64),
     /// Wall-clock time, including all other work.
     Time(Duration),
+}
+
+/// Background that a splat is seen over where photos are masked out, so that nothing is left there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MaskBackground {
+    /// Black.
+    Black,
+    /// White.
+    White,
+    /// Another colour in every step, which no Gaussian can imitate.
+    Random,
+}
+
+impl MaskBackground {
+    /// Returns red, green and blue of the background of a step.
+    pub(super) fn colour(self, random: &mut impl Rng) -> [f32; 3] {
+        match self {
+            MaskBackground::Black => [0.; 3],
+            MaskBackground::White => [1.; 3],
+            MaskBackground::Random => random.random(),
+        }
+    }
 }
 
 /// Options of a session.
@@ -38,6 +61,8 @@ pub struct RefineOptions {
     pub correct_poses: bool,
     /// Learns the exposure of each photo relative to the others if `true`.
     pub correct_exposures: bool,
+    /// Background that masked pixels have in the optimization. If it is `None`, the optimization ignores masked pixels.
+    pub mask_background: Option<MaskBackground>,
     /// Size to which photos are cropped and resized. If it is `None`, they keep their shape, and large ones are downscaled.
     pub size: Option<ImageSize>,
     /// Device of the depth estimation and the optimization.
@@ -57,6 +82,7 @@ impl Default for RefineOptions {
             views: None,
             correct_poses: false,
             correct_exposures: false,
+            mask_background: None,
             size: None,
             device: Device::Cpu,
         }

@@ -3,7 +3,7 @@
 use super::corrections::Corrections;
 use crate::data::View;
 use crate::error::Result;
-use crate::loss::{psnr_of_mse, ssim};
+use crate::loss::{masked_mse, masked_photometric, psnr_of_mse, ssim};
 use crate::render::render_views;
 use crate::scene::{Camera, Gaussians};
 use serde::Serialize;
@@ -60,8 +60,14 @@ impl Patches {
         let exact = |t: &Tensor| t.to_device(Device::Cpu).to_kind(Kind::Double).clamp(0., 1.);
         let scores = pictures.iter().zip(&self.views).map(|(picture, view)| {
             let (picture, photo) = (exact(&picture.rgb), exact(&view.image));
-            let mse = (&picture - &photo).square().mean(Kind::Double).double_value(&[]);
-            [psnr_of_mse(mse), ssim(&picture, &photo).double_value(&[])]
+            let (mse, ssim) = match &view.mask {
+                Some(mask) => {
+                    let mask = exact(mask);
+                    (masked_mse(&picture, &photo, &mask), masked_photometric(&picture, &photo, &mask, 0., 1.))
+                }
+                None => ((&picture - &photo).square().mean(Kind::Double), ssim(&picture, &photo)),
+            };
+            [psnr_of_mse(mse.double_value(&[])), ssim.double_value(&[])]
         });
         let count = self.views.len() as f64;
         let sums = scores.reduce(|a, b| [a[0] + b[0], a[1] + b[1]]);
@@ -69,12 +75,21 @@ impl Patches {
     }
 }
 
-/// Cuts out the patch at the relative position `place`, from 0 to 1 along x and y.
+/// Cuts out the patch at the relative position `place`, from 0 to 1 along x and y. If the view has a mask, its middle is the pixel at
+/// `place[1]` of the list of those that count, or as near to it as the image allows.
 fn patch(view: &View, place: [f64; 2]) -> View {
     let Camera { width, height, intrinsics, .. } = view.camera;
     let [wide, high] = [width, height].map(|side| side.min(SIDE));
-    let [left, top] = [(width - wide, place[0]), (height - high, place[1])]
-        .map(|(free, place)| (f64::from(free) * place).floor() as i64);
+    let free = [width - wide, height - high];
+    let counted = view.mask.as_ref().map(|mask| mask.select(0, 0).gt(0.).nonzero());
+    let [left, top] = match counted.filter(|counted| counted.numel() > 0) {
+        Some(counted) => {
+            let pixel = counted.get((counted.size()[0] as f64 * place[1]).floor() as i64);
+            let corner = |axis: i64, side: u32| pixel.int64_value(&[axis]) - i64::from(side / 2);
+            [corner(1, wide).clamp(0, free[0].into()), corner(0, high).clamp(0, free[1].into())]
+        }
+        None => [0, 1].map(|axis| (f64::from(free[axis]) * place[axis]).floor() as i64),
+    };
     let cut = |image: &Tensor| image.narrow(1, top, high.into()).narrow(2, left, wide.into()).contiguous();
     let intrinsics = intrinsics.cropped(left as f64, top as f64);
     let camera = Camera { intrinsics, width: wide, height: high, ..view.camera };

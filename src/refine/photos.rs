@@ -72,9 +72,14 @@ fn smaller(camera: &Camera) -> Option<ImageSize> {
 pub(super) fn distinct(photos: &[View], depth: f64) -> Vec<usize> {
     let small: Vec<Tensor> = photos
         .iter()
-        .map(|View { image, camera, .. }| {
+        .map(|View { image, mask, camera, .. }| {
             let factor = (COMPARED_SIDE / f64::from(camera.width.max(camera.height))).min(1.);
             let side = |pixels: u32| ((f64::from(pixels) * factor).round() as i64).max(1);
+            // A photo with another mask shows something else.
+            let image = match mask {
+                Some(mask) => Tensor::cat(&[image * mask, mask.shallow_clone()], 0),
+                None => image.shallow_clone(),
+            };
             image.unsqueeze(0).adaptive_avg_pool2d([side(camera.height), side(camera.width)])
         })
         .collect();
@@ -154,12 +159,27 @@ impl Photos {
 /// Halves the width and height of the photos, or returns them unchanged if they would become too small.
 fn halved(batch: &ViewBatch) -> ViewBatch {
     let size = batch.images.size();
-    let (images, intrinsics) = if size[3].min(size[4]) < 2 * i64::from(LEAST_SIDE) {
-        (batch.images.shallow_clone(), batch.intrinsics.shallow_clone())
+    let (images, masks, intrinsics) = if size[3].min(size[4]) < 2 * i64::from(LEAST_SIDE) {
+        let masks = batch.masks.as_ref().map(Tensor::shallow_clone);
+        (batch.images.shallow_clone(), masks, batch.intrinsics.shallow_clone())
     } else {
         let intrinsics = batch.intrinsics.copy();
         let _ = intrinsics.narrow(2, 0, 2).g_mul_scalar_(0.5);
-        (batch.images.squeeze_dim(0).avg_pool2d(2, 2, 0, false, true, None).unsqueeze(0), intrinsics)
+        let half = |t: &Tensor| t.squeeze_dim(0).avg_pool2d(2, 2, 0, false, true, None).unsqueeze(0);
+        let (images, masks) = pool_masked(&batch.images, batch.masks.as_ref(), half);
+        (images, masks, intrinsics)
     };
-    ViewBatch { images, intrinsics, c2w: batch.c2w.shallow_clone(), w2c: batch.w2c.shallow_clone() }
+    ViewBatch { images, masks, intrinsics, c2w: batch.c2w.shallow_clone(), w2c: batch.w2c.shallow_clone() }
+}
+
+/// Downscales images [.., 3, H, W] and their masks [.., 1, H, W] by `pool`. Colours are means over the pixels that count.
+pub(super) fn pool_masked(
+    images: &Tensor,
+    masks: Option<&Tensor>,
+    pool: impl Fn(&Tensor) -> Tensor,
+) -> (Tensor, Option<Tensor>) {
+    const LEAST: f64 = 1e-6;
+    let Some(masks) = masks else { return (pool(images), None) };
+    let weights = pool(masks);
+    (pool(&(images * masks)) / weights.clamp_min(LEAST), Some(weights))
 }

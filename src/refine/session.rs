@@ -193,6 +193,21 @@ impl<'a> RefineSession<'a> {
         let mut held_out =
             load_photos(capture, &held_out, options.size, |done| should_continue(photos.len() + done))?;
         let frame = LocalFrame::from_cameras(&capture.cameras());
+        let masked_out = leave_out_masked(&mut photos).into_iter().chain(leave_out_masked(&mut held_out));
+        let masked_out: Vec<String> = masked_out.collect();
+        if photos.is_empty() {
+            return Err(Error::input(
+                capture.file(),
+                "the masks",
+                "no pixel that counts",
+                "some in every photo",
+            ));
+        }
+        if !masked_out.is_empty() {
+            let line =
+                format!("{}: masked out as a whole, and left out: {}", capture.name, names(&masked_out));
+            on_event(RefineEvent::Warning(&line));
+        }
         for view in photos.iter_mut().chain(&mut held_out) {
             view.camera = frame.camera_to_local(&view.camera);
         }
@@ -515,7 +530,8 @@ impl<'a> RefineSession<'a> {
             }
             steps => steps,
         };
-        let task = Task { photos: &photos, depth, config, budget, seed: *seed };
+        let background = self.options.mask_background;
+        let task = Task { photos: &photos, depth, config, budget, seed: *seed, background };
         let mut marks = EVAL_FRACTIONS.iter().peekable();
         let (mut is_due, mut failure) = (false, None);
         let gaussians = refine(&mut optimizer, &mut corrections, &task, |at| {
@@ -566,6 +582,11 @@ impl<'a> RefineSession<'a> {
         self.scoring += self.last_scoring;
         Ok(())
     }
+}
+
+/// Removes the views without a pixel that counts, and returns their names.
+fn leave_out_masked(views: &mut Vec<View>) -> Vec<String> {
+    views.extract_if(.., |view| view.is_masked_out()).map(|view| view.name).collect()
 }
 
 /// Returns the error of a session that is ended before there is a result.

@@ -1,6 +1,7 @@
 //! Depth estimation by a plane sweep (Collins 1996): finds for every pixel the depth at which its neighbourhood looks most alike in photos
 //! taken from other positions. It needs no weights and no points.
 
+use super::photos::pool_masked;
 use super::view_selection::{
     are_near_duplicates, at_octaves, extent, farthest_first, neighbours, projection,
 };
@@ -35,6 +36,10 @@ const MIN_AGREEING_FRACTION: f64 = 0.05;
 const PATCH: i64 = 9;
 /// Constant that is added to variances, so that noise doesn't correlate.
 const LEAST_VARIANCE: f64 = 1e-4;
+/// Minimum product of the weights of two pixels that are compared.
+const MIN_COUNTED: f64 = 0.5;
+/// Minimum fraction of a patch that counts in both photos.
+const LEAST_MASS: f64 = 0.25;
 /// Correlation at or below which a depth has no weight.
 const UNSURE: f64 = 0.5;
 /// Correlation above which a depth is usually right.
@@ -61,6 +66,8 @@ pub struct DepthMap {
     pub depth: Tensor,
     /// Mask of the pixels on whose depth the photos agree, [h, w]. Other depths come from pixels around them.
     pub sure: Tensor,
+    /// Mask of the pixels that count, [h, w], at least one; `None` if all do. The depths of the others are meaningless.
+    pub counted: Option<Tensor>,
 }
 
 /// Downscaled photo on the device of the computation.
@@ -70,6 +77,8 @@ struct SmallPhoto {
     image: Tensor,
     /// Mean over the colour channels, [h, w].
     grey: Tensor,
+    /// Weight of each pixel, [h, w]; `None` if every pixel counts.
+    weight: Option<Tensor>,
 }
 
 /// Computes depths for the pixels of the views. If there are many views, it processes a subset that together shows what all of them show,
@@ -115,11 +124,13 @@ fn sweep_one(this: &SmallPhoto, others: &[&SmallPhoto], nearest: Option<f64>, de
         (None, None) => 2. / depth,
     };
     let (inverse, correlation) = most_alike(this, others, nearest, PLANES);
+    let counted = this.counted();
     DepthMap {
         camera: this.camera,
         image: this.image.shallow_clone(),
-        depth: filled(&inverse, &correlation).clamp_min(nearest / FARTHEST).reciprocal(),
+        depth: filled(&inverse, &correlation, counted.as_ref()).clamp_min(nearest / FARTHEST).reciprocal(),
         sure: correlation.gt(SURE),
+        counted,
     }
 }
 
@@ -158,7 +169,7 @@ struct Measured {
     depth: f64,
     /// Distance of the median from infinity, in planes.
     planes: f64,
-    /// Fraction of all pixels whose correlation is above `SURE`.
+    /// Fraction of the pixels that count whose correlation is above `SURE`.
     share: f64,
 }
 
@@ -166,7 +177,9 @@ fn measured(this: &SmallPhoto, other: &SmallPhoto) -> Measured {
     let nearest = nearest_of_cameras(this, other);
     let (inverse, correlation) = most_alike(this, &[other], nearest, COARSE_PLANES);
     let sure = inverse.masked_select(&correlation.gt(SURE));
-    let share = sure.numel() as f64 / inverse.numel() as f64;
+    let pixels =
+        this.counted().map_or(inverse.numel() as i64, |counted| counted.sum(Kind::Int64).int64_value(&[]));
+    let share = sure.numel() as f64 / pixels as f64;
     let plane = nearest / (COARSE_PLANES - 1) as f64;
     let median = if sure.numel() == 0 { 0. } else { sure.median().double_value(&[]) };
     Measured { depth: 1. / median.max(plane), planes: (median / plane).round(), share }
@@ -189,8 +202,9 @@ impl SmallPhoto {
         let factor = (longest_side / side(camera.width.max(camera.height))).min(1.);
         let resized = |pixels: u32| ((side(pixels) * factor).round() as i64).max(PATCH);
         let (height, width) = (resized(camera.height), resized(camera.width));
-        let image = view.image.to_device(device).unsqueeze(0);
-        let image = image.adaptive_avg_pool2d([height, width]).squeeze_dim(0);
+        let pool = |t: &Tensor| t.unsqueeze(0).adaptive_avg_pool2d([height, width]).squeeze_dim(0);
+        let mask = view.mask.as_ref().map(|mask| mask.to_device(device));
+        let (image, weight) = pool_masked(&view.image.to_device(device), mask.as_ref(), pool);
         let grey = image.mean_dim([0].as_slice(), false, Kind::Float);
         let scale = (width as f64 / side(camera.width), height as f64 / side(camera.height));
         let intrinsics = camera.intrinsics.resized(scale.0, scale.1);
@@ -198,7 +212,13 @@ impl SmallPhoto {
             camera: Camera { intrinsics, width: width as u32, height: height as u32, ..camera },
             image,
             grey,
+            weight: weight.map(|weight| weight.squeeze_dim(0)),
         }
+    }
+
+    /// Returns the mask of the pixels with at least half of the largest weight, [h, w]; `None` if every pixel counts.
+    fn counted(&self) -> Option<Tensor> {
+        self.weight.as_ref().map(|weight| weight.ge_tensor(&(weight.max() * 0.5)))
     }
 
     fn centre(&self) -> DVec3 {
@@ -235,12 +255,24 @@ fn most_alike(this: &SmallPhoto, others: &[&SmallPhoto], nearest: f64, planes: i
     let step = nearest / (planes - 1) as f64;
     let planes = Tensor::linspace(0., nearest, planes, options).view([planes, 1]);
     let own = this.grey.unsqueeze(0);
-    let (own_mean, own_variance) = mean_and_variance(&own);
+    let (own_mean, own_variance) = mean_and_variance(&own, around);
     let alike = |other: &&SmallPhoto| {
-        let (seen, inside) = warp(other, this, &planes);
-        let (mean, variance) = mean_and_variance(&seen);
-        let covariance = around(&(&seen * &own)) - mean * &own_mean;
-        (covariance / (variance * &own_variance).sqrt()).where_scalarother(&inside, -1.)
+        let (seen, seen_weight, inside) = warp(other, this, &planes);
+        let weights: Vec<&Tensor> = this.weight.iter().chain(&seen_weight).collect();
+        if weights.is_empty() {
+            let (mean, variance) = mean_and_variance(&seen, around);
+            let covariance = around(&(&seen * &own)) - mean * &own_mean;
+            return (covariance / (variance * &own_variance).sqrt()).where_scalarother(&inside, -1.);
+        }
+        // Windows are weighted by both masks.
+        let weight = weights.iter().fold(seen.ones_like(), |product, &weight| product * weight);
+        let mass = around(&weight);
+        let mean_of = |t: &Tensor| around(&(t * &weight)) / mass.clamp_min(LEAST_MASS);
+        let (mean, variance) = mean_and_variance(&seen, mean_of);
+        let (own_mean, own_variance) = mean_and_variance(&own, mean_of);
+        let covariance = mean_of(&(&seen * &own)) - mean * own_mean;
+        let counts = inside.logical_and(&weight.ge(MIN_COUNTED)).logical_and(&mass.ge(LEAST_MASS));
+        (covariance / (variance * own_variance).sqrt()).where_scalarother(&counts, -1.)
     };
     let correlations = Tensor::stack(&others.iter().map(alike).collect::<Vec<_>>(), 0);
     let half = (others.len() as i64 / 2).max(1);
@@ -249,9 +281,9 @@ fn most_alike(this: &SmallPhoto, others: &[&SmallPhoto], nearest: f64, planes: i
     (plane.to_kind(Kind::Float) * step, correlation)
 }
 
-/// Returns the values of `other` at the positions of the pixels of `this` on each of the planes, and a mask of the positions that are
-/// inside the image of `other`, both [planes, h, w].
-fn warp(other: &SmallPhoto, this: &SmallPhoto, planes: &Tensor) -> (Tensor, Tensor) {
+/// Returns the values of `other` at the positions of the pixels of `this` on each of the planes, the weights there if `other` has a mask,
+/// and a mask of the positions that are inside the image of `other`, all [planes, h, w].
+fn warp(other: &SmallPhoto, this: &SmallPhoto, planes: &Tensor) -> (Tensor, Option<Tensor>, Tensor) {
     let [height, width] = this.size();
     let to_other: DMat4 = other.camera.c2w.inverse() * this.camera.c2w;
     let rows = to_other.transpose().to_cols_array_2d();
@@ -271,8 +303,10 @@ fn warp(other: &SmallPhoto, this: &SmallPhoto, planes: &Tensor) -> (Tensor, Tens
     let inside = u.abs().le(1.).logical_and(&v.abs().le(1.)).logical_and(&z.gt(0.)).view(volume);
     let grid = Tensor::stack(&[u, v], -1).view([1, count * height, width, 2]);
     let (bilinear, at_the_border) = (0, 1);
-    let seen = other.grey.unsqueeze(0).unsqueeze(0).grid_sampler(&grid, bilinear, at_the_border, false);
-    (seen.view(volume), inside)
+    let sample = |t: &Tensor| {
+        t.unsqueeze(0).unsqueeze(0).grid_sampler(&grid, bilinear, at_the_border, false).view(volume)
+    };
+    (sample(&other.grey), other.weight.as_ref().map(sample), inside)
 }
 
 /// Returns x, y and z of the pixels' rays with z = 1, [h·w] each.
@@ -293,14 +327,15 @@ fn around(t: &Tensor) -> Tensor {
     along(&along(t, [PATCH, 1]), [1, PATCH])
 }
 
-fn mean_and_variance(t: &Tensor) -> (Tensor, Tensor) {
-    let mean = around(t);
-    let variance = around(&t.square()) - mean.square() + LEAST_VARIANCE;
+/// Returns the mean and the variance in the neighbourhood of every pixel; `mean_of` computes means.
+fn mean_and_variance(t: &Tensor, mean_of: impl Fn(&Tensor) -> Tensor) -> (Tensor, Tensor) {
+    let mean = mean_of(t);
+    let variance = mean_of(&t.square()) - mean.square() + LEAST_VARIANCE;
     (mean, variance)
 }
 
 /// Replaces inverse depths of low correlation by those of reliable pixels around them, the nearest weighted most.
-fn filled(inverse: &Tensor, correlation: &Tensor) -> Tensor {
+fn filled(inverse: &Tensor, correlation: &Tensor, counted: Option<&Tensor>) -> Tensor {
     let size = inverse.size();
     let weight = (correlation - UNSURE).clamp_min(0.).square();
     let (mut sum, mut weights) = ((inverse * &weight).unsqueeze(0), weight.unsqueeze(0));
@@ -313,7 +348,8 @@ fn filled(inverse: &Tensor, correlation: &Tensor) -> Tensor {
         total_weights += &weights * factor;
     }
     // Pixels without any reliable pixel around them get the median.
-    let (least, median) = (1e-9, inverse.median().double_value(&[]));
+    let median = counted.map_or(inverse.shallow_clone(), |counted| inverse.masked_select(counted)).median();
+    let (least, median) = (1e-9, median.double_value(&[]));
     ((total + least * median) / (total_weights + least)).view(size.as_slice())
 }
 
@@ -343,6 +379,26 @@ mod tests {
             }
         };
         let views = [view(-0.5), view(0.), view(0.5)];
+        // A mask of the left half, where the photos show something else.
+        let masked = views.each_ref().map(|view| {
+            let (image, mask) = (view.image.copy(), Tensor::ones([1, 64, 64], options));
+            image.narrow(2, 0, 24).copy_(&Tensor::rand([3, 64, 24], options));
+            let _ = mask.narrow(2, 0, 24).zero_();
+            View { image, mask: Some(mask), ..view.shallow_clone() }
+        });
+        for swept in sweep(&masked, &[], Device::Cpu, |_| true) {
+            let off = (&swept.depth / depth - 1.).abs();
+            let counted = swept.counted.unwrap();
+            assert_eq!(counted.sum(Kind::Int64).int64_value(&[]), 64 * 40);
+            let off = off.masked_select(&counted).quantile_scalar(0.75, 0, false, "linear").double_value(&[]);
+            assert!(off < 0.02, "{off}");
+            // No pixel is sure that is masked out in its own photo, and most others are.
+            let sure = |first: i64, count: i64| {
+                swept.sure.narrow(1, first, count).to_kind(Kind::Double).mean(Kind::Double).double_value(&[])
+            };
+            assert_eq!(sure(0, 24), 0.);
+            assert!(sure(24, 40) > 0.6, "{}", sure(24, 40));
+        }
         for swept in sweep(&views, &[], Device::Cpu, |_| true) {
             let off = (swept.depth / depth - 1.).abs().median().double_value(&[]);
             assert!(off < 0.02, "{off}");

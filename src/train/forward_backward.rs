@@ -36,8 +36,8 @@ impl ForwardBackward<'_> {
     ) -> Result<Tensor> {
         let context = &batch.context;
         let model = self.model;
-        let tokens =
-            stopwatch.time("tokens", || model.tokens(&context.images, &context.c2w, &context.intrinsics));
+        let tokens = stopwatch
+            .time("tokens", || model.tokens(&context.input_images(), &context.c2w, &context.intrinsics));
         let tokens_leaf = leaf(&tokens);
         let (encoded, kept) = stopwatch.time("encoder", || match self.config.train.checkpoint_rounds {
             true => {
@@ -83,7 +83,7 @@ impl ForwardBackward<'_> {
         let compares = batch.paired && self.config.loss.consistency_depth > 0.;
         if pixels.is_none() && compares && self.group.world_size() > 1 {
             let alpha = alpha.detach().chunk(2, 0);
-            let counted = depth_pixels([&alpha[0], &alpha[1]]);
+            let counted = depth_pixels([&alpha[0], &alpha[1]], batch.target_masks().as_ref());
             self.group.all_reduce(&counted)?;
             pixels = Some(counted);
         }
@@ -94,10 +94,11 @@ impl ForwardBackward<'_> {
     pub fn depth_pixels(&self, batch: &Batch) -> Result<Tensor> {
         let context = &batch.context;
         no_grad(|| {
-            let decoded = self.model.forward(&context.images, &context.c2w, &context.intrinsics, self.stage);
+            let decoded =
+                self.model.forward(&context.input_images(), &context.c2w, &context.intrinsics, self.stage);
             let rendered = render(&decoded.gaussians, &batch.target.cameras(), DEFAULT_EPS2D)?;
             let alpha = rendered.alpha.chunk(2, 0);
-            Ok(depth_pixels([&alpha[0], &alpha[1]]))
+            Ok(depth_pixels([&alpha[0], &alpha[1]], batch.target_masks().as_ref()))
         })
     }
 }

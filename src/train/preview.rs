@@ -15,7 +15,7 @@ pub(super) fn preview(model: &GlobalSplat, batch: &Batch, stage: Stage) -> Resul
     let (shown, target) =
         (context.select(&[middle(&context.images)]), target.select(&[middle(&target.images)]));
     let pictures = tch::no_grad(|| {
-        let decoded = model.forward(&context.images, &context.c2w, &context.intrinsics, stage);
+        let decoded = model.forward(&context.input_images(), &context.c2w, &context.intrinsics, stage);
         render(&decoded.gaussians, &target.cameras(), DEFAULT_EPS2D)
     })?;
     let first = |t: &Tensor| t.select(0, 0).select(0, 0).to_device(Device::Cpu);

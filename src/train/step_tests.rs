@@ -6,7 +6,7 @@ use crate::data::{Batch, Capture, LoadTimes, LoadedScene, ViewBatch};
 use crate::device::Stopwatch;
 use crate::loss::{LossConfig, Losses, PerceptualKind, PerceptualLoss, StepFraction, Term, Vgg19, losses};
 use crate::model::{ModelConfig, Precision, Stage, Streams, backward_from_grads, leaf};
-use crate::render::{DEFAULT_EPS2D, render};
+use crate::render::{DEFAULT_EPS2D, RenderOutput, render};
 use crate::scene::{Camera, Intrinsics};
 use glam::{DMat4, DVec3};
 use globalsplat_csrc::ops::{computing, moves, record_ops, record_outermost_ops, without_own_linear_layers};
@@ -35,6 +35,7 @@ pub(super) fn scenes(count: usize) -> Vec<LoadedScene> {
         LoadedScene {
             name: format!("noise_{number}"),
             images: (0..5 * 3 * SIZE * SIZE).map(|_| random.random()).collect(),
+            masks: None,
             size: [SIZE, SIZE].into(),
             cameras: (0..5).map(camera).collect(),
             context: vec![0, 1, 2, 3, 4],
@@ -44,6 +45,28 @@ pub(super) fn scenes(count: usize) -> Vec<LoadedScene> {
         }
     };
     (0..count).map(scene).collect()
+}
+
+/// Returns the scenes of [`sample`], with the left third of the images of two of them masked out, at half weight next to it, and set to
+/// `value`.
+fn masked_scenes(value: u8) -> Vec<LoadedScene> {
+    let mut scenes = scenes(3);
+    for scene in &mut scenes[..2] {
+        let side = SIZE as usize;
+        let weight = |pixel: usize| match pixel % side {
+            ..10 => 0,
+            10 => 127,
+            _ => 255,
+        };
+        scene
+            .images
+            .iter_mut()
+            .enumerate()
+            .filter(|(i, _)| weight(*i) == 0)
+            .for_each(|(_, byte)| *byte = value);
+        scene.masks = Some((0..5 * side * side).map(weight).collect());
+    }
+    scenes
 }
 
 pub(super) fn config(model: ModelConfig, train: TrainConfig) -> Config {
@@ -168,11 +191,59 @@ fn assert_same_gradients(
 
 #[test]
 fn slices_of_a_step_add_up_to_it() {
-    let sample = sample();
-    let whole = gradients(&config(small(), TrainConfig::default()), &sample);
-    for micro_batch in [1, 2] {
-        let sliced = config(small(), TrainConfig { micro_batch, ..Default::default() });
-        assert_same(&gradients(&sliced, &sample), &whole, 1e-5);
+    for sample in [sample(), Batch::from_scenes(&masked_scenes(0), Device::Cpu).unwrap()] {
+        let whole = gradients(&config(small(), TrainConfig::default()), &sample);
+        for micro_batch in [1, 2] {
+            let sliced = config(small(), TrainConfig { micro_batch, ..Default::default() });
+            assert_same(&gradients(&sliced, &sample), &whole, 1e-5);
+        }
+    }
+}
+
+/// A step doesn't depend on the colours of masked pixels, neither of the context nor of the targets, and the loss has no gradient there.
+#[test]
+fn masked_pixels_contribute_nothing_to_a_step() {
+    let config = config(small(), TrainConfig::default());
+    let [black, grey] = [0, 77].map(|value| Batch::from_scenes(&masked_scenes(value), Device::Cpu).unwrap());
+    assert!(!black.target.images.equal(&grey.target.images));
+    // The features of a photo's pixels beside its mask depend on those under it.
+    let of = |sample: &Batch| {
+        of_model(&config, |trainer| {
+            trainer.perceptual = None;
+            numbers(&trainer.gradients(sample, STAGE, &mut Stopwatch::default()).expect("a step"))
+        })
+    };
+    let [(losses_of_black, of_black), (losses_of_grey, of_grey)] = [of(&black), of(&grey)];
+    assert_eq!(losses_of_black.total, losses_of_grey.total);
+    assert!(of_black == of_grey);
+    // Without the masks, it would.
+    let unmasked = |sample: &Batch| {
+        let mut sample = sample.slice(0, 3);
+        (sample.context.masks, sample.target.masks) = (None, None);
+        of(&sample).0.total
+    };
+    assert_ne!(unmasked(&black), unmasked(&grey));
+
+    let trainer = far_from_the_start(&config);
+    let sample = black.paired(&subsets(black.context_views(), 0));
+    let ViewBatch { c2w, intrinsics, .. } = &sample.context;
+    let decoded =
+        tch::no_grad(|| trainer.model.forward(&sample.context.input_images(), c2w, intrinsics, STAGE));
+    let RenderOutput { rgb, alpha, depth } =
+        render(&decoded.gaussians, &sample.target.cameras(), DEFAULT_EPS2D).expect("pictures");
+    let rendered = RenderOutput { rgb: leaf(&rgb), alpha: leaf(&alpha), depth: leaf(&depth) };
+    let perceptual = trainer.perceptual.as_ref();
+    losses(&config.loss, perceptual, &sample, &decoded, &rendered, &StepFraction::WHOLE).total.backward();
+    for (name, leaf) in [("rgb", &rendered.rgb), ("alpha", &rendered.alpha), ("depth", &rendered.depth)] {
+        let largest = |scene: i64, column: i64| {
+            leaf.grad().select(0, scene).narrow(-1, column, 10).abs().max().double_value(&[])
+        };
+        for scene in [0, 1, 3, 4] {
+            assert_eq!(largest(scene, 0), 0., "{name} of scene {scene}");
+            assert!(largest(scene, 12) > 0., "{name} of scene {scene}");
+        }
+        // This scene has no mask.
+        assert!(largest(2, 0) > 0., "{name}");
     }
 }
 

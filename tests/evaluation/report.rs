@@ -19,7 +19,7 @@ fn scene(name: &str, psnr: f64, lpips: bool) -> SceneScores {
     let ssim = psnr / 64.; // exact in binary, like all values here, and so exact in JSON
     let view = |i: i32| {
         let psnr = psnr + f64::from(i - 1);
-        ViewScore { image: format!("{i:06}.png"), psnr, ssim, lpips_vgg, lpips_alex }
+        ViewScore { image: format!("{i:06}.png"), psnr, ssim, lpips_vgg, lpips_alex, pixel_fraction: None }
     };
     let views = (0..3).map(view).collect();
     let scores = CaptureScores {
@@ -28,6 +28,7 @@ fn scene(name: &str, psnr: f64, lpips: bool) -> SceneScores {
         ssim,
         lpips_vgg,
         lpips_alex,
+        pixel_fraction: None,
         gaussians: Some(16_384),
         views,
     };

@@ -532,6 +532,17 @@ impl Capture {
         Ok(frame.undistort(self.read_photo(frame)?.0, None, None))
     }
 
+    /// Returns the photo of view `index` like [`Capture::photo`], and the weights of its pixels, as in [`Photo::mask`], in equal channels.
+    ///
+    /// # Errors
+    /// Fails like [`Capture::load`].
+    pub fn photo_with_mask(&self, index: usize) -> Result<(RgbImage, Option<RgbImage>)> {
+        let frame = &self.frames[index];
+        let (pixels, alpha) = self.read_photo(frame)?;
+        let mask = frame.read_mask(alpha)?.map(|mask| frame.undistort(mask, None, None));
+        Ok((frame.undistort(pixels, None, None), mask))
+    }
+
     /// Reads the photo as its lens took it, and its opacity if it isn't opaque.
     fn read_photo(&self, frame: &Frame) -> Result<(RgbImage, Option<GrayImage>)> {
         if let ImageLocation::Source { source, index } = &frame.image {

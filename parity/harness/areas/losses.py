@@ -5,6 +5,7 @@ import reference.loss.consistency
 import reference.loss.decoder_regularization
 import reference.loss.depth_smoothness
 import reference.loss.frustum
+import reference.loss.mask
 import reference.loss.mse
 import reference.loss.ssim
 
@@ -199,3 +200,70 @@ def depth_smoothness(rng):
 @reference_for("depth_smoothness")
 def depth_smoothness_reference(config, params, inputs):
     return {"loss": config["factor"] * reference.loss.depth_smoothness.depth_smoothness(inputs["depth"], inputs["photo"])}
+
+
+def masks(rng, *shape):
+    """Returns weights of 0 on the left, 1 on the right, and random ones between; those of the first image are 0."""
+    weights = np.clip(np.linspace(-1.0, 2.0, shape[-1]) + uniform(rng, -0.2, 0.2, *shape), 0.0, 1.0)
+    if shape[0] > 1:
+        weights[0] = 0.0
+    return weights
+
+
+@case
+def masked_mse(rng):
+    """Mean squared error of images of which parts are masked out, and one as a whole."""
+    for shape in [(1, 1, 3, 5, 4), (2, 3, 3, 7, 12)]:
+        images = {"rendered": uniform(rng, 0.0, 1.0, *shape), "truth": uniform(rng, 0.0, 1.0, *shape)}
+        images["mask"] = masks(rng, *shape[:-3], 1, *shape[-2:])
+        yield Draw(by(*shape), images, differentiate=("rendered",))
+
+
+@reference_for("masked_mse")
+def masked_mse_reference(config, params, inputs):
+    return {"loss": reference.loss.mask.masked_mse(inputs["rendered"], inputs["truth"], inputs["mask"])}
+
+
+@case
+def masked_photometric(rng):
+    """L1 and SSIM of images of which parts are masked out, and one as a whole."""
+    for shape, absolute, similar in [
+        ((1, 3, 11, 40), 1.0, 0.0),
+        ((2, 3, 26, 27), 0.8, 0.2),
+        ((1, 3, 33, 16), 0.6, -0.4),
+        ((2, 2, 3, 17, 43), 0.5, 0.5),
+    ]:
+        truth = uniform(rng, 0.0, 1.0, *shape)
+        inputs = {"picture": 0.5 * truth + uniform(rng, 0.0, 0.5, *shape), "truth": truth}
+        inputs["mask"] = masks(rng, *shape[:-3], 1, *shape[-2:])
+        config = {"absolute": absolute, "similar": similar}
+        label = f"{by(*shape)}, {absolute:g} and {similar:g}"
+        yield Draw(label, inputs, config=config, differentiate=("picture",))
+
+
+@reference_for("masked_photometric")
+def masked_photometric_reference(config, params, inputs):
+    picture, truth, mask = (inputs[name].flatten(0, -4) for name in ("picture", "truth", "mask"))
+    weight = reference.loss.mask.mean_weight(mask)
+    difference = (mask * (picture - truth).abs()).mean() / weight
+    similarity = reference.loss.mask.masked_ssim(picture, truth, mask, reference.loss.ssim.ssim)
+    return {"loss": config["absolute"] * difference + config["similar"] * similarity}
+
+
+@case
+def masked_depth_smoothness(rng):
+    """Depth steps, some at masked pixels, and pixels without depth. No weight is near the threshold of one half."""
+    for shape, factor in [((2, 17, 43), 0.7), ((1, 2, 33, 16), 3.0)]:
+        photo = uniform(rng, 0.0, 1.0, *shape[:-2], 3, *shape[-2:])
+        depth = uniform(rng, 0.5, 8.0, *shape) * (uniform(rng, 0.0, 1.0, *shape) < 0.9)
+        mask = masks(rng, *shape)
+        mask[np.abs(mask - 0.5) < 0.05] = 0.75
+        inputs = {"depth": depth, "photo": photo, "mask": mask}
+        yield Draw(by(*shape), inputs, config={"factor": factor}, differentiate=("depth",))
+
+
+@reference_for("masked_depth_smoothness")
+def masked_depth_smoothness_reference(config, params, inputs):
+    counts = (inputs["mask"] >= 0.5).to(inputs["depth"].dtype)
+    loss = reference.loss.depth_smoothness.depth_smoothness(inputs["depth"] * counts, inputs["photo"])
+    return {"loss": config["factor"] * loss / reference.loss.mask.mean_weight(counts)}

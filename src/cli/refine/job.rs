@@ -2,7 +2,7 @@
 
 use super::super::progress::{self, Progress};
 use super::super::signals::StopRequest;
-use super::super::{memory, model, open_capture, report_downscaling, splat_out, warn};
+use super::super::{memory, model, open_masked_capture, report_downscaling, splat_out, warn};
 use super::report::print_result;
 use anyhow::Result;
 use globalsplat::data::Capture;
@@ -33,6 +33,7 @@ pub enum InitialFile {
 /// Refinement of a capture, with its files and what is reported.
 pub struct RefineJob {
     pub scene: PathBuf,
+    pub masks: Option<PathBuf>,
     pub out: PathBuf,
     pub initial: InitialFile,
     pub options: RefineOptions,
@@ -54,7 +55,7 @@ impl RefineJob {
             check_writable_png(sheet)?;
         }
         let stop = StopRequest::install()?;
-        let capture = open_capture(&self.scene)?;
+        let capture = open_masked_capture(&self.scene, self.masks.as_deref())?;
         self.check_outputs(&capture)?;
         let (mut splat, mut loaded) = (None, None);
         let initial = match &self.initial {

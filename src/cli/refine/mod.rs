@@ -10,7 +10,7 @@ use anyhow::Result;
 use clap::{Args, ValueEnum};
 use globalsplat::data::Holdout;
 use globalsplat::error::Error;
-use globalsplat::refine::{Budget, MIN_SIDE, RefineConfig, RefineOptions};
+use globalsplat::refine::{Budget, MIN_SIDE, MaskBackground, RefineConfig, RefineOptions};
 use globalsplat::scene::ImageSize;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -43,6 +43,13 @@ pub struct Refine {
     /// Capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
     #[arg(long, value_name = "PATH")]
     scene: PathBuf,
+    /// Folder of masks named like the photos, as in photo.jpg.png or photo.png: black pixels are ignored; by default the masks and
+    /// transparency of the capture itself
+    #[arg(long, value_name = "DIR")]
+    masks: Option<PathBuf>,
+    /// Background of masked pixels instead of ignoring them, so that the splat stays empty there
+    #[arg(long, value_enum, value_name = "COLOUR")]
+    mask_background: Option<Background>,
     /// Output splat: .ply, .compressed.ply, .spz or .splat
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
@@ -104,6 +111,17 @@ enum From {
     Weights,
 }
 
+/// Background of masked pixels.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Background {
+    /// Black
+    Black,
+    /// White
+    White,
+    /// Another colour in every step
+    Random,
+}
+
 impl Refine {
     pub fn run(self) -> Result<()> {
         check_views(self.views)?;
@@ -118,8 +136,8 @@ impl Refine {
             None if needs_model => InitialFile::Model(self.weights),
             None => InitialFile::Photos,
         };
-        let Refine { scene, out, sheet, local_origin, lpips, json, .. } = self;
-        RefineJob { scene, out, initial, options, local_origin, sheet, lpips, json }.run()
+        let Refine { scene, masks, out, sheet, local_origin, lpips, json, .. } = self;
+        RefineJob { scene, masks, out, initial, options, local_origin, sheet, lpips, json }.run()
     }
 
     fn needs_model(&self) -> Result<bool> {
@@ -148,6 +166,11 @@ impl Refine {
             views: self.views,
             correct_poses: self.correct_poses,
             correct_exposures: self.correct_exposures,
+            mask_background: self.mask_background.map(|background| match background {
+                Background::Black => MaskBackground::Black,
+                Background::White => MaskBackground::White,
+                Background::Random => MaskBackground::Random,
+            }),
             size,
             device: device::parse(&self.device)?,
             ..RefineOptions::default()

@@ -56,8 +56,11 @@ struct PrefetchedBatch {
     sample: Result<PendingBatch>,
 }
 
+/// Decoded photo, and its mask in equal channels, which is cropped and resized in the same way.
+type MaskedPhoto = (RgbImage, Option<RgbImage>);
+
 /// Decoded photos by scene and view.
-type DecodedPhotos = HashMap<(SceneIndex, usize), Arc<RgbImage>>;
+type DecodedPhotos = HashMap<(SceneIndex, usize), Arc<MaskedPhoto>>;
 
 /// State shared by all threads.
 #[derive(Debug)]
@@ -348,13 +351,22 @@ impl Shared {
         let size = config.image_size;
         let image_bytes = CHANNELS * size.height as usize * size.width as usize;
         let mut images = vec![0; chosen.len() * image_bytes];
-        for ((planes, region), &view) in images.chunks_exact_mut(image_bytes).zip(regions).zip(&chosen) {
+        let (mut masks, mut mask_planes) = (None, vec![]);
+        for (position, (planes, region)) in images.chunks_exact_mut(image_bytes).zip(regions).enumerate() {
             let start = Instant::now();
             let photo = self
-                .photo(scene_index, capture, shown[view])
+                .photo(scene_index, capture, shown[chosen[position]])
                 .map_err(|why| (Fault::Image, why.to_string()))?;
+            let (photo, mask) = &*photo;
             let decoded = Instant::now();
-            augmentation.show(&mut tools.resampler, &photo, region, size, planes);
+            augmentation.show(&mut tools.resampler, photo, region, size, planes);
+            if let Some(mask) = mask {
+                let pixels = image_bytes / CHANNELS;
+                let masks = masks.get_or_insert_with(|| vec![u8::MAX; chosen.len() * pixels]);
+                mask_planes.resize(image_bytes, 0);
+                augmentation.show(&mut tools.resampler, mask, region, size, &mut mask_planes);
+                masks[position * pixels..][..pixels].copy_from_slice(&mask_planes[..pixels]);
+            }
             let resized = Instant::now();
             augmentation.jitter.apply_to_bytes(planes, &mut tools.scratch);
             tools.times += LoadTimes {
@@ -365,16 +377,16 @@ impl Shared {
             };
         }
         let (name, times) = (capture.name.clone(), tools.times);
-        Ok(LoadedScene { name, images, size, cameras, context, target, far, times })
+        Ok(LoadedScene { name, images, masks, size, cameras, context, target, far, times })
     }
 
-    fn photo(&self, scene_index: SceneIndex, capture: &Capture, view: usize) -> Result<Arc<RgbImage>> {
-        let Some(photos) = &self.photos else { return Ok(Arc::new(capture.photo(view)?)) };
+    fn photo(&self, scene_index: SceneIndex, capture: &Capture, view: usize) -> Result<Arc<MaskedPhoto>> {
+        let Some(photos) = &self.photos else { return Ok(Arc::new(capture.photo_with_mask(view)?)) };
         let kept = photos.lock().expect("no thread panics here").get(&(scene_index, view)).cloned();
         if let Some(photo) = kept {
             return Ok(photo);
         }
-        let photo = Arc::new(capture.photo(view)?);
+        let photo = Arc::new(capture.photo_with_mask(view)?);
         photos.lock().expect("no thread panics here").insert((scene_index, view), photo.clone());
         Ok(photo)
     }

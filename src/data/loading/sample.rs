@@ -5,6 +5,7 @@ use crate::data::batch::{ViewBatch, view_matrices};
 use crate::device::{PendingCopy, Upload};
 use crate::error::Result;
 use globalsplat_capture::CHANNELS;
+use std::ops::Range;
 use tch::{Device, Kind, Tensor};
 
 /// Largest value of a byte.
@@ -42,16 +43,29 @@ impl Batch {
         }
     }
 
-    /// Builds a batch on the CPU. `images` makes a tensor of the given shape from the pixel bytes of the chosen images.
+    /// Builds a batch on the CPU. `images` makes a tensor of the given shape from the pixel bytes of the chosen images, or of their masks.
     fn on_host(scenes: &[LoadedScene], images: impl Fn(&[&[u8]], &[i64]) -> Result<Tensor>) -> Result<Self> {
         let far: Vec<f64> = scenes.iter().map(|scene| scene.far).collect();
+        let has_masks = scenes.iter().any(|scene| scene.masks.is_some());
+        // Every pixel of a scene without masks counts.
+        let pixels = scenes[0].size.height as usize * scenes[0].size.width as usize;
+        let ones = vec![u8::MAX; if has_masks { pixels } else { 0 }];
         let batch = |chosen: fn(&LoadedScene) -> &[usize]| -> Result<ViewBatch> {
             let matrices = scenes.iter().map(|scene| {
                 let cameras: Vec<_> = chosen(scene).iter().map(|&position| scene.cameras[position]).collect();
                 view_matrices(&cameras, Device::Cpu)
             });
-            let (chosen, shape) = chosen_images(scenes, chosen);
-            Ok(ViewBatch::with_images(images(&chosen, &shape)?, &matrices.collect::<Vec<_>>()))
+            let (photos, shape) =
+                chosen_planes(scenes, chosen, CHANNELS, |scene, place| &scene.images[place]);
+            let photos = images(&photos, &shape)?;
+            let masks = has_masks.then(|| {
+                let (masks, shape) = chosen_planes(scenes, chosen, 1, |scene, place| match &scene.masks {
+                    Some(masks) => &masks[place],
+                    None => &ones,
+                });
+                images(&masks, &shape)
+            });
+            Ok(ViewBatch::with_images(photos, masks.transpose()?, &matrices.collect::<Vec<_>>()))
         };
         Ok(Batch {
             names: scenes.iter().map(|scene| scene.name.clone()).collect(),
@@ -93,6 +107,16 @@ impl Batch {
         }
     }
 
+    /// Returns `targets`, a tensor of the target views, of every scene once: a paired sample has the same targets twice.
+    pub(crate) fn once(&self, targets: &Tensor) -> Tensor {
+        targets.chunk(if self.paired { 2 } else { 1 }, 0).swap_remove(0)
+    }
+
+    /// Returns the masks of the target views of every scene once, `[B, C, 1, H, W]`; `None` if every pixel counts.
+    pub(crate) fn target_masks(&self) -> Option<Tensor> {
+        self.target.masks.as_ref().map(|masks| self.once(masks))
+    }
+
     /// Returns the number of context views per scene.
     pub fn context_views(&self) -> usize {
         self.context.images.size()[1] as usize
@@ -106,6 +130,8 @@ impl Batch {
 pub(super) struct PendingBatch {
     names: Vec<String>,
     tensors: PendingCopy<9>,
+    /// Masks of the context and target views.
+    masks: Option<PendingCopy<2>>,
 }
 
 impl PendingBatch {
@@ -114,37 +140,47 @@ impl PendingBatch {
         let Batch { names, context, target, far, .. } =
             Batch::on_host(scenes, |images, shape| Ok(bytes(images, upload.bytes(shape)?)))?;
         let ([a, b, c, d], [e, f, g, h]) = (context.tensors(), target.tensors());
-        Ok(PendingBatch { names, tensors: upload.begin([a, b, c, d, e, f, g, h, &far])? })
+        let masks = context.masks.as_ref().zip(target.masks.as_ref());
+        let masks = masks.map(|(context, target)| upload.begin([context, target])).transpose()?;
+        Ok(PendingBatch { names, tensors: upload.begin([a, b, c, d, e, f, g, h, &far])?, masks })
     }
 
     /// Waits for the copies and returns the sample on the device.
     pub fn wait(self) -> Result<Batch> {
         let [a, b, c, d, e, f, g, h, far] = self.tensors.wait()?;
-        let in_floats = |bytes: Tensor| {
+        let in_floats = |bytes: Tensor| -> Tensor {
             let mut floats = bytes.to_kind(Kind::Float);
             let _in_place = floats.g_div_scalar_(f64::from(LEVELS));
             floats
         };
-        let context = ViewBatch::from_tensors([in_floats(a), b, c, d]);
-        let target = ViewBatch::from_tensors([in_floats(e), f, g, h]);
+        let [context_masks, target_masks] = match self.masks {
+            Some(masks) => masks.wait()?.map(|masks| Some(in_floats(masks))),
+            None => [None, None],
+        };
+        let context = ViewBatch::from_tensors([in_floats(a), b, c, d], context_masks);
+        let target = ViewBatch::from_tensors([in_floats(e), f, g, h], target_masks);
         Ok(Batch { names: self.names, context, target, far, paired: false })
     }
 }
 
-/// Returns the chosen images of all scenes, scene by scene, and their common shape `[B, V, 3, H, W]`.
-fn chosen_images(scenes: &[LoadedScene], chosen: fn(&LoadedScene) -> &[usize]) -> (Vec<&[u8]>, [i64; 5]) {
+/// Returns the planes of the chosen images of all scenes, `channels` of each, scene by scene, and their common shape
+/// `[B, V, channels, H, W]`. `planes` returns the bytes of a scene in a range of those of all its images.
+fn chosen_planes<'a>(
+    scenes: &'a [LoadedScene],
+    chosen: fn(&LoadedScene) -> &[usize],
+    channels: usize,
+    planes: impl Fn(&'a LoadedScene, Range<usize>) -> &'a [u8],
+) -> (Vec<&'a [u8]>, [i64; 5]) {
     let (size, views) = (scenes[0].size, chosen(&scenes[0]).len());
-    let shape = [scenes.len(), views, CHANNELS, size.height as usize, size.width as usize];
-    let bytes = shape[2..].iter().product();
-    let of_scene = |scene| chosen(scene).iter().map(move |&position| image(scene, position, bytes));
+    let shape = [scenes.len(), views, channels, size.height as usize, size.width as usize];
+    let bytes: usize = shape[2..].iter().product();
+    let planes = &planes;
+    let of_scene = |scene| {
+        chosen(scene).iter().map(move |&position| planes(scene, position * bytes..(position + 1) * bytes))
+    };
     let images: Vec<&[u8]> = scenes.iter().flat_map(of_scene).collect();
     assert_eq!(images.len(), scenes.len() * views, "scenes of one kind");
     (images, shape.map(|n| n as i64))
-}
-
-/// Returns the scene's image at `position`; each image has `bytes` bytes.
-fn image(scene: &LoadedScene, position: usize, bytes: usize) -> &[u8] {
-    &scene.images[position * bytes..][..bytes]
 }
 
 /// Copies `images` one after the other into `memory`, a byte tensor on the CPU.
@@ -174,4 +210,45 @@ fn floats(images: &[&[u8]], shape: &[i64]) -> Tensor {
         }
     }
     floats
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::data::LoadTimes;
+    use crate::scene::{Camera, Intrinsics};
+    use glam::DMat4;
+
+    /// Scenes with and without masks make a batch, on either way to a device.
+    #[test]
+    fn scenes_without_masks_count_everywhere() {
+        let intrinsics = Intrinsics { fx: 4., fy: 4., cx: 2., cy: 1. };
+        let scene = |masks: Option<Vec<u8>>| LoadedScene {
+            name: String::new(),
+            images: (0..3 * 24).collect(),
+            masks,
+            size: [2, 4].into(),
+            cameras: vec![Camera { intrinsics, c2w: DMat4::IDENTITY, width: 4, height: 2 }; 3],
+            context: vec![0, 2],
+            target: vec![1],
+            far: 1.,
+            times: LoadTimes::default(),
+        };
+        let masks: Vec<u8> = (0..24).map(|i| if i % 4 == 0 { 0 } else { 255 - i }).collect();
+        let scenes = [scene(None), scene(Some(masks.clone()))];
+        let pending =
+            PendingBatch::begin(&scenes, &Upload::new(Device::Cpu).unwrap()).unwrap().wait().unwrap();
+        let expected = |position: usize| {
+            Tensor::from_slice(&masks[8 * position..][..8]).to_kind(Kind::Float).view([1, 2, 4]) / 255.
+        };
+        for batch in [Batch::from_scenes(&scenes, Device::Cpu).unwrap(), pending] {
+            let (context, target) = (batch.context.masks.unwrap(), batch.target.masks.unwrap());
+            assert_eq!((context.size(), target.size()), (vec![2, 2, 1, 2, 4], vec![2, 1, 1, 2, 4]));
+            for (views, view, position) in [(&context, 0, 0), (&context, 1, 2), (&target, 0, 1)] {
+                assert_eq!(views.select(0, 0).min().double_value(&[]), 1.);
+                assert!(views.get(1).get(view).allclose(&expected(position), 1e-6, 0., false));
+            }
+        }
+        assert!(Batch::from_scenes(&scenes[..1], Device::Cpu).unwrap().context.masks.is_none());
+    }
 }

@@ -32,6 +32,8 @@ pub struct LoadedScene {
     pub name: String,
     /// 8-bit pixels, `[N, 3, H, W]`.
     pub images: Vec<u8>,
+    /// 8-bit weights of the pixels, `[N, H, W]`: 255 where a pixel counts, 0 where it is masked out. `None` if every pixel counts.
+    pub masks: Option<Vec<u8>>,
     /// Size of all images.
     pub size: ImageSize,
     /// Cameras of the images, in normalized world coordinates.
