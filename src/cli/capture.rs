@@ -1,33 +1,41 @@
-use super::{print_json, progress, stop_flag};
+//! The command `capture`, and the captures that other commands make of photos.
+
+use super::signals::StopRequest;
+use super::{print_json, progress};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::io::check_writable_dir;
-use globalsplat_sfm::{Colmap, Matching, PoseOptions, Step, estimate_poses};
+use globalsplat_sfm::{
+    CaptureOptions, CaptureProgress, CaptureReport, Colmap, Matching, PoseOptions, VideoOptions, VideoPass,
+    make_capture,
+};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering;
 
-/// Make a capture from a folder of photos: find their camera poses, by COLMAP.
+/// Make a capture from a folder of photos or a video: find the camera poses, by COLMAP.
 ///
 /// COLMAP is the newer of the colmap on the PATH and pycolmap, which `make poses` or `pip install pycolmap` installs;
 /// GLOBALSPLAT_COLMAP names a colmap, or a Python that has pycolmap. It runs on all cores, without a GPU and offline. Ctrl-C
 /// stops it, and the same command continues. Photos that are damaged, of a single colour or identical to another are left
-/// out.
+/// out. Of a video, which ffmpeg reads, the sharpest frames are taken, as far apart as the picture has moved.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat capture photos/room --out captures/room\n  \
-    globalsplat capture photos/garden --out captures/garden --camera-model OPENCV_FISHEYE\n  \
-    globalsplat capture photos/walk --out captures/walk --matching sequential")]
+    globalsplat capture walk.mp4 --frames 150 --out captures/walk\n  \
+    globalsplat capture photos/garden --out captures/garden --camera-model OPENCV_FISHEYE")]
 pub struct Capture {
-    /// Folder of photos, JPEG or PNG, that show the same scene and overlap
-    #[arg(value_name = "PHOTOS")]
-    photos: PathBuf,
+    /// Folder of photos that show the same scene and overlap, or a video
+    #[arg(value_name = "PHOTOS|VIDEO")]
+    source: PathBuf,
     /// Folder for the capture: images, sparse and capture.json
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
+    /// Number of frames to take from a video; by default one per 6 % of the picture's longer side that it moves, but 30 to 300
+    #[arg(long, value_name = "N")]
+    frames: Option<usize>,
     /// Camera model of COLMAP; by default OPENCV for 10 or more photos of the same size, and SIMPLE_RADIAL for fewer
     #[arg(long, value_name = "MODEL")]
     camera_model: Option<String>,
     /// Pairs of photos to match: exhaustive: every pair; sequential: each photo with the next ones by name, and those nearby by
-    /// GPS; auto: exhaustive for up to 200 photos, else sequential
+    /// GPS; auto: sequential for videos and more than 200 photos, else exhaustive
     #[arg(long, value_name = "PAIRS", default_value = "auto", value_parser = str::parse::<Matching>)]
     matching: Matching,
     /// Print the result as one JSON object
@@ -37,39 +45,103 @@ pub struct Capture {
 
 impl Capture {
     pub fn run(self) -> Result<()> {
-        let colmap = Colmap::find()?;
-        check_writable_dir(&self.out)?;
-        eprintln!("{colmap}");
-        let stop = stop_flag()?;
         let camera_model = self.camera_model.map(|model| model.to_uppercase());
-        let options = PoseOptions { camera_model, matching: self.matching };
-        let mut bar: Option<(Step, progress::Progress)> = None;
-        let report = estimate_poses(&self.photos, &self.out, &options, &colmap, &mut |progress| {
-            if bar.as_ref().is_none_or(|(step, _)| *step != progress.step) {
-                let next = progress::bar(progress.total as u64, progress.step.unit());
-                if let Some((_, finished)) = bar.replace((progress.step, next)) {
-                    finished.finish_and_clear();
-                }
-            }
-            if let Some((_, bar)) = &bar {
-                bar.set_position(progress.done as u64);
-            }
-            !stop.load(Ordering::Relaxed)
-        });
-        if let Some((_, bar)) = bar {
-            bar.finish_and_clear();
-        }
-        let out = self.out.display();
-        let Some(report) = report? else { anyhow::bail!("stopped; the same command continues in {out}") };
+        let options = CaptureOptions {
+            video: VideoOptions { frames: self.frames },
+            poses: PoseOptions { camera_model, matching: self.matching },
+        };
+        let stop = StopRequest::install()?;
+        let report = run_make_capture(&self.source, &self.out, &options, &stop)?;
         if self.json {
             let mut json = serde_json::to_value(&report)?;
             json["out"] = self.out.to_string_lossy().into();
             print_json(&json);
         } else {
+            let out = self.out.display();
             let splat = Path::new(self.out.file_name().unwrap_or("scene".as_ref())).with_extension("ply");
-            println!("{out}: {report}");
+            println!("{out}: {}", report.poses);
             println!("next: globalsplat refine --scene {out} --out {}", splat.display());
         }
         Ok(())
+    }
+}
+
+/// Makes a capture of `source` in the folder `out`, with progress on standard error. A request to stop ends the program with an error.
+fn run_make_capture(
+    source: &Path,
+    out: &Path,
+    options: &CaptureOptions,
+    stop: &StopRequest,
+) -> Result<CaptureReport> {
+    let colmap = Colmap::find()?;
+    check_writable_dir(out)?;
+    eprintln!("{colmap}");
+    let mut bar: Option<(&'static str, progress::Progress)> = None;
+    stop.set_ends_at_once(false);
+    let report = make_capture(source, out, options, &colmap, |progress| {
+        let (unit, done, total) = match progress {
+            CaptureProgress::Video(at) => {
+                let unit = match at.pass {
+                    VideoPass::Measure => "frames measured",
+                    VideoPass::Write => "frames written",
+                };
+                (unit, at.done, at.total.unwrap_or(at.done))
+            }
+            CaptureProgress::Poses(at) => (at.step.unit(), at.done, at.total),
+        };
+        if bar.as_ref().is_none_or(|(current, _)| *current != unit) {
+            let next = progress::bar(total as u64, unit);
+            if let Some((_, finished)) = bar.replace((unit, next)) {
+                finished.finish_and_clear();
+            }
+        }
+        if let Some((_, bar)) = &bar {
+            bar.set_length(total as u64);
+            bar.set_position(done as u64);
+        }
+        !stop.is_requested()
+    });
+    stop.set_ends_at_once(true);
+    if let Some((_, bar)) = bar {
+        bar.finish_and_clear();
+    }
+    let Some(report) = report? else {
+        anyhow::bail!("stopped; the same command continues in {}", out.display())
+    };
+    if let Some(video) = &report.video {
+        eprintln!("{}: {}", source.display(), video.summary);
+        video.warnings.iter().for_each(|line| eprintln!("{}: {line}", source.display()));
+    }
+    Ok(report)
+}
+
+/// The photos of a command: a capture, or photos or a video of which one is made.
+#[derive(Args)]
+#[group(required = true, multiple = false)]
+pub struct SceneSource {
+    /// Capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
+    #[arg(long, value_name = "PATH")]
+    scene: Option<PathBuf>,
+    /// Folder of photos, or a video, without camera poses: COLMAP finds them first, as in `globalsplat capture`, and the capture
+    /// is kept beside the output, as room_capture for room.ply
+    #[arg(long, value_name = "PHOTOS|VIDEO")]
+    photos: Option<PathBuf>,
+}
+
+impl SceneSource {
+    /// Returns `true` if the capture has to be made first.
+    pub fn is_unposed(&self) -> bool {
+        self.photos.is_some()
+    }
+
+    /// Returns the path of the capture. If it has to be made, it is made beside the output `out`.
+    pub fn path(&self, out: &Path, stop: &StopRequest) -> Result<PathBuf> {
+        let Some(photos) = &self.photos else { return Ok(self.scene.clone().unwrap_or_default()) };
+        let name = out.file_name().unwrap_or_default().to_string_lossy();
+        let stem = name.split('.').next().unwrap_or_default();
+        let capture = out.with_file_name(format!("{stem}_capture"));
+        let report = run_make_capture(photos, &capture, &CaptureOptions::default(), stop)?;
+        eprintln!("{}: {}", capture.display(), report.poses);
+        Ok(capture)
     }
 }

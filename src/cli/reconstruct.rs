@@ -1,5 +1,7 @@
+use super::capture::SceneSource;
 use super::memory::keep_during;
 use super::refine::{InitialFile, RefineJob, parse_time};
+use super::signals::StopRequest;
 use super::{check_views, device, model, open_masked_capture, print_json, splat_out};
 use anyhow::Result;
 use clap::Args;
@@ -21,16 +23,15 @@ use std::path::PathBuf;
 /// The splat is in the capture's own world coordinates, so a render from a camera of the capture matches its photo.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat reconstruct --scene captures/room --out room.ply\n  \
-    globalsplat reconstruct --weights model.safetensors --scene captures/room --out room.ply\n  \
+    globalsplat reconstruct --photos photos/room --out room.ply\n  \
     globalsplat reconstruct --weights model.safetensors --scene captures/room --views-at 512 --out room.ply")]
 pub struct Reconstruct {
     /// Weights: a file that `export` or `import` wrote, or a checkpoint (.ckpt); by default the weights embedded in this
     /// program
     #[arg(long, value_name = "FILE")]
     weights: Option<PathBuf>,
-    /// Capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
-    #[arg(long, value_name = "PATH")]
-    scene: PathBuf,
+    #[command(flatten)]
+    scene: SceneSource,
     /// Folder of masks named like the photos, as in photo.jpg.png or photo.png: the model doesn't see black pixels; by default the
     /// masks and transparency of the capture itself
     #[arg(long, value_name = "DIR")]
@@ -91,8 +92,13 @@ impl Reconstruct {
         let asked = model::parse_precision(&self.precision)?;
         let started = process_age();
         let mut stopwatch = Stopwatch::default();
+        let stop = StopRequest::install()?;
+        let scene = match self.scene.is_unposed() {
+            true => stopwatch.time("poses", || self.scene.path(&self.out, &stop))?,
+            false => self.scene.path(&self.out, &stop)?,
+        };
         let loaded = stopwatch.time("weights", || model::load(self.weights.as_deref(), asked, device))?;
-        let capture = stopwatch.time("photos", || open_masked_capture(&self.scene, self.masks.as_deref()))?;
+        let capture = stopwatch.time("photos", || open_masked_capture(&scene, self.masks.as_deref()))?;
         let mut inputs = InputFiles::default();
         capture.add_input_files(&mut inputs);
         self.weights.iter().for_each(|path| inputs.add_all(weights_files(path)));

@@ -2,6 +2,7 @@
 
 mod colmap;
 mod estimate;
+mod make_capture;
 mod photos;
 mod record;
 mod video;
@@ -9,5 +10,6 @@ mod video;
 pub use colmap::{CAMERA_MODELS, Colmap, VARIABLE};
 pub use estimate::{Matching, PoseOptions, PoseProgress, PoseReport, Step, estimate_poses};
 pub use globalsplat_files::{Error, Result};
+pub use make_capture::{CaptureOptions, CaptureProgress, CaptureReport, VideoRecord, make_capture};
 pub use photos::SkippedPhoto;
 pub use video::{VideoFrames, VideoOptions, VideoPass, VideoProgress, extract_frames, is_video};

@@ -1,5 +1,6 @@
 //! A refinement with its files: reads the inputs, shows the progress, and writes the outputs.
 
+use super::super::capture::SceneSource;
 use super::super::progress::{self, Progress};
 use super::super::signals::StopRequest;
 use super::super::{memory, model, open_masked_capture, report_downscaling, splat_out, warn};
@@ -32,7 +33,7 @@ pub enum InitialFile {
 
 /// Refinement of a capture, with its files and what is reported.
 pub struct RefineJob {
-    pub scene: PathBuf,
+    pub scene: SceneSource,
     pub masks: Option<PathBuf>,
     pub out: PathBuf,
     pub initial: InitialFile,
@@ -45,9 +46,8 @@ pub struct RefineJob {
 
 impl RefineJob {
     pub fn run(mut self) -> Result<()> {
+        let age = process_age().unwrap_or_default();
         let now = Instant::now();
-        let clock = now.checked_sub(process_age().unwrap_or_default()).unwrap_or(now);
-        self.options.started = Some(clock);
         memory::keep();
         check_writable_splat(&self.out)?;
         splat_out::check_origin(&self.out, self.local_origin)?;
@@ -55,7 +55,14 @@ impl RefineJob {
             check_writable_png(sheet)?;
         }
         let stop = StopRequest::install()?;
-        let capture = open_masked_capture(&self.scene, self.masks.as_deref())?;
+        let path = self.scene.path(&self.out, &stop)?;
+        // The time budget begins after the poses of photos are found.
+        let clock = match self.scene.is_unposed() {
+            true => Instant::now(),
+            false => now.checked_sub(age).unwrap_or(now),
+        };
+        self.options.started = Some(clock);
+        let capture = open_masked_capture(&path, self.masks.as_deref())?;
         self.check_outputs(&capture)?;
         let (mut splat, mut loaded) = (None, None);
         let initial = match &self.initial {

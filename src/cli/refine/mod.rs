@@ -5,6 +5,7 @@ mod report;
 
 pub use job::{InitialFile, RefineJob};
 
+use super::capture::SceneSource;
 use super::{check_former_option, check_views, device, parse_size};
 use anyhow::Result;
 use clap::{Args, ValueEnum};
@@ -25,6 +26,7 @@ const MAX_SECONDS: f64 = 365. * 24. * 3600.;
 /// early and writes the current splat.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat refine --scene captures/room --out room.ply\n  \
+    globalsplat refine --photos photos/room --out room.ply\n  \
     globalsplat refine --splat room.ply --scene captures/room --out better.ply --seconds 30\n  \
     globalsplat refine --scene captures/room --holdout every:8 --sheet views.png --out room.ply")]
 pub struct Refine {
@@ -40,9 +42,8 @@ pub struct Refine {
     /// Former option. Its other values than `gaussians` are refused
     #[arg(long, hide = true)]
     space: Option<String>,
-    /// Capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
-    #[arg(long, value_name = "PATH")]
-    scene: PathBuf,
+    #[command(flatten)]
+    scene: SceneSource,
     /// Folder of masks named like the photos, as in photo.jpg.png or photo.png: black pixels are ignored; by default the masks and
     /// transparency of the capture itself
     #[arg(long, value_name = "DIR")]
