@@ -1,12 +1,11 @@
 //! Processing of a photo between its file and a network: decoding, removal of lens distortion, cropping, resizing.
 
 mod codec;
-mod distortion;
 mod fit;
 mod jpeg;
-mod lens;
 mod planes;
 mod resample;
+mod undistort;
 
 pub use codec::{
     DecodedPhoto, PHOTO_EXTENSIONS, decode_photo, encode_photo, encoded_image_size, read_image,
@@ -16,5 +15,4 @@ pub use fit::{fit, source_region};
 pub use planes::{CHANNELS, Planes};
 pub use resample::{Region, Resampler};
 
-pub(crate) use distortion::Distortion;
-pub(crate) use lens::{Lens, undistort};
+pub(crate) use undistort::{LookupTable, ViewPixels, undistort};
