@@ -103,9 +103,16 @@ fn transforms_with_lenses_that_are_none() {
     set("k1", Value::Null, &["k1 is null or NaN", "a number"]);
     set("k5", json!(0.1), &["k5 is 0.1", "FULL_OPENCV as camera_model"]);
     set("k1", json!(-9.), &["the distortion of frame 0 is k1 -9", "folds", "every pixel"]);
-    set("camera_model", json!("OPENCV_FISHEYE"), &["camera_model is \"OPENCV_FISHEYE\"", "PINHOLE"]);
-    set("is_fisheye", json!(true), &["is_fisheye is true", "expected false"]);
-    set("distortion_params", json!([0.1, 0., 0., 0., 0., 0.]), &["distortion_params is a list of 6", "k1"]);
+    set("camera_model", json!("VR180_L"), &["camera_model is \"VR180_L\"", "PINHOLE", "EQUIRECTANGULAR"]);
+    set(
+        "camera_model",
+        json!("EQUIRECTANGULAR"),
+        &["the size of frame 0 is 40×40 pixels", "twice the height"],
+    );
+    set("camera_model", json!("EUCM"), &["the parameters of frame 0 is [", "6 parameters for EUCM"]);
+    set("is_fisheye", json!("yes"), &["is_fisheye is \"yes\"", "true or false"]);
+    set("distortion_params", json!([0.1, 0.]), &["distortion_params is 2 numbers", "k1, k2, k3, k4, p1, p2"]);
+    set("distortion_params", json!(0.1), &["distortion_params is 0.1", "a list of numbers"]);
     refused_transforms(
         |t| t["frames"][4]["fl_x"] = json!([1.]),
         &["fl_x of frame 4 is a list of 1", "a number"],
@@ -162,8 +169,13 @@ fn refused_text(name: &str, from: &str, to: &str, parts: &[&str]) {
 #[test]
 fn colmap_text_with_cameras_that_are_none() {
     let cameras = |from: &str, to: &str, parts: &[&str]| refused_text("cameras", from, to, parts);
-    let known = "SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV";
-    cameras("PINHOLE", "OPENCV_FISHEYE", &["model of camera 7 is OPENCV_FISHEYE", known]);
+    let known = "SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, OPENCV_FISHEYE, FULL_OPENCV";
+    cameras("PINHOLE", "ORTHOPHOTO", &["model of camera 7 is ORTHOPHOTO", known]);
+    cameras(
+        "PINHOLE 40 40 36 36 20 20",
+        "EQUIRECTANGULAR 40 40 40 40",
+        &["the size of camera 7 is 40×40", "twice"],
+    );
     cameras(
         "PINHOLE",
         "FULL_OPENCV",

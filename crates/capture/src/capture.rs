@@ -4,35 +4,62 @@ use crate::formats::find_masks;
 use crate::geometry::{Camera, ImageSize, check_pose, nearest_rigid_of_scaled};
 use crate::holdout::Holdout;
 use crate::image_source::ImageSource;
+use crate::lens::{Distortion, Lens, LensModel, PhotoPart, PinholeView, Projection, split_into_views};
 use crate::pixels::{
-    DecodedPhoto, Distortion, Lens, Planes, decode_photo, encode_photo, fit, grey_to_rgb, has_alpha_channel,
-    multiply, read_image_size, read_mask, source_region, undistort,
+    DecodedPhoto, LookupTable, Planes, ViewPixels, decode_photo, encode_photo, fit, grey_to_rgb,
+    has_alpha_channel, multiply, read_image_size, read_mask, source_region, undistort,
 };
-use glam::DMat4;
+use glam::{DMat4, DVec4};
 use globalsplat_files::{Error, InputFiles, Result, split_keyed_path};
 use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 use std::borrow::Cow;
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashMap};
 use std::ops::Range;
 use std::path::{Component, Path, PathBuf};
 use std::sync::Arc;
 
-/// A view whose pixels are not loaded.
+/// A photo whose pixels are not loaded.
 #[derive(Debug, Clone)]
 pub(crate) struct Frame {
     pub image: ImageLocation,
-    /// Name of the image in the capture.
-    pub name: String,
-    /// Pinhole camera of the image after `distortion` is removed, at the size of the image file.
-    pub camera: Camera,
-    /// Distortion of the lens that took the image in the file.
-    pub distortion: Distortion,
     /// File of the image's mask.
     pub mask: Option<PathBuf>,
+    /// Name of the image in the capture.
+    pub name: String,
+    /// Intrinsics of the lens, pose, and size of the image file. If the lens is a perspective one, this is the pinhole camera of the
+    /// image after the distortion is removed.
+    pub camera: Camera,
+    /// Lens that took the image in the file.
+    pub lens: LensModel,
 }
 
-/// Location of a view's image.
+impl Frame {
+    /// Returns the weights of the photo's pixels as its lens took them, in equal channels: the mask's, multiplied by the photo's
+    /// opacity `alpha`. Returns `None` if there is neither.
+    fn read_mask(&self, alpha: Option<GrayImage>) -> Result<Option<RgbImage>> {
+        let alpha = alpha.map(|alpha| grey_to_rgb(&alpha));
+        let Some(file) = &self.mask else { return Ok(alpha) };
+        let mut mask = read_mask(file, (self.camera.width, self.camera.height))?;
+        if let Some(alpha) = alpha {
+            multiply(&mut mask, &alpha);
+        }
+        Ok(Some(mask))
+    }
+}
+
+/// A pinhole view of a photo.
+#[derive(Debug, Clone)]
+struct View {
+    /// Index of the photo in [`Capture::frames`].
+    frame: usize,
+    /// Name of the photo, or of the part of it that the view shows.
+    name: String,
+    camera: Camera,
+    projection: Projection,
+}
+
+/// Location of a photo's image.
 #[derive(Debug, Clone)]
 pub(crate) enum ImageLocation {
     /// An image file.
@@ -46,30 +73,6 @@ pub(crate) enum ImageLocation {
     },
     /// Image `index` of a source that computes images on request.
     Source { source: Arc<dyn ImageSource>, index: usize },
-}
-
-impl Frame {
-    /// Removes lens distortion from an image that the lens took, at least in the part that fitting to `size` reads. Uses `lens` if it
-    /// matches the frame.
-    fn undistort(&self, pixels: RgbImage, size: Option<ImageSize>, lens: Option<&Lens>) -> RgbImage {
-        if let Some(lens) = lens.filter(|lens| lens.matches_camera(&self.distortion, &self.camera)) {
-            return lens.undistort(pixels);
-        }
-        let window = size.map(|size| source_region(&self.camera, size));
-        undistort(pixels, &self.distortion, &self.camera, window)
-    }
-
-    /// Returns the weights of the photo's pixels as its lens took them, in equal channels: the mask's, multiplied by the photo's
-    /// opacity `alpha`. Returns `None` if there is neither.
-    fn read_mask(&self, alpha: Option<GrayImage>) -> Result<Option<RgbImage>> {
-        let alpha = alpha.map(|alpha| grey_to_rgb(&alpha));
-        let Some(file) = &self.mask else { return Ok(alpha) };
-        let mut mask = read_mask(file, (self.camera.width, self.camera.height))?;
-        if let Some(alpha) = alpha {
-            multiply(&mut mask, &alpha);
-        }
-        Ok(Some(mask))
-    }
 }
 
 impl ImageLocation {
@@ -102,9 +105,11 @@ pub struct Capture {
     /// Name of the folder, or key of the scene in a chunk.
     pub name: String,
     file: PathBuf,
-    /// Frames of all views. Those of the capture's own test part come last.
+    /// All photos. Those of the capture's own test part come last.
     frames: Vec<Frame>,
-    /// Number of frames in the training part, which come first in `frames`.
+    /// Views of all photos, in their order.
+    views: Vec<View>,
+    /// Number of views in the training part, which come first in `views`.
     train: usize,
     is_complete: bool,
     warnings: Vec<String>,
@@ -245,9 +250,11 @@ impl Capture {
             return Err(Error::input(&file, "the number of views", frames.len(), expected));
         }
         let is_complete = changes.missing.is_empty();
-        let warnings = check_frames(&file, &mut frames, changes, purpose)?;
-        let train = frames.len();
-        Ok(Capture { name, file, frames, train, is_complete, warnings })
+        let mut warnings = check_frames(&file, &mut frames, changes, purpose)?;
+        let (views, lines) = views_of_frames(&file, &frames, purpose)?;
+        warnings.extend(lines);
+        let train = views.len();
+        Ok(Capture { name, file, frames, views, train, is_complete, warnings })
     }
 
     /// Creates a capture whose images are computed by `source` on request: image i is seen by camera i, and named by its index.
@@ -263,10 +270,10 @@ impl Capture {
     ) -> Result<Self> {
         let frame = |(index, &camera): (usize, &Camera)| Frame {
             image: ImageLocation::Source { source: source.clone(), index },
+            mask: None,
             name: format!("{index:06}"),
             camera,
-            distortion: Distortion::default(),
-            mask: None,
+            lens: LensModel::default(),
         };
         let frames = cameras.iter().enumerate().map(frame).collect();
         Capture::new(name, file, frames, Changes::default(), Purpose::Photos)
@@ -282,6 +289,10 @@ impl Capture {
     ) -> Result<Self> {
         self.is_complete &= changes.missing.is_empty();
         self.warnings.extend(check_frames(file, &mut frames, changes, purpose)?);
+        let (views, lines) = views_of_frames(file, &frames, purpose)?;
+        self.warnings.extend(lines);
+        let first = self.frames.len();
+        self.views.extend(views.into_iter().map(|view| View { frame: first + view.frame, ..view }));
         self.frames.append(&mut frames);
         Ok(self)
     }
@@ -293,11 +304,11 @@ impl Capture {
     /// Fails if the folder can't be read or has no mask for any photo, or if a mask has another aspect ratio than its photo.
     pub fn with_masks(mut self, folder: &Path) -> Result<Self> {
         std::fs::read_dir(folder).map_err(Error::read(folder))?;
-        let names: Vec<&str> = self.names().collect();
+        let names: Vec<&str> = self.frames.iter().map(|frame| frame.name.as_str()).collect();
         let masks = find_masks(&[folder.to_owned()], &names);
         let without: Vec<&str> =
             names.iter().zip(&masks).filter(|(_, mask)| mask.is_none()).map(|(name, _)| *name).collect();
-        if without.len() == self.len() {
+        if without.len() == names.len() {
             let expected = format!("{}.png", names[0]);
             return Err(Error::input(folder, "the folder", "without a mask for any photo", expected));
         }
@@ -306,7 +317,7 @@ impl Capture {
             format!(
                 "{}: {count} of {} photos have no mask and count whole: {names}",
                 folder.display(),
-                self.len()
+                self.frames.len()
             )
         });
         for (frame, mask) in self.frames.iter_mut().zip(masks) {
@@ -329,17 +340,20 @@ impl Capture {
         &self.warnings
     }
 
-    /// Returns `true` if every photo named by the capture exists, so that the indices of its views are those in the capture's file.
+    /// Returns `true` if every photo named by the capture exists, so that the indices of its photos are those in the capture's file.
     pub fn is_complete(&self) -> bool {
         self.is_complete
     }
 
     /// Returns the indices of the context views and those of the held-out views. [`Holdout::None`] holds out the capture's own test
-    /// part, if it has one. Any other split is made of the remaining views alone and leaves the test part out.
+    /// part, if it has one. Any other split is made of the remaining views alone and leaves the test part out. It counts photos, so
+    /// that all views of a photo are on the same side.
     pub fn split(&self, holdout: Holdout) -> (Vec<usize>, Vec<usize>) {
         match holdout {
             Holdout::None => (0..self.len()).partition(|&view| view < self.train),
-            Holdout::Every { .. } => holdout.split(self.train),
+            Holdout::Every { every, first } => {
+                (0..self.train).partition(|&view| self.views[view].frame % every != first)
+            }
         }
     }
 
@@ -354,14 +368,19 @@ impl Capture {
         if self.has_test_part() { (self.train..self.len()).collect() } else { (0..self.len()).collect() }
     }
 
-    /// Returns the number of views.
+    /// Returns the number of views. It is the number of photos, unless photos of wide lenses are split.
     pub fn len(&self) -> usize {
+        self.views.len()
+    }
+
+    /// Returns the number of photos.
+    pub fn photo_count(&self) -> usize {
         self.frames.len()
     }
 
     /// Returns `true` if there are no views, which never happens: a capture has at least one camera.
     pub fn is_empty(&self) -> bool {
-        self.frames.is_empty()
+        self.views.is_empty()
     }
 
     /// Returns the file that describes the capture.
@@ -369,30 +388,21 @@ impl Capture {
         &self.file
     }
 
-    /// Returns the cameras, at the sizes of the image files.
+    /// Returns the cameras of the views, at the sizes of the image files, or at that of the part of a photo that a view shows.
     pub fn cameras(&self) -> Vec<Camera> {
-        self.frames.iter().map(|frame| frame.camera).collect()
+        self.views.iter().map(|view| view.camera).collect()
     }
 
-    /// Returns `true` if any photo has fewer pixels than `size` along a side. Fitting enlarges such a photo, which adds no detail.
+    /// Returns `true` if any view has fewer pixels than `size` along a side. Fitting enlarges such a view, which adds no detail.
     pub fn has_smaller(&self, size: ImageSize) -> bool {
         let is_smaller = |camera: &Camera| camera.height < size.height || camera.width < size.width;
-        self.frames.iter().any(|frame| is_smaller(&frame.camera))
+        self.views.iter().any(|view| is_smaller(&view.camera))
     }
 
-    /// Returns the names of the images, in order.
+    /// Returns the names of the views, in order. They are those of the images; if a photo is split into several views, as in
+    /// `photo@left.jpg`, with the part that the view shows.
     pub fn names(&self) -> impl Iterator<Item = &str> {
-        self.frames.iter().map(|frame| frame.name.as_str())
-    }
-
-    /// Returns the number of photos with a mask: a file, or an alpha channel by their header.
-    pub fn mask_count(&self) -> usize {
-        let has_mask = |frame: &&Frame| match &frame.image {
-            _ if frame.mask.is_some() => true,
-            ImageLocation::File(photo) => has_alpha_channel(photo).unwrap_or(false),
-            ImageLocation::Bytes { .. } | ImageLocation::Source { .. } => false,
-        };
-        self.frames.par_iter().filter(has_mask).count()
+        self.views.iter().map(|view| view.name.as_str())
     }
 
     /// Returns a unique file name without extension for the rendered image of each view. The names are those of the photos,
@@ -406,6 +416,16 @@ impl Capture {
     /// names with suffixes are equal.
     pub fn render_names_with(&self, suffixes: &[&str]) -> Vec<String> {
         render_names(&self.names().collect::<Vec<_>>(), suffixes)
+    }
+
+    /// Returns the number of photos with a mask: a file, or an alpha channel by their header.
+    pub fn mask_count(&self) -> usize {
+        let has_mask = |frame: &&Frame| match &frame.image {
+            _ if frame.mask.is_some() => true,
+            ImageLocation::File(photo) => has_alpha_channel(photo).unwrap_or(false),
+            ImageLocation::Bytes { .. } | ImageLocation::Source { .. } => false,
+        };
+        self.frames.par_iter().filter(has_mask).count()
     }
 
     /// Adds the files that the capture is read from to `inputs`: those that describe it, and its photos.
@@ -428,28 +448,47 @@ impl Capture {
         }
     }
 
-    /// Reads the views `indices`, fitted to `size`, or at their own size if it is `None`.
+    /// Reads the views `indices`, fitted to `size`, or at their own size if it is `None`. A photo is decoded once for all of its views.
     ///
     /// # Errors
     /// Fails if an image or a mask is missing or can't be decoded, if an image has another size than the capture declares, or if there
-    /// are several and each is wholly masked out.
+    /// are several views and each is wholly masked out.
     pub fn load(&self, indices: &[usize], size: Option<ImageSize>) -> Result<Vec<Photo>> {
-        let lens = self.shared_lens(indices, size);
-        let pixels = |&index: &usize| {
-            let Camera { width, height, .. } = self.frames[index].camera;
-            u64::from(width) * u64::from(height)
+        // Positions in `indices` of the views of each photo, in the order in which the photos come first.
+        let mut photos: Vec<Vec<usize>> = vec![];
+        let mut photo_of_frame = HashMap::new();
+        for (position, &index) in indices.iter().enumerate() {
+            let photo = *photo_of_frame.entry(self.views[index].frame).or_insert(photos.len());
+            photos.resize_with(photos.len().max(photo + 1), Vec::new);
+            photos[photo].push(position);
+        }
+        let views =
+            |positions: &[usize]| positions.iter().map(|&at| &self.views[indices[at]]).collect::<Vec<_>>();
+        let tables = match photos.as_slice() {
+            [first, _, ..] => lookup_tables(&views(first), size),
+            _ => vec![],
         };
-        let largest = indices.iter().map(pixels).max().unwrap_or(0).max(1);
+        let pixels = |positions: &Vec<usize>| {
+            let views = views(positions);
+            let area = |camera: &Camera| u64::from(camera.width) * u64::from(camera.height);
+            let parts = views.iter().filter(|view| matches!(view.projection, Projection::Part(_)));
+            area(&self.frames[views[0].frame].camera) + parts.map(|view| area(&view.camera)).sum::<u64>()
+        };
+        let largest = photos.iter().map(pixels).max().unwrap_or(0).max(1);
         let at_once = (DECODED_BYTES / (DECODED_BYTES_PER_PIXEL * largest)).max(1) as usize;
-        let mut views = vec![];
-        for indices in indices.chunks(at_once) {
-            let load = |&index: &usize| self.load_view(&self.frames[index], size, lens.as_ref());
-            let loaded: Vec<_> = indices.par_iter().map(load).collect();
+        let mut loaded: Vec<Option<Photo>> = indices.iter().map(|_| None).collect();
+        for photos in photos.chunks(at_once) {
+            let load = |positions: &Vec<usize>| self.load_views(&views(positions), size, &tables);
+            let all: Vec<_> = photos.par_iter().map(load).collect();
             // If several images can't be read, the error is that of the first one.
-            for view in loaded {
-                views.push(view?);
+            for (positions, views) in photos.iter().zip(all) {
+                for (&position, view) in positions.iter().zip(views?) {
+                    loaded[position] = Some(view);
+                }
             }
         }
+        let views: Vec<Photo> =
+            loaded.into_iter().map(|photo| photo.expect("every view is one of a photo")).collect();
         match views.as_slice() {
             [first, _, ..] if views.iter().all(Photo::is_masked_out) => {
                 let field = format!("the mask of {:?} and of {} other photos", first.name, views.len() - 1);
@@ -467,18 +506,6 @@ impl Capture {
         self.load(&(0..self.len()).collect::<Vec<_>>(), size)
     }
 
-    /// Returns the lens of the first of several views, which most other views usually share. Returns `None` for a single view, for a
-    /// lens without distortion, and for the largest photos: the lens takes 16 bytes per pixel, and the size that the capture declares
-    /// isn't verified yet.
-    fn shared_lens(&self, indices: &[usize], size: Option<ImageSize>) -> Option<Lens> {
-        const MAX_PIXELS: u64 = 1 << 23;
-        let Frame { camera, distortion, .. } = &self.frames[*indices.first()?];
-        let is_shared = indices.len() > 1
-            && *distortion != Distortion::default()
-            && u64::from(camera.width) * u64::from(camera.height) <= MAX_PIXELS;
-        is_shared.then(|| Lens::new(*distortion, *camera, size.map(|size| source_region(camera, size))))
-    }
-
     /// Computes the CRC-32 of the views `indices`: the bytes of their photo files and masks, and their cameras. Images that are
     /// computed contribute their cameras alone.
     ///
@@ -487,8 +514,13 @@ impl Capture {
     pub fn checksum(&self, indices: impl IntoIterator<Item = usize>) -> Result<u32> {
         let mut hasher = crc32fast::Hasher::new();
         for index in indices {
-            let Frame { image, camera, distortion, mask, .. } = &self.frames[index];
-            hasher.update(format!("{camera:?}{distortion:?}").as_bytes());
+            let View { frame, camera, projection, .. } = &self.views[index];
+            let Frame { image, mask, .. } = &self.frames[*frame];
+            hasher.update(format!("{camera:?}").as_bytes());
+            match projection {
+                Projection::Distortion(distortion) => hasher.update(format!("{distortion:?}").as_bytes()),
+                Projection::Part(part) => hasher.update(format!("{part:?}").as_bytes()),
+            }
             if !matches!(image, ImageLocation::Source { .. }) {
                 hasher.update(&image.read()?);
             }
@@ -499,37 +531,45 @@ impl Capture {
         Ok(hasher.finalize())
     }
 
-    fn load_view(&self, frame: &Frame, size: Option<ImageSize>, lens: Option<&Lens>) -> Result<Photo> {
-        let (pixels, alpha) = self.read_photo(frame)?;
-        let fit_pixels = |pixels: RgbImage| {
-            let image = frame.undistort(pixels, size, lens);
-            match size {
-                Some(size) => fit(&image, &frame.camera, size),
-                None => (Planes::from_rgb(&image), frame.camera),
-            }
+    /// Loads `views`, all of one photo. Uses those of `tables` that match.
+    fn load_views(
+        &self,
+        views: &[&View],
+        size: Option<ImageSize>,
+        tables: &[LookupTable],
+    ) -> Result<Vec<Photo>> {
+        let (photo, mask) = self.read_photo(&self.frames[views[0].frame])?;
+        let load = |view: &&View| {
+            let fit_image = |image: &RgbImage| match size {
+                Some(size) => fit(image, &view.camera, size),
+                None => (Planes::from_rgb(image), view.camera),
+            };
+            let pixels = view_pixels(&photo, view, size, tables);
+            let (image, camera) = fit_image(pixels.as_ref().map_or(&photo, |pixels| &pixels.image));
+            let mask = view_mask(mask.as_ref(), pixels.and_then(|pixels| pixels.mask), view, size, tables)
+                .map(|mask| fit_image(&mask).0.into_first_channel())
+                .filter(|mask| mask.iter().any(|&weight| weight < u8::MAX));
+            Photo { name: view.name.clone(), image, mask, camera }
         };
-        let (image, camera) = fit_pixels(pixels);
-        let mask = frame.read_mask(alpha)?.map(|mask| fit_pixels(mask).0.into_first_channel());
-        let mask = mask.filter(|mask| mask.iter().any(|&weight| weight < u8::MAX));
-        Ok(Photo { name: frame.name.clone(), image, mask, camera })
+        Ok(views.iter().map(load).collect())
     }
 
     /// Returns the depths of view `index` along its camera's axis at the pixel centres, row by row, in the capture's unit. They are
     /// infinite in the sky. Returns `None` unless an [`ImageSource`] computes them.
     pub fn depth(&self, index: usize) -> Option<Vec<f32>> {
-        match &self.frames[index].image {
+        match &self.frames[self.views[index].frame].image {
             ImageLocation::Source { source, index } => source.depth(*index),
             ImageLocation::File(_) | ImageLocation::Bytes { .. } => None,
         }
     }
 
-    /// Returns the photo of view `index` at its camera's size, with lens distortion removed.
+    /// Returns the photo of view `index` at its camera's size, with lens distortion removed. Pixels that the photo doesn't show are
+    /// black.
     ///
     /// # Errors
     /// Fails like [`Capture::load`].
     pub fn photo(&self, index: usize) -> Result<RgbImage> {
-        let frame = &self.frames[index];
-        Ok(frame.undistort(self.read_photo(frame)?.0, None, None))
+        Ok(self.photo_with_mask(index)?.0)
     }
 
     /// Returns the photo of view `index` like [`Capture::photo`], and the weights of its pixels, as in [`Photo::mask`], in equal channels.
@@ -537,19 +577,22 @@ impl Capture {
     /// # Errors
     /// Fails like [`Capture::load`].
     pub fn photo_with_mask(&self, index: usize) -> Result<(RgbImage, Option<RgbImage>)> {
-        let frame = &self.frames[index];
-        let (pixels, alpha) = self.read_photo(frame)?;
-        let mask = frame.read_mask(alpha)?.map(|mask| frame.undistort(mask, None, None));
-        Ok((frame.undistort(pixels, None, None), mask))
+        let view = &self.views[index];
+        let (photo, mask) = self.read_photo(&self.frames[view.frame])?;
+        let (image, shown) = match view_pixels(&photo, view, None, &[]) {
+            Some(ViewPixels { image, mask }) => (image, mask),
+            None => (photo, None),
+        };
+        Ok((image, view_mask(mask.as_ref(), shown, view, None, &[])))
     }
 
-    /// Reads the photo as its lens took it, and its opacity if it isn't opaque.
-    fn read_photo(&self, frame: &Frame) -> Result<(RgbImage, Option<GrayImage>)> {
+    /// Returns the pixels of a photo as its lens took them, and their weights in equal channels if it has a mask.
+    fn read_photo(&self, frame: &Frame) -> Result<(RgbImage, Option<RgbImage>)> {
         if let ImageLocation::Source { source, index } = &frame.image {
             return Ok((source.image(*index), None));
         }
         let photo = self.decode(frame, &frame.image.read()?)?;
-        Ok((photo.pixels, photo.alpha))
+        Ok((photo.pixels, frame.read_mask(photo.alpha)?))
     }
 
     fn decode(&self, frame: &Frame, encoded: &[u8]) -> Result<DecodedPhoto> {
@@ -564,19 +607,155 @@ impl Capture {
     }
 
     /// Returns the image file of view `index` as a pinhole camera would have written it. These are the original bytes if the image
-    /// is 8-bit RGB, upright and free of distortion.
+    /// is 8-bit RGB, upright and free of distortion. Pixels that the photo doesn't show are black.
     ///
     /// # Errors
     /// Fails like [`Capture::load`].
     pub fn encoded(&self, index: usize) -> Result<Vec<u8>> {
-        let frame = &self.frames[index];
+        let view = &self.views[index];
+        let frame = &self.frames[view.frame];
         let bytes = frame.image.read()?;
         let photo = self.decode(frame, &bytes)?;
-        if photo.as_stored && frame.distortion == Distortion::default() {
-            return Ok(bytes.into_owned());
+        match view_pixels(&photo.pixels, view, None, &[]) {
+            Some(view) => encode_photo(&view.image, photo.is_jpeg),
+            None if photo.as_stored => Ok(bytes.into_owned()),
+            None => encode_photo(&photo.pixels, photo.is_jpeg),
         }
-        let pixels = undistort(photo.pixels, &frame.distortion, &frame.camera, None);
-        encode_photo(&pixels, photo.is_jpeg)
+    }
+}
+
+/// Returns lookup tables for `views` of a photo, which those of most other photos usually share. Returns none if a view is the photo,
+/// and for the largest photos: a table takes 16 bytes per pixel, and the size that the capture declares isn't verified yet.
+fn lookup_tables(views: &[&View], size: Option<ImageSize>) -> Vec<LookupTable> {
+    const MAX_PIXELS: u64 = 1 << 23;
+    let pixels = views.iter().map(|view| u64::from(view.camera.width) * u64::from(view.camera.height));
+    if views.iter().any(|view| view.projection.is_identity()) || pixels.sum::<u64>() > MAX_PIXELS {
+        return vec![];
+    }
+    let window = |camera: &Camera| size.map(|size| source_region(camera, size));
+    let table = |view: &&View| LookupTable::new(view.projection.clone(), view.camera, window(&view.camera));
+    views.iter().map(table).collect()
+}
+
+/// Returns the pixels of `view`, at least in the part that fitting to `size` reads, or `None` if they are those of `photo`. Uses one
+/// of `tables` if it matches.
+fn view_pixels(
+    photo: &RgbImage,
+    view: &View,
+    size: Option<ImageSize>,
+    tables: &[LookupTable],
+) -> Option<ViewPixels> {
+    let View { projection, camera, .. } = view;
+    match tables.iter().find(|table| table.matches_camera(projection, camera)) {
+        Some(table) => Some(table.undistort(photo)),
+        None => undistort(photo, projection, camera, size.map(|size| source_region(camera, size))),
+    }
+}
+
+/// Returns the weights of the pixels of `view`, in equal channels, at least in the part that fitting to `size` reads: those of the photo's
+/// `mask`, and 0 where the photo doesn't show the view, as `shown` says. Returns `None` if every pixel counts.
+fn view_mask(
+    mask: Option<&RgbImage>,
+    shown: Option<Vec<u8>>,
+    view: &View,
+    size: Option<ImageSize>,
+    tables: &[LookupTable],
+) -> Option<RgbImage> {
+    let Camera { width, height, .. } = view.camera;
+    let shown =
+        shown.and_then(|shown| GrayImage::from_raw(width, height, shown)).map(|shown| grey_to_rgb(&shown));
+    let Some(mask) = mask else { return shown };
+    let mut mask = view_pixels(mask, view, size, tables).map_or_else(|| mask.clone(), |pixels| pixels.image);
+    if let Some(shown) = shown {
+        multiply(&mut mask, &shown);
+    }
+    Some(mask)
+}
+
+/// Returns the pinhole views of `frames`, which `file` describes, and a line for each kind of lens whose photos change.
+fn views_of_frames(file: &Path, frames: &[Frame], purpose: Purpose) -> Result<(Vec<View>, Vec<String>)> {
+    // Photos of one camera have the same lens.
+    let mut lenses: Vec<Lens> = vec![];
+    let lens_of_frame: Vec<Option<usize>> = frames
+        .iter()
+        .map(|frame| {
+            let is_split =
+                matches!(purpose, Purpose::Photos) && !matches!(frame.lens, LensModel::Perspective(_));
+            let lens = is_split.then(|| Lens::new(&frame.camera, frame.lens))?;
+            let known = lenses.iter().rposition(|known| *known == lens);
+            Some(known.unwrap_or_else(|| {
+                lenses.push(lens);
+                lenses.len() - 1
+            }))
+        })
+        .collect();
+    let part =
+        |lens: &Lens, view: PinholeView| (view, Arc::new(PhotoPart { lens: *lens, rotation: view.rotation }));
+    let parts = |lens: &Lens| split_into_views(lens).into_iter().map(|view| part(lens, view)).collect();
+    let parts: Vec<Vec<(PinholeView, Arc<PhotoPart>)>> = lenses.par_iter().map(parts).collect();
+    let mut views = vec![];
+    for (index, (frame, lens)) in frames.iter().zip(&lens_of_frame).enumerate() {
+        let Frame { name, camera, lens: model, .. } = frame;
+        let Some(lens) = *lens else {
+            let distortion = match model {
+                LensModel::Perspective(distortion) => *distortion,
+                LensModel::Equirectangular => {
+                    let expected = "a camera with a field of view below 180 degrees";
+                    return Err(Error::input(
+                        file,
+                        format!("the camera of {name}"),
+                        "EQUIRECTANGULAR",
+                        expected,
+                    ));
+                }
+                _ => Distortion::default(),
+            };
+            let projection = Projection::Distortion(distortion);
+            views.push(View { frame: index, name: name.clone(), camera: *camera, projection });
+            continue;
+        };
+        views.extend(parts[lens].iter().map(|(view, part)| {
+            let PinholeView { suffix, rotation, intrinsics, size: ImageSize { height, width } } = *view;
+            let [x, y, z] = [rotation.x_axis, rotation.y_axis, rotation.z_axis].map(|axis| axis.extend(0.));
+            let c2w = camera.c2w * DMat4::from_cols(x, y, z, DVec4::W);
+            let camera = Camera { intrinsics, c2w, width, height };
+            View {
+                frame: index,
+                name: part_name(name, suffix),
+                camera,
+                projection: Projection::Part(part.clone()),
+            }
+        }));
+    }
+    let line = |kind: &str, is_kind: &dyn Fn(usize) -> bool| {
+        let counts =
+            lens_of_frame.iter().flatten().filter(|&&lens| is_kind(lens)).map(|&lens| parts[lens].len());
+        let (photos, views) = counts.fold((0, 0), |(photos, views), count| (photos + 1, views + count));
+        let outcome = match views > photos {
+            true => format!("are split into {views} pinhole views"),
+            false => "are turned into pinhole views".into(),
+        };
+        let all = frames.len();
+        (photos > 0).then(|| format!("{}: {photos} of {all} photos {kind} and {outcome}", file.display()))
+    };
+    let shows_all = |lens: usize| lenses[lens].model == LensModel::Equirectangular;
+    let is_wide = |lens: usize| !shows_all(lens) && parts[lens].len() > 1;
+    let is_other = |lens: usize| !shows_all(lens) && parts[lens].len() == 1;
+    let lines = [
+        line("show 360 degrees", &shows_all),
+        line("have a wide field of view", &is_wide),
+        line("have a fisheye lens or the like", &is_other),
+    ];
+    Ok((views, lines.into_iter().flatten().collect()))
+}
+
+/// Returns the name of the part `suffix` of photo `name`, with `suffix` before the name's extension.
+fn part_name(name: &str, suffix: &str) -> String {
+    let start = name.rfind('/').map_or(0, |slash| slash + 1);
+    let end = name[start..].rfind('.').filter(|&dot| dot > 0).map_or(name.len(), |dot| start + dot);
+    match suffix {
+        "" => name.into(),
+        _ => format!("{}@{suffix}{}", &name[..end], &name[end..]),
     }
 }
 
@@ -633,6 +812,26 @@ fn fit_cameras_to_photos(file: &Path, frames: &mut [Frame]) -> Option<String> {
     ))
 }
 
+/// Returns `camera` scaled to a photo of size (width, height) if that size differs from the camera's and the aspect ratios agree to
+/// within a pixel of the smaller image. The size may also agree with width and height swapped, because loading may rotate a photo.
+fn scaled_to(camera: &Camera, (width, height): (u32, u32)) -> Option<Camera> {
+    let said = (camera.width, camera.height);
+    let choices = [(width, height), (height, width)];
+    if choices.contains(&said) {
+        return None;
+    }
+    let shares = |a: u32, b: u32| f64::from(a.min(b)) / f64::from(a.max(b));
+    let agrees = |&(width, height): &(u32, u32)| {
+        let (x, y) = (shares(width, said.0), shares(height, said.1));
+        let is_one_way = (width <= said.0) == (height <= said.1) || x == 1. || y == 1.;
+        let pixel = |a: u32, b: u32| 1. / f64::from(a.max(b));
+        is_one_way && (x - y).abs() <= pixel(width, said.0) + pixel(height, said.1)
+    };
+    let (width, height) = choices.into_iter().find(agrees)?;
+    let (x, y) = (f64::from(width) / f64::from(said.0), f64::from(height) / f64::from(said.1));
+    Some(Camera { intrinsics: camera.intrinsics.resized(x, y), width, height, ..*camera })
+}
+
 /// Checks that the masks of `frames` have the sizes of their photos up to a factor. Returns a line about those that have another size.
 fn check_masks(file: &Path, frames: &[Frame]) -> Result<Option<String>> {
     let is_resized = |frame: &Frame| -> Result<bool> {
@@ -663,26 +862,6 @@ fn check_masks(file: &Path, frames: &[Frame]) -> Result<Option<String>> {
         let names = format_names(names.into_iter());
         format!("{file}: the masks of {count} of {all} photos have another size and are resized: {names}")
     }))
-}
-
-/// Returns `camera` scaled to a photo of size (width, height) if that size differs from the camera's and the aspect ratios agree to
-/// within a pixel of the smaller image. The size may also agree with width and height swapped, because loading may rotate a photo.
-fn scaled_to(camera: &Camera, (width, height): (u32, u32)) -> Option<Camera> {
-    let said = (camera.width, camera.height);
-    let choices = [(width, height), (height, width)];
-    if choices.contains(&said) {
-        return None;
-    }
-    let shares = |a: u32, b: u32| f64::from(a.min(b)) / f64::from(a.max(b));
-    let agrees = |&(width, height): &(u32, u32)| {
-        let (x, y) = (shares(width, said.0), shares(height, said.1));
-        let is_one_way = (width <= said.0) == (height <= said.1) || x == 1. || y == 1.;
-        let pixel = |a: u32, b: u32| 1. / f64::from(a.max(b));
-        is_one_way && (x - y).abs() <= pixel(width, said.0) + pixel(height, said.1)
-    };
-    let (width, height) = choices.into_iter().find(agrees)?;
-    let (x, y) = (f64::from(width) / f64::from(said.0), f64::from(height) / f64::from(said.1));
-    Some(Camera { intrinsics: camera.intrinsics.resized(x, y), width, height, ..*camera })
 }
 
 fn render_names(names: &[&str], suffixes: &[&str]) -> Vec<String> {

@@ -5,6 +5,7 @@ mod formats;
 mod geometry;
 mod holdout;
 mod image_source;
+mod lens;
 mod pixels;
 
 pub use capture::{Capture, Photo};
@@ -21,6 +22,7 @@ pub use geometry::{
 pub use globalsplat_files::{Error, Result};
 pub use holdout::Holdout;
 pub use image_source::ImageSource;
+pub use lens::Lens;
 pub use pixels::{
     CHANNELS, DecodedPhoto, PHOTO_EXTENSIONS, Planes, Region, Resampler, decode_photo, encode_photo,
     exif_focal, fit, is_equirectangular, read_image, read_image_size, source_region,

@@ -131,8 +131,18 @@ const LENS: [&str; 16] = [
     "p1",
     "p2",
 ];
-const LENS_MODELS: [&str; 7] =
-    ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", "FULL_OPENCV", "OPENCV_FISHEYE"];
+const LENS_MODELS: [&str; 10] = [
+    "OPENCV",
+    "PINHOLE",
+    "SIMPLE_PINHOLE",
+    "RADIAL",
+    "SIMPLE_RADIAL",
+    "FULL_OPENCV",
+    "OPENCV_FISHEYE",
+    "FISHEYE624",
+    "EUCM",
+    "EQUIRECTANGULAR",
+];
 
 impl Lens {
     fn add_to(&self, json: &mut Value) {
@@ -215,7 +225,7 @@ struct ColmapImage {
 }
 
 /// Names and parameter counts of camera models, in COLMAP's numbering.
-const COLMAP_MODELS: [(&str, usize); 7] = [
+const COLMAP_MODELS: [(&str, usize); 18] = [
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
     ("SIMPLE_RADIAL", 4),
@@ -223,16 +233,33 @@ const COLMAP_MODELS: [(&str, usize); 7] = [
     ("OPENCV", 8),
     ("OPENCV_FISHEYE", 8),
     ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    ("SIMPLE_DIVISION", 4),
+    ("DIVISION", 5),
+    ("SIMPLE_FISHEYE", 3),
+    ("FISHEYE", 4),
+    ("EUCM", 6),
+    ("EQUIRECTANGULAR", 2),
 ];
+
+/// Indices of the models with a focal length for each axis.
+const TWO_FOCAL_LENGTHS: [usize; 10] = [1, 4, 5, 6, 7, 10, 11, 13, 15, 16];
 
 impl ColmapCamera {
     /// Returns the index of the model, and parameters that are valid for it, unless others were drawn.
     fn model(&self) -> (usize, Vec<f64>) {
         let model = usize::from(self.model.unsigned_abs()) % COLMAP_MODELS.len();
         let side = f64::from(SIDE);
-        let right =
-            [&[side; 2][..if [1, 4, 5, 6].contains(&model) { 2 } else { 1 }], &[side / 2.; 2], &[0.01; 8]]
-                .concat();
+        let right = [
+            &[side; 2][..if TWO_FOCAL_LENGTHS.contains(&model) { 2 } else { 1 }],
+            &[side / 2.; 2],
+            &[0.01; 12],
+        ]
+        .concat();
         let right = right[..COLMAP_MODELS[model].1.min(right.len())].to_vec();
         (model, self.parameters.clone().unwrap_or(right))
     }

@@ -6,7 +6,7 @@ use super::photos::{find_photos, portable};
 use super::{CaptureOpener, file_in, folder_name};
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
 use crate::geometry::{Camera, Intrinsics, pose_to_rows};
-use crate::pixels::Distortion;
+use crate::lens::LensModel;
 use glam::DMat4;
 use globalsplat_files::{Error, Result, read_text, write_json};
 use serde::{Deserialize, Serialize};
@@ -64,8 +64,8 @@ pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
             image: ImageLocation::File(photo),
             name,
             camera,
-            distortion: Distortion::default(),
             mask: None,
+            lens: LensModel::default(),
         });
     }
     Capture::new(folder_name(root), file.to_owned(), frames, changes, purpose)

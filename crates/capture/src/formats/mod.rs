@@ -71,7 +71,8 @@ fn file_in(path: &Path, name: &str) -> Option<PathBuf> {
 /// If several formats match, the first that can be read is used. Missing photos are left out, and cameras are scaled to photos
 /// whose size differs from the declared one. [`Capture::warnings`] lists everything that is left out or changed.
 ///
-/// Lens distortion is removed when the images are loaded, so every camera is a pinhole camera with OpenCV axes.
+/// Lens distortion is removed when the images are loaded, so every camera is a pinhole camera with OpenCV axes. A photo of a fisheye
+/// or of 360 degrees may become several views.
 ///
 /// ```no_run
 /// use globalsplat_capture::open_capture;

@@ -1,15 +1,15 @@
 //! `transforms.json` of nerfstudio and instant-ngp: {"frames": [{"file_path", "transform_matrix" 4×4, camera-to-world with OpenGL
 //! axes}]}, and lens parameters for all frames or for each: `w`, `h`, `fl_x`, `fl_y`, `cx`, `cy` in pixels, `camera_angle_x` and
-//! `camera_angle_y` in radians, and the distortion `k1` to `k6`, `p1`, `p2` (spec 10.3). NeRF's synthetic scenes have a file of
-//! this kind for each split.
+//! `camera_angle_y` in radians, the `camera_model`, and the distortion `k1` to `k6`, `p1`, `p2` (spec 10.3). NeRF's synthetic scenes
+//! have a file of this kind for each split.
 
 use super::json::null_for_not_a_number;
 use super::natural::natural_order;
 use super::photos::{find_photos, portable};
 use super::{CaptureOpener, file_in, folder_name};
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
-use crate::geometry::{Camera, Intrinsics, nearest_rigid_of_scaled};
-use crate::pixels::Distortion;
+use crate::geometry::{Camera, ImageSize, Intrinsics, nearest_rigid_of_scaled};
+use crate::lens::{COLMAP_MODELS, Distortion, Lens, LensModel, sphere};
 use crate::pixels::read_image_size;
 use glam::{DMat4, DVec4};
 use globalsplat_files::{Error, Result, read_text};
@@ -29,18 +29,34 @@ const TEST_FILES: [&str; 2] = ["transforms_test.json", "transforms_val.json"];
 const TRAIN_LIST: &str = "train_filenames";
 const TEST_LISTS: [&str; 2] = ["test_filenames", "val_filenames"];
 
-/// Names of the lenses that [`Distortion`] describes.
-const CAMERA_MODELS: [&str; 6] =
-    ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL", FULL_OPENCV];
+/// Names of the perspective lenses whose coefficients have keys of their own.
+const PERSPECTIVE_MODELS: [&str; 5] = ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL"];
 
 /// Name of the lens model whose k4 to k6 form a denominator.
 const FULL_OPENCV: &str = "FULL_OPENCV";
+
+/// Names of the fisheyes whose coefficients are k1 to k4, p1 and p2.
+const FISHEYE_MODELS: [&str; 5] =
+    [OPENCV_FISHEYE, "FISHEYE", "SIMPLE_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE"];
+
+const OPENCV_FISHEYE: &str = "OPENCV_FISHEYE";
+
+/// nerfstudio's name of COLMAP's RAD_TAN_THIN_PRISM_FISHEYE.
+const FISHEYE624: (&str, &str) = ("FISHEYE624", "RAD_TAN_THIN_PRISM_FISHEYE");
+
+const EQUIRECTANGULAR: &str = "EQUIRECTANGULAR";
+
+/// Key of a list of coefficients.
+const COEFFICIENTS: &str = "distortion_params";
+
+/// Keys of the coefficients that nerfstudio lists as `distortion_params`, in its order.
+const COEFFICIENT_KEYS: [&str; 6] = ["k1", "k2", "k3", "k4", "p1", "p2"];
 
 /// Groups of keys that together describe one property of a frame's lens. If a frame has one key of a group, the keys shared by all
 /// frames are ignored for this group.
 const FAMILIES: [&[&str]; 2] = [
     &["fl_x", "fl_y", "camera_angle_x", "camera_angle_y"],
-    &["k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "distortion_params"],
+    &["k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", COEFFICIENTS],
 ];
 
 /// Recognizes a folder with a `transforms.json`, or with a `transforms_train.json` and optional test files, or a file
@@ -220,11 +236,6 @@ pub(super) fn from_opengl(entries: &[f64; 16]) -> DMat4 {
     opengl * DMat4::from_diagonal(DVec4::new(1., -1., -1., 1.))
 }
 
-/// Returns `true` if `value` names the lens `model`.
-fn is_model(value: &Value, model: &str) -> bool {
-    value.as_str().is_some_and(|value| value.eq_ignore_ascii_case(model))
-}
-
 /// Fields of a frame, each either its own or the one shared by all frames.
 struct Fields<'a> {
     file: &'a Path,
@@ -308,7 +319,7 @@ impl<'a> Fields<'a> {
     }
 
     fn frame(&self, image: PathBuf, name: &str, changes: &mut Changes) -> Result<Frame> {
-        self.check_camera_model()?;
+        let model = self.camera_model()?;
         let (width, height) = match (self.size("w")?, self.size("h")?) {
             (Some(width), Some(height)) => (width, height),
             _ => self.purpose.size(self.file, &format!("frame {}", self.index), read_image_size(&image))?,
@@ -317,14 +328,15 @@ impl<'a> Fields<'a> {
         if scale != 1. {
             changes.scaled.push((name.to_string(), scale));
         }
-        let camera = Camera { intrinsics: self.intrinsics(width, height)?, c2w, width, height };
-        let distortion = self.distortion()?;
-        let refuse =
-            |name: &str, (found, expected)| Error::input(self.file, self.name(name), found, expected);
-        let intrinsics = camera.intrinsics.check(width, height);
-        intrinsics.map_err(|(name, found, expected)| refuse(&name, (found, expected)))?;
-        distortion.check(&camera).map_err(|e| refuse("the distortion", e))?;
-        Ok(Frame { image: ImageLocation::File(image), name: portable(name), camera, distortion, mask: None })
+        let lens = self.lens(&model, ImageSize { height, width })?;
+        let camera = Camera { intrinsics: lens.intrinsics, c2w, width, height };
+        Ok(Frame {
+            image: ImageLocation::File(image),
+            name: portable(name),
+            camera,
+            lens: lens.model,
+            mask: None,
+        })
     }
 
     /// Returns the intrinsics. A missing focal length is computed from the angle of view if possible, otherwise it equals that of
@@ -344,49 +356,97 @@ impl<'a> Fields<'a> {
         Ok(Intrinsics { fx, fy, cx, cy })
     }
 
-    fn distortion(&self) -> Result<Distortion> {
-        if let Some((value, name)) = self.find("distortion_params") {
-            return Err(Error::input(
-                self.file,
-                name,
-                describe_value(Some(value)),
-                "the coefficients by name, as in k1",
-            ));
+    /// Returns the lens of photos of `size` that `model` names.
+    fn lens(&self, model: &str, size: ImageSize) -> Result<Lens> {
+        let ImageSize { width, height } = size;
+        let refuse = |(name, found, expected): (String, String, String)| {
+            Error::input(self.file, self.name(&name), found, expected)
+        };
+        let intrinsics = match model {
+            // nerfstudio writes focal lengths of other meanings, or none.
+            EQUIRECTANGULAR => {
+                let [fx, fy, cx, cy] = sphere(f64::from(width), f64::from(height));
+                Intrinsics { fx, fy, cx, cy }
+            }
+            _ => self.intrinsics(width, height)?,
+        };
+        let camera = Camera { intrinsics, c2w: DMat4::IDENTITY, width, height };
+        let model = match model {
+            EQUIRECTANGULAR => LensModel::Equirectangular,
+            _ if FISHEYE_MODELS.contains(&model) => {
+                let ([k1, k2, k3, k4, ..], tangential) = self.coefficients(model)?;
+                LensModel::fisheye([k1, k2, k3, k4], tangential)
+            }
+            _ if model == FULL_OPENCV || PERSPECTIVE_MODELS.contains(&model) => {
+                let ([k1, k2, k3, k4, k5, k6], tangential) = self.coefficients(model)?;
+                let (k4, denominator) = if model == FULL_OPENCV { (0., [k4, k5, k6]) } else { (k4, [0.; 3]) };
+                LensModel::Perspective(Distortion { radial: [k1, k2, k3, k4], denominator, tangential })
+            }
+            model => {
+                let Intrinsics { fx, fy, cx, cy } = intrinsics;
+                let name = if model == FISHEYE624.0 { FISHEYE624.1 } else { model };
+                let parameters = [vec![fx, fy, cx, cy], self.list()?.unwrap_or_default()].concat();
+                return Lens::from_colmap(name, &parameters, size).map_err(refuse);
+            }
+        };
+        let lens = Lens::new(&camera, model);
+        lens.check().map(|()| lens).map_err(refuse)
+    }
+
+    /// Returns the coefficients k1 to k6, and p1 and p2. `model` is the name of the lens.
+    fn coefficients(&self, model: &str) -> Result<([f64; 6], [f64; 2])> {
+        let list = self.list()?;
+        if let Some(list) = &list
+            && list.len() != COEFFICIENT_KEYS.len()
+        {
+            let expected = format!("{} numbers: {}", COEFFICIENT_KEYS.len(), COEFFICIENT_KEYS.join(", "));
+            return Err(self.refuse(COEFFICIENTS, format!("{} numbers", list.len()), &expected));
         }
-        let number = |key: &str| Ok::<_, Error>(self.number(key)?.unwrap_or(0.));
-        let (k4, k5, k6) = (number("k4")?, number("k5")?, number("k6")?);
-        let is_rational = self.find("camera_model").is_some_and(|(model, _)| is_model(model, FULL_OPENCV));
-        for (key, value) in [("k5", k5), ("k6", k6)] {
-            if value != 0. && !is_rational {
+        let number = |key: &str| {
+            let listed = list.as_ref().zip(COEFFICIENT_KEYS.iter().position(|known| *known == key));
+            Ok::<_, Error>(self.number(key)?.or(listed.map(|(list, at)| list[at])).unwrap_or(0.))
+        };
+        for key in ["k5", "k6"] {
+            let value = number(key)?;
+            if value != 0. && model != FULL_OPENCV {
                 return Err(self.refuse(key, value, "0, or FULL_OPENCV as camera_model"));
             }
         }
-        let (k4, denominator) = if is_rational { (0., [k4, k5, k6]) } else { (k4, [0.; 3]) };
-        Ok(Distortion {
-            radial: [number("k1")?, number("k2")?, number("k3")?, k4],
-            denominator,
-            tangential: [number("p1")?, number("p2")?],
-        })
+        let radial =
+            [number("k1")?, number("k2")?, number("k3")?, number("k4")?, number("k5")?, number("k6")?];
+        Ok((radial, [number("p1")?, number("p2")?]))
     }
 
-    fn check_camera_model(&self) -> Result<()> {
-        if let Some((model, name)) = self.find("camera_model")
-            && !CAMERA_MODELS.iter().any(|known| is_model(model, known))
-        {
-            let expected = format!("one of {}", CAMERA_MODELS.join(", "));
-            return Err(Error::input(self.file, name, describe_value(Some(model)), expected));
+    /// Returns the numbers of `distortion_params`, if there are any.
+    fn list(&self) -> Result<Option<Vec<f64>>> {
+        let Some((value, name)) = self.find(COEFFICIENTS) else { return Ok(None) };
+        let numbers = value.as_array().and_then(|list| list.iter().map(Value::as_f64).collect());
+        let refused = || Error::input(self.file, name, describe_value(Some(value)), "a list of numbers");
+        numbers.ok_or_else(refused).map(Some)
+    }
+
+    /// Returns the name of the lens model. instant-ngp says in `is_fisheye` that it is OpenCV's fisheye.
+    fn camera_model(&self) -> Result<String> {
+        let is_fisheye = match self.find("is_fisheye") {
+            None => false,
+            Some((Value::Bool(is_fisheye), _)) => *is_fisheye,
+            Some((value, name)) => {
+                return Err(Error::input(self.file, name, describe_value(Some(value)), "true or false"));
+            }
+        };
+        let Some((value, name)) = self.find("camera_model") else {
+            return Ok(if is_fisheye { OPENCV_FISHEYE } else { PERSPECTIVE_MODELS[0] }.into());
+        };
+        let known = COLMAP_MODELS.iter().map(|(known, _)| *known).chain([FISHEYE624.0]);
+        let model = value.as_str().unwrap_or_default().to_ascii_uppercase();
+        match known.clone().any(|known| known == model) {
+            true if is_fisheye && model == PERSPECTIVE_MODELS[0] => Ok(OPENCV_FISHEYE.into()),
+            true => Ok(model),
+            false => {
+                let expected = format!("one of {}", known.collect::<Vec<_>>().join(", "));
+                Err(Error::input(self.file, name, describe_value(Some(value)), expected))
+            }
         }
-        if let Some((value, name)) = self.find("is_fisheye")
-            && value != &Value::Bool(false)
-        {
-            return Err(Error::input(
-                self.file,
-                name,
-                describe_value(Some(value)),
-                "false, as fisheye lenses aren't known",
-            ));
-        }
-        Ok(())
     }
 
     /// Returns `transform_matrix` with OpenCV axes, and the scale factor that was removed from its rotation.

@@ -1,15 +1,14 @@
 //! Processing of a photo between its file and a network: decoding, removal of lens distortion, cropping, resizing.
 
 mod codec;
-mod distortion;
 mod fit;
 mod heif;
 mod jpeg;
-mod lens;
 mod mask;
 mod metadata;
 mod planes;
 mod resample;
+mod undistort;
 
 pub use codec::{
     DecodedPhoto, PHOTO_EXTENSIONS, decode_photo, encode_photo, encoded_image_size, read_image,
@@ -21,6 +20,5 @@ pub use metadata::{exif_focal, is_equirectangular};
 pub use planes::{CHANNELS, Planes};
 pub use resample::{Region, Resampler};
 
-pub(crate) use distortion::Distortion;
-pub(crate) use lens::{Lens, undistort};
 pub(crate) use mask::{grey_to_rgb, multiply, read_mask};
+pub(crate) use undistort::{LookupTable, ViewPixels, undistort};

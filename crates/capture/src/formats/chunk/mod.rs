@@ -6,7 +6,8 @@ mod scenes;
 use super::CaptureOpener;
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
 use crate::geometry::{Camera, Intrinsics};
-use crate::pixels::{Distortion, SUPPORTED_IMAGES, encoded_image_size};
+use crate::lens::LensModel;
+use crate::pixels::{SUPPORTED_IMAGES, encoded_image_size};
 use glam::{DMat4, DVec4};
 use globalsplat_files::{Error, Result, split_keyed_path};
 use globalsplat_torch_file::Archive;
@@ -136,7 +137,7 @@ impl Chunk {
                 let name = format!("{index:06}");
                 let camera = camera(numbers, size.unwrap_or(usual));
                 let photo = ImageLocation::Bytes { file: self.bytes.clone(), bytes, name: named.join(&name) };
-                Frame { image: photo, name, camera, distortion: Distortion::default(), mask: None }
+                Frame { image: photo, name, camera, mask: None, lens: LensModel::default() }
             });
         Capture::new(scene.key.clone(), named.clone(), frames.collect(), Changes::default(), purpose)
     }

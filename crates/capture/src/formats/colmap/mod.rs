@@ -10,8 +10,8 @@ use super::natural::natural_order;
 use super::photos::{find_masks, find_photos, portable};
 use super::{CaptureOpener, MASKS, folder_name};
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose, format_names};
-use crate::geometry::{Camera, Intrinsics};
-use crate::pixels::Distortion;
+use crate::geometry::{Camera, ImageSize};
+use crate::lens::{COLMAP_MODELS, Lens, LensModel};
 use fields::{Bytes, Words, is_comment};
 use glam::{DMat4, DQuat, DVec3};
 use globalsplat_files::{Error, Result, read_text};
@@ -28,32 +28,6 @@ const DENSE: (&str, &str) = ("dense", "sparse");
 
 /// Name of the folder of photos.
 const PHOTOS: &str = "images";
-
-/// Camera models in COLMAP's numbering, each with its number of parameters.
-const MODELS: [(&str, usize); 18] = [
-    ("SIMPLE_PINHOLE", 3),
-    ("PINHOLE", 4),
-    ("SIMPLE_RADIAL", 4),
-    ("RADIAL", 5),
-    ("OPENCV", 8),
-    ("OPENCV_FISHEYE", 8),
-    ("FULL_OPENCV", 12),
-    ("FOV", 5),
-    ("SIMPLE_RADIAL_FISHEYE", 4),
-    ("RADIAL_FISHEYE", 5),
-    ("THIN_PRISM_FISHEYE", 12),
-    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
-    ("SIMPLE_DIVISION", 4),
-    ("DIVISION", 5),
-    ("SIMPLE_FISHEYE", 3),
-    ("FISHEYE", 4),
-    ("EUCM", 6),
-    ("EQUIRECTANGULAR", 2),
-];
-
-/// Supported camera models.
-const SUPPORTED: [&str; 6] =
-    ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"];
 
 /// Files of a model.
 struct Model {
@@ -122,7 +96,7 @@ const UNIT_TOLERANCE: f64 = 1e-3;
 /// A line of cameras.txt.
 struct CameraEntry {
     id: u32,
-    /// Name of the camera model. It may be missing from [`SUPPORTED`] if no image uses the camera.
+    /// Name of the camera model. It may be unknown if no image uses the camera.
     model: String,
     width: u64,
     height: u64,
@@ -231,7 +205,7 @@ fn read(
             let expected = format!("one of the {} in {}", cameras.len(), model.cameras.display());
             return refuse("camera id", image.camera.to_string(), expected);
         };
-        let (camera, distortion) = match lenses.get(&camera.id) {
+        let (camera, lens) = match lenses.get(&camera.id) {
             Some(lens) => *lens,
             None => *lenses.entry(camera.id).or_insert(lens(&model.cameras, camera)?),
         };
@@ -257,7 +231,7 @@ fn read(
             image: ImageLocation::File(photo),
             name: portable(&image.name),
             camera,
-            distortion,
+            lens,
             mask,
         });
     }
@@ -265,8 +239,8 @@ fn read(
     Capture::new(folder_name(folder), model.images.clone(), frames, changes, purpose)
 }
 
-/// Returns the camera, at the origin, and its distortion.
-fn lens(file: &Path, entry: &CameraEntry) -> Result<(Camera, Distortion)> {
+/// Returns the camera, at the origin, and its lens.
+fn lens(file: &Path, entry: &CameraEntry) -> Result<(Camera, LensModel)> {
     let refuse = |name: &str, found: String, expected: String| {
         Error::input(file, format!("{name} of camera {}", entry.id), found, expected)
     };
@@ -275,38 +249,10 @@ fn lens(file: &Path, entry: &CameraEntry) -> Result<(Camera, Distortion)> {
         _ => Err(refuse(name, size.to_string(), "a number of pixels".into())),
     };
     let (width, height) = (size("width", entry.width)?, size("height", entry.height)?);
-    let none = Distortion::default();
-    let radial = |k1: f64, k2: f64| Distortion { radial: [k1, k2, 0., 0.], ..none };
-    let ([fx, fy, cx, cy], distortion) = match (entry.model.as_str(), entry.parameters.as_slice()) {
-        ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f, cx, cy], none),
-        ("PINHOLE", &[fx, fy, cx, cy]) => ([fx, fy, cx, cy], none),
-        ("SIMPLE_RADIAL", &[f, cx, cy, k]) => ([f, f, cx, cy], radial(k, 0.)),
-        ("RADIAL", &[f, cx, cy, k1, k2]) => ([f, f, cx, cy], radial(k1, k2)),
-        ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => {
-            ([fx, fy, cx, cy], Distortion { tangential: [p1, p2], ..radial(k1, k2) })
-        }
-        ("FULL_OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6]) => {
-            let (radial, denominator) = ([k1, k2, k3, 0.], [k4, k5, k6]);
-            ([fx, fy, cx, cy], Distortion { radial, denominator, tangential: [p1, p2] })
-        }
-        (model, parameters) => {
-            let Some((_, count)) =
-                MODELS.iter().find(|(known, _)| SUPPORTED.contains(known) && *known == model)
-            else {
-                return Err(refuse("model", entry.model.clone(), format!("one of {}", SUPPORTED.join(", "))));
-            };
-            return Err(refuse(
-                "the parameters",
-                format!("{parameters:?}"),
-                format!("{count} parameters for {model}"),
-            ));
-        }
-    };
-    let intrinsics = Intrinsics { fx, fy, cx, cy };
-    intrinsics.check(width, height).map_err(|(name, found, expected)| refuse(&name, found, expected))?;
-    let camera = Camera { intrinsics, c2w: DMat4::IDENTITY, width, height };
-    distortion.check(&camera).map_err(|(found, expected)| refuse("the distortion", found, expected))?;
-    Ok((camera, distortion))
+    let lens = Lens::from_colmap(&entry.model, &entry.parameters, ImageSize { width, height })
+        .map_err(|(name, found, expected)| refuse(&name, found, expected))?;
+    let camera = Camera { intrinsics: lens.intrinsics, c2w: DMat4::IDENTITY, width, height };
+    Ok((camera, lens.model))
 }
 
 /// Reads lines of the form CAMERA_ID MODEL WIDTH HEIGHT PARAMS…
@@ -371,10 +317,10 @@ fn cameras_of_bytes(file: &Path) -> Result<Vec<CameraEntry>> {
     for i in 0..bytes.count("the number of cameras", SMALLEST)? {
         let id = u32::from_le_bytes(bytes.take(|| format!("the id of camera {i}, counted from 0,"))?);
         let number = i32::from_le_bytes(bytes.take(|| format!("model of camera {id}"))?);
-        let model = usize::try_from(number).ok().and_then(|number| MODELS.get(number));
+        let model = usize::try_from(number).ok().and_then(|number| COLMAP_MODELS.get(number));
         // The number of parameters of an unknown model is unknown, and so is the start of the next camera.
         let (model, parameters) = model.ok_or_else(|| {
-            let expected = format!("one of {}", SUPPORTED.join(", "));
+            let expected = format!("one of {}", COLMAP_MODELS.map(|(name, _)| name).join(", "));
             Error::input(file, format!("model of camera {id}"), format!("number {number}"), expected)
         })?;
         let width = u64::from_le_bytes(bytes.take(|| format!("width of camera {id}"))?);

@@ -1,6 +1,6 @@
 //! Lens distortion (spec 10.5).
 
-use crate::geometry::{Camera, Intrinsics};
+use crate::geometry::{ImageSize, Intrinsics};
 
 /// Lens distortion in the OpenCV model. The lens shows a ray (x, y, 1) in camera axes where a pinhole camera would show the ray
 /// (x', y', 1):
@@ -27,7 +27,7 @@ pub(crate) struct Distortion {
 
 impl Distortion {
     /// Returns the distorted point (x', y') of (x, y).
-    pub(super) fn apply(&self, x: f64, y: f64) -> (f64, f64) {
+    pub fn apply(&self, x: f64, y: f64) -> (f64, f64) {
         let [p1, p2] = self.tangential;
         let (r2, l, _) = self.radial_factor(x, y);
         (x * l + 2. * p1 * x * y + p2 * (r2 + 2. * x * x), y * l + p1 * (r2 + 2. * y * y) + 2. * p2 * x * y)
@@ -66,18 +66,18 @@ impl Distortion {
         ]
     }
 
-    /// Checks that no two rays of `camera`'s pinhole image map to one point of the photo, which happens if a polynomial is used
+    /// Checks that no two rays of the pinhole image of `size` map to one point of the photo, which happens if a polynomial is used
     /// beyond the image it was fitted to. The Jacobian's determinant and the denominator must be above 0 all over the image.
     ///
     /// # Errors
     /// Returns (what was found, what was expected).
-    pub fn check(&self, camera: &Camera) -> Result<(), (String, String)> {
+    pub fn check(&self, intrinsics: &Intrinsics, size: ImageSize) -> Result<(), (String, String)> {
         /// Number of sample points along each side of the image.
         const POINTS: u32 = 33;
-        let Intrinsics { fx, fy, cx, cy } = camera.intrinsics;
+        let Intrinsics { fx, fy, cx, cy } = *intrinsics;
         let at = |i: u32, size: u32| f64::from(i) / f64::from(POINTS - 1) * f64::from(size);
         let folds = (0..POINTS * POINTS).any(|i| {
-            let (u, v) = (at(i % POINTS, camera.width), at(i / POINTS, camera.height));
+            let (u, v) = (at(i % POINTS, size.width), at(i / POINTS, size.height));
             let (x, y) = ((u - cx) / fx, (v - cy) / fy);
             let [xx, xy, yy] = self.jacobian(x, y);
             let determinant = xx * yy - xy * xy;
@@ -98,13 +98,12 @@ impl Distortion {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::DMat4;
 
     const LENS: Distortion =
         Distortion { radial: [-0.12, 0.05, -0.01, 0.002], denominator: [0.; 3], tangential: [0.003, -0.002] };
     const RATIONAL: Distortion = Distortion { denominator: [0.3, -0.07, 0.02], ..LENS };
     const INTRINSICS: Intrinsics = Intrinsics { fx: 50., fy: 48., cx: 33., cy: 23. };
-    const CAMERA: Camera = Camera { intrinsics: INTRINSICS, c2w: DMat4::IDENTITY, width: 64, height: 48 };
+    const SIZE: ImageSize = ImageSize { height: 48, width: 64 };
 
     /// Returns the ray that the lens shows at (x', y'), by Newton's method with the Jacobian.
     fn invert(lens: &Distortion, distorted: (f64, f64)) -> (f64, f64) {
@@ -160,17 +159,17 @@ mod tests {
 
     #[test]
     fn a_lens_that_folds_is_refused() {
-        LENS.check(&CAMERA).expect("a good lens");
+        LENS.check(&INTRINSICS, SIZE).expect("a good lens");
         // The map x − x³ turns back at x = 0.577, which lies inside the image.
         for k1 in [-1., f64::NAN, f64::INFINITY] {
             let lens = Distortion { radial: [k1, 0., 0., 0.], ..Distortion::default() };
-            let (found, _) = lens.check(&CAMERA).unwrap_err();
+            let (found, _) = lens.check(&INTRINSICS, SIZE).unwrap_err();
             assert!(found.contains(&format!("k1 {k1}")) && found.contains("folds"), "{found}");
         }
-        RATIONAL.check(&CAMERA).expect("a good lens");
+        RATIONAL.check(&INTRINSICS, SIZE).expect("a good lens");
         // The map 1 / (1 − 3r²) has a pole inside the image, and is steep on either side of it.
         let pole = Distortion { denominator: [-3., 0., 0.], ..Distortion::default() };
-        let (found, _) = pole.check(&CAMERA).unwrap_err();
+        let (found, _) = pole.check(&INTRINSICS, SIZE).unwrap_err();
         assert!(found.contains("over [-3.0, 0.0, 0.0]") && found.contains("folds"), "{found}");
     }
 }

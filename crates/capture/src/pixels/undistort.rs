@@ -1,35 +1,44 @@
-//! Removal of lens distortion from photos (spec 10.5).
+//! Photos as pinhole cameras would have taken them (spec 10.5).
 
-use super::distortion::Distortion;
 use crate::geometry::{Camera, Intrinsics};
-use glam::Vec4;
+use crate::lens::{Distortion, Projection};
+use glam::{DVec3, Vec4};
 use image::RgbImage;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Returns the photo as `camera`, a pinhole camera, would have taken it.
+/// Pixels of a pinhole view.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct ViewPixels {
+    pub image: RgbImage,
+    /// 255 for each pixel that the photo shows and 0 for the others, row by row. `None` if the photo shows all of them.
+    pub mask: Option<Vec<u8>>,
+}
+
+/// Returns the photo as `camera`, a pinhole camera, would have taken it, or `None` if the photo is just that.
 ///
-/// Pixel (i, j) has the ray x = (j + ½ − cx)/fx, y = (i + ½ − cy)/fy, and takes its colour from the photo at (fx·x' + cx, fy·y' +
-/// cy), interpolated linearly between the four surrounding pixel centres. Beyond the photo its border is repeated. Pixels outside
-/// `window`'s columns and rows, if it is given, are unspecified.
+/// Pixel (i, j) has the ray x = (j + ½ − cx)/fx, y = (i + ½ − cy)/fy, and takes its colour from the position in the photo to which
+/// `projection` maps the ray, interpolated linearly between the four surrounding pixel centres. Beyond the photo its border is
+/// repeated, or, if the view is a part of the photo, pixels are black and masked out. Pixels outside `window`'s columns and rows, if
+/// it is given, are unspecified.
 pub(crate) fn undistort(
-    photo: RgbImage,
-    distortion: &Distortion,
+    photo: &RgbImage,
+    projection: &Projection,
     camera: &Camera,
     window: Option<[Range<usize>; 2]>,
-) -> RgbImage {
-    if *distortion == Distortion::default() {
-        return photo;
+) -> Option<ViewPixels> {
+    if projection.is_identity() {
+        return None;
     }
     let [columns, rows] = window.unwrap_or_else(|| whole(camera));
-    let mut looks = RowLookup::new(distortion, camera, &columns);
+    let mut looks = RowLookup::new(projection, camera, &columns);
     let mut row = vec![SamplePosition::default(); columns.len()];
-    let mut picture = Undistortion::new(photo);
+    let mut picture = Undistortion::new(photo, projection, camera);
     for i in rows {
         looks.fill(i, &mut row);
         picture.fill(i, columns.start, &row);
     }
-    picture.finish()
+    Some(picture.finish())
 }
 
 /// Returns all columns and rows of `camera`'s image.
@@ -37,10 +46,10 @@ fn whole(camera: &Camera) -> [Range<usize>; 2] {
     [camera.width, camera.height].map(|count| 0..count as usize)
 }
 
-/// Precomputed lookup positions that all photos of one camera share.
+/// Precomputed lookup positions that all views of one projection share.
 #[derive(Debug)]
-pub(crate) struct Lens {
-    distortion: Distortion,
+pub(crate) struct LookupTable {
+    projection: Projection,
     camera: Camera,
     columns: Range<usize>,
     rows: Range<usize>,
@@ -48,27 +57,27 @@ pub(crate) struct Lens {
     places: Vec<SamplePosition>,
 }
 
-impl Lens {
+impl LookupTable {
     /// Computes the positions for `window`'s columns and rows, or for the whole image.
-    pub fn new(distortion: Distortion, camera: Camera, window: Option<[Range<usize>; 2]>) -> Self {
+    pub fn new(projection: Projection, camera: Camera, window: Option<[Range<usize>; 2]>) -> Self {
         let [columns, rows] = window.unwrap_or_else(|| whole(&camera));
         let mut places = vec![SamplePosition::default(); columns.len() * rows.len()];
         places.par_chunks_mut(columns.len()).zip(rows.clone()).for_each_init(
-            || RowLookup::new(&distortion, &camera, &columns),
+            || RowLookup::new(&projection, &camera, &columns),
             |looks, (row, i)| looks.fill(i, row),
         );
-        Lens { distortion, camera, columns, rows, places }
+        LookupTable { projection, camera, columns, rows, places }
     }
 
-    /// Returns `true` if the lens matches `distortion` and `camera`, whatever the camera's pose.
-    pub fn matches_camera(&self, distortion: &Distortion, camera: &Camera) -> bool {
+    /// Returns `true` if the table is that of `projection` and `camera`, whatever the camera's pose.
+    pub fn matches_camera(&self, projection: &Projection, camera: &Camera) -> bool {
         let known = |camera: &Camera| (camera.intrinsics, camera.width, camera.height);
-        self.distortion == *distortion && known(&self.camera) == known(camera)
+        self.projection == *projection && known(&self.camera) == known(camera)
     }
 
-    /// Removes the distortion from `photo` like the function [`undistort`].
-    pub fn undistort(&self, photo: RgbImage) -> RgbImage {
-        let mut picture = Undistortion::new(photo);
+    /// Returns the view of `photo` like the function [`undistort`].
+    pub fn undistort(&self, photo: &RgbImage) -> ViewPixels {
+        let mut picture = Undistortion::new(photo, &self.projection, &self.camera);
         for (i, row) in self.rows.clone().zip(self.places.chunks(self.columns.len())) {
             picture.fill(i, self.columns.start, row);
         }
@@ -77,6 +86,7 @@ impl Lens {
 }
 
 /// Position in a photo to take a colour from: the pixel to the upper left, and the fractional distances to the next ones, 0 to 1.
+/// Outside the photo, `to_right` is NaN.
 #[derive(Debug, Clone, Copy, Default)]
 struct SamplePosition {
     left: u32,
@@ -87,7 +97,7 @@ struct SamplePosition {
 
 /// Computes the lookup positions of a pinhole camera's pixels, row by row.
 struct RowLookup<'a> {
-    distortion: &'a Distortion,
+    projection: &'a Projection,
     camera: &'a Camera,
     /// Ray coordinate x of each column.
     across: Vec<f64>,
@@ -96,21 +106,42 @@ struct RowLookup<'a> {
 }
 
 impl<'a> RowLookup<'a> {
-    fn new(distortion: &'a Distortion, camera: &'a Camera, columns: &Range<usize>) -> Self {
+    fn new(projection: &'a Projection, camera: &'a Camera, columns: &Range<usize>) -> Self {
         let Intrinsics { fx, cx, .. } = camera.intrinsics;
         let across: Vec<f64> = columns.clone().map(|j| (j as f64 + 0.5 - cx) / fx).collect();
         let seen = vec![(0., 0.); across.len()];
-        RowLookup { distortion, camera, across, seen }
+        RowLookup { projection, camera, across, seen }
     }
 
     /// Computes the lookup positions of row `i`.
     fn fill(&mut self, i: usize, row: &mut [SamplePosition]) {
+        let Intrinsics { fy, cy, .. } = self.camera.intrinsics;
+        let y = (i as f64 + 0.5 - cy) / fy;
+        let part = match self.projection {
+            Projection::Distortion(distortion) => return self.fill_distorted(distortion, y, row),
+            Projection::Part(part) => part,
+        };
+        let last = part.lens.size();
+        let [last_column, last_row] = [last.width, last.height].map(|count| f64::from(count - 1));
+        for (place, &x) in row.iter_mut().zip(&self.across) {
+            *place = match part.position_of(DVec3::new(x, y, 1.)) {
+                Some(position) => {
+                    let (left, to_right) = between(position.x, last_column);
+                    let (top, to_bottom) = between(position.y, last_row);
+                    SamplePosition { left, top, to_right, to_bottom }
+                }
+                None => SamplePosition { to_right: f32::NAN, ..SamplePosition::default() },
+            };
+        }
+    }
+
+    /// Computes the lookup positions of the row with the ray coordinate `y` in a photo with the camera's intrinsics and size.
+    fn fill_distorted(&mut self, distortion: &Distortion, y: f64, row: &mut [SamplePosition]) {
         let Camera { intrinsics: Intrinsics { fx, fy, cx, cy }, width, height, .. } = *self.camera;
         let [last_column, last_row] = [width, height].map(|count| f64::from(count - 1));
-        let y = (i as f64 + 0.5 - cy) / fy;
         // A separate loop, so that the compiler vectorizes it over several pixels.
         for (seen, x) in self.seen.iter_mut().zip(&self.across) {
-            *seen = self.distortion.apply(*x, y);
+            *seen = distortion.apply(*x, y);
         }
         for (place, seen) in row.iter_mut().zip(&self.seen) {
             let (left, to_right) = between(fx * seen.0 + cx, last_column);
@@ -136,26 +167,37 @@ fn between(position: f64, last: f64) -> (u32, f32) {
 }
 
 /// A photo and its undistorted version.
-struct Undistortion {
+struct Undistortion<'a> {
+    /// Size of the photo.
     width: usize,
     height: usize,
-    photo: Vec<u8>,
-    /// Undistorted pixels and one more byte, so that four bytes can be written at the last pixel.
+    photo: &'a [u8],
+    /// Size of the undistorted version, and its pixels and one more byte, so that four bytes can be written at the last pixel.
+    size: [u32; 2],
     undistorted: Vec<u8>,
+    mask: Option<Vec<u8>>,
 }
 
-impl Undistortion {
-    fn new(photo: RgbImage) -> Self {
-        let (width, height) = (photo.width() as usize, photo.height() as usize);
-        let photo = photo.into_raw();
-        Undistortion { width, height, undistorted: vec![0; photo.len() + 1], photo }
+impl<'a> Undistortion<'a> {
+    fn new(photo: &'a RgbImage, projection: &Projection, camera: &Camera) -> Self {
+        let size = [camera.width, camera.height];
+        let pixels = size.iter().map(|&count| count as usize).product();
+        Undistortion {
+            width: photo.width() as usize,
+            height: photo.height() as usize,
+            photo,
+            size,
+            undistorted: vec![0; 3 * pixels + 1],
+            mask: matches!(projection, Projection::Part(_)).then(|| vec![0; pixels]),
+        }
     }
 
     /// Fills row `i`, starting at column `first`.
     fn fill(&mut self, i: usize, first: usize, row: &[SamplePosition]) {
         /// Constant 2²³: a float32 this large has no fraction, and added integers below 256 are in its lowest bits.
         const WHOLE: f32 = 8_388_608.;
-        let Undistortion { width, height, photo, undistorted } = self;
+        let Undistortion { width, height, photo, size, undistorted, mask } = self;
+        let start = i * size[0] as usize + first;
         // Read four bytes instead of three, to fill a vector.
         let colour = |bytes: &[u8]| {
             let bytes: [u8; 4] = bytes.try_into().expect("four numbers");
@@ -171,7 +213,7 @@ impl Undistortion {
                 mix(colour(&pair[..4]), colour(&pair[3..]), share)
             }
         };
-        let undistorted = &mut undistorted[3 * (i * *width + first)..];
+        let undistorted = &mut undistorted[3 * start..];
         for (j, place) in row.iter().enumerate() {
             let (left, top) = (place.left as usize, place.top as usize);
             let bottom = (top + 1).min(*height - 1);
@@ -181,36 +223,50 @@ impl Undistortion {
             let levels = (mix(above, below, place.to_bottom) + WHOLE).to_array();
             undistorted[3 * j..][..4].copy_from_slice(&levels.map(|level| level.to_bits() as u8));
         }
+        let Some(mask) = mask else { return };
+        let pixels = undistorted.chunks_exact_mut(3).zip(&mut mask[start..]);
+        for ((pixel, weight), place) in pixels.zip(row) {
+            // A NaN has no level.
+            let is_shown = !place.to_right.is_nan();
+            *weight = if is_shown { u8::MAX } else { 0 };
+            if !is_shown {
+                pixel.fill(0);
+            }
+        }
     }
 
-    fn finish(mut self) -> RgbImage {
+    fn finish(mut self) -> ViewPixels {
         self.undistorted.pop();
-        let [width, height] = [self.width, self.height].map(|count| count as u32);
-        RgbImage::from_raw(width, height, self.undistorted).expect("three bytes a pixel")
+        let [width, height] = self.size;
+        let image = RgbImage::from_raw(width, height, self.undistorted).expect("three bytes a pixel");
+        // Most views lie inside the photo.
+        ViewPixels { image, mask: self.mask.filter(|mask| mask.contains(&0)) }
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::{DMat4, DVec3};
+    use glam::DMat4;
     use image::Rgb;
 
-    const LENS: Distortion = Distortion {
+    const DISTORTION: Distortion = Distortion {
         radial: [-0.12, 0.05, -0.01, 0.002],
         denominator: [0.1, -0.03, 0.],
         tangential: [0.003, -0.002],
     };
+    const LENS: Projection = Projection::Distortion(DISTORTION);
     const INTRINSICS: Intrinsics = Intrinsics { fx: 50., fy: 48., cx: 33., cy: 23. };
     const CAMERA: Camera = Camera { intrinsics: INTRINSICS, c2w: DMat4::IDENTITY, width: 64, height: 48 };
 
     #[test]
     fn no_distortion_changes_no_pixel() {
         let photo = RgbImage::from_fn(64, 48, |x, y| Rgb([x as u8 * 4, y as u8 * 5, (x * y % 251) as u8]));
-        assert_eq!(undistort(photo.clone(), &Distortion::default(), &CAMERA, None), photo);
+        assert_eq!(undistort(&photo, &Projection::default(), &CAMERA, None), None);
         // This distortion is small enough to pass through the interpolation without visible change.
         let tiny = Distortion { radial: [1e-12, 0., 0., 0.], ..Distortion::default() };
-        assert_eq!(undistort(photo.clone(), &tiny, &CAMERA, None), photo);
+        let undistorted = undistort(&photo, &Projection::Distortion(tiny), &CAMERA, None);
+        assert_eq!(undistorted, Some(ViewPixels { image: photo, mask: None }));
     }
 
     /// Colours agree with the formulas of [`undistort`] in float64.
@@ -220,11 +276,11 @@ mod tests {
             let level = |k: u32| ((x * 7919 + y * 104_729 + k * 31).wrapping_mul(2_654_435_761) >> 24) as u8;
             Rgb([level(1), level(2), level(3)])
         });
-        let removed = undistort(photo.clone(), &LENS, &CAMERA, None);
+        let removed = undistort(&photo, &LENS, &CAMERA, None).unwrap().image;
         let level = |x: f64, y: f64, k: usize| f64::from(photo.get_pixel(x as u32, y as u32)[k]);
         for (j, i, found) in removed.enumerate_pixels() {
             let (x, y) = (f64::from(j) + 0.5 - INTRINSICS.cx, f64::from(i) + 0.5 - INTRINSICS.cy);
-            let (x, y) = LENS.apply(x / INTRINSICS.fx, y / INTRINSICS.fy);
+            let (x, y) = DISTORTION.apply(x / INTRINSICS.fx, y / INTRINSICS.fy);
             let u = (INTRINSICS.fx * x + INTRINSICS.cx - 0.5).clamp(0., 63.);
             let v = (INTRINSICS.fy * y + INTRINSICS.cy - 0.5).clamp(0., 47.);
             let (s, t, right, below) = (u.fract(), v.fract(), (u + 1.).min(63.), (v + 1.).min(47.));
@@ -241,29 +297,29 @@ mod tests {
     #[test]
     fn a_window_has_the_same_pixels_as_the_full_image() {
         let photo = RgbImage::from_fn(64, 48, |x, y| Rgb([x as u8 * 4, y as u8 * 5, (x * y % 251) as u8]));
-        let whole = undistort(photo.clone(), &LENS, &CAMERA, None);
+        let view = |window| undistort(&photo, &LENS, &CAMERA, window).unwrap().image;
         let window = Some([7..40, 0..29]);
-        let part = undistort(photo.clone(), &LENS, &CAMERA, window.clone());
+        let (whole, part) = (view(None), view(window.clone()));
         for (x, y) in (7..40).flat_map(|x| (0..29).map(move |y| (x, y))) {
             assert_eq!(part.get_pixel(x, y), whole.get_pixel(x, y), "({x}, {y})");
         }
         assert_ne!(part, whole);
-        // A shared lens gives the same pixels.
-        let lens = |window| Lens::new(LENS, CAMERA, window);
-        assert_eq!(lens(None).undistort(photo.clone()), whole);
-        assert_eq!(lens(window).undistort(photo), part);
+        // A lookup table gives the same pixels.
+        let table = |window| LookupTable::new(LENS, CAMERA, window).undistort(&photo).image;
+        assert_eq!(table(None), whole);
+        assert_eq!(table(window), part);
     }
 
     #[test]
-    fn matches_camera_compares_distortion_intrinsics_and_size() {
-        let lens = Lens::new(LENS, CAMERA, None);
+    fn matches_camera_compares_projection_intrinsics_and_size() {
+        let table = LookupTable::new(LENS, CAMERA, None);
         let elsewhere = Camera { c2w: DMat4::from_translation(DVec3::ONE), ..CAMERA };
-        assert!(lens.matches_camera(&LENS, &CAMERA) && lens.matches_camera(&LENS, &elsewhere));
-        assert!(!lens.matches_camera(&Distortion::default(), &CAMERA));
+        assert!(table.matches_camera(&LENS, &CAMERA) && table.matches_camera(&LENS, &elsewhere));
+        assert!(!table.matches_camera(&Projection::default(), &CAMERA));
         let longer = Camera { intrinsics: Intrinsics { fx: 51., ..INTRINSICS }, ..CAMERA };
         assert!(
-            !lens.matches_camera(&LENS, &longer)
-                && !lens.matches_camera(&LENS, &Camera { width: 65, ..CAMERA })
+            !table.matches_camera(&LENS, &longer)
+                && !table.matches_camera(&LENS, &Camera { width: 65, ..CAMERA })
         );
     }
 
@@ -272,7 +328,7 @@ mod tests {
         for (width, height) in [(1, 1), (1, 5), (5, 1), (2, 2)] {
             let photo = RgbImage::from_fn(width, height, |x, y| Rgb([40 * x as u8, 50 * y as u8, 7]));
             let camera = Camera { width, height, ..CAMERA };
-            let removed = undistort(photo, &LENS, &camera, None);
+            let removed = undistort(&photo, &LENS, &camera, None).unwrap().image;
             assert_eq!(removed.dimensions(), (width, height));
             assert!(removed.pixels().all(|pixel| pixel[2] == 7), "{width}×{height}: {removed:?}");
         }

@@ -1,0 +1,418 @@
+//! Lenses: the camera models of COLMAP, and the pinhole views of photos that other lenses took.
+
+use glam::{DVec2, DVec3};
+use globalsplat_capture::{
+    Camera, Capture, Holdout, ImageSize, Intrinsics, Lens, Photo, decode_photo, open_capture,
+    read_camera_path, read_image,
+};
+use globalsplat_test_kit::formats::{
+    assert_same_cameras, cameras, in_images, names, transforms, write_colmap_text,
+};
+use image::imageops::{self, FilterType};
+use image::{Rgb, RgbImage};
+use serde::Deserialize;
+use serde_json::{Value, json};
+use std::path::Path;
+use tempfile::TempDir;
+
+/// Cameras of `scripts/lens_reference.py`.
+#[derive(Deserialize)]
+struct Reference {
+    cameras: Vec<ReferenceCamera>,
+}
+
+#[derive(Deserialize)]
+struct ReferenceCamera {
+    model: String,
+    size: ImageSize,
+    params: Vec<f64>,
+    /// Pixels u and v, and rays x, y and z.
+    points: Vec<[f64; 5]>,
+}
+
+impl ReferenceCamera {
+    fn lens(&self) -> Lens {
+        Lens::from_colmap(&self.model, &self.params, self.size).expect(&self.model)
+    }
+}
+
+fn reference_cameras() -> Vec<ReferenceCamera> {
+    let reference: Reference = serde_json::from_str(include_str!("data/lens_models.json")).unwrap();
+    reference.cameras
+}
+
+#[test]
+fn every_model_of_colmap_agrees_with_pycolmap() {
+    let cameras = reference_cameras();
+    for camera in &cameras {
+        let (lens, name) = (camera.lens(), &camera.model);
+        for &[u, v, x, y, z] in &camera.points {
+            let (pixel, ray) = (DVec2::new(u, v), DVec3::new(x, y, z));
+            let found = lens.project(ray).unwrap_or_else(|| panic!("{name} {:?}: {ray}", camera.params));
+            assert!((found - pixel).length() < 1e-6, "{name} {:?}: {found} for {pixel}", camera.params);
+            // A length doesn't change the direction.
+            let scaled = lens.project(ray * 7.5).unwrap();
+            assert!((scaled - pixel).length() < 1e-6, "{name}: {scaled} for {pixel}");
+            let found =
+                lens.unproject(pixel).unwrap_or_else(|| panic!("{name} {:?}: {pixel}", camera.params));
+            // The error in pixels is less than that in radians times the image's size.
+            let error = (found - ray).length() * f64::from(camera.size.width.max(camera.size.height));
+            assert!(error < 1e-6, "{name} {:?}: {found} for {ray}", camera.params);
+        }
+    }
+    let mut models: Vec<&String> = cameras.iter().map(|camera| &camera.model).collect();
+    models.dedup();
+    assert_eq!((cameras.len(), models.len()), (54, 18));
+}
+
+/// Returns the corners of 40 × 40 equal parts of an image.
+fn grid(size: ImageSize) -> impl Iterator<Item = DVec2> {
+    let size = DVec2::new(size.width.into(), size.height.into());
+    (0..41 * 41).map(move |i| size * DVec2::new(f64::from(i % 41), f64::from(i / 41)) / 40.)
+}
+
+#[test]
+fn rays_of_pixels_come_back_to_the_pixels() {
+    for camera in reference_cameras() {
+        let lens = camera.lens();
+        let mut count = 0;
+        for pixel in grid(camera.size) {
+            let Some(ray) = lens.unproject(pixel) else { continue };
+            count += 1;
+            assert!((ray.length() - 1.).abs() < 1e-12);
+            let mut found =
+                lens.project(ray).unwrap_or_else(|| panic!("{} {:?}: {ray}", camera.model, camera.params));
+            // Both edges of an equirectangular photo show the same rays, and so do all pixels of its first row.
+            if camera.model == "EQUIRECTANGULAR" {
+                let width = f64::from(camera.size.width);
+                found.x += width * ((pixel.x - found.x) / width).round();
+                if ray.x.hypot(ray.z) < 1e-12 {
+                    found.x = pixel.x;
+                }
+            }
+            assert!(
+                (found - pixel).length() < 1e-6,
+                "{} {:?}: {found} for {pixel}",
+                camera.model,
+                camera.params
+            );
+        }
+        assert!(count > 41 * 41 * 9 / 10, "{} {:?}: {count}", camera.model, camera.params);
+    }
+}
+
+/// Size of a photo of all directions.
+const WIDTH: u32 = 320;
+const HEIGHT: u32 = 160;
+
+/// Returns the colour of the sky in a direction of the world.
+fn sky(direction: DVec3) -> [f64; 3] {
+    let wave = |axis: DVec3| 127.5 + 100. * (1.5 * direction.normalize().dot(axis)).sin();
+    [wave(DVec3::new(1., 0.3, 0.)), wave(DVec3::new(0., 1., -0.4)), wave(DVec3::new(-0.2, 0., 1.))]
+}
+
+/// Returns the cameras of five photos of `lens`.
+fn cameras_of(lens: &Lens) -> Vec<Camera> {
+    let ImageSize { height, width } = lens.size();
+    cameras().into_iter().map(|camera| Camera { width, height, ..camera }).collect()
+}
+
+/// Writes photos of the sky that `lens` takes at the poses of [`cameras`]. Pixels that the lens doesn't define repeat those at the border
+/// of what it does.
+fn write_photos(folder: &Path, lens: &Lens) {
+    std::fs::create_dir_all(folder).unwrap();
+    let ImageSize { height, width } = lens.size();
+    let centre = lens.project(DVec3::Z).unwrap();
+    let ray =
+        |pixel: DVec2| (0..).find_map(|n| lens.unproject(centre.lerp(pixel, 0.995f64.powi(n)))).unwrap();
+    let pixel = |i: u32| DVec2::new(f64::from(i % width) + 0.5, f64::from(i / width) + 0.5);
+    let rays: Vec<DVec3> = (0..width * height).map(|i| ray(pixel(i))).collect();
+    for (name, camera) in names().iter().zip(cameras()) {
+        let photo = RgbImage::from_fn(width, height, |x, y| {
+            let colour = sky(camera.c2w.transform_vector3(rays[(y * width + x) as usize]));
+            Rgb(colour.map(|level| level.round() as u8))
+        });
+        photo.save(folder.join(name)).unwrap();
+    }
+}
+
+/// Returns a COLMAP capture of the sky whose photos have the lens `model`, such as `SIMPLE_FISHEYE 100 80 80`.
+fn capture_of(model: &str, size: [u32; 2]) -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let (name, parameters) = model.split_once(' ').unwrap();
+    let parameters: Vec<f64> = parameters.split(' ').map(|number| number.parse().unwrap()).collect();
+    let lens = Lens::from_colmap(name, &parameters, size.into()).unwrap();
+    write_photos(&folder.path().join("images"), &lens);
+    write_colmap_text(&folder.path().join("sparse/0"), &names(), &cameras_of(&lens), model);
+    folder
+}
+
+/// Checks that every pixel of `photo` that counts has the colour of the sky along its ray, and that the others are black. Returns the
+/// fraction of pixels that count.
+fn check_colours(photo: &Photo, tolerance: f64) -> f64 {
+    let Photo { camera, mask, .. } = photo;
+    let Intrinsics { fx, fy, cx, cy } = camera.intrinsics;
+    let mut counted = 0;
+    for (x, y, found) in photo.image.to_rgb().enumerate_pixels() {
+        match mask.as_ref().map_or(255, |mask| mask[(y * camera.width + x) as usize]) {
+            0 => assert_eq!(found.0, [0; 3]),
+            255 => {
+                counted += 1;
+                let ray = DVec3::new((f64::from(x) + 0.5 - cx) / fx, (f64::from(y) + 0.5 - cy) / fy, 1.);
+                let expected = sky(camera.c2w.transform_vector3(ray));
+                let is_near =
+                    |(found, expected): (&u8, f64)| (f64::from(*found) - expected).abs() < tolerance;
+                assert!(
+                    found.0.iter().zip(expected).all(is_near),
+                    "{found:?} for {expected:?} at ({x}, {y}) of {}",
+                    photo.name
+                );
+            }
+            weight => panic!("a weight of {weight}"),
+        }
+    }
+    f64::from(counted) / f64::from(camera.width * camera.height)
+}
+
+const THIN_PRISM: &str = "THIN_PRISM_FISHEYE 125 124 89 61 -0.03 0.01 0.001 -0.002 0.001 0 0.002 -0.001";
+
+#[test]
+fn views_show_the_colours_of_the_rays_of_the_photo() {
+    // Fractions of the pixels of a photo's views that count, at least and at most. Faces of a photo of all directions count in full.
+    for (model, size, names, share) in [
+        ("EQUIRECTANGULAR 160 80", [80, 160], 6, [1., 1.]),
+        ("OPENCV_FISHEYE 105 106 79 61 0.03 -0.01 0.002 0", [120, 160], 1, [0.7, 1.]),
+        ("RADIAL_FISHEYE 52 80 39 0.02 0.005", [77, 160], 2, [0.6, 1.]),
+        ("FISHEYE 40 40 81 79", [160, 160], 5, [0.6, 1.]),
+        (THIN_PRISM, [120, 180], 1, [0.7, 1.]),
+        ("EUCM 70 70 81 40 0.55 1.1", [80, 160], 2, [0.6, 1.]),
+        ("DIVISION 50 52 81 59 -0.25", [120, 160], 5, [0.4, 1.]),
+        // The radial distortion turns back at 74 degrees. Up to there, ever more rays share a pixel.
+        ("RADIAL_FISHEYE 50 62 57 -0.2 0", [115, 125], 5, [0.4, 0.9]),
+    ] {
+        let folder = capture_of(model, size);
+        let capture = open_capture(folder.path()).unwrap();
+        assert_eq!((capture.photo_count(), capture.len()), (5, 5 * names), "{model}");
+        let photos = capture.load_all(None).unwrap();
+        let tolerance = if model.contains("-0.2 0") { 20. } else { 3. };
+        let shares: Vec<f64> = photos.iter().map(|photo| check_colours(photo, tolerance)).collect();
+        let mean = shares.iter().sum::<f64>() / shares.len() as f64;
+        assert!(share[0] <= mean && mean <= share[1], "{model}: {shares:?}");
+        assert_eq!(photos.iter().any(|photo| photo.mask.is_some()), names != 6, "{model}");
+        for (index, photo) in photos.iter().enumerate().step_by(7) {
+            let centre = cameras()[index / names].c2w.w_axis;
+            assert!(photo.camera.c2w.w_axis.abs_diff_eq(centre, 1e-9), "{model}");
+            let (alone, mask) = capture.photo_with_mask(index).unwrap();
+            let mask = mask.map(|mask| mask.pixels().map(|weight| weight[0]).collect());
+            assert!(alone == photo.image.to_rgb() && mask == photo.mask, "{model}");
+            assert_eq!(read_encoded(&capture, index), alone, "{model}");
+        }
+    }
+}
+
+/// Returns the pixels of the file that [`Capture::encoded`] makes.
+fn read_encoded(capture: &Capture, index: usize) -> RgbImage {
+    let Camera { width, height, .. } = capture.cameras()[index];
+    decode_photo(&capture.encoded(index).unwrap(), Path::new("encoded"), (width, height)).unwrap().pixels
+}
+
+#[test]
+fn views_of_a_photo_are_named_loaded_and_held_out_together() {
+    let folder = capture_of("EQUIRECTANGULAR 320 160", [HEIGHT, WIDTH]);
+    let capture = open_capture(folder.path()).unwrap();
+    let [line] = capture.warnings() else { panic!("{:?}", capture.warnings()) };
+    assert!(line.ends_with("5 of 5 photos show 360 degrees and are split into 30 pinhole views"), "{line}");
+    let faces = ["front", "right", "back", "left", "up", "down"];
+    let expected = (0..5).flat_map(|i| faces.map(move |face| format!("{i:03}@{face}.png")));
+    assert!(capture.names().eq(expected.clone()), "{:?}", capture.names().collect::<Vec<_>>());
+    let files = expected.map(|name| name.replace(".png", ""));
+    assert!(capture.render_names().into_iter().eq(files));
+
+    let (shown, held_out) = capture.split("every:3+1".parse().unwrap());
+    assert_eq!(held_out, [6, 7, 8, 9, 10, 11, 24, 25, 26, 27, 28, 29]);
+    assert_eq!(shown, [0, 1, 2, 3, 4, 5, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23]);
+    assert_eq!(capture.split(Holdout::None), ((0..30).collect(), vec![]));
+
+    // Views come in the order of their indices, even twice.
+    let all = capture.load_all(Some([32, 48].into())).unwrap();
+    let indices = [29, 3, 0, 24, 3, 8];
+    let some = capture.load(&indices, Some([32, 48].into())).unwrap();
+    for (photo, index) in some.iter().zip(indices) {
+        assert_eq!(photo.name, capture.names().nth(index).unwrap());
+        assert!(photo.image == all[index].image && photo.mask == all[index].mask);
+    }
+    // The checksum depends on the view.
+    assert_ne!(capture.checksum([0]).unwrap(), capture.checksum([1]).unwrap());
+}
+
+#[test]
+fn masks_are_fitted_like_their_photos() {
+    let folder = capture_of("FISHEYE 80 80 161 158", [320, 320]);
+    let capture = open_capture(folder.path()).unwrap();
+    let size = ImageSize::from([48, 64]);
+    let full = capture.load(&[2], None).unwrap().remove(0);
+    let fitted = capture.load(&[2], Some(size)).unwrap().remove(0);
+    let mask = fitted.mask.unwrap();
+    assert_eq!((mask.len(), fitted.image.size()), (48 * 64, (48, 64)));
+    let (fitted, camera) = (fitted.camera.intrinsics, full.camera);
+    let mut counts = [0; 2];
+    for (i, &weight) in mask.iter().enumerate() {
+        let (u, v) = ((i % 64) as f64 + 0.5, (i / 64) as f64 + 0.5);
+        let position = |point: f64, [focal, centre]: [f64; 2], [full_focal, full_centre]: [f64; 2]| {
+            (point - centre) / focal * full_focal + full_centre
+        };
+        let k = camera.intrinsics;
+        let u = position(u, [fitted.fx, fitted.cx], [k.fx, k.cx]) as u32;
+        let v = position(v, [fitted.fy, fitted.cy], [k.fy, k.cy]) as u32;
+        let full = full.mask.as_ref().unwrap();
+        let around = (v.saturating_sub(9)..(v + 10).min(camera.height))
+            .flat_map(|y| (u.saturating_sub(9)..(u + 10).min(camera.width)).map(move |x| (x, y)))
+            .map(|(x, y)| full[(y * camera.width + x) as usize]);
+        let around: Vec<u8> = around.collect();
+        for (kind, value) in [0, 255].into_iter().enumerate() {
+            if around.iter().all(|&weight| weight == value) {
+                counts[kind] += 1;
+                // The filter reaches further than that, with small weights.
+                assert!(weight.abs_diff(value) <= 2, "{weight} at ({u}, {v})");
+            }
+        }
+    }
+    assert!(counts.iter().all(|&count| count > 50), "{counts:?}");
+}
+
+/// Writes a `transforms.json` beside the photos of `folder`, and opens it.
+fn open_transforms(folder: &Path, change: impl FnOnce(&mut Value)) -> globalsplat_capture::Result<Capture> {
+    let mut contents = transforms(&in_images(&names()), &cameras());
+    change(&mut contents);
+    let file = folder.join("transforms.json");
+    std::fs::write(&file, contents.to_string()).unwrap();
+    open_capture(&file)
+}
+
+/// Checks that `found` has the views of `expected`, up to the rounding of their poses.
+fn assert_same_views(found: &Capture, expected: &Capture) {
+    assert_same_cameras(found, &expected.cameras());
+    let [found, expected] = [found, expected].map(|capture| capture.load_all(None).unwrap());
+    for (found, expected) in found.iter().zip(&expected) {
+        assert!(found.image == expected.image && found.mask == expected.mask, "{}", found.name);
+    }
+}
+
+#[test]
+fn lenses_of_transforms_are_those_of_colmap() {
+    let folder = capture_of("EQUIRECTANGULAR 320 160", [HEIGHT, WIDTH]);
+    let sphere = open_transforms(folder.path(), |t| {
+        (t["w"], t["h"], t["camera_model"]) = (json!(WIDTH), json!(HEIGHT), json!("EQUIRECTANGULAR"));
+    });
+    assert_same_views(&sphere.unwrap(), &open_capture(&folder.path().join("sparse")).unwrap());
+
+    let lens = "OPENCV_FISHEYE 52 53 39 31 0.03 -0.01 0.002 0.001";
+    let folder = capture_of(lens, [60, 80]);
+    let expected = open_capture(&folder.path().join("sparse")).unwrap();
+    let lens = |t: &mut Value| {
+        for (key, value) in ["fl_x", "fl_y", "cx", "cy", "w", "h"].iter().zip([52, 53, 39, 31, 80, 60]) {
+            t[*key] = json!(value);
+        }
+    };
+    let coefficients = |t: &mut Value| {
+        for (key, value) in ["k1", "k2", "k3", "k4"].iter().zip([0.03, -0.01, 0.002, 0.001]) {
+            t[*key] = json!(value);
+        }
+    };
+    type Change<'a> = &'a dyn Fn(&mut Value);
+    let changes: [Change; 4] = [
+        &|t| {
+            coefficients(t);
+            t["camera_model"] = json!("OPENCV_FISHEYE");
+        },
+        &|t| {
+            coefficients(t);
+            t["is_fisheye"] = json!(true);
+        },
+        &|t| {
+            t["camera_model"] = json!("opencv_fisheye");
+            t["distortion_params"] = json!([0.03, -0.01, 0.002, 0.001, 0, 0]);
+        },
+        &|t| {
+            t["camera_model"] = json!("FISHEYE624");
+            t["distortion_params"] = json!([0.03, -0.01, 0.002, 0.001, 0, 0, 0, 0, 0, 0, 0, 0]);
+        },
+    ];
+    for change in changes {
+        let capture = open_transforms(folder.path(), |t| {
+            lens(t);
+            change(t);
+        });
+        assert_same_views(&capture.unwrap(), &expected);
+    }
+    // A frame may have a lens of its own. Here, one is said to be a pinhole camera.
+    let mixed = open_transforms(folder.path(), |t| {
+        lens(t);
+        coefficients(t);
+        t["camera_model"] = json!("OPENCV_FISHEYE");
+        (t["frames"][2]["camera_model"], t["frames"][2]["k1"]) = (json!("PINHOLE"), json!(0));
+    });
+    let mixed = mixed.unwrap();
+    let photos = mixed.load_all(None).unwrap();
+    let (pinhole, expected) = (photos[2].image.to_rgb(), expected.load_all(None).unwrap());
+    assert_eq!(pinhole, read_image(&folder.path().join("images/002.png")).unwrap());
+    assert!(photos[1].image == expected[1].image);
+    let [line] = mixed.warnings() else { panic!("{:?}", mixed.warnings()) };
+    assert!(line.contains("4 of 5 photos have a fisheye lens or the like and are turned into"), "{line}");
+}
+
+#[test]
+fn photos_of_other_sizes_and_poses_of_paths_keep_the_field_of_view() {
+    let folder = capture_of("FISHEYE 40 40 81 79", [160, 160]);
+    let expected = open_capture(folder.path()).unwrap().load(&[0], None).unwrap();
+    for name in names() {
+        let file = folder.path().join("images").join(name);
+        let half = imageops::resize(&read_image(&file).unwrap(), 80, 80, FilterType::Triangle);
+        half.save(file).unwrap();
+    }
+    let capture = open_capture(folder.path()).unwrap();
+    assert!(capture.warnings()[0].contains("their intrinsics are scaled"), "{:?}", capture.warnings());
+    let found = capture.load(&[0], None).unwrap();
+    assert_eq!(found[0].camera.intrinsics.fx, 20.);
+    let [(found_height, _), (height, _)] = [&found[0], &expected[0]].map(|photo| photo.image.size());
+    assert!(found_height.abs_diff(height / 2) <= 1, "{found_height} {height}");
+    check_colours(&found[0], 6.);
+    // A path has one camera for each pose.
+    let path = read_camera_path(folder.path(), None).unwrap();
+    assert_eq!(path.cameras.len(), 5);
+    assert!(path.cameras.iter().all(|camera| camera.intrinsics.fx == 40. && camera.width == 160));
+    let sphere = capture_of("EQUIRECTANGULAR 320 160", [HEIGHT, WIDTH]);
+    let error = read_camera_path(sphere.path(), None).unwrap_err().to_string();
+    assert!(error.contains("the camera of 000.png is EQUIRECTANGULAR"), "{error}");
+}
+
+#[test]
+fn parameters_that_describe_no_lens_are_refused() {
+    let refused = |model: &str, parameters: &[f64], parts: &[&str]| {
+        let (field, found, expected) = Lens::from_colmap(model, parameters, [240, 320].into()).unwrap_err();
+        let error = format!("{field} is {found}, expected {expected}");
+        parts.iter().for_each(|part| assert!(error.contains(part), "{part:?} is not in: {error}"));
+    };
+    let nan = f64::NAN;
+    refused("LENS", &[1.], &["model is LENS", "one of SIMPLE_PINHOLE", "EQUIRECTANGULAR"]);
+    refused("FISHEYE", &[100., 160., 120.], &["the parameters is [100.0", "4 parameters for FISHEYE"]);
+    refused("SIMPLE_FISHEYE", &[-100., 160., 120.], &["focal length fx is -100", "above 0"]);
+    refused("SIMPLE_FISHEYE", &[100., 900., 120.], &["principal point cx is 900", "0 to 320"]);
+    refused("FISHEYE", &[100., nan, 160., 120.], &["focal length fy is NaN"]);
+    refused(
+        "OPENCV_FISHEYE",
+        &[100., 100., 160., 120., nan, 0., 0., 0.],
+        &["the distortion is k [NaN", "0 %"],
+    );
+    // The lens folds at 8 degrees.
+    refused("SIMPLE_RADIAL_FISHEYE", &[100., 160., 120., -17.], &["k [-17.0", "0 % of the photo have a ray"]);
+    refused("THIN_PRISM_FISHEYE", &[f64::INFINITY; 12], &["focal length fx is inf"]);
+    refused("FOV", &[100., 100., 160., 120., 3.2], &["omega 3.2", "below π"]);
+    refused("FOV", &[100., 100., 160., 120., nan], &["omega NaN"]);
+    refused("DIVISION", &[100., 100., 160., 120., nan], &["k NaN", "0 %"]);
+    refused("EUCM", &[100., 100., 160., 120., 1.5, 1.], &["alpha 1.5", "from 0 to 1"]);
+    refused("EUCM", &[100., 100., 160., 120., 0.5, nan], &["beta NaN"]);
+    refused("EQUIRECTANGULAR", &[320., 240.], &["the size is 320×240 pixels", "twice the height"]);
+    let (field, found, _) = Lens::from_colmap("EQUIRECTANGULAR", &[99., 50.], [160, 320].into()).unwrap_err();
+    assert_eq!((field.as_str(), found.as_str()), ("the parameters", "[99, 50]"));
+}
