@@ -18,6 +18,8 @@ use std::time::Instant;
 const EXHAUSTIVE_PHOTOS: usize = 200;
 /// Distance up to which photos in shooting order are matched.
 const OVERLAP: usize = 10;
+/// Number of photos spread over a sequence of which every pair is matched.
+const SPREAD: usize = 64;
 /// Number of pairs that one call of COLMAP matches.
 const PAIRS_PER_CALL: usize = 256;
 
@@ -48,8 +50,8 @@ pub enum Matching {
     Auto,
     /// Every pair.
     Exhaustive,
-    /// Each photo with the 10 next ones in order of their names, with those 16, 32, 64, … later, and with those taken nearby if the
-    /// photos have GPS positions.
+    /// Each photo with the 10 next ones in order of their names, every pair among 64 photos spread evenly, and each photo with those taken
+    /// nearby if photos have GPS positions.
     Sequential,
 }
 
@@ -422,7 +424,8 @@ impl Estimate<'_> {
             Matching::Auto => count <= EXHAUSTIVE_PHOTOS,
             matching => matching == Matching::Exhaustive,
         };
-        let pairs = if is_exhaustive { exhaustive_pairs(count) } else { sequential_pairs(count, OVERLAP) };
+        let pairs =
+            if is_exhaustive { exhaustive_pairs(count) } else { sequential_pairs(count, OVERLAP, SPREAD) };
         while self.record.matched_pairs < pairs.len() {
             let done = self.record.matched_pairs;
             let next = &pairs[done..pairs.len().min(done + PAIRS_PER_CALL)];
