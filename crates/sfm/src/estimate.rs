@@ -344,6 +344,9 @@ impl Estimate<'_> {
     fn run(&mut self, command: Command, step: Step, before: usize, total: usize) -> Result<Outcome> {
         let command = command.path("database_path", &self.database());
         let mut done = before;
+        if !(self.on_progress)(PoseProgress { step, done, total }) {
+            return Ok(Outcome::Stopped);
+        }
         command.run(self.colmap, &self.out.join("colmap.log"), &mut |count| {
             done = count.map_or(done, |count| (before + count).min(total));
             (self.on_progress)(PoseProgress { step, done, total })
