@@ -205,15 +205,14 @@ pub fn estimate_poses(
     fs::create_dir_all(&images).map_err(Error::write(&images))?;
     record.write(out)?;
     let mut estimate = Estimate { out, images, colmap, record, on_progress };
-    let steps: [(Step, fn(&mut Estimate, &Path) -> Result<Outcome>); 4] = [
-        (Step::Photos, |estimate, photos| estimate.import(photos)),
-        (Step::Features, |estimate, _| estimate.extract_features()),
-        (Step::Pairs, |estimate, _| estimate.match_pairs()),
-        (Step::Poses, |estimate, _| estimate.place_photos()),
-    ];
-    for (step, run) in steps {
+    for step in [Step::Photos, Step::Features, Step::Pairs, Step::Poses] {
         let start = Instant::now();
-        let outcome = run(&mut estimate, photos);
+        let outcome = match step {
+            Step::Photos => estimate.import(photos),
+            Step::Features => estimate.extract_features(),
+            Step::Pairs => estimate.match_pairs(),
+            Step::Poses => estimate.place_photos(),
+        };
         if estimate.record.report.is_none() {
             *estimate.record.seconds.entry(step).or_default() += start.elapsed().as_secs_f64();
         }
