@@ -34,8 +34,9 @@ pub struct Capture {
     /// Camera model of COLMAP; by default OPENCV for 10 or more photos of the same size, and SIMPLE_RADIAL for fewer
     #[arg(long, value_name = "MODEL")]
     camera_model: Option<String>,
-    /// Pairs of photos to match: exhaustive: every pair; sequential: each photo with the next ones by name, and those nearby by
-    /// GPS; auto: sequential for videos and more than 200 photos, else exhaustive
+    /// Pairs of photos to match: exhaustive: every pair; sequential: each photo with the next 10 by name and those nearby by GPS,
+    /// and every pair among 64; auto: sequential for videos and more than 200 photos, else
+    /// exhaustive
     #[arg(long, value_name = "PAIRS", default_value = "auto", value_parser = str::parse::<Matching>)]
     matching: Matching,
     /// Print the result as one JSON object

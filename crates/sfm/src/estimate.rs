@@ -18,6 +18,8 @@ use std::time::Instant;
 const EXHAUSTIVE_PHOTOS: usize = 200;
 /// Distance up to which photos in shooting order are matched.
 const OVERLAP: usize = 10;
+/// Number of photos spread over a sequence of which every pair is matched.
+const SPREAD: usize = 64;
 /// Number of pairs that one call of COLMAP matches.
 const PAIRS_PER_CALL: usize = 256;
 
@@ -48,8 +50,8 @@ pub enum Matching {
     Auto,
     /// Every pair.
     Exhaustive,
-    /// Each photo with the 10 next ones in order of their names, with those 16, 32, 64, … later, and with those taken nearby if the
-    /// photos have GPS positions.
+    /// Each photo with the 10 next ones in order of their names, every pair among 64 photos spread evenly, and each photo with those taken
+    /// nearby if photos have GPS positions.
     Sequential,
 }
 
@@ -203,15 +205,14 @@ pub fn estimate_poses(
     fs::create_dir_all(&images).map_err(Error::write(&images))?;
     record.write(out)?;
     let mut estimate = Estimate { out, images, colmap, record, on_progress };
-    let steps: [(Step, fn(&mut Estimate, &Path) -> Result<Outcome>); 4] = [
-        (Step::Photos, |estimate, photos| estimate.import(photos)),
-        (Step::Features, |estimate, _| estimate.extract_features()),
-        (Step::Pairs, |estimate, _| estimate.match_pairs()),
-        (Step::Poses, |estimate, _| estimate.place_photos()),
-    ];
-    for (step, run) in steps {
+    for step in [Step::Photos, Step::Features, Step::Pairs, Step::Poses] {
         let start = Instant::now();
-        let outcome = run(&mut estimate, photos);
+        let outcome = match step {
+            Step::Photos => estimate.import(photos),
+            Step::Features => estimate.extract_features(),
+            Step::Pairs => estimate.match_pairs(),
+            Step::Poses => estimate.place_photos(),
+        };
         if estimate.record.report.is_none() {
             *estimate.record.seconds.entry(step).or_default() += start.elapsed().as_secs_f64();
         }
@@ -342,6 +343,9 @@ impl Estimate<'_> {
     fn run(&mut self, command: Command, step: Step, before: usize, total: usize) -> Result<Outcome> {
         let command = command.path("database_path", &self.database());
         let mut done = before;
+        if !(self.on_progress)(PoseProgress { step, done, total }) {
+            return Ok(Outcome::Stopped);
+        }
         command.run(self.colmap, &self.out.join("colmap.log"), &mut |count| {
             done = count.map_or(done, |count| (before + count).min(total));
             (self.on_progress)(PoseProgress { step, done, total })
@@ -422,7 +426,8 @@ impl Estimate<'_> {
             Matching::Auto => count <= EXHAUSTIVE_PHOTOS,
             matching => matching == Matching::Exhaustive,
         };
-        let pairs = if is_exhaustive { exhaustive_pairs(count) } else { sequential_pairs(count, OVERLAP) };
+        let pairs =
+            if is_exhaustive { exhaustive_pairs(count) } else { sequential_pairs(count, OVERLAP, SPREAD) };
         while self.record.matched_pairs < pairs.len() {
             let done = self.record.matched_pairs;
             let next = &pairs[done..pairs.len().min(done + PAIRS_PER_CALL)];

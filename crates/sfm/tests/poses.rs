@@ -49,8 +49,8 @@ fn nearest_rotation(sum: DMat3) -> DMat3 {
     (0..30).fold(sum, |x, _| (x + x.inverse().transpose()) * 0.5)
 }
 
-/// Returns the largest errors of `found` after the similarity that fits it to `truth`: of positions, relative to the largest distance of two
-/// cameras, and of rotations, in degrees.
+/// Returns the largest errors of `found` after the similarity that fits it to `truth`: of positions, relative to the largest distance
+/// of two cameras, and of rotations, in degrees.
 fn largest_errors(found: &[DMat4], truth: &[DMat4]) -> (f64, f64) {
     let turns = truth.iter().zip(found).map(|(truth, found)| rotation(truth) * rotation(found).transpose());
     let turn = nearest_rotation(turns.fold(DMat3::ZERO, |sum, turn| sum + turn) * (1. / found.len() as f64));

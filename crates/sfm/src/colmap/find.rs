@@ -28,9 +28,9 @@ pub struct Colmap {
 }
 
 impl Colmap {
-    /// Finds COLMAP: the program or the Python that [`VARIABLE`] names; else the newest of `colmap` on the PATH and the pycolmap of the
-    /// first Python that has it, and of equal versions pycolmap. Python is looked for in `.venv` of the working directory and of the folders
-    /// above this program, in the active virtual or Conda environment, and as `python3` on the PATH.
+    /// Finds COLMAP: the program or the Python that [`VARIABLE`] names; else the newest of `colmap` on the PATH and the pycolmap of
+    /// the first Python that has it, and of equal versions pycolmap. Python is looked for in `.venv` of the working directory and of
+    /// the folders above this program, in the active virtual or Conda environment, and as `python3` on the PATH.
     ///
     /// # Errors
     /// Returns an error that says how to install COLMAP if there is none, or what is wrong with the one that [`VARIABLE`] names.

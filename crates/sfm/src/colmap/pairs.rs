@@ -11,15 +11,15 @@ pub(crate) fn exhaustive_pairs(count: usize) -> Vec<(usize, usize)> {
     pairs
 }
 
-/// Returns the pairs of photos in shooting order that are at most `overlap` apart, or a power of two: the latter connect a path that
-/// returns to where it was.
-pub(crate) fn sequential_pairs(count: usize, overlap: usize) -> Vec<(usize, usize)> {
-    let far = (0..usize::BITS).map(|power| 1 << power).filter(|&distance| distance > overlap);
-    let distances: Vec<usize> = (1..=overlap).chain(far).take_while(|&distance| distance < count).collect();
-    (0..count)
-        .flat_map(|first| distances.iter().map(move |distance| (first, first + distance)))
-        .filter(|(_, second)| *second < count)
-        .collect()
+/// Returns the pairs of photos in shooting order that are at most `overlap` apart, and every pair among `spread` photos that are spread
+/// evenly. The latter connect a path to where it was before; without them COLMAP may place its parts wrongly to each other.
+pub(crate) fn sequential_pairs(count: usize, overlap: usize, spread: usize) -> Vec<(usize, usize)> {
+    let near = |first: usize| (first + 1..count.min(first + overlap + 1)).map(move |second| (first, second));
+    let step = count.div_ceil(spread).max(1);
+    let far = exhaustive_pairs(count.div_ceil(step))
+        .into_iter()
+        .map(|(first, second)| (first * step, second * step));
+    (0..count).flat_map(near).chain(far.filter(|(first, second)| second - first > overlap)).collect()
 }
 
 #[cfg(test)]
@@ -38,12 +38,15 @@ mod tests {
     }
 
     #[test]
-    fn sequences_pair_neighbours_and_powers_of_two() {
-        let pairs = sequential_pairs(40, 3);
+    fn sequences_pair_neighbours_and_photos_spread_evenly() {
+        let pairs = sequential_pairs(40, 3, 5);
         let of_first: Vec<usize> =
             pairs.iter().filter(|(first, _)| *first == 0).map(|(_, second)| *second).collect();
-        assert_eq!(of_first, [1, 2, 3, 4, 8, 16, 32]);
-        assert_eq!(pairs.last(), Some(&(38, 39)));
-        assert_eq!(sequential_pairs(3, 10), [(0, 1), (0, 2), (1, 2)]);
+        assert_eq!(of_first, [1, 2, 3, 8, 16, 24, 32]);
+        // 3 neighbours of each photo but the last three, which have 2, 1 and 0; and the pairs of 5.
+        assert_eq!(pairs.len(), 37 * 3 + 2 + 1 + 10);
+        assert_eq!(pairs.iter().collect::<BTreeSet<_>>().len(), pairs.len());
+        assert!(pairs.iter().all(|(first, second)| first < second && *second < 40));
+        assert_eq!(sequential_pairs(3, 10, 64), [(0, 1), (0, 2), (1, 2)]);
     }
 }
