@@ -31,7 +31,8 @@ pub struct Capture {
     /// Number of frames to take from a video; by default one per 6 % of the picture's longer side that it moves, but 30 to 300
     #[arg(long, value_name = "N")]
     frames: Option<usize>,
-    /// Camera model of COLMAP; by default OPENCV for 10 or more photos of the same size, and SIMPLE_RADIAL for fewer
+    /// Camera model of COLMAP; by default EQUIRECTANGULAR for photos whose metadata say that they show 360 degrees, else OPENCV for
+    /// 10 or more photos of one size and focal length, and SIMPLE_RADIAL for fewer
     #[arg(long, value_name = "MODEL")]
     camera_model: Option<String>,
     /// Pairs of photos to match: exhaustive: every pair; sequential: each photo with the next 10 by name and those nearby by GPS,

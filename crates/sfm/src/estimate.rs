@@ -3,7 +3,7 @@
 use crate::colmap::{
     CAMERA_MODELS, Colmap, Command, ModelSummary, Outcome, exhaustive_pairs, read_models, sequential_pairs,
 };
-use crate::photos::{FoundPhoto, Photo, SkippedPhoto, import_photos, list_photos};
+use crate::photos::{FoundPhoto, Photo, SkippedPhoto, find_photos, import_photos};
 use crate::record::{FILE, Record};
 use globalsplat_files::{Error, Result, write_atomically};
 use serde::{Deserialize, Serialize};
@@ -71,7 +71,8 @@ impl FromStr for Matching {
 /// Settings of [`estimate_poses`].
 #[derive(Debug, Clone, Default)]
 pub struct PoseOptions {
-    /// One of [`CAMERA_MODELS`]. By default OPENCV for 10 or more photos of the same size, and SIMPLE_RADIAL for fewer.
+    /// One of [`CAMERA_MODELS`]. By default EQUIRECTANGULAR for panoramas of 360° whose XMP data say so, else OPENCV for
+    /// 10 or more photos of one size and focal length, and SIMPLE_RADIAL for fewer.
     pub camera_model: Option<String>,
     /// Choice of pairs.
     pub matching: Matching,
@@ -129,6 +130,8 @@ pub struct PoseReport {
     pub reprojection_error: f64,
     /// Number of points of the largest model.
     pub points: usize,
+    /// Line about files in the folder that aren't photos.
+    pub other_files: Option<String>,
     /// Photos that are damaged, show nothing, or are identical to another.
     pub skipped: Vec<SkippedPhoto>,
     /// Names of the other photos that aren't in the largest model.
@@ -150,6 +153,7 @@ impl fmt::Display for PoseReport {
         if self.models.len() > 1 {
             write!(f, "\n{} separate models, of which the largest is used", self.models.len())?;
         }
+        self.other_files.iter().try_for_each(|line| write!(f, "\n{line}"))?;
         if !self.skipped.is_empty() {
             let skipped = self.skipped.iter().map(|photo| format!("{} ({})", photo.name, photo.reason));
             write!(f, "\nnot used: {}", format_first(skipped))?;
@@ -196,9 +200,9 @@ pub fn estimate_poses(
         ));
     }
     check_folders(photos, out)?;
-    let found = list_photos(photos)?;
+    let (found, others) = find_photos(photos)?;
     if found.len() < 2 {
-        return Err(Error::input(photos, "the number of photos", found.len(), "2 or more JPEG or PNG files"));
+        return Err(Error::input(photos, "the number of photos", found.len(), "2 or more"));
     }
     let images = out.join("images");
     let record = prepare_record(photos, out, options, colmap, found)?;
@@ -225,7 +229,7 @@ pub fn estimate_poses(
         estimate.record.report = Some(estimate.report()?);
         estimate.record.write(out)?;
     }
-    Ok(estimate.record.report)
+    Ok(estimate.record.report.map(|report| PoseReport { other_files: others, ..report }))
 }
 
 /// Checks that a capture of the photos in `photos` may be written to `out`: the photos may be the capture's own images, but no other folder
@@ -352,12 +356,12 @@ impl Estimate<'_> {
         })
     }
 
-    /// Detects features. Photos of one size share a camera, whose number is that of their group.
+    /// Detects features. Photos of one size and focal length share a camera, whose number is that of their group.
     fn extract_features(&mut self) -> Result<Outcome> {
         if self.record.has_features {
             return Ok(Outcome::Finished);
         }
-        let groups = group_by_size(self.photos());
+        let groups = group_by_camera(self.photos());
         let total = self.photos().len();
         if !self.record.has_cameras {
             // COLMAP would give photos a second camera if it was stopped between writing the first one and its photo.
@@ -396,10 +400,19 @@ impl Estimate<'_> {
 
     /// Returns the command that extracts the features of `photos`, whose camera has `sharing` photos.
     fn extraction(&self, photos: &[Photo], sharing: usize) -> Result<Command> {
-        let default = if sharing >= OPENCV_PHOTOS { "OPENCV" } else { "SIMPLE_RADIAL" };
+        let default = match sharing {
+            _ if photos.iter().all(|photo| photo.is_equirectangular) => "EQUIRECTANGULAR",
+            OPENCV_PHOTOS.. => "OPENCV",
+            _ => "SIMPLE_RADIAL",
+        };
         let model = self.record.camera_model.as_deref().unwrap_or(default);
-        let focal = if model.contains("FISHEYE") { FISHEYE_FOCAL } else { FOCAL };
         let side = photos.iter().map(|photo| photo.width.max(photo.height)).max().unwrap_or(0);
+        // COLMAP reads the EXIF data of photos with a camera of their own itself.
+        let focal = match photos[0].focal.filter(|_| sharing > 1) {
+            Some(focal) => focal / f64::from(side),
+            None if model.contains("FISHEYE") => FISHEYE_FOCAL,
+            None => FOCAL,
+        };
         let list = self.write_list("photos.txt", photos.iter().map(|photo| photo.name.clone()))?;
         Ok(Command::new("feature_extractor")
             .path("image_path", &self.images)
@@ -495,6 +508,7 @@ impl Estimate<'_> {
             placed: names.len(),
             reprojection_error: error,
             points,
+            other_files: None,
             skipped: self.record.skipped.clone(),
             advice: self.advice(&models),
             unplaced,
@@ -534,16 +548,20 @@ impl Estimate<'_> {
 
 /// Photos by their cameras.
 struct CameraGroups {
-    /// Photos of one size each, two or more.
+    /// Photos of one size, focal length and kind each, two or more.
     shared: Vec<Vec<Photo>>,
-    /// Photos whose size no other has.
+    /// The other photos.
     single: Vec<Photo>,
 }
 
-fn group_by_size(photos: &[Photo]) -> CameraGroups {
+fn group_by_camera(photos: &[Photo]) -> CameraGroups {
     let mut groups = BTreeMap::<_, Vec<Photo>>::new();
     for photo in photos {
-        groups.entry((photo.width, photo.height)).or_default().push(photo.clone());
+        let focal = photo.focal.map(|focal| focal.round() as u64);
+        groups
+            .entry((photo.width, photo.height, focal, photo.is_equirectangular))
+            .or_default()
+            .push(photo.clone());
     }
     let (single, shared): (Vec<_>, Vec<_>) = groups.into_values().partition(|group| group.len() == 1);
     CameraGroups { shared, single: single.into_iter().flatten().collect() }

@@ -1,7 +1,10 @@
 //! Photos of a folder, checked and brought into a capture's folder of images.
 
-use globalsplat_capture::{PHOTO_EXTENSIONS, decode_photo, encode_photo, read_image_size};
+use globalsplat_capture::{
+    decode_photo, encode_photo, exif_focal, is_equirectangular, list_photos, read_image_size,
+};
 use globalsplat_files::{Error, Result, checksum, write_atomically};
+use image::{Rgb, RgbImage};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::collections::{HashMap, HashSet};
@@ -31,6 +34,10 @@ pub(crate) struct Photo {
     pub width: u32,
     /// Height in pixels.
     pub height: u32,
+    /// Focal length that the file's EXIF data tell, in pixels.
+    pub focal: Option<f64>,
+    /// `true` if the file's XMP data declare a panorama of 360°.
+    pub is_equirectangular: bool,
 }
 
 /// A photo that isn't used.
@@ -42,35 +49,19 @@ pub struct SkippedPhoto {
     pub reason: String,
 }
 
-/// Returns the photos in `folder` and its subfolders, in order of their names. Hidden files and folders are ignored.
+/// Returns the photos in `folder` and its subfolders, in order of their names, and a line about the other files, if there are any.
 ///
 /// # Errors
 /// Returns an error if a folder or a photo can't be read, or if there is no photo.
-pub(crate) fn list_photos(folder: &Path) -> Result<Vec<FoundPhoto>> {
-    let mut paths = vec![];
-    collect_photos(folder, &mut paths)?;
-    paths.sort();
+pub(crate) fn find_photos(folder: &Path) -> Result<(Vec<FoundPhoto>, Option<String>)> {
+    let list = list_photos(folder)?;
     let describe = |path: &PathBuf| {
         let bytes = fs::metadata(path).map_err(Error::read(path))?.len();
         let name = path.strip_prefix(folder).unwrap_or(path).to_string_lossy().replace('\\', "/");
         Ok(FoundPhoto { name, bytes, checksum: checksum([path])? })
     };
-    paths.par_iter().map(describe).collect()
-}
-
-fn collect_photos(folder: &Path, paths: &mut Vec<PathBuf>) -> Result<()> {
-    for entry in fs::read_dir(folder).map_err(Error::read(folder))? {
-        let entry = entry.map_err(Error::read(folder))?;
-        let path = entry.path();
-        let extension = path.extension().unwrap_or_default().to_ascii_lowercase();
-        if entry.file_name().as_encoded_bytes().starts_with(b".") {
-        } else if path.is_dir() {
-            collect_photos(&path, paths)?;
-        } else if PHOTO_EXTENSIONS.iter().any(|known| extension == *known) {
-            paths.push(path);
-        }
-    }
-    Ok(())
+    let found = list.photos.par_iter().map(describe).collect::<Result<_>>()?;
+    Ok((found, list.warning()))
 }
 
 /// Photos of a folder after [`import_photos`].
@@ -82,8 +73,9 @@ pub(crate) struct ImportedPhotos {
     pub skipped: Vec<SkippedPhoto>,
 }
 
-/// Brings the photos `found` in `source` into the folder `images`, by a hard link where the file system allows it. Photos that EXIF
-/// says to rotate are written upright, since COLMAP reads pixels as they are stored. Returns `None` if `on_photo`, which gets the number of
+/// Brings the photos `found` in `source` into the folder `images`, by a hard link where the file system allows it. COLMAP
+/// reads pixels as they are stored: photos that EXIF says to rotate are written upright, and those that aren't JPEGs or PNGs are
+/// converted, with their opacity as a mask beside `images`. Returns `None` if `on_photo`, which gets the number of
 /// photos that were looked at, returns `false`.
 ///
 /// # Errors
@@ -115,9 +107,24 @@ pub(crate) fn import_photos(
         for (photo, inspected) in few.iter().zip(read) {
             match inspected {
                 Ok(inspected) => {
-                    let name = list_name(&photo.name, &mut names);
-                    place(&source.join(&photo.name), inspected.upright, &images.join(&name))?;
-                    imported.photos.push(Photo { name, width: inspected.width, height: inspected.height });
+                    let path = source.join(&photo.name);
+                    let suffix = if inspected.is_converted { ".jpg" } else { "" };
+                    let name = list_name(&format!("{}{suffix}", photo.name), &mut names);
+                    place(&path, inspected.contents, &images.join(&name))?;
+                    if let Some(mask) = inspected.mask {
+                        place(
+                            &path,
+                            Some(mask),
+                            &images.with_file_name("masks").join(format!("{name}.png")),
+                        )?;
+                    }
+                    imported.photos.push(Photo {
+                        name,
+                        width: inspected.width,
+                        height: inspected.height,
+                        focal: exif_focal(&path),
+                        is_equirectangular: is_equirectangular(&path),
+                    });
                 }
                 Err(reason) => imported.skipped.push(SkippedPhoto { name: photo.name.clone(), reason }),
             }
@@ -142,11 +149,18 @@ fn list_name(name: &str, taken: &mut HashSet<String>) -> String {
     safe
 }
 
-/// A photo that was decoded: the size of its upright pixels, and the upright photo's contents if they differ from the file.
+/// A photo that was decoded.
 struct Inspected {
+    /// Width of the upright pixels.
     width: u32,
+    /// Height of the upright pixels.
     height: u32,
-    upright: Option<Vec<u8>>,
+    /// Contents of a file that COLMAP reads, if the photo's own isn't one.
+    contents: Option<Vec<u8>>,
+    /// `true` if the contents are a JPEG, and the file has another extension.
+    is_converted: bool,
+    /// PNG of the photo's opacity, if it has one and `contents` lacks it.
+    mask: Option<Vec<u8>>,
 }
 
 /// Decodes the photo at `path`; returns why it can't be used if it is damaged or shows nothing.
@@ -165,9 +179,23 @@ fn inspect(path: &Path) -> Result<Inspected, String> {
     if brightest - darkest <= BLANK {
         return Err("of a single colour".into());
     }
+    let extension = path.extension().unwrap_or_default().to_ascii_lowercase();
+    let [is_png, is_jpeg] = [extension == "png", extension == "jpg" || extension == "jpeg"];
     let is_rotated = pixels.dimensions() != (width, height);
-    let upright = is_rotated.then(|| encode_photo(&pixels, decoded.is_jpeg)).transpose().map_err(refuse)?;
-    Ok(Inspected { width: pixels.width(), height: pixels.height(), upright })
+    let is_readable = (is_png || is_jpeg) && !is_rotated;
+    let contents = (!is_readable).then(|| encode_photo(&pixels, !is_png)).transpose().map_err(refuse)?;
+    let mask = decoded.alpha.filter(|_| !is_readable).map(|alpha| {
+        let (width, height) = alpha.dimensions();
+        let grey = RgbImage::from_fn(width, height, |x, y| Rgb([alpha.get_pixel(x, y)[0]; 3]));
+        encode_photo(&grey, false)
+    });
+    Ok(Inspected {
+        width: pixels.width(),
+        height: pixels.height(),
+        contents,
+        is_converted: !is_png && !is_jpeg,
+        mask: mask.transpose().map_err(refuse)?,
+    })
 }
 
 /// Writes `contents` to `target`, or links `target` to the file `source`, copying it if it can't be linked.
@@ -200,7 +228,7 @@ fn place(source: &Path, contents: Option<Vec<u8>>, target: &Path) -> Result<()> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use image::{ImageFormat, RgbImage};
+    use image::{ImageFormat, Rgba, RgbaImage};
 
     fn write_photo(path: &Path, seed: u8) {
         let photo = RgbImage::from_fn(16, 8, |x, y| image::Rgb([x as u8 * 9, y as u8 * 9, seed]));
@@ -208,7 +236,7 @@ mod tests {
     }
 
     fn import(source: &Path, images: &Path) -> ImportedPhotos {
-        import_photos(source, &list_photos(source).unwrap(), images, &mut |_| true).unwrap().unwrap()
+        import_photos(source, &find_photos(source).unwrap().0, images, &mut |_| true).unwrap().unwrap()
     }
 
     #[test]
@@ -234,6 +262,26 @@ mod tests {
         assert_eq!(skipped[..2], [("b/3.png", "identical to b/2.png"), ("black.png", "of a single colour")]);
         assert_eq!((skipped.len(), skipped[2].0), (3, "cut.png"));
         assert!(skipped[2].1.starts_with("undecodable ("), "{}", skipped[2].1);
+    }
+
+    #[test]
+    fn photos_that_colmap_may_not_read_are_converted_with_their_opacity() {
+        let folder = tempfile::tempdir().unwrap();
+        let (source, images) = (folder.path().join("photos"), folder.path().join("images"));
+        fs::create_dir_all(&source).unwrap();
+        let photo = RgbaImage::from_fn(16, 8, |x, y| {
+            Rgba([x as u8 * 15, y as u8 * 30, 90, if x < 8 { 0 } else { 255 }])
+        });
+        photo.save_with_format(source.join("a.webp"), ImageFormat::WebP).unwrap();
+        write_photo(&source.join("a.png"), 1);
+        let ImportedPhotos { photos, skipped } = import(&source, &images);
+        assert!(skipped.is_empty(), "{skipped:?}");
+        let names: Vec<&str> = photos.iter().map(|photo| photo.name.as_str()).collect();
+        assert_eq!(names, ["a.png", "a.webp.jpg"]);
+        let mask = globalsplat_capture::read_image(&folder.path().join("masks/a.webp.jpg.png")).unwrap();
+        assert!(mask.enumerate_pixels().all(|(x, _, level)| level[0] == if x < 8 { 0 } else { 255 }));
+        let converted = globalsplat_capture::read_image(&images.join("a.webp.jpg")).unwrap();
+        assert!(converted.get_pixel(12, 4)[0].abs_diff(180) < 12, "{:?}", converted.get_pixel(12, 4));
     }
 
     #[test]

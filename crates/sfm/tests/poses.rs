@@ -79,7 +79,9 @@ fn poses_are_those_of_the_scene_and_a_stopped_estimate_continues() {
     let (photos, out) = (folder.path().join("photos"), folder.path().join("out"));
     let truth: Vec<DMat4> = write_photos(&photos).iter().map(|camera| camera.c2w).collect();
     std::fs::copy(photos.join("00.png"), photos.join("copy.png")).unwrap();
-    std::fs::write(photos.join("damaged.png"), b"no photo").unwrap();
+    let whole = std::fs::read(photos.join("00.png")).unwrap();
+    std::fs::write(photos.join("damaged.png"), &whole[..whole.len() / 2]).unwrap();
+    std::fs::write(photos.join("text.png"), b"no photo").unwrap();
     let options = PoseOptions::default();
 
     // Stopped among the features, then after them.
@@ -96,6 +98,7 @@ fn poses_are_those_of_the_scene_and_a_stopped_estimate_continues() {
     assert_eq!((report.photos, report.placed, report.unplaced.len()), (12, 10, 0), "{report}");
     let skipped: Vec<&str> = report.skipped.iter().map(|photo| photo.name.as_str()).collect();
     assert_eq!(skipped, ["copy.png", "damaged.png"]);
+    assert!(report.other_files.as_ref().is_some_and(|line| line.ends_with("left out: text.png")), "{report}");
     assert!(report.points > 500 && report.reprojection_error < 1., "{report}");
 
     let capture = open_capture(&out).unwrap();
@@ -172,7 +175,7 @@ fn bad_requests_are_refused_in_one_sentence() {
     std::fs::create_dir_all(at("empty")).unwrap();
     assert_eq!(
         refusal("empty", "out", plain()),
-        "empty: the number of photos is 0, expected 2 or more JPEG or PNG files"
+        "empty: the folder is without photos, of 0 files, expected photos, each a JPEG, PNG, WebP, TIFF, BMP, HEIC or AVIF"
     );
     write_noise(&at("same"));
     for index in 1..4 {
