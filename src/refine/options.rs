@@ -1,10 +1,11 @@
 //! Options of a refinement session.
 
 use super::config::RefineConfig;
+use super::photos::loaded_size;
 use crate::data::{Capture, Holdout};
 use crate::error::{Error, Result};
 use crate::reconstruct::spread_over_path;
-use crate::scene::ImageSize;
+use crate::scene::{Camera, ImageSize};
 use rand::Rng;
 use std::time::{Duration, Instant};
 use tch::Device;
@@ -40,6 +41,13 @@ impl MaskBackground {
     }
 }
 
+/// Maximum memory of the photos to match, unless their number is given. Smaller copies of them take as much again.
+const MAX_PHOTO_BYTES: u64 = 768 << 20;
+/// Maximum memory of the held-out views.
+const MAX_HELD_OUT_BYTES: u64 = 256 << 20;
+/// Memory per pixel of a photo: three channels in float32.
+const BYTES_PER_PIXEL: u64 = 12;
+
 /// Options of a session.
 #[derive(Debug, Clone)]
 pub struct RefineOptions {
@@ -55,7 +63,7 @@ pub struct RefineOptions {
     pub seed: u64,
     /// Views that are held out and scored, see [`Capture::split`].
     pub holdout: Holdout,
-    /// Maximum number of the other views, spread along the camera path; if it is `None`, all are used.
+    /// Maximum number of the other views, spread along the camera path; if it is `None`, as many as fit into about 2 GB of memory.
     pub views: Option<usize>,
     /// Learns corrections of the camera poses if `true`.
     pub correct_poses: bool,
@@ -107,17 +115,83 @@ impl RefineOptions {
         Ok(())
     }
 
-    /// Returns the indices of the photos to match and of the held-out views.
-    pub(super) fn select_views(&self, capture: &Capture) -> [Vec<usize>; 2] {
-        let (shown, held_out) = capture.split(self.holdout);
-        let shown = spread_over_path(&capture.cameras(), &shown, self.views.unwrap_or(usize::MAX));
-        [shown, held_out]
+    /// Returns the indices of the photos to match and of the held-out views, and a warning if large captures have more than fit into memory.
+    pub(super) fn select_views(&self, capture: &Capture) -> ([Vec<usize>; 2], Option<String>) {
+        let cameras = capture.cameras();
+        let (all_shown, all_held_out) = capture.split(self.holdout);
+        let bytes = |camera: &Camera| {
+            let ImageSize { height, width } = loaded_size(camera, self.size);
+            BYTES_PER_PIXEL * u64::from(height) * u64::from(width)
+        };
+        let largest = cameras.iter().map(bytes).max().unwrap_or(1);
+        let fitting = |bytes: u64| (bytes / largest).max(2) as usize;
+        let shown = spread_over_path(&cameras, &all_shown, self.views.unwrap_or(fitting(MAX_PHOTO_BYTES)));
+        let held_out = spread_over_path(&cameras, &all_held_out, fitting(MAX_HELD_OUT_BYTES));
+        let is_limited =
+            (self.views.is_none() && shown.len() < all_shown.len()) || held_out.len() < all_held_out.len();
+        let warning = is_limited.then(|| {
+            format!(
+                "{}: {} of {} photos are matched and {} of {} scored, spread along the camera path, as more need more than about 2 GB of memory",
+                capture.name,
+                shown.len(),
+                all_shown.len(),
+                held_out.len(),
+                all_held_out.len()
+            )
+        });
+        ([shown, held_out], warning)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scene::Intrinsics;
+    use glam::{DMat4, DVec3};
+    use globalsplat_capture::ImageSource;
+    use image::RgbImage;
+    use std::sync::Arc;
+
+    #[derive(Debug)]
+    struct NoImages;
+
+    impl ImageSource for NoImages {
+        fn name(&self) -> &str {
+            "no images"
+        }
+
+        fn image(&self, _: usize) -> RgbImage {
+            unreachable!("no image is loaded")
+        }
+
+        fn depth(&self, _: usize) -> Option<Vec<f32>> {
+            None
+        }
+    }
+
+    #[test]
+    fn large_captures_are_limited_to_what_fits_into_memory() {
+        let intrinsics = Intrinsics { fx: 1600., fy: 1600., cx: 800., cy: 600. };
+        let camera = |index: i32| {
+            let c2w = DMat4::from_translation(DVec3::X * f64::from(index));
+            Camera { intrinsics, c2w, width: 1600, height: 1200 }
+        };
+        let cameras: Vec<Camera> = (0..2000).map(camera).collect();
+        let capture = Capture::from_source("walk".into(), "".into(), &cameras, Arc::new(NoImages)).unwrap();
+        let options = RefineOptions { holdout: Holdout::Every { every: 8, first: 0 }, ..Default::default() };
+        let ([shown, held_out], warning) = options.select_views(&capture);
+        // 512×384 pixels of 12 bytes each.
+        let each = 12 * 512 * 384;
+        assert_eq!((shown.len(), held_out.len()), ((768 << 20) / each, (256 << 20) / each));
+        let line = warning.unwrap();
+        assert!(line.starts_with("walk: 341 of 1750 photos are matched and 113 of 250 scored"), "{line}");
+        let small = RefineOptions { size: Some([96, 128].into()), ..options.clone() };
+        let ([shown, held_out], warning) = small.select_views(&capture);
+        assert_eq!((shown.len(), held_out.len(), warning), (1750, 250, None));
+        let asked = RefineOptions { views: Some(500), holdout: Holdout::None, ..options };
+        let ([shown, held_out], warning) = asked.select_views(&capture);
+        assert_eq!((shown.len(), held_out.len(), warning), (500, 0, None));
+    }
 
     #[test]
     fn options_out_of_range_are_refused() {

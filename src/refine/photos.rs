@@ -39,8 +39,7 @@ pub fn load_photos(
     let cameras = capture.cameras();
     let size_of = |index: usize| size.or_else(|| smaller(&cameras[index]));
     for &index in indices {
-        let Camera { width, height, .. } = cameras[index];
-        let ImageSize { width, height } = size_of(index).unwrap_or(ImageSize { width, height });
+        let ImageSize { width, height } = loaded_size(&cameras[index], size);
         if width.min(height) < MIN_SIDE {
             let field = format!("the size of {}", capture.names().nth(index).unwrap_or_default());
             let expected = format!("{MIN_SIDE} pixels or more along each side");
@@ -58,6 +57,12 @@ pub fn load_photos(
         }
     }
     Ok(views)
+}
+
+/// Returns the size of the photo of `camera` after [`load_photos`] has fitted it to `size`.
+pub(super) fn loaded_size(camera: &Camera, size: Option<ImageSize>) -> ImageSize {
+    let Camera { width, height, .. } = *camera;
+    size.or_else(|| smaller(camera)).unwrap_or(ImageSize { height, width })
 }
 
 fn smaller(camera: &Camera) -> Option<ImageSize> {

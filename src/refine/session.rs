@@ -186,7 +186,10 @@ impl<'a> RefineSession<'a> {
     ) -> Result<Self> {
         let clock = options.started.unwrap_or_else(Instant::now);
         options.check()?;
-        let [shown, held_out] = options.select_views(capture);
+        let ([shown, held_out], warning) = options.select_views(capture);
+        if let Some(line) = warning {
+            let _ = on_event(RefineEvent::Warning(&line));
+        }
         let count = shown.len() + held_out.len();
         let mut should_continue = |done: usize| on_event(RefineEvent::Loading { done, count });
         let mut photos = load_photos(capture, &shown, options.size, &mut should_continue)?;
