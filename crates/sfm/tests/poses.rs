@@ -6,7 +6,9 @@ use globalsplat_sfm::{Colmap, Matching, PoseOptions, PoseReport, Step, estimate_
 use globalsplat_synth::{Video, VideoSettings};
 use globalsplat_test_kit::skip;
 use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
+use std::path::Path;
+
+mod noise;
 
 /// Returns COLMAP, or skips the test.
 fn find_colmap() -> Option<Colmap> {
@@ -124,80 +126,13 @@ fn poses_are_those_of_the_scene_and_a_stopped_estimate_continues() {
     assert!(error.is_request() && error.to_string().contains("other or changed photos"), "{error}");
 }
 
-/// Writes 4 photos that share nothing.
-fn write_noise(folder: &Path) {
-    std::fs::create_dir_all(folder).unwrap();
-    for index in 0..4u32 {
-        let noise = image::RgbImage::from_fn(200, 200, |x, y| {
-            let mut state = (index << 20 | x << 10 | y).wrapping_mul(2_654_435_761);
-            state ^= state >> 15;
-            state = state.wrapping_mul(2_246_822_519);
-            image::Rgb([(state >> 24) as u8; 3])
-        });
-        noise.save(folder.join(format!("{index}.png"))).unwrap();
-    }
-}
-
 #[test]
 fn photos_that_share_nothing_are_an_error() {
     let Some(colmap) = find_colmap() else { return };
     let folder = tempfile::tempdir().unwrap();
     let (photos, out) = (folder.path().join("photos"), folder.path().join("out"));
-    write_noise(&photos);
+    noise::write_noise(&photos);
     let error = estimate_poses(&photos, &out, &PoseOptions::default(), &colmap, &mut |_| true).unwrap_err();
     assert!(!error.is_request(), "{error}");
     assert!(error.to_string().starts_with("COLMAP placed none of the 4 photos: "), "{error}");
-}
-
-/// Returns a COLMAP for calls that fail before they start it.
-#[cfg(unix)]
-fn stand_in(folder: &Path) -> (PathBuf, Colmap) {
-    use std::os::unix::fs::PermissionsExt;
-    let program = folder.join("colmap");
-    std::fs::write(&program, "#!/bin/sh\necho 'COLMAP 3.9 -- Structure-from-Motion'\n").unwrap();
-    std::fs::set_permissions(&program, PermissionsExt::from_mode(0o755)).unwrap();
-    let colmap = Colmap::at(&program).unwrap();
-    (program, colmap)
-}
-
-#[test]
-#[cfg(unix)]
-fn bad_requests_are_refused_in_one_sentence() {
-    let folder = tempfile::tempdir().unwrap();
-    let (_, colmap) = stand_in(folder.path());
-    let at = |name: &str| folder.path().join(name);
-    let refusal = |photos: &str, out: &str, options: PoseOptions| {
-        let error = estimate_poses(&at(photos), &at(out), &options, &colmap, &mut |_| true).unwrap_err();
-        assert!(error.is_request(), "{error}");
-        error.to_string().replace(&format!("{}/", folder.path().display()), "")
-    };
-    let plain = PoseOptions::default;
-    std::fs::create_dir_all(at("empty")).unwrap();
-    assert_eq!(
-        refusal("empty", "out", plain()),
-        "empty: the folder is without photos, of 0 files, expected photos, each a JPEG, PNG, WebP, TIFF, BMP, HEIC or AVIF"
-    );
-    write_noise(&at("same"));
-    for index in 1..4 {
-        std::fs::copy(at("same/0.png"), at(&format!("same/{index}.png"))).unwrap();
-    }
-    assert_eq!(
-        refusal("same", "out", plain()),
-        "same: the number of photos is 4, of which 3 can't be used (1.png is identical to 0.png, 2.png is identical to 0.png, 3.png is \
-         identical to 0.png), expected 2 or more different ones"
-    );
-    write_noise(&at("photos"));
-    std::fs::create_dir_all(at("full")).unwrap();
-    std::fs::write(at("full/thesis.tex"), "").unwrap();
-    assert_eq!(
-        refusal("photos", "full", plain()),
-        "full: the output is a folder with thesis.tex, expected a new folder, or one with such a capture"
-    );
-    assert_eq!(
-        refusal("photos", "photos/out", plain()),
-        "photos/out: the output is inside the folder of photos, expected a folder outside of photos"
-    );
-    let unknown = PoseOptions { camera_model: Some("FISH".into()), ..plain() };
-    let refused = refusal("photos", "out", unknown);
-    assert!(refused.starts_with("the camera model is FISH, expected one of SIMPLE_PINHOLE, "), "{refused}");
 }
