@@ -66,6 +66,48 @@ fn photos_alone_become_a_splat() {
     assert!(sheet.is_file());
 }
 
+/// Commands leave out what the masks in a folder cover.
+#[test]
+fn masks_in_a_folder_are_left_out() {
+    let (folder, room) = room();
+    let masks = folder.path().join("masks");
+    for photo in open_capture(&room).unwrap().names() {
+        let mut pixels = image::open(room.join(photo)).unwrap().to_rgb8();
+        let (width, height) = pixels.dimensions();
+        let mut mask = image::GrayImage::from_pixel(width, height, image::Luma([255]));
+        for (x, y) in (0..width / 2).flat_map(|x| (0..height).map(move |y| (x, y))) {
+            pixels.put_pixel(x, y, image::Rgb([255, 0, 255]));
+            mask.put_pixel(x, y, image::Luma([0]));
+        }
+        pixels.save(room.join(photo)).unwrap();
+        let mask_file = masks.join(photo).with_extension("png");
+        std::fs::create_dir_all(mask_file.parent().unwrap()).unwrap();
+        mask.save(mask_file).unwrap();
+    }
+    let (truth, scene, masks) = (room.join("truth.ply"), arg(&room), arg(&masks));
+    let eval = ["eval", "--splat", arg(&truth), "--scene", scene];
+    let masked = run_json(&[&eval[..], &["--masks", masks, "--json"]].concat());
+    let unmasked = run_json(&[&eval[..], &["--json"]].concat());
+    assert!(number(&masked, "/psnr") > number(&unmasked, "/psnr") + 10., "{masked}");
+    assert_eq!(number(&masked, "/pixel_fraction"), 0.5);
+    assert!(unmasked.get("pixel_fraction").is_none());
+    let table = succeed(&[&eval[..], &["--masks", masks]].concat());
+    assert!(table.ends_with("scored over 50.0 % of the pixels: the others are masked out\n"), "{table}");
+
+    let out = folder.path().join("out.ply");
+    let bytes = |arguments: &[&str]| {
+        succeed(&[arguments, &["--scene", scene, "--out", arg(&out)]].concat());
+        std::fs::read(&out).unwrap()
+    };
+    let reconstruct = ["reconstruct", "--views", "2"];
+    assert!(bytes(&[&reconstruct[..], &["--masks", masks]].concat()) != bytes(&reconstruct));
+    let refine = ["refine", "--steps", "3", "--gaussians", "200", "--masks", masks];
+    let ignored = bytes(&refine);
+    for colour in ["black", "white", "random"] {
+        assert!(bytes(&[&refine[..], &["--mask-background", colour]].concat()) != ignored, "{colour}");
+    }
+}
+
 /// The number of threads does not change the bytes with the same steps and seed; another seed gives others.
 #[test]
 fn threads_do_not_change_the_bytes() {

@@ -7,7 +7,7 @@ use globalsplat::data::{
 };
 use globalsplat::error::{Error, Result};
 use globalsplat::scene::{Camera, Intrinsics};
-use image::{Rgb, RgbImage};
+use image::{ImageFormat, Rgb, RgbImage, Rgba, RgbaImage};
 use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Arc;
@@ -228,6 +228,46 @@ fn without_augmentation_every_view_is_the_same_in_every_sample() {
     };
     let shown = scenes(&mut DataLoader::start(&config, 0, data, 1, 0).unwrap(), 4);
     assert!(shown.iter().all(|scene| scene.images == shown[0].images && scene.context == [0, 1, 2, 3, 4, 5]));
+}
+
+/// Masks are cropped, resized and mirrored as their photos are: white photos on transparent ground equal their opacity.
+#[test]
+fn masks_follow_their_photos() {
+    let folder = tempfile::tempdir().unwrap();
+    write_capture(folder.path(), 1, 6);
+    for view in 0..6 {
+        let is_opaque = |x: u32, y: u32| view == 0 || (x > 10 + view && (x + y) % 9 > 3);
+        let photo =
+            RgbaImage::from_fn(WIDTH, HEIGHT, |x, y| Rgba([255, 255, 255, 255 * u8::from(is_opaque(x, y))]));
+        let bytes = std::fs::File::create(folder.path().join(format!("{view:03}.jpg"))).unwrap();
+        // The content decides on the format, not the name.
+        photo.write_to(&mut std::io::BufWriter::new(bytes), ImageFormat::Png).unwrap();
+    }
+    let data = Arc::new(vec![open_capture(folder.path()).unwrap()]);
+    let config = DataConfig {
+        context_views: 6,
+        window: [6, 6],
+        jitter: JitterConfig::OFF,
+        photo_cache_mb: 1,
+        ..config()
+    };
+    let mut loader = DataLoader::start(&config, 0, data, 1, 0).unwrap();
+    let mut emptier = BTreeSet::new();
+    for scene in scenes(&mut loader, 12) {
+        let (masks, pixels) = (scene.masks.as_ref().expect("masks"), 16 * 24);
+        for (mask, image) in masks.chunks(pixels).zip(scene.images.chunks(3 * pixels)) {
+            assert!(mask == &image[..pixels]);
+        }
+        assert!(masks[..pixels].iter().all(|&weight| weight == 255));
+        let half = |first: usize| -> u32 {
+            let rows = masks[5 * pixels..].chunks(24);
+            rows.flat_map(|row| &row[first..first + 12]).map(|&weight| u32::from(weight)).sum()
+        };
+        emptier.insert(half(0) < half(12));
+        let batch = Batch::from_scenes(&[scene], Device::Cpu).unwrap();
+        assert!(batch.context.masks.unwrap().equal(&batch.context.images.narrow(2, 0, 1)));
+    }
+    assert_eq!(emptier.len(), 2, "mirrored, and not");
 }
 
 /// Returns seven good scenes, a broken group, a scene with broken cameras, a short one, and one with broken photos.
