@@ -159,7 +159,7 @@ case "${1:-all}" in
 ordinary) run_ordinary ;;
 small) run_small ;;
 sample)
-    share=$(($(git rev-list --count HEAD) % shares))
+    share=$(($(git rev-list --count HEAD 2>/dev/null || echo 0) % shares))
     run_ordinary
     ;;
 all)

@@ -4,6 +4,7 @@ use super::signals::StopRequest;
 use super::{print_json, progress};
 use anyhow::Result;
 use clap::Args;
+use globalsplat::Error;
 use globalsplat::io::check_writable_dir;
 use globalsplat_sfm::{
     CaptureOptions, CaptureProgress, CaptureReport, Colmap, Matching, PoseOptions, VideoOptions, VideoPass,
@@ -35,9 +36,8 @@ pub struct Capture {
     /// 10 or more photos of one size and focal length, and SIMPLE_RADIAL for fewer
     #[arg(long, value_name = "MODEL")]
     camera_model: Option<String>,
-    /// Pairs of photos to match: exhaustive: every pair; sequential: each photo with the next 10 by name and those nearby by GPS,
-    /// and every pair among 64; auto: sequential for videos and more than 200 photos, else
-    /// exhaustive
+    /// Pairs of photos to match: exhaustive, which is every pair; sequential, which is each photo with the next 10 by name and those
+    /// nearby by GPS, and every pair among 64; or auto, which is sequential for videos and more than 200 photos
     #[arg(long, value_name = "PAIRS", default_value = "auto", value_parser = str::parse::<Matching>)]
     matching: Matching,
     /// Print the result as one JSON object
@@ -50,8 +50,11 @@ impl Capture {
         let camera_model = self.camera_model.map(|model| model.to_uppercase());
         let options = CaptureOptions {
             video: VideoOptions { frames: self.frames },
-            poses: PoseOptions { camera_model, matching: self.matching },
+            poses: PoseOptions { camera_model, matching: self.matching, keeps_finished: false },
         };
+        if self.frames.is_some() && self.source.is_dir() {
+            return Err(Error::request("--frames is for videos, and the source is a folder of photos").into());
+        }
         let stop = StopRequest::install()?;
         let report = run_make_capture(&self.source, &self.out, &options, &stop)?;
         if self.json {
@@ -75,6 +78,7 @@ fn run_make_capture(
     options: &CaptureOptions,
     stop: &StopRequest,
 ) -> Result<CaptureReport> {
+    std::fs::metadata(source).map_err(Error::read(source))?;
     let colmap = Colmap::find()?;
     check_writable_dir(out)?;
     eprintln!("{colmap}");
@@ -140,9 +144,12 @@ impl SceneSource {
     pub fn path(&self, out: &Path, stop: &StopRequest) -> Result<PathBuf> {
         let Some(photos) = &self.photos else { return Ok(self.scene.clone().unwrap_or_default()) };
         let name = out.file_name().unwrap_or_default().to_string_lossy();
-        let stem = name.split('.').next().unwrap_or_default();
-        let capture = out.with_file_name(format!("{stem}_capture"));
-        let report = run_make_capture(photos, &capture, &CaptureOptions::default(), stop)?;
+        let stem = name.rsplit_once('.').map_or(&*name, |(stem, _)| stem);
+        let capture = out.with_file_name(format!("{}_capture", stem.trim_end_matches(".compressed")));
+        // A capture that `globalsplat capture` made with other settings is used as it is.
+        let poses = PoseOptions { keeps_finished: true, ..PoseOptions::default() };
+        let report =
+            run_make_capture(photos, &capture, &CaptureOptions { poses, ..Default::default() }, stop)?;
         eprintln!("{}: {}", capture.display(), report.poses);
         Ok(capture)
     }

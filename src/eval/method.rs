@@ -206,13 +206,23 @@ pub fn score_output(
     perceptual: &Perceptual,
     mut see: impl FnMut(&View, &EvalImage, &ViewScore) -> Result<()>,
 ) -> Result<CaptureScores> {
-    let MethodOutput { scene, source, first, gaussians, .. } = output;
+    let MethodOutput { scene, source, first, gaussians, warnings, .. } = output;
     let mut scores = vec![];
     for i in 0..scene.target.len() {
         let (ground_truth, image) = first.take().map_or_else(|| source.load_target(scene, i), Ok)?;
+        if ground_truth.is_masked_out() {
+            warnings.push(format!(
+                "{}: {} is masked out as a whole, and not scored",
+                scene.name, ground_truth.name
+            ));
+            continue;
+        }
         let score = perceptual.add_to(score_view(&image.rgb, &ground_truth)?, &image.rgb, &ground_truth);
         see(&ground_truth, &image, &score)?;
         scores.push(score);
+    }
+    if scores.is_empty() {
+        return Err(Error::request(format!("{}: every view to score is masked out as a whole", scene.name)));
     }
     Ok(CaptureScores::from_views(&scene.name, scores, *gaussians))
 }

@@ -138,7 +138,10 @@ impl Baselines {
         let mean = sum / context.len() as f64;
         let mut means = vec![];
         for i in 0..target.len() {
-            means.push(score_view(&mean, &target.load(i)?)?);
+            let view = target.load(i)?;
+            if !view.is_masked_out() {
+                means.push(score_view(&mean, &view)?);
+            }
         }
         Ok(Baselines {
             nearest_photo: nearest_context_baseline(scene, context, target)?,
@@ -162,7 +165,10 @@ pub(super) fn nearest_context_baseline(
         let distance = |&photo: &usize| shown[photo].distance(centre);
         let nearest = (0..shown.len()).min_by(|a, b| distance(a).total_cmp(&distance(b)));
         let nearest = context.load(nearest.expect("a context view"))?;
-        scores.push(score_view(&nearest.image, &target.load(i)?)?);
+        let view = target.load(i)?;
+        if !view.is_masked_out() {
+            scores.push(score_view(&nearest.image, &view)?);
+        }
     }
     Ok(CaptureScores::from_views(scene, scores, None))
 }

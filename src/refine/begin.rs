@@ -120,7 +120,10 @@ fn sample_gaussians(depth_maps: &[DepthMap], points: &[Point], count: usize, see
     let left = count - balls.len();
     for (index, of) in depth_maps.iter().enumerate() {
         // Cumulative shares, so that the counts add up to `left`.
-        let share = |i: usize| (left as f64 * shares[i] / shares[depth_maps.len()]) as usize;
+        let share = |i: usize| match i == depth_maps.len() {
+            true => left,
+            false => (left as f64 * shares[i] / shares[depth_maps.len()]) as usize,
+        };
         sample_pixels(of, share(index + 1) - share(index), spacing, &mut random, &mut balls);
     }
     raw(&balls)

@@ -45,8 +45,8 @@ impl MaskBackground {
 const MAX_PHOTO_BYTES: u64 = 768 << 20;
 /// Maximum memory of the held-out views.
 const MAX_HELD_OUT_BYTES: u64 = 256 << 20;
-/// Memory per pixel of a photo: three channels in float32.
-const BYTES_PER_PIXEL: u64 = 12;
+/// Memory per pixel of a photo: three channels and a mask in float32.
+const BYTES_PER_PIXEL: u64 = 16;
 
 /// Options of a session.
 #[derive(Debug, Clone)]
@@ -180,11 +180,11 @@ mod tests {
         let capture = Capture::from_source("walk".into(), "".into(), &cameras, Arc::new(NoImages)).unwrap();
         let options = RefineOptions { holdout: Holdout::Every { every: 8, first: 0 }, ..Default::default() };
         let ([shown, held_out], warning) = options.select_views(&capture);
-        // 512×384 pixels of 12 bytes each.
-        let each = 12 * 512 * 384;
+        // 512×384 pixels of 16 bytes each.
+        let each = 16 * 512 * 384;
         assert_eq!((shown.len(), held_out.len()), ((768 << 20) / each, (256 << 20) / each));
         let line = warning.unwrap();
-        assert!(line.starts_with("walk: 341 of 1750 photos are matched and 113 of 250 scored"), "{line}");
+        assert!(line.starts_with("walk: 256 of 1750 photos are matched and 85 of 250 scored"), "{line}");
         let small = RefineOptions { size: Some([96, 128].into()), ..options.clone() };
         let ([shown, held_out], warning) = small.select_views(&capture);
         assert_eq!((shown.len(), held_out.len(), warning), (1750, 250, None));

@@ -451,8 +451,7 @@ impl Capture {
     /// Reads the views `indices`, fitted to `size`, or at their own size if it is `None`. A photo is decoded once for all of its views.
     ///
     /// # Errors
-    /// Fails if an image or a mask is missing or can't be decoded, if an image has another size than the capture declares, or if there
-    /// are several views and each is wholly masked out.
+    /// Fails if an image or a mask is missing or can't be decoded, if an image has another size than the capture declares.
     pub fn load(&self, indices: &[usize], size: Option<ImageSize>) -> Result<Vec<Photo>> {
         // Positions in `indices` of the views of each photo, in the order in which the photos come first.
         let mut photos: Vec<Vec<usize>> = vec![];
@@ -489,13 +488,7 @@ impl Capture {
         }
         let views: Vec<Photo> =
             loaded.into_iter().map(|photo| photo.expect("every view is one of a photo")).collect();
-        match views.as_slice() {
-            [first, _, ..] if views.iter().all(Photo::is_masked_out) => {
-                let field = format!("the mask of {:?} and of {} other photos", first.name, views.len() - 1);
-                Err(Error::input(&self.file, field, "black all over", "white where a photo counts"))
-            }
-            _ => Ok(views),
-        }
+        Ok(views)
     }
 
     /// Reads every view like [`Capture::load`].

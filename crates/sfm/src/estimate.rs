@@ -3,6 +3,7 @@
 use crate::colmap::{
     CAMERA_MODELS, Colmap, Command, ModelSummary, Outcome, exhaustive_pairs, read_models, sequential_pairs,
 };
+use crate::make_capture::VIDEO_FILE;
 use crate::photos::{FoundPhoto, Photo, SkippedPhoto, find_photos, import_photos};
 use crate::record::{FILE, Record};
 use globalsplat_files::{Error, Result, write_atomically};
@@ -21,7 +22,7 @@ const OVERLAP: usize = 10;
 /// Number of photos spread over a sequence of which every pair is matched.
 const SPREAD: usize = 64;
 /// Number of pairs that one call of COLMAP matches.
-const PAIRS_PER_CALL: usize = 256;
+const PAIRS_PER_CALL: usize = 128;
 
 /// Side in pixels to which larger photos are reduced before features are detected.
 const MAX_SIDE: u32 = 1600;
@@ -76,6 +77,8 @@ pub struct PoseOptions {
     pub camera_model: Option<String>,
     /// Choice of pairs.
     pub matching: Matching,
+    /// `true` to use a finished estimate as it is, whatever settings it was made with.
+    pub keeps_finished: bool,
 }
 
 /// Steps of [`estimate_poses`].
@@ -255,7 +258,7 @@ fn prepare_record(
     colmap: &Colmap,
     found: Vec<FoundPhoto>,
 ) -> Result<Record> {
-    let PoseOptions { camera_model, matching } = options.clone();
+    let PoseOptions { camera_model, matching, .. } = options.clone();
     let new = Record {
         colmap: colmap.name_and_version(),
         camera_model,
@@ -281,6 +284,9 @@ fn prepare_record(
             format!("the {} photos of {}, or a folder without a capture", new.found.len(), photos.display()),
         ));
     }
+    if options.keeps_finished && old.report.is_some() {
+        return Ok(old);
+    }
     let mut record = Record { colmap: new.colmap, camera_model: new.camera_model, matching, ..old.clone() };
     if (&record.colmap, &record.camera_model) != (&old.colmap, &old.camera_model) {
         record.has_cameras = false;
@@ -296,11 +302,13 @@ fn prepare_record(
     Ok(record)
 }
 
-/// Checks that the folder `out` is missing, empty, or has nothing but the photos.
+/// Checks that the folder `out` is missing, empty, or has nothing but the photos and the record of the video that they are from.
 fn check_new_folder(photos: &Path, out: &Path) -> Result<()> {
     let photos = photos.canonicalize().map_err(Error::read(photos))?;
     for entry in fs::read_dir(out).into_iter().flatten().flatten() {
-        if entry.path().canonicalize().ok().as_ref() != Some(&photos) {
+        let is_own =
+            entry.file_name() == VIDEO_FILE || entry.file_name().as_encoded_bytes().starts_with(b".");
+        if !is_own && entry.path().canonicalize().ok().as_ref() != Some(&photos) {
             let found = format!("a folder with {}", entry.file_name().display());
             return Err(Error::input(out, "the output", found, "a new folder, or one with such a capture"));
         }
@@ -407,8 +415,7 @@ impl Estimate<'_> {
         };
         let model = self.record.camera_model.as_deref().unwrap_or(default);
         let side = photos.iter().map(|photo| photo.width.max(photo.height)).max().unwrap_or(0);
-        // COLMAP reads the EXIF data of photos with a camera of their own itself.
-        let focal = match photos[0].focal.filter(|_| sharing > 1) {
+        let focal = match photos[0].focal {
             Some(focal) => focal / f64::from(side),
             None if model.contains("FISHEYE") => FISHEYE_FOCAL,
             None => FOCAL,
@@ -479,11 +486,15 @@ impl Estimate<'_> {
         fs::create_dir(&partial).map_err(Error::write(&partial))?;
         let mapper = Command::new("mapper").path("image_path", &self.images).path("output_path", &partial);
         let outcome = self.run(mapper, Step::Poses, 0, self.photos().len());
-        // COLMAP's program fails if it places no photo, which is reported in other words.
+        // COLMAP's program fails with this message if it places no photo, which is reported in other words.
+        let is_without_model = |why: &Error| why.to_string().contains("sparse model");
         let is_empty = fs::read_dir(&partial).map_err(Error::read(&partial))?.next().is_none();
         match outcome {
             Ok(Outcome::Stopped) => return Ok(Outcome::Stopped),
-            Err(_) | Ok(_) if is_empty => return Err(none_placed(self.photos().len(), self.out)),
+            Ok(_) if is_empty => return Err(none_placed(self.photos().len(), self.out)),
+            Err(why) if is_empty && is_without_model(&why) => {
+                return Err(none_placed(self.photos().len(), self.out));
+            }
             outcome => outcome?,
         };
         remove(&sparse)?;
@@ -548,7 +559,7 @@ impl Estimate<'_> {
 
 /// Photos by their cameras.
 struct CameraGroups {
-    /// Photos of one size, focal length and kind each, two or more.
+    /// Photos of one size, focal length and kind each: two or more, or one whose metadata tell its camera.
     shared: Vec<Vec<Photo>>,
     /// The other photos.
     single: Vec<Photo>,
@@ -563,7 +574,10 @@ fn group_by_camera(photos: &[Photo]) -> CameraGroups {
             .or_default()
             .push(photo.clone());
     }
-    let (single, shared): (Vec<_>, Vec<_>) = groups.into_values().partition(|group| group.len() == 1);
+    let is_single = |group: &Vec<Photo>| {
+        matches!(group.as_slice(), [Photo { focal: None, is_equirectangular: false, .. }])
+    };
+    let (single, shared): (Vec<_>, Vec<_>) = groups.into_values().partition(is_single);
     CameraGroups { shared, single: single.into_iter().flatten().collect() }
 }
 

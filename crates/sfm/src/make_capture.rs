@@ -9,7 +9,7 @@ use std::path::Path;
 use std::time::UNIX_EPOCH;
 
 /// Name of the file that records which video the frames are from, in the capture's folder.
-const VIDEO_FILE: &str = "video.json";
+pub(crate) const VIDEO_FILE: &str = "video.json";
 
 /// Options of [`make_capture`].
 #[derive(Debug, Clone, Default)]
@@ -107,7 +107,7 @@ pub fn make_capture(
         let report = estimate(source, &poses, &mut on_progress)?;
         return Ok(report.map(|poses| CaptureReport { video: None, poses }));
     }
-    let Some(video) = frames_of_video(source, out, &options.video, &mut on_progress)? else {
+    let Some(video) = frames_of_video(source, out, options, &mut on_progress)? else {
         return Ok(None);
     };
     if poses.matching == Matching::Auto {
@@ -122,21 +122,35 @@ pub fn make_capture(
 fn frames_of_video(
     video: &Path,
     out: &Path,
-    options: &VideoOptions,
+    options: &CaptureOptions,
     on_progress: &mut dyn FnMut(CaptureProgress) -> bool,
 ) -> Result<Option<VideoRecord>> {
-    let record = VideoRecord::new(video, options.frames)?;
+    let record = VideoRecord::new(video, options.video.frames)?;
     let file = out.join(VIDEO_FILE);
     if file.exists() {
         let refuse = |why| Error::input(&file, "the contents", why, "what an earlier run wrote");
         let old: VideoRecord = serde_json::from_str(&read_text(&file)?).map_err(refuse)?;
-        if !record.matches(&old) {
+        let asked = VideoRecord {
+            frames: if options.poses.keeps_finished { old.frames } else { record.frames },
+            ..record.clone()
+        };
+        if !asked.matches(&old) {
             let expected = format!("{}, or a folder without a capture", record.describe());
             return Err(Error::input(&file, "the video", old.describe(), expected));
         }
         return Ok(Some(old));
     }
-    if std::fs::read_dir(out).is_ok_and(|mut entries| entries.next().is_some()) {
+    // A call that was killed leaves hidden files, or frames alone.
+    let is_own = |entry: std::fs::DirEntry| {
+        let name = entry.file_name();
+        let is_frame = |frame: std::fs::DirEntry| frame.file_name().as_encoded_bytes().starts_with(b"frame_");
+        let has_frames_alone = || {
+            std::fs::read_dir(entry.path())
+                .is_ok_and(|mut frames| frames.all(|frame| frame.is_ok_and(is_frame)))
+        };
+        name.as_encoded_bytes().starts_with(b".") || name == "images" && has_frames_alone()
+    };
+    if std::fs::read_dir(out).is_ok_and(|mut entries| !entries.all(|entry| entry.is_ok_and(is_own))) {
         return Err(Error::input(
             out,
             "the output",
@@ -145,7 +159,7 @@ fn frames_of_video(
         ));
     }
     let mut is_stopped = false;
-    let frames = extract_frames(video, &out.join("images"), options, |progress| {
+    let frames = extract_frames(video, &out.join("images"), &options.video, |progress| {
         is_stopped |= !on_progress(CaptureProgress::Video(progress));
         !is_stopped
     });

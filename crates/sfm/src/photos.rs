@@ -57,7 +57,8 @@ pub(crate) fn find_photos(folder: &Path) -> Result<(Vec<FoundPhoto>, Option<Stri
     let list = list_photos(folder)?;
     let describe = |path: &PathBuf| {
         let bytes = fs::metadata(path).map_err(Error::read(path))?.len();
-        let name = path.strip_prefix(folder).unwrap_or(path).to_string_lossy().replace('\\', "/");
+        let name = path.strip_prefix(folder).unwrap_or(path).to_string_lossy();
+        let name = if cfg!(windows) { name.replace('\\', "/") } else { name.into_owned() };
         Ok(FoundPhoto { name, bytes, checksum: checksum([path])? })
     };
     let found = list.photos.par_iter().map(describe).collect::<Result<_>>()?;
@@ -79,7 +80,7 @@ pub(crate) struct ImportedPhotos {
 /// photos that were looked at, returns `false`.
 ///
 /// # Errors
-/// Returns an error if a file can't be written.
+/// Returns an error if a file can't be written, or if `source` is `images` and a photo in it would need another name or other contents.
 pub(crate) fn import_photos(
     source: &Path,
     found: &[FoundPhoto],
@@ -98,6 +99,9 @@ pub(crate) fn import_photos(
             imported.skipped.push(SkippedPhoto { name: photo.name.clone(), reason });
         }
     }
+    let is_in_place =
+        source.canonicalize().is_ok_and(|source| images.canonicalize().is_ok_and(|images| images == source));
+    let all_names: HashSet<&str> = found.iter().map(|photo| photo.name.as_str()).collect();
     let mut names = HashSet::new();
     let mut done = imported.skipped.len();
     // Few photos at a time, for progress and memory.
@@ -108,15 +112,23 @@ pub(crate) fn import_photos(
             match inspected {
                 Ok(inspected) => {
                     let path = source.join(&photo.name);
-                    let suffix = if inspected.is_converted { ".jpg" } else { "" };
-                    let name = list_name(&format!("{}{suffix}", photo.name), &mut names);
-                    place(&path, inspected.contents, &images.join(&name))?;
-                    if let Some(mask) = inspected.mask {
-                        place(
-                            &path,
-                            Some(mask),
-                            &images.with_file_name("masks").join(format!("{name}.png")),
-                        )?;
+                    let name = match inspected.is_converted {
+                        true => converted_name(&photo.name, &all_names),
+                        false => photo.name.clone(),
+                    };
+                    let name = list_name(&name, &mut names);
+                    if !is_in_place {
+                        place(&path, inspected.contents, &images.join(&name))?;
+                        let target = images.with_file_name("masks").join(format!("{name}.png"));
+                        match (mask_of(source, &photo.name), inspected.mask) {
+                            (Some(mask), _) => place(&mask, None, &target)?,
+                            (None, Some(mask)) => place(&path, Some(mask), &target)?,
+                            (None, None) => {}
+                        }
+                    } else if inspected.contents.is_some() || name != photo.name {
+                        let found = "one that COLMAP can't read as it is, by its name, format or rotation";
+                        let expected = "an output whose images aren't the photos themselves";
+                        return Err(Error::input(path, "the photo", found, expected));
                     }
                     imported.photos.push(Photo {
                         name,
@@ -135,6 +147,20 @@ pub(crate) fn import_photos(
         }
     }
     Ok(Some(imported))
+}
+
+/// Returns the name of the JPEG that the photo `name` is converted to: with another extension, or with one more if that is the name of
+/// another photo.
+fn converted_name(name: &str, all_names: &HashSet<&str>) -> String {
+    let other = Path::new(name).with_extension("jpg").to_string_lossy().into_owned();
+    if all_names.contains(other.as_str()) { format!("{name}.jpg") } else { other }
+}
+
+/// Returns the mask of the photo `name` in the folder `masks` of `source`, if there is one.
+fn mask_of(source: &Path, name: &str) -> Option<PathBuf> {
+    let masks = source.join("masks");
+    let stem = Path::new(name).with_extension("").to_string_lossy().into_owned();
+    [name, &stem].map(|name| masks.join(format!("{name}.png"))).into_iter().find(|mask| mask.is_file())
 }
 
 /// Returns a name that COLMAP's lists can hold, and that differs from `taken`, to which it is added.
@@ -179,8 +205,13 @@ fn inspect(path: &Path) -> Result<Inspected, String> {
     if brightest - darkest <= BLANK {
         return Err("of a single colour".into());
     }
-    let extension = path.extension().unwrap_or_default().to_ascii_lowercase();
-    let [is_png, is_jpeg] = [extension == "png", extension == "jpg" || extension == "jpeg"];
+    // COLMAP goes by the extension.
+    let has_extension = |known: &[&str]| {
+        path.extension()
+            .is_some_and(|extension| known.iter().any(|known| extension.eq_ignore_ascii_case(known)))
+    };
+    let is_png = decoded.is_png && has_extension(&["png"]);
+    let is_jpeg = decoded.is_jpeg && has_extension(&["jpg", "jpeg"]);
     let is_rotated = pixels.dimensions() != (width, height);
     let is_readable = (is_png || is_jpeg) && !is_rotated;
     let contents = (!is_readable).then(|| encode_photo(&pixels, !is_png)).transpose().map_err(refuse)?;
@@ -201,17 +232,6 @@ fn inspect(path: &Path) -> Result<Inspected, String> {
 /// Writes `contents` to `target`, or links `target` to the file `source`, copying it if it can't be linked.
 fn place(source: &Path, contents: Option<Vec<u8>>, target: &Path) -> Result<()> {
     let source = source.canonicalize().map_err(Error::read(source))?;
-    if target.canonicalize().is_ok_and(|target| target == source) {
-        return match contents {
-            None => Ok(()),
-            Some(_) => Err(Error::input(
-                target,
-                "the orientation",
-                "a rotation in EXIF, which needs an upright copy",
-                "an output whose images aren't the photos themselves",
-            )),
-        };
-    }
     let folder = target.parent().unwrap_or(target);
     fs::create_dir_all(folder).map_err(Error::write(folder))?;
     if let Some(contents) = contents {
@@ -274,14 +294,36 @@ mod tests {
         });
         photo.save_with_format(source.join("a.webp"), ImageFormat::WebP).unwrap();
         write_photo(&source.join("a.png"), 1);
+        // The contents of a PNG under another extension.
+        write_photo(&source.join("b.jpg"), 2);
+        fs::create_dir_all(source.join("masks")).unwrap();
+        fs::write(source.join("masks/b.png"), "a mask").unwrap();
         let ImportedPhotos { photos, skipped } = import(&source, &images);
         assert!(skipped.is_empty(), "{skipped:?}");
         let names: Vec<&str> = photos.iter().map(|photo| photo.name.as_str()).collect();
-        assert_eq!(names, ["a.png", "a.webp.jpg"]);
-        let mask = globalsplat_capture::read_image(&folder.path().join("masks/a.webp.jpg.png")).unwrap();
+        assert_eq!(names, ["a.png", "a.jpg", "b.jpg.jpg"]);
+        let mask = globalsplat_capture::read_image(&folder.path().join("masks/a.jpg.png")).unwrap();
         assert!(mask.enumerate_pixels().all(|(x, _, level)| level[0] == if x < 8 { 0 } else { 255 }));
-        let converted = globalsplat_capture::read_image(&images.join("a.webp.jpg")).unwrap();
+        let converted = globalsplat_capture::read_image(&images.join("a.jpg")).unwrap();
+        assert_eq!(fs::read(folder.path().join("masks/b.jpg.jpg.png")).unwrap(), b"a mask");
         assert!(converted.get_pixel(12, 4)[0].abs_diff(180) < 12, "{:?}", converted.get_pixel(12, 4));
+    }
+
+    #[test]
+    fn photos_in_the_folder_of_images_are_left_as_they_are() {
+        let folder = tempfile::tempdir().unwrap();
+        let images = folder.path().join("images");
+        fs::create_dir_all(&images).unwrap();
+        write_photo(&images.join("a_1.png"), 1);
+        write_photo(&images.join("b.png"), 2);
+        let before = fs::read(images.join("a_1.png")).unwrap();
+        assert_eq!(import(&images, &images).photos.len(), 2);
+        write_photo(&images.join("a 1.png"), 3);
+        let error =
+            import_photos(&images, &find_photos(&images).unwrap().0, &images, &mut |_| true).unwrap_err();
+        assert!(error.to_string().contains("a 1.png: the photo is one that COLMAP can't read"), "{error}");
+        assert_eq!(fs::read(images.join("a_1.png")).unwrap(), before);
+        assert_eq!(fs::read_dir(&images).unwrap().count(), 3);
     }
 
     #[test]

@@ -73,7 +73,7 @@ pub struct Refine {
     /// Views to hold out and score: every:N, every:N+K, or none for only the capture's own test split
     #[arg(long, value_name = "WHICH", default_value = "none")]
     holdout: String,
-    /// Maximum number of the other views, spread along the camera path
+    /// Maximum number of the other views, spread along the camera path; by default as many as fit into about 2 GB of memory
     #[arg(long, value_name = "N")]
     views: Option<usize>,
     /// Crop and resize photos to this size; by default they keep their aspect ratio, with at most 512 pixels along the longer

@@ -43,6 +43,8 @@ pub struct DecodedPhoto {
     pub as_stored: bool,
     /// `true` if the file is a JPEG.
     pub is_jpeg: bool,
+    /// `true` if the file is a PNG.
+    pub is_png: bool,
 }
 
 /// Decodes the photo `encoded`, the contents of `file`, like [`read_image`]. The capture declares the photo to have `size` = (width,
@@ -71,7 +73,13 @@ pub fn decode_photo(encoded: &[u8], file: &Path, size: (u32, u32)) -> Result<Dec
     }
     let as_stored = !turn && is_rgb && matches!(image, DynamicImage::ImageRgb8(_));
     let (pixels, alpha) = split_alpha(image);
-    Ok(DecodedPhoto { pixels, alpha, as_stored, is_jpeg: format == Some(ImageFormat::Jpeg) })
+    Ok(DecodedPhoto {
+        pixels,
+        alpha,
+        as_stored,
+        is_jpeg: format == Some(ImageFormat::Jpeg),
+        is_png: format == Some(ImageFormat::Png),
+    })
 }
 
 /// Encodes a photo as a JPEG of high quality, or as a PNG.

@@ -8,7 +8,7 @@ use std::io::{BufRead, BufReader, Read, Write};
 use std::path::Path;
 use std::process::{self, Child, ExitStatus, Stdio};
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// Program that runs a command by pycolmap.
 const PYTHON: &str = include_str!("pycolmap_command.py");
@@ -98,6 +98,7 @@ impl Command {
         send_lines(child.0.stdout.take().expect("a pipe was requested"), sender.clone());
         send_lines(child.0.stderr.take().expect("a pipe was requested"), sender);
         let mut last_words = "without a message".to_string();
+        let mut last_call = Instant::now();
         loop {
             let is_wanted = match lines.recv_timeout(PAUSE) {
                 Ok(line) => {
@@ -105,7 +106,12 @@ impl Command {
                     if let Some(message) = message_in(&line) {
                         last_words = message.to_string();
                     }
-                    count_in(&line).is_none_or(|count| on_count(Some(count)))
+                    let count = count_in(&line);
+                    let is_due = count.is_some() || last_call.elapsed() >= PAUSE;
+                    if is_due {
+                        last_call = Instant::now();
+                    }
+                    !is_due || on_count(count)
                 }
                 Err(RecvTimeoutError::Timeout) => on_count(None),
                 Err(RecvTimeoutError::Disconnected) => break,
