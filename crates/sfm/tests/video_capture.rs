@@ -17,7 +17,8 @@ fn write_video(path: &Path) -> bool {
 /// Returns a COLMAP whose commands all fail.
 fn failing_colmap(folder: &Path) -> Colmap {
     let program = folder.join("colmap");
-    let script = "#!/bin/sh\nif [ $1 = help ]; then echo 'COLMAP 3.9 -- Structure-from-Motion'; else exit 1; fi\n";
+    let script =
+        "#!/bin/sh\nif [ $1 = help ]; then echo 'COLMAP 3.9 -- Structure-from-Motion'; else exit 1; fi\n";
     std::fs::write(&program, script).unwrap();
     std::fs::set_permissions(&program, PermissionsExt::from_mode(0o755)).unwrap();
     Colmap::at(&program).unwrap()
