@@ -70,6 +70,8 @@ check-crates:
 # Packages these crates as for crates.io, and builds each package by itself. Needs cargo 1.90 for packages that depend on each other.
 .PHONY: check-packages
 check-packages:
+	@# Packages of an earlier run have the same version, so cargo would take what it unpacked and compiled of them.
+	@rm -rf target/package target/debug/.fingerprint/globalsplat-* $(or $(CARGO_HOME),~/.cargo)/registry/src/-*/globalsplat-*
 	env -u LIBTORCH $(CARGO) package --locked --allow-dirty $(CRATES)
 
 check-format:
