@@ -152,3 +152,21 @@ impl<const N: usize> fmt::Debug for PendingCopy<N> {
         f.write_str("PendingCopy")
     }
 }
+
+/// Lock on libtorch's number of threads, which tests share. MKL splits a product among them, so the last bits of results depend on it.
+#[cfg(test)]
+pub(crate) mod num_threads {
+    use std::sync::{PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
+
+    static LOCK: RwLock<()> = RwLock::new(());
+
+    /// Guard of a test that compares the bits of several runs.
+    pub fn keep() -> RwLockReadGuard<'static, ()> {
+        LOCK.read().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Guard of a test that changes the number of threads.
+    pub fn change() -> RwLockWriteGuard<'static, ()> {
+        LOCK.write().unwrap_or_else(PoisonError::into_inner)
+    }
+}

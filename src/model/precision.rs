@@ -148,12 +148,14 @@ impl FromStr for Precision {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::device::num_threads;
     use tch::no_grad;
 
     /// Products have the same bits for any number of threads. The shapes have few and many rows and columns, in whole and partial blocks,
     /// because libraries split sums depending on each.
     #[test]
     fn products_have_the_same_bits_for_any_number_of_threads() {
+        let _guard = num_threads::change();
         let numbers = |count: i64, phase: f64| {
             (Tensor::arange(count, (Kind::Double, Device::Cpu)).square() + phase).sin().to_kind(Kind::Float)
         };

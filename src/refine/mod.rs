@@ -208,6 +208,7 @@ pub fn scene_depth(gaussians: &Gaussians, views: &[View]) -> Result<f64> {
 mod tests {
     use super::*;
     use crate::bench::synthetic_scene;
+    use crate::device::num_threads;
     use crate::eval::score_views;
     use crate::scene::{ImageSize, Intrinsics, RawGaussians};
     use glam::{DMat4, DVec3};
@@ -248,6 +249,7 @@ mod tests {
 
     /// Refines a splat on `views`, which starts from the depths of `start`, and returns it.
     fn refined(start: &[View], views: &[View], background: Option<MaskBackground>) -> Gaussians {
+        let _guard = num_threads::change();
         let config = RefineConfig::default();
         let raw = gaussians_from_photos(start, &[], None, 400, 0, Device::Cpu, |_| true).expect("depths");
         let depth = scene_depth(&raw.activate(), views).unwrap();
@@ -353,6 +355,7 @@ mod tests {
             let mut optimizer =
                 GaussianOptimizer::new(&RawGaussians::from_gaussians(&gaussians), 1., &config);
             let mut corrections = Corrections::new(4, true, true, 1., &config, Device::Cpu);
+            let _guard = num_threads::change();
             refine(&mut optimizer, &mut corrections, &task_of(count), |_| true).unwrap();
         };
         let count = |ops: &[String], name: &str| ops.iter().filter(|op| *op == name).count();

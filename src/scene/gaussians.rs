@@ -149,6 +149,7 @@ pub(crate) fn sigmoid(logits: &Tensor) -> Tensor {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::device::num_threads;
 
     #[test]
     fn activation_inverts_from_gaussians() {
@@ -193,6 +194,7 @@ mod tests {
 
     #[test]
     fn sigmoid_has_the_same_bits_for_any_number_of_threads() {
+        let _guard = num_threads::change();
         let logits = Tensor::arange(3 * 33_331, (Kind::Float, Device::Cpu)).sin().view([3, -1]) * 9.;
         let expected = sigmoid(&logits);
         let threads = tch::get_num_threads();

@@ -4,7 +4,7 @@ use super::step_tests::{config, far_from_the_start, scenes, small, trained};
 use super::{StepReport, Trainer};
 use crate::config::{Config, OptimizerKind, TrainConfig};
 use crate::data::{Batch, LoadedScene, TrainingScenes};
-use crate::device::Stopwatch;
+use crate::device::{Stopwatch, num_threads};
 use crate::loss::Term;
 use crate::ranks::ProcessGroup;
 use crate::ranks::tests::{can_meet, run_on_ranks};
@@ -62,6 +62,7 @@ fn assert_like_one(
     tolerance: f64,
     disturb: impl Fn(usize, &mut [LoadedScene]) + Copy + Sync,
 ) -> Vec<StepReport> {
+    let _guard = num_threads::keep();
     let start = weights(&far_from_the_start(config));
     let (alone, expected) = trained_on(alone, ProcessGroup::single(), disturb);
     let alone = weights(&alone);
@@ -179,6 +180,7 @@ fn a_sharded_optimizer_matches_an_unsharded_one() {
 }
 
 fn sharding_changes_nothing(optimizer: OptimizerKind) {
+    let _guard = num_threads::keep();
     let config = training(TrainConfig { optimizer, ..Default::default() });
     let trained = |sharded: bool| {
         run_on_ranks(3, |group| {

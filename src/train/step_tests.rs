@@ -3,7 +3,7 @@
 use super::{Trainer, subsets};
 use crate::config::{Config, TrainConfig};
 use crate::data::{Batch, Capture, LoadTimes, LoadedScene, ViewBatch};
-use crate::device::Stopwatch;
+use crate::device::{Stopwatch, num_threads};
 use crate::loss::{LossConfig, Losses, PerceptualKind, PerceptualLoss, StepFraction, Term, Vgg19, losses};
 use crate::model::{ModelConfig, Precision, Stage, Streams, backward_from_grads, leaf};
 use crate::render::{DEFAULT_EPS2D, RenderOutput, render};
@@ -203,6 +203,7 @@ fn slices_of_a_step_add_up_to_it() {
 /// A step doesn't depend on the colours of masked pixels, neither of the context nor of the targets, and the loss has no gradient there.
 #[test]
 fn masked_pixels_contribute_nothing_to_a_step() {
+    let _guard = num_threads::keep();
     let config = config(small(), TrainConfig::default());
     let [black, grey] = [0, 77].map(|value| Batch::from_scenes(&masked_scenes(value), Device::Cpu).unwrap());
     assert!(!black.target.images.equal(&grey.target.images));
@@ -251,6 +252,7 @@ fn masked_pixels_contribute_nothing_to_a_step() {
 /// the gradients of weights are rounded in each slice.
 #[test]
 fn scenes_side_by_side_make_the_same_step_every_time() {
+    let _guard = num_threads::change();
     let sample = sample();
     let threads = tch::get_num_threads();
     for (precision, tolerance) in [(Precision::F32, 1e-5), (Precision::Bf16, 1e-2)] {
