@@ -1,7 +1,7 @@
 //! Poses that COLMAP finds for the photos of a synthetic scene, whose poses are known.
 
 use glam::{DMat3, DMat4, DVec3};
-use globalsplat_capture::{Camera, open_capture};
+use globalsplat_capture::{Camera, Lens, open_capture};
 use globalsplat_sfm::{Colmap, Matching, PoseOptions, PoseReport, Step, estimate_poses};
 use globalsplat_synth::{Video, VideoSettings};
 use globalsplat_test_kit::skip;
@@ -124,6 +124,23 @@ fn poses_are_those_of_the_scene_and_a_stopped_estimate_continues() {
     std::fs::remove_file(photos.join("05.png")).unwrap();
     let error = estimate_poses(&photos, &out, &sequential, &colmap, &mut |_| true).unwrap_err();
     assert!(error.is_request() && error.to_string().contains("other or changed photos"), "{error}");
+}
+
+#[test]
+fn fisheyes_without_a_known_focal_length_are_placed() {
+    let Some(colmap) = find_colmap() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let (photos, out) = (folder.path().join("photos"), folder.path().join("out"));
+    std::fs::create_dir(&photos).unwrap();
+    let settings = VideoSettings { frames: 8, size: [300, 400].into(), pictures: vec![] };
+    let video = Video::new(1, 3, &settings);
+    let lens = Lens::from_colmap("SIMPLE_FISHEYE", &[180., 200., 150.], settings.size).unwrap();
+    for index in 0..settings.frames {
+        video.photo_through(index, &lens).save(photos.join(format!("{index}.png"))).unwrap();
+    }
+    let options = PoseOptions { camera_model: Some("SIMPLE_FISHEYE".into()), ..Default::default() };
+    let (report, _) = estimate(&photos, &out, &options, &colmap);
+    assert_eq!((report.placed, report.unplaced.len()), (8, 0), "{report}");
 }
 
 #[test]
