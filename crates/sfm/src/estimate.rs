@@ -30,6 +30,9 @@ const MAX_SIDE: u32 = 1600;
 const UPSAMPLED_SIDE: u32 = 1000;
 /// Number of features per photo.
 const FEATURES: u32 = 2048;
+/// Largest distance in pixels between a feature and the projection of its point, in photos of at most [`MAX_SIDE`] pixels; COLMAP's 4
+/// keeps wrong matches on repeated textures, such as paving.
+const MAX_REPROJECTION_ERROR: f64 = 2.;
 
 /// Minimum number of photos with one camera for which the camera has separate focal lengths and tangential distortion.
 const OPENCV_PHOTOS: usize = 10;
@@ -494,7 +497,12 @@ impl Estimate<'_> {
         };
         remove(&partial)?;
         fs::create_dir(&partial).map_err(Error::write(&partial))?;
-        let mapper = Command::new("mapper").path("image_path", &self.images).path("output_path", &partial);
+        let side = self.photos().iter().map(|photo| photo.width.max(photo.height)).max().unwrap_or(0);
+        let reduction = (f64::from(side) / f64::from(MAX_SIDE)).max(1.);
+        let mapper = Command::new("mapper")
+            .path("image_path", &self.images)
+            .path("output_path", &partial)
+            .option("Mapper.filter_max_reproj_error", MAX_REPROJECTION_ERROR * reduction);
         let outcome = self.run(mapper, Step::Poses, 0, self.photos().len());
         // COLMAP's program fails with this message if it places no photo, which is reported in other words.
         let is_without_model = |why: &Error| why.to_string().contains("sparse model");
