@@ -117,7 +117,14 @@ fn photos_that_share_nothing_are_an_error() {
     let folder = tempfile::tempdir().unwrap();
     let (photos, out) = (folder.path().join("photos"), folder.path().join("out"));
     noise::write_noise(&photos);
-    let error = estimate_poses(&photos, &out, &PoseOptions::default(), &colmap, &mut |_| true).unwrap_err();
-    assert!(!error.is_request(), "{error}");
-    assert!(error.to_string().starts_with("COLMAP placed none of the 4 photos: "), "{error}");
+    for count in [4, 2] {
+        let options = PoseOptions::default();
+        let error = estimate_poses(&photos, &out, &options, &colmap, &mut |_| true).unwrap_err();
+        assert!(!error.is_request(), "{error}");
+        let error = error.to_string();
+        assert!(error.starts_with(&format!("COLMAP placed none of the {count} photos: ")), "{error}");
+        assert_eq!(error.lines().count(), 1);
+        std::fs::remove_dir_all(&out).unwrap();
+        (2..count).for_each(|index| std::fs::remove_file(photos.join(format!("{index}.png"))).unwrap());
+    }
 }
