@@ -30,14 +30,27 @@ const MAX_SIDE: u32 = 1600;
 const UPSAMPLED_SIDE: u32 = 1000;
 /// Number of features per photo.
 const FEATURES: u32 = 2048;
+/// Largest distance in pixels between a feature and the projection of its point, in photos of at most [`MAX_SIDE`] pixels; COLMAP's 4
+/// keeps wrong matches on repeated textures, such as paving.
+const MAX_REPROJECTION_ERROR: f64 = 2.;
 
 /// Minimum number of photos with one camera for which the camera has separate focal lengths and tangential distortion.
 const OPENCV_PHOTOS: usize = 10;
 /// Focal length of photos without EXIF, relative to their longer side: that of a phone's or a camera's wide lens. The estimate may fail if
 /// it is far off.
 const FOCAL: f64 = 0.85;
-/// [`FOCAL`] of a fisheye lens.
+/// [`FOCAL`] of a fisheye lens. For one of 0.38, the estimate succeeds from 0.25 to 0.6.
 const FISHEYE_FOCAL: f64 = 0.4;
+/// Fisheye models of COLMAP, and their numbers of focal lengths and of distortion coefficients.
+const FISHEYE_MODELS: [(&str, usize, usize); 7] = [
+    ("OPENCV_FISHEYE", 2, 4),
+    ("SIMPLE_RADIAL_FISHEYE", 1, 1),
+    ("RADIAL_FISHEYE", 1, 2),
+    ("THIN_PRISM_FISHEYE", 2, 8),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 2, 12),
+    ("SIMPLE_FISHEYE", 1, 0),
+    ("FISHEYE", 2, 0),
+];
 
 /// Share of the photos below which a report says what to try.
 const FEW_PLACED: f64 = 0.8;
@@ -369,7 +382,7 @@ impl Estimate<'_> {
         if self.record.has_features {
             return Ok(Outcome::Finished);
         }
-        let groups = group_by_camera(self.photos());
+        let groups = group_by_camera(self.photos(), self.record.camera_model.as_deref());
         let total = self.photos().len();
         if !self.record.has_cameras {
             // COLMAP would give photos a second camera if it was stopped between writing the first one and its photo.
@@ -415,17 +428,17 @@ impl Estimate<'_> {
         };
         let model = self.record.camera_model.as_deref().unwrap_or(default);
         let side = photos.iter().map(|photo| photo.width.max(photo.height)).max().unwrap_or(0);
-        let focal = match photos[0].focal {
-            Some(focal) => focal / f64::from(side),
-            None if model.contains("FISHEYE") => FISHEYE_FOCAL,
-            None => FOCAL,
-        };
         let list = self.write_list("photos.txt", photos.iter().map(|photo| photo.name.clone()))?;
-        Ok(Command::new("feature_extractor")
+        let focal = photos[0].focal.map_or(FOCAL, |focal| focal / f64::from(side));
+        let command = Command::new("feature_extractor");
+        let command = match fisheye_parameters(model, &photos[0]) {
+            Some(parameters) => command.option("ImageReader.camera_params", parameters),
+            None => command.option("ImageReader.default_focal_length_factor", focal),
+        };
+        Ok(command
             .path("image_path", &self.images)
             .path("image_list_path", &list)
             .option("ImageReader.camera_model", model)
-            .option("ImageReader.default_focal_length_factor", focal)
             .option("FeatureExtraction.use_gpu", false)
             .option("FeatureExtraction.max_image_size", MAX_SIDE)
             .option("SiftExtraction.max_num_features", FEATURES)
@@ -484,7 +497,12 @@ impl Estimate<'_> {
         };
         remove(&partial)?;
         fs::create_dir(&partial).map_err(Error::write(&partial))?;
-        let mapper = Command::new("mapper").path("image_path", &self.images).path("output_path", &partial);
+        let side = self.photos().iter().map(|photo| photo.width.max(photo.height)).max().unwrap_or(0);
+        let reduction = (f64::from(side) / f64::from(MAX_SIDE)).max(1.);
+        let mapper = Command::new("mapper")
+            .path("image_path", &self.images)
+            .path("output_path", &partial)
+            .option("Mapper.filter_max_reproj_error", MAX_REPROJECTION_ERROR * reduction);
         let outcome = self.run(mapper, Step::Poses, 0, self.photos().len());
         // COLMAP's program fails with this message if it places no photo, which is reported in other words.
         let is_without_model = |why: &Error| why.to_string().contains("sparse model");
@@ -559,13 +577,15 @@ impl Estimate<'_> {
 
 /// Photos by their cameras.
 struct CameraGroups {
-    /// Photos of one size, focal length and kind each: two or more, or one whose metadata tell its camera.
+    /// Photos of one size, focal length and kind each: two or more, or one whose camera isn't left to COLMAP, because its metadata tell it or
+    /// it is a fisheye.
     shared: Vec<Vec<Photo>>,
     /// The other photos.
     single: Vec<Photo>,
 }
 
-fn group_by_camera(photos: &[Photo]) -> CameraGroups {
+fn group_by_camera(photos: &[Photo], model: Option<&str>) -> CameraGroups {
+    let is_fisheye = FISHEYE_MODELS.iter().any(|(fisheye, ..)| model == Some(*fisheye));
     let mut groups = BTreeMap::<_, Vec<Photo>>::new();
     for photo in photos {
         let focal = photo.focal.map(|focal| focal.round() as u64);
@@ -575,10 +595,22 @@ fn group_by_camera(photos: &[Photo]) -> CameraGroups {
             .push(photo.clone());
     }
     let is_single = |group: &Vec<Photo>| {
-        matches!(group.as_slice(), [Photo { focal: None, is_equirectangular: false, .. }])
+        !is_fisheye && matches!(group.as_slice(), [Photo { focal: None, is_equirectangular: false, .. }])
     };
     let (single, shared): (Vec<_>, Vec<_>) = groups.into_values().partition(is_single);
     CameraGroups { shared, single: single.into_iter().flatten().collect() }
+}
+
+/// Returns the parameters at which the estimate of a fisheye lens starts, in COLMAP's notation: the focal length that EXIF tells or
+/// [`FISHEYE_FOCAL`], the photo's centre, and no distortion. Returns `None` for other models.
+///
+/// COLMAP 4.2 matches no photos of a fisheye whose focal length isn't given.
+fn fisheye_parameters(model: &str, photo: &Photo) -> Option<String> {
+    let &(_, focals, coefficients) = FISHEYE_MODELS.iter().find(|(fisheye, ..)| *fisheye == model)?;
+    let (width, height) = (f64::from(photo.width), f64::from(photo.height));
+    let focal = photo.focal.unwrap_or(FISHEYE_FOCAL * width.max(height));
+    let parameters = [vec![focal; focals], vec![width / 2., height / 2.], vec![0.; coefficients]].concat();
+    Some(parameters.iter().map(f64::to_string).collect::<Vec<_>>().join(","))
 }
 
 /// Returns the error for a folder of `total` photos of which fewer than two aren't `skipped`.
@@ -595,4 +627,34 @@ fn none_placed(count: usize, out: &Path) -> Error {
          taken from a single point; see {}",
         out.join("colmap.log").display()
     ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use globalsplat_capture::Lens;
+
+    #[test]
+    fn fisheyes_start_without_distortion() {
+        let photo = |focal| {
+            let name = "a.jpg".to_string();
+            Photo { name, width: 400, height: 300, focal, is_equirectangular: false }
+        };
+        let mut count = 0;
+        for model in CAMERA_MODELS {
+            let Some(parameters) = fisheye_parameters(model, &photo(None)) else {
+                assert!(!model.contains("FISHEYE"), "{model}");
+                continue;
+            };
+            count += 1;
+            let parameters: Vec<f64> = parameters.split(',').map(|number| number.parse().unwrap()).collect();
+            let lens = Lens::from_colmap(model, &parameters, [300, 400].into()).expect(model);
+            // A ray 0.5 radians to the right.
+            let point = lens.project(glam::DVec3::new(0.5f64.sin(), 0., 0.5f64.cos())).unwrap();
+            assert!(point.abs_diff_eq(glam::DVec2::new(200. + 0.5 * 160., 150.), 1e-9), "{model}: {point}");
+        }
+        assert_eq!(count, FISHEYE_MODELS.len());
+        let by_exif = fisheye_parameters("FISHEYE", &photo(Some(150.5)));
+        assert_eq!(by_exif.as_deref(), Some("150.5,150.5,200,150"));
+    }
 }

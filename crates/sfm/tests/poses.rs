@@ -1,10 +1,10 @@
 //! Poses that COLMAP finds for the photos of a synthetic scene, whose poses are known.
 
-use glam::{DMat3, DMat4, DVec3};
-use globalsplat_capture::{Camera, open_capture};
+use glam::DMat4;
+use globalsplat_capture::{Camera, Lens, open_capture};
 use globalsplat_sfm::{Colmap, Matching, PoseOptions, PoseReport, Step, estimate_poses};
 use globalsplat_synth::{Video, VideoSettings};
-use globalsplat_test_kit::skip;
+use globalsplat_test_kit::{pose_errors, skip};
 use std::collections::BTreeSet;
 use std::path::Path;
 
@@ -40,38 +40,6 @@ fn estimate(
         true
     });
     (report.unwrap().expect("nothing stops it"), steps)
-}
-
-fn rotation(pose: &DMat4) -> DMat3 {
-    DMat3::from_mat4(*pose)
-}
-
-/// Returns the nearest rotation, by Newton's iteration for the polar decomposition.
-fn nearest_rotation(sum: DMat3) -> DMat3 {
-    (0..30).fold(sum, |x, _| (x + x.inverse().transpose()) * 0.5)
-}
-
-/// Returns the largest errors of `found` after the similarity that fits it to `truth`: of positions, relative to the largest distance
-/// of two cameras, and of rotations, in degrees.
-fn largest_errors(found: &[DMat4], truth: &[DMat4]) -> (f64, f64) {
-    let turns = truth.iter().zip(found).map(|(truth, found)| rotation(truth) * rotation(found).transpose());
-    let turn = nearest_rotation(turns.fold(DMat3::ZERO, |sum, turn| sum + turn) * (1. / found.len() as f64));
-    let centres = |poses: &[DMat4]| poses.iter().map(|pose| pose.w_axis.truncate()).collect::<Vec<DVec3>>();
-    let (truths, founds) = (centres(truth), centres(found));
-    let mean = |centres: &[DVec3]| centres.iter().sum::<DVec3>() / centres.len() as f64;
-    let (mean_truth, mean_found) = (mean(&truths), mean(&founds));
-    let turned: Vec<DVec3> = founds.iter().map(|centre| turn * (*centre - mean_found)).collect();
-    let products =
-        turned.iter().zip(&truths).map(|(found, truth)| found.dot(*truth - mean_truth)).sum::<f64>();
-    let scale = products / turned.iter().map(|found| found.length_squared()).sum::<f64>();
-    let size = truths.iter().flat_map(|a| truths.iter().map(move |b| a.distance(*b))).fold(0., f64::max);
-    let offsets =
-        turned.iter().zip(&truths).map(|(found, truth)| (scale * *found + mean_truth).distance(*truth));
-    let angles = truth.iter().zip(found).map(|(truth, found)| {
-        let rest = rotation(truth).transpose() * turn * rotation(found);
-        (((rest.x_axis.x + rest.y_axis.y + rest.z_axis.z - 1.) / 2.).clamp(-1., 1.)).acos().to_degrees()
-    });
-    (offsets.fold(0., f64::max) / size, angles.fold(0., f64::max))
 }
 
 #[test]
@@ -110,8 +78,8 @@ fn poses_are_those_of_the_scene_and_a_stopped_estimate_continues() {
     // All photos have one camera, though the first ones were read before the estimate was stopped.
     assert!(cameras.iter().all(|camera| camera.intrinsics == cameras[0].intrinsics));
     let found: Vec<DMat4> = cameras.iter().map(|camera| camera.c2w).collect();
-    let (position, angle) = largest_errors(&found, &truth);
-    assert!(position < 0.005 && angle < 0.3, "{position} of the scene, {angle}°");
+    let errors = pose_errors(&found, &truth);
+    assert!(errors.iter().all(|&(position, angle)| position < 0.005 && angle < 0.3), "{errors:?}");
 
     // A finished estimate is reported again, and other pairs leave the features.
     let (again, steps) = estimate(&photos, &out, &options, &colmap);
@@ -127,12 +95,36 @@ fn poses_are_those_of_the_scene_and_a_stopped_estimate_continues() {
 }
 
 #[test]
+fn fisheyes_without_a_known_focal_length_are_placed() {
+    let Some(colmap) = find_colmap() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let (photos, out) = (folder.path().join("photos"), folder.path().join("out"));
+    std::fs::create_dir(&photos).unwrap();
+    let settings = VideoSettings { frames: 8, size: [300, 400].into(), pictures: vec![] };
+    let video = Video::new(1, 3, &settings);
+    let lens = Lens::from_colmap("SIMPLE_FISHEYE", &[180., 200., 150.], settings.size).unwrap();
+    for index in 0..settings.frames {
+        video.photo_through(index, &lens).save(photos.join(format!("{index}.png"))).unwrap();
+    }
+    let options = PoseOptions { camera_model: Some("SIMPLE_FISHEYE".into()), ..Default::default() };
+    let (report, _) = estimate(&photos, &out, &options, &colmap);
+    assert_eq!((report.placed, report.unplaced.len()), (8, 0), "{report}");
+}
+
+#[test]
 fn photos_that_share_nothing_are_an_error() {
     let Some(colmap) = find_colmap() else { return };
     let folder = tempfile::tempdir().unwrap();
     let (photos, out) = (folder.path().join("photos"), folder.path().join("out"));
     noise::write_noise(&photos);
-    let error = estimate_poses(&photos, &out, &PoseOptions::default(), &colmap, &mut |_| true).unwrap_err();
-    assert!(!error.is_request(), "{error}");
-    assert!(error.to_string().starts_with("COLMAP placed none of the 4 photos: "), "{error}");
+    for count in [4, 2] {
+        let options = PoseOptions::default();
+        let error = estimate_poses(&photos, &out, &options, &colmap, &mut |_| true).unwrap_err();
+        assert!(!error.is_request(), "{error}");
+        let error = error.to_string();
+        assert!(error.starts_with(&format!("COLMAP placed none of the {count} photos: ")), "{error}");
+        assert_eq!(error.lines().count(), 1);
+        std::fs::remove_dir_all(&out).unwrap();
+        (2..count).for_each(|index| std::fs::remove_file(photos.join(format!("{index}.png"))).unwrap());
+    }
 }

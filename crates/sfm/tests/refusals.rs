@@ -3,9 +3,11 @@
 
 #![cfg(unix)]
 
-use globalsplat_sfm::{Colmap, PoseOptions, estimate_poses};
+use globalsplat_sfm::{CaptureOptions, Colmap, PoseOptions, estimate_poses, make_capture};
+use globalsplat_test_kit::skip;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
+use std::process::Command;
 
 mod noise;
 
@@ -58,4 +60,44 @@ fn bad_requests_are_refused_in_one_sentence() {
     let unknown = PoseOptions { camera_model: Some("FISH".into()), ..plain() };
     let refused = refusal("photos", "out", unknown);
     assert!(refused.starts_with("the camera model is FISH, expected one of SIMPLE_PINHOLE, "), "{refused}");
+
+    // Photos taken with the lens cap on.
+    std::fs::create_dir(at("black")).unwrap();
+    for side in [40, 50] {
+        image::RgbImage::new(side, side).save(at(&format!("black/{side}.png"))).unwrap();
+    }
+    let capture_refusal = |source: &str| {
+        let options = CaptureOptions::default();
+        let error = make_capture(&at(source), &at("new"), &options, &colmap, |_| true).unwrap_err();
+        assert!(error.is_request(), "{error}");
+        error.to_string().replace(&format!("{}/", folder.path().display()), "")
+    };
+    assert_eq!(
+        capture_refusal("black"),
+        "black: the number of photos is 2, of which 2 can't be used (40.png is of a single colour, 50.png is of a single colour), expected \
+         2 or more different ones"
+    );
+    std::fs::remove_dir_all(at("new")).unwrap();
+
+    let ffmpeg = |arguments: &[&str]| {
+        Command::new("ffmpeg")
+            .args(["-v", "error", "-f", "lavfi", "-i"])
+            .args(arguments)
+            .current_dir(&folder)
+            .status()
+    };
+    if let Err(why) = ffmpeg(&["sine=duration=1", "sound.wav"]) {
+        return skip("ffmpeg", &why.to_string());
+    }
+    assert!(ffmpeg(&["testsrc=size=64x48", "-frames:v", "1", "-c:v", "mjpeg", "one.mkv"]).unwrap().success());
+    std::fs::write(at("notes.mp4"), "notes of a walk\n".repeat(200)).unwrap();
+    for (source, expected) in [
+        ("sound.wav", "sound.wav: the content is sound without pictures, expected a video"),
+        ("one.mkv", "one.mkv: the number of frames is 1, expected 2 or more"),
+        ("notes.mp4", "notes.mp4: "),
+    ] {
+        let refused = capture_refusal(source);
+        assert!(refused.starts_with(expected) && refused.lines().count() == 1, "{refused}");
+        assert!(!at("new").exists(), "{source}");
+    }
 }

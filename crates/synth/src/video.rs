@@ -7,8 +7,8 @@ use super::texture::Texture;
 use super::tracer::{SampleChoice, Tracer};
 use super::walk::{CameraSpace, Exhibit, walk};
 use super::{open, room, things};
-use glam::{DMat4, Vec2, Vec3, vec2, vec3};
-use globalsplat_capture::{Camera, ImageSize, Intrinsics};
+use glam::{DMat3, DMat4, DVec2, DVec3, Vec2, Vec3, vec2, vec3};
+use globalsplat_capture::{Camera, ImageSize, Intrinsics, Lens};
 use image::RgbImage;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -84,12 +84,37 @@ impl Video {
     /// Renders image `index`.
     pub fn photo(&self, index: usize) -> RgbImage {
         let camera = &self.cameras[index];
-        let exposure = self.sensor.exposure(index as f32 / self.cameras.len() as f32);
-        let half = 0.5 * vec2(camera.width as f32, camera.height as f32);
+        let size = ImageSize { height: camera.height, width: camera.width };
         let spread = 1. / (camera.intrinsics.fx as f32 * RAYS as f32);
-        let eye = camera.c2w.w_axis.truncate().as_vec3();
-        RgbImage::from_fn(camera.width, camera.height, |x, y| {
-            let pixel = y * camera.width + x;
+        self.render(index, size, spread, |at| Some(towards(camera, at)))
+    }
+
+    /// Renders what `lens` shows from the pose of image `index`. Pixels without a ray are black.
+    pub fn photo_through(&self, index: usize, lens: &Lens) -> RgbImage {
+        let size = lens.size();
+        let rotation = DMat3::from_mat4(self.cameras[index].c2w);
+        let middle = 0.5 * DVec2::new(size.width.into(), size.height.into());
+        let [left, right] = [middle, middle + DVec2::X].map(|at| lens.unproject(at).unwrap_or(DVec3::Z));
+        let spread = left.angle_between(right) as f32 / RAYS as f32;
+        self.render(index, size, spread, |at| {
+            lens.unproject(at.as_dvec2()).map(|ray| (rotation * ray).as_vec3())
+        })
+    }
+
+    /// Renders an image of `size` from the position of image `index`. `towards` returns the unit direction through a position in pixels,
+    /// or `None` for black; `spread` is the angle between neighbouring rays in radians.
+    fn render(
+        &self,
+        index: usize,
+        size: ImageSize,
+        spread: f32,
+        towards: impl Fn(Vec2) -> Option<Vec3>,
+    ) -> RgbImage {
+        let exposure = self.sensor.exposure(index as f32 / self.cameras.len() as f32);
+        let half = 0.5 * vec2(size.width as f32, size.height as f32);
+        let eye = self.cameras[index].c2w.w_axis.truncate().as_vec3();
+        RgbImage::from_fn(size.width, size.height, |x, y| {
+            let pixel = y * size.width + x;
             let mut random = Hash::new(self.seed, index as u32, pixel);
             let mut light = Vec3::ZERO;
             for sample in 0..Self::RAYS_PER_PIXEL {
@@ -98,7 +123,8 @@ impl Video {
                 let at = vec2(x as f32, y as f32) + (cell + jitter) / RAYS as f32;
                 let on_lamp = vec2(random.uniform(), random.uniform());
                 let choice = SampleChoice { turn: sample as usize, on_lamp };
-                let radiance = self.tracer.trace(eye, towards(camera, at), spread, choice);
+                let Some(ray) = towards(at) else { continue };
+                let radiance = self.tracer.trace(eye, ray, spread, choice);
                 // Clamp the radiance, so that a ray that hits a lamp doesn't dominate its pixel.
                 light += radiance.min(Vec3::splat(8.));
             }
@@ -196,4 +222,29 @@ fn mean_light(tracer: &Tracer, cameras: &[Camera]) -> Vec3 {
         }
     }
     (sum / (picked.len() * SIDE * SIDE) as f32).map(f32::exp)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pinhole_lens_shows_the_photo_and_no_light_comes_from_outside_a_lens() {
+        let settings = VideoSettings { frames: 2, size: [24, 32].into(), pictures: vec![] };
+        let video = Video::new(1, 3, &settings);
+        let Intrinsics { fx, fy, cx, cy } = video.cameras[1].intrinsics;
+        let lens = |model, parameters: &[f64]| Lens::from_colmap(model, parameters, settings.size).unwrap();
+        let through = video.photo_through(1, &lens("PINHOLE", &[fx, fy, cx, cy]));
+        let photo = video.photo(1);
+        // Rays that graze an edge may hit something else after rounding.
+        let same = through
+            .pixels()
+            .zip(photo.pixels())
+            .filter(|(a, b)| a.0.iter().zip(b.0).all(|(a, b)| a.abs_diff(b) <= 1));
+        assert!(same.count() >= 24 * 32 * 99 / 100);
+        // The circle of this lens has a radius of 5π pixels; the corners are 20 pixels from the centre.
+        let circle = video.photo_through(1, &lens("SIMPLE_FISHEYE", &[5., 16., 12.]));
+        assert!(circle.get_pixel(0, 0).0.iter().all(|value| *value < 8), "{:?}", circle.get_pixel(0, 0));
+        assert!(circle.get_pixel(16, 12).0.iter().any(|value| *value > 8));
+    }
 }

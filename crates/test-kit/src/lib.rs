@@ -2,6 +2,9 @@
 //! skipped tests.
 
 pub mod formats;
+mod poses;
+
+pub use poses::pose_errors;
 
 use std::ffi::OsString;
 use std::fs::OpenOptions;

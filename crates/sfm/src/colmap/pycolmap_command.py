@@ -19,12 +19,13 @@ threading.Thread(target=exit_with_parent, daemon=True).start()
 pycolmap.logging.logtostderr = True
 options = json.loads(sys.argv[2])
 extraction, matching = pycolmap.FeatureExtractionOptions(), pycolmap.FeatureMatchingOptions()
+pipeline = pycolmap.IncrementalPipelineOptions()
 sections = {
     "ImageReader": pycolmap.ImageReaderOptions(),
     "FeatureExtraction": extraction,
     "SiftExtraction": extraction.sift,
     "FeatureMatching": matching,
-    "Mapper": pycolmap.IncrementalPipelineOptions(),
+    "Mapper": pipeline.mapper,
 }
 camera_mode = pycolmap.CameraMode.AUTO
 for name in list(options):
@@ -56,7 +57,7 @@ elif sys.argv[1] == "spatial_matcher":
     pycolmap.match_spatial(database, matching_options=matching, device=pycolmap.Device.cpu)
 elif sys.argv[1] == "mapper":
     pycolmap.incremental_mapping(
-        database, options["image_path"], options["output_path"], options=sections["Mapper"]
+        database, options["image_path"], options["output_path"], options=pipeline
     )
 else:
     sys.exit(f"unknown command {sys.argv[1]}")
