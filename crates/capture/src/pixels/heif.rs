@@ -1,4 +1,4 @@
-//! HEIC and AVIF: files of boxes (ISO/IEC 14496-12, 23008-12). The size is read from them; the ffmpeg on the PATH decodes the pixels.
+//! HEIC and AVIF: files of boxes (ISO/IEC 14496-12, 23008-12). The size is read from them; programs on the PATH decode the pixels.
 
 use globalsplat_files::{Error, Result};
 use image::metadata::Orientation;
@@ -61,36 +61,46 @@ impl HeifHeader {
         }
     }
 
-    /// Decodes the image of `encoded`, the contents of `file`, and rotates it.
+    /// Decodes the image of `encoded`, the contents of `file`, and rotates it: by the ffmpeg on the PATH, else by libheif's program.
+    /// Versions of ffmpeg before 7.1 decode AVIF, and of HEIC at most one of the tiles that make up the photos of phones.
     ///
     /// # Errors
-    /// Returns an error if the file is truncated or damaged, or if there is no ffmpeg or it can't decode the file.
+    /// Returns an error if the file is truncated or damaged, or if neither program is installed and decodes it.
     pub fn decode(&self, encoded: &[u8], file: &Path) -> Result<DynamicImage> {
         let undecodable = |why: String| {
-            let expected = "a JPEG or PNG, to which heif-convert or sips converts it, or an ffmpeg on the PATH that decodes it";
+            let expected = "a JPEG or PNG, to which heif-convert or sips converts it, or on the PATH an ffmpeg or heif-dec that decodes it";
             Error::input(file, "the image", format!("undecodable ({why})"), expected)
         };
         if Boxes(encoded).any(|part| !part.is_whole) {
             return Err(undecodable("its data end before the image does".into()));
         }
-        let bitmap = run_ffmpeg(encoded).map_err(undecodable)?;
-        let mut image = image::load_from_memory_with_format(&bitmap, ImageFormat::Bmp)
-            .map_err(|e| undecodable(format!("ffmpeg wrote no image: {e}")))?;
-        let found = (image.width(), image.height());
-        if found != self.size {
-            // Some versions of ffmpeg decode a single one of the tiles that make up the image.
-            let ((width, height), (of_width, of_height)) = (found, self.size);
-            return Err(undecodable(format!(
-                "ffmpeg decodes {width}×{height} of its {of_width}×{of_height} pixels"
-            )));
-        }
-        image.apply_orientation(self.rotation);
-        Ok(image)
+        let by_ffmpeg = run_ffmpeg(encoded).and_then(|image| check_size("ffmpeg", image, self.size));
+        let image = by_ffmpeg.map(|mut image| {
+            image.apply_orientation(self.rotation);
+            image
+        });
+        // libheif rotates.
+        let by_libheif =
+            || run_libheif(encoded).map(|image| check_size("libheif", image?, self.rotated_size()));
+        image.or_else(|why| by_libheif().unwrap_or(Err(why))).map_err(undecodable)
     }
 }
 
-/// Returns `encoded` as a BMP, or why ffmpeg can't convert it.
-fn run_ffmpeg(encoded: &[u8]) -> std::result::Result<Vec<u8>, String> {
+/// Returns `image` if it has the given size: a single tile is smaller than the image.
+fn check_size(
+    program: &str,
+    image: DynamicImage,
+    size: (u32, u32),
+) -> std::result::Result<DynamicImage, String> {
+    let (width, height) = (image.width(), image.height());
+    if (width, height) == size {
+        return Ok(image);
+    }
+    Err(format!("{program} decodes {width}×{height} of its {}×{} pixels", size.0, size.1))
+}
+
+/// Decodes `encoded` by ffmpeg without rotating it, or returns why ffmpeg can't.
+fn run_ffmpeg(encoded: &[u8]) -> std::result::Result<DynamicImage, String> {
     let mut command = Command::new("ffmpeg");
     // The cache lets ffmpeg seek in its standard input.
     command
@@ -123,20 +133,41 @@ fn run_ffmpeg(encoded: &[u8]) -> std::result::Result<Vec<u8>, String> {
     });
     let output = output.map_err(|e| format!("ffmpeg failed: {e}"))?;
     if output.status.success() && !output.stdout.is_empty() {
-        return Ok(output.stdout);
+        return image::load_from_memory_with_format(&output.stdout, ImageFormat::Bmp)
+            .map_err(|e| format!("ffmpeg wrote no image: {e}"));
     }
     let message = String::from_utf8_lossy(&output.stderr);
-    // The cache reports that it can't seek to the end of a pipe, which is no error.
+    // The cache reports that it can't seek to the end of a pipe, which is no error. A line may begin with an address: `[mov @ 0x…] `.
     let lines = message
         .lines()
         .map(str::trim)
-        .filter(|line| !line.starts_with("[cache") && !line.starts_with("Last message"));
+        .filter(|line| !line.starts_with("[cache") && !line.starts_with("Last message"))
+        .map(|line| {
+            line.strip_prefix('[').and_then(|line| line.split_once("] ")).map_or(line, |(_, line)| line)
+        });
     let lines = lines.collect::<Vec<_>>().join("; ");
     Err(if lines.is_empty() {
         format!("ffmpeg failed, {}", output.status)
     } else {
         format!("ffmpeg: {lines}")
     })
+}
+
+/// Decodes and rotates `encoded` by libheif's program, which has two names, or returns why it can't. Returns `None` if it isn't on the PATH.
+fn run_libheif(encoded: &[u8]) -> Option<std::result::Result<DynamicImage, String>> {
+    let run = |program: &str| {
+        let failed = |e: &dyn std::fmt::Display| format!("{program} failed: {e}");
+        let folder = tempfile::tempdir().map_err(|e| failed(&e))?;
+        let [heic, png] = ["photo.heic", "photo.png"].map(|name| folder.path().join(name));
+        std::fs::write(&heic, encoded).map_err(|e| failed(&e))?;
+        let output = Command::new(program).args([&heic, &png]).stdin(Stdio::null()).output();
+        let output = match output {
+            Err(e) if e.kind() == ErrorKind::NotFound => return Ok(None),
+            output => output.map_err(|e| failed(&e))?,
+        };
+        image::open(&png).map(Some).map_err(|_| failed(&String::from_utf8_lossy(&output.stderr).trim()))
+    };
+    ["heif-dec", "heif-convert"].into_iter().find_map(|program| run(program).transpose())
 }
 
 /// A part of a file.
