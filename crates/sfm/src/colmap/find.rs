@@ -40,11 +40,16 @@ impl Colmap {
         }
         let program = Self::new("colmap".into(), false);
         let python = python_programs().into_iter().find_map(|python| Self::new(python, true));
-        let found = [program, python].into_iter().flatten();
-        let supported = found.filter(|colmap| colmap.check().is_ok());
-        supported.max_by_key(|colmap| parse_version(&colmap.version)).ok_or_else(|| {
+        let newest = |found: [Option<Self>; 2]| {
+            found
+                .into_iter()
+                .flatten()
+                .max_by_key(|colmap| (colmap.check().is_ok(), parse_version(&colmap.version)))
+        };
+        let found = newest([program, python]).ok_or_else(|| {
             Error::request(format!("COLMAP, which finds the poses of photos, isn't installed ({GET})"))
-        })
+        })?;
+        found.check().map(|()| found)
     }
 
     /// Returns the COLMAP at `path`, a `colmap` program or a Python that has pycolmap.
