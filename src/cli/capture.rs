@@ -40,6 +40,10 @@ pub struct Capture {
     /// nearby by GPS, and every pair among 64; or auto, which is sequential for videos and more than 200 photos
     #[arg(long, value_name = "PAIRS", default_value = "auto", value_parser = str::parse::<Matching>)]
     matching: Matching,
+    /// Folder of masks named like the photos, as in photo.jpg.png or photo.png: nothing is matched in black pixels; by default the
+    /// folder `masks` among the photos
+    #[arg(long, value_name = "DIR")]
+    masks: Option<PathBuf>,
     /// Print the result as one JSON object
     #[arg(long)]
     json: bool,
@@ -50,7 +54,12 @@ impl Capture {
         let camera_model = self.camera_model.map(|model| model.to_uppercase());
         let options = CaptureOptions {
             video: VideoOptions { frames: self.frames },
-            poses: PoseOptions { camera_model, matching: self.matching, keeps_finished: false },
+            poses: PoseOptions {
+                camera_model,
+                matching: self.matching,
+                masks: self.masks,
+                keeps_finished: false,
+            },
         };
         if self.frames.is_some() && self.source.is_dir() {
             return Err(Error::request("--frames is for videos, and the source is a folder of photos").into());
@@ -65,10 +74,17 @@ impl Capture {
             let out = self.out.display();
             let splat = Path::new(self.out.file_name().unwrap_or("scene".as_ref())).with_extension("ply");
             println!("{out}: {}", report.poses);
-            println!("next: globalsplat refine --scene {out} --out {}", splat.display());
+            println!("next: globalsplat refine --scene {} --out {}", quoted(&self.out), quoted(&splat));
         }
         Ok(())
     }
+}
+
+/// Returns `path` as an argument of a shell, in quotes if it needs them.
+fn quoted(path: &Path) -> String {
+    let path = path.display().to_string();
+    let is_plain = |c: char| c.is_alphanumeric() || "/._-+@:,".contains(c);
+    if path.chars().all(is_plain) { path } else { format!("'{}'", path.replace('\'', r"'\''")) }
 }
 
 /// Makes a capture of `source` in the folder `out`, with progress on standard error. A request to stop ends the program with an error.
@@ -140,14 +156,15 @@ impl SceneSource {
         self.photos.is_some()
     }
 
-    /// Returns the path of the capture. If it has to be made, it is made beside the output `out`.
-    pub fn path(&self, out: &Path, stop: &StopRequest) -> Result<PathBuf> {
+    /// Returns the path of the capture. If it has to be made, it is made beside the output `out`, with the masks in the folder `masks`.
+    pub fn path(&self, masks: Option<&Path>, out: &Path, stop: &StopRequest) -> Result<PathBuf> {
         let Some(photos) = &self.photos else { return Ok(self.scene.clone().unwrap_or_default()) };
         let name = out.file_name().unwrap_or_default().to_string_lossy();
         let stem = name.rsplit_once('.').map_or(&*name, |(stem, _)| stem);
         let capture = out.with_file_name(format!("{}_capture", stem.trim_end_matches(".compressed")));
         // A capture that `globalsplat capture` made with other settings is used as it is.
-        let poses = PoseOptions { keeps_finished: true, ..PoseOptions::default() };
+        let masks = masks.map(Path::to_owned);
+        let poses = PoseOptions { keeps_finished: true, masks, ..PoseOptions::default() };
         let report =
             run_make_capture(photos, &capture, &CaptureOptions { poses, ..Default::default() }, stop)?;
         eprintln!("{}: {}", capture.display(), report.poses);

@@ -4,7 +4,7 @@ use crate::colmap::{
     CAMERA_MODELS, Colmap, Command, ModelSummary, Outcome, exhaustive_pairs, read_models, sequential_pairs,
 };
 use crate::make_capture::VIDEO_FILE;
-use crate::photos::{FoundPhoto, Photo, SkippedPhoto, find_photos, import_photos};
+use crate::photos::{FoundPhoto, MASKS, Photo, SkippedPhoto, find_photos, import_photos};
 use crate::record::{FILE, Record};
 use globalsplat_files::{Error, Result, write_atomically};
 use serde::{Deserialize, Serialize};
@@ -90,6 +90,9 @@ pub struct PoseOptions {
     pub camera_model: Option<String>,
     /// Choice of pairs.
     pub matching: Matching,
+    /// Folder of masks, named like the photos; by default the folder `masks` among the photos, if there is one. Black pixels have no
+    /// features.
+    pub masks: Option<PathBuf>,
     /// `true` to use a finished estimate as it is, whatever settings it was made with.
     pub keeps_finished: bool,
 }
@@ -271,11 +274,12 @@ fn prepare_record(
     colmap: &Colmap,
     found: Vec<FoundPhoto>,
 ) -> Result<Record> {
-    let PoseOptions { camera_model, matching, .. } = options.clone();
+    let PoseOptions { camera_model, matching, masks, .. } = options.clone();
     let new = Record {
         colmap: colmap.name_and_version(),
         camera_model,
         matching,
+        masks,
         found,
         photos: None,
         skipped: vec![],
@@ -299,6 +303,9 @@ fn prepare_record(
     }
     if options.keeps_finished && old.report.is_some() {
         return Ok(old);
+    }
+    if new.masks != old.masks {
+        return Ok(new);
     }
     let mut record = Record { colmap: new.colmap, camera_model: new.camera_model, matching, ..old.clone() };
     if (&record.colmap, &record.camera_model) != (&old.colmap, &old.camera_model) {
@@ -344,7 +351,8 @@ impl Estimate<'_> {
         if self.record.photos.is_none() {
             let total = self.record.found.len();
             let mut report = |done| (self.on_progress)(PoseProgress { step: Step::Photos, done, total });
-            let imported = import_photos(source, &self.record.found, &self.images, &mut report)?;
+            let masks = self.record.masks.as_deref();
+            let imported = import_photos(source, &self.record.found, masks, &self.images, &mut report)?;
             let Some(imported) = imported else { return Ok(Outcome::Stopped) };
             if imported.photos.len() < 2 {
                 return Err(too_few(source, total, &imported.skipped));
@@ -435,6 +443,8 @@ impl Estimate<'_> {
             Some(parameters) => command.option("ImageReader.camera_params", parameters),
             None => command.option("ImageReader.default_focal_length_factor", focal),
         };
+        let masks = self.out.join(MASKS);
+        let command = if masks.is_dir() { command.path("ImageReader.mask_path", &masks) } else { command };
         Ok(command
             .path("image_path", &self.images)
             .path("image_list_path", &list)

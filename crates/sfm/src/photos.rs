@@ -1,7 +1,8 @@
 //! Photos of a folder, checked and brought into a capture's folder of images.
 
 use globalsplat_capture::{
-    decode_photo, encode_photo, exif_focal, is_equirectangular, list_photos, read_image_size,
+    decode_photo, encode_photo, exif_focal, find_masks, is_equirectangular, list_photos, read_image_size,
+    read_mask,
 };
 use globalsplat_files::{Error, Result, checksum, write_atomically};
 use image::{Rgb, RgbImage};
@@ -10,6 +11,9 @@ use serde::{Deserialize, Serialize};
 use std::collections::{HashMap, HashSet};
 use std::fs;
 use std::path::{Path, PathBuf};
+
+/// Name of the folder of masks, among the photos of a user and in a capture.
+pub(crate) const MASKS: &str = "masks";
 
 /// Maximum difference between values of a photo that shows nothing, such as one taken with the lens cap on.
 const BLANK: u8 = 8;
@@ -76,14 +80,16 @@ pub(crate) struct ImportedPhotos {
 
 /// Brings the photos `found` in `source` into the folder `images`, by a hard link where the file system allows it. COLMAP
 /// reads pixels as they are stored: photos that EXIF says to rotate are written upright, and those that aren't JPEGs or PNGs are
-/// converted, with their opacity as a mask beside `images`. Returns `None` if `on_photo`, which gets the number of
-/// photos that were looked at, returns `false`.
+/// converted. Masks, which are files in `masks` or the opacity of a converted photo, are written to the folder [`MASKS`] beside `images`,
+/// each of the size of its photo. Returns `None` if `on_photo`, which gets the number of photos that were looked at, returns `false`.
 ///
 /// # Errors
-/// Returns an error if a file can't be written, or if `source` is `images` and a photo in it would need another name or other contents.
+/// Returns an error if a file can't be written, if a mask can't be read, if `masks` is given and has none for any photo, or if `source` is
+/// `images` and a photo in it would need another name or other contents.
 pub(crate) fn import_photos(
     source: &Path,
     found: &[FoundPhoto],
+    masks: Option<&Path>,
     images: &Path,
     on_photo: &mut dyn FnMut(usize) -> bool,
 ) -> Result<Option<ImportedPhotos>> {
@@ -102,11 +108,13 @@ pub(crate) fn import_photos(
     let is_in_place =
         source.canonicalize().is_ok_and(|source| images.canonicalize().is_ok_and(|images| images == source));
     let all_names: HashSet<&str> = found.iter().map(|photo| photo.name.as_str()).collect();
+    let mask_files = find_mask_files(source, found, masks)?;
     let mut names = HashSet::new();
     let mut done = imported.skipped.len();
     // Few photos at a time, for progress and memory.
     for few in distinct.chunks(2 * rayon::current_num_threads()) {
-        let read = |photo: &&FoundPhoto| inspect(&source.join(&photo.name));
+        let mask_of = |photo: &FoundPhoto| mask_files.get(photo.name.as_str()).map(PathBuf::as_path);
+        let read = |photo: &&FoundPhoto| inspect(&source.join(&photo.name), mask_of(photo));
         let read: Vec<_> = few.par_iter().map(read).collect();
         for (photo, inspected) in few.iter().zip(read) {
             match inspected {
@@ -119,16 +127,17 @@ pub(crate) fn import_photos(
                     let name = list_name(&name, &mut names);
                     if !is_in_place {
                         place(&path, inspected.contents, &images.join(&name))?;
-                        let target = images.with_file_name("masks").join(format!("{name}.png"));
-                        match (mask_of(source, &photo.name), inspected.mask) {
-                            (Some(mask), _) => place(&mask, None, &target)?,
-                            (None, Some(mask)) => place(&path, Some(mask), &target)?,
-                            (None, None) => {}
-                        }
                     } else if inspected.contents.is_some() || name != photo.name {
                         let found = "one that COLMAP can't read as it is, by its name, format or rotation";
                         let expected = "an output whose images aren't the photos themselves";
                         return Err(Error::input(path, "the photo", found, expected));
+                    }
+                    let target = images.with_file_name(MASKS).join(format!("{name}.png"));
+                    match inspected.mask? {
+                        Some(mask) => place(&path, Some(mask), &target)?,
+                        // A run with other masks may have left one.
+                        None if !is_in_place => drop(fs::remove_file(target)),
+                        None => {}
                     }
                     imported.photos.push(Photo {
                         name,
@@ -156,11 +165,22 @@ fn converted_name(name: &str, all_names: &HashSet<&str>) -> String {
     if all_names.contains(other.as_str()) { format!("{name}.jpg") } else { other }
 }
 
-/// Returns the mask of the photo `name` in the folder `masks` of `source`, if there is one.
-fn mask_of(source: &Path, name: &str) -> Option<PathBuf> {
-    let masks = source.join("masks");
-    let stem = Path::new(name).with_extension("").to_string_lossy().into_owned();
-    [name, &stem].map(|name| masks.join(format!("{name}.png"))).into_iter().find(|mask| mask.is_file())
+/// Returns the masks of the photos `found`, by the photo's name: those in `masks`, or in the folder [`MASKS`] of `source`.
+fn find_mask_files<'a>(
+    source: &Path,
+    found: &'a [FoundPhoto],
+    masks: Option<&Path>,
+) -> Result<HashMap<&'a str, PathBuf>> {
+    let names: Vec<&str> = found.iter().map(|photo| photo.name.as_str()).collect();
+    let folder = masks.map_or_else(|| source.join(MASKS), Path::to_owned);
+    let files = find_masks(std::slice::from_ref(&folder), &names);
+    let files: HashMap<_, _> =
+        names.iter().zip(files).filter_map(|(name, file)| Some((*name, file?))).collect();
+    if masks.is_some() && files.is_empty() {
+        let expected = format!("{}.png", names.first().unwrap_or(&"photo.jpg"));
+        return Err(Error::input(folder, "the folder", "without a mask for any photo", expected));
+    }
+    Ok(files)
 }
 
 /// Returns a name that COLMAP's lists can hold, and that differs from `taken`, to which it is added.
@@ -185,12 +205,12 @@ struct Inspected {
     contents: Option<Vec<u8>>,
     /// `true` if the contents are a JPEG, and the file has another extension.
     is_converted: bool,
-    /// PNG of the photo's opacity, if it has one and `contents` lacks it.
-    mask: Option<Vec<u8>>,
+    /// PNG of the photo's mask, or of its opacity, if it has one and `contents` lacks it.
+    mask: Result<Option<Vec<u8>>>,
 }
 
-/// Decodes the photo at `path`; returns why it can't be used if it is damaged or shows nothing.
-fn inspect(path: &Path) -> Result<Inspected, String> {
+/// Decodes the photo at `path` and its mask in the file `mask`; returns why it can't be used if it is damaged or shows nothing.
+fn inspect(path: &Path, mask: Option<&Path>) -> Result<Inspected, String> {
     let refuse = |why: Error| match why {
         Error::Input { found, .. } => found,
         other => other.to_string(),
@@ -215,18 +235,37 @@ fn inspect(path: &Path) -> Result<Inspected, String> {
     let is_rotated = pixels.dimensions() != (width, height);
     let is_readable = (is_png || is_jpeg) && !is_rotated;
     let contents = (!is_readable).then(|| encode_photo(&pixels, !is_png)).transpose().map_err(refuse)?;
-    let mask = decoded.alpha.filter(|_| !is_readable).map(|alpha| {
-        let (width, height) = alpha.dimensions();
-        let grey = RgbImage::from_fn(width, height, |x, y| Rgb([alpha.get_pixel(x, y)[0]; 3]));
-        encode_photo(&grey, false)
-    });
+    let levels = match (mask, decoded.alpha) {
+        // COLMAP compares a mask with its photo pixel by pixel.
+        (Some(file), _) => check_aspect(file, pixels.dimensions())
+            .and_then(|()| read_mask(file, pixels.dimensions()))
+            .map(Some),
+        (None, Some(alpha)) if !is_readable => {
+            let (width, height) = alpha.dimensions();
+            Ok(Some(RgbImage::from_fn(width, height, |x, y| Rgb([alpha.get_pixel(x, y)[0]; 3]))))
+        }
+        (None, _) => Ok(None),
+    };
+    let mask = levels.and_then(|levels| levels.map(|levels| encode_photo(&levels, false)).transpose());
     Ok(Inspected {
         width: pixels.width(),
         height: pixels.height(),
         contents,
         is_converted: !is_png && !is_jpeg,
-        mask: mask.transpose().map_err(refuse)?,
+        mask,
     })
+}
+
+/// Checks that the mask `file` has `size` = (width, height), the size of its photo, or both sides by one factor.
+fn check_aspect(file: &Path, size: (u32, u32)) -> Result<()> {
+    let found = read_image_size(file)?;
+    let [(w, h), (width, height)] = [found, size].map(|(w, h)| (f64::from(w), f64::from(h)));
+    // Each side of the mask may be rounded.
+    if (w * height - h * width).abs() <= (width + height) / 2. {
+        return Ok(());
+    }
+    let expected = format!("{}×{} pixels as its upright photo, or both by one factor", size.0, size.1);
+    Err(Error::input(file, "the mask", format!("{}×{} pixels", found.0, found.1), expected))
 }
 
 /// Writes `contents` to `target`, or links `target` to the file `source`, copying it if it can't be linked.
@@ -256,7 +295,7 @@ mod tests {
     }
 
     fn import(source: &Path, images: &Path) -> ImportedPhotos {
-        import_photos(source, &find_photos(source).unwrap().0, images, &mut |_| true).unwrap().unwrap()
+        import_photos(source, &find_photos(source).unwrap().0, None, images, &mut |_| true).unwrap().unwrap()
     }
 
     #[test]
@@ -296,8 +335,12 @@ mod tests {
         write_photo(&source.join("a.png"), 1);
         // The contents of a PNG under another extension.
         write_photo(&source.join("b.jpg"), 2);
-        fs::create_dir_all(source.join("masks")).unwrap();
-        fs::write(source.join("masks/b.png"), "a mask").unwrap();
+        // A mask of half the photo's size.
+        let masks = source.join("masks");
+        fs::create_dir_all(&masks).unwrap();
+        RgbImage::from_fn(8, 4, |x, _| Rgb([if x < 4 { 255 } else { 0 }; 3]))
+            .save(masks.join("b.png"))
+            .unwrap();
         let ImportedPhotos { photos, skipped } = import(&source, &images);
         assert!(skipped.is_empty(), "{skipped:?}");
         let names: Vec<&str> = photos.iter().map(|photo| photo.name.as_str()).collect();
@@ -305,8 +348,38 @@ mod tests {
         let mask = globalsplat_capture::read_image(&folder.path().join("masks/a.jpg.png")).unwrap();
         assert!(mask.enumerate_pixels().all(|(x, _, level)| level[0] == if x < 8 { 0 } else { 255 }));
         let converted = globalsplat_capture::read_image(&images.join("a.jpg")).unwrap();
-        assert_eq!(fs::read(folder.path().join("masks/b.jpg.jpg.png")).unwrap(), b"a mask");
+        let mask = globalsplat_capture::read_image(&folder.path().join("masks/b.jpg.jpg.png")).unwrap();
+        assert_eq!((mask.dimensions(), mask.get_pixel(2, 2)[0], mask.get_pixel(13, 5)[0]), ((16, 8), 255, 0));
         assert!(converted.get_pixel(12, 4)[0].abs_diff(180) < 12, "{:?}", converted.get_pixel(12, 4));
+    }
+
+    #[test]
+    fn masks_of_another_folder_replace_those_of_an_earlier_run() {
+        let folder = tempfile::tempdir().unwrap();
+        let [source, images, masks] = ["photos", "out/images", "other"].map(|name| folder.path().join(name));
+        let import = |masks| import_photos(&source, &find_photos(&source)?.0, masks, &images, &mut |_| true);
+        fs::create_dir_all(source.join("masks")).unwrap();
+        fs::create_dir_all(&masks).unwrap();
+        write_photo(&source.join("a.png"), 1);
+        write_photo(&source.join("b.png"), 2);
+        write_photo(&source.join("masks/a.png"), 3);
+        import(None).unwrap();
+        let written = |name: &str| folder.path().join("out/masks").join(name).exists();
+        assert_eq!(["a.png.png", "b.png.png"].map(written), [true, false]);
+        let error = import(Some(&masks)).unwrap_err().to_string();
+        assert!(
+            error.ends_with("other: the folder is without a mask for any photo, expected a.png.png"),
+            "{error}"
+        );
+        write_photo(&masks.join("b.png.png"), 2);
+        import(Some(&masks)).unwrap();
+        assert_eq!(["a.png.png", "b.png.png"].map(written), [false, true]);
+        RgbImage::new(8, 16).save(masks.join("b.png.png")).unwrap();
+        let error = import(Some(&masks)).unwrap_err().to_string();
+        assert!(error.contains("the mask is 8×16 pixels, expected 16×8 pixels"), "{error}");
+        fs::write(masks.join("b.png.png"), "no image").unwrap();
+        let error = import(Some(&masks)).unwrap_err().to_string();
+        assert!(error.contains("b.png.png: the image"), "{error}");
     }
 
     #[test]
@@ -319,8 +392,8 @@ mod tests {
         let before = fs::read(images.join("a_1.png")).unwrap();
         assert_eq!(import(&images, &images).photos.len(), 2);
         write_photo(&images.join("a 1.png"), 3);
-        let error =
-            import_photos(&images, &find_photos(&images).unwrap().0, &images, &mut |_| true).unwrap_err();
+        let error = import_photos(&images, &find_photos(&images).unwrap().0, None, &images, &mut |_| true)
+            .unwrap_err();
         assert!(error.to_string().contains("a 1.png: the photo is one that COLMAP can't read"), "{error}");
         assert_eq!(fs::read(images.join("a_1.png")).unwrap(), before);
         assert_eq!(fs::read_dir(&images).unwrap().count(), 3);

@@ -5,7 +5,7 @@ use crate::photos::{FoundPhoto, Photo, SkippedPhoto};
 use globalsplat_files::{Error, Result, read_text, write_json};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Name of the file, in the capture's folder.
 pub(crate) const FILE: &str = "capture.json";
@@ -19,6 +19,8 @@ pub(crate) struct Record {
     pub camera_model: Option<String>,
     /// Choice of pairs.
     pub matching: Matching,
+    /// Folder of masks that the user named.
+    pub masks: Option<PathBuf>,
     /// Photos in the folder of the user.
     pub found: Vec<FoundPhoto>,
     /// Photos in the folder of images, once they are all there.

@@ -5,6 +5,7 @@ use globalsplat_capture::{Camera, Lens, open_capture};
 use globalsplat_sfm::{Colmap, Matching, PoseOptions, PoseReport, Step, estimate_poses};
 use globalsplat_synth::{Video, VideoSettings};
 use globalsplat_test_kit::{pose_errors, skip};
+use image::RgbImage;
 use std::collections::BTreeSet;
 use std::path::Path;
 
@@ -109,6 +110,21 @@ fn fisheyes_without_a_known_focal_length_are_placed() {
     let options = PoseOptions { camera_model: Some("SIMPLE_FISHEYE".into()), ..Default::default() };
     let (report, _) = estimate(&photos, &out, &options, &colmap);
     assert_eq!((report.placed, report.unplaced.len()), (8, 0), "{report}");
+}
+
+#[test]
+fn masked_pixels_have_no_features() {
+    let Some(colmap) = find_colmap() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let [photos, masks, out] = ["photos", "masks", "out"].map(|name| folder.path().join(name));
+    let count = write_photos(&photos).len();
+    std::fs::create_dir(&masks).unwrap();
+    for index in 0..count {
+        RgbImage::new(480, 360).save(masks.join(format!("{index:02}.png"))).unwrap();
+    }
+    let options = PoseOptions { masks: Some(masks), ..Default::default() };
+    let error = estimate_poses(&photos, &out, &options, &colmap, &mut |_| true).unwrap_err().to_string();
+    assert!(error.starts_with("COLMAP placed none of the 10 photos: "), "{error}");
 }
 
 #[test]

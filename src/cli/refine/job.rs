@@ -55,7 +55,7 @@ impl RefineJob {
             check_writable_png(sheet)?;
         }
         let stop = StopRequest::install()?;
-        let path = self.scene.path(&self.out, &stop)?;
+        let path = self.scene.path(self.masks.as_deref(), &self.out, &stop)?;
         // The time budget begins after the poses of photos are found.
         let clock = match self.scene.is_unposed() {
             true => Instant::now(),

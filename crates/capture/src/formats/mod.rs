@@ -17,11 +17,11 @@ pub use cameras_json::write_cameras_json;
 pub use chunk::{CHUNK_EXTENSION, CHUNK_INDEX_FILE, Chunk, camera_numbers};
 pub use colmap::{Point, read_points};
 pub use photo_folder::{PhotoList, list_photos};
+pub use photos::find_masks;
 
 use crate::capture::{Capture, Purpose};
 use globalsplat_files::{Error, Result};
 use natural::natural_order;
-pub(crate) use photos::find_masks;
 use std::path::{Path, PathBuf};
 
 /// Function that looks for a capture of one format at a path: a folder, or the file that describes the capture.

@@ -51,8 +51,8 @@ pub(super) fn find_photos(bases: &[PathBuf], names: &[&str]) -> Vec<Option<PathB
 }
 
 /// Looks for the masks of the photos `names` in `folders`: files with the name of the photo, with the extension of an image added or
-/// in place of its own. Photos of the same name but for the extension share a mask.
-pub(crate) fn find_masks(folders: &[PathBuf], names: &[&str]) -> Vec<Option<PathBuf>> {
+/// in place of its own. Photos of the same name but for the extension share a mask. Returns one path, or `None`, for each photo.
+pub fn find_masks(folders: &[PathBuf], names: &[&str]) -> Vec<Option<PathBuf>> {
     if !folders.iter().any(|folder| folder.is_dir()) {
         return vec![None; names.len()];
     }

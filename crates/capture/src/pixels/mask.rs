@@ -14,7 +14,7 @@ use std::path::Path;
 ///
 /// # Errors
 /// Fails if the file can't be read or decoded.
-pub(crate) fn read_mask(file: &Path, size: (u32, u32)) -> Result<RgbImage> {
+pub fn read_mask(file: &Path, size: (u32, u32)) -> Result<RgbImage> {
     let encoded = std::fs::read(file).map_err(Error::read(file))?;
     let mut mask = image::DynamicImage::from(decode_photo(&encoded, file, size)?.pixels).into_luma8();
     if mask.pixels().all(|level| level[0] <= 1) {

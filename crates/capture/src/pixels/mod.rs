@@ -20,5 +20,6 @@ pub use metadata::{exif_focal, is_equirectangular};
 pub use planes::{CHANNELS, Planes};
 pub use resample::{Region, Resampler};
 
-pub(crate) use mask::{grey_to_rgb, multiply, read_mask};
+pub use mask::read_mask;
+pub(crate) use mask::{grey_to_rgb, multiply};
 pub(crate) use undistort::{LookupTable, ViewPixels, undistort};
