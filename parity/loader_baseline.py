@@ -109,7 +109,8 @@ class Chunks(IterableDataset):
         worker = get_worker_info()
         paths = self.paths[worker.id :: worker.num_workers]
         random.seed(worker.id)
-        while True:
+        # A worker without chunks has no samples.
+        while paths:
             random.shuffle(paths)
             for path in paths:
                 scenes = torch.load(path, weights_only=True)
