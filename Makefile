@@ -56,7 +56,8 @@ test:
 quick: check-crates check-format check-lints
 	$(CARGO) test --release --locked --lib
 
-CHECKS := check-crates check-format check-lints check-library check-docs check-tests
+# WITHOUT names checks to leave out, such as one that has just been run.
+CHECKS := $(filter-out $(WITHOUT),check-crates check-format check-lints check-library check-docs check-tests)
 .PHONY: checks $(CHECKS)
 checks: $(CHECKS) parity
 $(filter-out check-crates,$(CHECKS)): venv
