@@ -1,10 +1,10 @@
 use super::{
-    check_former_option, check_views, device, model, open_masked_capture, print_json, progress, ranks,
-    report_downscaling, stop_flag, warn, warn_of_many,
+    check_former_option, check_views, device, model, open_masked_capture, parse_holdout, parse_photo_size,
+    print_json, progress, ranks, report_downscaling, stop_flag, warn, warn_of_many,
 };
 use anyhow::Result;
 use clap::{ArgGroup, Args};
-use globalsplat::data::{Capture, Dataset, Holdout, Split, View};
+use globalsplat::data::{Capture, Dataset, Holdout, PhotoSize, Split, View};
 use globalsplat::device::peak_memory_bytes;
 use globalsplat::error::Error;
 use globalsplat::eval::{
@@ -72,8 +72,9 @@ pub struct Eval {
     /// a whole word, else the name of its folder
     #[arg(long, value_name = "NAME", requires = "data", conflicts_with = "scene")]
     dataset: Option<String>,
-    /// Target views: every:N, every:N+K, or none for the capture's own test split; by default as in the model's training
-    #[arg(long, value_name = "WHICH", conflicts_with_all = ["splat", "renders", "data"])]
+    /// Target views: every:N, every:N+K, or none for the capture's own test split; by default as in the model's training, and for
+    /// splats and images all
+    #[arg(long, value_name = "WHICH", conflicts_with = "data")]
     holdout: Option<String>,
     /// Number of input photos, spread along the camera path; by default all that are not held out
     #[arg(long, value_name = "N", conflicts_with_all = ["splat", "renders", "data"])]
@@ -88,6 +89,10 @@ pub struct Eval {
     /// images, for images from other methods 256 on a dataset, and on one capture the size of its photos
     #[arg(long, value_name = "PIXELS")]
     pictures_at: Option<u32>,
+    /// Size of the scored images of a splat or of another method on one capture: their longer side, as in 1600, or WxH, to which
+    /// photos are cropped and resized; by default the size of the photos
+    #[arg(long, value_name = "N|WxH", conflicts_with_all = ["weights", "data", "pictures_at"])]
+    size: Option<String>,
     /// Also write an image: photo, render and depth side by side, a row per view; downscaled if it would have more than 64
     /// million pixels
     #[arg(long, value_name = "FILE.png", conflicts_with_all = ["renders", "data"])]
@@ -189,7 +194,12 @@ impl Eval {
     fn one_scene(&self, capture: &Capture, model: Option<Model>) -> Result<EvalScene> {
         let target_size = self.target_size(model)?;
         let Some(model) = model else {
-            return Ok(EvalScene::all_views(capture, self.pictures_at.map(|_| target_size)));
+            let holdout = self.holdout.as_deref().map(parse_holdout).transpose()?;
+            let size = match &self.size {
+                Some(size) => parse_photo_size(size)?,
+                None => self.pictures_at.map_or(PhotoSize::Own, |_| PhotoSize::Exactly(target_size)),
+            };
+            return Ok(EvalScene::without_context(capture, holdout, size)?);
         };
         let photo_size = model.input.photo_size(model.config.data.image_size);
         Ok(EvalScene::held_out(capture, self.holdout(model)?, self.views, photo_size, target_size)?)
@@ -202,7 +212,7 @@ impl Eval {
             true => LazyPhotos::Loaded(scene.context.iter().map(View::shallow_clone).collect()),
             false => {
                 let shown = context_views(capture, self.holdout(model)?, self.views);
-                LazyPhotos::from_capture(capture, &shown, Some(size))
+                LazyPhotos::from_capture(capture, &shown, PhotoSize::Exactly(size))
             }
         };
         Ok(Baselines::compute(&scene.name, &photos, &scene.target)?)
@@ -210,7 +220,7 @@ impl Eval {
 
     fn holdout(&self, model: Model) -> Result<Holdout> {
         match &self.holdout {
-            Some(text) => Ok(text.parse::<Holdout>().map_err(Error::request)?),
+            Some(text) => parse_holdout(text),
             None => Ok(model.config.data.holdout),
         }
     }

@@ -40,8 +40,9 @@ mod weights_out;
 
 use clap::{Parser, Subcommand};
 use globalsplat::Error;
-use globalsplat::data::Capture;
+use globalsplat::data::{Capture, Holdout, PhotoSize};
 use globalsplat::error::panic_message;
+use globalsplat::refine::MIN_SIDE;
 use globalsplat::scene::ImageSize;
 use option_names::name_options;
 use std::backtrace::{Backtrace, BacktraceStatus};
@@ -197,6 +198,27 @@ fn parse_size(text: &str) -> Result<ImageSize, Error> {
         Some((width @ 1..=16384, height @ 1..=16384)) => Ok(ImageSize { width, height }),
         _ => Err(Error::request(format!("--size {text}: expected WxH, as in 640x480, up to 16384x16384"))),
     }
+}
+
+/// Parses the size of photos as `--size` takes it: the longer side, or a size that they are cropped and resized to.
+fn parse_photo_size(text: &str) -> Result<PhotoSize, Error> {
+    let least = MIN_SIDE..=16384;
+    let size = match text.parse() {
+        Ok(longest) => least.contains(&longest).then_some(PhotoSize::Within(longest)),
+        Err(_) => match parse_size(text) {
+            Ok(size) => (least.contains(&size.width) && least.contains(&size.height))
+                .then_some(PhotoSize::Exactly(size)),
+            Err(_) => None,
+        },
+    };
+    let expected =
+        format!("the longer side, as in 1600, or WxH, as in 640x480, with sides of {MIN_SIDE} to 16384");
+    size.ok_or_else(|| Error::request(format!("--size {text}: expected {expected}")))
+}
+
+/// Parses the views that `--holdout` holds out.
+fn parse_holdout(text: &str) -> anyhow::Result<Holdout> {
+    Ok(text.parse::<Holdout>().map_err(Error::request)?)
 }
 
 /// Returns a flag that becomes true when the user or the system asks the program to stop.

@@ -2,13 +2,12 @@ use super::capture::SceneSource;
 use super::memory::keep_during;
 use super::refine::{InitialFile, RefineJob, parse_time};
 use super::signals::StopRequest;
-use super::{check_views, device, model, open_masked_capture, print_json, splat_out};
+use super::{check_views, device, model, open_masked_capture, parse_holdout, print_json, splat_out};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::{Capture, Holdout};
+use globalsplat::data::Capture;
 use globalsplat::device::Stopwatch;
 use globalsplat::device::peak_memory_bytes;
-use globalsplat::error::Error;
 use globalsplat::eval::process_age;
 use globalsplat::io::{InputFiles, check_writable_splat, weights_files};
 use globalsplat::reconstruct::{Input, Model, load_context, reconstruct};
@@ -71,7 +70,7 @@ pub struct Reconstruct {
 impl Reconstruct {
     /// Reconstructs the same splat and then optimizes its Gaussians for `seconds`.
     fn run_refined(self, seconds: f64) -> Result<()> {
-        let holdout = self.holdout.parse::<Holdout>().map_err(Error::request)?;
+        let holdout = parse_holdout(&self.holdout)?;
         let budget = parse_time(seconds)?;
         let device = device::parse(&self.device)?;
         let options = RefineOptions { budget, holdout, views: self.views, device, ..Default::default() };
@@ -86,7 +85,7 @@ impl Reconstruct {
             return self.run_refined(seconds);
         }
         let device = device::parse(&self.device)?;
-        let holdout = self.holdout.parse::<Holdout>().map_err(Error::request)?;
+        let holdout = parse_holdout(&self.holdout)?;
         check_writable_splat(&self.out)?;
         splat_out::check_origin(&self.out, self.local_origin)?;
         let asked = model::parse_precision(&self.precision)?;

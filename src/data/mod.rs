@@ -8,6 +8,7 @@ mod config;
 mod dataset;
 mod jitter;
 mod loading;
+mod photo_size;
 mod polyphase;
 mod view;
 
@@ -24,6 +25,7 @@ pub use globalsplat_synth::{SyntheticDataset, read_pictures};
 pub use loading::{
     BadData, Batch, BatchShard, DataLoader, LoadTimes, LoadedScene, SceneGroups, TrainingScenes,
 };
+pub use photo_size::PhotoSize;
 pub use polyphase::polyphase;
 pub use view::{View, load_all_views, load_views, tensor_from_planes};
 

@@ -1,8 +1,7 @@
 //! Photos that are loaded one at a time.
 
-use crate::data::{Capture, View, load_views};
+use crate::data::{Capture, PhotoSize, View, load_views};
 use crate::error::Result;
-use crate::scene::ImageSize;
 use glam::DMat4;
 
 /// Photos of a capture. They are decoded on access, so that large photos don't fill the memory all at once.
@@ -18,14 +17,14 @@ pub enum LazyPhotos {
         indices: Vec<usize>,
         /// Names of the photos.
         names: Vec<String>,
-        /// Size that the photos are fitted to; `None` loads them at their own size.
-        size: Option<ImageSize>,
+        /// Size of the photos.
+        size: PhotoSize,
     },
 }
 
 impl LazyPhotos {
-    /// Creates a source of the photos `indices` of `capture`, under their names in the capture, fitted to `size`.
-    pub fn from_capture(capture: &Capture, indices: &[usize], size: Option<ImageSize>) -> Self {
+    /// Creates a source of the photos `indices` of `capture`, under their names in the capture, at `size`.
+    pub fn from_capture(capture: &Capture, indices: &[usize], size: PhotoSize) -> Self {
         let all: Vec<&str> = capture.names().collect();
         let names = indices.iter().map(|&index| all[index].to_string()).collect();
         LazyPhotos::OnDisk { capture: capture.clone(), indices: indices.to_vec(), names, size }
@@ -63,7 +62,8 @@ impl LazyPhotos {
         match self {
             LazyPhotos::Loaded(views) => Ok(views[i].shallow_clone()),
             LazyPhotos::OnDisk { capture, indices, names, size } => {
-                let view = load_views(capture, &indices[i..=i], *size)?.remove(0);
+                let size = size.resized(&capture.cameras()[indices[i]]);
+                let view = load_views(capture, &indices[i..=i], size)?.remove(0);
                 Ok(View { name: names[i].clone(), ..view })
             }
         }

@@ -2,7 +2,7 @@
 
 use super::index::{EvaluationIndex, SceneFrames};
 use super::photo_source::LazyPhotos;
-use crate::data::{Capture, Holdout, SceneGroup, View, load_views};
+use crate::data::{Capture, Holdout, PhotoSize, SceneGroup, View, load_views};
 use crate::error::{Error, Result};
 use crate::reconstruct::load_context;
 use crate::scene::ImageSize;
@@ -28,19 +28,26 @@ pub struct EvalScene {
 }
 
 impl EvalScene {
-    /// Creates a scene for splats and images. Its targets are all photos of `capture`, or those of its own test part if it has one, fitted
-    /// to `size` if given.
-    pub fn all_views(capture: &Capture, size: Option<ImageSize>) -> Self {
-        let (views, names) = (capture.scored_views(), capture.render_names());
-        EvalScene {
+    /// Creates a scene for splats and images, whose targets have the given size. They are the views that `holdout` holds out; without it,
+    /// those of the capture's own test part, or all views if it has none.
+    ///
+    /// # Errors
+    /// Fails if `holdout` holds nothing out, or leaves fewer than two views.
+    pub fn without_context(capture: &Capture, holdout: Option<Holdout>, size: PhotoSize) -> Result<Self> {
+        let views = match holdout {
+            Some(holdout) => split_views(capture, holdout)?.1,
+            None => capture.scored_views(),
+        };
+        let names = capture.render_names();
+        Ok(EvalScene {
             name: capture.name.clone(),
             context: vec![],
             target: LazyPhotos::from_capture(capture, &views, size),
             render_names: views.into_iter().map(|view| names[view].clone()).collect(),
             frames: None,
             checksum: 0,
-            enlarged: size.is_some_and(|size| capture.has_smaller(size)),
-        }
+            enlarged: matches!(size, PhotoSize::Exactly(size) if capture.has_smaller(size)),
+        })
     }
 
     /// Creates a scene for a model. The context consists of the photos that `holdout` leaves, or of `views` of them, spread over the
@@ -60,7 +67,7 @@ impl EvalScene {
         Ok(EvalScene {
             name: capture.name.clone(),
             context: load_context(capture, holdout, views, photo_size)?,
-            target: LazyPhotos::from_capture(capture, &held_out, Some(target_size)),
+            target: LazyPhotos::from_capture(capture, &held_out, PhotoSize::Exactly(target_size)),
             render_names: held_out.iter().map(|&view| all[view].clone()).collect(),
             frames: None,
             checksum: 0,
@@ -84,7 +91,7 @@ impl EvalScene {
             capture: capture.clone(),
             indices: frames.target.clone(),
             names: render_names.clone(),
-            size: Some(loader.target_size),
+            size: PhotoSize::Exactly(loader.target_size),
         };
         let mut sizes = loader.photo_size.into_iter().chain([loader.target_size]);
         let enlarged = sizes.any(|size| capture.has_smaller(size));

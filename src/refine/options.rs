@@ -1,8 +1,7 @@
 //! Options of a refinement session.
 
 use super::config::RefineConfig;
-use super::photos::loaded_size;
-use crate::data::{Capture, Holdout};
+use crate::data::{Capture, Holdout, PhotoSize};
 use crate::error::{Error, Result};
 use crate::reconstruct::spread_over_path;
 use crate::scene::{Camera, ImageSize};
@@ -41,6 +40,8 @@ impl MaskBackground {
     }
 }
 
+/// Default of the longer side of photos in pixels. Thousands of Gaussians can't show more detail, and more pixels take more time.
+const LONGEST_SIDE: u32 = 512;
 /// Maximum memory of the photos to match, unless their number is given. Smaller copies of them take as much again.
 const MAX_PHOTO_BYTES: u64 = 768 << 20;
 /// Maximum memory of the held-out views.
@@ -71,8 +72,8 @@ pub struct RefineOptions {
     pub correct_exposures: bool,
     /// Background that masked pixels have in the optimization. If it is `None`, the optimization ignores masked pixels.
     pub mask_background: Option<MaskBackground>,
-    /// Size to which photos are cropped and resized. If it is `None`, they keep their shape, and large ones are downscaled.
-    pub size: Option<ImageSize>,
+    /// Size of the photos.
+    pub size: PhotoSize,
     /// Device of the depth estimation and the optimization.
     pub device: Device,
 }
@@ -91,7 +92,7 @@ impl Default for RefineOptions {
             correct_poses: false,
             correct_exposures: false,
             mask_background: None,
-            size: None,
+            size: PhotoSize::Within(LONGEST_SIDE),
             device: Device::Cpu,
         }
     }
@@ -120,7 +121,7 @@ impl RefineOptions {
         let cameras = capture.cameras();
         let (all_shown, all_held_out) = capture.split(self.holdout);
         let bytes = |camera: &Camera| {
-            let ImageSize { height, width } = loaded_size(camera, self.size);
+            let ImageSize { height, width } = self.size.of(camera);
             BYTES_PER_PIXEL * u64::from(height) * u64::from(width)
         };
         let largest = cameras.iter().map(bytes).max().unwrap_or(1);
@@ -185,7 +186,7 @@ mod tests {
         assert_eq!((shown.len(), held_out.len()), ((768 << 20) / each, (256 << 20) / each));
         let line = warning.unwrap();
         assert!(line.starts_with("walk: 256 of 1750 photos are matched and 85 of 250 scored"), "{line}");
-        let small = RefineOptions { size: Some([96, 128].into()), ..options.clone() };
+        let small = RefineOptions { size: PhotoSize::Exactly([96, 128].into()), ..options.clone() };
         let ([shown, held_out], warning) = small.select_views(&capture);
         assert_eq!((shown.len(), held_out.len(), warning), (1750, 250, None));
         let asked = RefineOptions { views: Some(500), holdout: Holdout::None, ..options };

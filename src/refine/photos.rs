@@ -1,19 +1,16 @@
 //! Photos that a splat is refined on, at several sizes.
 
 use super::view_selection::are_near_duplicates;
-use crate::data::{Capture, View, ViewBatch, load_views, view_batch};
+use crate::data::{Capture, PhotoSize, View, ViewBatch, load_views, view_batch};
 use crate::error::{Error, Result};
-use crate::scene::{Camera, ImageSize};
+use crate::scene::ImageSize;
 use glam::DMat4;
 use rand::Rng;
 use rand::seq::index::sample;
 use std::collections::BTreeMap;
 use tch::{Device, Kind, Tensor};
 
-/// Maximum length of a photo's longer side in pixels; larger photos are resized. Thousands of Gaussians can't show more detail, and more
-/// pixels take more time.
-const LONGEST_SIDE: f64 = 512.;
-/// Minimum length of a photo's shorter side in pixels after downscaling.
+/// Minimum length of a photo's shorter side in pixels after halving.
 const LEAST_SIDE: u32 = 32;
 /// Minimum side of a photo in pixels: the side of the SSIM window (spec 9.4).
 pub const MIN_SIDE: u32 = 11;
@@ -24,8 +21,7 @@ const COMPARED_SIDE: f64 = 64.;
 /// Maximum mean squared difference of near duplicates: 40 dB.
 const NEARLY_EQUAL: f64 = 1e-4;
 
-/// Reads the photos of `indices`, cropped and resized to `size`. If `size` is `None`, photos keep their shape, and large ones are
-/// downscaled. `should_continue` is called with the number of photos read so far, and ends the work if it returns `false`.
+/// Reads the photos of `indices` at `size`. `should_continue` is called with the number of photos read so far, and ends the work if it returns `false`.
 ///
 /// # Errors
 /// Fails like [`Capture::load`], if a photo has fewer than [`MIN_SIDE`] pixels along a side, or if `should_continue` ends the work before
@@ -33,13 +29,13 @@ const NEARLY_EQUAL: f64 = 1e-4;
 pub fn load_photos(
     capture: &Capture,
     indices: &[usize],
-    size: Option<ImageSize>,
+    size: PhotoSize,
     mut should_continue: impl FnMut(usize) -> bool,
 ) -> Result<Vec<View>> {
     let cameras = capture.cameras();
-    let size_of = |index: usize| size.or_else(|| smaller(&cameras[index]));
+    let size_of = |index: usize| size.resized(&cameras[index]);
     for &index in indices {
-        let ImageSize { width, height } = loaded_size(&cameras[index], size);
+        let ImageSize { width, height } = size.of(&cameras[index]);
         if width.min(height) < MIN_SIDE {
             let field = format!("the size of {}", capture.names().nth(index).unwrap_or_default());
             let expected = format!("{MIN_SIDE} pixels or more along each side");
@@ -57,19 +53,6 @@ pub fn load_photos(
         }
     }
     Ok(views)
-}
-
-/// Returns the size of the photo of `camera` after [`load_photos`] has fitted it to `size`.
-pub(super) fn loaded_size(camera: &Camera, size: Option<ImageSize>) -> ImageSize {
-    let Camera { width, height, .. } = *camera;
-    size.or_else(|| smaller(camera)).unwrap_or(ImageSize { height, width })
-}
-
-fn smaller(camera: &Camera) -> Option<ImageSize> {
-    let (longer, shorter) = (camera.width.max(camera.height), camera.width.min(camera.height));
-    let scale = (LONGEST_SIDE / f64::from(longer)).max(f64::from(LEAST_SIDE) / f64::from(shorter));
-    let side = |pixels: u32| ((f64::from(pixels) * scale).round() as u32).max(1);
-    (scale < 1.).then(|| ImageSize { height: side(camera.height), width: side(camera.width) })
 }
 
 /// Returns the indices of the photos that aren't near duplicates of a photo before them. Near duplicates of a scene at `depth` show nearly

@@ -437,8 +437,10 @@ fn invalid_refinements_are_refused_with_one_sentence() {
     }
     assert!(with(&["--seconds", "0"]).contains("--seconds is 0"));
     assert!(with(&["--seconds", "1e300"]).contains("--seconds is 1000"));
-    for size in ["64x8", "10x10", "2000x1"] {
-        assert!(with(&["--size", size]).contains(&format!("--size {size}: expected 11 pixels or more")));
+    for size in ["64x8", "10x10", "2000x1", "8", "64x", "-3"] {
+        let expected =
+            "expected the longer side, as in 1600, or WxH, as in 640x480, with sides of 11 to 16384";
+        assert!(with(&[&format!("--size={size}")]).contains(&format!("--size {size}: {expected}")), "{size}");
     }
     assert!(with(&["--from", "nothing", "--weights", "a.safetensors"]).contains("uses no weights"));
     for space in ["tokens", "both"] {

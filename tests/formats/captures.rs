@@ -3,7 +3,7 @@
 use crate::common::program::room;
 use crate::common::{captures, has_lpips, rerun_test, skip};
 use glam::{DMat3, DVec3};
-use globalsplat::data::{Capture, find_captures, open_capture};
+use globalsplat::data::{Capture, PhotoSize, find_captures, open_capture};
 use globalsplat::eval::{CaptureScores, EvalScene, Method, Perceptual, score_output};
 use globalsplat::io::{read_splat, write_splat};
 use globalsplat::render::transform;
@@ -33,7 +33,7 @@ fn known(table: &[(&str, [f64; 2])]) -> Vec<(PathBuf, Capture, [f64; 2])> {
 
 /// Scores the published splat of the capture in `folder` at all of its cameras.
 fn published_scores(folder: &Path, capture: &Capture, perceptual: &Perceptual) -> CaptureScores {
-    let scene = EvalScene::all_views(capture, None);
+    let scene = EvalScene::without_context(capture, None, PhotoSize::Own).expect("views");
     let mut made = Method::Splat(folder.join("reference.ply"))
         .render_targets(scene, tch::Device::Cpu)
         .expect("a picture");

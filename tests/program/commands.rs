@@ -232,6 +232,18 @@ fn a_splat_is_scored_by_its_capture() {
     assert!(views.iter().all(|v| v["psnr"].is_f64() && v["ssim"].is_f64()));
     // Three images of 6·40 pixels and two gaps wide, nine images and eight gaps high.
     assert_eq!(image::image_dimensions(&sheet).unwrap(), (3 * 240 + 2 * 4, 9 * 240 + 8 * 4));
+
+    // The held-out views alone, with half as many pixels along each side.
+    let eval = ["eval", "--splat", arg(&splat), "--scene", arg(&room), "--holdout", "every:3", "--json"];
+    let [whole, half] = ["40", "20"].map(|size| json(&[&eval[..], &["--size", size]].concat()));
+    let names = |scores: &Value| {
+        let views = scores["views"].as_array().unwrap();
+        views.iter().map(|view| view["image"].as_str().unwrap().to_string()).collect::<Vec<_>>()
+    };
+    assert_eq!(names(&whole), ["images/000.png", "images/003.png", "images/006.png"]);
+    assert_eq!(names(&half), names(&whole));
+    let psnr = |scores: &Value| scores["psnr"].as_f64().unwrap();
+    assert!(psnr(&whole) > 50. && (20. ..50.).contains(&psnr(&half)), "{} {}", psnr(&whole), psnr(&half));
 }
 
 #[test]

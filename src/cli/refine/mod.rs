@@ -6,13 +6,12 @@ mod report;
 pub use job::{InitialFile, RefineJob};
 
 use super::capture::SceneSource;
-use super::{check_former_option, check_views, device, parse_size};
+use super::{check_former_option, check_views, device, parse_holdout, parse_photo_size};
 use anyhow::Result;
 use clap::{Args, ValueEnum};
 use globalsplat::data::Holdout;
 use globalsplat::error::Error;
-use globalsplat::refine::{Budget, MIN_SIDE, MaskBackground, RefineConfig, RefineOptions};
-use globalsplat::scene::ImageSize;
+use globalsplat::refine::{Budget, MaskBackground, RefineConfig, RefineOptions};
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -76,9 +75,9 @@ pub struct Refine {
     /// Maximum number of the other views, spread along the camera path; by default as many as fit into about 2 GB of memory
     #[arg(long, value_name = "N")]
     views: Option<usize>,
-    /// Crop and resize photos to this size; by default they keep their aspect ratio, with at most 512 pixels along the longer
-    /// side
-    #[arg(long, value_name = "WxH")]
+    /// Size of the photos: the longer side to which larger ones are downscaled, as in 1600, or WxH, to which all are cropped and
+    /// resized; by default 512
+    #[arg(long, value_name = "N|WxH")]
     size: Option<String>,
     /// Also optimize a correction of each camera's pose
     #[arg(long)]
@@ -126,7 +125,7 @@ enum Background {
 impl Refine {
     pub fn run(self) -> Result<()> {
         check_views(self.views)?;
-        let holdout = self.holdout.parse::<Holdout>().map_err(Error::request)?;
+        let holdout = parse_holdout(&self.holdout)?;
         let options = self.options(holdout)?;
         let needs_model = self.needs_model()?;
         let why =
@@ -150,13 +149,8 @@ impl Refine {
     }
 
     fn options(&self, holdout: Holdout) -> Result<RefineOptions> {
-        let size = self.size.as_deref().map(parse_size).transpose()?;
-        if let Some(ImageSize { width, height }) = size
-            && width.min(height) < MIN_SIDE
-        {
-            let why = format!("--size {width}x{height}: expected {MIN_SIDE} pixels or more along each side");
-            return Err(Error::request(why).into());
-        }
+        let default = RefineOptions::default();
+        let size = self.size.as_deref().map_or(Ok(default.size), parse_photo_size)?;
         let time = parse_time(self.seconds)?;
         Ok(RefineOptions {
             config: RefineConfig::with(&self.set, self.splat.is_some())?,
@@ -174,7 +168,7 @@ impl Refine {
             }),
             size,
             device: device::parse(&self.device)?,
-            ..RefineOptions::default()
+            ..default
         })
     }
 }
