@@ -1,0 +1,92 @@
+#!/usr/bin/env python3
+"""Measures how good splats are that `globalsplat refine` optimizes in given times, on views that are held out.
+
+    .venv/bin/python scripts/quality_per_minute.py --capture DIR [HOLDOUT] [--capture …] [--variant NAME ARGUMENTS]
+        [--peer NAME DIR] [--seconds 30 60 120 300 900] [--seeds 3] [--size 1008] [--out OUT]
+
+HOLDOUT is every:8 by default. A variant is a name and arguments of `refine`, as in `--variant large "--size 1008
+--gaussians 100000"`; without one, the defaults are measured. All splats are scored by `globalsplat eval` on the same
+pixels: the held-out views with the longer side --size, or their own if it is smaller. --peer scores the splats of another
+program alike: DIR/CAPTURE.SECONDS.SEED.ply, from the other views. Prints a Markdown table of mean PSNR, SSIM and LPIPS (VGG, if
+`make weights` was run) over the seeds, with the 95 % confidence interval of PSNR. Every result is kept in OUT and not
+repeated. Run nothing else meanwhile.
+"""
+
+import argparse
+import shlex
+import statistics
+from pathlib import Path
+
+from core_runs import row, told_once
+
+# Quantiles of Student's t distribution for 95 % confidence, by the number of samples.
+STUDENT = {2: 12.71, 3: 4.30, 4: 3.18, 5: 2.78, 6: 2.57, 7: 2.45, 8: 2.36}
+
+
+def scores(out, splat, folder, holdout, size):
+    """Returns the scores of a splat on the held-out views."""
+    file = out / f"{splat.stem}.scores.json"
+    return told_once(file, "eval", "--splat", splat, "--scene", folder, "--holdout", holdout, "--size", size)
+
+
+def refined(out, name, folder, holdout, seconds, seed, arguments):
+    """Returns the splat that `refine` makes of a capture in `seconds` seconds, and its JSON output."""
+    file = out / f"{name}.{Path(folder).name}.{seconds:g}.{seed}.json"
+    splat = file.with_suffix(".ply")
+    command = ["refine", "--scene", folder, "--holdout", holdout, "--seconds", str(seconds), "--seed", str(seed)]
+    return splat, told_once(file, *command, "--out", splat, *arguments)
+
+
+def mean(values, digits):
+    """Formats the mean of `values`, which may lack some."""
+    known = [value for value in values if value is not None]
+    return f"{statistics.mean(known):.{digits}f}" if known else ""
+
+
+def with_interval(values):
+    """Formats the mean of `values` with its 95 % confidence interval."""
+    if len(values) not in STUDENT:
+        return mean(values, 2)
+    half = STUDENT[len(values)] * statistics.stdev(values) / len(values) ** 0.5
+    return f"{statistics.mean(values):.2f} ± {half:.2f}"
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--capture", nargs="+", action="append", required=True, metavar="DIR HOLDOUT")
+    parser.add_argument("--variant", nargs=2, action="append", default=[], metavar=("NAME", "ARGUMENTS"))
+    parser.add_argument("--peer", nargs=2, action="append", default=[], metavar=("NAME", "DIR"))
+    parser.add_argument("--seconds", type=float, nargs="*", default=[30, 60, 120, 300, 900])
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--size", default="1008")
+    parser.add_argument("--out", type=Path, default=Path("runs/quality"))
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    variants = arguments.variant or [("default", "")]
+    row("capture", "method", "time", "steps", "Gaussians", "PSNR, dB", "SSIM", "LPIPS")
+    row(*["---"] * 8)
+    for folder, *holdout in arguments.capture:
+        holdout = holdout[0] if holdout else "every:8"
+        for seconds in arguments.seconds:
+            results = {name: [] for name, _ in [*variants, *arguments.peer]}
+            for seed in range(arguments.seeds):
+                for name, more in variants:
+                    splat, told = refined(arguments.out, name, folder, holdout, seconds, seed, shlex.split(more))
+                    found = scores(arguments.out, splat, folder, holdout, arguments.size)
+                    results[name].append({"steps": told["steps"], **found})
+                for name, splats in arguments.peer:
+                    splat = Path(splats) / f"{Path(folder).name}.{seconds:g}.{seed}.ply"
+                    if splat.is_file():
+                        kept = arguments.out / name
+                        kept.mkdir(exist_ok=True)
+                        results[name].append(scores(kept, splat, folder, holdout, arguments.size))
+            for name, found in results.items():
+                if found:
+                    of = lambda key: [result.get(key) for result in found]
+                    time, psnr = f"{seconds:g} s", with_interval(of("psnr"))
+                    row(Path(folder).name, name, time, mean(of("steps"), 0), mean(of("gaussians"), 0), psnr,
+                        mean(of("ssim"), 3), mean(of("lpips_vgg"), 3))
+
+
+if __name__ == "__main__":
+    main()
