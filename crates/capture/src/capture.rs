@@ -64,7 +64,8 @@ struct View {
 pub(crate) enum ImageLocation {
     /// An image file.
     File(PathBuf),
-    /// A byte range of an in-memory file that holds many images.
+    /// A byte range of an in-memory file that holds many images, which chunks do.
+    #[cfg_attr(not(feature = "chunks"), expect(dead_code))]
     Bytes {
         file: Arc<Vec<u8>>,
         bytes: Range<usize>,

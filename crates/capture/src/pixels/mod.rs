@@ -10,10 +10,9 @@ mod planes;
 mod resample;
 mod undistort;
 
-pub use codec::{
-    DecodedPhoto, PHOTO_EXTENSIONS, decode_photo, encode_photo, encoded_image_size, read_image,
-    read_image_size,
-};
+#[cfg(feature = "chunks")]
+pub use codec::encoded_image_size;
+pub use codec::{DecodedPhoto, PHOTO_EXTENSIONS, decode_photo, encode_photo, read_image, read_image_size};
 pub(crate) use codec::{SUPPORTED_IMAGES, has_alpha_channel};
 pub use fit::{fit, source_region};
 pub use metadata::{exif_focal, is_equirectangular};
