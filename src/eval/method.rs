@@ -4,7 +4,7 @@ use super::perceptual::Perceptual;
 use super::scene::EvalScene;
 use super::scores::{CaptureScores, ViewScore, score_view};
 use crate::data::View;
-use crate::device::{device_memory_bytes, peak_memory_bytes};
+use crate::device::{peak_device_memory_bytes, peak_memory_bytes};
 use crate::error::{Error, Result};
 use crate::io::{
     InputFiles, PHOTO_EXTENSIONS, Splat, checksum, find_splat, origin_file, read_image, read_splat,
@@ -151,7 +151,7 @@ impl Method<'_> {
     pub(super) fn memory(&self) -> Option<Memory> {
         match self {
             Method::Model(model) => {
-                let device = device_memory_bytes(model.device);
+                let device = peak_device_memory_bytes(model.device);
                 Some(Memory { host: peak_memory_bytes(), device })
             }
             _ => None,

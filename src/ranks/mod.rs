@@ -32,7 +32,8 @@ pub(crate) mod tests {
         let have_met = std::sync::Barrier::new(ranks);
         std::thread::scope(|scope| {
             let rank = |rank| {
-                let (store, have_met, work) = (store.another().expect("a connection"), &have_met, &work);
+                let (store, have_met, work) =
+                    (store.clone_connection().expect("a connection"), &have_met, &work);
                 scope.spawn(move || {
                     let dist_env = DistributedEnv {
                         rank,
@@ -194,7 +195,7 @@ pub(crate) mod tests {
         }
         let store = ffi::connect("127.0.0.1", 0, true, "test", 60).expect("a store");
         // The error comes from NCCL's constructor. So it was found and called, and its exception is passed through.
-        let error = ffi::nccl(&store, 0, 1, 60).err().expect("no GPU").to_string();
+        let error = ffi::new_nccl_group(&store, 0, 1, 60).err().expect("no GPU").to_string();
         assert!(error.contains("no GPUs found"), "{error}");
     }
 }

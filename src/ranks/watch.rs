@@ -53,13 +53,13 @@ impl Watchdog {
     /// # Errors
     /// Returns an error if the store can't be reached.
     pub fn begin(dist_env: &DistributedEnv, end: fn(Option<String>)) -> Result<Self> {
-        let serves = !dist_env.is_agent_store && dist_env.rank == 0;
+        let is_server = !dist_env.is_agent_store && dist_env.rank == 0;
         // A store that torchrun hosts is the same after a restart.
         let round = if dist_env.is_agent_store { dist_env.restarts } else { 0 };
         let store = ffi::connect(
             &dist_env.host,
             dist_env.port,
-            serves,
+            is_server,
             &format!("globalsplat/{round}"),
             CONNECT_TIMEOUT_SECONDS,
         );
@@ -70,8 +70,11 @@ impl Watchdog {
         })?;
         let (sender, receiver) = channel();
         let listening = Mutex::new(Some(sender));
-        let own =
-            Watchdog { store: store.another()?, dist_env: dist_env.clone(), listening: Mutex::default() };
+        let own = Watchdog {
+            store: store.clone_connection()?,
+            dist_env: dist_env.clone(),
+            listening: Mutex::default(),
+        };
         // Calls to a store whose machine is gone block, so another thread checks when the store last answered.
         let answered = Arc::new(Mutex::new(Some(Instant::now())));
         let last = answered.clone();
