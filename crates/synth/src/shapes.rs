@@ -119,7 +119,7 @@ pub(super) fn curtain(width: f32, height: f32, folds: f32, depth: f32) -> Mesh {
 pub(super) fn roughen(mesh: Mesh, noise: &Noise, frequency: f32, strength: f32) -> Mesh {
     mesh.warped(|p| {
         let q = p * frequency;
-        let offset = Vec3::new(noise.at(q), noise.at(q + 31.7), noise.at(q - 57.3));
+        let offset = Vec3::new(noise.sample(q), noise.sample(q + 31.7), noise.sample(q - 57.3));
         p + strength * offset
     })
 }
