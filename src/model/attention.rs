@@ -7,7 +7,7 @@ use tch::{Device, Kind, Tensor};
 
 /// Computes softmax(q kᵀ / √(d/h)) v over `heads` heads. q is [B, n, d], k and v are [B, m, d]; the result is [B, n, d] and of their kind.
 pub(crate) fn attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
-    let out = attend(q, k, v, heads);
+    let out = dispatch_attention(q, k, v, heads);
     let size = q.size();
     let flops = 4 * size[0] * size[1] * k.size()[1] * size[2];
     // The backward pass recomputes the scores, and computes gradients of queries, keys, attention weights and values.
@@ -15,7 +15,7 @@ pub(crate) fn attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tenso
     out
 }
 
-fn attend(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
+fn dispatch_attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
     let (kind, width, all) = (q.kind(), q.size()[2] / heads, [q, k, v]);
     let fits = |t: &&Tensor| t.device() == Device::Cpu && t.kind() == kind && t.size()[1] > 0;
     if !all.iter().all(fits) {

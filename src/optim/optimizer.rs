@@ -394,7 +394,7 @@ mod tests {
 
     /// Both implementations give the same values and moments after steps with clipped gradients. One parameter has no gradient at first.
     #[test]
-    fn both_ways_to_make_a_step_agree() {
+    fn fused_and_single_tensor_steps_agree() {
         let sizes = [("a", 7), ("b", 1000), ("c", 1), ("d", 64)];
         let states = WAYS.map(|step| {
             let leaves = sizes.map(|(name, size)| {

@@ -4,12 +4,12 @@
 mod buckets;
 mod dist_env;
 mod group;
-mod watch;
+mod watchdog;
 
 pub use buckets::Buckets;
 pub use dist_env::DistributedEnv;
 pub use group::{Backends, ProcessGroup};
-pub use watch::Watchdog;
+pub use watchdog::Watchdog;
 
 #[cfg(test)]
 pub(crate) mod tests {
@@ -136,7 +136,7 @@ pub(crate) mod tests {
             let leaf = |size: i64| Tensor::ones([size], (Kind::Float, Device::Cpu)).set_requires_grad(true);
             let leaves = [leaf(5), leaf(3), leaf(7), leaf(2)];
             // One bucket for each of the first two leaves, and one for the others.
-            let buckets = Buckets::of_bytes(&group, &leaves, 4 * 5);
+            let buckets = Buckets::with_bucket_bytes(&group, &leaves, 4 * 5);
             let mut steps = vec![];
             for step in 1..3 {
                 for leaf in &leaves {

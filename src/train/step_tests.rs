@@ -253,7 +253,7 @@ fn masked_pixels_contribute_nothing_to_a_step() {
 /// Parallel slices give the same step every time, in one, two and three slices. Only the mean connects the scenes of this step. In bf16,
 /// the gradients of weights are rounded in each slice.
 #[test]
-fn scenes_side_by_side_make_the_same_step_every_time() {
+fn parallel_slices_make_the_same_step_every_time() {
     let _guard = num_threads::change();
     let sample = sample();
     let threads = tch::get_num_threads();
@@ -291,7 +291,7 @@ fn scenes_side_by_side_make_the_same_step_every_time() {
 }
 
 #[test]
-fn rounds_that_are_computed_again_give_the_same_gradients() {
+fn recomputed_rounds_give_the_same_gradients() {
     let sample = sample();
     for streams in [Streams::Dual, Streams::Single] {
         let model = ModelConfig { streams, ..small() };
@@ -306,7 +306,7 @@ fn rounds_that_are_computed_again_give_the_same_gradients() {
 }
 
 #[test]
-fn a_step_in_parts_is_the_plain_one() {
+fn a_step_in_parts_matches_one_backward_pass() {
     let sample = sample();
     for streams in [Streams::Dual, Streams::Single] {
         let config = config(ModelConfig { streams, ..small() }, TrainConfig::default());

@@ -332,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_at_the_same_distance_from_all_sides_has_no_gaps() {
+    fn triangles_of_a_fan_have_no_gaps() {
         // A fan of triangles around a point, seen along every edge.
         let point = |i: usize| {
             let angle = i as f32 / 12. * std::f32::consts::TAU;

@@ -159,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn shapes_are_closed_and_their_outside_is_out() {
+    fn shapes_are_closed_and_face_outwards() {
         let ring = |t: f32| vec3((TAU * t).cos(), 0., -(TAU * t).sin());
         for (name, mesh, expected) in [
             ("box", cuboid(vec3(2., 3., 4.), 0.), 24.),

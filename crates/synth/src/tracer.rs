@@ -276,7 +276,7 @@ mod tests {
 
     /// Radiance follows Lambert's law: reflectance · irradiance · cos / π, whatever the number of lights.
     #[test]
-    fn matte_floors_are_as_bright_as_light_and_angle_say() {
+    fn matte_floors_follow_lamberts_law() {
         for lights in 1..=4 {
             let tracer = world(186, |contents, _| {
                 for i in 0..lights {
@@ -322,7 +322,7 @@ mod tests {
 
     /// Under a uniform sky, a surface is as bright as the sky times its reflectance.
     #[test]
-    fn floors_under_an_even_sky_are_as_bright_as_they_are_white() {
+    fn floors_reflect_a_uniform_sky() {
         let light = Vec3::splat(0.7);
         let sky = Sky { zenith: light, horizon: light, ground: light, ..DARK };
         for grey in [90, 186] {
@@ -368,7 +368,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_in_between_casts_a_shadow_and_sends_light_on() {
+    fn objects_cast_shadows_and_receive_bounced_light() {
         let sun = Light::Sun { towards: Vec3::Y, spread: 0., colour: Vec3::splat(3.) };
         let tracer = world(186, |contents, material| {
             contents.lights.push(sun);

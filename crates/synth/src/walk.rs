@@ -275,7 +275,7 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     #[test]
-    fn things_are_seen_from_below_and_above_and_from_before_their_wall() {
+    fn orbits_show_objects_from_below_above_and_in_front() {
         let mut builder = SceneBuilder::new(ChaCha8Rng::seed_from_u64(1), vec![]);
         let (min, max) = (Vec3::splat(-9.), Vec3::splat(9.));
         let place = CameraSpace { min, max, eye_heights: (1., 2.), clearance: 0.3, walls: Some(0.3) };

@@ -77,7 +77,7 @@ mod tests {
     }
 
     #[test]
-    fn everything_that_matters_changes_the_name() {
+    fn every_compile_input_changes_the_file_name() {
         let nvrtc = Nvrtc { version: (13, 0), architectures: vec![75, 90] };
         let newer = Nvrtc { version: (13, 1), ..nvrtc.clone() };
         let mut names = vec![

@@ -50,7 +50,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_log_is_understood() {
+    fn resources_are_parsed_from_a_log() {
         let log = "ptxas info    : 244 bytes gmem\n\
                    ptxas info    : Compiling entry function 'gs_blend' for 'sm_90'\n\
                    ptxas info    : Function properties for gs_blend\n\

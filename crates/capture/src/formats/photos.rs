@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn one_photo_does_not_stand_for_two() {
+    fn one_photo_is_not_matched_twice() {
         assert_eq!(
             found(&["0.png", "1.png"], &["left/0.png", "right/0.png", "left/1.png"]),
             [None, None, None]

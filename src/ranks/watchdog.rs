@@ -81,7 +81,7 @@ impl Watchdog {
         let listen = move || {
             let mut others = PeerHeartbeats::new(&own.dist_env);
             loop {
-                match others.lost(&own.store) {
+                match others.exchange_heartbeats(&own.store) {
                     Some(why) => return end(own.claim_message(&why)),
                     None => *last.lock().expect("no thread panics here") = Some(Instant::now()),
                 }
@@ -170,14 +170,17 @@ impl PeerHeartbeats {
     }
 
     /// Sends a heartbeat. Returns the reason if the other ranks can't be reached any more.
-    fn lost(&mut self, store: &ffi::Store) -> Option<String> {
-        match self.listen(store) {
+    fn exchange_heartbeats(&mut self, store: &ffi::Store) -> Option<String> {
+        match self.try_exchange_heartbeats(store) {
             Ok(found) => found,
             Err(_) => Some("lost the connection to the rendezvous store: its host process has ended".into()),
         }
     }
 
-    fn listen(&mut self, store: &ffi::Store) -> std::result::Result<Option<String>, cxx::Exception> {
+    fn try_exchange_heartbeats(
+        &mut self,
+        store: &ffi::Store,
+    ) -> std::result::Result<Option<String>, cxx::Exception> {
         store.add(&key::beats(self.rank), 1)?;
         if store.add(key::FAILED, 0)? > 0 {
             // The rank that failed has already printed its error.
