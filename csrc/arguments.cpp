@@ -34,7 +34,7 @@ void Arguments::check() const {
   TORCH_CHECK(eps2d >= 0, "eps2d is ", eps2d, ", expected 0 or more");
 }
 
-Inputs Arguments::on(at::Device device) const {
+Inputs Arguments::to_inputs(at::Device device) const {
   const auto type = means.scalar_type() == at::kDouble ? at::kDouble : at::kFloat;
   const auto there = [&](const Tensor& t) { return t.to(device, type).contiguous(); };
   return {{there(means), there(scales), there(quaternions), there(opacities), there(sh)},

@@ -22,7 +22,7 @@ struct Arguments {
 
   // Returns contiguous inputs on `device`, all of one type: float64 if the means are, and float32 otherwise. Moving and converting are
   // differentiable, so gradients return to the caller's device and type. Intrinsics get no gradient.
-  Inputs on(at::Device device) const;
+  Inputs to_inputs(at::Device device) const;
 };
 
 Arguments borrowed(const SplatArguments& of);

@@ -9,8 +9,8 @@
 #include <vector>
 
 #include "globalsplat-csrc/src/attention.rs.h"
-#include "kernels/attend.h"
-#include "kernels/rows.h"
+#include "kernels/attention_types.h"
+#include "kernels/multi_head_attention.h"
 #include "threads.h"
 
 namespace globalsplat {
@@ -53,23 +53,23 @@ void multiply(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row, int
   at::native::cpublas::brgemm(m, n, k, a_row, b_row, c_row, adds, numbers(a), numbers(b), c, true);
 }
 
-void done() { at::native::cpublas::brgemm_release(true); }
+void release() { at::native::cpublas::brgemm_release(true); }
 
 // Returns the product functions.
-raster::Bf16Products products() { return {multiply, done}; }
+raster::Bf16Gemm bf16_gemm() { return {multiply, release}; }
 
 // Returns true if bf16 products work. libtorch throws if oneDNN doesn't support them, and oneDNN if their instructions are disabled.
-bool has_bf16_products() {
+bool has_bf16_gemm() {
   static const bool has = [] {
     const std::vector<raster::Bf16> zeros(16 * 16);
     std::vector<float> sums(16 * 16);
-    const raster::Bf16Products tried = products();
+    const raster::Bf16Gemm tried = bf16_gemm();
     try {
       tried.multiply(16, 16, 16, 16, 16, 16, false, zeros.data(), zeros.data(), sums.data());
     } catch (const std::exception&) {
       return false;
     }
-    tried.done();
+    tried.release();
     return true;
   }();
   return has;
@@ -82,9 +82,10 @@ struct AttentionFunction : torch::autograd::Function<AttentionFunction> {
     const raster::AttentionShape shape = shape_of(q, k, heads);
     float* const sums = log_sums.data_ptr<float>();
     if (is_bf16(q))
-      raster::attend_bf16(shape, read_all<raster::Bf16>(q, k, v), written<raster::Bf16>(out), sums, products(), threads());
+      raster::multi_head_attention_bf16(shape, read_all<raster::Bf16>(q, k, v), written<raster::Bf16>(out), sums, bf16_gemm(),
+                                        get_num_threads());
     else
-      raster::attend(shape, read_all<float>(q, k, v), written<float>(out), sums, threads());
+      raster::multi_head_attention(shape, read_all<float>(q, k, v), written<float>(out), sums, get_num_threads());
     ctx->save_for_backward({q, k, v, out, log_sums});
     ctx->saved_data["heads"] = heads;
     return out;
@@ -98,12 +99,12 @@ struct AttentionFunction : torch::autograd::Function<AttentionFunction> {
     const raster::AttentionShape shape = shape_of(q, k, ctx->saved_data["heads"].toInt());
     const float* const sums = t[4].const_data_ptr<float>();
     if (is_bf16(q))
-      raster::attend_backward_bf16(
+      raster::multi_head_attention_backward_bf16(
           shape, read_all<raster::Bf16>(q, k, v), read<raster::Bf16>(out), sums, read<raster::Bf16>(grad_out),
-          {written<raster::Bf16>(dq), written<raster::Bf16>(dk), written<raster::Bf16>(dv)}, products(), threads());
+          {written<raster::Bf16>(dq), written<raster::Bf16>(dk), written<raster::Bf16>(dv)}, bf16_gemm(), get_num_threads());
     else
-      raster::attend_backward(shape, read_all<float>(q, k, v), read<float>(out), sums, read<float>(grad_out),
-                              {written<float>(dq), written<float>(dk), written<float>(dv)}, threads());
+      raster::multi_head_attention_backward(shape, read_all<float>(q, k, v), read<float>(out), sums, read<float>(grad_out),
+                                            {written<float>(dq), written<float>(dk), written<float>(dv)}, get_num_threads());
     return {dq, dk, dv, Tensor()};
   }
 };
@@ -112,7 +113,7 @@ struct AttentionFunction : torch::autograd::Function<AttentionFunction> {
 
 bool supports_attention(int64_t width, bool is_bf16) {
   const bool fits = width > 0 && width % (is_bf16 ? 8 : 4) == 0 && width <= raster::kAttentionWidth;
-  return fits && (!is_bf16 || has_bf16_products());
+  return fits && (!is_bf16 || has_bf16_gemm());
 }
 
 size_t attention(size_t q_address, size_t k_address, size_t v_address, int64_t heads) {

@@ -11,7 +11,7 @@ const BRIDGES: [&str; 12] = [
     "src/chunk.rs",
     "src/cuda.rs",
     "src/device.rs",
-    "src/fit.rs",
+    "src/image_losses.rs",
     "src/linear.rs",
     "src/ops.rs",
     "src/optim.rs",
@@ -105,8 +105,8 @@ fn main() {
     cpp()
         .files([
             "kernels/raster.cpp",
-            "kernels/attend.cpp",
-            "kernels/fit.cpp",
+            "kernels/multi_head_attention.cpp",
+            "kernels/image_losses.cpp",
             "kernels/optim.cpp",
             "kernels/parallel.cpp",
             "kernels/kernels.cpp",
@@ -116,7 +116,7 @@ fn main() {
     cpp()
         .includes(["kernels", "cuda"])
         .flag("-ffp-contract=off")
-        .files(["cuda/fitting.cpp", "cuda/frame.cpp", "cuda/emulator.cpp", "cuda/emulated_kernels.cpp"])
+        .files(["cuda/launch_losses.cpp", "cuda/frame.cpp", "cuda/emulator.cpp", "cuda/emulated_kernels.cpp"])
         .compile("globalsplat_cuda");
     match env::var("CARGO_CFG_TARGET_ARCH").as_deref() {
         Ok("x86_64") => {

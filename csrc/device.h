@@ -21,7 +21,7 @@ class CudaEvent {
   explicit CudaEvent(int32_t gpu);
 
   // Returns the milliseconds since `earlier`. Waits until the GPU has reached both events.
-  double since(const CudaEvent& earlier) const;
+  double milliseconds_since(const CudaEvent& earlier) const;
 
  private:
   c10::Event event_;
@@ -30,9 +30,9 @@ class CudaEvent {
 std::unique_ptr<CudaEvent> record_event(int32_t gpu);
 
 // New tensors on a GPU, and the event after which they hold the copied data.
-class Copies {
+class PendingCopies {
  public:
-  Copies(std::vector<at::Tensor> tensors, c10::Event done);
+  PendingCopies(std::vector<at::Tensor> tensors, c10::Event done);
 
   // Passes the tensors to the caller, once and in order. Work that is enqueued in the GPU's current stream from now on waits for the
   // copies; the host doesn't.
@@ -51,7 +51,7 @@ class CopyStream {
 
   // Starts copying host tensors, given by their addresses. Tensors outside of page-locked memory are first copied into it. The originals
   // may be freed at once.
-  std::unique_ptr<Copies> copy(rust::Slice<const size_t> tensors) const;
+  std::unique_ptr<PendingCopies> copy(rust::Slice<const size_t> tensors) const;
 
  private:
   c10::Stream stream_;
@@ -60,11 +60,11 @@ class CopyStream {
 std::unique_ptr<CopyStream> copy_stream(int32_t gpu);
 
 // Allocates an uninitialized byte tensor in page-locked host memory, from which a GPU can copy by itself. The caller owns it.
-void page_locked_bytes(rust::Slice<const int64_t> shape, rust::Slice<size_t> out);
+void empty_pinned_bytes(rust::Slice<const int64_t> shape, rust::Slice<size_t> out);
 
 // Returns the peak of the bytes that tensors take on a GPU since the start of the program or the last reset; the second function resets it.
-uint64_t peak_bytes(int32_t gpu);
-void reset_peak_bytes(int32_t gpu);
+uint64_t max_memory_allocated(int32_t gpu);
+void reset_peak_memory_stats(int32_t gpu);
 
 // Disables TF32 in CUDA's float32 convolutions, which by default round factors to TF32's 11 bits. Matrix products don't use TF32 by
 // default.

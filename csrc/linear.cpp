@@ -30,28 +30,29 @@ constexpr int64_t kRows = 2048;
 // kBlocks.
 constexpr int64_t kBlockRows = 256, kBlockColumns = 256, kBlocks = 16;
 
-using Product = Tensor(const Tensor&, const Tensor&, const std::optional<Tensor>&, c10::string_view,
-                       c10::List<std::optional<at::Scalar>>, std::optional<c10::string_view>);
+using MkldnnLinear = Tensor(const Tensor&, const Tensor&, const std::optional<Tensor>&, c10::string_view,
+                            c10::List<std::optional<at::Scalar>>, std::optional<c10::string_view>);
 
 // Finds the op that torch's compiler uses for a linear layer. libtorch may have been built without it.
-std::optional<c10::TypedOperatorHandle<Product>> find_product() {
+std::optional<c10::TypedOperatorHandle<MkldnnLinear>> find_mkldnn_linear() {
   const auto found = c10::Dispatcher::singleton().findSchema({"mkldnn::_linear_pointwise", ""});
   if (!found) return {};
-  return found->typed<Product>();
+  return found->typed<MkldnnLinear>();
 }
 
-const std::optional<c10::TypedOperatorHandle<Product>>& product() {
-  static const auto known = find_product();
+const std::optional<c10::TypedOperatorHandle<MkldnnLinear>>& mkldnn_linear() {
+  static const auto known = find_mkldnn_linear();
   return known;
 }
 
 // Returns true if oneDNN computes float32 products faster than MKL, libtorch's default: MKL leaves half of the vector units idle on
 // processors of other makers than Intel.
-bool is_for_one_dnn() {
+bool is_onednn_faster() {
 #if defined(__x86_64__)
   static const bool is = [] {
     __builtin_cpu_init();
-    return at::hasMKL() && product() && __builtin_cpu_supports("avx2") && simd_limit() != SimdLimit::Portable && !__builtin_cpu_is("intel");
+    return at::hasMKL() && mkldnn_linear() && __builtin_cpu_supports("avx2") &&
+           simd_limit() != SimdLimit::Portable && !__builtin_cpu_is("intel");
   }();
   return is;
 #else
@@ -61,8 +62,8 @@ bool is_for_one_dnn() {
 
 // Computes xs [m, k] · weightsᵀ [n, k] + bias, if there is one, in float32 or bfloat16.
 Tensor multiply(const Tensor& xs, const Tensor& weights, const std::optional<Tensor>& bias) {
-  if (xs.scalar_type() == at::kBFloat16 || !is_for_one_dnn()) return at::linear(xs, weights, bias);
-  return product()->call(xs, weights, bias, "none", c10::List<std::optional<at::Scalar>>(), "");
+  if (xs.scalar_type() == at::kBFloat16 || !is_onednn_faster()) return at::linear(xs, weights, bias);
+  return mkldnn_linear()->call(xs, weights, bias, "none", c10::List<std::optional<at::Scalar>>(), "");
 }
 
 // Calls task(0) to task(count - 1), distributed over libtorch's threads. On such a thread, oneDNN and MKL use only that thread.

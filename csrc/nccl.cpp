@@ -51,7 +51,7 @@ c10::intrusive_ptr<T> constructed(void (*constructor)(void*, Arguments...), std:
 
 }  // namespace
 
-std::unique_ptr<ProcessGroup> nccl(const Store& store, int32_t rank, int32_t ranks, int64_t seconds) {
+std::unique_ptr<ProcessGroup> new_nccl_group(const Store& store, int32_t rank, int32_t ranks, int64_t seconds) {
   // Options contain a struct of NCCL that grows from version to version.
   int version = 0;
   loaded<int(int*)>("ncclGetVersion")(&version);
@@ -65,7 +65,7 @@ std::unique_ptr<ProcessGroup> nccl(const Store& store, int32_t rank, int32_t ran
   return std::make_unique<ProcessGroup>(constructed<ProcessGroupNCCL>(constructor, store.inner(), rank, ranks, std::move(options)));
 }
 #else
-std::unique_ptr<ProcessGroup> nccl(const Store&, int32_t, int32_t, int64_t) { throw std::runtime_error("built without NCCL"); }
+std::unique_ptr<ProcessGroup> new_nccl_group(const Store&, int32_t, int32_t, int64_t) { throw std::runtime_error("built without NCCL"); }
 #endif
 
 }  // namespace globalsplat

@@ -1,5 +1,6 @@
 #include "optim.h"
 
+#include <ATen/Dispatch.h>
 #include <ATen/ops/_foreach_mul.h>
 #include <ATen/ops/_foreach_norm.h>
 #include <ATen/ops/_fused_adamw.h>
@@ -7,6 +8,7 @@
 #include <ATen/ops/linalg_vector_norm.h>
 #include <ATen/ops/stack.h>
 
+#include <array>
 #include <vector>
 
 #include "globalsplat-csrc/src/optim.rs.h"
@@ -43,7 +45,7 @@ void zero_grad(rust::Slice<const size_t> tensors) {
 }
 
 void fused_adamw(rust::Slice<const size_t> values, rust::Slice<const size_t> gradients, rust::Slice<const size_t> first,
-                 rust::Slice<const size_t> second, const AdamWNumbers& of) {
+                 rust::Slice<const size_t> second, const AdamWOptions& of) {
   if (values.empty()) return;
   const auto x = borrowed(values), g = borrowed(gradients), m = borrowed(first), v = borrowed(second);
   // The kernel assumes equal memory layouts and checks nothing but the type.
@@ -63,7 +65,7 @@ void fused_adamw(rust::Slice<const size_t> values, rust::Slice<const size_t> gra
                     of.epsilon, /*amsgrad=*/false, /*maximize=*/false);
 }
 
-void muon(rust::Slice<const size_t> values, rust::Slice<const size_t> gradients, rust::Slice<const size_t> first, const MuonNumbers& of) {
+void muon(rust::Slice<const size_t> values, rust::Slice<const size_t> gradients, rust::Slice<const size_t> first, const MuonOptions& of) {
   const auto x = borrowed(values), g = borrowed(gradients), m = borrowed(first);
   TORCH_CHECK(g.size() == x.size() && m.size() == x.size(), "every matrix must have a gradient and a running mean of it");
   std::vector<raster::MuonMatrix> matrices;
@@ -79,7 +81,23 @@ void muon(rust::Slice<const size_t> values, rust::Slice<const size_t> gradients,
       matrices.push_back({x[k].data_ptr<float>() + begin, g[k].const_data_ptr<float>() + begin, m[k].data_ptr<float>() + begin, rows, columns});
     }
   }
-  raster::muon({of.learning_rate, of.learning_rate * of.weight_decay, of.beta}, matrices, threads());
+  raster::muon({of.learning_rate, of.learning_rate * of.weight_decay, of.beta}, matrices, get_num_threads());
+}
+
+void adam(const AdamArguments& of) {
+  const std::array<size_t, 4> addresses = {of.value, of.gradient, of.first, of.second};
+  const std::vector<Tensor> tensors = borrowed(rust::Slice<const size_t>(addresses.data(), addresses.size()));
+  const Tensor& value = tensors[0];
+  for (const Tensor& t : tensors)
+    TORCH_CHECK(t.device().is_cpu() && t.is_contiguous() && t.sizes() == value.sizes() && t.scalar_type() == value.scalar_type() &&
+                    (t.scalar_type() == at::kFloat || t.scalar_type() == at::kDouble),
+                "a parameter, its gradient and its moments must have one shape and type, be contiguous, and be on the CPU");
+  AT_DISPATCH_FLOATING_TYPES(value.scalar_type(), "adam", [&] {
+    const raster::AdamState<scalar_t> state{value.data_ptr<scalar_t>(), tensors[1].data_ptr<scalar_t>(),
+                                            tensors[2].data_ptr<scalar_t>(), tensors[3].data_ptr<scalar_t>()};
+    raster::adam<scalar_t>({of.step_size, of.bias_correction2_sqrt, of.decay, of.beta1, of.beta2, of.epsilon}, state, value.numel(),
+                           get_num_threads());
+  });
 }
 
 }  // namespace globalsplat

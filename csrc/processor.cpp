@@ -36,7 +36,7 @@ SimdLimit limit_libraries() {
 // Set before main(), when no library has chosen a kernel yet and there are no other threads.
 const SimdLimit limit = limit_libraries();
 
-Bf16Support found() {
+Bf16Support detect_bf16_support() {
   if (limit != SimdLimit::None) return Bf16Support::None;
   const auto capabilities = at::cpu::get_cpu_capabilities();
   const auto has = [&](const char* name) {
@@ -54,8 +54,8 @@ SimdLimit simd_limit() { return limit; }
 
 rust::String libtorch_simd_level() { return at::get_cpu_capability(); }
 
-Bf16Support bf16_of_cpu() {
-  static const Bf16Support known = found();
+Bf16Support cpu_bf16_support() {
+  static const Bf16Support known = detect_bf16_support();
   return known;
 }
 

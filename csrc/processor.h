@@ -16,7 +16,7 @@ SimdLimit simd_limit();
 
 // Returns the CPU's bf16 instructions that libtorch detects, or None if GLOBALSPLAT_SIMD disables them. Without such instructions, bf16
 // products are slower than float32 products.
-Bf16Support bf16_of_cpu();
+Bf16Support cpu_bf16_support();
 
 // Returns true if the current GPU has bf16 instructions.
 bool gpu_has_bf16();

@@ -44,14 +44,14 @@ c10::intrusive_ptr<c10d::Work> start_one_at_a_time(const Start& start) {
 
 Store::Store(c10::intrusive_ptr<c10d::Store> store) : store_(std::move(store)) {}
 
-std::unique_ptr<Store> Store::another() const { return std::make_unique<Store>(store_->clone()); }
+std::unique_ptr<Store> Store::clone_connection() const { return std::make_unique<Store>(store_->clone()); }
 
 int64_t Store::add(rust::Str key, int64_t amount) const { return store_->add(string(key), amount); }
 
-std::unique_ptr<Store> connect(rust::Str host, uint16_t port, bool serves, rust::Str prefix, int64_t seconds) {
+std::unique_ptr<Store> connect(rust::Str host, uint16_t port, bool is_server, rust::Str prefix, int64_t seconds) {
   c10d::TCPStoreOptions options;
   options.port = port;
-  options.isServer = serves;
+  options.isServer = is_server;
   options.waitWorkers = false;
   options.timeout = std::chrono::seconds(seconds);
   auto store = c10::make_intrusive<c10d::TCPStore>(string(host), options);
@@ -60,8 +60,8 @@ std::unique_ptr<Store> connect(rust::Str host, uint16_t port, bool serves, rust:
 
 bool has_gloo() { return GLOBALSPLAT_GLOO; }
 
-std::unique_ptr<ProcessGroup> gloo([[maybe_unused]] const Store& store, [[maybe_unused]] int32_t rank, [[maybe_unused]] int32_t ranks,
-                            [[maybe_unused]] int64_t seconds) {
+std::unique_ptr<ProcessGroup> new_gloo_group([[maybe_unused]] const Store& store, [[maybe_unused]] int32_t rank,
+                                             [[maybe_unused]] int32_t ranks, [[maybe_unused]] int64_t seconds) {
 #if GLOBALSPLAT_GLOO
   using c10d::ProcessGroupGloo;
   auto options = ProcessGroupGloo::Options::create(std::chrono::seconds(seconds));
@@ -116,11 +116,11 @@ struct Buckets::State {
   std::vector<Bucket> buckets;
   bool waiting = false;  // true while gradients are collected
   size_t sent = 0;       // number of buckets sent
-  std::vector<bool> came;
+  std::vector<bool> has_gradient;
   std::vector<c10::intrusive_ptr<c10d::Work>> works;
   std::exception_ptr error;
 
-  void arrived(size_t parameter);
+  void on_gradient(size_t parameter);
   void send(const Bucket& bucket);
 };
 
@@ -128,10 +128,10 @@ namespace {
 
 // Hook that notifies a state that a parameter has its gradient.
 template <class State>
-struct Arrival final : torch::autograd::PostAccumulateGradHook {
-  Arrival(std::shared_ptr<State> state, size_t parameter) : state(std::move(state)), parameter(parameter) {}
+struct GradientHook final : torch::autograd::PostAccumulateGradHook {
+  GradientHook(std::shared_ptr<State> state, size_t parameter) : state(std::move(state)), parameter(parameter) {}
 
-  void operator()(const at::Tensor&) override { state->arrived(parameter); }
+  void operator()(const at::Tensor&) override { state->on_gradient(parameter); }
 
   std::shared_ptr<State> state;
   size_t parameter;
@@ -139,12 +139,12 @@ struct Arrival final : torch::autograd::PostAccumulateGradHook {
 
 }  // namespace
 
-void Buckets::State::arrived(size_t parameter) {
+void Buckets::State::on_gradient(size_t parameter) {
   if (!waiting || error) return;
   // An exception must not leave a hook in the middle of the backward pass.
   try {
-    TORCH_CHECK(!came[parameter], "a parameter has had its gradient twice in a step");
-    came[parameter] = true;
+    TORCH_CHECK(!has_gradient[parameter], "a parameter has had its gradient twice in a step");
+    has_gradient[parameter] = true;
     --buckets[bucket_of[parameter]].missing;
     while (sent < buckets.size() && buckets[sent].missing == 0) send(buckets[sent]);
   } catch (...) {
@@ -178,7 +178,7 @@ Buckets::Buckets(Ranks ranks, std::vector<at::Tensor> parameters, int64_t bytes)
   State& state = *state_;
   state.ranks = std::move(ranks);
   state.parameters = std::move(parameters);
-  state.came.resize(state.parameters.size());
+  state.has_gradient.resize(state.parameters.size());
   int64_t size = 0;
   for (size_t i = 0; i < state.parameters.size(); ++i) {
     const at::Tensor& parameter = state.parameters[i];
@@ -191,7 +191,7 @@ Buckets::Buckets(Ranks ranks, std::vector<at::Tensor> parameters, int64_t bytes)
     state.buckets.back().end = i + 1;
     state.bucket_of.push_back(state.buckets.size() - 1);
     size += int64_t(parameter.nbytes());
-    torch::autograd::impl::set_post_acc_grad_hooks(parameter, std::make_unique<Arrival<State>>(state_, i));
+    torch::autograd::impl::set_post_acc_grad_hooks(parameter, std::make_unique<GradientHook<State>>(state_, i));
   }
 }
 
@@ -202,7 +202,7 @@ Buckets::~Buckets() {
 void Buckets::begin() const {
   State& state = *state_;
   for (auto& bucket : state.buckets) bucket.missing = bucket.end - bucket.first;
-  state.came.assign(state.parameters.size(), false);
+  state.has_gradient.assign(state.parameters.size(), false);
   state.sent = 0;
   state.works.clear();
   state.error = nullptr;

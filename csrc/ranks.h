@@ -24,7 +24,7 @@ class Store {
   explicit Store(c10::intrusive_ptr<c10d::Store> store);
 
   // Opens another connection, for another thread.
-  std::unique_ptr<Store> another() const;
+  std::unique_ptr<Store> clone_connection() const;
 
   // Adds to a number, initially 0, and returns the sum.
   int64_t add(rust::Str key, int64_t amount) const;
@@ -35,9 +35,9 @@ class Store {
   c10::intrusive_ptr<c10d::Store> store_;
 };
 
-// Connects to the store at `host`. The process hosts the store itself if it `serves` (with port 0: on a free port). Keys with another
+// Connects to the store at `host`. The process hosts the store itself if `is_server` (with port 0: on a free port). Keys with another
 // `prefix` are separate. No operation waits longer than `seconds`.
-std::unique_ptr<Store> connect(rust::Str host, uint16_t port, bool serves, rust::Str prefix, int64_t seconds);
+std::unique_ptr<Store> connect(rust::Str host, uint16_t port, bool is_server, rust::Str prefix, int64_t seconds);
 
 // Return true if this build supports ranks on CPUs (Gloo) and on GPUs (NCCL).
 bool has_gloo();
@@ -66,9 +66,9 @@ class ProcessGroup {
 };
 
 // Creates a group for CPU tensors. Collectives that take longer than `seconds` fail.
-std::unique_ptr<ProcessGroup> gloo(const Store& store, int32_t rank, int32_t ranks, int64_t seconds);
+std::unique_ptr<ProcessGroup> new_gloo_group(const Store& store, int32_t rank, int32_t ranks, int64_t seconds);
 // Creates a group for GPU tensors. libtorch's CUDA library must have been loaded. Collectives that take longer than `seconds` fail.
-std::unique_ptr<ProcessGroup> nccl(const Store& store, int32_t rank, int32_t ranks, int64_t seconds);
+std::unique_ptr<ProcessGroup> new_nccl_group(const Store& store, int32_t rank, int32_t ranks, int64_t seconds);
 
 // Gradients of a step, summed over all ranks in buckets. A bucket is sent as soon as the backward pass has computed all of its gradients
 // and the previous bucket has been sent, so the order is the same on all ranks.

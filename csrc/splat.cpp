@@ -115,7 +115,7 @@ void run(const SplatArguments& of, rust::Slice<size_t> out) {
   a.check();
   const at::Device home = a.means.device();
   const at::DeviceType there = backend_of(a.means).device;
-  const Inputs in = a.on(there == home.type() ? home : at::Device(there));
+  const Inputs in = a.to_inputs(there == home.type() ? home : at::Device(there));
   const Gaussians& g = in.gaussians;
   const tensor_list results = Function::apply(g.means, g.scales, g.quaternions, g.opacities, g.sh, in.w2c, in.intrinsics,
                                               in.width, in.height, in.eps2d);

@@ -11,11 +11,11 @@ std::atomic<int> own{0};
 
 }  // namespace
 
-int threads() {
+int get_num_threads() {
   const int count = own;
   return count > 0 ? count : at::get_num_threads();
 }
 
-void set_threads(int count) { own = count; }
+void set_num_threads(int count) { own = count; }
 
 }  // namespace globalsplat

@@ -7,7 +7,7 @@
 #include "cuda/kernel_times.cpp"
 #include "cuda/splat.cpp"
 #include "device.cpp"
-#include "fit.cpp"
+#include "image_losses.cpp"
 #include "linear.cpp"
 #include "ops.cpp"
 #include "optim.cpp"

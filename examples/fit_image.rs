@@ -4,7 +4,7 @@
 //!
 //! The output image shows the photo, the initial render, and the final render.
 
-use globalsplat::data::{fit, tensor_from_planes};
+use globalsplat::data::{resize_and_crop, tensor_from_planes};
 use globalsplat::eval::psnr;
 use globalsplat::io::{read_image, tile_horizontally, write_png};
 use globalsplat::loss::{mse, ssim};
@@ -63,7 +63,8 @@ fn load(path: &Path) -> Result<(Tensor, Camera)> {
         Camera { intrinsics, c2w: glam::DMat4::IDENTITY, width: image.width(), height: image.height() };
     let scale = LONGEST_SIDE / width.max(height);
     let side = |side: f64| ((side * scale).round() as u32).max(16);
-    let (planes, camera) = fit(&image, &camera, ImageSize { width: side(width), height: side(height) });
+    let (planes, camera) =
+        resize_and_crop(&image, &camera, ImageSize { width: side(width), height: side(height) });
     Ok((tensor_from_planes(&planes), camera))
 }
 

@@ -38,7 +38,8 @@ for sanitizer in $sanitizers; do
         compile "$sanitizer-$isa" kernels/kernels_isa.cpp "${flags_of[$sanitizer]}" -ffp-contract=off "-DGS_ISA=$isa" \
             "${flags_of[$isa]:-}"
     done
-    for source in kernels/{raster,attend,fit,optim,parallel,kernels}.cpp cuda/{fitting,frame}.cpp checks/{checks,refusals,schedules}.cpp; do
+    for source in kernels/{raster,multi_head_attention,image_losses,optim,parallel,kernels}.cpp cuda/{launch_losses,frame}.cpp \
+        checks/{checks,injected_failures,schedules}.cpp; do
         compile "$sanitizer-$(basename "$source" .cpp)" "$source" "${flags_of[$sanitizer]}" -Icsrc/kernels
     done
     compile "$sanitizer-emulated_kernels" cuda/emulated_kernels.cpp "${flags_of[$sanitizer]}" -ffp-contract=off -Icsrc/kernels
@@ -50,7 +51,10 @@ for sanitizer in $sanitizers; do
 done | xargs -P "$(nproc)" -d '\n' -n 1 bash -c
 for sanitizer in $sanitizers; do
     objects=()
-    for part in $isas raster attend fit optim parallel kernels fitting frame emulated_kernels emulator checks refusals schedules; do objects+=("$out/$sanitizer-$part.o"); done
+    for part in $isas raster multi_head_attention image_losses optim parallel kernels launch_losses frame emulated_kernels emulator checks \
+        injected_failures schedules; do
+        objects+=("$out/$sanitizer-$part.o")
+    done
     # shellcheck disable=SC2086
     ${CXX:-g++} ${flags_of[$sanitizer]} "${objects[@]}" -pthread -o "$out/$sanitizer"
 done

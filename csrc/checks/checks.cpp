@@ -24,13 +24,13 @@
 #include <thread>
 
 #include "../cuda/emulated.h"
-#include "../kernels/attend.h"
-#include "../kernels/fit.h"
+#include "../kernels/attention_types.h"
+#include "../kernels/image_losses.h"
 #include "../kernels/kernels.h"
+#include "../kernels/multi_head_attention.h"
 #include "../kernels/optim.h"
 #include "../kernels/parallel.h"
-#include "../kernels/rows.h"
-#include "refusals.h"
+#include "injected_failures.h"
 #include "scenes.h"
 #include "schedules.h"
 
@@ -72,9 +72,9 @@ bool same(const std::vector<Item>& a, const std::vector<Item>& b) {
 template <class T>
 class Render {
  public:
-  Render(const Scene<T>& scene, int threads) : settings_{scene.width, scene.height, 0.05, threads}, views_(scene.views) {
+  Render(const Scene<T>& scene, int num_threads) : settings_{scene.width, scene.height, 0.05, num_threads}, views_(scene.views) {
     // Unwritten outputs differ from those of a render with another number of threads.
-    const T unwritten = T(threads);
+    const T unwritten = T(num_threads);
     const size_t pixels = size_t(scene.width) * size_t(scene.height);
     for (const Arrays<T>& g : scene.gaussians) {
       scenes_.push_back({g.means.data(), g.scales.data(), g.quaternions.data(), g.opacities.data(), g.sh.data(),
@@ -172,9 +172,9 @@ int64_t same_bits(const Scene<T>& scene, const std::vector<int>& thread_counts) 
   const std::string name = scene.name + ", " + type_name<T>() + ", " + std::to_string(scene.bases) + " bases";
   begin(name);
   Render<T> one = expected(scene);
-  for (const int threads : thread_counts) {
-    begin(name + ", " + std::to_string(threads) + " threads");
-    Render<T> render(scene, threads);
+  for (const int num_threads : thread_counts) {
+    begin(name + ", " + std::to_string(num_threads) + " threads");
+    Render<T> render(scene, num_threads);
     render.draw();
     render.backward();
     render.expect_bits_of(one);
@@ -184,7 +184,7 @@ int64_t same_bits(const Scene<T>& scene, const std::vector<int>& thread_counts) 
 
 // Losses and their gradients, and a step of Adam. Arrays have their exact sizes, so that out-of-bounds reads are detected.
 template <class T>
-int64_t fits(const std::vector<int>& thread_counts) {
+int64_t check_losses(const std::vector<int>& thread_counts) {
   Random random(11);
   const auto numbers = [&](size_t count) {
     std::vector<T> values;
@@ -192,15 +192,15 @@ int64_t fits(const std::vector<int>& thread_counts) {
     return values;
   };
   int64_t count = 0;
-  // evaluate(gradient, threads) returns a loss, and writes the gradient's `all` values unless it is null.
+  // evaluate(gradient, num_threads) returns a loss, and writes the gradient's `all` values unless it is null.
   const auto expect_the_same = [&](const std::string& what, size_t all, const auto& evaluate) {
     std::vector<T> one(all);
     begin(what + ", " + type_name<T>());
     const double value = evaluate(one.data(), 1);
     expect(evaluate(nullptr, 1) == value, "the gradient changes the value");
-    for (const int threads : thread_counts) {
-      std::vector<T> gradient(all, T(threads));
-      const double again = evaluate(gradient.data(), threads);
+    for (const int num_threads : thread_counts) {
+      std::vector<T> gradient(all, T(num_threads));
+      const double again = evaluate(gradient.data(), num_threads);
       expect(again == value && same(gradient, one), "threads change a loss");
       ++count;
     }
@@ -208,40 +208,41 @@ int64_t fits(const std::vector<int>& thread_counts) {
   for (const auto& [planes, height, width] : {std::array<int, 3>{1, 11, 11}, {3, 12, 37}, {6, 43, 48}}) {
     const size_t all = size_t(planes * height * width);
     const std::vector<T> pictures = numbers(all), photos = numbers(all);
-    const raster::FitJob<T> job{pictures.data(), photos.data(), planes, width, height};
+    const raster::PhotometricJob<T> job{pictures.data(), photos.data(), planes, width, height};
     for (const double ssim_weight : {0.0, -0.2})
-      expect_the_same("a fit", all, [&](T* gradient, int threads) {
-        return raster::photometric<T>(job, 0.8, ssim_weight, gradient, threads);
+      expect_the_same("the photometric loss", all, [&](T* gradient, int num_threads) {
+        return raster::photometric<T>(job, 0.8, ssim_weight, gradient, num_threads);
       });
   }
   for (const auto& [views, height, width] : {std::array<int, 3>{1, 1, 1}, {3, 12, 37}, {2, 43, 48}}) {
     const size_t all = size_t(views * height * width);
     const std::vector<T> depths = numbers(all), photos = numbers(3 * all);
-    const raster::DepthJob<T> job{depths.data(), photos.data(), views, width, height};
-    expect_the_same("smoothness", all, [&](T* gradient, int threads) {
-      return raster::depth_smoothness<T>(job, 0.3, gradient, threads);
+    const raster::SmoothnessJob<T> job{depths.data(), photos.data(), views, width, height};
+    expect_the_same("smoothness", all, [&](T* gradient, int num_threads) {
+      return raster::depth_smoothness<T>(job, 0.3, gradient, num_threads);
     });
   }
   const size_t many = 40'000;
   const std::vector<T> gradient = numbers(many), start = numbers(many);
-  const auto stepped = [&](int threads) {
+  const auto stepped = [&](int num_threads) {
     begin("a step of Adam, " + type_name<T>());
     std::vector<T> value = start, first = start, second = start;
-    raster::adam<T>({0.1, 0.5, 0.01, 0.9, 0.999, 1e-8}, {value.data(), gradient.data(), first.data(), second.data()}, int64_t(many), threads);
+    raster::adam<T>({0.1, 0.5, 0.01, 0.9, 0.999, 1e-8}, {value.data(), gradient.data(), first.data(), second.data()}, int64_t(many),
+                    num_threads);
     value.insert(value.end(), first.begin(), first.end());
     value.insert(value.end(), second.begin(), second.end());
     return value;
   };
   const std::vector<T> one = stepped(1);
-  for (const int threads : thread_counts) {
-    expect(same(stepped(threads), one), "threads change a step of Adam");
+  for (const int num_threads : thread_counts) {
+    expect(same(stepped(num_threads), one), "threads change a step of Adam");
     ++count;
   }
   return count;
 }
 
 // Reference for a step of Muon (muon.h), which doesn't transpose X, in scalar float64 code.
-std::vector<double> after_muon(const raster::MuonStep& step, const raster::MuonMatrix& of) {
+std::vector<double> muon_reference(const raster::MuonStep& step, const raster::MuonMatrix& of) {
   const auto [rows, columns] = std::array<int64_t, 2>{of.rows, of.columns};
   std::vector<double> x(size_t(rows * columns));
   double squares = 0;
@@ -273,7 +274,7 @@ std::vector<double> after_muon(const raster::MuonStep& step, const raster::MuonM
 }
 
 // Steps of Muon on matrices of all shapes, with exactly the scratch memory that they request.
-int64_t matrices(const std::vector<int>& thread_counts) {
+int64_t check_muon(const std::vector<int>& thread_counts) {
   const raster::MuonStep step{0.1, 0.01, 0.95};
   std::vector<std::vector<float>> numbers;
   std::vector<raster::MuonMatrix> all;
@@ -293,7 +294,7 @@ int64_t matrices(const std::vector<int>& thread_counts) {
   draw();
   for (const raster::MuonMatrix& matrix : all) {
     begin("a step of Muon on " + std::to_string(matrix.rows) + " × " + std::to_string(matrix.columns));
-    const std::vector<double> expected = after_muon(step, matrix);
+    const std::vector<double> expected = muon_reference(step, matrix);
     const size_t bytes = sizeof(float) * size_t(raster::muon_scratch_size(matrix.rows, matrix.columns));
     const std::unique_ptr<float, decltype(&std::free)> scratch(static_cast<float*>(std::aligned_alloc(64, bytes)), std::free);
     raster::kernels().muon(step, matrix, scratch.get());
@@ -301,10 +302,10 @@ int64_t matrices(const std::vector<int>& thread_counts) {
       expect(std::abs(matrix.value[k] - expected[k]) < 1e-5, "a step of Muon goes elsewhere");
   }
   const std::vector<std::vector<float>> one = numbers;
-  for (const int threads : thread_counts) {
-    begin("steps of Muon, " + std::to_string(threads) + " threads");
+  for (const int num_threads : thread_counts) {
+    begin("steps of Muon, " + std::to_string(num_threads) + " threads");
     draw();
-    raster::muon(step, all, threads);
+    raster::muon(step, all, num_threads);
     for (size_t k = 0; k < one.size(); ++k) expect(same(numbers[k], one[k]), "threads change a step of Muon");
   }
   return int64_t(all.size() + thread_counts.size());
@@ -320,7 +321,7 @@ std::vector<raster::Bf16> cut_to_bf16(const std::vector<float>& numbers) {
   return cut;
 }
 
-// Reference for raster::Bf16Products in scalar code.
+// Reference for raster::Bf16Gemm in scalar code.
 void multiply_bf16(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row, int64_t c_row, bool adds, const raster::Bf16* a,
                    const raster::Bf16* b, float* c) {
   for (int64_t i = 0; i < m; ++i)
@@ -332,7 +333,7 @@ void multiply_bf16(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row
 }
 
 // Attention, forward and backward. Here, too, arrays have their exact sizes.
-int64_t attentions(const std::vector<int>& thread_counts) {
+int64_t check_attention(const std::vector<int>& thread_counts) {
   Random random(12);
   const auto numbers = [&](int64_t count) {
     std::vector<float> values;
@@ -349,30 +350,30 @@ int64_t attentions(const std::vector<int>& thread_counts) {
     const int64_t row = shape.heads * shape.width, in = shape.queries * row, seen = shape.keys * row;
     const std::vector<float> q = numbers(shape.scenes * in), grad_out = numbers(shape.scenes * in);
     const std::vector<float> k = numbers(shape.scenes * seen), v = numbers(shape.scenes * seen);
-    const auto attended = [&](int threads) {
-      begin("attention of " + std::to_string(shape.queries) + " to " + std::to_string(shape.keys) + ", " + std::to_string(threads) +
+    const auto attended = [&](int num_threads) {
+      begin("attention of " + std::to_string(shape.queries) + " to " + std::to_string(shape.keys) + ", " + std::to_string(num_threads) +
             " threads");
-      const auto unwritten = [&](size_t n) { return std::vector<float>(n, float(threads)); };
+      const auto unwritten = [&](size_t n) { return std::vector<float>(n, float(num_threads)); };
       const raster::AttentionInputs<float> inputs{{q.data(), in, row}, {k.data(), seen, row}, {v.data(), seen, row}};
       std::vector<float> out = unwritten(q.size()), log_sums = unwritten(size_t(shape.scenes * shape.heads * shape.queries));
-      raster::attend(shape, inputs, {out.data(), in, row}, log_sums.data(), threads);
+      raster::multi_head_attention(shape, inputs, {out.data(), in, row}, log_sums.data(), num_threads);
       std::vector<float> dq = unwritten(q.size()), dk = unwritten(k.size()), dv = unwritten(v.size());
-      raster::attend_backward(shape, inputs, {out.data(), in, row}, log_sums.data(), {grad_out.data(), in, row},
-                              {{dq.data(), in, row}, {dk.data(), seen, row}, {dv.data(), seen, row}}, threads);
+      raster::multi_head_attention_backward(shape, inputs, {out.data(), in, row}, log_sums.data(), {grad_out.data(), in, row},
+                                            {{dq.data(), in, row}, {dk.data(), seen, row}, {dv.data(), seen, row}}, num_threads);
       for (const std::vector<float>* more : {&log_sums, &dq, &dk, &dv}) out.insert(out.end(), more->begin(), more->end());
       if (shape.width % 8 != 0) return out;
 
       using Halves = std::vector<raster::Bf16>;
       const Halves q_cut = cut_to_bf16(q), k_cut = cut_to_bf16(k), v_cut = cut_to_bf16(v), grad_out_cut = cut_to_bf16(grad_out);
-      const auto unwritten_cut = [&](size_t n) { return Halves(n, raster::Bf16(threads)); };
+      const auto unwritten_cut = [&](size_t n) { return Halves(n, raster::Bf16(num_threads)); };
       const raster::AttentionInputs<raster::Bf16> cut{{q_cut.data(), in, row}, {k_cut.data(), seen, row}, {v_cut.data(), seen, row}};
-      const raster::Bf16Products products = {multiply_bf16, [] {}};
+      const raster::Bf16Gemm gemm = {multiply_bf16, [] {}};
       Halves out_cut = unwritten_cut(q.size()), dq_cut = unwritten_cut(q.size());
       Halves dk_cut = unwritten_cut(k.size()), dv_cut = unwritten_cut(v.size());
-      raster::attend_bf16(shape, cut, {out_cut.data(), in, row}, log_sums.data(), products, threads);
-      raster::attend_backward_bf16(shape, cut, {out_cut.data(), in, row}, log_sums.data(), {grad_out_cut.data(), in, row},
-                                   {{dq_cut.data(), in, row}, {dk_cut.data(), seen, row}, {dv_cut.data(), seen, row}}, products,
-                                   threads);
+      raster::multi_head_attention_bf16(shape, cut, {out_cut.data(), in, row}, log_sums.data(), gemm, num_threads);
+      raster::multi_head_attention_backward_bf16(shape, cut, {out_cut.data(), in, row}, log_sums.data(), {grad_out_cut.data(), in, row},
+                                                 {{dq_cut.data(), in, row}, {dk_cut.data(), seen, row}, {dv_cut.data(), seen, row}}, gemm,
+                                                 num_threads);
       out.insert(out.end(), log_sums.begin(), log_sums.end());
       for (const Halves* more : {&out_cut, &dq_cut, &dk_cut, &dv_cut})
         for (const raster::Bf16 number : *more) out.push_back(raster::to_float(number));
@@ -380,8 +381,8 @@ int64_t attentions(const std::vector<int>& thread_counts) {
     };
     const std::vector<float> one = attended(1);
     for (const float number : one) expect(std::isfinite(number), "attention isn't finite");
-    for (const int threads : thread_counts) {
-      expect(same(attended(threads), one), "threads change attention");
+    for (const int num_threads : thread_counts) {
+      expect(same(attended(num_threads), one), "threads change attention");
       ++count;
     }
   }
@@ -392,8 +393,9 @@ int64_t attentions(const std::vector<int>& thread_counts) {
 int64_t bits(bool is_short) {
   std::vector<int> thread_counts = {2, 3, 16};
   if (!is_short)
-    for (int threads = 4; threads < 16; ++threads) thread_counts.push_back(threads);
-  int64_t count = fits<float>(thread_counts) + fits<double>(thread_counts) + matrices(thread_counts) + attentions(thread_counts);
+    for (int num_threads = 4; num_threads < 16; ++num_threads) thread_counts.push_back(num_threads);
+  int64_t count = check_losses<float>(thread_counts) + check_losses<double>(thread_counts) + check_muon(thread_counts);
+  count += check_attention(thread_counts);
   size_t turn = 0;  // the short form covers all degrees, but one per scene
   for (const int bases : {1, 4, 9, 16}) {
     const std::vector<Scene<double>> scenes = all_scenes(bases);
@@ -402,7 +404,7 @@ int64_t bits(bool is_short) {
         for_both(scenes[i], [&](const auto& scene) { count += same_bits(scene, thread_counts); });
     ++turn;
   }
-  for_both(crowd(1), [&](const auto& scene) { count += same_bits(scene, {16}); });
+  for_both(many_gaussians(1), [&](const auto& scene) { count += same_bits(scene, {16}); });
   return count;
 }
 
@@ -461,18 +463,18 @@ int64_t callers(bool is_short) {
   return callers_of<float>(scenes, rounds) + callers_of<double>(scenes, rounds);
 }
 
-// Returns once `threads` threads are working at the same time.
-void meet(int threads) {
+// Returns once `num_threads` threads are working at the same time.
+void wait_for_threads(int num_threads) {
   std::atomic<int> arrived{0};
-  parallel_for(threads, threads, [&](int64_t) {
+  parallel_for(num_threads, num_threads, [&](int64_t) {
     ++arrived;
-    while (arrived < threads) std::this_thread::yield();
+    while (arrived < num_threads) std::this_thread::yield();
   });
 }
 
 Scene<double> small_scene() {
   Random random(10);
-  return scattered(random, "small", 20, 20, 2, 2, 40, 4);
+  return random_scene(random, "small", 20, 20, 2, 2, 40, 4);
 }
 
 // Failures to create all threads or some of them, and other uses of parallel_for().
@@ -488,26 +490,26 @@ int64_t threads(bool is_short) {
     render.expect_bits_of(one);
     ++count;
   };
-  refuse_threads();
+  fail_thread_creation();
   renders("every thread refused");
   renders("every thread refused again");
 
   begin("no memory for a thread");
-  allow_threads();
+  allow_thread_creation();
   std::atomic<int64_t> sum{0};
   const std::function<void(int64_t)> add = [&](int64_t i) { sum += i; };
-  refuse_memory(0, true);
+  fail_allocations(0, true);
   parallel_for(8, 100, add);
-  expect(allow_memory() > 0 && sum == 4950, "the work wasn't done on the caller");
+  expect(stop_failing_allocations() > 0 && sum == 4950, "the work wasn't done on the caller");
   ++count;
 
-  meet(3);
-  refuse_threads();
+  wait_for_threads(3);
+  fail_thread_creation();
   renders("the first two threads given, the others refused");
-  allow_threads();
+  allow_thread_creation();
   renders("threads refused before");
   begin("threads given at last");
-  meet(8);
+  wait_for_threads(8);
   ++count;
 
   for (int round = 0; round < (is_short ? 20 : 1000); ++round) {
@@ -536,25 +538,25 @@ int64_t threads(bool is_short) {
 
 // Failures of every single allocation of a render, and of all allocations from one on.
 template <class T>
-int64_t memory_of(const Scene<T>& scene, int threads, bool all_after) {
-  begin("memory refused, " + type_name<T>() + ", " + std::to_string(threads) + " threads");
-  Render<T> one = expected(scene), render(scene, threads);
-  meet(threads);
+int64_t memory_of(const Scene<T>& scene, int num_threads, bool all_after) {
+  begin("memory refused, " + type_name<T>() + ", " + std::to_string(num_threads) + " threads");
+  Render<T> one = expected(scene), render(scene, num_threads);
+  wait_for_threads(num_threads);
   for (int64_t n = 0;; ++n) {
     alarm(kTimeoutSeconds);
-    const int64_t before = blocks();
+    const int64_t before = count_live_blocks();
     bool caught = false;
-    refuse_memory(n, all_after);
+    fail_allocations(n, all_after);
     try {
       render.draw();
       render.backward();
     } catch (const std::bad_alloc&) {
       caught = true;
     }
-    const int64_t refused = allow_memory();
+    const int64_t refused = stop_failing_allocations();
     render.drop();
     expect(caught == (refused > 0), "the exception doesn't reach the caller");
-    expect(blocks() == before, "memory is lost");
+    expect(count_live_blocks() == before, "memory is lost");
     if (!caught) {
       expect(n > 0, "nothing asks for memory");
       render.expect_bits_of(one);
@@ -570,8 +572,8 @@ int64_t memory_of(const Scene<T>& scene, int threads, bool all_after) {
 int64_t memory(bool is_short) {
   int64_t count = 0;
   for_both(small_scene(), [&](const auto& scene) {
-    for (const int threads : is_short ? std::vector<int>{3} : std::vector<int>{1, 2, 8})
-      for (const bool all_after : {false, true}) count += memory_of(scene, threads, all_after);
+    for (const int num_threads : is_short ? std::vector<int>{3} : std::vector<int>{1, 2, 8})
+      for (const bool all_after : {false, true}) count += memory_of(scene, num_threads, all_after);
   });
   return count;
 }
@@ -585,7 +587,7 @@ int64_t orders(bool is_short) {
   begin("sums of kernels");
   for (const uint64_t seed : seeds) expect_none(sums_differ(seed));
   begin("losses of kernels");
-  expect_none(fits_differ(seeds));
+  expect_none(losses_differ(seeds));
   int64_t count = 2 * int64_t(seeds.size());
   size_t turn = 0;
   for (const int bases : {1, 4, 9, 16}) {

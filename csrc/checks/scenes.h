@@ -58,8 +58,8 @@ inline raster::Camera<double> rotated_camera(double x, double y, double z) {
 
 // Creates a scene whose splats have sizes from less than a pixel to a third of the image, and opacities from 0 to 1. Some are outside of
 // the image.
-inline Scene<double> scattered(Random& random, std::string name, int width, int height, int batch, int cameras, size_t count,
-                               int bases) {
+inline Scene<double> random_scene(Random& random, std::string name, int width, int height, int batch, int cameras, size_t count,
+                                  int bases) {
   Scene<double> scene{name, width, height, bases, {}, {}};
   const double side = std::max(width, height);
   for (int b = 0; b < batch; ++b) {
@@ -90,9 +90,9 @@ inline Scene<double> scattered(Random& random, std::string name, int width, int 
 
 // Creates a scene of the given Gaussians, with random rotations and colours. The first camera is at the origin, without rotation; others
 // are translated.
-inline Scene<double> scene_of(Random& random, std::string name, int bases, std::vector<double> means,
-                              std::vector<double> scales, std::vector<double> opacities, int cameras = 1, int width = 48,
-                              int height = 33) {
+inline Scene<double> make_scene(Random& random, std::string name, int bases, std::vector<double> means,
+                                std::vector<double> scales, std::vector<double> opacities, int cameras = 1, int width = 48,
+                                int height = 33) {
   const size_t count = opacities.size();
   Scene<double> scene{name, width, height, bases, {}, {}};
   scene.gaussians.push_back({means, scales, random.normal(4 * count, 1), opacities,
@@ -102,7 +102,7 @@ inline Scene<double> scene_of(Random& random, std::string name, int bases, std::
   return scene;
 }
 
-// Returns means at the given depths, within the view of the first camera of scene_of(), or within a part of it if `spread` is smaller.
+// Returns means at the given depths, within the view of the first camera of make_scene(), or within a part of it if `spread` is smaller.
 inline std::vector<double> means_at(Random& random, const std::vector<double>& depths, double spread = 0.6) {
   std::vector<double> means;
   for (const double depth : depths)
@@ -117,16 +117,16 @@ inline std::vector<double> repeated(const std::vector<double>& values, size_t co
   return out;
 }
 
-// Returns all scenes but crowd().
+// Returns all scenes but many_gaussians().
 inline std::vector<Scene<double>> all_scenes(int bases) {
   Random random(7);
   std::vector<Scene<double>> scenes;
   const auto add_scattered = [&](const char* name, int width, int height, int batch, int cameras, size_t count) {
-    scenes.push_back(scattered(random, name, width, height, batch, cameras, count, bases));
+    scenes.push_back(random_scene(random, name, width, height, batch, cameras, count, bases));
   };
   const auto add = [&](const char* name, std::vector<double> means, std::vector<double> scales,
                        std::vector<double> opacities, int cameras = 1, int width = 48, int height = 33) {
-    scenes.push_back(scene_of(random, name, bases, means, scales, opacities, cameras, width, height));
+    scenes.push_back(make_scene(random, name, bases, means, scales, opacities, cameras, width, height));
   };
   const auto depths = [&](size_t count) { return random.uniform(count, 1, 3); };
 
@@ -216,9 +216,9 @@ inline std::vector<Scene<double>> all_scenes(int bases) {
 }
 
 // Creates a scene with more Gaussians than are sorted and binned in one chunk.
-inline Scene<double> crowd(int bases) {
+inline Scene<double> many_gaussians(int bases) {
   Random random(8);
-  return scattered(random, "crowd", 20, 20, 1, 1, 66000, bases);
+  return random_scene(random, "crowd", 20, 20, 1, 1, 66000, bases);
 }
 
 // Converts a scene to numbers of type T.

@@ -6,8 +6,8 @@
 #include <cstring>
 
 #include "../cuda/emulated.h"
-#include "../cuda/fitting.h"
 #include "../cuda/frame.h"
+#include "../cuda/launch_losses.h"
 #include "../kernels/kernels.h"
 
 namespace globalsplat::checks {
@@ -180,14 +180,14 @@ std::string sums_differ(uint64_t seed) {
   return sums[0] == expected[0] && sums[1] == expected[1] && total == totals[0] ? "" : "prefix sums differ";
 }
 
-std::string fits_differ(const std::vector<uint64_t>& seeds) {
+std::string losses_differ(const std::vector<uint64_t>& seeds) {
   Random random(12);
   const auto numbers = [&](size_t count) {
     Numbers values;
     for (const double value : random.uniform(count, 0, 1)) values.push_back(float(value));
     return values;
   };
-  const auto sum_of = [](const cuda::Parts& parts) {
+  const auto sum_of = [](const cuda::PartialSums& parts) {
     double sum = 0;
     for (int64_t k = 0; k < parts.count; ++k) sum += static_cast<const double*>(parts.numbers.get())[k];
     return sum;
@@ -223,7 +223,7 @@ std::string fits_differ(const std::vector<uint64_t>& seeds) {
     for (const auto& [l1_weight, ssim_weight] : {std::array<double, 2>{0.8, 0}, {0, 1}, {0.8, -0.2}}) {
       const size_t size = size_t(planes * height * width);
       const Numbers pictures = numbers(size), photos = numbers(size);
-      const raster::FitJob<float> job{pictures.data(), photos.data(), planes, width, height};
+      const raster::PhotometricJob<float> job{pictures.data(), photos.data(), planes, width, height};
       const double a = l1_weight, s = ssim_weight;
       const std::string found = difference(
           size, [&](float* gradient) { return raster::photometric<float>(job, a, s, gradient, 1); },
@@ -235,7 +235,7 @@ std::string fits_differ(const std::vector<uint64_t>& seeds) {
     Numbers depths = numbers(size);
     const Numbers photos = numbers(3 * size);
     for (size_t k = 0; k < size; k += 7) depths[k] = 0;
-    const raster::DepthJob<float> job{depths.data(), photos.data(), views, width, height};
+    const raster::SmoothnessJob<float> job{depths.data(), photos.data(), views, width, height};
     const std::string found = difference(
         size, [&](float* gradient) { return raster::depth_smoothness<float>(job, 0.3, gradient, 1); },
         [&](const cuda::Device& device, float* gradient) { return cuda::depth_smoothness(device, job, 0.3, gradient); });

@@ -19,6 +19,6 @@ std::string sums_differ(uint64_t seed);
 
 // Tests the losses that compare images with photos, and their gradients. Returns a description of the first difference; empty if there is
 // none.
-std::string fits_differ(const std::vector<uint64_t>& seeds);
+std::string losses_differ(const std::vector<uint64_t>& seeds);
 
 }  // namespace globalsplat::checks

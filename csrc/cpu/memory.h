@@ -7,14 +7,14 @@
 #include <vector>
 
 #include "../backend.h"
-#include "../kernels/lens.h"
+#include "../kernels/projection_params.h"
 #include "../kernels/raster.h"
 
 namespace globalsplat::cpu {
 
 // Calls body(0.) or body(0.f), depending on the type of the inputs.
 template <class Body>
-auto by_type(const Inputs& in, Body body) {
+auto dispatch_by_type(const Inputs& in, Body body) {
   return in.gaussians.means.scalar_type() == at::kDouble ? body(0.) : body(0.f);
 }
 

@@ -4,7 +4,7 @@
 #include <vector>
 
 #include "../kernels/kernels.h"
-#include "../kernels/lens.h"
+#include "../kernels/projection_params.h"
 #include "backend.h"
 #include "memory.h"
 
@@ -16,18 +16,18 @@ template <class T>
 struct ProjectedScenes {
   std::vector<raster::Gaussians<T>> scenes;
   int64_t cameras;
-  std::vector<raster::Lens<T>> lenses;             // [scenes · cameras]
+  std::vector<raster::ProjectionParams<T>> params;    // [scenes · cameras]
   std::vector<std::vector<raster::Splat<T>>> splats;  // [scenes · cameras][N]
 
   explicit ProjectedScenes(const Inputs& in) : scenes(scenes_of<T>(in)), cameras(in.cameras()) {
     std::vector<raster::Splat<T>*> places;
     for (const auto& view : views_of<T>(in)) {
-      lenses.push_back(raster::lens_of(view.camera, int(in.width), int(in.height), in.eps2d));
+      params.push_back(raster::make_projection_params(view.camera, int(in.width), int(in.height), in.eps2d));
       splats.emplace_back(size_t(in.count()));
       places.push_back(splats.back().data());
     }
     for (size_t b = 0; b < scenes.size(); ++b)
-      raster::kernels().of<T>().project(scenes[b], 0, scenes[b].count, lenses.data() + int64_t(b) * cameras, cameras,
+      raster::kernels().of<T>().project(scenes[b], 0, scenes[b].count, params.data() + int64_t(b) * cameras, cameras,
                                         places.data() + int64_t(b) * cameras);
   }
 
@@ -102,7 +102,7 @@ Gradients project_backward_as(const Inputs& in, const Projected& gradients, bool
   std::vector<raster::CameraGradient<T>> cameras(of_cameras ? views : 0);
   for (size_t b = 0; b < projected.scenes.size(); ++b) {
     const int64_t view = int64_t(b) * projected.cameras;
-    raster::kernels().of<T>().project_backward(projected.scenes[b], 0, int64_t(count), projected.lenses.data() + view,
+    raster::kernels().of<T>().project_backward(projected.scenes[b], 0, int64_t(count), projected.params.data() + view,
                                                projected.cameras, of_views.data() + view, places[b],
                                                of_cameras ? cameras.data() + view : nullptr);
   }
@@ -113,11 +113,11 @@ Gradients project_backward_as(const Inputs& in, const Projected& gradients, bool
 }  // namespace
 
 Projected project(const Inputs& in) {
-  return by_type(in, [&](auto number) { return project_as<decltype(number)>(in); });
+  return dispatch_by_type(in, [&](auto number) { return project_as<decltype(number)>(in); });
 }
 
 Gradients project_backward(const Inputs& in, const Projected& gradients, bool of_cameras) {
-  return by_type(in, [&](auto number) { return project_backward_as<decltype(number)>(in, gradients, of_cameras); });
+  return dispatch_by_type(in, [&](auto number) { return project_backward_as<decltype(number)>(in, gradients, of_cameras); });
 }
 
 }  // namespace globalsplat::cpu

@@ -6,11 +6,11 @@
 
 #include "../arguments.h"
 #include "../kernels/kernels.h"
+#include "../threads.h"
 #include "backend.h"
 #include "cpu.h"
 #include "globalsplat-csrc/src/render.rs.h"
 #include "memory.h"
-#include "../threads.h"
 
 namespace globalsplat {
 namespace cpu {
@@ -43,14 +43,14 @@ std::unique_ptr<raster::Frame<T>> draw(const Inputs& in, RenderOutput& out, rast
   out.rgb = at::empty({in.scenes(), in.cameras(), 3, in.height, in.width}, options);
   out.alpha = at::empty({in.scenes(), in.cameras(), in.height, in.width}, options);
   out.depth = at::empty_like(out.alpha);
-  const raster::Settings settings{int(in.width), int(in.height), in.eps2d, threads()};
+  const raster::Settings settings{int(in.width), int(in.height), in.eps2d, get_num_threads()};
   return raster::Frame<T>::draw(scenes_of<T>(in), views_of<T>(in), settings, pictures_of<T>(out), times);
 }
 
 }  // namespace
 
 RenderOutput splat(const Inputs& in, std::unique_ptr<const SavedState>& saved) {
-  return by_type(in, [&](auto number) {
+  return dispatch_by_type(in, [&](auto number) {
     using T = decltype(number);
     RenderOutput out;
     saved = std::make_unique<SavedFrame<T>>(draw<T>(in, out, last_times));
@@ -60,7 +60,7 @@ RenderOutput splat(const Inputs& in, std::unique_ptr<const SavedState>& saved) {
 
 Gradients splat_backward(const Inputs& in, const RenderOutput& outputs, const RenderOutput& gradients, const SavedState& saved,
                          bool of_cameras) {
-  return by_type(in, [&](auto number) {
+  return dispatch_by_type(in, [&](auto number) {
     using T = decltype(number);
     Gradients out{empty_like(in.gaussians), {}};
     std::vector<raster::CameraGradient<T>> cameras(of_cameras ? size_t(in.scenes() * in.cameras()) : 0);
@@ -87,11 +87,11 @@ PairCounts count_pairs(const SplatArguments& of) {
   TORCH_CHECK(a.means.scalar_type() != at::kDouble, "pairs can be counted for float32 Gaussians only");
   RenderOutput pictures;
   raster::StageTimes times;
-  const raster::PairCounts counts = cpu::draw<float>(a.on(at::kCPU), pictures, times)->count();
+  const raster::PairCounts counts = cpu::draw<float>(a.to_inputs(at::kCPU), pictures, times)->count();
   return {counts.tile_entries, counts.evaluated, counts.contributing};
 }
 
-double multiply_add_peak(double seconds) { return raster::multiply_add_peak(threads(), seconds); }
+double multiply_add_peak(double seconds) { return raster::multiply_add_peak(get_num_threads(), seconds); }
 
 rust::String simd_level() { return raster::kernels().name; }
 

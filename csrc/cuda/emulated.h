@@ -12,7 +12,7 @@ class Emulator : public Device {
   explicit Emulator(uint64_t seed) : seed_(seed) {}
   Memory allocate(size_t bytes) const override;
   // Throws std::logic_error on a deadlock: if threads wait for others that don't arrive.
-  void launch(const char* kernel, Blocks blocks, int threads, void** arguments) const override;
+  void launch(const char* kernel, Blocks blocks, int threads_per_block, void** arguments) const override;
   uint64_t read(const uint64_t* number) const override { return *number; }
 
  private:

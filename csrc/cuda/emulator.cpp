@@ -32,7 +32,7 @@
 namespace globalsplat::cuda::emulated {
 namespace {
 
-constexpr int kMostThreads = 1024;          // per block
+constexpr int kMaxThreads = 1024;           // per block
 constexpr size_t kStack = 256 << 10;        // bytes
 constexpr size_t kSharedMemory = 48 << 10;  // bytes per block: the minimum that GPUs have
 constexpr size_t kLine = 64;                // alignment of its arrays
@@ -52,7 +52,7 @@ struct Stack {
   [[maybe_unused]] void* fiber = nullptr;  // ThreadSanitizer's
 };
 
-void go_on(Stack& from, Stack& to) {
+void switch_stack(Stack& from, Stack& to) {
   GS_TSAN(__tsan_switch_to_fiber(to.fiber, __tsan_switch_to_fiber_no_sync));
   GS_ASAN(__sanitizer_start_switch_fiber(&from.fake, to.bottom, to.size));
   swapcontext(&from.context, &to.context);
@@ -62,7 +62,7 @@ void go_on(Stack& from, Stack& to) {
 // List of threads, by their index in the block. The data that stacks share consists of plain arrays: a template that a file compiled with
 // sanitizers also instantiates might be linked from there.
 struct Threads {
-  int numbers[kMostThreads];
+  int numbers[kMaxThreads];
   int count = 0;
   void add(int number) { numbers[count++] = number; }
 };
@@ -83,7 +83,7 @@ struct Thread {
 
 // Block that this thread of the CPU runs.
 struct Block {
-  std::unique_ptr<Thread> threads[kMostThreads];  // as many as the largest block so far
+  std::unique_ptr<Thread> threads[kMaxThreads];  // as many as the largest block so far
   Stack scheduler;
   const Kernel* kernel = nullptr;
   void** arguments = nullptr;
@@ -91,7 +91,7 @@ struct Block {
   int current = 0, done = 0;
   bool votes[2] = {};  // of this barrier and the next one
   Threads ready, waiting;
-  Warp warps[kMostThreads / 32];
+  Warp warps[kMaxThreads / 32];
   std::vector<std::unique_ptr<char[]>> shared;  // the last one belongs to this block
 };
 Block& block() {
@@ -103,7 +103,7 @@ Block& block() {
 int skipped_barrier = -1;  // the barrier that all threads skip
 
 // Fills uninitialized memory with values that differ every time and are often NaN.
-void fill_with_anything(void* memory, size_t bytes, std::mt19937_64& random) {
+void fill_with_garbage(void* memory, size_t bytes, std::mt19937_64& random) {
   for (size_t k = 0; k < bytes; k += 8) {
     uint64_t word = random();
     if (word % 2 == 0) word |= 0x7FC00000'7FC00000u;
@@ -121,7 +121,7 @@ void run_threads() {
     block().kernel->run(block().arguments);
     GS_TSAN(__tsan_release(&block().arguments));
     ++block().done;
-    go_on(current().stack, block().scheduler);
+    switch_stack(current().stack, block().scheduler);
   }
 }
 
@@ -140,14 +140,14 @@ std::unique_ptr<Thread> new_thread() {
 }
 
 // Waits until `all` threads have arrived.
-void meet(Threads& waiting, int all) {
+void wait_at_barrier(Threads& waiting, int all) {
   GS_TSAN(__tsan_release(&waiting));
   if (waiting.count + 1 == all) {
     for (int k = 0; k < waiting.count; ++k) block().ready.add(waiting.numbers[k]);
     waiting.count = 0;
   } else {
     waiting.add(block().current);
-    go_on(current().stack, block().scheduler);
+    switch_stack(current().stack, block().scheduler);
   }
 }
 
@@ -157,7 +157,7 @@ void run_block(std::mt19937_64& order) {
   const int threads = int(block().size.x);
   if (block().shared.empty() || !kReuse) block().shared.emplace_back(new char[kSharedMemory]);
   // Values that the previous block left must not be usable.
-  fill_with_anything(block().shared.back().get(), kSharedMemory, order);
+  fill_with_garbage(block().shared.back().get(), kSharedMemory, order);
   GS_TSAN(__tsan_release(&block().kernel));
   block().done = block().ready.count = block().waiting.count = 0;
   block().votes[0] = block().votes[1] = false;
@@ -171,7 +171,7 @@ void run_block(std::mt19937_64& order) {
     int* const ready = block().ready.numbers;
     std::swap(ready[order() % uint64_t(block().ready.count)], ready[block().ready.count - 1]);
     block().current = ready[--block().ready.count];
-    go_on(block().scheduler, current().stack);
+    switch_stack(block().scheduler, current().stack);
   }
   if (block().done < threads) {
     for (auto& thread : block().threads) thread.reset();
@@ -186,25 +186,25 @@ Index block_index() { return block().index; }
 Index block_size() { return block().size; }
 Index grid_size() { return block().grid; }
 
-void meet_in_block(int place) {
+void sync_block(int place) {
   if (place == skipped_barrier) return;
-  meet(block().waiting, int(block().size.x));
+  wait_at_barrier(block().waiting, int(block().size.x));
   GS_TSAN(__tsan_acquire(&block().waiting));
 }
 
-void meet_in_warp(int place) {
+void sync_warp(int place) {
   if (place == skipped_barrier) return;
   Warp& warp = own_warp();
   warp.place = -1;
-  meet(warp.waiting, 32);
+  wait_at_barrier(warp.waiting, 32);
   GS_TSAN(__tsan_acquire(&warp.waiting));
 }
 
-bool vote_in_block(int place, bool given) {
+bool sync_block_or(int place, bool given) {
   const unsigned turn = current().votes++ % 2;
   block().votes[turn] |= given;
   if (block().waiting.count + 1 == int(block().size.x)) block().votes[1 - turn] = false;  // all threads have read it
-  meet_in_block(place);
+  sync_block(place);
   return block().votes[turn];
 }
 
@@ -217,7 +217,7 @@ void exchange(int line, uint64_t given, uint64_t (&out)[32]) {
   warp.place = line;
   uint64_t(&place)[32] = warp.given[current().exchanges++ % 2];
   place[block().current % 32] = given;
-  meet(warp.waiting, 32);
+  wait_at_barrier(warp.waiting, 32);
   for (int k = 0; k < 32; ++k) out[k] = place[k];
 }
 
@@ -236,18 +236,19 @@ Memory Emulator::allocate(size_t bytes) const {
   constexpr std::align_val_t alignment{256};
   void* const memory = ::operator new(bytes, alignment);
   std::mt19937_64 random(seed_++);
-  fill_with_anything(memory, bytes, random);
+  fill_with_garbage(memory, bytes, random);
   return Memory(memory, [alignment](void* p) { ::operator delete(p, alignment); });
 }
 
-void Emulator::launch(const char* kernel, Blocks blocks, int threads, void** arguments) const {
+void Emulator::launch(const char* kernel, Blocks blocks, int threads_per_block, void** arguments) const {
   block().kernel = kernel_named(kernel);
   if (block().kernel == nullptr) throw std::logic_error(std::string("there is no kernel ") + kernel);
   block().arguments = arguments;
-  block().size = {unsigned(threads), 1};
+  block().size = {unsigned(threads_per_block), 1};
   block().grid = {unsigned(blocks.x), unsigned(blocks.y)};
-  if (threads > kMostThreads || threads % 32 != 0) throw std::logic_error("a block of " + std::to_string(threads) + " threads");
-  for (int k = 0; k < threads; ++k)
+  if (threads_per_block > kMaxThreads || threads_per_block % 32 != 0)
+    throw std::logic_error("a block of " + std::to_string(threads_per_block) + " threads");
+  for (int k = 0; k < threads_per_block; ++k)
     if (!block().threads[k]) block().threads[k] = new_thread();
   GS_TSAN(block().scheduler.fiber = __tsan_get_current_fiber());
 

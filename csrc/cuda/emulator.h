@@ -17,8 +17,8 @@
 #define blockIdx (::globalsplat::cuda::emulated::block_index())
 #define blockDim (::globalsplat::cuda::emulated::block_size())
 #define gridDim (::globalsplat::cuda::emulated::grid_size())
-#define __syncthreads() ::globalsplat::cuda::emulated::meet_in_block(__COUNTER__)
-#define __syncwarp() ::globalsplat::cuda::emulated::meet_in_warp(__COUNTER__)
+#define __syncthreads() ::globalsplat::cuda::emulated::sync_block(__COUNTER__)
+#define __syncwarp() ::globalsplat::cuda::emulated::sync_warp(__COUNTER__)
 
 namespace globalsplat::cuda::emulated {
 
@@ -31,10 +31,10 @@ Index block_size();
 Index grid_size();
 
 // Barriers of a block's, or of a warp's, threads. `place` identifies the call in the source.
-void meet_in_block(int place);
-void meet_in_warp(int place);
+void sync_block(int place);
+void sync_warp(int place);
 // Barrier that also returns true if any of the block's threads passed true.
-bool vote_in_block(int place, bool given);
+bool sync_block_or(int place, bool given);
 // Exchanges values among the threads of a warp: `out` receives all 32. It doesn't order other memory accesses. All threads must call it
 // from the same line.
 void exchange(int line, uint64_t given, uint64_t (&out)[32]);
@@ -62,7 +62,7 @@ inline unsigned ballot(int line, bool given) {
   for (int k = 0; k < 32; ++k) bits |= unsigned(all[k]) << k;
   return bits;
 }
-inline unsigned alike(int line, int given) {
+inline unsigned match_any(int line, int given) {
   uint64_t all[32];
   exchange(line, uint64_t(uint32_t(given)), all);
   unsigned bits = 0;
@@ -80,8 +80,8 @@ inline int own_lane() { return int(thread_index().x % 32); }
 #define __shfl_xor_sync(mask, given, by) GS_FROM_LANE(given, GS_OWN_LANE ^ (by))
 #define __ballot_sync(mask, given) ::globalsplat::cuda::emulated::ballot(__LINE__, given)
 #define __any_sync(mask, given) (__ballot_sync(mask, given) != 0)
-#define __match_any_sync(mask, given) ::globalsplat::cuda::emulated::alike(__LINE__, given)
-#define __syncthreads_or(given) ::globalsplat::cuda::emulated::vote_in_block(__COUNTER__, given)
+#define __match_any_sync(mask, given) ::globalsplat::cuda::emulated::match_any(__LINE__, given)
+#define __syncthreads_or(given) ::globalsplat::cuda::emulated::sync_block_or(__COUNTER__, given)
 
 inline int __popc(unsigned bits) { return __builtin_popcount(bits); }
 inline int __ffs(int bits) { return __builtin_ffs(bits); }

@@ -17,16 +17,16 @@ Memory allocate_array(const Device& device, int64_t count) {
   return device.allocate(size_t(count) * sizeof(T));
 }
 
-Blocks for_each(int64_t items, int threads, int64_t rows = 1) { return {parts(items, threads), rows}; }
+Blocks for_each(int64_t items, int threads_per_block, int64_t rows = 1) { return {ceil_div(items, threads_per_block), rows}; }
 
 // Maximum number of rows of blocks in a launch. A view's Gaussians, or pixels, are counted by 32 bits.
-constexpr int64_t kMostRows = 65535;
+constexpr int64_t kMaxRows = 65535;
 
 Call call_of(const Arguments& of) {
   const int64_t views = of.scenes * of.cameras;
-  const int columns = parts(of.width, raster::kTile), rows = parts(of.height, raster::kTile);
+  const int columns = ceil_div(of.width, raster::kTile), rows = ceil_div(of.height, raster::kTile);
   constexpr int64_t most = std::numeric_limits<int32_t>::max();
-  if (views > kMostRows || views * of.gaussians.count > most || views * columns * rows > most)
+  if (views > kMaxRows || views * of.gaussians.count > most || views * columns * rows > most)
     throw std::length_error("a call renders at most 65535 views, and at most 2 billion tiles or splats over all views");
   return {int(views), int(of.cameras), int(of.gaussians.count), of.gaussians.bases, {of.width, of.height, columns, rows}};
 }
@@ -38,24 +38,25 @@ int64_t places_of_tiles(const Call& call) { return int64_t(call.views) * call.gr
 
 ProjectedScenes::ProjectedScenes(const Device& device, const Arguments& of, bool counts_tiles)
     : call(call_of(of)),
-      lenses(allocate_array<Lens<float>>(device, call.views)),
+      params(allocate_array<ProjectionParams<float>>(device, call.views)),
       splats(allocate_array<Splat<float>>(device, int64_t(call.views) * call.count)),
       tile_counts(counts_tiles ? allocate_array<uint32_t>(device, places_of_tiles(call)) : Memory()) {
-  const int64_t threads = counts_tiles ? std::max<int64_t>(call.views, places_of_tiles(call)) : call.views;
-  GS_LAUNCH(device, gs_lenses, for_each(threads, kWarp), kWarp, call, float(of.eps2d), of.w2c, of.intrinsics,
-            as<Lens<float>>(lenses), as<uint32_t>(tile_counts));
+  const int64_t num_threads = counts_tiles ? std::max<int64_t>(call.views, places_of_tiles(call)) : call.views;
+  GS_LAUNCH(device, gs_lenses, for_each(num_threads, kWarp), kWarp, call, float(of.eps2d), of.w2c, of.intrinsics,
+            as<ProjectionParams<float>>(params), as<uint32_t>(tile_counts));
   GS_LAUNCH(device, gs_project, for_each(call.count, kGaussianThreads, call.views), kGaussianThreads, call, of.gaussians,
-            as<Lens<float>>(lenses), as<Splat<float>>(splats));
+            as<ProjectionParams<float>>(params), as<Splat<float>>(splats));
 }
 
 void ProjectedScenes::backward(const Device& device, const Arguments& of, const SplatGradient<float>* records, const uint32_t* first,
                     const GaussianGradients<float>& out, float* w2c) const {
-  const int warps = parts(call.count, kWarp);
+  const int warps = ceil_div(call.count, kWarp);
   const Memory camera_gradients = w2c == nullptr ? Memory() : allocate_array<CameraGradient<float>>(device, int64_t(call.views) * warps);
   // With several cameras, all warps of a block process the same Gaussians.
   const int gaussians = call.cameras > 1 ? kWarp : kGaussianThreads;
   GS_LAUNCH(device, gs_project_backward, for_each(call.count, gaussians, of.scenes), kGaussianThreads, call, of.gaussians,
-            as<Lens<float>>(lenses), as<Splat<float>>(splats), records, first, out, as<CameraGradient<float>>(camera_gradients));
+            as<ProjectionParams<float>>(params), as<Splat<float>>(splats), records, first, out,
+            as<CameraGradient<float>>(camera_gradients));
   if (w2c != nullptr)
     GS_LAUNCH(device, gs_sum_cameras, for_each(int64_t(call.views) * 16 * kWarp, kGaussianThreads), kGaussianThreads, call.views,
               warps, as<CameraGradient<float>>(camera_gradients), w2c);
@@ -64,7 +65,7 @@ void ProjectedScenes::backward(const Device& device, const Arguments& of, const 
 Frame::Frame(const Device& device, const Arguments& of, const RenderOutput<float>& out) : projected_(device, of, true), count_(0) {
   const Call& call = projected_.call;
   const int64_t splats = int64_t(call.views) * call.count, places = places_of_tiles(call);
-  const int64_t groups = parts(call.count, kWarp) * int64_t(call.views);
+  const int64_t groups = ceil_div(call.count, kWarp) * int64_t(call.views);
   const Blocks blocks = for_each(call.count, kGaussianThreads, call.views);
 
   const Memory group_pairs = allocate_array<uint32_t>(device, groups), pairs_before = allocate_array<uint32_t>(device, groups);

@@ -26,7 +26,7 @@ struct ProjectedScenes {
                 const GaussianGradients<float>& out, float* w2c) const;
 
   Call call;
-  Memory lenses;       // Lens[views]
+  Memory params;       // ProjectionParams[views]
   Memory splats;       // Splat[views][N]
   Memory tile_counts;  // uint32_t[views · tiles + 1], or null
 };

@@ -1,8 +1,8 @@
 // Projection of Gaussians to splats, forward and backward: the maths of kernels/project.h with one Gaussian per thread.
 #pragma once
 
-#include "lens.h"
 #include "project.h"
+#include "projection_params.h"
 #include "warp.h"
 
 namespace globalsplat::cuda {
@@ -38,19 +38,20 @@ inline void with_bases(Gaussians<float> g, const Body& body) {
 
 extern "C" {
 
-// Computes the lenses, one view per thread. If `tile_counts` isn't null, sets it to 0 for every tile of every view, plus one element.
-__global__ void gs_lenses(Call call, float eps2d, const float* w2c, const float* intrinsics, Lens<float>* lenses,
+// Computes the projection parameters, one view per thread. If `tile_counts` isn't null, sets it to 0 for every tile of every view, plus one
+// element.
+__global__ void gs_lenses(Call call, float eps2d, const float* w2c, const float* intrinsics, ProjectionParams<float>* params,
                           uint32_t* tile_counts) {
   const int64_t k = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
   if (k < call.views)
-    lenses[k] = raster::lens_of(raster::camera_of(w2c + 16 * k, intrinsics + 9 * k), call.grid.width, call.grid.height,
-                                double(eps2d));
+    params[k] = raster::make_projection_params(raster::camera_of(w2c + 16 * k, intrinsics + 9 * k), call.grid.width, call.grid.height,
+                                               double(eps2d));
   if (tile_counts != nullptr && k <= int64_t(call.views) * call.grid.tiles()) tile_counts[k] = 0;
 }
 
 // Projects Gaussians, with one row of blocks per view.
 __global__ void __launch_bounds__(kGaussianThreads)
-    gs_project(Call call, Gaussians<float> gaussians, const Lens<float>* lenses, Splat<float>* splats) {
+    gs_project(Call call, Gaussians<float> gaussians, const ProjectionParams<float>* params, Splat<float>* splats) {
   const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x, view = blockIdx.y;
   if (i >= call.count) return;
   // Stored as a whole, four values at a time.
@@ -59,7 +60,7 @@ __global__ void __launch_bounds__(kGaussianThreads)
     Splat<float>* const place = &own;
     raster::lane::project({g.means + 3 * i, g.scales + 3 * i, g.quaternions + 4 * i, g.opacities + i, g.sh + 3 * g.bases * i,
                            1, g.bases},
-                          0, 1, lenses + view, 1, &place);
+                          0, 1, params + view, 1, &place);
   });
   splats[view * call.count + i] = own;
 }
@@ -72,7 +73,7 @@ __global__ void __launch_bounds__(kGaussianThreads)
 // the warps' order. Spherical harmonics, three quarters of all values, go through shared memory, which makes their global memory accesses
 // contiguous.
 __global__ void __launch_bounds__(kGaussianThreads, 4)
-    gs_project_backward(Call call, Gaussians<float> gaussians, const Lens<float>* lenses, const Splat<float>* splats,
+    gs_project_backward(Call call, Gaussians<float> gaussians, const ProjectionParams<float>* params, const Splat<float>* splats,
                         const SplatGradient<float>* records, const uint32_t* first, GaussianGradients<float> out,
                         CameraGradient<float>* camera_gradients) {
   constexpr int kWarps = kGaussianThreads / kWarp, kRow = 3 * raster::kMaxBases + 1;  // odd, which avoids bank conflicts
@@ -89,7 +90,7 @@ __global__ void __launch_bounds__(kGaussianThreads, 4)
   const bool is_dealt = call.cameras > 1;
   const int sharing = is_dealt ? kWarps : 1, member = warp() % sharing;  // number of warps with the same Gaussians, and index among them
   const int64_t begin = (int64_t(blockIdx.x) * kWarps + warp() - member) / sharing * kWarp;
-  const int64_t view = int64_t(blockIdx.y) * call.cameras, i = begin + lane(), groups = parts(call.count, kWarp);
+  const int64_t view = int64_t(blockIdx.y) * call.cameras, i = begin + lane(), groups = ceil_div(call.count, kWarp);
   // Excess threads have no Gaussian, but take part in sums.
   const bool is_there = i < call.count;
   const int there = int(begin >= call.count ? 0 : call.count - begin < kWarp ? call.count - begin : kWarp);
@@ -109,7 +110,7 @@ __global__ void __launch_bounds__(kGaussianThreads, 4)
       const uint32_t from = is_there ? first[place] : 0, to = is_there ? first[place + 1] : 0;
       float d[raster::kSplatGradientNumbers] = {}, of_camera[raster::kCameraNumbers] = {};
       for (uint32_t record = from; record < to; ++record) {
-        const auto* const numbers = reinterpret_cast<const Two*>(records + record);
+        const auto* const numbers = reinterpret_cast<const FloatPair*>(records + record);
         for (int n = 0; n < raster::kSplatGradientNumbers; ++n) d[n] += numbers[n / 2].numbers[n % 2];
       }
       if (from < to) {
@@ -117,22 +118,22 @@ __global__ void __launch_bounds__(kGaussianThreads, 4)
         raster::lane::Group<float> group;
         raster::lane::Projection<float> projection{};  // only visible Gaussians have records
         raster::lane::Shading<float> shading;
-        const Lens<float>& lens = lenses[view + k];
+        const ProjectionParams<float>& of_view = params[view + k];
         float d_r[3];
         const Splat<float>& splat = splats[place];
         for (int n = 0; n < 3; ++n) group.mean[n] = scene.means[3 * i + n];
-        raster::lane::look_at_group(group, scene.bases, lens, true, shading);
+        raster::lane::compute_directions(group, scene.bases, of_view, true, shading);
         raster::lane::shade_group_backward<float>(
             scene.bases, shading, {splat.red > 0, splat.green > 0, splat.blue > 0}, d,
             [&](int n) { return coefficients[lane()][n]; },
             [&](int n, float x, float y) { sums_of_sh[n] = raster::lane::add_product(x, y, ever ? sums_of_sh[n] : 0); }, d_r);
         raster::lane::load_shapes(scene, i, i + 1, group);
-        raster::lane::project_group(group, lens, projection);
-        raster::lane::project_group_backward(group, lens, projection, true, d, d_r, sum, camera_gradients != nullptr, of_camera);
+        raster::lane::project_group(group, of_view, projection);
+        raster::lane::project_group_backward(group, of_view, projection, true, d, d_r, sum, camera_gradients != nullptr, of_camera);
         ever = true;
       }
       if (camera_gradients != nullptr) {
-        const Fold<raster::kCameraNumbers, kWarp> fold;
+        const WarpReduction<raster::kCameraNumbers, kWarp> fold;
         const float number = fold(of_camera);
         if (fold.which >= 0 && begin < call.count) camera_gradients[(view + k) * groups + begin / kWarp].numbers[fold.which] = number;
       }
@@ -141,8 +142,9 @@ __global__ void __launch_bounds__(kGaussianThreads, 4)
       for (int n = 0; n < width; ++n) sums_of_sh[n] = 0;
     __syncthreads();
 
-    // Writes the sums over warps to global memory. The result of keep() can't have been computed earlier, so it has occupied no registers.
-    const auto at = scene_of(out, scene, keep(int(blockIdx.y)));
+    // Writes the sums over warps to global memory. The result of keep_in_register() can't have been computed earlier, so it has occupied no
+    // registers.
+    const auto at = scene_of(out, scene, keep_in_register(int(blockIdx.y)));
     for (int k = own; k < there * width; k += sharing * kWarp) {
       float number = 0;
       for (int n = 0; n < sharing; ++n) number += memory.sh[warp() - member + n][k / width][k % width];

@@ -8,7 +8,7 @@
 #endif
 
 #include "gaussians.h"
-#include "lists.h"
 #include "losses.h"
 #include "sort.h"
+#include "tile_lists.h"
 #include "tiles.h"

@@ -1,20 +1,20 @@
-// Losses that compare images with photos, and their gradients: the kernels of ../kernels/ssim.h and smooth.h for GPUs. Results have the
+// Losses that compare images with photos, and their gradients: the kernels of ../kernels/ssim.h and smoothness.h for GPUs. Results have the
 // same bits as on the CPU except for sums over blocks. Each block writes one weighted partial sum to `parts`.
 #pragma once
 
 #include "call.h"
-#include "neighbours.h"
+#include "ssim_window.h"
+#include "unevenness.h"
 #include "warp.h"
-#include "window.h"
 
 namespace globalsplat::cuda {
 
 // Number of columns that a tile's windows read, or whose windows contain its pixels.
-inline constexpr int kFitReach = kFitColumns + raster::kWindow - 1;
+inline constexpr int kLossReach = kLossColumns + raster::kWindow - 1;
 
 // Sums over a block's threads in a fixed order; the result is valid in the first thread.
 inline double block_sum(double value) {
-  GS_SHARED(double, sums, [kFitThreads / kWarp]);
+  GS_SHARED(double, sums, [kLossThreads / kWarp]);
   for (int step = kWarp / 2; step > 0; step /= 2) value += __shfl_xor_sync(kAll, value, step);
   if (lane() == 0) sums[warp()] = value;
   __syncthreads();
@@ -25,12 +25,12 @@ inline double block_sum(double value) {
 }
 
 // Tile of a block: a part of a plane of `columns` × `rows` windows or pixels.
-struct FitTile {
-  FitTile(int columns, int rows) {
-    const int across = parts(columns, kFitColumns), tiles = across * parts(rows, kFitRows), tile = int(blockIdx.x) % tiles;
+struct LossTile {
+  LossTile(int columns, int rows) {
+    const int across = ceil_div(columns, kLossColumns), tiles = across * ceil_div(rows, kLossRows), tile = int(blockIdx.x) % tiles;
     plane = int(blockIdx.x) / tiles;
-    left = tile % across * kFitColumns;
-    top = tile / across * kFitRows;
+    left = tile % across * kLossColumns;
+    top = tile / across * kLossRows;
   }
   int64_t plane;
   int left, top;
@@ -40,25 +40,25 @@ extern "C" {
 
 // Computes Σ SSIM of a tile of windows times `each`; writes the slopes to `slopes`, [planes, 3, H − 10, W − 10], if it isn't null. Windows
 // are summed first along columns, then along rows.
-__global__ void __launch_bounds__(kFitThreads) gs_ssim(FitPlanes of, double each, float* slopes, double* parts) {
+__global__ void __launch_bounds__(kLossThreads) gs_ssim(PhotometricPlanes of, double each, float* slopes, double* parts) {
   const int columns = of.width - raster::kWindow + 1, rows = of.height - raster::kWindow + 1;
-  const FitTile tile(columns, rows);
+  const LossTile tile(columns, rows);
   const int64_t pixels = int64_t(of.width) * of.height, windows = int64_t(columns) * rows;
-  GS_SHARED(float, sums, [5][kFitRows][kFitReach]);
-  for (int k = int(threadIdx.x); k < kFitRows * kFitReach; k += kFitThreads) {
-    const int row = tile.top + k / kFitReach, column = tile.left + k % kFitReach;
+  GS_SHARED(float, sums, [5][kLossRows][kLossReach]);
+  for (int k = int(threadIdx.x); k < kLossRows * kLossReach; k += kLossThreads) {
+    const int row = tile.top + k / kLossReach, column = tile.left + k % kLossReach;
     raster::lane::WindowMeans<float> means = {};
     if (row < rows && column < of.width)
       for (int n = 0; n < raster::kWindow; ++n) {
         const int64_t at = tile.plane * pixels + int64_t(row + n) * of.width + column;
         raster::lane::add_pixels<float>(of.window[n], of.pictures[at], of.photos[at], means);
       }
-    for (int j = 0; j < 5; ++j) sums[j][k / kFitReach][k % kFitReach] = means[j];
+    for (int j = 0; j < 5; ++j) sums[j][k / kLossReach][k % kLossReach] = means[j];
   }
   __syncthreads();
   double sum = 0;
-  for (int k = int(threadIdx.x); k < kFitRows * kFitColumns; k += kFitThreads) {
-    const int row = k / kFitColumns, column = k % kFitColumns;
+  for (int k = int(threadIdx.x); k < kLossRows * kLossColumns; k += kLossThreads) {
+    const int row = k / kLossColumns, column = k % kLossColumns;
     if (tile.top + row >= rows || tile.left + column >= columns) continue;
     raster::lane::WindowMeans<float> means = {};
     for (int n = 0; n < raster::kWindow; ++n)
@@ -75,28 +75,28 @@ __global__ void __launch_bounds__(kFitThreads) gs_ssim(FitPlanes of, double each
 
 // Computes Σ |x − y| of a tile of pixels times `l1_weight`, and its gradient plus `ssim_weight` times that of Σ SSIM, from all windows'
 // slopes if they aren't null. `gradient`, [planes, H, W], may be null.
-__global__ void __launch_bounds__(kFitThreads)
-    gs_fit_gradient(FitPlanes of, const float* slopes, double l1_weight, float ssim_weight, float* gradient, double* parts) {
+__global__ void __launch_bounds__(kLossThreads)
+    gs_fit_gradient(PhotometricPlanes of, const float* slopes, double l1_weight, float ssim_weight, float* gradient, double* parts) {
   const int columns = of.width - raster::kWindow + 1, last = of.height - raster::kWindow;
-  const FitTile tile(of.width, of.height);
+  const LossTile tile(of.width, of.height);
   const int64_t pixels = int64_t(of.width) * of.height, windows = int64_t(columns) * (last + 1);
-  GS_SHARED(float, sums, [3][kFitRows][kFitReach]);
+  GS_SHARED(float, sums, [3][kLossRows][kLossReach]);
   if (slopes != nullptr) {
-    for (int k = int(threadIdx.x); k < kFitRows * kFitReach; k += kFitThreads) {
-      const int row = tile.top + k / kFitReach, column = tile.left + k % kFitReach - (raster::kWindow - 1);
+    for (int k = int(threadIdx.x); k < kLossRows * kLossReach; k += kLossThreads) {
+      const int row = tile.top + k / kLossReach, column = tile.left + k % kLossReach - (raster::kWindow - 1);
       raster::lane::WindowSlopes<float> down = {};
       if (column >= 0 && column < columns)
         for (int at = row < raster::kWindow ? 0 : row - raster::kWindow + 1; at <= row && at <= last; ++at)
           for (int j = 0; j < 3; ++j)
             down[j] = raster::lane::add_product(
                 of.window[row - at], slopes[(tile.plane * 3 + j) * windows + int64_t(at) * columns + column], down[j]);
-      for (int j = 0; j < 3; ++j) sums[j][k / kFitReach][k % kFitReach] = down[j];
+      for (int j = 0; j < 3; ++j) sums[j][k / kLossReach][k % kLossReach] = down[j];
     }
     __syncthreads();
   }
   double sum = 0;
-  for (int k = int(threadIdx.x); k < kFitRows * kFitColumns; k += kFitThreads) {
-    const int row = k / kFitColumns, column = k % kFitColumns;
+  for (int k = int(threadIdx.x); k < kLossRows * kLossColumns; k += kLossThreads) {
+    const int row = k / kLossColumns, column = k % kLossColumns;
     if (tile.top + row >= of.height || tile.left + column >= of.width) continue;
     const int64_t at = tile.plane * pixels + int64_t(tile.top + row) * of.width + tile.left + column;
     const float x = of.pictures[at], y = of.photos[at];
@@ -117,8 +117,8 @@ __global__ void __launch_bounds__(kFitThreads)
 
 // Computes the unevenness of the pairs of one pixel per thread with the pixels to the right and below, times `each`; and the gradient from
 // all four pairs, [views, H, W], if it isn't null.
-__global__ void __launch_bounds__(kFitThreads) gs_unevenness(DepthJob<float> of, double each, float* gradient, double* parts) {
-  const int64_t k = int64_t(blockIdx.x) * kFitThreads + threadIdx.x, pixels = int64_t(of.width) * of.height;
+__global__ void __launch_bounds__(kLossThreads) gs_unevenness(SmoothnessJob<float> of, double each, float* gradient, double* parts) {
+  const int64_t k = int64_t(blockIdx.x) * kLossThreads + threadIdx.x, pixels = int64_t(of.width) * of.height;
   double sum = 0;
   if (k < of.views * pixels) {
     const int64_t view = k / pixels;

@@ -11,7 +11,7 @@ namespace globalsplat::cuda {
 inline constexpr int kTileWarps = kTileThreads / kWarp;
 inline constexpr int kHalf = kWarp / 2;       // lanes per block of pixels
 inline constexpr int kBatch = kWarp;          // entries per batch
-inline constexpr int kNothing = kBatch;       // index after a batch, at which a splat without effect is stored
+inline constexpr int kInvisible = kBatch;     // index after a batch, at which a splat without effect is stored
 static_assert(sizeof(Splat<float>) == 64 && kTileThreads * 2 == kBatch * 16, "a batch's splats are two numbers a thread");
 static_assert(raster::kBlocks == 2 * kTileWarps && raster::kBlock * raster::kBlock == kHalf, "two blocks a warp");
 
@@ -64,7 +64,7 @@ inline RenderOutput<Number> pictures_of(const RenderOutput<Number>& all, const G
 }
 
 // Returns a splat whose α is 0 and whose values are all finite.
-inline Splat<float> nothing() {
+inline Splat<float> invisible_splat() {
   Splat<float> splat{};
   splat.log2_opacity = -1e30f;
   return splat;
@@ -74,14 +74,14 @@ inline Splat<float> nothing() {
 using Order = uint8_t[2][kBatch];
 
 // Builds the lists of both half-warps. In each lane, two bits of `blocks` tell which of the warp's blocks its item touches. Entries of
-// `order` after the last item are kNothing; returns the length of the longer list. The warp must synchronize before it reads them.
+// `order` after the last item are kInvisible; returns the length of the longer list. The warp must synchronize before it reads them.
 inline int list_items(uint32_t blocks, Order& order) {
   int longest = 0;
   for (int k = 0; k < 2; ++k) {
     const bool reaches = (blocks >> k & 1) != 0;
     const unsigned reaching = __ballot_sync(kAll, reaches);
     const int count = __popc(reaching);
-    order[k][__popc((reaches ? reaching : ~reaching) & before()) + (reaches ? 0 : count)] = uint8_t(reaches ? lane() : kNothing);
+    order[k][__popc((reaches ? reaching : ~reaching) & lanemask_lt()) + (reaches ? 0 : count)] = uint8_t(reaches ? lane() : kInvisible);
     if (count > longest) longest = count;
   }
   return longest;
@@ -99,7 +99,7 @@ __global__ void GS_FORWARD_BOUNDS
   };
   GS_SHARED(Shared, of_warps, [kTileWarps]);
   auto& [batch, orders] = of_warps[warp()];
-  if (lane() == 0) batch[kNothing] = nothing();
+  if (lane() == 0) batch[kInvisible] = invisible_splat();
   const int64_t tile = int64_t(blockIdx.y) * call.grid.tiles() + blockIdx.x;
   const Pixel pixel(call.grid);
   raster::lane::Pixels<float> sums{pixel.inside ? 1.0f : 0.0f};
@@ -135,11 +135,11 @@ __global__ void __launch_bounds__(kTileThreads, kBackwardBlocks)
                       RenderOutput<const float> pictures, RenderOutput<const float> gradients, SplatGradient<float>* records) {
   constexpr int kNumbers = raster::kSplatGradientNumbers;
   // Each thread handles two values of a splat, and of a sum.
-  constexpr int kParts = int(sizeof(Splat<float>) / sizeof(Two)), kSums = kNumbers / 2;
+  constexpr int kParts = int(sizeof(Splat<float>) / sizeof(FloatPair)), kSums = kNumbers / 2;
   // A single struct, so that one address is kept instead of one per array.
   struct Shared {
     Splat<float> batch[kBatch + 1];
-    Two sums[raster::kBlocks][kBatch][kSums];
+    FloatPair sums[raster::kBlocks][kBatch][kSums];
     uint32_t has_sums[raster::kBlocks];  // bit k: the block has sums of item k
     Order orders[kTileWarps];
   };
@@ -168,20 +168,20 @@ __global__ void __launch_bounds__(kTileThreads, kBackwardBlocks)
   const int item = int(threadIdx.x) / kParts, part = int(threadIdx.x) % kParts;
   const auto fetch_part = [&](const TileEntry& entry, uint32_t begin) {
     const uint32_t splat = __shfl_sync(kAll, entry.splat, item);
-    return begin + uint32_t(item) < end ? reinterpret_cast<const Two*>(splats + splat)[part] : Two{};
+    return begin + uint32_t(item) < end ? reinterpret_cast<const FloatPair*>(splats + splat)[part] : FloatPair{};
   };
-  const Fold<kNumbers, kHalf> fold;
+  const WarpReduction<kNumbers, kHalf> fold;
   // Indices of the sums of a batch that this thread adds over blocks.
   const int sum_item = int(threadIdx.x) / kSums, sum_part = int(threadIdx.x) % kSums;
 
   uint32_t begin = tile_start[tile];
   if (begin >= end) return;
-  if (threadIdx.x == 0) batch[kNothing] = nothing();
+  if (threadIdx.x == 0) batch[kInvisible] = invisible_splat();
   TileEntry entry = fetch_entry(begin), next = fetch_entry(begin + kBatch);
-  Two own = fetch_part(entry, begin);
+  FloatPair own = fetch_part(entry, begin);
   // The next batch is stored while some threads still add the previous sums, which no thread overwrites before all have stored theirs.
   for (; begin < end; begin += kBatch) {
-    reinterpret_cast<Two*>(batch + item)[part] = own;
+    reinterpret_cast<FloatPair*>(batch + item)[part] = own;
     // Once all pixels have ended, the remaining splats get zero gradients.
     if (!__syncthreads_or(state.transmittance > 0)) {
       for (uint64_t k = uint64_t(begin) * kNumbers + threadIdx.x; k < uint64_t(end) * kNumbers; k += kTileThreads)
@@ -206,9 +206,9 @@ __global__ void __launch_bounds__(kTileThreads, kBackwardBlocks)
       // Sums start at −0, so that the first addition is exact and can be optimized away.
       float sums[kNumbers];
       for (float& sum : sums) sum = -0.0f;
-      raster::lane::pass(splat, e, state, sums);
+      raster::lane::accumulate_gradient(splat, e, state, sums);
       const float sum = fold(sums);
-      if (at != kNothing) {
+      if (at != kInvisible) {
         if (fold.which >= 0) (&of_blocks[own_block()][at][0].numbers[0])[fold.which] = sum;
         has_sums |= 1u << at;
       }
@@ -218,11 +218,11 @@ __global__ void __launch_bounds__(kTileThreads, kBackwardBlocks)
 
     if (warp() < kBatch * kSums / kWarp) {
       const uint32_t record = __shfl_sync(kAll, entry.record, sum_item);
-      Two sum{};
+      FloatPair sum{};
       for (int of = 0; of < raster::kBlocks; ++of)
         if (summed[of] >> sum_item & 1)
           for (int k = 0; k < 2; ++k) sum.numbers[k] += of_blocks[of][sum_item][sum_part].numbers[k];
-      if (begin + uint32_t(sum_item) < end) reinterpret_cast<Two*>(records + record)[sum_part] = sum;
+      if (begin + uint32_t(sum_item) < end) reinterpret_cast<FloatPair*>(records + record)[sum_part] = sum;
     }
     entry = next;
     next = later;

@@ -32,12 +32,12 @@ class Gpu : public Device {
     return Memory(held.data_ptr(), [held](void*) {});
   }
 
-  void launch(const char* kernel, Blocks blocks, int threads, void** arguments) const override {
+  void launch(const char* kernel, Blocks blocks, int threads_per_block, void** arguments) const override {
     const at::Device device = options_.device();
     const c10::Stream stream = c10::impl::VirtualGuardImpl(device.type()).getStream(device);
     measured_launch(kernel, stream, [&] {
       launch_kernel(device.index(), reinterpret_cast<size_t>(stream.native_handle()), kernel,
-                    {uint32_t(blocks.x), uint32_t(blocks.y)}, uint32_t(threads), reinterpret_cast<size_t>(arguments));
+                    {uint32_t(blocks.x), uint32_t(blocks.y)}, uint32_t(threads_per_block), reinterpret_cast<size_t>(arguments));
     });
   }
 

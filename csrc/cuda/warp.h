@@ -11,12 +11,12 @@ inline int lane() { return int(threadIdx.x) % kWarp; }
 inline int warp() { return int(threadIdx.x) / kWarp; }  // index within the block
 
 // Two values that are read or written in one memory access.
-struct alignas(8) Two {
+struct alignas(8) FloatPair {
   float numbers[2];
 };
 
 // Returns the bits of the lanes before this one.
-inline unsigned before() { return (1u << lane()) - 1; }
+inline unsigned lanemask_lt() { return (1u << lane()) - 1; }
 
 // Returns the inclusive prefix sum of the lanes' values.
 template <class T>
@@ -29,16 +29,16 @@ inline T prefix_sum(T value) {
 }
 
 // Returns the same value, but makes the compiler keep it instead of recomputing it repeatedly in a loop.
-inline int keep(int number) { return __shfl_sync(kAll, number, lane()); }
+inline int keep_in_register(int number) { return __shfl_sync(kAll, number, lane()); }
 
 // Sums each of `count` ≤ 16 values over `lanes` adjacent lanes, always in the same order. In every step one half of the lanes that still
 // share their values keeps the first half of the values, and the other half the rest, which reduces the exchange: ten values of 16 lanes
 // take 11 shuffles instead of 40. Each lane is left with the sum of value number `which`, or with none if that is −1.
 template <int count, int lanes>
-class Fold {
+class WarpReduction {
  public:
-  Fold() : which(keep(number<count, lanes / 2>(0, count))) {
-    for (int k = 0; k < kSteps; ++k) is_upper_[k] = keep(lane() >> k & 1);
+  WarpReduction() : which(keep_in_register(number<count, lanes / 2>(0, count))) {
+    for (int k = 0; k < kSteps; ++k) is_upper_[k] = keep_in_register(lane() >> k & 1);
   }
   float operator()(const float (&numbers)[count]) const { return sum<count, kSteps - 1>(numbers); }
 

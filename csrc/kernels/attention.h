@@ -30,7 +30,7 @@ GS_INLINE float largest_score(float* scores, int64_t count, int64_t columns, flo
   return largest_lane(most);
 }
 
-inline void attend(const AttentionHead<float>& head, Rows<float> out, float* log_sums, float* memory) {
+inline void attention_forward(const AttentionHead<float>& head, Rows<float> out, float* log_sums, float* memory) {
   using V = Vector<float>;
   constexpr int lanes = Simd<float>::lanes;
   const int width = head.width, columns = attention_columns(width);
@@ -86,14 +86,14 @@ inline void attend(const AttentionHead<float>& head, Rows<float> out, float* log
   }
 }
 
-// Packs some of a head's queries for attend_backward(), with the output of the forward pass and its gradient.
-inline void pack_queries(const AttentionHead<float>& head, const AttentionPast<float>& past, const PackedQueries& to) {
+// Packs some of a head's queries for attention_backward(), with the output of the forward pass and its gradient.
+inline void pack_queries(const AttentionHead<float>& head, const AttentionOutputs<float>& outputs, const PackedQueries& to) {
   const int width = head.width, columns = attention_columns(width);
   const float scale = float(kLog2E / __builtin_sqrt(double(width)));
   pack_rows(head.q, head.queries, width, scale, columns, head.queries, to.q);
-  pack_rows(past.grad_out, head.queries, width, 1, columns, head.queries, to.grad_out);
+  pack_rows(outputs.grad_out, head.queries, width, 1, columns, head.queries, to.grad_out);
   for (int64_t i = 0; i < head.queries; ++i) {
-    const float *const out = past.out.data + i * past.out.stride, *const grad_out = to.grad_out + i * columns;
+    const float *const out = outputs.out.data + i * outputs.out.stride, *const grad_out = to.grad_out + i * columns;
     double sum = 0;
     for (int c = 0; c < width; ++c) sum += double(out[c]) * double(grad_out[c]);
     to.means[i] = float(sum);
@@ -103,8 +103,8 @@ inline void pack_queries(const AttentionHead<float>& head, const AttentionPast<f
 // Computes the backward pass for the keys and values in `head`, which may be only some of those of the forward pass. Writes their gradients
 // to `dk` and `dv`. Writes their contribution to the gradient of q, times √w, to `dq`, [whole_product_rows(queries),
 // attention_columns(width)].
-inline void attend_backward(const AttentionHead<float>& head, const PackedQueries& of, const float* log_sums, float* dq, Rows<float> dk,
-                            Rows<float> dv, float* memory) {
+inline void attention_backward(const AttentionHead<float>& head, const PackedQueries& of, const float* log_sums, float* dq, Rows<float> dk,
+                               Rows<float> dv, float* memory) {
   using V = Vector<float>;
   constexpr int lanes = Simd<float>::lanes;
   const int width = head.width, columns = attention_columns(width);

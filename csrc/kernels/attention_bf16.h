@@ -88,8 +88,8 @@ GS_INLINE void pack_pairs(Rows<const Bf16> from, int64_t count, int width, int c
 
 // Computes the forward pass of a head. Scores are stored transposed, k qᵀ, here and in the backward pass. So a vector holds the scores of
 // adjacent queries, and pᵀ is ready to be the second matrix of the product outᵀ = vᵀ pᵀ.
-inline void attend_bf16(const AttentionHead<Bf16>& head, const Bf16Products& products, Rows<Bf16> out, float* log_sums,
-                        float* memory) {
+inline void attention_forward_bf16(const AttentionHead<Bf16>& head, const Bf16Gemm& gemm, Rows<Bf16> out, float* log_sums,
+                                   float* memory) {
   using V = Vector<float>;
   constexpr int lanes = Simd<float>::lanes, vectors = kBf16Columns / lanes;
   const int width = head.width;
@@ -116,7 +116,7 @@ inline void attend_bf16(const AttentionHead<Bf16>& head, const Bf16Products& pro
     pack_columns(head.v.from(first), count, width, whole, kBf16Keys, v);
     for (int64_t panel = 0; panel < queries; panel += kBf16Columns) {
       float* const values = sums + panel * width;
-      products.multiply(count, kBf16Columns, width, k.stride, kBf16Columns, kBf16Columns, false, k.data, q + panel * width, scores);
+      gemm.multiply(count, kBf16Columns, width, k.stride, kBf16Columns, kBf16Columns, false, k.data, q + panel * width, scores);
       V new_max[vectors], shift[vectors], sum[vectors];
       for (int n = 0; n < vectors; ++n) new_max[n] = load<float>(maxima + panel + n * lanes);
       for (int64_t j = 0; j < count; ++j)
@@ -143,10 +143,10 @@ inline void attend_bf16(const AttentionHead<Bf16>& head, const Bf16Products& pro
         for (int64_t at = n * lanes; first > 0 && at < width * kBf16Columns; at += kBf16Columns)
           store<float>(values + at, load<float>(values + at) * rescale);
       }
-      products.multiply(width, kBf16Columns, whole, kBf16Keys, kBf16Columns, kBf16Columns, first > 0, v, p, values);
+      gemm.multiply(width, kBf16Columns, whole, kBf16Keys, kBf16Columns, kBf16Columns, first > 0, v, p, values);
     }
   }
-  products.done();
+  gemm.release();
   for (int64_t i = 0; i < head.queries; ++i) {
     const float* const values = sums + i / kBf16Columns * kBf16Columns * width + i % kBf16Columns;
     log_sums[i] = maxima[i] * scale + float(__builtin_log2(double(weights[i])));
@@ -154,9 +154,9 @@ inline void attend_bf16(const AttentionHead<Bf16>& head, const Bf16Products& pro
   }
 }
 
-// Packs one panel of a head's queries for attend_backward_bf16(), with the output of the forward pass and its gradient. The panel begins at
-// query `first`. `whole` is the number of queries rounded up to whole panels.
-inline void pack_queries_bf16(const AttentionHead<Bf16>& head, const AttentionPast<Bf16>& past, const float* log_sums, int64_t first,
+// Packs one panel of a head's queries for attention_backward_bf16(), with the output of the forward pass and its gradient. The panel begins
+// at query `first`. `whole` is the number of queries rounded up to whole panels.
+inline void pack_queries_bf16(const AttentionHead<Bf16>& head, const AttentionOutputs<Bf16>& outputs, const float* log_sums, int64_t first,
                               int64_t whole, const PackedBf16Queries& to) {
   const int width = head.width, columns = attention_columns(width);
   const int64_t count = head.queries - first < kBf16Columns ? head.queries - first : kBf16Columns;
@@ -167,7 +167,7 @@ inline void pack_queries_bf16(const AttentionHead<Bf16>& head, const AttentionPa
       pack_pairs({from.data + c, from.stride}, count, width - c, panel, as_rows + c * whole + first * panel);
     }
   };
-  const Rows<const Bf16> grad_out = past.grad_out.from(first), out = past.out.from(first);
+  const Rows<const Bf16> grad_out = outputs.grad_out.from(first), out = outputs.out.from(first);
   pack(head.q.from(first), to.q_columns, to.q_rows);
   pack(grad_out, to.grad_out_columns, to.grad_out_rows);
   for (int64_t i = 0; i < kBf16Columns; ++i) {
@@ -182,8 +182,8 @@ inline void pack_queries_bf16(const AttentionHead<Bf16>& head, const AttentionPa
 // Computes the backward pass for the keys and values in `head`, which may be only some of those of the forward pass. Writes their gradients
 // to `dk` and `dv`. Writes their contribution to the gradient of q, times √w, to `dq`, in panels of kBf16Columns queries, [width,
 // kBf16Columns]: dqᵀ = kᵀ dsᵀ.
-inline void attend_backward_bf16(const AttentionHead<Bf16>& head, const Bf16Products& products, const PackedBf16Queries& packed, float* dq,
-                                 Rows<Bf16> dk, Rows<Bf16> dv, float* memory) {
+inline void attention_backward_bf16(const AttentionHead<Bf16>& head, const Bf16Gemm& gemm, const PackedBf16Queries& packed, float* dq,
+                                    Rows<Bf16> dk, Rows<Bf16> dv, float* memory) {
   using V = Vector<float>;
   constexpr int lanes = Simd<float>::lanes;
   const int width = head.width, columns = attention_columns(width);
@@ -213,8 +213,8 @@ inline void attend_backward_bf16(const AttentionHead<Bf16>& head, const Bf16Prod
       for (int64_t i = 0; i < depth; i += kBf16Columns) {
         const int64_t query = tile + i;
         const auto multiply = [&](Rows<const Bf16> keys, const Bf16* queries, float* to) {
-          products.multiply(count, kBf16Columns, width, keys.stride, kBf16Columns, kBf16Columns, false, keys.data,
-                            queries + query * width, to);
+          gemm.multiply(count, kBf16Columns, width, keys.stride, kBf16Columns, kBf16Columns, false, keys.data,
+                        queries + query * width, to);
         };
         multiply(k, packed.q_columns, scores);
         multiply(v, packed.grad_out_columns, dp);
@@ -234,14 +234,14 @@ inline void attend_backward_bf16(const AttentionHead<Bf16>& head, const Bf16Prod
             const Bits even = round(j);
             store_pair(pairs + j * kBf16Columns + 2 * c, even, round(j + 1));
           }
-        products.multiply(width, kBf16Columns, whole, kBf16BackwardKeys, kBf16Columns, kBf16Columns, first > 0, k_columns, pairs,
-                          dq + query * width);
+        gemm.multiply(width, kBf16Columns, whole, kBf16BackwardKeys, kBf16Columns, kBf16Columns, first > 0, k_columns, pairs,
+                      dq + query * width);
       }
       for (int c = 0; c < columns; c += kBf16Columns) {
         const int panel = columns - c < kBf16Columns ? columns - c : kBf16Columns;
         const auto multiply = [&](const Bf16* keys, const Bf16* rows, float* sums) {
-          products.multiply(count, panel, depth, kBf16BackwardQueries, panel, columns, tile > 0, keys, rows + c * queries + tile * panel,
-                            sums + c);
+          gemm.multiply(count, panel, depth, kBf16BackwardQueries, panel, columns, tile > 0, keys, rows + c * queries + tile * panel,
+                        sums + c);
         };
         multiply(p, packed.grad_out_rows, dv_sums);
         multiply(ds, packed.q_rows, dk_sums);
@@ -253,7 +253,7 @@ inline void attend_backward_bf16(const AttentionHead<Bf16>& head, const Bf16Prod
         dv.data[(first + j) * dv.stride + c] = to_bf16(dv_sums[j * columns + c]);
       }
   }
-  products.done();
+  gemm.release();
 }
 
 }  // namespace globalsplat::raster::GS_ISA

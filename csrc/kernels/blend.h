@@ -203,11 +203,11 @@ GS_INLINE void load_gradients(const BlockPlace& at, int64_t plane, const RenderO
 }
 
 template <bool capped, class T>
-GS_INLINE void pass_blocks(const Splat<T>& s, uint32_t blocks, const Evaluated<T> (&evaluated)[kBlocks][kVectors<T>],
-                           PixelGradients<T> (&pixels)[kBlocks][kVectors<T>], Vector<T> (&sums)[kSplatGradientNumbers]) {
+GS_INLINE void accumulate_gradients(const Splat<T>& s, uint32_t blocks, const Evaluated<T> (&evaluated)[kBlocks][kVectors<T>],
+                                    PixelGradients<T> (&pixels)[kBlocks][kVectors<T>], Vector<T> (&sums)[kSplatGradientNumbers]) {
   for (; blocks != 0; blocks &= blocks - 1) {
     const int block = __builtin_ctz(blocks);
-    for (int k = 0; k < kVectors<T>; ++k) pass<T, capped>(s, evaluated[block][k], pixels[block][k], sums);
+    for (int k = 0; k < kVectors<T>; ++k) accumulate_gradient<T, capped>(s, evaluated[block][k], pixels[block][k], sums);
   }
 }
 
@@ -250,9 +250,9 @@ void blend_tile_backward(const TileJob<T>& job, const RenderOutput<const T>& pic
       for (int k = 0; k < kVectors<T>; ++k) evaluate(s, x[block % 4][k], y[block / 4][k], evaluated[block][k]);
     }
     if (may_be_capped(s))
-      pass_blocks<true>(s, reached, evaluated, pixels, sums);
+      accumulate_gradients<true>(s, reached, evaluated, pixels, sums);
     else
-      pass_blocks<false>(s, reached, evaluated, pixels, sums);
+      accumulate_gradients<false>(s, reached, evaluated, pixels, sums);
     sum_each(sums, &records[entry.record].power);
   }
 }

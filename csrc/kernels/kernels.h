@@ -1,30 +1,30 @@
 // Kernels that are compiled once per instruction set, and the choice among them.
 #pragma once
 
-#include "rows.h"
+#include "attention_types.h"
 #include "types.h"
 
 namespace globalsplat::raster {
 
-// Kernels in the order of their use, documented where they are defined: project.h, cover.h, blend.h.
+// Kernels in the order of their use, documented where they are defined: project.h, touched_tiles.h, blend.h.
 template <class T>
 struct KernelsOf {
-  void (*project)(const Gaussians<T>&, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,
+  void (*project)(const Gaussians<T>&, int64_t begin, int64_t end, const ProjectionParams<T>* params, int64_t views,
                   Splat<T>* const* splats);
-  int64_t (*cover)(const Splat<T>* splats, int64_t begin, int64_t end, const Grid&, TilePair* pairs, int64_t capacity,
-                   int64_t& used, uint32_t* first);
+  int64_t (*list_touched_tiles)(const Splat<T>* splats, int64_t begin, int64_t end, const Grid&, TilePair* pairs, int64_t capacity,
+                                int64_t& used, uint32_t* first);
   void (*blend)(const TileJob<T>&, const RenderOutput<T>&);
   void (*blend_backward)(const TileJob<T>&, const RenderOutput<const T>& pictures, const RenderOutput<const T>& gradients,
                          SplatGradient<T>* records);
   PairCounts (*count)(const TileJob<T>&);
-  void (*project_backward)(const Gaussians<T>&, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,
+  void (*project_backward)(const Gaussians<T>&, int64_t begin, int64_t end, const ProjectionParams<T>* params, int64_t views,
                            const SplatRecords<T>* records, const GaussianGradients<T>& out,
                            CameraGradient<T>* cameras);
-  // Kernels outside of the rasterizer: ssim.h, smooth.h, adam.h.
-  double (*ssim)(const FitPlane<T>&, int begin, int end, T* scratch);
-  double (*fit_gradient)(const FitPlane<T>&, T l1_weight, T ssim_weight, int begin, int end, T* scratch);
-  double (*unevenness)(const DepthPlane<T>&, T factor, int begin, int end, T* scratch);
-  void (*adam)(const AdamStep&, const AdamNumbers<T>&, int64_t begin, int64_t end);
+  // Kernels outside of the rasterizer: ssim.h, smoothness.h, adam.h.
+  double (*ssim)(const PhotometricPlane<T>&, int begin, int end, T* scratch);
+  double (*photometric_gradient)(const PhotometricPlane<T>&, T l1_weight, T ssim_weight, int begin, int end, T* scratch);
+  double (*unevenness)(const SmoothnessPlane<T>&, T factor, int begin, int end, T* scratch);
+  void (*adam)(const AdamStep&, const AdamState<T>&, int64_t begin, int64_t end);
 };
 
 struct Kernels {
@@ -32,16 +32,16 @@ struct Kernels {
   KernelsOf<float> of_float;
   KernelsOf<double> of_double;
   // attention.h
-  void (*attend)(const AttentionHead<float>&, Rows<float> out, float* log_sums, float* scratch);
-  void (*pack_queries)(const AttentionHead<float>&, const AttentionPast<float>&, const PackedQueries& to);
-  void (*attend_backward)(const AttentionHead<float>&, const PackedQueries&, const float* log_sums, float* dq, Rows<float> dk,
-                          Rows<float> dv, float* scratch);
+  void (*attention_forward)(const AttentionHead<float>&, Rows<float> out, float* log_sums, float* scratch);
+  void (*pack_queries)(const AttentionHead<float>&, const AttentionOutputs<float>&, const PackedQueries& to);
+  void (*attention_backward)(const AttentionHead<float>&, const PackedQueries&, const float* log_sums, float* dq, Rows<float> dk,
+                             Rows<float> dv, float* scratch);
   // attention_bf16.h
-  void (*attend_bf16)(const AttentionHead<Bf16>&, const Bf16Products&, Rows<Bf16> out, float* log_sums, float* scratch);
-  void (*pack_queries_bf16)(const AttentionHead<Bf16>&, const AttentionPast<Bf16>&, const float* log_sums, int64_t first, int64_t whole,
+  void (*attention_forward_bf16)(const AttentionHead<Bf16>&, const Bf16Gemm&, Rows<Bf16> out, float* log_sums, float* scratch);
+  void (*pack_queries_bf16)(const AttentionHead<Bf16>&, const AttentionOutputs<Bf16>&, const float* log_sums, int64_t first, int64_t whole,
                             const PackedBf16Queries& to);
-  void (*attend_backward_bf16)(const AttentionHead<Bf16>&, const Bf16Products&, const PackedBf16Queries&, float* dq, Rows<Bf16> dk,
-                               Rows<Bf16> dv, float* scratch);
+  void (*attention_backward_bf16)(const AttentionHead<Bf16>&, const Bf16Gemm&, const PackedBf16Queries&, float* dq, Rows<Bf16> dk,
+                                  Rows<Bf16> dv, float* scratch);
   void (*muon)(const MuonStep&, const MuonMatrix&, float* scratch);  // muon.h
   int64_t (*multiply_adds)(int64_t rounds, float* out);
 

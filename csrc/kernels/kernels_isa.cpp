@@ -2,12 +2,12 @@
 #include "adam.h"
 #include "attention_bf16.h"
 #include "blend.h"
-#include "cover.h"
 #include "kernels.h"
 #include "muon.h"
 #include "project.h"
-#include "smooth.h"
+#include "smoothness.h"
 #include "ssim.h"
+#include "touched_tiles.h"
 
 namespace globalsplat::raster::GS_ISA {
 
@@ -17,16 +17,16 @@ namespace globalsplat::raster::GS_ISA {
 extern const Kernels table;
 const Kernels table = {
     GS_STRING(GS_ISA),
-    {project<float>, cover<float>, blend_tile<float>, blend_tile_backward<float>, count_tile<float>, project_backward<float>,
-     ssim<float>, fit_gradient<float>, unevenness<float>, adam<float>},
-    {project<double>, cover<double>, blend_tile<double>, blend_tile_backward<double>, count_tile<double>, project_backward<double>,
-     ssim<double>, fit_gradient<double>, unevenness<double>, adam<double>},
-    attend,
+    {project<float>, list_touched_tiles<float>, blend_tile<float>, blend_tile_backward<float>, count_tile<float>,
+     project_backward<float>, ssim<float>, photometric_gradient<float>, unevenness<float>, adam<float>},
+    {project<double>, list_touched_tiles<double>, blend_tile<double>, blend_tile_backward<double>, count_tile<double>,
+     project_backward<double>, ssim<double>, photometric_gradient<double>, unevenness<double>, adam<double>},
+    attention_forward,
     pack_queries,
-    attend_backward,
-    attend_bf16,
+    attention_backward,
+    attention_forward_bf16,
     pack_queries_bf16,
-    attend_backward_bf16,
+    attention_backward_bf16,
     muon,
     multiply_adds,
 };

@@ -33,7 +33,7 @@ GS_INLINE T load(const T* from) {
 }
 
 template <class T>
-GS_INLINE T load_some(const T* from, int) {
+GS_INLINE T load_partial(const T* from, int) {
   return *from;
 }
 
@@ -47,7 +47,7 @@ GS_INLINE float fnma(float a, float b, float c) { return ::fmaf(-a, b, c); }
 GS_INLINE float add_fused(float weight, float number, float sum) { return fma(weight, number, sum); }
 GS_INLINE float value_of(float sum) { return sum; }
 GS_INLINE float add_product(float a, float b, float c) { return fma(a, b, c); }
-GS_INLINE float take_product(float a, float b, float c) { return fnma(a, b, c); }
+GS_INLINE float subtract_product(float a, float b, float c) { return fnma(a, b, c); }
 GS_INLINE float sqrt(float v) { return ::sqrtf(v); }
 // Computes 1/v, accurate to the last bit but one like the vector version, in one instruction instead of ten.
 GS_INLINE float reciprocal(float v) {
@@ -62,7 +62,7 @@ GS_INLINE float reciprocal(float v) {
 
 GS_INLINE float select(bool m, float a, float b) { return m ? a : b; }
 GS_INLINE bool less(float a, float b) { return a < b; }
-GS_INLINE bool at_most(float a, float b) { return a <= b; }
+GS_INLINE bool less_equal(float a, float b) { return a <= b; }
 GS_INLINE bool both(bool a, bool b) { return a & b; }
 GS_INLINE bool any(bool m) { return m; }
 GS_INLINE int lane_bits(bool m) { return m; }

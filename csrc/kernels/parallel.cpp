@@ -21,10 +21,10 @@ namespace {
 class Pool {
  public:
   // Returns false if another call is running.
-  bool try_run(int threads, int64_t count, const std::function<void(int64_t)>& task) {
+  bool try_run(int num_threads, int64_t count, const std::function<void(int64_t)>& task) {
     std::unique_lock<std::mutex> lock(mutex_);
     if (task_ != nullptr) return false;
-    active_ = running_ = start(threads - 1);
+    active_ = running_ = start(num_threads - 1);
     task_ = &task;
     count_ = count;
     next_ = 0;
@@ -99,8 +99,8 @@ Pool& pool() {
 
 }  // namespace
 
-void parallel_for(int threads, int64_t count, const std::function<void(int64_t)>& task) {
-  if (threads > 1 && count > 1 && pool().try_run(threads, count, task)) return;
+void parallel_for(int num_threads, int64_t count, const std::function<void(int64_t)>& task) {
+  if (num_threads > 1 && count > 1 && pool().try_run(num_threads, count, task)) return;
   for (int64_t i = 0; i < count; ++i) task(i);
 }
 

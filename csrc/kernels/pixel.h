@@ -54,7 +54,7 @@ GS_INLINE Vector<T> exponent_of(const Splat<T>& s, const Offset<T>& at) {
 
 template <class T>
 GS_INLINE Mask<T> reaches(Vector<T> exponent) {
-  return at_most(broadcast<T>(T(-kLog2Of255)), exponent);
+  return less_equal(broadcast<T>(T(-kLog2Of255)), exponent);
 }
 
 // Returns true if α may reach its cap, which is the case for few splats.
@@ -129,14 +129,14 @@ GS_INLINE PixelGradients<T> pixel_gradients(Vector<T> transmittance, const Vecto
 
 // Processes a splat: updates the state, and adds the splat's gradient to `sums`, in SplatGradient's order.
 template <class T, bool capped = true>
-GS_INLINE void pass(const Splat<T>& s, const Evaluated<T>& e, PixelGradients<T>& px, Vector<T> sums[kSplatGradientNumbers]) {
+GS_INLINE void accumulate_gradient(const Splat<T>& s, const Evaluated<T>& e, PixelGradients<T>& px, Vector<T> sums[kSplatGradientNumbers]) {
   using V = Vector<T>;
   const Contribution<T> c = blend<T, capped>(px.transmittance, e.raw);
   V q = add_product(px.g_red, broadcast<T>(s.red), px.constant);
   q = add_product(px.g_green, broadcast<T>(s.green), q);
   q = add_product(px.g_blue, broadcast<T>(s.blue), q);
   q = add_product(px.per_z, broadcast<T>(s.z), q);
-  px.remaining = take_product(c.weight, q, px.remaining);
+  px.remaining = subtract_product(c.weight, q, px.remaining);
 
   // ν = −α ∂L/∂α; no gradient passes the cap.
   const Mask<T> follows = capped ? both(c.goes_on, less(e.raw, broadcast<T>(T(kMaxAlpha)))) : c.goes_on;

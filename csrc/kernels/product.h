@@ -2,7 +2,7 @@
 // them.
 #pragma once
 
-#include "rows.h"
+#include "attention_types.h"
 #include "simd.h"
 
 namespace globalsplat::raster::GS_ISA {

@@ -37,8 +37,8 @@ struct Projection {
   Mask<T> visible;
   Vector<T> t[3], inverse_z;
   Vector<T> a, b;                   // clamped t_x/z, t_y/z
-  Mask<T> a_free, b_free;
-  Vector<T> wrs[9], half[6];        // W R S and J W R S (2×3)
+  Mask<T> is_a_unclamped, is_b_unclamped;
+  Vector<T> wrs[9], jwrs[6];        // W R S and J W R S (2×3)
   Vector<T> cov_xx, cov_xy, cov_yy, determinant;
   Vector<T> factor_a, factor_b, factor_c;  // Splat's a, b, c
 };
@@ -128,42 +128,42 @@ GS_INLINE void load_group(const Gaussians<T>& g, int64_t begin, int64_t end, Gro
 
 // Projects a group. A NaN anywhere in a Gaussian's geometry makes it invisible.
 template <class T>
-GS_INLINE void project_group(const Group<T>& g, const Lens<T>& lens, Projection<T>& p) {
+GS_INLINE void project_group(const Group<T>& g, const ProjectionParams<T>& params, Projection<T>& p) {
   using V = Vector<T>;
-  const Camera<T>& c = lens.camera;
+  const Camera<T>& c = params.camera;
   const V largest = broadcast<T>(sizeof(T) == 4 ? T(3e38) : T(1e308)), zero{};
   for (int r = 0; r < 3; ++r)
     p.t[r] = c.rotation[3 * r] * g.mean[0] + c.rotation[3 * r + 1] * g.mean[1] + c.rotation[3 * r + 2] * g.mean[2] +
              c.translation[r];
-  p.visible = both(less(broadcast<T>(T(kNearPlane)), p.t[2]), at_most(broadcast<T>(T(kMinAlpha)), g.opacity));
+  p.visible = both(less(broadcast<T>(T(kNearPlane)), p.t[2]), less_equal(broadcast<T>(T(kMinAlpha)), g.opacity));
   if (!any(p.visible)) return;
 
   p.inverse_z = T(1) / p.t[2];
   const V x = p.t[0] * p.inverse_z, y = p.t[1] * p.inverse_z;
-  const V x_low = broadcast<T>(lens.x_low), x_high = broadcast<T>(lens.x_high);
-  const V y_low = broadcast<T>(lens.y_low), y_high = broadcast<T>(lens.y_high);
+  const V x_low = broadcast<T>(params.x_low), x_high = broadcast<T>(params.x_high);
+  const V y_low = broadcast<T>(params.y_low), y_high = broadcast<T>(params.y_high);
   p.a = clamp(x, x_low, x_high);
   p.b = clamp(y, y_low, y_high);
-  p.a_free = both(at_most(x_low, x), at_most(x, x_high));
-  p.b_free = both(at_most(y_low, y), at_most(y, y_high));
+  p.is_a_unclamped = both(less_equal(x_low, x), less_equal(x, x_high));
+  p.is_b_unclamped = both(less_equal(y_low, y), less_equal(y, y_high));
   for (int r = 0; r < 3; ++r)
     for (int k = 0; k < 3; ++k)
       p.wrs[3 * r + k] = c.rotation[3 * r] * g.axes[k] + c.rotation[3 * r + 1] * g.axes[3 + k] +
                          c.rotation[3 * r + 2] * g.axes[6 + k];
   const V fx = c.fx * p.inverse_z, fy = c.fy * p.inverse_z;
   for (int k = 0; k < 3; ++k) {
-    p.half[k] = fx * (p.wrs[k] - p.a * p.wrs[6 + k]);
-    p.half[3 + k] = fy * (p.wrs[3 + k] - p.b * p.wrs[6 + k]);
+    p.jwrs[k] = fx * (p.wrs[k] - p.a * p.wrs[6 + k]);
+    p.jwrs[3 + k] = fy * (p.wrs[3 + k] - p.b * p.wrs[6 + k]);
   }
-  const V* h = p.half;
-  p.cov_xx = h[0] * h[0] + h[1] * h[1] + h[2] * h[2] + lens.eps2d;
+  const V* h = p.jwrs;
+  p.cov_xx = h[0] * h[0] + h[1] * h[1] + h[2] * h[2] + params.eps2d;
   p.cov_xy = h[0] * h[3] + h[1] * h[4] + h[2] * h[5];
-  p.cov_yy = h[3] * h[3] + h[4] * h[4] + h[5] * h[5] + lens.eps2d;
+  p.cov_yy = h[3] * h[3] + h[4] * h[4] + h[5] * h[5] + params.eps2d;
   // det(H Hᵀ + εI) = |h₁ × h₂|² + ε (tr + ε): no cancellation for needles, unlike xx·yy − xy².
   const V cross_x = h[1] * h[5] - h[2] * h[4], cross_y = h[2] * h[3] - h[0] * h[5], cross_z = h[0] * h[4] - h[1] * h[3];
   p.determinant = cross_x * cross_x + cross_y * cross_y + cross_z * cross_z +
-                  lens.eps2d * (p.cov_xx + p.cov_yy - lens.eps2d);
-  p.visible = both(p.visible, both(less(zero, p.determinant), at_most(p.determinant, largest)));
+                  params.eps2d * (p.cov_xx + p.cov_yy - params.eps2d);
+  p.visible = both(p.visible, both(less(zero, p.determinant), less_equal(p.determinant, largest)));
 
   // Half the inverse is [[a², ab], [ab, b² + c²]]: 2a² = Σ_yy/det, and 2c² = 1/Σ_yy, because the Schur complement of an inverse is the
   // inverse of an entry. The factor log₂e converts exponents to base 2.
@@ -173,13 +173,13 @@ GS_INLINE void project_group(const Group<T>& g, const Lens<T>& lens, Projection<
   p.factor_c = sqrt(scale / p.cov_yy);
   p.visible = both(p.visible, both(less(zero, p.factor_a), less(zero, p.factor_c)));
   const V u = c.fx * x, v = c.fy * y;
-  p.visible = both(p.visible, both(at_most(u * u, largest), at_most(v * v, largest)));
+  p.visible = both(p.visible, both(less_equal(u * u, largest), less_equal(v * v, largest)));
 }
 
 // Computes the fields of Splat, in its order, for all lanes.
 template <class T>
-GS_INLINE void splats_of(const Group<T>& g, const Lens<T>& lens, const Projection<T>& p, const Shading<T>& s,
-                         Vector<T> out[16]) {
+GS_INLINE void make_splats(const Group<T>& g, const ProjectionParams<T>& params, const Projection<T>& p, const Shading<T>& s,
+                           Vector<T> out[16]) {
   using V = Vector<T>;
   const V zero{}, a = p.factor_a, b = p.factor_b, c = p.factor_c;
   // α ≥ 1/255 ⟺ s ≤ log₂(255·opacity). The margin covers the rounding of s, whose terms may exceed s itself: at the rim of a splat by 1 +
@@ -188,8 +188,8 @@ GS_INLINE void splats_of(const Group<T>& g, const Lens<T>& lens, const Projectio
   constexpr T rounding = sizeof(T) == 4 ? T(1e-6) : T(1e-15);
   const V reach = exact + T(1e-3) * (T(1) + exact) + rounding * exact * (T(1) + skew);
   const V radius = sqrt(reach), bb_cc = b * b + c * c;
-  const V numbers[16] = {lens.camera.fx * (p.t[0] * p.inverse_z) + lens.camera.cx,
-                         lens.camera.fy * (p.t[1] * p.inverse_z) + lens.camera.cy,
+  const V numbers[16] = {params.camera.fx * (p.t[0] * p.inverse_z) + params.camera.cx,
+                         params.camera.fy * (p.t[1] * p.inverse_z) + params.camera.cy,
                          a,
                          b,
                          c,
@@ -209,11 +209,11 @@ GS_INLINE void splats_of(const Group<T>& g, const Lens<T>& lens, const Projectio
 
 // Computes directions and basis functions, without colours. Lanes in which `visible` is false get a direction of zero.
 template <class T>
-GS_INLINE void look_at_group(const Group<T>& g, int bases, const Lens<T>& lens, Mask<T> visible, Shading<T>& s) {
+GS_INLINE void compute_directions(const Group<T>& g, int bases, const ProjectionParams<T>& params, Mask<T> visible, Shading<T>& s) {
   using V = Vector<T>;
   V distance2{};
   for (int k = 0; k < 3; ++k) {
-    s.direction[k] = select(visible, g.mean[k] - lens.centre[k], V{});
+    s.direction[k] = select(visible, g.mean[k] - params.centre[k], V{});
     distance2 += s.direction[k] * s.direction[k];
   }
   s.inverse_distance = select(visible, T(1) / sqrt(distance2), V{});
@@ -222,8 +222,8 @@ GS_INLINE void look_at_group(const Group<T>& g, int bases, const Lens<T>& lens, 
 }
 
 template <class T>
-GS_INLINE void shade_group(const Group<T>& g, int bases, const Lens<T>& lens, Mask<T> visible, Shading<T>& s) {
-  look_at_group(g, bases, lens, visible, s);
+GS_INLINE void shade_group(const Group<T>& g, int bases, const ProjectionParams<T>& params, Mask<T> visible, Shading<T>& s) {
+  compute_directions(g, bases, params, visible, s);
   for (int channel = 0; channel < 3; ++channel) {
     s.colour[channel] = broadcast<T>(T(0.5));
     for (int k = 0; k < bases; ++k) s.colour[channel] = fma(s.basis[k], g.sh[3 * k + channel], s.colour[channel]);
@@ -232,7 +232,7 @@ GS_INLINE void shade_group(const Group<T>& g, int bases, const Lens<T>& lens, Ma
 
 // Projects Gaussians begin … end − 1 into each of `views` cameras: splats[view][i].
 template <class T>
-void project(const Gaussians<T>& g, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,
+void project(const Gaussians<T>& g, int64_t begin, int64_t end, const ProjectionParams<T>* params, int64_t views,
              Splat<T>* const* splats) {
   static_assert(sizeof(Splat<T>) == 16 * sizeof(T));
   for (int64_t i = begin; i < end; i += Simd<T>::lanes) {
@@ -242,10 +242,10 @@ void project(const Gaussians<T>& g, int64_t begin, int64_t end, const Lens<T>* l
       Projection<T> projection;
       Shading<T> shading;
       Vector<T> numbers[16] = {};
-      project_group(group, lenses[view], projection);
+      project_group(group, params[view], projection);
       if (any(projection.visible)) {
-        shade_group(group, g.bases, lenses[view], projection.visible, shading);
-        splats_of(group, lenses[view], projection, shading, numbers);
+        shade_group(group, g.bases, params[view], projection.visible, shading);
+        make_splats(group, params[view], projection, shading, numbers);
       }
       store_columns(numbers, 16, group.count, &splats[view][i].u);
     }
@@ -286,7 +286,7 @@ GS_INLINE void shade_group_backward(int bases, const Shading<T>& s, const Mask<T
 // true; in other lanes `d` and `d_r` are 0. If `of_cameras` is set, `of_camera` receives the gradient of the camera from each lane, in
 // CameraGradient's order.
 template <class T>
-GS_INLINE void project_group_backward(const Group<T>& g, const Lens<T>& lens, const Projection<T>& p, Mask<T> touched,
+GS_INLINE void project_group_backward(const Group<T>& g, const ProjectionParams<T>& params, const Projection<T>& p, Mask<T> touched,
                                       const Vector<T> d[kSplatGradientNumbers], const Vector<T> d_r[3],
                                       GroupGradient<T>& out, bool of_cameras, Vector<T> of_camera[kCameraNumbers]) {
   using V = Vector<T>;
@@ -309,27 +309,27 @@ GS_INLINE void project_group_backward(const Group<T>& g, const Lens<T>& lens, co
   const V m_yy = -two_ln2_squared * (b * b * power_pp + T(2) * b * c * power_pr + c * c * power_rr);
 
   // Σ2D = H Hᵀ + εI: ∂L/∂H = 2 (∂L/∂Σ2D) H;  H = J V with V = W R S.
-  const Camera<T>& camera = lens.camera;
+  const Camera<T>& camera = params.camera;
   const V fx = camera.fx * p.inverse_z, fy = camera.fy * p.inverse_z;
-  V d_half[6], d_wrs[9];
+  V d_jwrs[6], d_wrs[9];
   V d_fx{}, d_fy{}, d_a{}, d_b{};  // with respect to f_x/z, f_y/z, a, b
   for (int k = 0; k < 3; ++k) {
-    d_half[k] = T(2) * (m_xx * p.half[k] + m_xy * p.half[3 + k]);
-    d_half[3 + k] = T(2) * (m_xy * p.half[k] + m_yy * p.half[3 + k]);
+    d_jwrs[k] = T(2) * (m_xx * p.jwrs[k] + m_xy * p.jwrs[3 + k]);
+    d_jwrs[3 + k] = T(2) * (m_xy * p.jwrs[k] + m_yy * p.jwrs[3 + k]);
   }
   for (int k = 0; k < 3; ++k) {
-    d_wrs[k] = fx * d_half[k];
-    d_wrs[3 + k] = fy * d_half[3 + k];
-    d_wrs[6 + k] = -fx * p.a * d_half[k] - fy * p.b * d_half[3 + k];
-    d_fx += d_half[k] * (p.wrs[k] - p.a * p.wrs[6 + k]);
-    d_fy += d_half[3 + k] * (p.wrs[3 + k] - p.b * p.wrs[6 + k]);
-    d_a -= fx * d_half[k] * p.wrs[6 + k];
-    d_b -= fy * d_half[3 + k] * p.wrs[6 + k];
+    d_wrs[k] = fx * d_jwrs[k];
+    d_wrs[3 + k] = fy * d_jwrs[3 + k];
+    d_wrs[6 + k] = -fx * p.a * d_jwrs[k] - fy * p.b * d_jwrs[3 + k];
+    d_fx += d_jwrs[k] * (p.wrs[k] - p.a * p.wrs[6 + k]);
+    d_fy += d_jwrs[3 + k] * (p.wrs[3 + k] - p.b * p.wrs[6 + k]);
+    d_a -= fx * d_jwrs[k] * p.wrs[6 + k];
+    d_b -= fy * d_jwrs[3 + k] * p.wrs[6 + k];
   }
 
   // t_x/z affects u always, and a if it isn't clamped.
-  const V d_x = camera.fx * d_u + select(p.a_free, d_a, zero);
-  const V d_y = camera.fy * d_v + select(p.b_free, d_b, zero);
+  const V d_x = camera.fx * d_u + select(p.is_a_unclamped, d_a, zero);
+  const V d_y = camera.fy * d_v + select(p.is_b_unclamped, d_b, zero);
   const V inverse_z2 = p.inverse_z * p.inverse_z;
   const V d_t[3] = {d_x * p.inverse_z, d_y * p.inverse_z,
                     d[9] - (d_x * p.t[0] + d_y * p.t[1]) * inverse_z2 - (d_fx * camera.fx + d_fy * camera.fy) * inverse_z2};
@@ -384,7 +384,7 @@ GS_INLINE Mask<T> sum_records(const SplatRecords<T>& from, int64_t first, int co
     const uint32_t begin = lane < count ? from.first[first + lane] : 0, end = lane < count ? from.first[first + lane + 1] : 0;
     for (uint32_t r = begin; r < end; ++r)
       for (int k = 0; k < parts; ++k)
-        sum[k] += load_some<T>(&from.records[r].power + k * lanes, kSplatGradientNumbers - k * lanes);
+        sum[k] += load_partial<T>(&from.records[r].power + k * lanes, kSplatGradientNumbers - k * lanes);
     for (int k = 0; k < parts; ++k) store<T>(sums[lane] + k * lanes, sum[k]);
     has_any[lane] = T(begin < end);
   }
@@ -396,7 +396,7 @@ GS_INLINE Mask<T> sum_records(const SplatRecords<T>& from, int64_t first, int co
 // camera's records. If `of_cameras` is set, add_camera_gradient(view, numbers) is called with the group's gradient of each camera, in
 // CameraGradient's order.
 template <class T, class RecordsOf, class AddCameraGradient>
-GS_INLINE void project_backward_group(const Gaussians<T>& g, int64_t i, int64_t end, const Lens<T>* lenses, int64_t views,
+GS_INLINE void project_backward_group(const Gaussians<T>& g, int64_t i, int64_t end, const ProjectionParams<T>* params, int64_t views,
                                       const RecordsOf& records_of, const GaussianGradients<T>& out, bool of_cameras,
                                       const AddCameraGradient& add_camera_gradient) {
   using V = Vector<T>;
@@ -411,15 +411,15 @@ GS_INLINE void project_backward_group(const Gaussians<T>& g, int64_t i, int64_t 
       ever = Mask<T>(ever | touched);
       Projection<T> projection;
       Shading<T> shading;
-      project_group(group, lenses[view], projection);
+      project_group(group, params[view], projection);
       if (any(projection.visible)) {  // all Gaussians with records are visible
-        shade_group(group, g.bases, lenses[view], touched, shading);
+        shade_group(group, g.bases, params[view], touched, shading);
         const Mask<T> is_lit[3] = {less(V{}, shading.colour[0]), less(V{}, shading.colour[1]), less(V{}, shading.colour[2])};
         V d_r[3];
         shade_group_backward<T>(
             g.bases, shading, is_lit, d, [&](int n) { return group.sh[n]; },
             [&](int n, V x, V y) { sum.sh[n] = add_product(x, y, sum.sh[n]); }, d_r);
-        project_group_backward(group, lenses[view], projection, touched, d, d_r, sum, of_cameras, of_camera);
+        project_group_backward(group, params[view], projection, touched, d, d_r, sum, of_cameras, of_camera);
       }
     }
     if (of_cameras) add_camera_gradient(view, of_camera);
@@ -437,7 +437,7 @@ GS_INLINE void project_backward_group(const Gaussians<T>& g, int64_t i, int64_t 
 
 // Computes all gradients of Gaussians begin … end − 1. If `cameras` isn't null, their gradients of the cameras are added to it.
 template <class T>
-void project_backward(const Gaussians<T>& g, int64_t begin, int64_t end, const Lens<T>* lenses, int64_t views,
+void project_backward(const Gaussians<T>& g, int64_t begin, int64_t end, const ProjectionParams<T>* params, int64_t views,
                       const SplatRecords<T>* records, const GaussianGradients<T>& out, CameraGradient<T>* cameras) {
   const auto add_camera_gradient = [&](int64_t view, const Vector<T>(&of_camera)[kCameraNumbers]) {
     T numbers[kCameraNumbers];
@@ -445,7 +445,7 @@ void project_backward(const Gaussians<T>& g, int64_t begin, int64_t end, const L
     for (int k = 0; k < kCameraNumbers; ++k) cameras[view].numbers[k] += numbers[k];
   };
   for (int64_t i = begin; i < end; i += Simd<T>::lanes)
-    project_backward_group(g, i, end, lenses, views, [&](int64_t view) { return records[view]; }, out, cameras != nullptr,
+    project_backward_group(g, i, end, params, views, [&](int64_t view) { return records[view]; }, out, cameras != nullptr,
                            add_camera_gradient);
 }
 

@@ -7,14 +7,14 @@
 #include <utility>
 
 #include "kernels.h"
-#include "lens.h"
 #include "parallel.h"
+#include "projection_params.h"
 
 namespace globalsplat::raster {
 
 namespace {
 
-constexpr int64_t kTask = kCoverTask;  // Gaussians per task of projection and of listing tiles
+constexpr int64_t kTask = kSplatsPerTask;  // Gaussians per task of projection and of listing tiles
 constexpr int64_t kChunk = 64 * 1024;  // Gaussians of a view per chunk of sorting and binning
 
 // Returns the seconds since its previous lap.
@@ -30,7 +30,7 @@ class Stopwatch {
   Clock::time_point start_ = Clock::now();
 };
 
-int64_t parts(int64_t count, int64_t size) { return (count + size - 1) / size; }
+int64_t ceil_div(int64_t count, int64_t size) { return (count + size - 1) / size; }
 
 }  // namespace
 
@@ -55,13 +55,13 @@ struct Frame<T>::TaskOutput {
 template <class T>
 Frame<T>::Frame(const std::vector<View<T>>& views, const std::vector<Gaussians<T>>& scenes, const Settings& settings)
     : settings_(settings),
-      grid_{settings.width, settings.height, int(parts(settings.width, kTile)), int(parts(settings.height, kTile))},
+      grid_{settings.width, settings.height, int(ceil_div(settings.width, kTile)), int(ceil_div(settings.height, kTile))},
       count_(scenes.empty() ? 0 : scenes[0].count),
-      tasks_(parts(count_, kTask)),
+      tasks_(ceil_div(count_, kTask)),
       views_(views.size()),
       first_view_(scenes.size() + 1, 0) {
   for (const View<T>& view : views) {
-    lenses_.push_back(lens_of(view.camera, settings.width, settings.height, settings.eps2d));
+    projection_params_.push_back(make_projection_params(view.camera, settings.width, settings.height, settings.eps2d));
     ++first_view_[size_t(view.scene) + 1];
   }
   for (size_t scene = 0; scene < scenes.size(); ++scene) first_view_[scene + 1] += first_view_[scene];
@@ -84,13 +84,13 @@ TileJob<T> Frame<T>::job(const PerView& view, int tile) const {
 
 // Lists the tiles of one task's splats, while they are in the cache. first_record is relative to the part's own first pair.
 template <class T>
-void Frame<T>::cover(PerView& view, int64_t begin, int64_t end, TaskOutput& part) const {
+void Frame<T>::list_touched_tiles(PerView& view, int64_t begin, int64_t end, TaskOutput& part) const {
   part.pairs = Buffer<TilePair>(size_t(4 * kTask));
   part.depths = Buffer<DepthItem<T>>(size_t(end - begin));
   uint32_t* first = view.first_record.data.get();
   for (int64_t i = begin;;) {
-    i = kernels().of<T>().cover(view.splats.data.get(), i, end, grid_, part.pairs.data.get(), int64_t(part.pairs.size),
-                                part.pair_count, first + i);
+    i = kernels().of<T>().list_touched_tiles(view.splats.data.get(), i, end, grid_, part.pairs.data.get(), int64_t(part.pairs.size),
+                                             part.pair_count, first + i);
     if (i == end) break;
     Buffer<TilePair> larger(2 * part.pairs.size + size_t(grid_.tiles()) + 4);
     std::copy_n(part.pairs.data.get(), part.pair_count, larger.data.get());
@@ -115,12 +115,13 @@ std::vector<typename Frame<T>::TaskOutput> Frame<T>::project(const std::vector<G
     view.first_record = Buffer<uint32_t>(size_t(count_) + 1);
     splats.push_back(view.splats.data.get());
   }
-  parallel_for(settings_.threads, int64_t(scenes.size()) * tasks_, [&](int64_t task) {
+  parallel_for(settings_.num_threads, int64_t(scenes.size()) * tasks_, [&](int64_t task) {
     const size_t scene = size_t(task / tasks_), first = first_view_[scene], last = first_view_[scene + 1];
     const int64_t begin = task % tasks_ * kTask, end = std::min(begin + kTask, count_);
-    kernels().of<T>().project(scenes[scene], begin, end, lenses_.data() + first, int64_t(last - first),
+    kernels().of<T>().project(scenes[scene], begin, end, projection_params_.data() + first, int64_t(last - first),
                               splats.data() + first);
-    for (size_t k = first; k < last; ++k) cover(views_[k], begin, end, task_outputs[k * size_t(tasks_) + size_t(task % tasks_)]);
+    for (size_t k = first; k < last; ++k)
+      list_touched_tiles(views_[k], begin, end, task_outputs[k * size_t(tasks_) + size_t(task % tasks_)]);
   });
   for (size_t k = 0; k < views_.size(); ++k) {
     int64_t pairs = 0, depths = 0;
@@ -146,14 +147,14 @@ std::vector<Buffer<DepthItem<T>>> Frame<T>::sort(const std::vector<TaskOutput>& 
     const TaskOutput* last = tasks_ == 0 ? nullptr : &task_outputs[(k + 1) * size_t(tasks_) - 1];
     order.emplace_back(last == nullptr ? 0 : last->depths_before + size_t(last->depth_count));
   }
-  parallel_for(settings_.threads, int64_t(task_outputs.size()), [&](int64_t task) {
+  parallel_for(settings_.num_threads, int64_t(task_outputs.size()), [&](int64_t task) {
     const TaskOutput& part = task_outputs[size_t(task)];
     const size_t k = size_t(task / tasks_);
     std::copy_n(part.depths.data.get(), part.depth_count, order[k].data.get() + part.depths_before);
     const int64_t begin = task % tasks_ * kTask, end = std::min(begin + kTask, count_);
     for (int64_t i = begin; i < end; ++i) views_[k].first_record[size_t(i)] += part.pairs_before;
   });
-  sort_by_depth<T>(settings_.threads, order, chunks());
+  sort_by_depth<T>(settings_.num_threads, order, chunks());
   return order;
 }
 
@@ -180,8 +181,8 @@ void Frame<T>::bin(const std::vector<TaskOutput>& task_outputs, const std::vecto
         visit(int64_t(pair->tile), TileEntry{splat, record, pair->blocks});
     }
   };
-  std::vector<Buffer<uint32_t>> starts = distribute(
-      settings_.threads, int64_t(views_.size()), chunks(), grid_.tiles(),
+  std::vector<Buffer<uint32_t>> starts = counting_sort(
+      settings_.num_threads, int64_t(views_.size()), chunks(), grid_.tiles(),
       [&](int64_t k, int64_t chunk, const auto& visit) {
         if (chunks() > 1) return each(k, chunk, [&](int64_t tile, const TileEntry&) { visit(tile); });
         // With a single chunk, all of a view's pairs are counted in memory order.
@@ -197,7 +198,7 @@ void Frame<T>::bin(const std::vector<TaskOutput>& task_outputs, const std::vecto
 
 template <class T>
 int64_t Frame<T>::chunks() const {
-  return std::max<int64_t>(1, parts(count_, kChunk));
+  return std::max<int64_t>(1, ceil_div(count_, kChunk));
 }
 
 template <class T>
@@ -215,7 +216,7 @@ std::unique_ptr<Frame<T>> Frame<T>::draw(const std::vector<Gaussians<T>>& scenes
   }
   times.bin = watch.lap();
   const int64_t tiles = frame->grid_.tiles();
-  parallel_for(settings.threads, int64_t(views.size()) * tiles, [&](int64_t task) {
+  parallel_for(settings.num_threads, int64_t(views.size()) * tiles, [&](int64_t task) {
     const size_t k = size_t(task / tiles);
     kernels().of<T>().blend(frame->job(frame->views_[k], int(task % tiles)), out[k]);
   });
@@ -236,7 +237,7 @@ void Frame<T>::backward(const std::vector<Gaussians<T>>& scenes, const std::vect
     gathered.emplace_back(view.entries.size);
     records.push_back({gathered.back().data.get(), view.first_record.data.get()});
   }
-  parallel_for(settings_.threads, int64_t(views_.size()) * tiles, [&](int64_t task) {
+  parallel_for(settings_.num_threads, int64_t(views_.size()) * tiles, [&](int64_t task) {
     const size_t k = size_t(task / tiles);
     kernels().of<T>().blend_backward(job(views_[k], int(task % tiles)), pictures[k], gradients[k], gathered[k].data.get());
   });
@@ -244,10 +245,10 @@ void Frame<T>::backward(const std::vector<Gaussians<T>>& scenes, const std::vect
 
   // Gradients of the cameras of a scene from each task's Gaussians: [tasks][views].
   std::vector<CameraGradient<T>> camera_gradients(cameras == nullptr ? 0 : size_t(tasks_) * views_.size());
-  parallel_for(settings_.threads, int64_t(scenes.size()) * tasks_, [&](int64_t task) {
+  parallel_for(settings_.num_threads, int64_t(scenes.size()) * tasks_, [&](int64_t task) {
     const size_t scene = size_t(task / tasks_), part = size_t(task % tasks_), first = first_view_[scene];
     const int64_t begin = int64_t(part) * kTask, end = std::min(begin + kTask, count_);
-    kernels().of<T>().project_backward(scenes[scene], begin, end, lenses_.data() + first,
+    kernels().of<T>().project_backward(scenes[scene], begin, end, projection_params_.data() + first,
                                        int64_t(first_view_[scene + 1] - first), records.data() + first, out[scene],
                                        cameras == nullptr ? nullptr : &camera_gradients[part * views_.size() + first]);
   });
@@ -274,9 +275,9 @@ PairCounts Frame<T>::count() const {
   return sum;
 }
 
-double multiply_add_peak(int threads, double seconds) {
-  std::vector<double> rates(size_t(threads), 0.);
-  parallel_for(threads, threads, [&](int64_t i) {
+double multiply_add_peak(int num_threads, double seconds) {
+  std::vector<double> rates(size_t(num_threads), 0.);
+  parallel_for(num_threads, num_threads, [&](int64_t i) {
     const auto start = std::chrono::steady_clock::now();
     float out = 1;
     int64_t operations = 0;

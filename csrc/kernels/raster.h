@@ -5,7 +5,7 @@
 #include <memory>
 #include <vector>
 
-#include "bins.h"
+#include "counting_sort.h"
 #include "types.h"
 
 namespace globalsplat::raster {
@@ -19,7 +19,7 @@ struct View {
 struct Settings {
   int width, height;
   double eps2d;  // added to the diagonal of every 2D covariance, pixels²
-  int threads;
+  int num_threads;
 };
 
 // Wall-clock seconds of the stages of one call, summed over all views.
@@ -55,7 +55,7 @@ class Frame {
   struct TaskOutput;
   Frame(const std::vector<View<T>>& views, const std::vector<Gaussians<T>>& scenes, const Settings& settings);
   std::vector<TaskOutput> project(const std::vector<Gaussians<T>>& scenes);
-  void cover(PerView& view, int64_t begin, int64_t end, TaskOutput& part) const;
+  void list_touched_tiles(PerView& view, int64_t begin, int64_t end, TaskOutput& part) const;
   std::vector<Buffer<DepthItem<T>>> sort(const std::vector<TaskOutput>& task_outputs);
   void bin(const std::vector<TaskOutput>& task_outputs, const std::vector<Buffer<DepthItem<T>>>& order);
   int64_t chunks() const;
@@ -66,11 +66,11 @@ class Frame {
   int64_t count_;  // Gaussians per scene
   int64_t tasks_;  // into which a scene's Gaussians are split
   std::vector<PerView> views_;
-  std::vector<Lens<T>> lenses_;
+  std::vector<ProjectionParams<T>> projection_params_;
   std::vector<size_t> first_view_;  // [scenes + 1] first view of each scene
 };
 
 // Measures the floating-point operations per second that multiply-adds alone reach on this number of threads, for benchmarks.
-double multiply_add_peak(int threads, double seconds);
+double multiply_add_peak(int num_threads, double seconds);
 
 }  // namespace globalsplat::raster

@@ -152,13 +152,15 @@ GS_INLINE Vector<float> value_of(const FusedSum<float>& sum) { return _mm_movelh
 GS_INLINE Vector<float> fused(const FusedSum<float>& a, const FusedSum<float>& b, const FusedSum<float>& c) {
   return value_of({a.low * b.low + c.low, a.high * b.high + c.high});
 }
-GS_INLINE Vector<float> fused_less(const FusedSum<float>& a, const FusedSum<float>& b, const FusedSum<float>& c) {
+GS_INLINE Vector<float> fused_subtract(const FusedSum<float>& a, const FusedSum<float>& b, const FusedSum<float>& c) {
   return value_of({c.low - a.low * b.low, c.high - a.high * b.high});
 }
 GS_INLINE Vector<float> fma(Vector<float> a, Vector<float> b, Vector<float> c) { return fused(widened(a), widened(b), widened(c)); }
 GS_INLINE Vector<float> fma(float a, Vector<float> b, Vector<float> c) { return fused(widened(a), widened(b), widened(c)); }
-GS_INLINE Vector<float> fnma(Vector<float> a, Vector<float> b, Vector<float> c) { return fused_less(widened(a), widened(b), widened(c)); }
-GS_INLINE Vector<float> fnma(Vector<float> a, Vector<float> b, float c) { return fused_less(widened(a), widened(b), widened(c)); }
+GS_INLINE Vector<float> fnma(Vector<float> a, Vector<float> b, Vector<float> c) {
+  return fused_subtract(widened(a), widened(b), widened(c));
+}
+GS_INLINE Vector<float> fnma(Vector<float> a, Vector<float> b, float c) { return fused_subtract(widened(a), widened(b), widened(c)); }
 GS_INLINE FusedSum<float> add_fused(Vector<float> weight, float number, FusedSum<float> sum) {
   const FusedSum<float> w = widened(weight), x = widened(number);
   const auto rounded = [](__m128d v) { return _mm_cvtps_pd(_mm_cvtpd_ps(v)); };
@@ -193,20 +195,20 @@ GS_INLINE V value_of(V sum) { return sum; }
 template <class V>
 GS_INLINE V add_product(V a, V b, V c) { return fma(a, b, c); }
 template <class V>
-GS_INLINE V take_product(V a, V b, V c) { return fnma(a, b, c); }
+GS_INLINE V subtract_product(V a, V b, V c) { return fnma(a, b, c); }
 #else
 template <class V>
 GS_INLINE V add_product(V a, V b, V c) { return c + a * b; }
 template <class V>
-GS_INLINE V take_product(V a, V b, V c) { return c - a * b; }
+GS_INLINE V subtract_product(V a, V b, V c) { return c - a * b; }
 #endif
 
 // Comparisons are false if an operand is NaN.
 #if defined(__AVX512F__)
 GS_INLINE Mask<float> less(Vector<float> a, Vector<float> b) { return _mm512_cmp_ps_mask(a, b, _CMP_LT_OQ); }
-GS_INLINE Mask<float> at_most(Vector<float> a, Vector<float> b) { return _mm512_cmp_ps_mask(a, b, _CMP_LE_OQ); }
+GS_INLINE Mask<float> less_equal(Vector<float> a, Vector<float> b) { return _mm512_cmp_ps_mask(a, b, _CMP_LE_OQ); }
 GS_INLINE Mask<double> less(Vector<double> a, Vector<double> b) { return _mm512_cmp_pd_mask(a, b, _CMP_LT_OQ); }
-GS_INLINE Mask<double> at_most(Vector<double> a, Vector<double> b) { return _mm512_cmp_pd_mask(a, b, _CMP_LE_OQ); }
+GS_INLINE Mask<double> less_equal(Vector<double> a, Vector<double> b) { return _mm512_cmp_pd_mask(a, b, _CMP_LE_OQ); }
 GS_INLINE Vector<float> select(Mask<float> m, Vector<float> a, Vector<float> b) { return _mm512_mask_blend_ps(m, b, a); }
 GS_INLINE Vector<double> select(Mask<double> m, Vector<double> a, Vector<double> b) { return _mm512_mask_blend_pd(m, b, a); }
 GS_INLINE int lane_bits(Mask<float> m) { return m; }
@@ -215,9 +217,9 @@ template <class T>
 GS_INLINE Mask<T> first_lanes(int count) { return Mask<T>((1 << count) - 1); }
 #else
 GS_INLINE Mask<float> less(Vector<float> a, Vector<float> b) { return a < b; }
-GS_INLINE Mask<float> at_most(Vector<float> a, Vector<float> b) { return a <= b; }
+GS_INLINE Mask<float> less_equal(Vector<float> a, Vector<float> b) { return a <= b; }
 GS_INLINE Mask<double> less(Vector<double> a, Vector<double> b) { return a < b; }
-GS_INLINE Mask<double> at_most(Vector<double> a, Vector<double> b) { return a <= b; }
+GS_INLINE Mask<double> less_equal(Vector<double> a, Vector<double> b) { return a <= b; }
 GS_INLINE Vector<float> select(Mask<float> m, Vector<float> a, Vector<float> b) { return m ? a : b; }
 GS_INLINE Vector<double> select(Mask<double> m, Vector<double> a, Vector<double> b) { return m ? a : b; }
 template <class T>
@@ -446,7 +448,7 @@ GS_INLINE int compress(const uint32_t* values, const uint32_t* flags, int count,
 
 // Loads `count` values and sets the other lanes to 0.
 template <class T>
-GS_INLINE Vector<T> load_some(const T* from, int count) {
+GS_INLINE Vector<T> load_partial(const T* from, int count) {
   if (count >= Simd<T>::lanes) return load<T>(from);
   T lane[Simd<T>::lanes] = {};
   __builtin_memcpy(lane, from, size_t(count) * sizeof(T));
@@ -455,12 +457,12 @@ GS_INLINE Vector<T> load_some(const T* from, int count) {
 
 #if defined(__AVX512F__)
 template <>
-GS_INLINE Vector<float> load_some<float>(const float* from, int count) {
+GS_INLINE Vector<float> load_partial<float>(const float* from, int count) {
   return _mm512_maskz_loadu_ps(__mmask16(count >= 16 ? 0xFFFF : (1 << count) - 1), from);
 }
 #elif defined(__AVX2__)
 template <>
-GS_INLINE Vector<float> load_some<float>(const float* from, int count) {
+GS_INLINE Vector<float> load_partial<float>(const float* from, int count) {
   if (count >= 8) return load<float>(from);
   const __m256i lane = _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7);
   return _mm256_maskload_ps(from, _mm256_cmpgt_epi32(_mm256_set1_epi32(count), lane));
@@ -468,7 +470,7 @@ GS_INLINE Vector<float> load_some<float>(const float* from, int count) {
 #endif
 
 template <class T>
-GS_INLINE void store_some(T* to, Vector<T> v, int count) {
+GS_INLINE void store_partial(T* to, Vector<T> v, int count) {
   if (count >= Simd<T>::lanes) return store<T>(to, v);
   T lane[Simd<T>::lanes];
   store<T>(lane, v);

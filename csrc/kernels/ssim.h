@@ -1,17 +1,17 @@
-// Photometric distance of an image from a photo, and its gradient: L1 and structural similarity (window.h), for one
+// Photometric distance of an image from a photo, and its gradient: L1 and structural similarity (ssim_window.h), for one
 // channel, a few rows at a time.
 #pragma once
 
 #include "simd.h"
+#include "ssim_window.h"
 #include "types.h"
-#include "window.h"
 
 namespace globalsplat::raster::GS_ISA {
 
 // Returns Σ SSIM over the windows whose first row is in [begin, end), and writes their slopes if requested. `scratch` has
-// fit_scratch_size(width) elements, also in the functions below.
+// loss_scratch_size(width) elements, also in the functions below.
 template <class T>
-double ssim(const FitPlane<T>& plane, int begin, int end, T* scratch) {
+double ssim(const PhotometricPlane<T>& plane, int begin, int end, T* scratch) {
   using V = Vector<T>;
   constexpr int lanes = Simd<T>::lanes;
   const int width = plane.width, windows = width - kWindow + 1, stride = width + kWindow + lanes;
@@ -24,7 +24,7 @@ double ssim(const FitPlane<T>& plane, int begin, int end, T* scratch) {
       const T* y = plane.photo + int64_t(row) * width + i;
       WindowMeans<T> means = {};
       for (int k = 0; k < kWindow; ++k, x += width, y += width)
-        add_pixels<T>(broadcast<T>(plane.weights[k]), load_some<T>(x, width - i), load_some<T>(y, width - i), means);
+        add_pixels<T>(broadcast<T>(plane.weights[k]), load_partial<T>(x, width - i), load_partial<T>(y, width - i), means);
       for (int j = 0; j < 5; ++j) store<T>(scratch + j * stride + i, means[j]);
     }
     // Sums along the row.
@@ -39,7 +39,7 @@ double ssim(const FitPlane<T>& plane, int begin, int end, T* scratch) {
       sum = sum + (left < lanes ? select(first_lanes<T>(left), similarity, V{}) : similarity);
       if (plane.slopes == nullptr) continue;
       T* const slopes = plane.slopes + int64_t(row) * windows + i;
-      for (int j = 0; j < 3; ++j) store_some<T>(slopes + j * count, of_window[j], left);
+      for (int j = 0; j < 3; ++j) store_partial<T>(slopes + j * count, of_window[j], left);
     }
   }
   return sum_of_lanes<T>(sum);
@@ -48,7 +48,7 @@ double ssim(const FitPlane<T>& plane, int begin, int end, T* scratch) {
 // Returns Σ |x − y| over the rows [begin, end). If requested, writes the gradient there: `l1_weight` times that of Σ |x − y| plus
 // `ssim_weight` times that of Σ SSIM. All slopes must be known unless `ssim_weight` is 0.
 template <class T>
-double fit_gradient(const FitPlane<T>& plane, T l1_weight, T ssim_weight, int begin, int end, T* scratch) {
+double photometric_gradient(const PhotometricPlane<T>& plane, T l1_weight, T ssim_weight, int begin, int end, T* scratch) {
   using V = Vector<T>;
   constexpr int lanes = Simd<T>::lanes;
   const int width = plane.width, windows = width - kWindow + 1, last = plane.height - kWindow;
@@ -65,14 +65,14 @@ double fit_gradient(const FitPlane<T>& plane, T l1_weight, T ssim_weight, int be
       for (int at = first; at <= stop; ++at)
         for (int j = 0; j < 3; ++j)
           slopes[j] = add_product(broadcast<T>(plane.weights[row - at]),
-                          load_some<T>(plane.slopes + j * count + int64_t(at) * windows + i, windows - i), slopes[j]);
+                          load_partial<T>(plane.slopes + j * count + int64_t(at) * windows + i, windows - i), slopes[j]);
       for (int j = 0; j < 3; ++j) store<T>(scratch + j * stride + kWindow - 1 + i, slopes[j]);
     }
     // Sums along the row.
     for (int i = 0; i < width; i += lanes) {
       const int64_t at = int64_t(row) * width + i;
       const int left = width - i;
-      const V x = load_some<T>(plane.picture + at, left), y = load_some<T>(plane.photo + at, left), d = x - y;
+      const V x = load_partial<T>(plane.picture + at, left), y = load_partial<T>(plane.photo + at, left), d = x - y;
       V gradient = gradient_of_difference<T>(x, y, l1_weight);
       if (ssim_weight != 0) {
         WindowSlopes<T> slopes = {};
@@ -82,7 +82,7 @@ double fit_gradient(const FitPlane<T>& plane, T l1_weight, T ssim_weight, int be
         gradient = add_gradient_of_similarity<T>(x, y, ssim_weight, slopes, gradient);
       }
       sum = sum + larger(d, -d);
-      if (plane.gradient != nullptr) store_some<T>(plane.gradient + at, gradient, left);
+      if (plane.gradient != nullptr) store_partial<T>(plane.gradient + at, gradient, left);
     }
   }
   return sum_of_lanes<T>(sum);

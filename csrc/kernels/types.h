@@ -23,7 +23,7 @@ inline constexpr uint32_t kExp2Eighths[8] = {0x3f800000, 0x3f7b95c2, 0x3f7837f0,
                                              0x3f7504f3, 0x3f75672a, 0x3f7744fd, 0x3f7ac0c7};
 inline constexpr int kTile = 16;                    // tile edge in pixels
 inline constexpr int kBlock = 4;                    // edge in pixels of the blocks in which a tile is culled and blended
-inline constexpr int kCoverTask = 512;              // maximum number of splats per call that lists tiles
+inline constexpr int kSplatsPerTask = 512;          // maximum number of splats per call that lists tiles
 inline constexpr int kBlocks = 16;                  // blocks per tile
 
 // Gaussians of one scene: row-major arrays of `count` Gaussians.
@@ -65,7 +65,7 @@ struct Camera {
 
 // Camera with precomputed values that all of its Gaussians share.
 template <class T>
-struct Lens {
+struct ProjectionParams {
   Camera<T> camera;
   int width, height;
   T eps2d;                         // added to the diagonal of every 2D covariance, pixels²
@@ -160,7 +160,7 @@ inline constexpr double kSsimSample = 121.0 / 120.0;
 
 // One channel of an image and of the photo, with buffers for its gradient. Row-major.
 template <class T>
-struct FitPlane {
+struct PhotometricPlane {
   const T* picture;  // [H, W]
   const T* photo;    // [H, W]
   T* slopes;         // [3, H − 10, W − 10], derivatives of each window's SSIM by its means of x, x² and xy; null if not requested
@@ -169,12 +169,12 @@ struct FitPlane {
   int width, height;
 };
 
-// Rate at which a difference of the photo's grey values reduces the weight of a difference of depths; see neighbours.h.
+// Rate at which a difference of the photo's grey values reduces the weight of a difference of depths; see unevenness.h.
 inline constexpr double kEdge = 10;
 
-// Depths of an image, with its photo and a buffer for the gradient; see smooth.h. Row-major.
+// Depths of an image, with its photo and a buffer for the gradient; see smoothness.h. Row-major.
 template <class T>
-struct DepthPlane {
+struct SmoothnessPlane {
   const T* depth;  // [H, W]
   const T* photo;  // [3, H, W]
   T* gradient;     // [H, W]; null if not requested
@@ -183,7 +183,7 @@ struct DepthPlane {
 
 // Depths of several views, [views, H, W], and the photos, [views, 3, H, W].
 template <class T>
-struct DepthJob {
+struct SmoothnessJob {
   const T* depths;
   const T* photos;
   int64_t views;
@@ -191,17 +191,17 @@ struct DepthJob {
 };
 
 // Returns the number of elements of scratch memory that a kernel needs for rows of this width.
-inline constexpr int fit_scratch_size(int width) { return 6 * (width + 33); }
+inline constexpr int loss_scratch_size(int width) { return 6 * (width + 33); }
 
 // Parameters of a step of Adam that all elements share; see adam.h.
 struct AdamStep {
-  double rate, root, decay;
+  double step_size, bias_correction2_sqrt, decay;
   double beta1, beta2, epsilon;
 };
 
 // Values, their gradients and their moments.
 template <class T>
-struct AdamNumbers {
+struct AdamState {
   T* value;
   const T* gradient;
   T* first;

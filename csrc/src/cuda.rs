@@ -5,12 +5,12 @@ mod cache;
 mod compile;
 mod gpu;
 mod libraries;
-mod usage;
+mod resources;
 
 pub use cache::cache_folder;
-pub use compile::{Compiled, Form, Nvrtc, OLDEST};
-pub use gpu::{Driver, Gpu, Prepared, prepare};
-pub use usage::{KernelUse, usage};
+pub use compile::{CodeFormat, Compiled, MIN_ARCHITECTURE, Nvrtc};
+pub use gpu::{Driver, Gpu, KernelOrigin, load_kernels};
+pub use resources::{KernelResources, parse_resources};
 
 use gpu::launch_kernel;
 
@@ -33,7 +33,7 @@ mod ffi {
             stream: usize,
             kernel: &str,
             blocks: BlockCounts,
-            threads: u32,
+            threads_per_block: u32,
             arguments: usize,
         ) -> Result<()>;
     }

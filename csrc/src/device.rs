@@ -17,13 +17,13 @@ mod ffi {
         fn record_event(gpu: i32) -> Result<UniquePtr<CudaEvent>>;
 
         /// Returns the milliseconds between two events; see `csrc/device.h`.
-        fn since(self: &CudaEvent, earlier: &CudaEvent) -> Result<f64>;
+        fn milliseconds_since(self: &CudaEvent, earlier: &CudaEvent) -> Result<f64>;
 
         /// Copies on a GPU that may still be in progress; see `csrc/device.h`.
-        type Copies;
+        type PendingCopies;
 
         /// Returns the copied tensors; see `csrc/device.h`.
-        fn take_tensors(self: &Copies, out: &mut [usize]) -> Result<()>;
+        fn take_tensors(self: &PendingCopies, out: &mut [usize]) -> Result<()>;
 
         /// Stream for copies to a GPU; see `csrc/device.h`.
         type CopyStream;
@@ -35,16 +35,16 @@ mod ffi {
         ///
         /// # Safety
         /// `tensors` must be addresses of live tensors.
-        unsafe fn copy(self: &CopyStream, tensors: &[usize]) -> Result<UniquePtr<Copies>>;
+        unsafe fn copy(self: &CopyStream, tensors: &[usize]) -> Result<UniquePtr<PendingCopies>>;
 
         /// Allocates a tensor in page-locked memory; see `csrc/device.h`.
-        fn page_locked_bytes(shape: &[i64], out: &mut [usize]) -> Result<()>;
+        fn empty_pinned_bytes(shape: &[i64], out: &mut [usize]) -> Result<()>;
 
         /// Returns the peak of a GPU's tensor memory in bytes; see `csrc/device.h`.
-        fn peak_bytes(gpu: i32) -> Result<u64>;
+        fn max_memory_allocated(gpu: i32) -> Result<u64>;
 
         /// Resets the peak of a GPU's tensor memory; see `csrc/device.h`.
-        fn reset_peak_bytes(gpu: i32) -> Result<()>;
+        fn reset_peak_memory_stats(gpu: i32) -> Result<()>;
 
         /// Disables TF32 in convolutions; see `csrc/device.h`.
         fn disable_tf32();
@@ -54,6 +54,6 @@ mod ffi {
 // SAFETY: libtorch's streams and events are not bound to a thread.
 unsafe impl Send for CudaEvent {}
 // SAFETY: as above, and tensors may be sent between threads.
-unsafe impl Send for Copies {}
+unsafe impl Send for PendingCopies {}
 // SAFETY: as above.
 unsafe impl Send for CopyStream {}

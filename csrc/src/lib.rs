@@ -4,7 +4,7 @@ pub mod attention;
 pub mod chunk;
 pub mod cuda;
 pub mod device;
-pub mod fit;
+pub mod image_losses;
 pub mod linear;
 pub mod ops;
 pub mod optim;

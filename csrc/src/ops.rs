@@ -72,7 +72,7 @@ pub const WAITING: [&str; 7] = [
 ///
 /// # Panics
 /// Panics if one of the ops waits for a GPU.
-pub fn moves(ops: &[String]) -> usize {
+pub fn count_device_copies(ops: &[String]) -> usize {
     let waits = ops.iter().find(|op| WAITING.contains(&op.as_str()));
     assert!(waits.is_none(), "{waits:?} waits");
     ops.iter().filter(|op| *op == "aten::to.device").count()

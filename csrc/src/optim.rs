@@ -1,4 +1,4 @@
-//! Optimizer steps on many tensors at once. Tensors are passed as addresses of `at::Tensor`, which is tch's `C_tensor`.
+//! Optimizer steps on many tensors at once, or on one. Tensors are passed as addresses of `at::Tensor`, which is tch's `C_tensor`.
 
 pub use ffi::*;
 
@@ -7,7 +7,7 @@ pub use ffi::*;
 #[cxx::bridge(namespace = "globalsplat")]
 mod ffi {
     /// Parameters of an AdamW step that all tensors share.
-    struct AdamWNumbers {
+    struct AdamWOptions {
         /// Number of this step, counted from 1.
         steps: i64,
         /// Learning rate: about the size of the step.
@@ -23,7 +23,7 @@ mod ffi {
     }
 
     /// Parameters of a Muon step that all matrices share.
-    struct MuonNumbers {
+    struct MuonOptions {
         /// Number of equally high matrices stacked vertically in each tensor.
         parts: i64,
         /// Learning rate: about the size of the step.
@@ -32,6 +32,30 @@ mod ffi {
         weight_decay: f64,
         /// Decay rate of the running mean of the gradient.
         beta: f64,
+    }
+
+    /// Arguments of a step of Adam on one tensor. Tensors are addresses of `at::Tensor` (tch's `C_tensor`) that the call borrows.
+    struct AdamArguments {
+        /// Tensor to update.
+        value: usize,
+        /// Gradient of the value.
+        gradient: usize,
+        /// Running mean of the gradient.
+        first: usize,
+        /// Running mean of the squared gradient.
+        second: usize,
+        /// Learning rate divided by 1 − β₁ᵗ.
+        step_size: f64,
+        /// Bias correction of the second moment, √(1 − β₂ᵗ).
+        bias_correction2_sqrt: f64,
+        /// Fraction of the value that is subtracted.
+        decay: f64,
+        /// Decay rate of `first`.
+        beta1: f64,
+        /// Decay rate of `second`.
+        beta2: f64,
+        /// Constant added to the square root of `second`.
+        epsilon: f64,
     }
 
     unsafe extern "C++" {
@@ -64,7 +88,7 @@ mod ffi {
             gradients: &[usize],
             first: &[usize],
             second: &[usize],
-            of: &AdamWNumbers,
+            of: &AdamWOptions,
         ) -> Result<()>;
 
         /// Runs a step of Muon; see `csrc/optim.h`.
@@ -75,7 +99,13 @@ mod ffi {
             values: &[usize],
             gradients: &[usize],
             first: &[usize],
-            of: &MuonNumbers,
+            of: &MuonOptions,
         ) -> Result<()>;
+
+        /// Runs a step of Adam; see `csrc/optim.h`.
+        ///
+        /// # Safety
+        /// The arguments must hold addresses of live tensors that nothing else reads or writes meanwhile.
+        unsafe fn adam(of: &AdamArguments) -> Result<()>;
     }
 }

@@ -19,7 +19,7 @@ mod ffi {
         include!("processor.h");
 
         /// Returns the CPU's bf16 instructions that libtorch detects, or `None` if `GLOBALSPLAT_SIMD` disables them.
-        fn bf16_of_cpu() -> Bf16Support;
+        fn cpu_bf16_support() -> Bf16Support;
 
         /// Returns the instruction set of libtorch's own kernels, such as "AVX2".
         fn libtorch_simd_level() -> String;

@@ -16,13 +16,13 @@ mod ffi {
         fn connect(
             host: &str,
             port: u16,
-            serves: bool,
+            is_server: bool,
             prefix: &str,
             seconds: i64,
         ) -> Result<UniquePtr<Store>>;
 
         /// Opens another connection, for another thread; see `csrc/ranks.h`.
-        fn another(self: &Store) -> Result<UniquePtr<Store>>;
+        fn clone_connection(self: &Store) -> Result<UniquePtr<Store>>;
 
         /// Adds to a number in the store and returns the sum; see `csrc/ranks.h`.
         fn add(self: &Store, key: &str, amount: i64) -> Result<i64>;
@@ -37,10 +37,20 @@ mod ffi {
         type ProcessGroup;
 
         /// Creates a process group for CPU tensors; see `csrc/ranks.h`.
-        fn gloo(store: &Store, rank: i32, ranks: i32, seconds: i64) -> Result<UniquePtr<ProcessGroup>>;
+        fn new_gloo_group(
+            store: &Store,
+            rank: i32,
+            ranks: i32,
+            seconds: i64,
+        ) -> Result<UniquePtr<ProcessGroup>>;
 
         /// Creates a process group for GPU tensors; see `csrc/ranks.h`.
-        fn nccl(store: &Store, rank: i32, ranks: i32, seconds: i64) -> Result<UniquePtr<ProcessGroup>>;
+        fn new_nccl_group(
+            store: &Store,
+            rank: i32,
+            ranks: i32,
+            seconds: i64,
+        ) -> Result<UniquePtr<ProcessGroup>>;
 
         /// Replaces a tensor by its sum over all ranks; see `csrc/ranks.h`.
         ///

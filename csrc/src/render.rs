@@ -116,9 +116,9 @@ mod ffi {
         fn simd_level() -> Result<String>;
 
         /// Returns the number of threads of our own kernels; see `csrc/threads.h`.
-        fn threads() -> i32;
+        fn get_num_threads() -> i32;
 
         /// Sets the number of threads of our own kernels; see `csrc/threads.h`.
-        fn set_threads(count: i32);
+        fn set_num_threads(count: i32);
     }
 }

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 # A gradient is only rounding error, without a direction to compare, if its norm relative to the largest one of the case
-# is at most NOTHING, or if it is zero in exact arithmetic because softmax is invariant to a constant. Then its norm
+# is at most NEGLIGIBLE, or if it is zero in exact arithmetic because softmax is invariant to a constant. Then its norm
 # relative to the largest one must be at most ZERO_TOLERANCE.
-NOTHING = 1e-12
+NEGLIGIBLE = 1e-12
 ZERO_IN_EXACT_ARITHMETIC = ("mem_k.bias",)
 ZERO_TOLERANCE = 1e-5
 
@@ -75,7 +75,7 @@ def compare_tensor(name, ours, expected, tolerance, scale, doubtful=None):
 
     if finding.measure == "exact":
         finding.error = finding.largest
-    elif is_gradient and (length <= NOTHING * scale or name.endswith(ZERO_IN_EXACT_ARITHMETIC)):
+    elif is_gradient and (length <= NEGLIGIBLE * scale or name.endswith(ZERO_IN_EXACT_ARITHMETIC)):
         finding.measure, finding.tolerance, finding.relative = "zero", ZERO_TOLERANCE, None
         finding.error = norm(ours) / (scale or 1.0)
     elif tolerance.pictures is not None and not is_gradient:

@@ -7,8 +7,8 @@ import platform
 import textwrap
 from pathlib import Path
 
-from .disturb import BEYOND, FACTOR
-from .table import by_case, doubtful, failures, is_gradient, is_output, flipped, undetected
+from .perturb import FACTOR, MIN_CHANGE_IN_TOLERANCES
+from .table import by_case, doubtful, failures, flipped, is_gradient, is_output, list_undetected
 from .tolerance import FLOAT32, FLOAT64
 
 WIDTH = 120
@@ -101,15 +101,15 @@ def whys(results):
 
 def self_test(results):
     tried = sum(result.tried for result in results)
-    missed = undetected(results)
+    missed = list_undetected(results)
     if not tried:
         return
     noticed = f"{len(missed):,} were not noticed:" if missed else "every one was noticed."
     yield prose(
         "The self-test takes every answer that passes and makes it wrong, one tensor at a time: left out, made NaN, "
         f"multiplied by {FACTOR:g}, without a slice along each axis, with two axes swapped, one more where it is a "
-        f"whole number, not zero where it should be. Where a tolerance is wide, mistakes are {BEYOND:g} times it. "
-        f"Of {tried:,} wrong answers {noticed}"
+        f"whole number, not zero where it should be. Where a tolerance is wide, mistakes are "
+        f"{MIN_CHANGE_IN_TOLERANCES:g} times it. Of {tried:,} wrong answers {noticed}"
     )
     yield bullets(missed)
 

@@ -24,7 +24,7 @@ MAIN_16K = {
 }
 
 
-def whole(rng, low, high):
+def integer(rng, low, high):
     """Returns a random integer from low to high, inclusive."""
     return int(rng.integers(low, high + 1))
 
@@ -39,18 +39,18 @@ def uniform(rng, low, high, *shape):
 
 def model_config(rng, **fixed):
     """Returns the configuration of a random small model, with sizes that mostly differ from each other."""
-    heads = whole(rng, 1, 4)
+    heads = integer(rng, 1, 4)
     config = {
-        "patch_size": whole(rng, 2, 5),
-        "latents": whole(rng, 3, 11),
-        "width": heads * whole(rng, 4, 8),
-        "rgb_width": whole(rng, 6, 20),
-        "ray_width": whole(rng, 6, 20),
-        "rounds": whole(rng, 1, 3),
-        "self_attention_blocks": whole(rng, 1, 2),
+        "patch_size": integer(rng, 2, 5),
+        "latents": integer(rng, 3, 11),
+        "width": heads * integer(rng, 4, 8),
+        "rgb_width": integer(rng, 6, 20),
+        "ray_width": integer(rng, 6, 20),
+        "rounds": integer(rng, 1, 3),
+        "self_attention_blocks": integer(rng, 1, 2),
         "heads": heads,
-        "candidates": 2 ** whole(rng, 1, 4),
-        "sh_degree": whole(rng, 0, 3),
+        "candidates": 2 ** integer(rng, 1, 4),
+        "sh_degree": integer(rng, 0, 3),
         "streams": "dual",
         "camera_code": True,
     }
@@ -244,8 +244,8 @@ def views(rng, batch, count, height, width):
 def pictures(rng, config, batch, count):
     """Returns the image size (height, width), a multiple of the patch size, and random images with cameras."""
     patch = config["patch_size"]
-    rows = whole(rng, 1, 4)
-    height, width = patch * rows, patch * (rows + whole(rng, 1, 3))
+    rows = integer(rng, 1, 4)
+    height, width = patch * rows, patch * (rows + integer(rng, 1, 3))
     if rng.random() < 0.5:
         height, width = width, height
     images = uniform(rng, 0.0, 1.0, batch, count, 3, height, width)

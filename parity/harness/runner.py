@@ -10,7 +10,7 @@ import torch
 from .areas import CASES
 from .close_calls import resolve_close_calls
 from .compare import compare
-from .disturb import undetected
+from .perturb import find_undetected
 from .evaluate import Evaluation
 from .exchange import Request, exchange
 from .registry import Draw
@@ -125,5 +125,5 @@ def run_cases(names, seed, answerer, self_test=(), on_progress=lambda text: None
             question.case, drawn.label, seed, tolerance, findings, doubtful, question.seconds, drawn.large, flipped
         )
         if question.case in self_test and result.passed:
-            result.tried, result.missed = undetected(answer, expected, tolerance, drawn.doubtful)
+            result.tried, result.missed = find_undetected(answer, expected, tolerance, drawn.doubtful)
         yield result

@@ -63,7 +63,7 @@ def scene(label, family=ADVERSARIAL, size=(33, 48)):
     return register
 
 
-def before(rng, size, means, scales, opacities, cameras=1):
+def in_front_of_cameras(rng, size, means, scales, opacities, cameras=1):
     """Places Gaussians in front of cameras with w2c = I; other cameras are 1/4 to the left and 1/2 ahead.
 
     Depths are exact, also in float32. The focal length is 32 and the principal point is the image centre.
@@ -85,8 +85,8 @@ def before(rng, size, means, scales, opacities, cameras=1):
     }
 
 
-def around(rng, depth, spread=0.6):
-    """Returns means at the given depths, within the field of view of `before` and a little beyond it."""
+def means_in_view(rng, depth, spread=0.6):
+    """Returns means at the given depths, within the field of view of `in_front_of_cameras` and a little beyond it."""
     depth = np.asarray(depth, dtype=np.float64)[:, None]
     return np.concatenate([spread * rng.uniform(-1.0, 1.0, (len(depth), 2)) * depth, depth], axis=-1)
 
@@ -97,7 +97,7 @@ def near_plane(rng, size):
     just_above = np.nextafter(np.float32(0.01), np.float32(1))
     depth = np.repeat([-3.0, -0.01, 0.0, 1e-9, 0.0099, 0.01, just_above, 0.0101, 0.02, 0.1], 3)
     scales = rng.uniform(0.05, 0.4, (len(depth), 3)) * np.maximum(np.abs(depth), 1e-3)[:, None]
-    return before(rng, size, around(rng, depth), scales, 0.4)
+    return in_front_of_cameras(rng, size, means_in_view(rng, depth), scales, 0.4)
 
 
 @scene("far outside")
@@ -105,25 +105,26 @@ def far_outside(rng, size):
     tangent = rng.uniform(-1.0, 1.0, (24, 2)) * np.repeat([2.0, 10.0, 1000.0], 8)[:, None]
     depth = rng.uniform(1.0, 3.0, (24, 1))
     scales = depth * np.abs(tangent).max(-1, keepdims=True) * rng.uniform(0.1, 1.0, (24, 3))
-    return before(rng, size, np.concatenate([tangent * depth, depth], axis=-1), scales, 0.5, cameras=2)
+    return in_front_of_cameras(rng, size, np.concatenate([tangent * depth, depth], axis=-1), scales, 0.5, cameras=2)
 
 
 @scene("needles and discs", THIN)
 def needles(rng, size):
     kinds = [[1e-7, 1e-7, 1.0], [1.0, 1e-7, 1.0], [1e-3, 1e-4, 0.5], [1e-12, 1e-12, 1e-12]]
-    return before(rng, size, around(rng, rng.uniform(1.0, 3.0, 24)), np.tile(kinds, (6, 1)), 0.5)
+    return in_front_of_cameras(rng, size, means_in_view(rng, rng.uniform(1.0, 3.0, 24)), np.tile(kinds, (6, 1)), 0.5)
 
 
 @scene("huge")
 def huge(rng, size):
     scales = 10.0 ** rng.uniform(1.0, 3.0, (8, 1)) * rng.uniform(0.5, 1.5, (8, 3))
-    return before(rng, size, around(rng, rng.uniform(1.0, 3.0, 8)), scales, 0.3)
+    return in_front_of_cameras(rng, size, means_in_view(rng, rng.uniform(1.0, 3.0, 8)), scales, 0.3)
 
 
 def quaternions_of_length(length):
     @scene(f"quaternions of length {length:g}")
     def make(rng, size):
-        inputs = before(rng, size, around(rng, rng.uniform(1.0, 3.0, 24)), rng.uniform(0.02, 0.3, (24, 3)), 0.5)
+        means = means_in_view(rng, rng.uniform(1.0, 3.0, 24))
+        inputs = in_front_of_cameras(rng, size, means, rng.uniform(0.02, 0.3, (24, 3)), 0.5)
         return inputs | {"quaternions": length * inputs["quaternions"]}
 
 
@@ -135,14 +136,15 @@ for length in (1e-30, 1e-20, 1e20, 1e30):
 @scene("opacity 0 to 1")
 def opacities(rng, size):
     opacity = np.tile([0.0, 1e-12, 0.0039, 0.0040, 0.5, 1.0], 4)  # 1/255 is 0.00392
-    return before(rng, size, around(rng, rng.uniform(1.0, 3.0, 24)), rng.uniform(0.02, 0.3, (24, 3)), opacity)
+    means = means_in_view(rng, rng.uniform(1.0, 3.0, 24))
+    return in_front_of_cameras(rng, size, means, rng.uniform(0.02, 0.3, (24, 3)), opacity)
 
 
 @scene("equal depths")
 def equal_depths(rng, size):
-    means = around(rng, np.full(30, 2.0))
+    means = means_in_view(rng, np.full(30, 2.0))
     means[20:] = means[:10]
-    return before(rng, size, means, rng.uniform(0.05, 0.4, (30, 3)), rng.uniform(0.1, 0.9, 30), cameras=2)
+    return in_front_of_cameras(rng, size, means, rng.uniform(0.05, 0.4, (30, 3)), rng.uniform(0.1, 0.9, 30), cameras=2)
 
 
 @scene("tile borders")
@@ -151,19 +153,20 @@ def tile_borders(rng, size):
     u, v = np.meshgrid([0.0, 16.0, 32.0, 48.0], [0.0, 16.0, 16.5, 32.0, 33.0])
     means = np.stack([(u.ravel() - 24.0) / 16.0, (v.ravel() - 16.5) / 16.0, np.full(u.size, 2.0)], axis=-1)
     scales = np.tile([[0.001], [0.0625], [1.0], [0.5]], (5, 1))
-    return before(rng, size, means, scales[rng.permutation(20)], rng.uniform(0.1, 0.9, 20))
+    return in_front_of_cameras(rng, size, means, scales[rng.permutation(20)], rng.uniform(0.1, 0.9, 20))
 
 
 @scene("opaque stack")
 def opaque_stack(rng, size):
-    return before(rng, size, around(rng, np.linspace(1.0, 4.0, 60), spread=0.2), 1.0, rng.uniform(0.3, 1.0, 60))
+    means = means_in_view(rng, np.linspace(1.0, 4.0, 60), spread=0.2)
+    return in_front_of_cameras(rng, size, means, 1.0, rng.uniform(0.3, 1.0, 60))
 
 
 @scene("all behind")
 def all_behind(rng, size):
-    return before(rng, size, around(rng, np.full(5, -2.0)), 0.3, 0.9)
+    return in_front_of_cameras(rng, size, means_in_view(rng, np.full(5, -2.0)), 0.3, 0.9)
 
 
 @scene("no Gaussian")
 def no_gaussian(rng, size):
-    return before(rng, size, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    return in_front_of_cameras(rng, size, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))

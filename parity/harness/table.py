@@ -96,16 +96,16 @@ def failures(results):
     return lines
 
 
-def undetected(results):
+def list_undetected(results):
     """Returns the perturbed results that pass nevertheless."""
     return [f"{result.case}, {result.label}: {what}" for result in results for what in result.missed]
 
 
 def self_test_report(results):
     tried = sum(result.tried for result in results)
-    missed = undetected(results)
+    missed = list_undetected(results)
     untested = [f"{result.case}, {result.label}" for result in results if not result.passed]
-    lines = [f"self-test: {tried} disturbed answers, {tried - len(missed)} judged failures"]
+    lines = [f"self-test: {tried} perturbed answers, {tried - len(missed)} judged failures"]
     lines += [f"not detected: {what}" for what in missed]
     lines += [f"not tested, as the answer itself fails: {what}" for what in untested]
     return "\n".join(lines)

@@ -53,7 +53,7 @@ def adamw_step(parameter, gradient, first, second, count, rate, decay, beta1=0.9
     return parameter * (1.0 - rate * decay) - rate * direction, first, second
 
 
-def levelled(matrix):
+def orthogonalized(matrix):
     """Orthogonalizes a matrix approximately, by Muon's Newton-Schulz iteration on its singular values.
 
     Divides the singular values by the Frobenius norm, and replaces each value s by a s + b s^3 + c s^5 five times.
@@ -69,9 +69,9 @@ def muon_step(parameter, gradient, mean, rate, decay, parts=1, beta=0.95):
     """Computes a Muon update of `parts` matrices that are stacked along the first axis. Returns the new (parameter,
     mean).
 
-    m <- b m + (1 - b) g,   u = (1 - b) g + b m,   p <- p (1 - rate decay) - rate 0.2 sqrt(max(R, C)) levelled(u)
+    m <- b m + (1 - b) g,   u = (1 - b) g + b m,   p <- p (1 - rate decay) - rate 0.2 sqrt(max(R, C)) orthogonalized(u)
     """
     mean = beta * mean + (1.0 - beta) * gradient
     ahead = (1.0 - beta) * gradient + beta * mean
-    steps = [0.2 * math.sqrt(max(part.shape)) * levelled(part) for part in ahead.chunk(parts)]
+    steps = [0.2 * math.sqrt(max(part.shape)) * orthogonalized(part) for part in ahead.chunk(parts)]
     return parameter * (1.0 - rate * decay) - rate * torch.cat(steps), mean

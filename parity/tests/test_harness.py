@@ -19,7 +19,7 @@ from harness import coverage, draw, exchange, scenes  # noqa: E402
 from harness.areas import CASES  # noqa: E402
 from harness.close_calls import closest, decisions_of_lpips  # noqa: E402
 from harness.compare import compare, compare_tensor  # noqa: E402
-from harness.disturb import undetected  # noqa: E402
+from harness.perturb import find_undetected  # noqa: E402
 from harness.document import document  # noqa: E402
 from harness.evaluate import Evaluation, answer_files  # noqa: E402
 from harness.runner import generator, run_cases, prepare_cases  # noqa: E402
@@ -114,14 +114,14 @@ def test_pictures_are_compared_by_their_largest_difference_where_rounding_does_n
 
 
 def test_every_perturbation_of_a_correct_answer_is_detected():
-    tried, missed = undetected(canned(), canned(), FLOAT32)
+    tried, missed = find_undetected(canned(), canned(), FLOAT32)
     assert tried > 15 and missed == []
 
 
 def test_a_comparison_that_excludes_all_pixels_is_detected():
     """If all pixels are excluded, images with any values pass."""
     pictures = {"out.alpha": np.full((1, 1, 2, 3), 0.5)}
-    tried, missed = undetected(pictures, pictures, FLOAT32, np.ones((1, 1, 2, 3), bool))
+    tried, missed = find_undetected(pictures, pictures, FLOAT32, np.ones((1, 1, 2, 3), bool))
     assert "out.alpha: times 1.001" in missed and "out.alpha: slice 0 of axis 2 dropped" in missed
     assert len(missed) == tried - 2  # all except "left out" and "not a number"
 
@@ -222,7 +222,7 @@ def test_the_main_model_has_its_parameters():
 def test_doubtful_pixels(opacities, depths, expected):
     """Gaussians at the centre of an image of one pixel are doubtful if they are near a threshold."""
     means = [[0.0, 0.0, depth] for depth in depths]
-    inputs = scenes.before(np.random.default_rng(0), (1, 1), means, 0.1, opacities)
+    inputs = scenes.in_front_of_cameras(np.random.default_rng(0), (1, 1), means, 0.1, opacities)
     assert doubtful_pixels(scenes.settings((1, 1)), inputs, 5e-4).item() == expected
 
 
@@ -335,7 +335,7 @@ def test_the_document_has_results_but_no_paths(tmp_path, capsys):
         written.append(path.read_text())
     assert written[0] == written[1] and str(tmp_path) not in written[0]
     said = capsys.readouterr().out
-    tried = re.search(r"(\d+) disturbed", said)[1]
+    tried = re.search(r"(\d+) perturbed", said)[1]
     words = " ".join(written[0].split())
     assert "2 draws of 1 case, none failed" in words and "mistakes are 2 times it." in words
     assert f"Of {tried} wrong answers every one was noticed." in words

@@ -39,7 +39,7 @@ pub struct AttentionRow {
 }
 
 /// Name of an implementation, its function, its inputs, and the gradient of its output.
-type Way<'a> = (&'static str, &'a dyn Fn([&Tensor; 3]) -> Tensor, &'a [Tensor; 3], &'a Tensor);
+type Implementation<'a> = (&'static str, &'a dyn Fn([&Tensor; 3]) -> Tensor, &'a [Tensor; 3], &'a Tensor);
 
 /// Times `repeats` calls of each implementation, alternating between them, for `queries` and `keys` with `heads` heads of total width
 /// `width`.
@@ -61,19 +61,19 @@ pub fn bench_attention(
     let torchs = |[q, k, v]: [&Tensor; 3]| {
         Tensor::scaled_dot_product_attention(q, k, v, None::<&Tensor>, 0., false, None, false)
     };
-    let ways: [Way; 3] = [
+    let implementations: [Implementation; 3] = [
         ("ours", &|[q, k, v]| attention(q, k, v, heads), &inputs, &gradient),
         ("libtorch", &|[q, k, v]| attention_libtorch(q, k, v, heads), &inputs, &gradient),
         ("libtorch, heads apart", &torchs, &inputs_apart, &gradient_apart),
     ];
     let peak = PeakThroughput::new(precision, Device::Cpu);
     let mut product = vec![];
-    let mut times = vec![(vec![], vec![]); ways.len()];
+    let mut times = vec![(vec![], vec![]); implementations.len()];
     // The first round warms up caches and threads.
     for round in 0..=repeats {
         let one_product = peak.time()?;
         let mut measured = vec![];
-        for (_, call, inputs, gradient) in ways {
+        for (_, call, inputs, gradient) in implementations {
             let mut watch = Stopwatch::default();
             no_grad(|| watch.time("forward", || drop(call(inputs.each_ref()))));
             let leaves = inputs.each_ref().map(|t| t.detach().set_requires_grad(true));
@@ -100,7 +100,7 @@ pub fn bench_attention(
         AttentionRow { pass, by, milliseconds, gflops, share: gflops / product_gflops }
     };
     let (forward, backward): (Vec<_>, Vec<_>) = times.into_iter().unzip();
-    let names = || ways.iter().map(|way| way.0);
+    let names = || implementations.iter().map(|implementation| implementation.0);
     let rows = names().zip(forward).map(|(by, times)| row("forward", by, 2., times));
     let rows = rows.chain(names().zip(backward).map(|(by, times)| row("backward", by, 5., times))).collect();
     Ok(AttentionReport {

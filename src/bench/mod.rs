@@ -71,7 +71,7 @@ impl Measured {
     }
 
     /// Returns the distributions of the total time and of each section. Requires at least one run.
-    fn told(mut self) -> (TimingStats, Vec<Section>) {
+    fn into_stats(mut self) -> (TimingStats, Vec<Section>) {
         (TimingStats::from_milliseconds(std::mem::take(&mut self.whole)), self.sections())
     }
 

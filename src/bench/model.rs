@@ -1,7 +1,7 @@
 //! Benchmark of the forward pass: the time of its parts, and its memory use.
 
 use super::TimingStats;
-use super::parts::{Part, Parts};
+use super::parts::{Part, PartRecorder};
 use super::peak_throughput::PeakThroughput;
 use super::train::synthetic_scene;
 use crate::config::Config;
@@ -70,7 +70,7 @@ pub fn bench_model(
         drop(no_grad(|| watch.time("pass", || model.forward(images, c2w, intrinsics, stage))));
         Ok(1e3 * watch.sections()?[0].1.as_secs_f64())
     };
-    let (mut parts, mut passes, mut products) = (Parts::default(), vec![], vec![]);
+    let (mut parts, mut passes, mut products) = (PartRecorder::default(), vec![], vec![]);
     // The first pass warms up caches, threads and the GPU's libraries.
     forward()?;
     reset_peak_memory(device);
@@ -78,7 +78,7 @@ pub fn bench_model(
         products.push(peak.time()?);
         // Events around every part slow down a GPU that runs kernels faster than the host launches them, so time a GPU's pass without them.
         let unwatched = (device != Device::Cpu).then(forward).transpose()?;
-        let watched = parts.watch(device, forward)?;
+        let watched = parts.record(device, forward)?;
         passes.push(unwatched.unwrap_or(watched));
     }
     let peak_gflops = peak.gflops(TimingStats::from_milliseconds(products).least);

@@ -25,7 +25,7 @@ pub struct Part {
 
 /// Statistics of the parts over all watched passes.
 #[derive(Default)]
-pub(super) struct Parts {
+pub(super) struct PartRecorder {
     parts: Vec<Sum>,
 }
 
@@ -38,12 +38,12 @@ struct Sum {
     bytes: f64,
 }
 
-impl Parts {
+impl PartRecorder {
     /// Runs `pass` and adds the statistics of its parts, timed by the clock of `device`.
     ///
     /// # Errors
     /// Returns the error of `pass`, or an error if a GPU is missing or fails.
-    pub fn watch<T>(&mut self, device: Device, pass: impl FnOnce() -> Result<T>) -> Result<T> {
+    pub fn record<T>(&mut self, device: Device, pass: impl FnOnce() -> Result<T>) -> Result<T> {
         let (result, spans) = record_spans(device, pass);
         let result = result?;
         let mut sums: Vec<Sum> = vec![];

@@ -1,6 +1,6 @@
 //! Benchmark of a training step: the time of its parts, and its memory use.
 
-use super::parts::{Part, Parts};
+use super::parts::{Part, PartRecorder};
 use super::peak_throughput::PeakThroughput;
 use super::{Measured, Section, TimingStats};
 use crate::config::Config;
@@ -113,7 +113,7 @@ pub fn bench_train(
     let scenes: Vec<LoadedScene> =
         seeds.take(config.train.batch_size).map(|seed| synthetic_scene(&config, seed)).collect();
     let upload = Upload::new(device)?;
-    let mut parts = Parts::default();
+    let mut parts = PartRecorder::default();
     let measured = measure(&mut trainer, &scenes, steps, &upload, &mut parts)?;
     let peak_bytes = peak_memory_bytes_on(device);
     let precision = config.train.precision;
@@ -123,11 +123,18 @@ pub fn bench_train(
     let products = (0..=PRODUCTS).map(|_| peak.time()).skip(1).collect::<Result<Vec<_>>>();
     tch::set_num_threads(threads);
     let peak_gflops = peak.gflops(TimingStats::from_milliseconds(products?).least);
-    let (milliseconds, sections) = measured.told();
+    let (milliseconds, sections) = measured.into_stats();
     let waited = sections.iter().find(|section| section.name == COMMUNICATION);
     let together = waited.map(|waited| {
         let scenes_per_second = 1e3 * (ranks * scenes.len()) as f64 / milliseconds.median;
-        together(trainer, &scenes, steps, &upload, scenes_per_second, waited.milliseconds.least)
+        measure_distributed_cost(
+            trainer,
+            &scenes,
+            steps,
+            &upload,
+            scenes_per_second,
+            waited.milliseconds.least,
+        )
     });
     Ok(TrainReport {
         scenes: scenes.len(),
@@ -155,7 +162,7 @@ fn measure(
     scenes: &[LoadedScene],
     steps: usize,
     upload: &Upload,
-    parts: &mut Parts,
+    parts: &mut PartRecorder,
 ) -> Result<Measured> {
     let mut measured = Measured::default();
     for step in 0..=steps {
@@ -164,7 +171,7 @@ fn measure(
         let mut train_step = || trainer.train_step(&sample, &mut watch, &mut || true);
         match step {
             0 => train_step()?,
-            _ => parts.watch(upload.device(), train_step)?,
+            _ => parts.record(upload.device(), train_step)?,
         };
         if step > 0 {
             measured.add(&mut watch)?;
@@ -174,7 +181,7 @@ fn measure(
 }
 
 /// Times the ranks' communication without steps, and their steps without communication.
-fn together(
+fn measure_distributed_cost(
     trainer: Trainer,
     scenes: &[LoadedScene],
     steps: usize,
@@ -191,14 +198,16 @@ fn together(
             communication.add(&mut watch)?;
         }
     }
-    let communication = communication.told().0;
+    let communication = communication.into_stats().0;
     let gradient_bytes = trainer.gradient_bytes();
     trainer.group().leave()?;
     let mut apart = trainer.with_group(ProcessGroup::single());
     Ok(DistributedCost {
         ranks,
         scenes_per_second,
-        apart_milliseconds: measure(&mut apart, scenes, steps, upload, &mut Parts::default())?.told().0,
+        apart_milliseconds: measure(&mut apart, scenes, steps, upload, &mut PartRecorder::default())?
+            .into_stats()
+            .0,
         communication_milliseconds: communication,
         hidden: (1. - waited / communication.median).clamp(0., 1.),
         gradient_bytes,

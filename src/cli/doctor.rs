@@ -10,7 +10,9 @@ use globalsplat::model::{Precision, are_denormals_flushed};
 use globalsplat::ranks::Backends;
 use globalsplat::reconstruct::BUNDLED_MODEL;
 use globalsplat::render::cpu::{libtorch_simd_level, simd_level};
-use globalsplat::render::cuda::{Driver, Form, KernelUse, Nvrtc, Prepared, cache_folder, prepare, usage};
+use globalsplat::render::cuda::{
+    CodeFormat, Driver, KernelOrigin, KernelResources, Nvrtc, cache_folder, load_kernels, parse_resources,
+};
 use globalsplat::train::MemoryEstimate;
 use globalsplat_sfm::Colmap;
 use serde_json::{Value, json};
@@ -55,7 +57,7 @@ impl Doctor {
         let weights =
             LpipsNetwork::ALL.map(|network| (network.metric(), find_pretrained(network.file_name())));
         let (driver, nvrtc) = (Driver::find(), Nvrtc::find());
-        let prepared: Vec<Result<Prepared, String>> = (0..usable as i32).map(prepare).collect();
+        let prepared: Vec<Result<KernelOrigin, String>> = (0..usable as i32).map(load_kernels).collect();
         let cache = cache_folder().map(|folder| folder.display().to_string());
         let (together, ffmpeg) = (Backends::built_in(), find_ffmpeg());
         let colmap = Colmap::find().map(|colmap| colmap.to_string()).map_err(|why| why.to_string());
@@ -194,7 +196,7 @@ fn or_error<T>(found: &Result<T, String>, tell: impl FnOnce(&T) -> Value) -> Val
 }
 
 /// Returns the driver's GPUs as JSON. Those that torch can use come first, and have their kernels.
-fn gpus(driver: &Driver, prepared: &[Result<Prepared, String>], unusable: &str) -> Value {
+fn gpus(driver: &Driver, prepared: &[Result<KernelOrigin, String>], unusable: &str) -> Value {
     let entries = driver.gpus.iter().enumerate().map(|(number, gpu)| {
         json!({
             "name": gpu.name,
@@ -207,11 +209,11 @@ fn gpus(driver: &Driver, prepared: &[Result<Prepared, String>], unusable: &str) 
     entries.collect()
 }
 
-fn state_of_kernels(prepared: Option<&Result<Prepared, String>>, unusable: &str) -> String {
+fn state_of_kernels(prepared: Option<&Result<KernelOrigin, String>>, unusable: &str) -> String {
     match prepared {
         None => format!("this libtorch can't use it: {unusable}"),
         Some(Err(why)) => format!("its kernels are missing: {why}"),
-        Some(Ok(Prepared { architecture, file, was_cached })) => {
+        Some(Ok(KernelOrigin { architecture, file, was_cached })) => {
             let how = if *was_cached { "read from" } else { "compiled just now, and kept in" };
             let of = capability(*architecture);
             match file {
@@ -285,10 +287,10 @@ fn memory_of_training(config: &Config, as_json: bool) -> globalsplat::Result<()>
 /// Prints a table of the resources of kernels, a row for each kernel and a column for each architecture.
 fn kernels(as_json: bool) -> globalsplat::Result<()> {
     let nvrtc = Nvrtc::find().map_err(Error::request)?;
-    let mut of_all: Vec<(i32, Vec<KernelUse>)> = vec![];
+    let mut of_all: Vec<(i32, Vec<KernelResources>)> = vec![];
     for &architecture in &nvrtc.architectures {
-        let compiled = nvrtc.compile(architecture, Form::Cubin).map_err(Error::request)?;
-        let mut kernels = usage(&compiled.log);
+        let compiled = nvrtc.compile(architecture, CodeFormat::Cubin).map_err(Error::request)?;
+        let mut kernels = parse_resources(&compiled.log);
         kernels.sort_by(|a, b| a.name.cmp(&b.name));
         of_all.push((architecture, kernels));
     }
@@ -310,7 +312,7 @@ fn kernels(as_json: bool) -> globalsplat::Result<()> {
     for (row, kernel) in of_all[0].1.iter().enumerate() {
         print!("{:<22}", kernel.name);
         for (_, kernels) in &of_all {
-            let KernelUse { registers, shared, spills, .. } = &kernels[row];
+            let KernelResources { registers, shared, spills, .. } = &kernels[row];
             print!("{:>14}", format!("{registers}/{shared}/{spills}"));
         }
         println!();

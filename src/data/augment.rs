@@ -42,7 +42,7 @@ impl Augmentation {
     ///
     /// # Errors
     /// Fails if the principal point is so close to the photo's edge that too little is left.
-    pub fn frame(&self, camera: &Camera, size: ImageSize) -> Result<(Region, Camera)> {
+    pub fn visible_region(&self, camera: &Camera, size: ImageSize) -> Result<(Region, Camera)> {
         let (full_width, full_height) = (f64::from(camera.width), f64::from(camera.height));
         let k = camera.intrinsics;
         let (centred_width, centred_height) =
@@ -72,7 +72,7 @@ impl Augmentation {
     }
 
     /// Writes `region` of `photo` into `planes`, `[3, H, W]` at `size`, with all augmentation except colour jitter.
-    pub fn show(
+    pub fn crop_and_flip(
         &self,
         resampler: &mut Resampler,
         photo: &RgbImage,
@@ -117,7 +117,7 @@ mod tests {
 
     #[test]
     fn the_principal_point_is_in_the_middle() {
-        let (region, shown) = plain().frame(&camera(), SIZE).unwrap();
+        let (region, shown) = plain().visible_region(&camera(), SIZE).unwrap();
         // There are 170.6 pixels above and 189.4 below: the region is 341.2 high, and by the aspect ratio 454.93 wide.
         assert!((region.top - 0.).abs() < 1e-9 && (region.height - 341.2).abs() < 1e-9, "{region:?}");
         assert!((region.width - 341.2 * 128. / 96.).abs() < 1e-9);
@@ -143,9 +143,9 @@ mod tests {
             [(1., [0., 0.], false), (1.3, [0.2, 0.7], false), (1., [0., 0.], true), (1.25, [0.9, 0.4], true)]
         {
             let augmentation = Augmentation { zoom, shift, flip, ..plain() };
-            let (region, shown) = augmentation.frame(&camera(), SIZE).unwrap();
+            let (region, shown) = augmentation.visible_region(&camera(), SIZE).unwrap();
             let mut planes = vec![0; 3 * 96 * 128];
-            augmentation.show(&mut Resampler::default(), &photo, region, SIZE, &mut planes);
+            augmentation.crop_and_flip(&mut Resampler::default(), &photo, region, SIZE, &mut planes);
             let (mut weight, mut sx, mut sy) = (0., 0., 0.);
             for (i, &byte) in planes[..96 * 128].iter().enumerate() {
                 let (u, v) = ((i % 128) as f64 + 0.5, (i / 128) as f64 + 0.5);
@@ -168,7 +168,7 @@ mod tests {
         let mut camera = camera();
         for cx in [-0.5, 3., 639.] {
             camera.intrinsics.cx = cx;
-            let error = plain().frame(&camera, SIZE).unwrap_err().to_string();
+            let error = plain().visible_region(&camera, SIZE).unwrap_err().to_string();
             assert!(error.contains("principal point"), "{error}");
         }
     }

@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn no_strength_changes_nothing() {
+    fn jitter_of_strength_0_is_the_identity() {
         let mut random = ChaCha8Rng::seed_from_u64(1);
         assert_eq!(Jitter::draw(&JitterConfig::OFF, &mut random), Jitter::default());
         use Adjustment::*;

@@ -3,7 +3,7 @@
 use crate::error::Result;
 use crate::io::rgb_from_tensor;
 use crate::scene::{Camera, ImageSize};
-use globalsplat_capture::{CHANNELS, Capture, Photo, Planes, fit};
+use globalsplat_capture::{CHANNELS, Capture, Photo, Planes, resize_and_crop};
 use rayon::prelude::*;
 use tch::{Kind, Tensor};
 
@@ -52,9 +52,10 @@ impl View {
     /// # Errors
     /// Fails if libtorch rejects the image because of its shape.
     pub fn fitted(&self, size: ImageSize) -> Result<Self> {
-        let (planes, camera) = fit(&rgb_from_tensor(&self.image)?, &self.camera, size);
+        let (planes, camera) = resize_and_crop(&rgb_from_tensor(&self.image)?, &self.camera, size);
         let fit_mask = |mask: &Tensor| -> Result<Tensor> {
-            let (planes, _) = fit(&rgb_from_tensor(&mask.expand([3, -1, -1], false))?, &self.camera, size);
+            let (planes, _) =
+                resize_and_crop(&rgb_from_tensor(&mask.expand([3, -1, -1], false))?, &self.camera, size);
             Ok(tensor_from_planes(&planes).narrow(0, 0, 1))
         };
         let mask = self.mask.as_ref().map(fit_mask).transpose()?;

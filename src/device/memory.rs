@@ -18,9 +18,9 @@ pub fn resident_memory_bytes() -> u64 {
 
 /// Returns the peak memory of the tensors on `device` in bytes, since the start of the program or the last [`reset_peak_memory`]. Returns
 /// `None` for the CPU.
-pub fn device_memory_bytes(device: Device) -> Option<u64> {
+pub fn peak_device_memory_bytes(device: Device) -> Option<u64> {
     match device {
-        Device::Cuda(number) => ffi::peak_bytes(number as i32).ok(),
+        Device::Cuda(number) => ffi::max_memory_allocated(number as i32).ok(),
         _ => None,
     }
 }
@@ -53,7 +53,7 @@ fn cgroup_limits() -> impl Iterator<Item = u64> {
 
 /// Returns the peak memory of work on `device` in bytes: of the GPU's tensors for a GPU, of the process for the CPU.
 pub fn peak_memory_bytes_on(device: Device) -> u64 {
-    device_memory_bytes(device).unwrap_or_else(peak_memory_bytes)
+    peak_device_memory_bytes(device).unwrap_or_else(peak_memory_bytes)
 }
 
 /// Resets the peak memory of the process and of `device` to the current use. The peak of the process can be reset only on Linux.
@@ -61,7 +61,7 @@ pub fn reset_peak_memory(device: Device) {
     // Writing 5 resets the peak resident memory (proc(5)). If this isn't supported, the old peak remains.
     let _ = std::fs::write("/proc/self/clear_refs", "5");
     if let Device::Cuda(number) = device {
-        let _ = ffi::reset_peak_bytes(number as i32);
+        let _ = ffi::reset_peak_memory_stats(number as i32);
     }
 }
 

@@ -5,7 +5,7 @@ mod memory;
 mod stopwatch;
 
 pub(crate) use memory::{
-    device_memory_bytes, peak_memory_bytes_on, reset_peak_memory, resident_memory_bytes,
+    peak_device_memory_bytes, peak_memory_bytes_on, reset_peak_memory, resident_memory_bytes,
 };
 pub use memory::{peak_memory_bytes, total_memory_bytes};
 pub use stopwatch::Stopwatch;
@@ -56,7 +56,7 @@ impl DeviceEvent {
     pub fn since(&self, earlier: &DeviceEvent) -> Result<Duration> {
         Ok(match (self, earlier) {
             (DeviceEvent::Gpu(event), DeviceEvent::Gpu(earlier)) => {
-                Duration::from_secs_f64(1e-3 * event.since(earlier)?.max(0.))
+                Duration::from_secs_f64(1e-3 * event.milliseconds_since(earlier)?.max(0.))
             }
             (DeviceEvent::Host(instant), DeviceEvent::Host(earlier)) => *instant - *earlier,
             _ => panic!("events of two devices"),
@@ -101,7 +101,7 @@ impl Upload {
             return Ok(Tensor::empty(shape, (Kind::Uint8, Device::Cpu)));
         }
         // SAFETY: on success the C++ side has stored a new tensor in `out`.
-        let [bytes] = unsafe { take_outputs(|out| ffi::page_locked_bytes(shape, out)) }?;
+        let [bytes] = unsafe { take_outputs(|out| ffi::empty_pinned_bytes(shape, out)) }?;
         Ok(bytes)
     }
 
@@ -130,7 +130,7 @@ impl fmt::Debug for Upload {
 /// Copy of tensors in progress.
 pub(crate) enum PendingCopy<const N: usize> {
     Done([Tensor; N]),
-    Gpu(UniquePtr<ffi::Copies>),
+    Gpu(UniquePtr<ffi::PendingCopies>),
 }
 
 impl<const N: usize> PendingCopy<N> {

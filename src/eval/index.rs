@@ -123,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_index_is_refused() {
+    fn malformed_indices_are_refused() {
         for (text, found) in [
             ("{}", "one without scenes"),
             ("{\"a\": null}", "one without scenes"),

@@ -4,7 +4,7 @@ use super::perceptual::Perceptual;
 use super::scene::EvalScene;
 use super::scores::{CaptureScores, ViewScore, score_view};
 use crate::data::View;
-use crate::device::{device_memory_bytes, peak_memory_bytes};
+use crate::device::{peak_device_memory_bytes, peak_memory_bytes};
 use crate::error::{Error, Result};
 use crate::io::{
     InputFiles, PHOTO_EXTENSIONS, Splat, checksum, find_splat, origin_file, read_image, read_splat,
@@ -67,7 +67,7 @@ pub struct EvalImage {
 
 /// Peak memory of a model, in bytes.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Memory {
+pub(super) struct PeakMemory {
     pub host: u64,
     pub device: Option<u64>,
 }
@@ -148,11 +148,11 @@ impl Method<'_> {
     }
 
     /// Returns the peak memory so far; `None` if no model is evaluated.
-    pub(super) fn memory(&self) -> Option<Memory> {
+    pub(super) fn memory(&self) -> Option<PeakMemory> {
         match self {
             Method::Model(model) => {
-                let device = device_memory_bytes(model.device);
-                Some(Memory { host: peak_memory_bytes(), device })
+                let device = peak_device_memory_bytes(model.device);
+                Some(PeakMemory { host: peak_memory_bytes(), device })
             }
             _ => None,
         }

@@ -4,11 +4,11 @@
 use super::comparison_image::comparison_image;
 use super::evaluation::{Efficiency, Evaluation, Failure, SceneScores, Summary};
 use super::index::EvaluationIndex;
-use super::journal::{Identity, Journal};
 use super::method::{Method, MethodOutput, score_output};
 use super::perceptual::Perceptual;
 use super::published::known_dataset;
 use super::scene::SceneLoader;
+use super::score_store::{Identity, ScoreStore};
 use super::scores_file::comparison_path;
 use crate::data::{Dataset, OpenGroup, SceneGroup};
 use crate::error::{Error, Result};
@@ -207,15 +207,15 @@ impl DatasetEvaluation<'_> {
         })
     }
 
-    /// Opens the journal. Returns the scores that it holds, and the keys of the scenes that it has no scores of, group after group.
+    /// Opens the store. Returns the scores that it holds, and the keys of the scenes that it has no scores of, group after group.
     fn begin(&self) -> Result<(Vec<SceneScores>, Vec<String>)> {
-        let journal = Journal::open(self.out, &self.identity()?)?;
+        let store = ScoreStore::open(self.out, &self.identity()?)?;
         let (mut kept, mut missing) = (vec![], vec![]);
         for (group, keys) in self.wanted()? {
             let open = OnceCell::new();
             let open = || open.get_or_init(|| group.open().ok()).as_ref();
             for key in keys {
-                match self.find_valid_scores(&journal, &key, open) {
+                match self.find_valid_scores(&store, &key, open) {
                     Some(scores) => kept.push(scores),
                     None => missing.push(key),
                 }
@@ -241,7 +241,7 @@ impl DatasetEvaluation<'_> {
         load_perceptual: impl FnOnce() -> Result<Perceptual>,
         on_progress: &mut impl FnMut(usize, usize) -> bool,
     ) -> Result<RankResults> {
-        let journal = Journal::new(self.out);
+        let store = ScoreStore::new(self.out);
         let total = kept + own.iter().map(|(_, keys)| keys.len()).sum::<usize>();
         let mut share = RankResults::default();
         let mut should_continue = on_progress(kept, total);
@@ -269,7 +269,7 @@ impl DatasetEvaluation<'_> {
                     scores.warm_up = warm_up && scores.forward_seconds.is_some();
                     scores.peak_memory_bytes = memory.map(|memory| memory.host);
                     scores.peak_device_memory_bytes = memory.and_then(|memory| memory.device);
-                    journal.keep(&key, &scores, content)?;
+                    store.write_scores(&key, &scores, content)?;
                     Ok(scores)
                 });
                 match scored {
@@ -309,11 +309,11 @@ impl DatasetEvaluation<'_> {
     /// again, if they are of other files or lack a score that can be computed now.
     fn find_valid_scores<'a>(
         &self,
-        journal: &Journal,
+        store: &ScoreStore,
         key: &str,
         open: impl FnOnce() -> Option<&'a OpenGroup>,
     ) -> Option<SceneScores> {
-        let kept = journal.read_scores(key)?;
+        let kept = store.read_scores(key)?;
         if Perceptual::could_add_to(&kept.scores.scores, self.target_size) {
             return None;
         }

@@ -62,7 +62,7 @@ pub fn write_sharded(path: &Path, weights: &Weights, most: u64) -> Result<PathBu
     if index.exists() {
         std::fs::remove_file(&index).map_err(Error::write(&index))?;
     }
-    written.into_iter().try_for_each(PartialFile::keep)?;
+    written.into_iter().try_for_each(PartialFile::persist)?;
     let metadata = [("total_size".to_string(), total.into())].into_iter().collect();
     write_json(&index, &ShardIndex { metadata, weight_map })?;
     Ok(index)

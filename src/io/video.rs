@@ -71,7 +71,7 @@ impl VideoWriter {
         let partial = PartialFile::create(path)?;
         let encoder = match Format::from_path(path) {
             Some(Format::Gif) => Encoder::Gif(Gif::begin(path, &partial.file, size, frames_per_second)?),
-            _ => Encoder::Mp4(Mp4::begin(path, &partial.place, size, frames_per_second)?),
+            _ => Encoder::Mp4(Mp4::begin(path, &partial.temporary_path, size, frames_per_second)?),
         };
         Ok(VideoWriter { path: path.to_owned(), size, frames: 0, encoder, partial })
     }
@@ -104,7 +104,7 @@ impl VideoWriter {
             Encoder::Gif(gif) => gif.finish(&path)?,
             Encoder::Mp4(mp4) => mp4.finish(&path)?,
         }
-        Ok(partial.keep()?)
+        Ok(partial.persist()?)
     }
 }
 

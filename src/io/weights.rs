@@ -28,10 +28,10 @@ pub fn write_weights(
     tensors: &BTreeMap<String, Tensor>,
     metadata: HashMap<String, String>,
 ) -> Result<()> {
-    Ok(write_weights_partially(path, tensors, metadata)?.keep()?)
+    Ok(write_weights_partially(path, tensors, metadata)?.persist()?)
 }
 
-/// Writes a file like [`write_weights`], but leaves it under its temporary name until [`PartialFile::keep`] is called.
+/// Writes a file like [`write_weights`], but leaves it under its temporary name until [`PartialFile::persist`] is called.
 ///
 /// # Errors
 /// Returns the errors of [`write_weights`].

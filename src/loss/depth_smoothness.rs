@@ -2,7 +2,7 @@
 
 use super::mask::mean_weight;
 use crate::ffi::take_outputs;
-use globalsplat_csrc::fit;
+use globalsplat_csrc::image_losses;
 use tch::Tensor;
 
 /// Computes `factor` times the mean of 2 |a − b| / (a + b) · exp(−10 |g − h|) over all pairs of horizontally or vertically neighbouring
@@ -15,7 +15,7 @@ use tch::Tensor;
 pub fn depth_smoothness(depths: &Tensor, photos: &Tensor, factor: f64) -> Tensor {
     let (depths, photos) = (depths.as_ptr() as usize, photos.as_ptr() as usize);
     // SAFETY: the tensors outlive the call, and on success the C++ side has stored a new tensor in `out`.
-    let done = unsafe { take_outputs(|out| fit::depth_smoothness(depths, photos, factor, out)) };
+    let done = unsafe { take_outputs(|out| image_losses::depth_smoothness(depths, photos, factor, out)) };
     let [loss] = done.unwrap_or_else(|error| panic!("{error}"));
     loss
 }

@@ -148,7 +148,7 @@ struct Tile {
 
 impl Tile {
     /// Divides `side` pixels into tiles of about `length` pixels.
-    fn cover(side: i64, length: i64) -> impl Iterator<Item = Tile> + Clone {
+    fn split(side: i64, length: i64) -> impl Iterator<Item = Tile> + Clone {
         let count = (side + length - 1) / length;
         let step = (side / count / LARGEST_STRIDE + 1) * LARGEST_STRIDE;
         (0..side).step_by(step as usize).map(move |first| {
@@ -158,13 +158,13 @@ impl Tile {
     }
 
     /// Returns the network's input for this tile: a slice of `images` along `dim`.
-    fn cut(self, images: &Tensor, dim: i64) -> Tensor {
+    fn slice_input(self, images: &Tensor, dim: i64) -> Tensor {
         images.narrow(dim, self.input_start, self.input_end - self.input_start)
     }
 
     /// Returns the tile's own values of `features`, whose stride along `dim` is `stride` pixels. At the end of the image a layer may have
     /// fewer features than the pixels and the stride suggest.
-    fn keep(self, features: &Tensor, dim: i64, stride: i64) -> Tensor {
+    fn slice_features(self, features: &Tensor, dim: i64, stride: i64) -> Tensor {
         let there = features.size()[dim as usize];
         let first = ((self.first - self.input_start) / stride).min(there);
         let is_last = self.end == self.input_end;
@@ -271,21 +271,21 @@ impl Lpips {
     /// Computes [`Lpips::distance`] of B images, `[B]`, in tiles with sides of about `length` pixels.
     fn distance_in_tiles(&self, image: &Tensor, ground_truth: &Tensor, length: i64) -> Tensor {
         let [.., height, width] = image.size()[..] else { panic!("an image has height and width") };
-        let columns = Tile::cover(width, length);
+        let columns = Tile::split(width, length);
         let tiles =
-            Tile::cover(height, length).flat_map(|row| columns.clone().map(move |column| (row, column)));
+            Tile::split(height, length).flat_map(|row| columns.clone().map(move |column| (row, column)));
         let strides = self.network.strides();
         // For every layer: the sum over pixels, [B], and the number of pixels.
         let mut sums: Vec<Option<(Tensor, i64)>> = strides.iter().map(|_| None).collect();
         for (row, column) in tiles {
             let cut = |images: &Tensor| {
                 let dims = images.dim() as i64;
-                column.cut(&row.cut(images, dims - 2), dims - 1)
+                column.slice_input(&row.slice_input(images, dims - 2), dims - 1)
             };
             let (image, ground_truth) = (cut(image), cut(ground_truth));
             let differences = self.differences(self.features(&image), self.features(&ground_truth));
             for ((difference, stride), sum) in differences.zip(&strides).zip(&mut sums) {
-                let own = column.keep(&row.keep(&difference, 2, *stride), 3, *stride);
+                let own = column.slice_features(&row.slice_features(&difference, 2, *stride), 3, *stride);
                 let count = own.size()[2] * own.size()[3];
                 let of_tile = own.sum_dim_intlist([1i64, 2, 3].as_slice(), false, Kind::Double);
                 *sum = Some(match sum.take() {

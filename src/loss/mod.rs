@@ -46,7 +46,7 @@ pub(crate) fn losses(
     let ground_truth = &batch.target.images;
     let masks = batch.target_masks();
     let mse = match &masks {
-        Some(masks) => mean_over_scenes(&rendered.rgb, &batch.once(ground_truth), masks, masked_mse),
+        Some(masks) => mean_over_scenes(&rendered.rgb, &batch.unpaired(ground_truth), masks, masked_mse),
         None => mse(&rendered.rgb, ground_truth),
     } * share.scenes;
     let perceptual = match (perceptual, &masks) {
@@ -54,9 +54,9 @@ pub(crate) fn losses(
             let loss = |image: &Tensor, ground_truth: &Tensor, mask: &Tensor| {
                 network.loss(&fill_masked(image, ground_truth, mask), ground_truth) / mean_weight(mask)
             };
-            mean_over_scenes(&rendered.rgb, &batch.once(ground_truth), masks, loss) * share.scenes
+            mean_over_scenes(&rendered.rgb, &batch.unpaired(ground_truth), masks, loss) * share.scenes
         }
-        (Some(network), None) => network.loss(&rendered.rgb, &batch.once(ground_truth)) * share.scenes,
+        (Some(network), None) => network.loss(&rendered.rgb, &batch.unpaired(ground_truth)) * share.scenes,
         (None, _) => mse.zeros_like(),
     };
     let consistency = match batch.paired {

@@ -3,7 +3,7 @@
 
 use super::mask::{fill_masked, mean_weight};
 use crate::ffi::take_outputs;
-use globalsplat_csrc::fit;
+use globalsplat_csrc::image_losses;
 use tch::Tensor;
 
 /// Computes `l1_weight` times the mean absolute difference plus `ssim_weight` times the mean SSIM. Both are means over images and channels;
@@ -16,8 +16,9 @@ use tch::Tensor;
 pub fn photometric(image: &Tensor, ground_truth: &Tensor, l1_weight: f64, ssim_weight: f64) -> Tensor {
     let (image, ground_truth) = (image.as_ptr() as usize, ground_truth.as_ptr() as usize);
     // SAFETY: the tensors outlive the call, and on success the C++ side has stored a new tensor in `out`.
-    let done =
-        unsafe { take_outputs(|out| fit::photometric(image, ground_truth, l1_weight, ssim_weight, out)) };
+    let done = unsafe {
+        take_outputs(|out| image_losses::photometric(image, ground_truth, l1_weight, ssim_weight, out))
+    };
     let [loss] = done.unwrap_or_else(|error| panic!("{error}"));
     loss
 }

@@ -2,12 +2,12 @@
 
 use super::flops::record_flops;
 use globalsplat_csrc::attention as ours;
-use globalsplat_csrc::processor::{Bf16Support, bf16_of_cpu};
+use globalsplat_csrc::processor::{Bf16Support, cpu_bf16_support};
 use tch::{Device, Kind, Tensor};
 
 /// Computes softmax(q kᵀ / √(d/h)) v over `heads` heads. q is [B, n, d], k and v are [B, m, d]; the result is [B, n, d] and of their kind.
 pub(crate) fn attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
-    let out = attend(q, k, v, heads);
+    let out = dispatch_attention(q, k, v, heads);
     let size = q.size();
     let flops = 4 * size[0] * size[1] * k.size()[1] * size[2];
     // The backward pass recomputes the scores, and computes gradients of queries, keys, attention weights and values.
@@ -15,7 +15,7 @@ pub(crate) fn attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tenso
     out
 }
 
-fn attend(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
+fn dispatch_attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
     let (kind, width, all) = (q.kind(), q.size()[2] / heads, [q, k, v]);
     let fits = |t: &&Tensor| t.device() == Device::Cpu && t.kind() == kind && t.size()[1] > 0;
     if !all.iter().all(fits) {
@@ -26,7 +26,7 @@ fn attend(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
         Kind::Float if takes(false) => attention_cpu_kernel(all, heads),
         Kind::BFloat16 if takes(true) => attention_cpu_kernel(all, heads),
         // Our kernel lacks bf16 products on this CPU, and libtorch's bf16 kernel is fast only with tiles (AMX): compute in float32.
-        Kind::BFloat16 if bf16_of_cpu() != Bf16Support::Tiles && takes(false) => {
+        Kind::BFloat16 if cpu_bf16_support() != Bf16Support::Tiles && takes(false) => {
             attention_cpu_kernel(all.map(|t| t.to_kind(Kind::Float)).each_ref(), heads).to_kind(kind)
         }
         _ => attention_libtorch(q, k, v, heads),
@@ -65,7 +65,7 @@ pub(crate) fn attention_libtorch(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64)
 #[cfg(test)]
 mod tests {
     use super::*;
-    use globalsplat_csrc::render::{set_threads, simd_level};
+    use globalsplat_csrc::render::{set_num_threads, simd_level};
     use globalsplat_test_kit::exit_code_of_test;
     use std::path::Path;
     use tch::no_grad;
@@ -92,9 +92,9 @@ mod tests {
     fn any_number_of_threads_gives_the_same_bits() {
         let expected = answers();
         for threads in [1, 2, 3] {
-            set_threads(threads);
+            set_num_threads(threads);
             let found = answers();
-            set_threads(0);
+            set_num_threads(0);
             assert!(expected.iter().zip(&found).all(|(a, b)| a.equal(b)), "{threads} threads");
         }
     }
@@ -140,9 +140,9 @@ mod tests {
             }
             let same = |others: Vec<Tensor>| found.iter().zip(&others).all(|(a, b)| a.equal(b));
             for threads in [1, 3] {
-                set_threads(threads);
+                set_num_threads(threads);
                 let alone = answers(&all, &|[q, k, v]| attention(q, k, v, heads));
-                set_threads(0);
+                set_num_threads(0);
                 assert!(same(alone), "{threads} threads change what is seen");
             }
             // Rows with a stride, as in chunks of one layer's output.

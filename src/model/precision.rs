@@ -2,7 +2,7 @@
 
 use super::flops::record_flops;
 use globalsplat_csrc::linear::linear;
-use globalsplat_csrc::processor::{Bf16Support, bf16_of_cpu, gpu_has_bf16};
+use globalsplat_csrc::processor::{Bf16Support, cpu_bf16_support, gpu_has_bf16};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
@@ -27,7 +27,7 @@ impl Precision {
     /// Returns bf16 if `device` has instructions for bf16 products, and float32 otherwise.
     pub fn fastest_on(device: Device) -> Self {
         let has_bf16 = match device {
-            Device::Cpu => bf16_of_cpu() != Bf16Support::None,
+            Device::Cpu => cpu_bf16_support() != Bf16Support::None,
             Device::Cuda(_) => gpu_has_bf16(),
             _ => false,
         };

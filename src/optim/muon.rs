@@ -2,7 +2,7 @@
 //! all about equal. So directions with small gradients are learned as fast as others (spec 8.5).
 
 use super::address::addresses;
-use globalsplat_csrc::optim::{self as ffi, MuonNumbers};
+use globalsplat_csrc::optim::{self as ffi, MuonOptions};
 use std::collections::BTreeMap;
 use tch::{Device, Kind, Tensor, no_grad};
 
@@ -29,7 +29,7 @@ pub(super) fn update(of: &Matrices, parts: i64, learning_rate: f64, weight_decay
         return update_by_libtorch(of, parts, learning_rate, weight_decay);
     }
     let list = |tensors: &[&Tensor]| addresses(tensors.iter().copied());
-    let numbers = MuonNumbers { parts, learning_rate, weight_decay, beta: BETA };
+    let numbers = MuonOptions { parts, learning_rate, weight_decay, beta: BETA };
     // SAFETY: the tensors outlive the call, and nothing else works on them meanwhile.
     let done = unsafe { ffi::muon(&list(&of.values), &list(&of.gradients), &list(&of.means), &numbers) };
     done.expect("matrices, their gradients and running means are alike");
@@ -133,12 +133,12 @@ mod tests {
 
     #[test]
     fn any_number_of_threads_gives_the_same_bits() {
-        use globalsplat_csrc::render::set_threads;
+        use globalsplat_csrc::render::set_num_threads;
         let expected = stepped(Kind::Float, update, 3);
         for threads in [1, 2, 3] {
-            set_threads(threads);
+            set_num_threads(threads);
             let found = stepped(Kind::Float, update, 3);
-            set_threads(0);
+            set_num_threads(0);
             assert!(expected.iter().zip(&found).all(|(a, b)| a.equal(b)), "{threads} threads");
         }
     }

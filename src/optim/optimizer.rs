@@ -4,8 +4,7 @@ use super::address::{address, addresses};
 use super::muon::{self, Matrices};
 use crate::error::{Error, Result};
 use crate::ffi::take_outputs;
-use globalsplat_csrc::fit::{AdamArguments, adam};
-use globalsplat_csrc::optim::{self as ffi, AdamWNumbers, fused_adamw, norm, scale};
+use globalsplat_csrc::optim::{self as ffi, AdamArguments, AdamWOptions, adam, fused_adamw, norm, scale};
 use std::collections::BTreeMap;
 use std::path::Path;
 use tch::{Device, Tensor};
@@ -61,15 +60,22 @@ impl Parameter {
         std::iter::once(("first", &self.first)).chain(self.second.iter().map(|second| ("second", second)))
     }
 
-    /// Updates the parameter by AdamW on the CPU. `rate` is the learning rate over 1 − β₁ᵗ, and `root2` is √(1 − β₂ᵗ).
-    fn update(&self, gradient: &Tensor, rate: f64, root2: f64, decay: f64, epsilon: f64) {
+    /// Updates the parameter by AdamW on the CPU. `step_size` is the learning rate over 1 − β₁ᵗ, and `bias_correction2_sqrt` is √(1 − β₂ᵗ).
+    fn update(
+        &self,
+        gradient: &Tensor,
+        step_size: f64,
+        bias_correction2_sqrt: f64,
+        decay: f64,
+        epsilon: f64,
+    ) {
         let arguments = AdamArguments {
             value: address(&self.value),
             gradient: address(gradient),
             first: address(&self.first),
             second: address(self.second.as_ref().expect("AdamW's")),
-            rate,
-            root: root2,
+            step_size,
+            bias_correction2_sqrt,
             decay,
             beta1: BETA1,
             beta2: BETA2,
@@ -244,13 +250,13 @@ impl Optimizer {
 
     /// Updates a group by AdamW on the CPU, for the step that [`Optimizer::step`] has counted.
     fn update_on_the_cpu(&self, group: usize) {
-        let correction1 = 1. - BETA1.powi(self.steps as i32);
-        let root2 = (1. - BETA2.powi(self.steps as i32)).sqrt();
+        let bias_correction1 = 1. - BETA1.powi(self.steps as i32);
+        let bias_correction2_sqrt = (1. - BETA2.powi(self.steps as i32)).sqrt();
         let Settings { learning_rate, weight_decay, .. } = self.groups[group];
-        let (rate, decay) = (learning_rate / correction1, learning_rate * weight_decay);
+        let (step_size, decay) = (learning_rate / bias_correction1, learning_rate * weight_decay);
         let (parameters, gradients) = self.with_gradients(group);
         for (p, gradient) in parameters.iter().zip(&gradients) {
-            p.update(gradient, rate, root2, decay, self.epsilon);
+            p.update(gradient, step_size, bias_correction2_sqrt, decay, self.epsilon);
         }
     }
 
@@ -261,7 +267,7 @@ impl Optimizer {
         let values = addresses(parameters.iter().map(|p| &p.value));
         let first = addresses(parameters.iter().map(|p| &p.first));
         let second = addresses(parameters.iter().filter_map(|p| p.second.as_ref()));
-        let numbers = AdamWNumbers {
+        let numbers = AdamWOptions {
             steps: self.steps,
             learning_rate,
             weight_decay,
@@ -388,7 +394,7 @@ mod tests {
 
     /// Both implementations give the same values and moments after steps with clipped gradients. One parameter has no gradient at first.
     #[test]
-    fn both_ways_to_make_a_step_agree() {
+    fn fused_and_single_tensor_steps_agree() {
         let sizes = [("a", 7), ("b", 1000), ("c", 1), ("d", 64)];
         let states = WAYS.map(|step| {
             let leaves = sizes.map(|(name, size)| {

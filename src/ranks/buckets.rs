@@ -8,11 +8,11 @@ use std::fmt;
 use tch::Tensor;
 
 /// Maximum size of a bucket, in bytes: the bucket size of torch's DistributedDataParallel.
-const MOST_BYTES: i64 = 25 << 20;
+const MAX_BUCKET_BYTES: i64 = 25 << 20;
 /// Minimum size of a bucket, in bytes. Smaller buckets take longer to start than to send.
-const LEAST_BYTES: i64 = 1 << 20;
+const MIN_BUCKET_BYTES: i64 = 1 << 20;
 /// Number of buckets of a small network, so that all but the last can be sent while the backward pass is running.
-const FEW: i64 = 8;
+const MIN_BUCKETS: i64 = 8;
 
 /// Buckets of a network's parameters.
 pub struct Buckets {
@@ -34,10 +34,14 @@ impl Buckets {
     /// Panics if the parameters differ in kind or device, or aren't leaves that require gradients.
     pub fn new(group: &ProcessGroup, parameters: &[Tensor]) -> Self {
         let bytes: usize = parameters.iter().map(|t| t.numel() * t.kind().elt_size_in_bytes()).sum();
-        Buckets::of_bytes(group, parameters, (bytes as i64 / FEW).clamp(LEAST_BYTES, MOST_BYTES))
+        Buckets::with_bucket_bytes(
+            group,
+            parameters,
+            (bytes as i64 / MIN_BUCKETS).clamp(MIN_BUCKET_BYTES, MAX_BUCKET_BYTES),
+        )
     }
 
-    pub(super) fn of_bytes(group: &ProcessGroup, parameters: &[Tensor], bytes: i64) -> Self {
+    pub(super) fn with_bucket_bytes(group: &ProcessGroup, parameters: &[Tensor], bytes: i64) -> Self {
         let addresses: Vec<usize> = parameters.iter().map(|t| t.as_ptr() as usize).collect();
         // SAFETY: the tensors outlive the call; the C++ side holds references of its own to what it keeps.
         let inner = group.inner().map(|group| unsafe { ffi::buckets(group, &addresses, bytes) });

@@ -88,14 +88,14 @@ impl ProcessGroup {
                 let install = "install what requirements.txt pins beside libtorch's wheel";
                 return Err(without("NCCL", install));
             }
-            Device::Cuda(_) => ffi::nccl(store, rank, ranks, seconds),
+            Device::Cuda(_) => ffi::new_nccl_group(store, rank, ranks, seconds),
             _ if !gloo => {
                 return Err(without(
                     "Gloo",
                     "install its headers (Debian and Ubuntu: apt install libgloo-dev)",
                 ));
             }
-            _ => ffi::gloo(store, rank, ranks, seconds),
+            _ => ffi::new_gloo_group(store, rank, ranks, seconds),
         };
         let inner = Some(inner.map_err(|e| {
             let why = e.what().lines().next().unwrap_or_default().to_string();

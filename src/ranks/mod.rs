@@ -4,12 +4,12 @@
 mod buckets;
 mod dist_env;
 mod group;
-mod watch;
+mod watchdog;
 
 pub use buckets::Buckets;
 pub use dist_env::DistributedEnv;
 pub use group::{Backends, ProcessGroup};
-pub use watch::Watchdog;
+pub use watchdog::Watchdog;
 
 #[cfg(test)]
 pub(crate) mod tests {
@@ -32,7 +32,8 @@ pub(crate) mod tests {
         let have_met = std::sync::Barrier::new(ranks);
         std::thread::scope(|scope| {
             let rank = |rank| {
-                let (store, have_met, work) = (store.another().expect("a connection"), &have_met, &work);
+                let (store, have_met, work) =
+                    (store.clone_connection().expect("a connection"), &have_met, &work);
                 scope.spawn(move || {
                     let dist_env = DistributedEnv {
                         rank,
@@ -135,7 +136,7 @@ pub(crate) mod tests {
             let leaf = |size: i64| Tensor::ones([size], (Kind::Float, Device::Cpu)).set_requires_grad(true);
             let leaves = [leaf(5), leaf(3), leaf(7), leaf(2)];
             // One bucket for each of the first two leaves, and one for the others.
-            let buckets = Buckets::of_bytes(&group, &leaves, 4 * 5);
+            let buckets = Buckets::with_bucket_bytes(&group, &leaves, 4 * 5);
             let mut steps = vec![];
             for step in 1..3 {
                 for leaf in &leaves {
@@ -194,7 +195,7 @@ pub(crate) mod tests {
         }
         let store = ffi::connect("127.0.0.1", 0, true, "test", 60).expect("a store");
         // The error comes from NCCL's constructor. So it was found and called, and its exception is passed through.
-        let error = ffi::nccl(&store, 0, 1, 60).err().expect("no GPU").to_string();
+        let error = ffi::new_nccl_group(&store, 0, 1, 60).err().expect("no GPU").to_string();
         assert!(error.contains("no GPUs found"), "{error}");
     }
 }

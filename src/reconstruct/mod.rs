@@ -4,7 +4,7 @@
 mod context;
 mod input;
 mod model_file;
-mod placing;
+mod placement_search;
 mod published;
 mod spread;
 
@@ -25,7 +25,7 @@ use crate::model::{GlobalSplat, Stage};
 use crate::render::transform;
 use crate::scene::{Gaussians, Placement, Similarity, normalize};
 use glam::{DMat4, DVec3};
-use placing::search_placement;
+use placement_search::search_placement;
 use std::time::Duration;
 use tch::Device;
 

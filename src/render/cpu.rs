@@ -51,8 +51,8 @@ pub struct KernelThreads {
 impl KernelThreads {
     /// Limits libtorch to one thread until the guard is dropped.
     pub fn take() -> Self {
-        let (libtorch, own) = (tch::get_num_threads(), ffi::threads());
-        ffi::set_threads(own);
+        let (libtorch, own) = (tch::get_num_threads(), ffi::get_num_threads());
+        ffi::set_num_threads(own);
         tch::set_num_threads(1);
         KernelThreads { libtorch, own }
     }
@@ -61,6 +61,6 @@ impl KernelThreads {
 impl Drop for KernelThreads {
     fn drop(&mut self) {
         tch::set_num_threads(self.libtorch);
-        ffi::set_threads(if self.own == self.libtorch { 0 } else { self.own });
+        ffi::set_num_threads(if self.own == self.libtorch { 0 } else { self.own });
     }
 }

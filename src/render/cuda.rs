@@ -1,7 +1,8 @@
 //! GPU-only functions: the driver, and kernels that are compiled at first use.
 
 pub use globalsplat_csrc::cuda::{
-    Driver, Form, Gpu, KernelUse, Nvrtc, Prepared, cache_folder, prepare, usage,
+    CodeFormat, Driver, Gpu, KernelOrigin, KernelResources, Nvrtc, cache_folder, load_kernels,
+    parse_resources,
 };
 
 pub use globalsplat_csrc::render::{KernelTime, measure_kernels};

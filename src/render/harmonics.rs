@@ -14,17 +14,17 @@ use tch::Tensor;
 /// Number of spherical harmonics of a colour channel, up to degree 3.
 const BASES: usize = 16;
 /// Weight of a change in all directions, relative to the cameras' total weight of 1.
-const ELSEWHERE: f64 = 1e-5;
+const OTHER_DIRECTIONS_WEIGHT: f64 = 1e-5;
 /// Number of rounds of coordinate descent over the coefficients. They hardly change after half as many.
 const ROUNDS: usize = 40;
 /// Factor by which a Gaussian may be too dark before its opacity is raised.
-const TOO_DARK: f64 = 1.05;
+const MAX_DARKENING: f64 = 1.05;
 /// Maximum opacity that a Gaussian is raised to.
 const MAX_OPACITY: f64 = 0.98;
 /// Radius of a Gaussian, in standard deviations, that decides whether it reaches into an image.
-const REACH: f64 = 2.;
+const VISIBLE_SIGMAS: f64 = 2.;
 /// Weight factor of an image that a Gaussian doesn't reach, relative to one that it reaches.
-const OUTSIDE: f64 = 1e-6;
+const OUTSIDE_WEIGHT: f64 = 1e-6;
 /// Camera depth in local units at or below which nothing is drawn (spec 6.2).
 const NEAR: f64 = 0.01;
 
@@ -50,7 +50,8 @@ pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &ShLimit
             let mean = DVec3::from_array([0, 1, 2].map(|axis| f64::from(means[3 * index + axis])));
             let radius =
                 scales[3 * index..][..3].iter().fold(0., |largest: f64, &s| largest.max(f64::from(s)));
-            Fit::new(mean, REACH * radius, coefficients, &cameras, limits).best(f64::from(opacities[index]))
+            Fit::new(mean, VISIBLE_SIGMAS * radius, coefficients, &cameras, limits)
+                .best(f64::from(opacities[index]))
         })
         .collect();
     let kept = bases.min((limits.degree + 1).pow(2));
@@ -104,7 +105,7 @@ impl<'a> Fit<'a> {
         seen.iter_mut().for_each(|(_, weight)| *weight /= total);
         let mut cost = [[0.; BASES]; BASES];
         for (row, costs) in cost.iter_mut().enumerate() {
-            costs[row] = ELSEWHERE;
+            costs[row] = OTHER_DIRECTIONS_WEIGHT;
             for (basis, weight) in &seen {
                 costs.iter_mut().zip(basis).for_each(|(cost, other)| *cost += weight * basis[row] * other);
             }
@@ -119,7 +120,7 @@ impl<'a> Fit<'a> {
         }
         let fitted = self.solve();
         let dark = self.darkness(&fitted);
-        if dark <= TOO_DARK || opacity >= MAX_OPACITY {
+        if dark <= MAX_DARKENING || opacity >= MAX_OPACITY {
             return (fitted, opacity);
         }
         // The product of colour and opacity stays the same. The colour includes the offset of ½.
@@ -179,7 +180,7 @@ fn basis_towards(camera: &Camera, mean: DVec3) -> [f64; BASES] {
     basis
 }
 
-/// Returns the weight of `camera` for a Gaussian: proportional to the number of pixels that it covers, and reduced by `OUTSIDE` if its
+/// Returns the weight of `camera` for a Gaussian: proportional to the number of pixels that it covers, and reduced by `OUTSIDE_WEIGHT` if its
 /// `radius` doesn't reach into the image. Returns `None` if its mean is nearer than `NEAR` or behind the camera.
 fn weight(camera: &Camera, w2c: &DMat4, mean: DVec3, radius: f64) -> Option<f64> {
     let seen = w2c.transform_point3(mean);
@@ -187,7 +188,7 @@ fn weight(camera: &Camera, w2c: &DMat4, mean: DVec3, radius: f64) -> Option<f64>
     let (x, y) = (k.fx * seen.x / seen.z + k.cx, k.fy * seen.y / seen.z + k.cy);
     let (wide, high) = (k.fx * radius / seen.z, k.fy * radius / seen.z);
     let inside = (-wide..=width + wide).contains(&x) && (-high..=height + high).contains(&y);
-    let factor = if inside { 1. } else { OUTSIDE };
+    let factor = if inside { 1. } else { OUTSIDE_WEIGHT };
     (seen.z > NEAR).then(|| factor * k.fx * k.fy / (seen.z * seen.z))
 }
 

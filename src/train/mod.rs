@@ -6,13 +6,13 @@ mod forward_backward;
 mod lock;
 mod memory_estimate;
 mod metrics;
+mod parallel_slices;
 mod parameter_groups;
 mod preview;
 #[cfg(test)]
 mod rank_tests;
 mod run;
 mod schedule;
-mod side_by_side;
 mod step_report;
 mod step_sync;
 #[cfg(test)]

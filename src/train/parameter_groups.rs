@@ -57,7 +57,7 @@ mod tests {
     use tch::{Device, nn::Init};
 
     #[test]
-    fn weights_decay_and_nothing_else_does() {
+    fn only_layer_weights_decay() {
         let vs = nn::VarStore::new(Device::Cpu);
         let layer = vs.root() / "layer";
         let _variables = [

@@ -23,12 +23,12 @@ fn training(train: TrainConfig) -> Config {
     config(small(), TrainConfig { steps: 100, warmup: 0., learning_rate: 3e-5, ..train })
 }
 
-/// Trains a trainer for some steps on its rank's share of `scenes`, which `disturb` changes before each step. Returns the trainer and its
+/// Trains a trainer for some steps on its rank's share of `scenes`, which `perturb` changes before each step. Returns the trainer and its
 /// reports.
 fn trained_on(
     config: &Config,
     group: ProcessGroup,
-    disturb: impl Fn(usize, &mut [LoadedScene]),
+    perturb: impl Fn(usize, &mut [LoadedScene]),
 ) -> (Trainer, Vec<StepReport>) {
     let (rank, share) = (group.rank(), SCENES / group.world_size());
     let mut trainer = far_from_the_start(config).with_group(group);
@@ -36,7 +36,7 @@ fn trained_on(
     trainer.perceptual = None;
     let step = |step: usize| {
         let mut scenes = scenes(SCENES);
-        disturb(step, &mut scenes);
+        perturb(step, &mut scenes);
         let sample = Batch::from_scenes(&scenes[rank * share..][..share], Device::Cpu).unwrap();
         trainer.train_step(&sample, &mut Stopwatch::default(), &mut || true).expect("a step")
     };
@@ -60,14 +60,14 @@ fn assert_like_one(
     config: &Config,
     alone: &Config,
     tolerance: f64,
-    disturb: impl Fn(usize, &mut [LoadedScene]) + Copy + Sync,
+    perturb: impl Fn(usize, &mut [LoadedScene]) + Copy + Sync,
 ) -> Vec<StepReport> {
     let _guard = num_threads::keep();
     let start = weights(&far_from_the_start(config));
-    let (alone, expected) = trained_on(alone, ProcessGroup::single(), disturb);
+    let (alone, expected) = trained_on(alone, ProcessGroup::single(), perturb);
     let alone = weights(&alone);
     let found = run_on_ranks(ranks, |group| {
-        let (trainer, reports) = trained_on(config, group, disturb);
+        let (trainer, reports) = trained_on(config, group, perturb);
         (weights(&trainer), reports)
     });
     for (rank, (weights, reports)) in found.iter().enumerate() {
@@ -139,14 +139,14 @@ fn a_nan_loss_on_one_rank_skips_the_step_on_all_ranks() {
     if !can_meet() {
         return;
     }
-    let disturb = |step: usize, scenes: &mut [LoadedScene]| {
+    let perturb = |step: usize, scenes: &mut [LoadedScene]| {
         if step == 3 {
             // A scene of the last rank.
             scenes[SCENES - 1].far = f64::NAN;
         }
     };
     let config = |micro_batch| training(TrainConfig { micro_batch, ..Default::default() });
-    let reports = assert_like_one(2, &config(0), &config(3), 0., disturb);
+    let reports = assert_like_one(2, &config(0), &config(3), 0., perturb);
     let skipped: Vec<bool> = reports.iter().map(|report| report.skipped).collect();
     assert!(skipped[3] && skipped.iter().filter(|skipped| **skipped).count() == 1, "{skipped:?}");
 }
@@ -158,12 +158,12 @@ fn a_skipped_step_reports_the_scenes_of_all_ranks() {
     }
     let config = training(TrainConfig::default());
     let found = run_on_ranks(2, |group| {
-        let disturb = |step: usize, scenes: &mut [LoadedScene]| {
+        let perturb = |step: usize, scenes: &mut [LoadedScene]| {
             if step == 0 {
                 scenes[0].far = f64::NAN;
             }
         };
-        trained_on(&config, group, disturb).1.into_iter().map(|report| report.scenes).collect::<Vec<_>>()
+        trained_on(&config, group, perturb).1.into_iter().map(|report| report.scenes).collect::<Vec<_>>()
     });
     let names = |numbers: std::ops::Range<usize>| numbers.map(|i| format!("noise_{i}")).collect::<Vec<_>>();
     assert!(found.iter().all(|scenes| scenes[0] == names(0..6)), "{found:?}");

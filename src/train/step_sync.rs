@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_packed_is_read_again() {
+    fn packed_steps_round_trip() {
         let sync = StepSync::of_rank(true, false, 7);
         let found = sums(&[sync]);
         assert_eq!(found.sync, sync);

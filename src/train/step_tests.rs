@@ -9,7 +9,9 @@ use crate::model::{ModelConfig, Precision, Stage, Streams, backward_from_grads, 
 use crate::render::{DEFAULT_EPS2D, RenderOutput, render};
 use crate::scene::{Camera, Intrinsics};
 use glam::{DMat4, DVec3};
-use globalsplat_csrc::ops::{computing, moves, record_ops, record_outermost_ops, without_own_linear_layers};
+use globalsplat_csrc::ops::{
+    computing, count_device_copies, record_ops, record_outermost_ops, without_own_linear_layers,
+};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeMap;
@@ -251,7 +253,7 @@ fn masked_pixels_contribute_nothing_to_a_step() {
 /// Parallel slices give the same step every time, in one, two and three slices. Only the mean connects the scenes of this step. In bf16,
 /// the gradients of weights are rounded in each slice.
 #[test]
-fn scenes_side_by_side_make_the_same_step_every_time() {
+fn parallel_slices_make_the_same_step_every_time() {
     let _guard = num_threads::change();
     let sample = sample();
     let threads = tch::get_num_threads();
@@ -289,7 +291,7 @@ fn scenes_side_by_side_make_the_same_step_every_time() {
 }
 
 #[test]
-fn rounds_that_are_computed_again_give_the_same_gradients() {
+fn recomputed_rounds_give_the_same_gradients() {
     let sample = sample();
     for streams in [Streams::Dual, Streams::Single] {
         let model = ModelConfig { streams, ..small() };
@@ -304,7 +306,7 @@ fn rounds_that_are_computed_again_give_the_same_gradients() {
 }
 
 #[test]
-fn a_step_in_parts_is_the_plain_one() {
+fn a_step_in_parts_matches_one_backward_pass() {
     let sample = sample();
     for streams in [Streams::Dual, Streams::Single] {
         let config = config(ModelConfig { streams, ..small() }, TrainConfig::default());
@@ -397,7 +399,7 @@ fn a_step_makes_only_expected_device_copies() {
         of_model(&config(small(), train), |trainer| {
             let ViewBatch { images, c2w, intrinsics, .. } = &sample.context;
             let (decoded, ops) = record_ops(|| trainer.model.forward(images, c2w, intrinsics, STAGE));
-            assert_eq!(moves(&ops), 0, "an inference");
+            assert_eq!(count_device_copies(&ops), 0, "an inference");
             let is_fused = |op: &&String| {
                 op.starts_with("aten::_scaled_dot_product_flash_attention") || *op == "globalsplat::attention"
             };
@@ -406,13 +408,13 @@ fn a_step_makes_only_expected_device_copies() {
             let cameras = sample.target.cameras();
             let (pictures, ops) = record_ops(|| render(&decoded.gaussians, &cameras, DEFAULT_EPS2D));
             // Rendering moves the rendered images to the device of the Gaussians.
-            let of_pictures = moves(&ops);
+            let of_pictures = count_device_copies(&ops);
             let pictures = pictures.expect("pictures");
             let perceptual = trainer.perceptual.as_ref();
             let (_, ops) = record_ops(|| {
                 losses(&trainer.config.loss, perceptual, &sample, &decoded, &pictures, &StepFraction::WHOLE)
             });
-            assert_eq!(moves(&ops), 0, "the losses");
+            assert_eq!(count_device_copies(&ops), 0, "the losses");
 
             let (report, ops) =
                 record_ops(|| trainer.train_step(&sample, &mut Stopwatch::default(), &mut || true));
@@ -421,7 +423,11 @@ fn a_step_makes_only_expected_device_copies() {
                 // Depths are compared over all slices, so their pixels are counted in an earlier pass.
                 count => 2 * sample.scenes().div_ceil(count),
             };
-            assert_eq!(moves(&ops), 1 + renders * of_pictures, "a step in slices of {micro_batch}");
+            assert_eq!(
+                count_device_copies(&ops),
+                1 + renders * of_pictures,
+                "a step in slices of {micro_batch}"
+            );
             report.expect("a step").losses
         });
     }

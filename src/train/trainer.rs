@@ -3,10 +3,10 @@
 use super::curriculum::stage_at;
 use super::forward_backward::ForwardBackward;
 use super::is_due;
+use super::parallel_slices::{ModelReplica, gradients_in_parallel};
 use super::parameter_groups::{in_backward_order, parameter_groups};
 use super::preview::preview;
 use super::schedule::learning_rate;
-use super::side_by_side::{ModelReplica, gradients_in_parallel};
 use super::step_report::StepReport;
 use super::step_sync::{StepSums, StepSync};
 use super::subsets::subsets;

@@ -81,7 +81,7 @@ fn pictures_are_the_same_from_other_sides() {
 }
 
 #[test]
-fn endings_that_are_unknown() {
+fn unknown_file_endings_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let splat = written(folder.path(), "a.ply", &random_splat(2, 0, 1));
     for (name, message) in [("a.obj", "the ending is .obj"), ("a", "the ending is missing")] {

@@ -545,7 +545,7 @@ fn extreme_gaussians_leave_everything_finite() {
 }
 
 #[test]
-fn nothing_to_see_is_black() {
+fn zero_gaussians_render_black() {
     let g = leaves(&gaussians(1, 0, 3, Kind::Float, 12));
     let p = draw(&g, &cameras(1, 1, 20, 10, Kind::Float));
     assert_eq!(p.rgb.abs().max().double_value(&[]) + p.alpha.max().double_value(&[]), 0.);

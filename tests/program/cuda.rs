@@ -1,7 +1,7 @@
 //! GPU kernels, as far as they can be tested without a GPU.
 
 use crate::common::{rerun_test, skip};
-use globalsplat::render::cuda::{Driver, Form, Nvrtc, cache_folder, prepare, usage};
+use globalsplat::render::cuda::{CodeFormat, Driver, Nvrtc, cache_folder, load_kernels, parse_resources};
 use std::path::Path;
 use std::process::Command;
 
@@ -24,9 +24,9 @@ fn kernels_compile_for_every_gpu_and_need_no_memory_for_registers() {
         nvrtc.architectures.iter().copied().filter(|of| (OLDEST..=NEWEST).contains(of)).collect();
     assert!(promised.contains(&OLDEST) && promised.contains(&NEWEST), "{promised:?}");
     for architecture in promised {
-        let compiled = nvrtc.compile(architecture, Form::Cubin).unwrap();
+        let compiled = nvrtc.compile(architecture, CodeFormat::Cubin).unwrap();
         assert!(compiled.image.starts_with(b"\x7fELF"), "{architecture}");
-        let kernels = usage(&compiled.log);
+        let kernels = parse_resources(&compiled.log);
         assert_eq!(kernels.len(), 12, "{}", compiled.log);
         for kernel in kernels {
             assert!(kernel.spills == 0 && kernel.shared <= SHARED, "{architecture}: {kernel:?}");
@@ -43,7 +43,7 @@ fn kernels_compile_for_every_gpu_and_need_no_memory_for_registers() {
 #[test]
 fn a_splat_s_sums_take_eleven_shuffles() {
     let Some(nvrtc) = nvrtc() else { return };
-    let ptx = nvrtc.compile(90, Form::Ptx).unwrap().image;
+    let ptx = nvrtc.compile(90, CodeFormat::Ptx).unwrap().image;
     let ptx = String::from_utf8_lossy(&ptx);
     let kernel = ptx.split(".entry ").find(|text| text.starts_with("gs_blend_backward")).expect("a kernel");
     assert_eq!(kernel.matches("shfl.sync.bfly").count(), 11);
@@ -53,9 +53,9 @@ fn a_splat_s_sums_take_eleven_shuffles() {
 fn newer_gpus_get_ptx_and_older_ones_are_refused() {
     let Some(nvrtc) = nvrtc() else { return };
     let newest = *nvrtc.architectures.last().unwrap();
-    assert_eq!(nvrtc.target(newest), Ok((newest, Form::Cubin)));
-    assert_eq!(nvrtc.target(newest + 10), Ok((newest, Form::Ptx)));
-    let ptx = nvrtc.compile(newest, Form::Ptx).unwrap().image;
+    assert_eq!(nvrtc.target(newest), Ok((newest, CodeFormat::Cubin)));
+    assert_eq!(nvrtc.target(newest + 10), Ok((newest, CodeFormat::Ptx)));
+    let ptx = nvrtc.compile(newest, CodeFormat::Ptx).unwrap().image;
     assert!(ptx.ends_with(&[0]) && String::from_utf8_lossy(&ptx).contains(".entry gs_blend"));
     let refused = nvrtc.target(nvrtc.architectures[0] - 1).unwrap_err();
     assert!(refused.contains("compute capability") && refused.contains("expected"), "{refused}");
@@ -94,11 +94,11 @@ fn kernels_are_compiled_once() {
         let gpu = &driver.gpus[0];
         assert_eq!((driver.version, gpu.name.as_str(), gpu.architecture), (13000, "Imaginary", 90));
         assert_eq!((gpu.memory, gpu.multiprocessors), (8 << 30, 132));
-        let prepared = prepare(0).unwrap();
-        assert_eq!((prepared.architecture, prepared.was_cached), (90, expected == "kept"));
-        let file = prepared.file.expect("a place for it");
+        let origin = load_kernels(0).unwrap();
+        assert_eq!((origin.architecture, origin.was_cached), (90, expected == "kept"));
+        let file = origin.file.expect("a place for it");
         assert!(file.starts_with(cache_folder().unwrap()) && file.is_file());
-        assert!(prepare(1).unwrap_err().contains("1 GPUs"));
+        assert!(load_kernels(1).unwrap_err().contains("1 GPUs"));
         return;
     }
     let (driver, cache) = (fake_driver(), tempfile::tempdir().expect("a temporary folder"));

@@ -91,7 +91,7 @@ fn a_run_that_is_killed_ten_times_ends_with_the_same_bits() {
 }
 
 #[test]
-fn a_broken_checkpoint_is_stepped_over() {
+fn a_broken_checkpoint_is_skipped() {
     let (folder, room) = room();
     let config = tiny_config(folder.path(), &room);
     let (whole, run) = (folder.path().join("whole"), folder.path().join("run"));

@@ -6,8 +6,8 @@ use crate::holdout::Holdout;
 use crate::image_source::ImageSource;
 use crate::lens::{Distortion, Lens, LensModel, PhotoPart, PinholeView, Projection, split_into_views};
 use crate::pixels::{
-    DecodedPhoto, LookupTable, Planes, ViewPixels, decode_photo, encode_photo, fit, grey_to_rgb,
-    has_alpha_channel, multiply, read_image_size, read_mask, source_region, undistort,
+    DecodedPhoto, LookupTable, Planes, ViewPixels, decode_photo, encode_photo, grey_to_rgb,
+    has_alpha_channel, multiply, read_image_size, read_mask, resize_and_crop, source_ranges, undistort,
 };
 use glam::{DMat4, DVec4};
 use globalsplat_files::{Error, InputFiles, Result, split_keyed_path};
@@ -535,7 +535,7 @@ impl Capture {
         let (photo, mask) = self.read_photo(&self.frames[views[0].frame])?;
         let load = |view: &&View| {
             let fit_image = |image: &RgbImage| match size {
-                Some(size) => fit(image, &view.camera, size),
+                Some(size) => resize_and_crop(image, &view.camera, size),
                 None => (Planes::from_rgb(image), view.camera),
             };
             let pixels = view_pixels(&photo, view, size, tables);
@@ -626,7 +626,7 @@ fn lookup_tables(views: &[&View], size: Option<ImageSize>) -> Vec<LookupTable> {
     if views.iter().any(|view| view.projection.is_identity()) || pixels.sum::<u64>() > MAX_PIXELS {
         return vec![];
     }
-    let window = |camera: &Camera| size.map(|size| source_region(camera, size));
+    let window = |camera: &Camera| size.map(|size| source_ranges(camera, size));
     let table = |view: &&View| LookupTable::new(view.projection.clone(), view.camera, window(&view.camera));
     views.iter().map(table).collect()
 }
@@ -642,7 +642,7 @@ fn view_pixels(
     let View { projection, camera, .. } = view;
     match tables.iter().find(|table| table.matches_camera(projection, camera)) {
         Some(table) => Some(table.undistort(photo)),
-        None => undistort(photo, projection, camera, size.map(|size| source_region(camera, size))),
+        None => undistort(photo, projection, camera, size.map(|size| source_ranges(camera, size))),
     }
 }
 

@@ -25,5 +25,5 @@ pub use image_source::ImageSource;
 pub use lens::Lens;
 pub use pixels::{
     CHANNELS, DecodedPhoto, PHOTO_EXTENSIONS, Planes, Region, Resampler, decode_photo, encode_photo,
-    exif_focal, fit, is_equirectangular, read_image, read_image_size, read_mask, source_region,
+    exif_focal, is_equirectangular, read_image, read_image_size, read_mask, resize_and_crop, source_ranges,
 };

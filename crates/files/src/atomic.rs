@@ -28,10 +28,10 @@ pub fn write_atomically<E: From<Error>>(
     path: &Path,
     fill: impl FnOnce(&mut dyn Write) -> Result<(), E>,
 ) -> Result<(), E> {
-    Ok(write_temporary(path, fill)?.keep()?)
+    Ok(write_temporary(path, fill)?.persist()?)
 }
 
-/// Writes a file like [`write_atomically`], but leaves it under its temporary name until [`PartialFile::keep`] is called.
+/// Writes a file like [`write_atomically`], but leaves it under its temporary name until [`PartialFile::persist`] is called.
 ///
 /// # Errors
 /// Returns the errors of [`write_atomically`].
@@ -182,7 +182,7 @@ pub fn recover_dirs(folder: &Path, own_entries: &[&str]) -> Result<()> {
     Ok(())
 }
 
-/// A file that is written beside its final path, and removed on drop unless it is kept.
+/// A file that is written beside its final path, and removed on drop unless it is persisted.
 #[derive(Debug)]
 pub struct PartialFile {
     /// Path in error messages.
@@ -190,10 +190,10 @@ pub struct PartialFile {
     /// Final path: `path` with links followed.
     target: PathBuf,
     /// Temporary path, which only this process uses.
-    pub place: PathBuf,
-    /// Open file at `place`, initially empty.
+    pub temporary_path: PathBuf,
+    /// Open file at `temporary_path`, initially empty.
     pub file: File,
-    /// `true` if the file at `place` no longer exists.
+    /// `true` if the file at `temporary_path` no longer exists.
     is_gone: bool,
 }
 
@@ -206,20 +206,20 @@ impl PartialFile {
     pub fn create(path: &Path) -> Result<Self> {
         let target = target_of(path, Metadata::is_file, "the name of a file")?;
         let make = |place: &Path| OpenOptions::new().write(true).create_new(true).open(place);
-        let (place, file) = claim(&target, make).map_err(Error::write(path))?;
+        let (temporary_path, file) = claim(&target, make).map_err(Error::write(path))?;
         if let Ok(replaced) = fs::metadata(&target) {
             // Best effort: some file systems have no permissions.
             let _ = file.set_permissions(writable_by_owner(replaced.permissions()));
         }
-        Ok(PartialFile { path: path.to_owned(), target, place, file, is_gone: false })
+        Ok(PartialFile { path: path.to_owned(), target, temporary_path, file, is_gone: false })
     }
 
     /// Renames the file to its final path.
     ///
     /// # Errors
     /// Returns an error if the file can't be written.
-    pub fn keep(mut self) -> Result<()> {
-        let whole = self.file.sync_all().and_then(|()| fs::rename(&self.place, &self.target));
+    pub fn persist(mut self) -> Result<()> {
+        let whole = self.file.sync_all().and_then(|()| fs::rename(&self.temporary_path, &self.target));
         whole.map_err(Error::write(&self.path))?;
         self.is_gone = true;
         sync_dir(parent_of(&self.target));
@@ -229,14 +229,14 @@ impl PartialFile {
     /// Removes the file.
     fn remove(mut self) -> io::Result<()> {
         self.is_gone = true;
-        unless_missing(fs::remove_file(&self.place))
+        unless_missing(fs::remove_file(&self.temporary_path))
     }
 }
 
 impl Drop for PartialFile {
     fn drop(&mut self) {
         if !self.is_gone {
-            let _ = fs::remove_file(&self.place);
+            let _ = fs::remove_file(&self.temporary_path);
         }
     }
 }
@@ -496,9 +496,9 @@ mod tests {
         assert_eq!(names(root.path()), [".room.ply.globalsplat-partial", ".room.ply.globalsplat-partial-1"]);
         (&first.file).write_all(b"first").unwrap();
         (&second.file).write_all(b"second").unwrap();
-        second.keep().unwrap();
+        second.persist().unwrap();
         assert_eq!(fs::read(&file).unwrap(), b"second");
-        first.keep().unwrap();
+        first.persist().unwrap();
         assert_eq!(fs::read(&file).unwrap(), b"first");
         drop(PartialFile::create(&file).unwrap());
         assert_eq!(names(root.path()), ["room.ply"]);

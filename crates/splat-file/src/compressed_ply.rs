@@ -21,11 +21,11 @@ const BOUNDED: [[&str; 3]; 3] = [["x", "y", "z"], ["scale_x", "scale_y", "scale_
 /// Names of a Gaussian's four words.
 const WORDS: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
 /// Numbers of bits of the three components of a position or scale.
-const WIDE: [u32; 3] = [11, 10, 11];
+const POSITION_BITS: [u32; 3] = [11, 10, 11];
 /// Numbers of bits of the three smaller components of a quaternion.
-const ROTATION: [u32; 3] = [10, 10, 10];
+const ROTATION_BITS: [u32; 3] = [10, 10, 10];
 /// Numbers of bits of red, green, blue and opacity.
-const COLOUR: [u32; 4] = [8, 8, 8, 8];
+const COLOUR_BITS: [u32; 4] = [8, 8, 8, 8];
 /// Largest magnitude of a log scale. Larger ones are clamped: they have no visible effect, but would widen the bounds of their chunk.
 const MAX_LOG_SCALE: f32 = 20.;
 /// Width of the range of SH coefficients, which is centred on 0.
@@ -78,10 +78,10 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
                 (low * (1. - fractions[axis]) + high * fractions[axis]) as f32
             })
         };
-        splat.means.push(between(&bounds[..6], unpack(position, WIDE)));
-        splat.log_scales.push(between(&bounds[6..12], unpack(scale, WIDE)));
+        splat.means.push(between(&bounds[..6], unpack(position, POSITION_BITS)));
+        splat.log_scales.push(between(&bounds[6..12], unpack(scale, POSITION_BITS)));
         splat.quaternions.push(unpack_rotation(rotation));
-        let [red, green, blue, opacity] = unpack(colour, COLOUR);
+        let [red, green, blue, opacity] = unpack(colour, COLOUR_BITS);
         let colour = match bounds.get(12..) {
             Some(bounds @ [_, ..]) => between(bounds, [red, green, blue]),
             _ => [red, green, blue].map(|channel| channel as f32),
@@ -157,10 +157,10 @@ pub(crate) fn write(path: &Path, splat: &Splat) -> Result<()> {
             let [red, green, blue] = colours.fractions(row);
             let colour = [red, green, blue, f64::from(splat.opacity(index))];
             let packed = [
-                pack(means.fractions(row), WIDE),
+                pack(means.fractions(row), POSITION_BITS),
                 pack_rotation(splat.unit_quaternion(index)),
-                pack(log_scales.fractions(row), WIDE),
-                pack(colour, COLOUR),
+                pack(log_scales.fractions(row), POSITION_BITS),
+                pack(colour, COLOUR_BITS),
             ];
             words.extend(packed.iter().flat_map(|word| word.to_le_bytes()));
         }
@@ -243,16 +243,16 @@ fn pack_rotation(quaternion: [f32; 4]) -> u32 {
     let largest = (0..4).rev().max_by(larger).expect("four components");
     let sign = f64::from(quaternion[largest].signum());
     let mut others = (0..4).filter(|&index| index != largest);
-    let fractions = ROTATION.map(|_| {
+    let fractions = ROTATION_BITS.map(|_| {
         let index = others.next().expect("three others");
         sign * f64::from(quaternion[index]) / SQRT_2 + 0.5
     });
-    (largest as u32) << 30 | pack(fractions, ROTATION)
+    (largest as u32) << 30 | pack(fractions, ROTATION_BITS)
 }
 
 /// Unpacks the unit quaternion that [`pack_rotation`] packed.
 fn unpack_rotation(word: u32) -> [f32; 4] {
-    let others = unpack(word, ROTATION).map(|fraction| (fraction - 0.5) * SQRT_2);
+    let others = unpack(word, ROTATION_BITS).map(|fraction| (fraction - 0.5) * SQRT_2);
     let rest = 1. - others.iter().map(|other| other * other).sum::<f64>();
     let mut quaternion = others.to_vec();
     quaternion.insert((word >> 30) as usize, rest.max(0.).sqrt());

@@ -72,5 +72,5 @@ pub(crate) fn write_with_origin(
     let json = serde_json::to_vec_pretty(&Contents { origin: origin.to_array() }).expect("numbers");
     partial.file.write_all(&json).map_err(Error::write(&file))?;
     write()?;
-    partial.keep()
+    partial.persist()
 }

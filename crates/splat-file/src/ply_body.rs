@@ -20,7 +20,7 @@ pub fn columns<T>(
 ) -> Result<Vec<T>> {
     let mut body = Body { path, rest: &bytes[header.length..], encoding: header.encoding };
     for before in header.elements.iter().take_while(|before| before.name != element) {
-        body.pass(before)?;
+        body.skip_element(before)?;
     }
     let Some(element) = header.element(element) else {
         return Err(Error::input(path, format!("the element {element}"), "missing", "the Gaussians"));
@@ -49,7 +49,7 @@ pub fn columns<T>(
                 (Kind::Number(scalar), Some(place)) => {
                     row_values[*place] = body.number(scalar, element, row, &property.name)?;
                 }
-                (kind, _) => body.pass_property(kind, element, row, &property.name)?,
+                (kind, _) => body.skip_property(kind, element, row, &property.name)?,
             }
         }
         values.extend(row_values.iter().map(|&value| convert(value)));
@@ -83,20 +83,20 @@ impl Body<'_> {
         Ok(())
     }
 
-    fn pass(&mut self, element: &Element) -> Result<()> {
+    fn skip_element(&mut self, element: &Element) -> Result<()> {
         self.check_length(element)?;
         if element.properties.is_empty() {
             return Ok(()); // however many rows there are
         }
         for row in 0..element.count {
             for property in &element.properties {
-                self.pass_property(property.kind, element, row, &property.name)?;
+                self.skip_property(property.kind, element, row, &property.name)?;
             }
         }
         Ok(())
     }
 
-    fn pass_property(&mut self, kind: Kind, element: &Element, row: usize, name: &str) -> Result<()> {
+    fn skip_property(&mut self, kind: Kind, element: &Element, row: usize, name: &str) -> Result<()> {
         match kind {
             Kind::Number(scalar) => self.number(scalar, element, row, name).map(drop),
             Kind::List(count, item) => {

@@ -1,11 +1,12 @@
 #![doc = include_str!("../README.md")]
 
+mod bvh;
 mod dataset;
 mod light;
 mod material;
 mod mesh;
 mod noise;
-mod open;
+mod outdoors;
 mod room;
 mod scene_builder;
 mod sensor;
@@ -13,7 +14,6 @@ mod shapes;
 mod texture;
 mod things;
 mod tracer;
-mod tree;
 mod video;
 mod walk;
 

@@ -5,7 +5,7 @@ use glam::{Vec2, Vec3};
 
 /// A light source. Light is linear RGB, where 1 is the light reflected by a well-lit white wall.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Lamp {
+pub(super) enum Light {
     /// The sun, infinitely far away in the direction `towards` (unit), with an angular width of `spread` radians. `colour` is the
     /// irradiance perpendicular to it.
     Sun { towards: Vec3, spread: f32, colour: Vec3 },
@@ -18,36 +18,36 @@ pub(super) enum Lamp {
 
 /// Light that arrives at a point.
 pub(super) struct IncidentLight {
-    /// Unit direction towards the lamp.
+    /// Unit direction towards the light source.
     pub towards: Vec3,
-    /// Distance to the point where the light left the lamp, in metres.
+    /// Distance to the point where the light left its source, in metres.
     pub distance: f32,
     /// Irradiance perpendicular to the ray, if nothing blocks it.
     pub colour: Vec3,
 }
 
-impl Lamp {
-    /// Returns the lamp with its light multiplied by `factor`.
-    pub fn dimmed(self, factor: f32) -> Lamp {
+impl Light {
+    /// Returns the light source with its light multiplied by `factor`.
+    pub fn dimmed(self, factor: f32) -> Light {
         match self {
-            Lamp::Sun { towards, spread, colour } => Lamp::Sun { towards, spread, colour: factor * colour },
-            Lamp::Ball { at, radius, colour } => Lamp::Ball { at, radius, colour: factor * colour },
-            Lamp::Panel { at, right, up, facing, colour } => {
-                Lamp::Panel { at, right, up, facing, colour: factor * colour }
+            Light::Sun { towards, spread, colour } => Light::Sun { towards, spread, colour: factor * colour },
+            Light::Ball { at, radius, colour } => Light::Ball { at, radius, colour: factor * colour },
+            Light::Panel { at, right, up, facing, colour } => {
+                Light::Panel { at, right, up, facing, colour: factor * colour }
             }
         }
     }
 
-    /// Returns the light that reaches `point` from the position on the lamp given by `at` in [0, 1)².
+    /// Returns the light that reaches `point` from the position on the light source given by `at` in [0, 1)².
     pub fn incident_at(&self, point: Vec3, at: Vec2) -> IncidentLight {
         match *self {
-            Lamp::Sun { towards, spread, colour } => {
+            Light::Sun { towards, spread, colour } => {
                 let (right, up) = towards.any_orthonormal_pair();
                 let offset = spread * (at - 0.5);
                 let towards = (towards + offset.x * right + offset.y * up).normalize();
                 IncidentLight { towards, distance: f32::INFINITY, colour }
             }
-            Lamp::Ball { at: centre, radius, colour } => {
+            Light::Ball { at: centre, radius, colour } => {
                 let (right, up) = (centre - point).normalize_or(Vec3::Y).any_orthonormal_pair();
                 let offset = radius * (at - 0.5);
                 let way = centre + offset.x * right + offset.y * up - point;
@@ -56,7 +56,7 @@ impl Lamp {
                 let colour = colour / (distance * distance).max(0.06);
                 IncidentLight { towards: way / distance, distance: (distance - 1.1 * radius).max(0.), colour }
             }
-            Lamp::Panel { at: centre, right, up, facing, colour } => {
+            Light::Panel { at: centre, right, up, facing, colour } => {
                 let offset = 2. * at - 1.;
                 let way = centre + offset.x * right + offset.y * up - point;
                 let distance = way.length().max(1e-3);
@@ -81,7 +81,7 @@ pub(super) struct Sky {
 
 impl Sky {
     /// Returns the radiance from the unit direction `towards`.
-    pub fn seen(&self, towards: Vec3) -> Vec3 {
+    pub fn radiance(&self, towards: Vec3) -> Vec3 {
         let up = towards.y;
         if up < 0. {
             return self.horizon.lerp(self.ground, (-8. * up).min(1.));
@@ -98,7 +98,7 @@ impl Sky {
     }
 
     /// Returns the mean radiance over the hemisphere around `normal`, without the shapes of the clouds.
-    pub fn around(&self, normal: Vec3) -> Vec3 {
+    pub fn mean_radiance(&self, normal: Vec3) -> Vec3 {
         let above = self.zenith.lerp(self.horizon, 0.5 + 0.3 * self.clouds);
         self.ground.lerp(above, 0.5 + 0.5 * normal.y)
     }

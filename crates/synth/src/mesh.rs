@@ -70,7 +70,7 @@ impl Mesh {
 
     /// Returns one point per vertex: the vertex, moved a fifth of the way to the mean of its triangles' centres. Unlike the vertices
     /// themselves, these points don't lie on an edge where another surface begins.
-    pub fn insides(&self) -> Vec<Vec3> {
+    pub fn inset_vertices(&self) -> Vec<Vec3> {
         let mut sums = vec![(Vec3::ZERO, 0.); self.positions.len()];
         for corners in &self.triangles {
             let centre = corners.map(|vertex| self.positions[vertex as usize]).iter().sum::<Vec3>() / 3.;

@@ -14,7 +14,7 @@ impl Noise {
     }
 
     /// Returns the noise at `place`, in [-1, 1].
-    pub fn at(&self, place: Vec3) -> f32 {
+    pub fn sample(&self, place: Vec3) -> f32 {
         let floor = place.floor();
         let fraction = place - floor;
         let weight = fraction * fraction * (3. - 2. * fraction);
@@ -32,7 +32,7 @@ impl Noise {
     pub fn fractal(&self, place: Vec3, octaves: u32) -> f32 {
         let terms = (0..octaves).map(|octave| {
             let scale = (1 << octave) as f32;
-            (self.at(place * scale + 17.1 * octave as f32) / scale, 1. / scale)
+            (self.sample(place * scale + 17.1 * octave as f32) / scale, 1. / scale)
         });
         let (sum, total) = terms.fold((0., 0.), |(sum, total), (term, weight)| (sum + term, total + weight));
         sum / total

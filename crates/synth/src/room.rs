@@ -1,9 +1,9 @@
 //! Rooms: floor, ceiling, walls with openings, and furnishings.
 
-use super::light::{Lamp, Sky};
+use super::light::{Light, Sky};
 use super::material::Material;
 use super::mesh::Mesh;
-use super::open::outside;
+use super::outdoors::outside;
 use super::scene_builder::{SceneBuilder, standing};
 use super::shapes::{cone, cuboid, superellipsoid};
 use super::texture::Purpose;
@@ -46,7 +46,7 @@ impl Wall {
 
 /// Builds a furnished room. Returns the space where cameras may be.
 pub(super) fn room(builder: &mut SceneBuilder, sky: &mut Sky) -> CameraSpace {
-    let size = vec3(builder.scaled(2.6, 9.), builder.within(2.3..3.6), builder.scaled(2.6, 9.));
+    let size = vec3(builder.log_uniform(2.6, 9.), builder.within(2.3..3.6), builder.log_uniform(2.6, 9.));
     let (wall, floor, ceiling) = (
         builder.material(Purpose::Wall),
         builder.material(Purpose::Floor),
@@ -59,11 +59,11 @@ pub(super) fn room(builder: &mut SceneBuilder, sky: &mut Sky) -> CameraSpace {
         let side = corners[(i + 1) % 4] - corners[i];
         let length = side.length();
         let mut wall = Wall { corner: corners[i], along: side / length, length, openings: vec![] };
-        open_up(builder, &mut wall, size.y);
+        add_openings(builder, &mut wall, size.y);
         walls.push(wall);
     }
     for (i, one) in walls.iter().enumerate() {
-        build(builder, one, size.y, if i == 0 { &accent } else { &wall });
+        build_wall(builder, one, size.y, if i == 0 { &accent } else { &wall });
     }
     let (x, z) = (Vec3::X * size.x, Vec3::Z * size.z);
     builder.add_mesh(Mesh::rectangle(z, x, -z, CELL), &floor, Affine3A::IDENTITY);
@@ -80,16 +80,16 @@ pub(super) fn room(builder: &mut SceneBuilder, sky: &mut Sky) -> CameraSpace {
     light(builder, size, sky, has_openings);
     let behind = 0.25;
     CameraSpace {
-        least: vec3(behind, 0.5, behind),
-        most: size - behind,
-        eye: (1., 1.75),
-        roomy: 0.3,
+        min: vec3(behind, 0.5, behind),
+        max: size - behind,
+        eye_heights: (1., 1.75),
+        clearance: 0.3,
         walls: Some(behind),
     }
 }
 
 /// Adds windows and doors to the wall.
-fn open_up(builder: &mut SceneBuilder, wall: &mut Wall, height: f32) {
+fn add_openings(builder: &mut SceneBuilder, wall: &mut Wall, height: f32) {
     for _ in 0..builder.one_of(&[0, 0, 1, 1, 2, 3]) {
         let is_door = builder.chance(0.3);
         let wide = if is_door { builder.within(0.8..1.8) } else { builder.within(0.6..2.2) };
@@ -110,7 +110,7 @@ fn open_up(builder: &mut SceneBuilder, wall: &mut Wall, height: f32) {
 }
 
 /// Builds the wall around its openings, their reveals and frames, and a skirting board.
-fn build(builder: &mut SceneBuilder, wall: &Wall, height: f32, material: &Material) {
+fn build_wall(builder: &mut SceneBuilder, wall: &Wall, height: f32, material: &Material) {
     let transform = wall.transform();
     let panel = |builder: &mut SceneBuilder, from: Vec2, to: Vec2| {
         let size = to - from;
@@ -247,7 +247,7 @@ fn furnish(builder: &mut SceneBuilder, size: Vec3, walls: &[Wall]) {
             let blocks_door =
                 wall.openings.iter().any(|o| o.is_door && reached > o.from.x - 0.8 && reached < o.to.x + 0.8);
             if !blocks_door && builder.chance(0.7) {
-                let turn = if builder.chance(0.85) { 0. } else { builder.turn() };
+                let turn = if builder.chance(0.85) { 0. } else { builder.angle() };
                 things::furniture(builder, transform * standing(spot, turn));
             }
             reached += builder.within(0.9..2.4);
@@ -269,7 +269,8 @@ fn furnish(builder: &mut SceneBuilder, size: Vec3, walls: &[Wall]) {
     let area = size.x * size.z;
     for _ in 0..builder.within(0..=(0.12 * area) as usize + 1) {
         let spot = vec3(builder.within(0.25..0.75) * size.x, 0., builder.within(0.25..0.75) * size.z);
-        let turn = if builder.chance(0.5) { FRAC_PI_2 * builder.within(0..4) as f32 } else { builder.turn() };
+        let turn =
+            if builder.chance(0.5) { FRAC_PI_2 * builder.within(0..4) as f32 } else { builder.angle() };
         things::furniture(builder, standing(spot, turn));
     }
     let floor = Affine3A::from_translation(vec3(0.5 * size.x, 0., 0.5 * size.z));
@@ -289,7 +290,7 @@ fn light(builder: &mut SceneBuilder, size: Vec3, sky: &mut Sky, has_openings: bo
             let half = vec2(builder.within(0.1..0.6), builder.within(0.1..0.4));
             let (right, up) = (half.x * Vec3::X, half.y * Vec3::Z);
             let colour = strength * tone;
-            builder.parts.lamps.push(Lamp::Panel {
+            builder.contents.lights.push(Light::Panel {
                 at: at - 0.05 * Vec3::Y,
                 right,
                 up,
@@ -313,13 +314,13 @@ fn light(builder: &mut SceneBuilder, size: Vec3, sky: &mut Sky, has_openings: bo
                 &cord,
                 Affine3A::from_translation(at + radius * Vec3::Y),
             );
-            builder.parts.lamps.push(Lamp::Ball { at, radius, colour: 0.8 * strength * tone });
+            builder.contents.lights.push(Light::Ball { at, radius, colour: 0.8 * strength * tone });
         }
     }
     if has_openings && builder.chance(0.7) {
-        let (turn, height) = (builder.turn(), builder.within(0.2..1.));
+        let (turn, height) = (builder.angle(), builder.within(0.2..1.));
         let towards = vec3(turn.cos(), height, turn.sin()).normalize();
-        builder.parts.lamps.push(Lamp::Sun { towards, spread: 0.02, colour: 8. * vec3(1., 0.93, 0.82) });
+        builder.contents.lights.push(Light::Sun { towards, spread: 0.02, colour: 8. * vec3(1., 0.93, 0.82) });
     }
     if has_openings {
         // The outdoors is brighter than rooms in daytime.
@@ -336,7 +337,7 @@ fn light(builder: &mut SceneBuilder, size: Vec3, sky: &mut Sky, has_openings: bo
 /// Builds a closed box full of plain shapes in mid-air and on the floor, with random textures. It contains no recognizable objects,
 /// and everything in it may be visible.
 pub(super) fn box_of_shapes(builder: &mut SceneBuilder, sky: &mut Sky) -> CameraSpace {
-    let size = vec3(builder.scaled(3., 10.), builder.within(2.4..5.), builder.scaled(3., 10.));
+    let size = vec3(builder.log_uniform(3., 10.), builder.within(2.4..5.), builder.log_uniform(3., 10.));
     let purposes = [Purpose::Wall, Purpose::Floor, Purpose::Thing, Purpose::Ground];
     let (x, y, z) = (Vec3::X * size.x, Vec3::Y * size.y, Vec3::Z * size.z);
     for (corner, along, up) in
@@ -347,18 +348,25 @@ pub(super) fn box_of_shapes(builder: &mut SceneBuilder, sky: &mut Sky) -> Camera
         builder.add_mesh(Mesh::rectangle(corner, along, up, CELL), &material, Affine3A::IDENTITY);
     }
     for _ in 0..builder.within(12..45) {
-        let part = vec3(builder.scaled(0.15, 2.), builder.scaled(0.15, 2.), builder.scaled(0.15, 2.));
+        let part =
+            vec3(builder.log_uniform(0.15, 2.), builder.log_uniform(0.15, 2.), builder.log_uniform(0.15, 2.));
         let mesh = things::plain(builder, part);
         let material = builder.material(Purpose::Thing);
         let mut spot = size * vec3(builder.within(0. ..1.), builder.within(0. ..1.), builder.within(0. ..1.));
-        let mut turn = Quat::from_axis_angle(builder.direction(), builder.turn());
+        let mut turn = Quat::from_axis_angle(builder.direction(), builder.angle());
         if builder.chance(0.6) {
-            (spot.y, turn) = (0., Quat::from_rotation_y(builder.turn()));
+            (spot.y, turn) = (0., Quat::from_rotation_y(builder.angle()));
         }
         builder.add_mesh(mesh, &material, Affine3A::from_rotation_translation(turn, spot));
     }
     light(builder, size, sky, false);
     let behind = 0.3;
-    let eye = (0.6, size.y - 0.4);
-    CameraSpace { least: Vec3::splat(behind), most: size - behind, eye, roomy: 0.3, walls: Some(behind) }
+    let eye_heights = (0.6, size.y - 0.4);
+    CameraSpace {
+        min: Vec3::splat(behind),
+        max: size - behind,
+        eye_heights,
+        clearance: 0.3,
+        walls: Some(behind),
+    }
 }

@@ -4,7 +4,7 @@ use super::material::Material;
 use super::mesh::Mesh;
 use super::noise::Noise;
 use super::texture::{Purpose, Texture};
-use super::tracer::Parts;
+use super::tracer::SceneContents;
 use glam::{Affine2, Affine3A, Quat, Vec2, Vec3};
 use rand::Rng;
 use rand::distr::uniform::{SampleRange, SampleUniform};
@@ -18,7 +18,7 @@ const SHARED: usize = 6;
 /// Builder that adds objects to a scene.
 pub(super) struct SceneBuilder {
     pub random: ChaCha8Rng,
-    pub parts: Parts,
+    pub contents: SceneContents,
     /// Images that the user wants to appear on surfaces.
     pub pictures: Vec<Arc<Texture>>,
     textures: Vec<(Purpose, Arc<Texture>)>,
@@ -26,7 +26,7 @@ pub(super) struct SceneBuilder {
 
 impl SceneBuilder {
     pub fn new(random: ChaCha8Rng, pictures: Vec<Arc<Texture>>) -> Self {
-        SceneBuilder { random, parts: Parts::default(), pictures, textures: vec![] }
+        SceneBuilder { random, contents: SceneContents::default(), pictures, textures: vec![] }
     }
 
     pub fn within<T: SampleUniform>(&mut self, range: impl SampleRange<T>) -> T {
@@ -34,7 +34,7 @@ impl SceneBuilder {
     }
 
     /// Returns a random value between `least` and `most` on a logarithmic scale: each doubling is equally likely.
-    pub fn scaled(&mut self, least: f32, most: f32) -> f32 {
+    pub fn log_uniform(&mut self, least: f32, most: f32) -> f32 {
         least * (most / least).powf(self.within(0. ..1.))
     }
 
@@ -46,13 +46,13 @@ impl SceneBuilder {
         choices[self.within(0..choices.len())]
     }
 
-    pub fn turn(&mut self) -> f32 {
+    pub fn angle(&mut self) -> f32 {
         self.within(0. ..TAU)
     }
 
     /// Returns a unit vector in a uniformly random direction.
     pub fn direction(&mut self) -> Vec3 {
-        let (y, angle) = (self.within(-1f32..1.), self.turn());
+        let (y, angle) = (self.within(-1f32..1.), self.angle());
         let ring = (1. - y * y).sqrt();
         Vec3::new(ring * angle.cos(), y, ring * angle.sin())
     }
@@ -83,8 +83,8 @@ impl SceneBuilder {
         let texture = self.texture(purpose);
         let mut material = Material::matte(texture);
         let (scale, angle) = match purpose {
-            Purpose::Thing => (self.scaled(0.6, 3.), self.turn()),
-            _ => (self.scaled(0.7, 1.5), 0.),
+            Purpose::Thing => (self.log_uniform(0.6, 3.), self.angle()),
+            _ => (self.log_uniform(0.7, 1.5), 0.),
         };
         let offset = Vec2::new(self.within(0. ..1.), self.within(0. ..1.));
         let larger = Affine2::from_scale(Vec2::splat(scale / material.texture.repeat_metres));
@@ -98,10 +98,10 @@ impl SceneBuilder {
             _ => 0.05,
         };
         if self.chance(glossy) {
-            material.gloss = self.scaled(0.02, 0.3);
-            material.polish = self.scaled(8., 300.);
+            material.gloss = self.log_uniform(0.02, 0.3);
+            material.polish = self.log_uniform(8., 300.);
             if self.chance(0.3) {
-                material.mirror = self.scaled(0.02, 0.12);
+                material.mirror = self.log_uniform(0.02, 0.12);
             }
         }
         material
@@ -119,7 +119,7 @@ impl SceneBuilder {
     }
 
     pub fn add_mesh(&mut self, mesh: Mesh, material: &Material, transform: Affine3A) {
-        self.parts.meshes.push((mesh.moved(transform), material.clone()));
+        self.contents.meshes.push((mesh.moved(transform), material.clone()));
     }
 }
 

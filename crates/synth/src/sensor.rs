@@ -28,7 +28,7 @@ impl Sensor {
     /// Draws a random sensor, exposed for images with the mean radiance `mean`.
     pub fn draw(builder: &mut SceneBuilder, mean: Vec3) -> Sensor {
         let brightness = mean.element_sum() / 3.;
-        let target = 0.2 * builder.scaled(0.6, 2.);
+        let target = 0.2 * builder.log_uniform(0.6, 2.);
         // Automatic white balance removes most of the light's colour.
         let neutral = brightness / mean.max(Vec3::splat(0.2 * brightness)).max(Vec3::splat(1e-6));
         let white = Vec3::ONE.lerp(neutral, builder.within(0.2..0.8));
@@ -49,7 +49,7 @@ impl Sensor {
 
     /// Returns the exposure factor of an image at `time`, which goes from 0 to 1 over the video.
     pub fn exposure(&self, time: f32) -> f32 {
-        (self.exposure_range * self.exposure_noise.at(vec3(4. * time, 0.5, 0.5))).exp2()
+        (self.exposure_range * self.exposure_noise.sample(vec3(4. * time, 0.5, 0.5))).exp2()
     }
 
     /// Converts radiance to sRGB bytes. `place` in [-1, 1]² is the position in the image. `exposure` is the image's exposure factor.
@@ -59,7 +59,7 @@ impl Sensor {
         let light = radiance * self.gain * exposure * falloff;
         let grey = light.dot(vec3(0.2126, 0.7152, 0.0722));
         let light = (grey + self.saturation * (light - grey)).max(Vec3::ZERO);
-        let mut random = Hash::new(self.seed, frame, pixel);
+        let mut random = PixelRng::new(self.seed, frame, pixel);
         light.to_array().map(|x| {
             let toned = self.tone(x);
             let deviation = self.noise.0 + self.noise.1 * toned * (1. - toned);
@@ -86,17 +86,17 @@ fn encode(x: f32) -> f32 {
 
 /// Random number generator that is seeded for each pixel, so that results don't depend on the order in which threads render pixels.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Hash {
+pub(super) struct PixelRng {
     state: u32,
 }
 
-impl Hash {
+impl PixelRng {
     pub fn new(seed: u32, frame: u32, pixel: u32) -> Self {
-        let mut hash = Hash { state: seed ^ frame.wrapping_mul(0x9e37_79b9) };
-        hash.next();
-        hash.state ^= pixel.wrapping_mul(0x85eb_ca6b);
-        hash.next();
-        hash
+        let mut rng = PixelRng { state: seed ^ frame.wrapping_mul(0x9e37_79b9) };
+        rng.next();
+        rng.state ^= pixel.wrapping_mul(0x85eb_ca6b);
+        rng.next();
+        rng
     }
 
     /// Returns the next 32 bits of O'Neill's (2014) permuted congruential generator.

@@ -119,7 +119,7 @@ pub(super) fn curtain(width: f32, height: f32, folds: f32, depth: f32) -> Mesh {
 pub(super) fn roughen(mesh: Mesh, noise: &Noise, frequency: f32, strength: f32) -> Mesh {
     mesh.warped(|p| {
         let q = p * frequency;
-        let offset = Vec3::new(noise.at(q), noise.at(q + 31.7), noise.at(q - 57.3));
+        let offset = Vec3::new(noise.sample(q), noise.sample(q + 31.7), noise.sample(q - 57.3));
         p + strength * offset
     })
 }
@@ -159,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn shapes_are_closed_and_their_outside_is_out() {
+    fn shapes_are_closed_and_face_outwards() {
         let ring = |t: f32| vec3((TAU * t).cos(), 0., -(TAU * t).sin());
         for (name, mesh, expected) in [
             ("box", cuboid(vec3(2., 3., 4.), 0.), 24.),

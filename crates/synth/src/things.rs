@@ -91,8 +91,8 @@ pub(super) fn heap(builder: &mut SceneBuilder, size: Vec3, transform: Affine3A, 
             vec3(builder.within(-0.4..0.4), builder.within(0. ..0.6f32).powi(2), builder.within(-0.4..0.4))
                 * size;
         let turn = match builder.chance(0.5) {
-            true => Quat::from_rotation_y(builder.turn()),
-            false => Quat::from_axis_angle(builder.direction(), builder.turn()),
+            true => Quat::from_rotation_y(builder.angle()),
+            false => Quat::from_axis_angle(builder.direction(), builder.angle()),
         };
         builder.add_mesh(mesh, &material, transform * Affine3A::from_rotation_translation(turn, spot));
     }
@@ -126,14 +126,17 @@ pub(super) fn table(builder: &mut SceneBuilder, transform: Affine3A) {
 pub(super) fn clutter(builder: &mut SceneBuilder, size: Vec2, transform: Affine3A, most: usize) {
     for _ in 0..builder.within(0..=most) {
         let spot = at(builder.within(-0.5..0.5) * size.x, 0., builder.within(-0.5..0.5) * size.y)
-            * turned(builder.turn());
+            * turned(builder.angle());
         match builder.within(0..5) {
             0 => books(builder, transform * spot, 0.3),
             1 => vessel(builder, transform * spot),
             2 => lamp(builder, transform * spot, 0.4),
             _ => {
-                let size =
-                    vec3(builder.scaled(0.05, 0.35), builder.scaled(0.04, 0.35), builder.scaled(0.05, 0.35));
+                let size = vec3(
+                    builder.log_uniform(0.05, 0.35),
+                    builder.log_uniform(0.04, 0.35),
+                    builder.log_uniform(0.05, 0.35),
+                );
                 let (mesh, material) = (plain(builder, size), builder.material(Purpose::Thing));
                 builder.add_mesh(mesh, &material, transform * spot);
             }
@@ -347,7 +350,7 @@ pub(super) fn leaves(builder: &mut SceneBuilder, transform: Affine3A, reach: f32
             vec3((u - 0.5) * wide, rise * length, 0.6 * length * v * v + 0.1 * wide * (2. * u - 1.).abs())
         });
         let tilt = Affine3A::from_rotation_x(builder.within(0. ..1.));
-        all.join(leaf.moved(turned(builder.turn()) * tilt));
+        all.join(leaf.moved(turned(builder.angle()) * tilt));
     }
     builder.add_mesh(all, &material, transform);
 }
@@ -368,7 +371,7 @@ pub(super) fn plant(builder: &mut SceneBuilder, transform: Affine3A) {
 
 /// Adds a framed picture on a wall, with its back at z = 0 and its centre at the origin.
 pub(super) fn picture(builder: &mut SceneBuilder, transform: Affine3A) {
-    let size = vec2(builder.scaled(0.2, 1.4), builder.scaled(0.2, 1.2));
+    let size = vec2(builder.log_uniform(0.2, 1.4), builder.log_uniform(0.2, 1.2));
     let poster = builder.picture(size);
     let frame = builder.material(Purpose::Thing);
     let edge = builder.within(0.01..0.08);
@@ -542,7 +545,8 @@ pub(super) fn fence(builder: &mut SceneBuilder, transform: Affine3A, length: f32
 
 /// Adds a single object, on the ground at `spot` or on a block there, to be viewed from all sides.
 pub(super) fn exhibit(builder: &mut SceneBuilder, spot: Vec3) -> Exhibit {
-    let size = vec3(builder.scaled(0.3, 1.5), builder.scaled(0.3, 1.5), builder.scaled(0.3, 1.5));
+    let size =
+        vec3(builder.log_uniform(0.3, 1.5), builder.log_uniform(0.3, 1.5), builder.log_uniform(0.3, 1.5));
     let below = if builder.chance(0.3) { 0. } else { builder.within(0.2..1.1) };
     if below > 0. {
         // The block reaches below the ground, which may be uneven.
@@ -551,16 +555,17 @@ pub(super) fn exhibit(builder: &mut SceneBuilder, spot: Vec3) -> Exhibit {
         let block = cuboid(vec3(broad * size.x, below + foot, broad * size.z), builder.within(0. ..0.05));
         builder.add_mesh(block, &material, Affine3A::from_translation(spot - foot * Vec3::Y));
     }
-    let transform = standing(spot + below * Vec3::Y, builder.turn());
+    let transform = standing(spot + below * Vec3::Y, builder.angle());
     exhibit_object(builder, size, transform);
     Exhibit { middle: spot + (below + 0.4 * size.y) * Vec3::Y, radius: 0.5 * size.length(), front: None }
 }
 
 /// Adds an object on a wall at `spot`, to be viewed from the direction `front`.
 pub(super) fn hung(builder: &mut SceneBuilder, spot: Vec3, front: Vec3) -> Exhibit {
-    let size = vec3(builder.scaled(0.3, 1.2), builder.scaled(0.2, 1.), builder.scaled(0.3, 1.2));
+    let size =
+        vec3(builder.log_uniform(0.3, 1.2), builder.log_uniform(0.2, 1.), builder.log_uniform(0.3, 1.2));
     // The object's up axis points away from the wall.
-    let off_the_wall = Quat::from_rotation_arc(Vec3::Y, front) * Quat::from_rotation_y(builder.turn());
+    let off_the_wall = Quat::from_rotation_arc(Vec3::Y, front) * Quat::from_rotation_y(builder.angle());
     exhibit_object(builder, size, Affine3A::from_rotation_translation(off_the_wall, spot));
     Exhibit { middle: spot + 0.4 * size.y * front, radius: 0.5 * size.length(), front: Some(front) }
 }
@@ -598,7 +603,11 @@ pub(super) fn furniture(builder: &mut SceneBuilder, transform: Affine3A) {
         }
         9 => plant(builder, transform),
         10 => {
-            let size = vec3(builder.scaled(0.3, 1.5), builder.scaled(0.3, 1.5), builder.scaled(0.3, 1.5));
+            let size = vec3(
+                builder.log_uniform(0.3, 1.5),
+                builder.log_uniform(0.3, 1.5),
+                builder.log_uniform(0.3, 1.5),
+            );
             let (mesh, material) = (plain(builder, size), builder.material(Purpose::Thing));
             builder.add_mesh(mesh, &material, transform);
         }

@@ -2,11 +2,11 @@
 
 use super::light::Sky;
 use super::scene_builder::SceneBuilder;
-use super::sensor::{Hash, Sensor};
+use super::sensor::{PixelRng, Sensor};
 use super::texture::Texture;
 use super::tracer::{SampleChoice, Tracer};
 use super::walk::{CameraSpace, Exhibit, walk};
-use super::{open, room, things};
+use super::{outdoors, room, things};
 use glam::{DMat3, DMat4, DVec2, DVec3, Vec2, Vec3, vec2, vec3};
 use globalsplat_capture::{Camera, ImageSize, Intrinsics, Lens};
 use image::RgbImage;
@@ -44,7 +44,7 @@ pub struct Video {
 }
 
 impl Video {
-    /// Number of camera rays per pixel. Each of them samples a lamp by one shadow ray.
+    /// Number of camera rays per pixel. Each of them samples a light source by one shadow ray.
     pub const RAYS_PER_PIXEL: u32 = RAYS * RAYS;
 
     /// Creates video number `index` of `seed`. The result doesn't depend on the number of threads.
@@ -62,7 +62,7 @@ impl Video {
     fn attempt(random: ChaCha8Rng, settings: &VideoSettings) -> Option<Video> {
         let mut builder = SceneBuilder::new(random, settings.pictures.clone());
         let (place, exhibit, sky) = world(&mut builder);
-        let tracer = Tracer::new(std::mem::take(&mut builder.parts), sky);
+        let tracer = Tracer::new(std::mem::take(&mut builder.contents), sky);
         let poses = walk(&mut builder, &tracer, place, exhibit, settings.frames)?;
         let cameras = cameras(&mut builder, poses, settings.size);
         let seen = mean_light(&tracer, &cameras);
@@ -115,14 +115,14 @@ impl Video {
         let eye = self.cameras[index].c2w.w_axis.truncate().as_vec3();
         RgbImage::from_fn(size.width, size.height, |x, y| {
             let pixel = y * size.width + x;
-            let mut random = Hash::new(self.seed, index as u32, pixel);
+            let mut random = PixelRng::new(self.seed, index as u32, pixel);
             let mut light = Vec3::ZERO;
             for sample in 0..Self::RAYS_PER_PIXEL {
                 let cell = vec2((sample % RAYS) as f32, (sample / RAYS) as f32);
                 let jitter = vec2(random.uniform(), random.uniform());
                 let at = vec2(x as f32, y as f32) + (cell + jitter) / RAYS as f32;
-                let on_lamp = vec2(random.uniform(), random.uniform());
-                let choice = SampleChoice { turn: sample as usize, on_lamp };
+                let on_light = vec2(random.uniform(), random.uniform());
+                let choice = SampleChoice { turn: sample as usize, on_light };
                 let Some(ray) = towards(at) else { continue };
                 let radiance = self.tracer.trace(eye, ray, spread, choice);
                 // Clamp the radiance, so that a ray that hits a lamp doesn't dominate its pixel.
@@ -158,25 +158,25 @@ impl fmt::Debug for Video {
 
 /// Builds a random scene, mostly rooms: people often photograph them, and they are the hardest to reconstruct.
 fn world(builder: &mut SceneBuilder) -> (CameraSpace, Option<Exhibit>, Sky) {
-    let mut sky = open::sky(builder);
+    let mut sky = outdoors::sky(builder);
     let place = match builder.within(0..100) {
         0..55 => room::room(builder, &mut sky),
         55..75 => room::box_of_shapes(builder, &mut sky),
-        _ => open::landscape(builder, &sky),
+        _ => outdoors::landscape(builder, &sky),
     };
     let exhibit = builder.chance(EXHIBITS).then(|| match place.walls {
         Some(behind) if builder.chance(HUNG) => {
             let (spot, front) = on_a_wall(builder, place, behind);
             things::hung(builder, spot, front)
         }
-        _ => things::exhibit(builder, (0.5 * (place.least + place.most)).with_y(0.)),
+        _ => things::exhibit(builder, (0.5 * (place.min + place.max)).with_y(0.)),
     });
     (place, exhibit, sky)
 }
 
 /// Returns a position on a wall, and the direction away from the wall.
 fn on_a_wall(builder: &mut SceneBuilder, place: CameraSpace, behind: f32) -> (Vec3, Vec3) {
-    let (least, most) = (place.least - behind, place.most + behind);
+    let (least, most) = (place.min - behind, place.max + behind);
     let share = vec3(builder.within(0.2..0.8), builder.within(0.3..0.75), builder.within(0.2..0.8));
     let spot = least + share * (most - least);
     match builder.within(0..4) {
@@ -189,7 +189,7 @@ fn on_a_wall(builder: &mut SceneBuilder, place: CameraSpace, behind: f32) -> (Ve
 
 fn cameras(builder: &mut SceneBuilder, poses: Vec<DMat4>, size: ImageSize) -> Vec<Camera> {
     let (width, height) = (f64::from(size.width), f64::from(size.height));
-    let focal = f64::from(builder.scaled(0.55, 1.6)) * width.min(height);
+    let focal = f64::from(builder.log_uniform(0.55, 1.6)) * width.min(height);
     let intrinsics = Intrinsics { fx: focal, fy: focal, cx: width / 2., cy: height / 2. };
     let camera = |c2w| Camera { intrinsics, c2w, width: size.width, height: size.height };
     poses.into_iter().map(camera).collect()
@@ -216,7 +216,7 @@ fn mean_light(tracer: &Tracer, cameras: &[Camera]) -> Vec3 {
         for i in 0..SIDE * SIDE {
             let cell = vec2((i % SIDE) as f32 + 0.5, (i / SIDE) as f32 + 0.5) / SIDE as f32;
             let at = cell * vec2(camera.width as f32, camera.height as f32);
-            let choice = SampleChoice { turn: i, on_lamp: Vec2::splat(0.5) };
+            let choice = SampleChoice { turn: i, on_light: Vec2::splat(0.5) };
             let radiance = tracer.trace(eye, towards(camera, at), 0.05, choice);
             sum += radiance.max(Vec3::splat(0.01)).map(f32::ln);
         }

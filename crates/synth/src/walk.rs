@@ -15,13 +15,13 @@ const WIDE: f32 = 1.8;
 /// Space where cameras may be.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct CameraSpace {
-    /// Minimum corner of the bounding box; `most` is the maximum corner.
-    pub least: Vec3,
-    pub most: Vec3,
+    /// Minimum corner of the bounding box; `max` is the maximum corner.
+    pub min: Vec3,
+    pub max: Vec3,
     /// Range of usual heights of a camera above the ground, in metres.
-    pub eye: (f32, f32),
+    pub eye_heights: (f32, f32),
     /// Free space that a camera needs around it, in metres.
-    pub roomy: f32,
+    pub clearance: f32,
     /// Distance of the walls behind the box's sides in metres, if there are walls.
     pub walls: Option<f32>,
 }
@@ -59,7 +59,7 @@ struct Path {
 
 impl Path {
     /// Creates a path that stays at the origin, with the shake of a hand-held camera.
-    fn by_hand(builder: &mut SceneBuilder) -> Self {
+    fn hand_held(builder: &mut SceneBuilder) -> Self {
         Path {
             start: Vec3::ZERO,
             target: Vec3::ZERO,
@@ -67,7 +67,7 @@ impl Path {
             motion: Vec3::ZERO,
             orbit: 0.,
             swing: (Vec3::ZERO, 0.),
-            shake: (builder.scaled(0.002, 0.04), builder.within(2. ..8.)),
+            shake: (builder.log_uniform(0.002, 0.04), builder.within(2. ..8.)),
             roll: (builder.within(-0.04..0.04), builder.within(-0.04..0.04)),
             wide: WIDE,
             noise: builder.noise(),
@@ -103,8 +103,8 @@ pub(super) fn walk(
         // Paths get shorter with every attempt.
         let patience = 1. - attempt as f32 / TRIES as f32;
         let path = match exhibit {
-            Some(exhibit) if builder.chance(0.85) => Some(around(builder, exhibit, place, patience)),
-            _ => through(builder, tracer, place, patience),
+            Some(exhibit) if builder.chance(0.85) => Some(orbit_path(builder, exhibit, place, patience)),
+            _ => walk_path(builder, tracer, place, patience),
         };
         if path.is_some_and(|path| is_free(&path, tracer, place, patience)) {
             let last = frames.max(2) - 1;
@@ -115,10 +115,10 @@ pub(super) fn walk(
 }
 
 /// Creates a hand-held path around an object, from a short distance.
-fn around(builder: &mut SceneBuilder, exhibit: Exhibit, place: CameraSpace, patience: f32) -> Path {
+fn orbit_path(builder: &mut SceneBuilder, exhibit: Exhibit, place: CameraSpace, patience: f32) -> Path {
     let Exhibit { middle, radius, front } = exhibit;
-    let away = 1.2 * radius + builder.scaled(0.3, 2.);
-    let height = (middle.y + builder.within(-0.4..0.9) * away).max(place.least.y + 0.2);
+    let away = 1.2 * radius + builder.log_uniform(0.3, 2.);
+    let height = (middle.y + builder.within(-0.4..0.9) * away).max(place.min.y + 0.2);
     let side = builder.one_of(&[-1., 1.]);
     let (from, orbit) = match front {
         // Move from one side in front of the wall to the other.
@@ -126,7 +126,7 @@ fn around(builder: &mut SceneBuilder, exhibit: Exhibit, place: CameraSpace, pati
             let from = builder.within(0.2..1.2);
             (side * from, -side * (from + builder.within(0.2..1.2)))
         }
-        None => (builder.turn(), side * builder.scaled(0.8, 6.)),
+        None => (builder.angle(), side * builder.log_uniform(0.8, 6.)),
     };
     let wander = |builder: &mut SceneBuilder| builder.within(-0.3..0.3) * patience * away;
     Path {
@@ -136,17 +136,17 @@ fn around(builder: &mut SceneBuilder, exhibit: Exhibit, place: CameraSpace, pati
         motion: vec3(wander(builder), wander(builder), wander(builder)),
         orbit: patience * orbit,
         // Some paths also view the object from below and from above.
-        swing: (Vec3::Y * away * patience * builder.scaled(0.02, 0.7), builder.within(2. ..9.)),
+        swing: (Vec3::Y * away * patience * builder.log_uniform(0.02, 0.7), builder.within(2. ..9.)),
         wide: away,
-        ..Path::by_hand(builder)
+        ..Path::hand_held(builder)
     }
 }
 
 /// Creates a path past the objects of the scene.
-fn through(builder: &mut SceneBuilder, tracer: &Tracer, place: CameraSpace, patience: f32) -> Option<Path> {
-    // Choose the standpoint with the widest view among several, as photographers do.
+fn walk_path(builder: &mut SceneBuilder, tracer: &Tracer, place: CameraSpace, patience: f32) -> Option<Path> {
+    // Choose the viewpoint with the widest view among several, as photographers do.
     let views: Vec<(Vec3, Vec3)> =
-        (0..builder.within(1..6)).map(|_| standpoint(builder, tracer, place)).collect();
+        (0..builder.within(1..6)).map(|_| random_viewpoint(builder, tracer, place)).collect();
     let width = |&(start, towards): &(Vec3, Vec3)| {
         let (right, up) =
             (towards.cross(Vec3::Y).normalize(), towards.cross(Vec3::Y).cross(towards).normalize());
@@ -163,7 +163,7 @@ fn through(builder: &mut SceneBuilder, tracer: &Tracer, place: CameraSpace, pati
         return None;
     }
     let (right, up) = (towards.cross(Vec3::Y).normalize(), Vec3::Y);
-    let length = patience * depth.min(8.) * builder.scaled(0.25, 1.6);
+    let length = patience * depth.min(8.) * builder.log_uniform(0.25, 1.6);
     let sign = builder.one_of(&[-1., 1.]);
     let mut path = Path {
         start,
@@ -172,7 +172,7 @@ fn through(builder: &mut SceneBuilder, tracer: &Tracer, place: CameraSpace, pati
             right * length * builder.within(0. ..0.12) + up * length * builder.within(0. ..0.05),
             builder.within(2. ..9.),
         ),
-        ..Path::by_hand(builder)
+        ..Path::hand_held(builder)
     };
     match builder.within(0..10) {
         // Forwards or backwards, as in walks and real-estate videos.
@@ -206,16 +206,16 @@ fn through(builder: &mut SceneBuilder, tracer: &Tracer, place: CameraSpace, pati
 }
 
 /// Returns the position of a standing or flying camera, and its viewing direction.
-fn standpoint(builder: &mut SceneBuilder, tracer: &Tracer, place: CameraSpace) -> (Vec3, Vec3) {
-    let CameraSpace { least, most, eye, .. } = place;
-    let start = least + (most - least) * vec3(builder.within(0. ..1.), 0., builder.within(0. ..1.));
-    let below = tracer.free_distance(start.with_y(most.y), Vec3::NEG_Y, 40.);
+fn random_viewpoint(builder: &mut SceneBuilder, tracer: &Tracer, place: CameraSpace) -> (Vec3, Vec3) {
+    let CameraSpace { min, max, eye_heights: (low, high), .. } = place;
+    let start = min + (max - min) * vec3(builder.within(0. ..1.), 0., builder.within(0. ..1.));
+    let below = tracer.free_distance(start.with_y(max.y), Vec3::NEG_Y, 40.);
     let is_flight = builder.chance(0.12);
     let height =
-        if is_flight { builder.within(eye.1..most.y.max(eye.1 + 0.1)) } else { builder.within(eye.0..eye.1) };
-    let start = start.with_y(((most.y - below).max(0.) + height).min(most.y));
+        if is_flight { builder.within(high..max.y.max(high + 0.1)) } else { builder.within(low..high) };
+    let start = start.with_y(((max.y - below).max(0.) + height).min(max.y));
     // Look mostly towards the middle of the scene, horizontally or slightly down.
-    let middle = (0.5 * (least + most) - start).with_y(0.).normalize_or(Vec3::X);
+    let middle = (0.5 * (min + max) - start).with_y(0.).normalize_or(Vec3::X);
     let turn = builder.within(-1f32..1.) * builder.one_of(&[0.6, 1.2, 3.1]);
     let pitch = if is_flight { builder.within(-0.8..-0.05) } else { builder.within(-0.35..0.15) };
     (start, (turned(middle, turn) + pitch * Vec3::Y).normalize())
@@ -229,14 +229,14 @@ fn turned(v: Vec3, angle: f32) -> Vec3 {
 
 /// Returns `true` if nothing blocks the path and every image shows something.
 fn is_free(path: &Path, tracer: &Tracer, place: CameraSpace, patience: f32) -> bool {
-    let margin = place.roomy * (0.3 + 0.7 * patience);
+    let margin = place.clearance * (0.3 + 0.7 * patience);
     let mut before: Option<Vec3> = None;
     (0..=CHECKED).all(|i| {
         let (at, towards, _) = path.at(i as f32 / CHECKED as f32);
         let towards = towards.normalize();
-        let inside = at.cmpge(place.least).all() && at.cmple(place.most).all();
+        let inside = at.cmpge(place.min).all() && at.cmple(place.max).all();
         let sides = [Vec3::X, Vec3::NEG_X, Vec3::Y, Vec3::NEG_Y, Vec3::Z, Vec3::NEG_Z];
-        let is_roomy = || sides.iter().all(|&side| tracer.free_distance(at, side, margin) >= margin);
+        let has_clearance = || sides.iter().all(|&side| tracer.free_distance(at, side, margin) >= margin);
         let right = towards.cross(Vec3::Y).normalize_or(Vec3::X);
         let up = right.cross(towards);
         // Reject views directly in front of a surface, and images that show nothing but one.
@@ -254,7 +254,7 @@ fn is_free(path: &Path, tracer: &Tracer, place: CameraSpace, patience: f32) -> b
             length < 1e-6 || tracer.free_distance(from, way / length, length) >= length
         });
         before = Some(at);
-        inside && is_open && is_roomy() && sees()
+        inside && is_open && has_clearance() && sees()
     })
 }
 
@@ -275,14 +275,15 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     #[test]
-    fn things_are_seen_from_below_and_above_and_from_before_their_wall() {
+    fn orbits_show_objects_from_below_above_and_in_front() {
         let mut builder = SceneBuilder::new(ChaCha8Rng::seed_from_u64(1), vec![]);
-        let (least, most) = (Vec3::splat(-9.), Vec3::splat(9.));
-        let place = CameraSpace { least, most, eye: (1., 2.), roomy: 0.3, walls: Some(0.3) };
+        let (min, max) = (Vec3::splat(-9.), Vec3::splat(9.));
+        let place = CameraSpace { min, max, eye_heights: (1., 2.), clearance: 0.3, walls: Some(0.3) };
         let (mut up_and_down, mut before) = (0, 0);
         for i in 0..400 {
             let front = (i % 2 == 0).then_some(Vec3::X);
-            let path = around(&mut builder, Exhibit { middle: Vec3::ZERO, radius: 0.5, front }, place, 1.);
+            let path =
+                orbit_path(&mut builder, Exhibit { middle: Vec3::ZERO, radius: 0.5, front }, place, 1.);
             let seen: Vec<(Vec3, Vec3, f32)> = (0..=16).map(|i| path.at(i as f32 / 16.)).collect();
             let pitches = seen.iter().map(|(_, towards, _)| towards.normalize().y.asin());
             let (lowest, highest) = pitches.fold((f32::MAX, f32::MIN), |(a, b), y| (a.min(y), b.max(y)));

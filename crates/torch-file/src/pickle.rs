@@ -124,7 +124,7 @@ impl<'a> Machine<'a> {
         Ok(())
     }
 
-    fn remember(&mut self, id: usize) -> Result<(), String> {
+    fn memoize(&mut self, id: usize) -> Result<(), String> {
         let &top = self.stack.last().ok_or("a pickle that pops from an empty stack")?;
         match id.cmp(&self.memo.len()) {
             std::cmp::Ordering::Less => self.memo[id] = top,
@@ -136,7 +136,7 @@ impl<'a> Machine<'a> {
         Ok(())
     }
 
-    fn recall(&mut self, id: usize) -> Result<(), String> {
+    fn push_memo(&mut self, id: usize) -> Result<(), String> {
         let value =
             self.memo.get(id).ok_or_else(|| format!("a pickle that recalls memo {id}, which is missing"));
         self.stack.push(*value?);
@@ -316,12 +316,12 @@ impl<'a> Machine<'a> {
                 self.global(module, name)?;
             }
             // BINPUT, LONG_BINPUT, BINGET, LONG_BINGET
-            b'q' => self.unsigned(1).and_then(|id| self.remember(id))?,
-            b'r' => self.unsigned(4).and_then(|id| self.remember(id))?,
-            b'h' => self.unsigned(1).and_then(|id| self.recall(id))?,
-            b'j' => self.unsigned(4).and_then(|id| self.recall(id))?,
+            b'q' => self.unsigned(1).and_then(|id| self.memoize(id))?,
+            b'r' => self.unsigned(4).and_then(|id| self.memoize(id))?,
+            b'h' => self.unsigned(1).and_then(|id| self.push_memo(id))?,
+            b'j' => self.unsigned(4).and_then(|id| self.push_memo(id))?,
             // MEMOIZE
-            0x94 => self.remember(self.memo.len())?,
+            0x94 => self.memoize(self.memo.len())?,
             // TUPLE, TUPLE1, TUPLE2, TUPLE3
             b't' => {
                 let values = self.pop_to_mark()?;

@@ -106,7 +106,7 @@ fn files_that_were_cut_off_are_refused() {
 
 /// No flipped bit makes the reader panic, and none in the zip format changes a tensor unnoticed.
 #[test]
-fn damaged_files_are_no_danger() {
+fn damaged_files_do_not_panic() {
     for (name, bytes) in FILES {
         for position in 0..bytes.len() {
             let mut flipped = bytes.to_vec();

@@ -1,6 +1,6 @@
 //! On-disk cache of compiled kernels: they are compiled once per machine, not at every start.
 
-use super::compile::{Form, Nvrtc, everything};
+use super::compile::{CodeFormat, Nvrtc, compile_inputs};
 use sha2::{Digest, Sha256};
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -16,9 +16,9 @@ pub fn cache_folder() -> Option<PathBuf> {
 }
 
 /// Returns the file name for the current kernel sources, compiled for this architecture, format and driver version.
-pub fn file_name(nvrtc: &Nvrtc, driver: i32, architecture: i32, form: Form) -> String {
+pub fn file_name(nvrtc: &Nvrtc, driver: i32, architecture: i32, format: CodeFormat) -> String {
     let mut digest = Sha256::new();
-    for part in everything(architecture, form) {
+    for part in compile_inputs(architecture, format) {
         digest.update((part.len() as u64).to_le_bytes());
         digest.update(part);
     }
@@ -77,17 +77,17 @@ mod tests {
     }
 
     #[test]
-    fn everything_that_matters_changes_the_name() {
+    fn every_compile_input_changes_the_file_name() {
         let nvrtc = Nvrtc { version: (13, 0), architectures: vec![75, 90] };
         let newer = Nvrtc { version: (13, 1), ..nvrtc.clone() };
         let mut names = vec![
-            file_name(&nvrtc, 13000, 90, Form::Cubin),
-            file_name(&newer, 13000, 90, Form::Cubin),
-            file_name(&nvrtc, 13010, 90, Form::Cubin),
-            file_name(&nvrtc, 13000, 75, Form::Cubin),
-            file_name(&nvrtc, 13000, 90, Form::Ptx),
+            file_name(&nvrtc, 13000, 90, CodeFormat::Cubin),
+            file_name(&newer, 13000, 90, CodeFormat::Cubin),
+            file_name(&nvrtc, 13010, 90, CodeFormat::Cubin),
+            file_name(&nvrtc, 13000, 75, CodeFormat::Cubin),
+            file_name(&nvrtc, 13000, 90, CodeFormat::Ptx),
         ];
-        assert_eq!(names[0], file_name(&nvrtc.clone(), 13000, 90, Form::Cubin));
+        assert_eq!(names[0], file_name(&nvrtc.clone(), 13000, 90, CodeFormat::Cubin));
         names.sort();
         names.dedup();
         assert_eq!(names.len(), 5);

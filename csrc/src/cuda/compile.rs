@@ -8,25 +8,25 @@ use std::ffi::{CStr, CString, c_char, c_int};
 use std::ptr;
 
 /// Source of the kernels. `HEADERS` are the files that it includes, by the names in its include directives.
-const TEXT: &str = include_str!("../../cuda/kernels.cu");
+const KERNEL_SOURCE: &str = include_str!("../../cuda/kernels.cu");
 const HEADERS: &[(&str, &str)] = &[
     ("call.h", include_str!("../../cuda/call.h")),
     ("gaussians.h", include_str!("../../cuda/gaussians.h")),
     ("lane.h", include_str!("../../kernels/lane.h")),
-    ("lens.h", include_str!("../../kernels/lens.h")),
-    ("lists.h", include_str!("../../cuda/lists.h")),
     ("losses.h", include_str!("../../cuda/losses.h")),
-    ("neighbours.h", include_str!("../../kernels/neighbours.h")),
     ("pixel.h", include_str!("../../kernels/pixel.h")),
     ("project.h", include_str!("../../kernels/project.h")),
-    ("reach.h", include_str!("../../kernels/reach.h")),
+    ("projection_params.h", include_str!("../../kernels/projection_params.h")),
     ("sh.h", include_str!("../../kernels/sh.h")),
     ("simd.h", include_str!("../../kernels/simd.h")),
     ("sort.h", include_str!("../../cuda/sort.h")),
+    ("ssim_window.h", include_str!("../../kernels/ssim_window.h")),
+    ("tile_lists.h", include_str!("../../cuda/tile_lists.h")),
     ("tiles.h", include_str!("../../cuda/tiles.h")),
+    ("touched_cells.h", include_str!("../../kernels/touched_cells.h")),
     ("types.h", include_str!("../../kernels/types.h")),
+    ("unevenness.h", include_str!("../../kernels/unevenness.h")),
     ("warp.h", include_str!("../../cuda/warp.h")),
-    ("window.h", include_str!("../../kernels/window.h")),
     // NVRTC has the functions of the standard library built in, but not its headers.
     ("cmath", ""),
     (
@@ -49,11 +49,11 @@ const OPTIONS: &[&str] = &[
 ];
 
 /// Minimum compute capability that the kernels support, as in 75 for 7.5.
-pub const OLDEST: i32 = 75;
+pub const MIN_ARCHITECTURE: i32 = 75;
 
 /// Output format of NVRTC.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Form {
+pub enum CodeFormat {
     /// Machine code for one architecture.
     Cubin,
     /// Intermediate code that the driver compiles for that architecture or a newer one.
@@ -93,7 +93,7 @@ impl Nvrtc {
             let mut architectures = vec![0; count as usize];
             nvrtc.check((nvrtc.nvrtcGetSupportedArchs)(architectures.as_mut_ptr()))?;
             // Warps of older GPUs lack instructions that the kernels need.
-            architectures.retain(|&of| of >= OLDEST);
+            architectures.retain(|&of| of >= MIN_ARCHITECTURE);
             architectures.sort_unstable();
             Ok(Nvrtc { version: (major, minor), architectures })
         }
@@ -103,17 +103,17 @@ impl Nvrtc {
     ///
     /// # Errors
     /// Returns an error if the GPU is too old.
-    pub fn target(&self, of: i32) -> Result<(i32, Form)> {
+    pub fn target(&self, of: i32) -> Result<(i32, CodeFormat)> {
         let known = self.architectures.iter().rev().find(|&&known| known <= of);
         match known {
-            Some(&known) if known == of => Ok((of, Form::Cubin)),
-            Some(&known) => Ok((known, Form::Ptx)),
+            Some(&known) if known == of => Ok((of, CodeFormat::Cubin)),
+            Some(&known) => Ok((known, CodeFormat::Ptx)),
             None => Err(format!(
                 "the GPU has compute capability {}.{}, expected {}.{} or more",
                 of / 10,
                 of % 10,
-                OLDEST / 10,
-                OLDEST % 10
+                MIN_ARCHITECTURE / 10,
+                MIN_ARCHITECTURE % 10
             )),
         }
     }
@@ -122,14 +122,14 @@ impl Nvrtc {
     ///
     /// # Errors
     /// Returns the compiler's messages.
-    pub fn compile(&self, architecture: i32, form: Form) -> Result<Compiled> {
+    pub fn compile(&self, architecture: i32, format: CodeFormat) -> Result<Compiled> {
         let terminated = |text: &str| CString::new(text).expect("C++ holds no 0");
-        let text = terminated(TEXT);
+        let text = terminated(KERNEL_SOURCE);
         let (names, headers): (Vec<CString>, Vec<CString>) =
             HEADERS.iter().map(|(name, header)| (terminated(name), terminated(header))).unzip();
         let addresses = |texts: &[CString]| texts.iter().map(|text| text.as_ptr()).collect::<Vec<_>>();
         let (name_addresses, header_addresses) = (addresses(&names), addresses(&headers));
-        let options: Vec<CString> = options(architecture, form).iter().map(|o| terminated(o)).collect();
+        let options: Vec<CString> = options(architecture, format).iter().map(|o| terminated(o)).collect();
 
         let nvrtc = nvrtc()?;
         let mut program = ptr::null_mut();
@@ -143,7 +143,7 @@ impl Nvrtc {
                 header_addresses.as_ptr(),
                 name_addresses.as_ptr(),
             ))?;
-            let compiled = nvrtc.compile(program, &addresses(&options), form);
+            let compiled = nvrtc.compile(program, &addresses(&options), format);
             nvrtc.check((nvrtc.nvrtcDestroyProgram)(&mut program))?;
             compiled
         }
@@ -155,18 +155,23 @@ impl NvrtcFunctions {
     ///
     /// # Safety
     /// `program` must be a valid program, and `options` null-terminated strings.
-    unsafe fn compile(&self, program: Program, options: &[*const c_char], form: Form) -> Result<Compiled> {
+    unsafe fn compile(
+        &self,
+        program: Program,
+        options: &[*const c_char],
+        format: CodeFormat,
+    ) -> Result<Compiled> {
         // SAFETY: the caller's promise; output buffers have the size that NVRTC reported.
         unsafe {
             let done = (self.nvrtcCompileProgram)(program, options.len() as c_int, options.as_ptr());
-            let log = self.filled(program, self.nvrtcGetProgramLogSize, self.nvrtcGetProgramLog)?;
+            let log = self.read_output(program, self.nvrtcGetProgramLogSize, self.nvrtcGetProgramLog)?;
             let log = CStr::from_bytes_until_nul(&log).unwrap_or_default().to_string_lossy().into_owned();
             if let Err(error) = self.check(done) {
                 return Err(format!("{error}: {log}"));
             }
-            let image = match form {
-                Form::Cubin => self.filled(program, self.nvrtcGetCUBINSize, self.nvrtcGetCUBIN)?,
-                Form::Ptx => self.filled(program, self.nvrtcGetPTXSize, self.nvrtcGetPTX)?,
+            let image = match format {
+                CodeFormat::Cubin => self.read_output(program, self.nvrtcGetCUBINSize, self.nvrtcGetCUBIN)?,
+                CodeFormat::Ptx => self.read_output(program, self.nvrtcGetPTXSize, self.nvrtcGetPTX)?,
             };
             Ok(Compiled { image, log })
         }
@@ -176,7 +181,7 @@ impl NvrtcFunctions {
     ///
     /// # Safety
     /// `program` must be a valid program, and the two functions must belong together.
-    unsafe fn filled(
+    unsafe fn read_output(
         &self,
         program: Program,
         size: unsafe extern "C" fn(Program, *mut usize) -> c_int,
@@ -203,21 +208,21 @@ impl NvrtcFunctions {
     }
 }
 
-fn options(architecture: i32, form: Form) -> Vec<String> {
-    let kind = match form {
-        Form::Cubin => "sm",
-        Form::Ptx => "compute",
+fn options(architecture: i32, format: CodeFormat) -> Vec<String> {
+    let kind = match format {
+        CodeFormat::Cubin => "sm",
+        CodeFormat::Ptx => "compute",
     };
     let mut options: Vec<String> = OPTIONS.iter().map(|option| option.to_string()).collect();
     options.push(format!("--gpu-architecture={kind}_{architecture}"));
-    if form == Form::Cubin {
+    if format == CodeFormat::Cubin {
         options.push("--ptxas-options=-v".into());
     }
     options
 }
 
 /// Returns everything that the output depends on except the compiler: sources, headers and options.
-pub(super) fn everything(architecture: i32, form: Form) -> impl Iterator<Item = String> {
+pub(super) fn compile_inputs(architecture: i32, format: CodeFormat) -> impl Iterator<Item = String> {
     let texts = HEADERS.iter().flat_map(|(name, header)| [name.to_string(), header.to_string()]);
-    std::iter::once(TEXT.to_string()).chain(texts).chain(options(architecture, form))
+    std::iter::once(KERNEL_SOURCE.to_string()).chain(texts).chain(options(architecture, format))
 }

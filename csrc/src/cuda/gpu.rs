@@ -2,7 +2,7 @@
 
 use super::{
     Result, cache,
-    compile::{Form, Nvrtc},
+    compile::{CodeFormat, Nvrtc},
     ffi::BlockCounts,
     libraries::{DriverFunctions, Handle, driver},
 };
@@ -108,7 +108,7 @@ impl DriverFunctions {
 }
 
 /// Kernels that are loaded on one device.
-struct Loaded {
+struct LoadedKernels {
     /// Primary context of the device, which torch uses, too.
     context: Handle,
     module: Handle,
@@ -116,11 +116,11 @@ struct Loaded {
 }
 
 // SAFETY: handles of the driver belong to the process, not to a thread.
-unsafe impl Send for Loaded {}
+unsafe impl Send for LoadedKernels {}
 
 /// Origin of the kernels of a device.
 #[derive(Debug)]
-pub struct Prepared {
+pub struct KernelOrigin {
     /// Architecture that they were compiled for, as in 90.
     pub architecture: i32,
     /// Cache file of the kernels, if there is one.
@@ -129,8 +129,8 @@ pub struct Prepared {
     pub was_cached: bool,
 }
 
-impl Loaded {
-    fn on(number: i32) -> Result<(Self, Prepared)> {
+impl LoadedKernels {
+    fn load(number: i32) -> Result<(Self, KernelOrigin)> {
         let found = Driver::find()?;
         let known = found.gpus.len();
         let gpu = found
@@ -138,9 +138,9 @@ impl Loaded {
             .get(number as usize)
             .ok_or(format!("GPU {number} doesn't exist: the driver reports {known} GPUs"))?;
         let nvrtc = Nvrtc::find()?;
-        let (architecture, form) = nvrtc.target(gpu.architecture)?;
+        let (architecture, format) = nvrtc.target(gpu.architecture)?;
         let file = cache::cache_folder()
-            .map(|folder| folder.join(cache::file_name(&nvrtc, found.version, architecture, form)));
+            .map(|folder| folder.join(cache::file_name(&nvrtc, found.version, architecture, format)));
         let driver = driver()?;
         let (mut device, mut context) = (0, null_mut());
         // SAFETY: the device exists; its context is retained for the lifetime of the process.
@@ -160,18 +160,18 @@ impl Loaded {
         let (module, file) = match kept {
             Some(module) => (module, file),
             None => {
-                let mut image = nvrtc.compile(architecture, form)?.image;
+                let mut image = nvrtc.compile(architecture, format)?.image;
                 let mut module = load(&image);
                 // A driver older than NVRTC may refuse its machine code; the driver then compiles PTX itself.
-                if module.is_err() && form == Form::Cubin {
-                    image = nvrtc.compile(architecture, Form::Ptx)?.image;
+                if module.is_err() && format == CodeFormat::Cubin {
+                    image = nvrtc.compile(architecture, CodeFormat::Ptx)?.image;
                     module = load(&image);
                 }
                 (module?, file.filter(|file| cache::write(file, &image)))
             }
         };
         let kernels = HashMap::new();
-        Ok((Loaded { context, module, kernels }, Prepared { architecture, file, was_cached }))
+        Ok((LoadedKernels { context, module, kernels }, KernelOrigin { architecture, file, was_cached }))
     }
 
     fn kernel(&mut self, driver: &DriverFunctions, name: &str) -> Result<Handle> {
@@ -188,16 +188,16 @@ impl Loaded {
     }
 }
 
-static DEVICES: LazyLock<Mutex<HashMap<i32, Loaded>>> = LazyLock::new(Default::default);
+static DEVICES: LazyLock<Mutex<HashMap<i32, LoadedKernels>>> = LazyLock::new(Default::default);
 
 /// Loads the kernels on the device with this index: from the cache, or compiled now.
 ///
 /// # Errors
 /// Returns an error if a library is missing, or if the compiler or the driver fails.
-pub fn prepare(device: i32) -> Result<Prepared> {
-    let (loaded, prepared) = Loaded::on(device)?;
+pub fn load_kernels(device: i32) -> Result<KernelOrigin> {
+    let (loaded, origin) = LoadedKernels::load(device)?;
     DEVICES.lock().unwrap_or_else(PoisonError::into_inner).insert(device, loaded);
-    Ok(prepared)
+    Ok(origin)
 }
 
 /// Launches a kernel; see `launch_kernel` in the bridge.
@@ -209,13 +209,13 @@ pub unsafe fn launch_kernel(
     stream: usize,
     kernel: &str,
     blocks: BlockCounts,
-    threads: u32,
+    threads_per_block: u32,
     arguments: usize,
 ) -> Result<()> {
     let mut devices = DEVICES.lock().unwrap_or_else(PoisonError::into_inner);
     let loaded = match devices.entry(device) {
         Entry::Occupied(known) => known.into_mut(),
-        Entry::Vacant(place) => place.insert(Loaded::on(device)?.0),
+        Entry::Vacant(place) => place.insert(LoadedKernels::load(device)?.0),
     };
     let driver = driver()?;
     let function = loaded.kernel(driver, kernel)?;
@@ -228,7 +228,7 @@ pub unsafe fn launch_kernel(
                 blocks.x,
                 blocks.y,
                 1,
-                threads,
+                threads_per_block,
                 1,
                 1,
                 shared_bytes,

@@ -8,7 +8,7 @@ import reference.rotation
 import torch
 
 from .. import draw
-from ..draw import normal, uniform, whole
+from ..draw import integer, normal, uniform
 from ..names import reference_config, with_prefix
 from ..registry import Draw, by, case, reference_for
 
@@ -55,7 +55,7 @@ def heads(rng):
     """Outputs of the heads for every candidate, before clamps, for each degree of spherical harmonics."""
     for degree in range(4):
         config = draw.model_config(rng, sh_degree=degree)
-        inputs = latents(rng, config, whole(rng, 1, 3))
+        inputs = latents(rng, config, integer(rng, 1, 3))
         params = draw.parameters(rng, config, "gaussian_decoder.")
         label = f"{by(*inputs['geometry'].shape)}, K {config['candidates']}, degree {degree}"
         yield Draw(label, inputs, config, params, ("geometry", "appearance"))
@@ -80,13 +80,13 @@ def merge(rng):
     """Merging of values from the whole range within the clamps, at every stage of the curriculum."""
     for candidates in (2, 16):
         for stage, mix in stages_of(candidates):
-            shape = whole(rng, 1, 2), whole(rng, 3, 9), candidates
+            shape = integer(rng, 1, 2), integer(rng, 3, 9), candidates
             inputs = {
                 "positions": normal(rng, *shape, 3),
                 "log_scales": uniform(rng, -10.2, -1.0, *shape, 3),
                 "rotations": normal(rng, *shape, 6),
                 "opacity_logits": uniform(rng, -13.0, 6.0, *shape, 1),
-                "sh": normal(rng, *shape, 3 * whole(rng, 1, 4) ** 2),
+                "sh": normal(rng, *shape, 3 * integer(rng, 1, 4) ** 2),
                 "gate": normal(rng, *shape),
             }
             label = f"{by(*shape)}, stage {stage}, λ {mix}"
@@ -106,7 +106,7 @@ def decoder(rng):
     for candidates in (2, 16):
         for stage, mix in stages_of(candidates):
             config = draw.model_config(rng, candidates=candidates)
-            inputs = latents(rng, config, whole(rng, 1, 2))
+            inputs = latents(rng, config, integer(rng, 1, 2))
             params = draw.parameters(rng, config, "gaussian_decoder.")
             label = f"{by(*inputs['geometry'].shape)}, K {candidates}, stage {stage}, λ {mix}"
             config |= {"stage": stage, "mix": mix}

@@ -9,7 +9,7 @@ import reference.stream
 import torch
 
 from .. import draw
-from ..draw import normal, whole
+from ..draw import integer, normal
 from ..names import reference_config, with_prefix
 from ..registry import Draw, by, case, reference_for
 from ..tolerance import Tolerance
@@ -154,7 +154,7 @@ def stream_round(rng):
     """One round of one stream: cross-attention of the slots to the memory, then self-attention."""
     for _ in range(3):
         config = draw.model_config(rng)
-        batch, slots, memory = whole(rng, 1, 3), whole(rng, 6, 15), whole(rng, 5, 30)
+        batch, slots, memory = integer(rng, 1, 3), integer(rng, 6, 15), integer(rng, 5, 30)
         inputs = {
             "slots": normal(rng, batch, slots, config["width"]),
             "memory": normal(rng, batch, memory, config["ray_width"] + config["rgb_width"]),
@@ -178,7 +178,7 @@ def self_attention_block(rng):
     """Self-attention blocks of at least one slot, which attends only to itself."""
     for _ in range(3):
         config = draw.model_config(rng)
-        slots = normal(rng, whole(rng, 1, 3), whole(rng, 1, 15), config["width"])
+        slots = normal(rng, integer(rng, 1, 3), integer(rng, 1, 15), config["width"])
         params = draw.parameters(rng, config, "slot_encoder.geo_rounds.0.tower.0.")
         yield Draw(f"{by(*slots.shape)}, heads {config['heads']}", {"slots": slots}, config, params, ("slots",))
 
@@ -194,7 +194,7 @@ def mixer(rng):
     """The exchange between the two streams after a round."""
     for _ in range(3):
         config = draw.model_config(rng)
-        shape = whole(rng, 1, 3), whole(rng, 1, 15), config["width"]
+        shape = integer(rng, 1, 3), integer(rng, 1, 15), config["width"]
         inputs = {"geometry": normal(rng, *shape), "appearance": normal(rng, *shape)}
         params = draw.parameters(rng, config, "slot_encoder.pair_adapters.0.")
         yield Draw(by(*shape), inputs, config, params, ("geometry", "appearance"))
@@ -212,7 +212,7 @@ def encoder(rng):
     """The complete encoder, with two streams and with the ablation's single stream."""
     for streams in ("dual", "dual", "single"):
         config = draw.model_config(rng, streams=streams)
-        shape = whole(rng, 1, 3), whole(rng, 4, 40), config["ray_width"] + config["rgb_width"]
+        shape = integer(rng, 1, 3), integer(rng, 4, 40), config["ray_width"] + config["rgb_width"]
         params = draw.parameters(rng, config)
         params = {name: value for name, value in params.items() if name.startswith(("scene_tokens", "slot_encoder"))}
         label = f"{by(*shape)}, slots {by(config['latents'], config['width'])}, rounds {config['rounds']}, {streams}"

@@ -10,7 +10,7 @@ import reference.loss.mse
 import reference.loss.ssim
 
 from .. import draw
-from ..draw import normal, uniform, whole
+from ..draw import integer, normal, uniform
 from ..registry import Draw, by, case, reference_for
 
 
@@ -70,7 +70,7 @@ def sh_soft_cap_reference(config, params, inputs):
 def decoder_regularization(rng):
     """Scales, coefficients and opacities on both sides of their thresholds."""
     for opacity in (True, False):
-        shape = whole(rng, 1, 3), whole(rng, 2, 9), whole(rng, 1, 16)
+        shape = integer(rng, 1, 3), integer(rng, 2, 9), integer(rng, 1, 16)
         inputs = {
             "log_scales": normal(rng, *shape, 3, scale=3.0, mean=-3.0),
             "rotations": normal(rng, *shape, 6),

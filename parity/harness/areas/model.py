@@ -3,7 +3,7 @@
 import reference.model
 
 from .. import draw
-from ..draw import uniform, whole
+from ..draw import integer, uniform
 from ..names import reference_config
 from ..registry import Draw, by, case, reference_for
 from .decoder import decoder_params, gaussians
@@ -19,7 +19,7 @@ def model(rng):
         (1, 0.0, {"camera_code": False}),
     ]:
         config = draw.model_config(rng, **fixed)
-        image, inputs = draw.pictures(rng, config, whole(rng, 1, 2), whole(rng, 1, 3))
+        image, inputs = draw.pictures(rng, config, integer(rng, 1, 2), integer(rng, 1, 3))
         suffix = "" if config["camera_code"] else ", no camera code"
         label = f"{by(*inputs['images'].shape)}, stage {stage}, λ {mix}, {config['streams']}{suffix}"
         params = draw.parameters(rng, config)

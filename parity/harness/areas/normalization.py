@@ -3,7 +3,7 @@
 import reference.normalize
 
 from .. import draw
-from ..draw import whole
+from ..draw import integer
 from ..registry import Draw, case, reference_for
 from ..tolerance import FLOAT64
 
@@ -16,7 +16,7 @@ def scene_normalization(rng):
     direction.
     """
     for count in (1, 2, 7, 36):
-        c2w = draw.poses(rng, count, turn=0.4, move=whole(rng, 1, 20))
+        c2w = draw.poses(rng, count, turn=0.4, move=integer(rng, 1, 20))
         yield Draw(f"{count} cameras", {"c2w": c2w}, tolerance=FLOAT64)
     together = draw.poses(rng, 3)
     together[:, :3, 3] = together[0, :3, 3]

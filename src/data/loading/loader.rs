@@ -77,7 +77,7 @@ struct Shared {
 
 /// Per-thread state that is reused from photo to photo.
 #[derive(Debug, Default)]
-struct Tools {
+struct WorkerState {
     resampler: Resampler,
     scratch: Vec<f32>,
     times: LoadTimes,
@@ -138,13 +138,13 @@ impl DataLoader {
                 .step_by(threads)
                 .map(move |turn| (shard.sample(first, turn), shard.step(first, turn)));
             let work = move || {
-                let mut tools = Tools::default();
+                let mut state = WorkerState::default();
                 for (sample, step) in turns {
                     // Nobody receives samples once the loader is dropped.
                     if shared.stopped.load(Ordering::Relaxed) {
                         return;
                     }
-                    let load = AssertUnwindSafe(|| shared.load(sample, step, &mut tools));
+                    let load = AssertUnwindSafe(|| shared.load(sample, step, &mut state));
                     let scene = catch_unwind(load).unwrap_or_else(|panic| {
                         let why = panic_message(&*panic);
                         Err(Error::failed(format!("internal error while loading sample {sample}: {why}")))
@@ -271,16 +271,16 @@ impl Drop for DataLoader {
 impl Shared {
     /// Loads sample `sample` of step `step`: the scene whose turn it is. A bad scene is replaced by another one of its group, or of
     /// the following groups if the group has no usable scene.
-    fn load(&self, sample: u64, step: u64, tools: &mut Tools) -> Result<LoadedScene> {
+    fn load(&self, sample: u64, step: u64, state: &mut WorkerState) -> Result<LoadedScene> {
         let mut random = ChaCha8Rng::seed_from_u64(self.seed);
         random.set_stream(sample);
-        tools.times = LoadTimes::default();
+        state.times = LoadTimes::default();
         let views = context_views(&self.config, self.seed, step);
-        let (first, groups) = self.order.turn(sample);
+        let (first, groups) = self.order.locate(sample);
         for group in groups {
             let start = Instant::now();
             let opened = self.groups.open(group);
-            tools.times.read += start.elapsed().as_secs_f64();
+            state.times.read += start.elapsed().as_secs_f64();
             let scenes: &[Result<Capture>] = match &*opened {
                 CachedGroup::Scenes(scenes) => scenes,
                 CachedGroup::Broken(why) => {
@@ -302,7 +302,7 @@ impl Shared {
                     shuffled = usize::MAX;
                 }
                 let scene_index = SceneIndex { group, scene: turns[turn] };
-                match self.load_scene(scene_index, scenes.get(scene_index.scene), views, &mut random, tools) {
+                match self.load_scene(scene_index, scenes.get(scene_index.scene), views, &mut random, state) {
                     Ok(scene) => return Ok(scene),
                     Err((fault, why)) => self.bad_data_log.add(fault, std::iter::once(scene_index), why)?,
                 }
@@ -317,7 +317,7 @@ impl Shared {
         capture: Option<&Result<Capture>>,
         context: usize,
         random: &mut impl Rng,
-        tools: &mut Tools,
+        state: &mut WorkerState,
     ) -> std::result::Result<LoadedScene, (Fault, String)> {
         let broken = |why: &Error| (Fault::Scene, why.to_string());
         let capture = match capture {
@@ -339,7 +339,8 @@ impl Shared {
         let mut chosen = [&views.context[..], &views.target].concat();
         chosen.sort_unstable();
         chosen.dedup();
-        let framed = chosen.iter().map(|&view| augmentation.frame(&cameras[shown[view]], config.image_size));
+        let framed =
+            chosen.iter().map(|&view| augmentation.visible_region(&cameras[shown[view]], config.image_size));
         let framed = framed.collect::<Result<Vec<_>>>().map_err(in_capture)?;
         let (regions, cameras): (Vec<_>, Vec<_>) = framed.into_iter().unzip();
         let among = |views: &[usize]| -> Vec<usize> {
@@ -359,24 +360,24 @@ impl Shared {
                 .map_err(|why| (Fault::Image, why.to_string()))?;
             let (photo, mask) = &*photo;
             let decoded = Instant::now();
-            augmentation.show(&mut tools.resampler, photo, region, size, planes);
+            augmentation.crop_and_flip(&mut state.resampler, photo, region, size, planes);
             if let Some(mask) = mask {
                 let pixels = image_bytes / CHANNELS;
                 let masks = masks.get_or_insert_with(|| vec![u8::MAX; chosen.len() * pixels]);
                 mask_planes.resize(image_bytes, 0);
-                augmentation.show(&mut tools.resampler, mask, region, size, &mut mask_planes);
+                augmentation.crop_and_flip(&mut state.resampler, mask, region, size, &mut mask_planes);
                 masks[position * pixels..][..pixels].copy_from_slice(&mask_planes[..pixels]);
             }
             let resized = Instant::now();
-            augmentation.jitter.apply_to_bytes(planes, &mut tools.scratch);
-            tools.times += LoadTimes {
+            augmentation.jitter.apply_to_bytes(planes, &mut state.scratch);
+            state.times += LoadTimes {
                 decode: (decoded - start).as_secs_f64(),
                 resize: (resized - decoded).as_secs_f64(),
                 augment: resized.elapsed().as_secs_f64(),
                 ..Default::default()
             };
         }
-        let (name, times) = (capture.name.clone(), tools.times);
+        let (name, times) = (capture.name.clone(), state.times);
         Ok(LoadedScene { name, images, masks, size, cameras, context, target, far, times })
     }
 

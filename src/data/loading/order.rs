@@ -40,7 +40,7 @@ impl Order {
     }
 
     /// Returns the scene of `sample`, and the groups of its epoch from there on, each of them once.
-    pub fn turn(&self, sample: u64) -> (SceneIndex, Vec<usize>) {
+    pub fn locate(&self, sample: u64) -> (SceneIndex, Vec<usize>) {
         let (epoch, mut position) = (sample / self.scenes, (sample % self.scenes) as usize);
         let mut groups = self.shuffled(self.sizes.len(), epoch, 0);
         let mut turn = 0;
@@ -77,7 +77,7 @@ mod tests {
     #[test]
     fn every_epoch_shows_every_scene_once_and_keeps_groups_together() {
         let order = Order::new(vec![3, 0, 5, 1, 4], 7);
-        let epoch = |e: u64| (0..13).map(|i| order.turn(13 * e + i).0).collect::<Vec<_>>();
+        let epoch = |e: u64| (0..13).map(|i| order.locate(13 * e + i).0).collect::<Vec<_>>();
         for e in 0..20 {
             let shown = epoch(e);
             assert_eq!(shown.iter().collect::<BTreeSet<_>>().len(), 13);
@@ -86,16 +86,16 @@ mod tests {
         }
         assert_ne!(epoch(0), epoch(1));
         let other = Order::new(vec![3, 0, 5, 1, 4], 8);
-        assert_ne!(epoch(0), (0..13).map(|i| other.turn(i).0).collect::<Vec<_>>());
+        assert_ne!(epoch(0), (0..13).map(|i| other.locate(i).0).collect::<Vec<_>>());
     }
 
     #[test]
-    fn turn_lists_the_groups_that_follow() {
+    fn locate_lists_the_groups_that_follow() {
         let order = Order::new(vec![2, 2, 2], 3);
-        let (first, groups) = order.turn(0);
+        let (first, groups) = order.locate(0);
         assert_eq!(groups[0], first.group);
-        assert_eq!(groups[1], order.turn(2).0.group);
-        assert_eq!(groups[2], order.turn(4).0.group);
-        assert_eq!(order.turn(2).1[2], first.group);
+        assert_eq!(groups[1], order.locate(2).0.group);
+        assert_eq!(groups[2], order.locate(4).0.group);
+        assert_eq!(order.locate(2).1[2], first.group);
     }
 }

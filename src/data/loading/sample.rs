@@ -108,13 +108,13 @@ impl Batch {
     }
 
     /// Returns `targets`, a tensor of the target views, of every scene once: a paired sample has the same targets twice.
-    pub(crate) fn once(&self, targets: &Tensor) -> Tensor {
+    pub(crate) fn unpaired(&self, targets: &Tensor) -> Tensor {
         targets.chunk(if self.paired { 2 } else { 1 }, 0).swap_remove(0)
     }
 
     /// Returns the masks of the target views of every scene once, `[B, C, 1, H, W]`; `None` if every pixel counts.
     pub(crate) fn target_masks(&self) -> Option<Tensor> {
-        self.target.masks.as_ref().map(|masks| self.once(masks))
+        self.target.masks.as_ref().map(|masks| self.unpaired(masks))
     }
 
     /// Returns the number of context views per scene.

@@ -48,7 +48,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_read_well() {
+    fn numbers_are_formatted() {
         assert_eq!(thousands(5601), "5,601");
         assert_eq!(thousands(123), "123");
         assert_eq!(thousands(4_064_762), "4,064,762");

@@ -7,7 +7,7 @@
 //! - `render_height` and `render_width`, in pixels;
 //! - optionally `camera_type`, which must be `"perspective"`, and `fps` or `seconds`.
 
-use super::json::null_for_not_a_number;
+use super::json::replace_nan_with_null;
 use super::transforms_json::{describe_value, from_opengl};
 use super::{cameras_json, is_capture, open_for, transforms_json};
 use crate::capture::{Purpose, check_cameras};
@@ -45,7 +45,7 @@ pub fn read_camera_path(path: &Path, size: Option<ImageSize>) -> Result<CameraPa
             true => {
                 let text = read_text(path)?;
                 // Invalid JSON is reported later, by the reader of the format.
-                Some(serde_json::from_str(&null_for_not_a_number(&text)).unwrap_or(Value::Null))
+                Some(serde_json::from_str(&replace_nan_with_null(&text)).unwrap_or(Value::Null))
             }
         };
     let has_key = |key: &str| json.as_ref().is_some_and(|json| json.get(key).is_some());

@@ -1,7 +1,7 @@
 //! Reader and writer of `cameras.json` folders: {"image_shape": [H, W], "views": [{"image", "intrinsic" 3×3 in pixels, "c2w" 4×4}]}
 //! (spec 10.2).
 
-use super::json::null_for_not_a_number;
+use super::json::replace_nan_with_null;
 use super::photos::{find_photos, portable};
 use super::{CaptureOpener, file_in, folder_name};
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
@@ -92,7 +92,7 @@ fn rows(values: &[f64], width: usize) -> Vec<Vec<Number>> {
 
 fn parse(file: &Path) -> Result<File> {
     let text = read_text(file)?;
-    serde_json::from_str(&null_for_not_a_number(&text)).map_err(|e| {
+    serde_json::from_str(&replace_nan_with_null(&text)).map_err(|e| {
         let expected = "{\"image_shape\": [H, W], \"views\": [{\"image\", \"intrinsic\", \"c2w\"}]}";
         Error::input(file, "the file", format!("not a description of cameras ({e})"), expected)
     })

@@ -1,7 +1,7 @@
 //! Support for JSON as Python writes it.
 
 /// Replaces NaN, Infinity and −Infinity outside of strings by null.
-pub(super) fn null_for_not_a_number(text: &str) -> String {
+pub(super) fn replace_nan_with_null(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     let mut rest = text;
     let (mut in_string, mut escaped) = (false, false);
@@ -26,11 +26,11 @@ pub(super) fn null_for_not_a_number(text: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::null_for_not_a_number;
+    use super::replace_nan_with_null;
 
     #[test]
     fn only_numbers_are_replaced() {
         let text = r#"{"NaN \" NaN": [NaN, -Infinity, 1.5], "b": Infinity}"#;
-        assert_eq!(null_for_not_a_number(text), r#"{"NaN \" NaN": [null, null, 1.5], "b": null}"#);
+        assert_eq!(replace_nan_with_null(text), r#"{"NaN \" NaN": [null, null, 1.5], "b": null}"#);
     }
 }

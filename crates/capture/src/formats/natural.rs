@@ -55,7 +55,7 @@ mod tests {
     }
 
     #[test]
-    fn it_is_a_total_order() {
+    fn natural_order_is_total() {
         let mut random = StdRng::seed_from_u64(0);
         let letters = ["0", "0", "1", "2", "9", "a", "/", "_", "é", "٣"];
         let names: Vec<String> = (0..150)

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 const REDUCED: [u32; 3] = [2, 4, 8];
 
 /// Maximum number of leading folders of a name that may be skipped.
-const DEEPEST: usize = 16;
+const MAX_SKIPPED_FOLDERS: usize = 16;
 
 /// Minimum number of photos of a capture.
 const MIN_PHOTOS: usize = 2;
@@ -31,7 +31,7 @@ pub(super) fn find_photos(bases: &[PathBuf], names: &[&str]) -> Vec<Option<PathB
     let deepest = names.iter().map(|name| parts(name).count()).max().unwrap_or(0);
     let reductions = || std::iter::once(None).chain(REDUCED.map(Some));
     let rules = bases.iter().flat_map(|base| {
-        (0..deepest.clamp(1, DEEPEST))
+        (0..deepest.clamp(1, MAX_SKIPPED_FOLDERS))
             .flat_map(move |skipped| reductions().map(move |reduced| Rule { base, skipped, reduced }))
     });
     let mut best = (0, vec![None; names.len()]);
@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn one_photo_does_not_stand_for_two() {
+    fn one_photo_is_not_matched_twice() {
         assert_eq!(
             found(&["0.png", "1.png"], &["left/0.png", "right/0.png", "left/1.png"]),
             [None, None, None]

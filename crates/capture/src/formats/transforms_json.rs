@@ -3,13 +3,13 @@
 //! `camera_angle_y` in radians, the `camera_model`, and the distortion `k1` to `k6`, `p1`, `p2` (spec 10.3). NeRF's synthetic scenes
 //! have a file of this kind for each split.
 
-use super::json::null_for_not_a_number;
+use super::json::replace_nan_with_null;
 use super::natural::natural_order;
 use super::photos::{find_photos, portable};
 use super::{CaptureOpener, file_in, folder_name};
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
 use crate::geometry::{Camera, ImageSize, Intrinsics, nearest_rigid_of_scaled};
-use crate::lens::{COLMAP_MODELS, Distortion, Lens, LensModel, sphere};
+use crate::lens::{COLMAP_MODELS, Distortion, Lens, LensModel, equirectangular_intrinsics};
 use crate::pixels::read_image_size;
 use glam::{DMat4, DVec4};
 use globalsplat_files::{Error, Result, read_text};
@@ -156,7 +156,7 @@ fn root(file: &Path) -> &Path {
 fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Lists)> {
     let text = read_text(file)?;
     let expected = "{\"frames\": [{\"file_path\", \"transform_matrix\"}], …}";
-    let json: Value = serde_json::from_str(&null_for_not_a_number(&text))
+    let json: Value = serde_json::from_str(&replace_nan_with_null(&text))
         .map_err(|e| Error::input(file, "the file", format!("no JSON ({e})"), expected))?;
     let entries = match json.get("frames") {
         Some(Value::Array(entries)) => entries,
@@ -365,7 +365,7 @@ impl<'a> Fields<'a> {
         let intrinsics = match model {
             // nerfstudio writes focal lengths of other meanings, or none.
             EQUIRECTANGULAR => {
-                let [fx, fy, cx, cy] = sphere(f64::from(width), f64::from(height));
+                let [fx, fy, cx, cy] = equirectangular_intrinsics(f64::from(width), f64::from(height));
                 Intrinsics { fx, fy, cx, cy }
             }
             _ => self.intrinsics(width, height)?,

@@ -350,7 +350,7 @@ mod tests {
     }
 
     #[test]
-    fn half_turns_are_turns_and_nothing_more() {
+    fn half_turns_add_no_extra_rotation() {
         for angle in [PI - 1e-3, PI - 1e-9, PI, PI + 1e-9, PI + 1e-3] {
             let turned =
                 |i: u32| camera([f64::from(i), 0., 0.], DQuat::from_rotation_y(angle * f64::from(i)), 60.);

@@ -131,7 +131,9 @@ impl Lens {
             ("SIMPLE_DIVISION", &[f, cx, cy, k]) => ([f, f, cx, cy], LensModel::Division { k }),
             ("DIVISION", &[fx, fy, cx, cy, k]) => ([fx, fy, cx, cy], LensModel::Division { k }),
             ("EUCM", &[fx, fy, cx, cy, alpha, beta]) => ([fx, fy, cx, cy], LensModel::Eucm { alpha, beta }),
-            ("EQUIRECTANGULAR", &[width, height]) => (sphere(width, height), LensModel::Equirectangular),
+            ("EQUIRECTANGULAR", &[width, height]) => {
+                (equirectangular_intrinsics(width, height), LensModel::Equirectangular)
+            }
             (model, parameters) => {
                 let expected = format!("{count} parameters for {model}");
                 return Err(("the parameters".into(), format!("{parameters:?}"), expected));
@@ -175,7 +177,7 @@ impl Lens {
             }
             LensModel::Equirectangular => {
                 let Intrinsics { fx, fy, cx, cy } = self.intrinsics;
-                let whole = sphere(f64::from(width), f64::from(height));
+                let whole = equirectangular_intrinsics(f64::from(width), f64::from(height));
                 let is_whole = |(found, whole): (f64, f64)| (found / whole - 1.).abs() < 0.01;
                 return match [fx, fy, cx, cy].into_iter().zip(whole).all(is_whole) {
                     true => Ok(()),
@@ -252,7 +254,7 @@ impl Lens {
 }
 
 /// Returns fx, fy, cx and cy of a photo of all directions.
-pub(crate) fn sphere(width: f64, height: f64) -> [f64; 4] {
+pub(crate) fn equirectangular_intrinsics(width: f64, height: f64) -> [f64; 4] {
     [width / TAU, height / PI, width / 2., height / 2.]
 }
 

@@ -27,22 +27,23 @@ impl HeifHeader {
     ///
     /// A file may hold tiles, thumbnails and depths beside its image, none of them larger: the largest size is that of the image.
     pub fn parse(start: &[u8]) -> Option<Self> {
-        let mut boxes = Boxes(start);
+        let mut boxes = HeifBoxes(start);
         let brands = boxes.next().filter(|first| first.kind == b"ftyp")?.contents;
         brands.chunks(4).any(|brand| BRANDS.contains(&brand)).then_some(())?;
         // Four bytes of a version and flags precede the boxes in a `meta` box.
         let meta = boxes.find(|part| part.kind == b"meta")?.contents.get(4..)?;
-        let properties = Boxes(meta).find(|part| part.kind == b"iprp")?.contents;
-        let properties = Boxes(properties).find(|part| part.kind == b"ipco")?.contents;
+        let properties = HeifBoxes(meta).find(|part| part.kind == b"iprp")?.contents;
+        let properties = HeifBoxes(properties).find(|part| part.kind == b"ipco")?.contents;
         let side = |bytes: &[u8]| Some(u32::from_be_bytes(*bytes.first_chunk()?));
-        let size = |part: Box| {
+        let size = |part: HeifBox| {
             (part.kind == b"ispe")
                 .then(|| Some((side(part.contents.get(4..)?)?, side(part.contents.get(8..)?)?)))?
         };
-        let size =
-            Boxes(properties).filter_map(size).max_by_key(|size| u64::from(size.0) * u64::from(size.1))?;
+        let size = HeifBoxes(properties)
+            .filter_map(size)
+            .max_by_key(|size| u64::from(size.0) * u64::from(size.1))?;
         let quarter_turns =
-            Boxes(properties).find(|part| part.kind == b"irot").and_then(|part| part.contents.first());
+            HeifBoxes(properties).find(|part| part.kind == b"irot").and_then(|part| part.contents.first());
         let rotation = match quarter_turns.map_or(0, |turns| turns & 3) {
             0 => Orientation::NoTransforms,
             1 => Orientation::Rotate270,
@@ -71,7 +72,7 @@ impl HeifHeader {
             let expected = "a JPEG or PNG, to which heif-convert or sips converts it, or on the PATH an ffmpeg or heif-dec that decodes it";
             Error::input(file, "the image", format!("undecodable ({why})"), expected)
         };
-        if Boxes(encoded).any(|part| !part.is_whole) {
+        if HeifBoxes(encoded).any(|part| !part.is_whole) {
             return Err(undecodable("its data end before the image does".into()));
         }
         let by_ffmpeg = run_ffmpeg(encoded).and_then(|image| check_size("ffmpeg", image, self.size));
@@ -171,7 +172,7 @@ fn run_libheif(encoded: &[u8]) -> Option<std::result::Result<DynamicImage, Strin
 }
 
 /// A part of a file.
-struct Box<'a> {
+struct HeifBox<'a> {
     kind: &'a [u8],
     /// The contents, as far as they are there.
     contents: &'a [u8],
@@ -180,12 +181,12 @@ struct Box<'a> {
 }
 
 /// Iterator over the boxes in some bytes.
-struct Boxes<'a>(&'a [u8]);
+struct HeifBoxes<'a>(&'a [u8]);
 
-impl<'a> Iterator for Boxes<'a> {
-    type Item = Box<'a>;
+impl<'a> Iterator for HeifBoxes<'a> {
+    type Item = HeifBox<'a>;
 
-    fn next(&mut self) -> Option<Box<'a>> {
+    fn next(&mut self) -> Option<HeifBox<'a>> {
         let bytes = self.0;
         let kind = bytes.get(4..8)?;
         let (header, length) = match u32::from_be_bytes(*bytes.first_chunk()?) {
@@ -196,6 +197,6 @@ impl<'a> Iterator for Boxes<'a> {
         let end = length.max(header);
         let contents = bytes.get(header..end.min(bytes.len()))?;
         self.0 = bytes.get(end..).unwrap_or_default();
-        Some(Box { kind, contents, is_whole: end <= bytes.len() })
+        Some(HeifBox { kind, contents, is_whole: end <= bytes.len() })
     }
 }

@@ -7,7 +7,7 @@ const LOOKUP_BITS: u32 = 9;
 /// Maximum number of scans that are checked; decoders refuse more.
 const MAX_SCANS: usize = 100;
 /// Bit mask of all 64 coefficients of a block.
-const ALL: u64 = u64::MAX;
+const ALL_COEFFICIENTS: u64 = u64::MAX;
 
 const SOI: u8 = 0xd8;
 const EOI: u8 = 0xd9;
@@ -72,24 +72,25 @@ pub(super) const END_MARKER: [u8; 2] = [0xff, EOI];
 /// # Errors
 /// Returns a description of what is missing.
 pub(super) fn check_jpeg(bytes: &[u8]) -> Result<CheckedJpeg, String> {
-    let mut walk = Walk { bytes, at: 2, frame: None, tables: Default::default(), restart_interval: 0 };
+    let mut walker =
+        JpegWalker { bytes, at: 2, frame: None, tables: Default::default(), restart_interval: 0 };
     let mut unread = false;
     for _ in 0..MAX_SCANS {
-        match walk.next_scan()? {
-            Next::Scan(scan) => unread = walk.scan(&scan)?,
-            Next::End { marked, skipped } => return walk.finish(marked, skipped || unread),
+        match walker.next_scan()? {
+            Next::Scan(scan) => unread = walker.walk_scan(&scan)?,
+            Next::End { marked, skipped } => return walker.finish(marked, skipped || unread),
             Next::Unknown => break,
         }
     }
     Ok(CheckedJpeg { components: None, is_marked: true })
 }
 
-struct Walk<'a> {
+struct JpegWalker<'a> {
     bytes: &'a [u8],
     at: usize,
     frame: Option<Frame>,
     /// Huffman tables for DC and for AC coefficients.
-    tables: [[Option<Table>; 4]; 2],
+    tables: [[Option<HuffmanTable>; 4]; 2],
     /// Restart interval in MCUs; 0 if there is none.
     restart_interval: usize,
 }
@@ -137,7 +138,7 @@ enum Next {
     Unknown,
 }
 
-impl Walk<'_> {
+impl JpegWalker<'_> {
     /// Reads segments up to the header of the next scan.
     fn next_scan(&mut self) -> Result<Next, String> {
         let mut skipped = false;
@@ -207,7 +208,7 @@ impl Walk<'_> {
             let symbols = counts.iter().map(|&count| usize::from(count)).sum();
             let (symbols, rest) = rest.split_at_checked(symbols)?;
             let slot = self.tables.get_mut(usize::from(head >> 4))?.get_mut(usize::from(head & 15))?;
-            *slot = Some(Table::new(counts, symbols)?);
+            *slot = Some(HuffmanTable::new(counts, symbols)?);
             segment = rest;
         }
         Some(())
@@ -240,10 +241,10 @@ impl Walk<'_> {
     }
 
     /// Walks through the data of `scan` and returns `true` if bytes are left over.
-    fn scan(&mut self, scan: &Scan) -> Result<bool, String> {
-        let Walk { bytes, frame, tables, restart_interval, .. } = self;
+    fn walk_scan(&mut self, scan: &Scan) -> Result<bool, String> {
+        let JpegWalker { bytes, frame, tables, restart_interval, .. } = self;
         let frame = frame.as_mut().expect("a scan is of a frame");
-        let mut bits = Bits { bytes, at: self.at, buffer: 0, count: 0 };
+        let mut bits = BitReader { bytes, at: self.at, buffer: 0, count: 0 };
         let (across, down) = frame.grid(scan);
         let mut run = 0;
         for mcu in 0..across * down {
@@ -263,7 +264,7 @@ impl Walk<'_> {
                     let block = (row * high + y) * component.stride + column * wide + x;
                     let mut unused = 0;
                     let nonzero = component.nonzero.get_mut(block).unwrap_or(&mut unused);
-                    bits.block(scan, frame.is_progressive, tables, nonzero, &mut run).ok_or_else(cut)?;
+                    bits.walk_block(scan, frame.is_progressive, tables, nonzero, &mut run).ok_or_else(cut)?;
                 }
             }
         }
@@ -271,7 +272,8 @@ impl Walk<'_> {
             let component = &mut frame.components[index];
             component.is_begun = true;
             if scan.low == 0 {
-                component.complete |= (ALL >> (63 - scan.last)) & (ALL << scan.first);
+                component.complete |=
+                    (ALL_COEFFICIENTS >> (63 - scan.last)) & (ALL_COEFFICIENTS << scan.first);
             }
         }
         self.at = bits.at;
@@ -285,7 +287,7 @@ impl Walk<'_> {
         // A progressive file may end after any scan, as its author chose. A file without an end marker must hold all of its data.
         let is_whole = |component: &Component| match marked {
             true => component.is_begun,
-            false => component.complete == ALL && !unread,
+            false => component.complete == ALL_COEFFICIENTS && !unread,
         };
         match frame.components.iter().all(is_whole) {
             true => Ok(CheckedJpeg { components: Some(frame.components.len()), is_marked: marked }),
@@ -350,7 +352,7 @@ impl Frame {
 }
 
 /// A Huffman code.
-struct Table {
+struct HuffmanTable {
     /// Length and symbol of a code, by the next [`LOOKUP_BITS`] bits; the length is 0 if the code is longer.
     lookup: Vec<(u8, u8)>,
     /// For each code length, the first code beyond those of this length, shifted to 16 bits, and the offset from a code to the index of its
@@ -359,7 +361,7 @@ struct Table {
     symbols: Vec<u8>,
 }
 
-impl Table {
+impl HuffmanTable {
     fn new(counts: &[u8; 16], symbols: &[u8]) -> Option<Self> {
         let mut lookup = vec![(0, 0); 1 << LOOKUP_BITS];
         let mut ends = [(0, 0); 17];
@@ -380,12 +382,12 @@ impl Table {
             ends[length as usize].0 = code << (16 - length);
             code <<= 1;
         }
-        Some(Table { lookup, ends, symbols: symbols.to_vec() })
+        Some(HuffmanTable { lookup, ends, symbols: symbols.to_vec() })
     }
 }
 
 /// Bit reader for the data between two markers.
-struct Bits<'a> {
+struct BitReader<'a> {
     bytes: &'a [u8],
     at: usize,
     /// Unread bits; the highest bit is the next one.
@@ -393,7 +395,7 @@ struct Bits<'a> {
     count: u32,
 }
 
-impl Bits<'_> {
+impl BitReader<'_> {
     /// Fills the buffer until it has at least 32 bits, or all bits that are left before the next marker.
     #[inline]
     fn fill(&mut self) {
@@ -420,7 +422,7 @@ impl Bits<'_> {
         }
     }
 
-    /// Takes up to 16 bits. [`Bits::fill`] must be called first.
+    /// Takes up to 16 bits. [`BitReader::fill`] must be called first.
     #[inline]
     fn take(&mut self, count: u32) -> Option<u32> {
         self.count = self.count.checked_sub(count)?;
@@ -431,7 +433,7 @@ impl Bits<'_> {
 
     /// Returns the next symbol. At least 16 bits remain in the buffer after it, unless the data end before.
     #[inline]
-    fn symbol(&mut self, table: &Table) -> Option<u8> {
+    fn symbol(&mut self, table: &HuffmanTable) -> Option<u8> {
         self.fill();
         let (length, symbol) = table.lookup[(self.buffer >> (64 - LOOKUP_BITS)) as usize];
         if length > 0 {
@@ -456,11 +458,11 @@ impl Bits<'_> {
 
     /// Walks through a block. `run` is the number of blocks that follow without new coefficients.
     #[inline]
-    fn block(
+    fn walk_block(
         &mut self,
         scan: &Scan,
         is_progressive: bool,
-        [dc, ac]: [Option<&Table>; 2],
+        [dc, ac]: [Option<&HuffmanTable>; 2],
         nonzero: &mut u64,
         run: &mut u32,
     ) -> Option<()> {
@@ -474,15 +476,15 @@ impl Bits<'_> {
             }
         }
         match (is_progressive, scan.refines) {
-            (false, _) => self.sequential(ac?),
+            (false, _) => self.walk_sequential(ac?),
             (true, _) if scan.last == 0 => Some(()),
-            (true, false) => self.first_bits(scan, ac?, nonzero, run),
-            (true, true) => self.more_bits(scan, ac?, nonzero, run),
+            (true, false) => self.walk_ac_first(scan, ac?, nonzero, run),
+            (true, true) => self.walk_ac_refine(scan, ac?, nonzero, run),
         }
     }
 
     #[inline]
-    fn sequential(&mut self, table: &Table) -> Option<()> {
+    fn walk_sequential(&mut self, table: &HuffmanTable) -> Option<()> {
         let mut k = 1;
         while k < 64 {
             let symbol = self.symbol(table)?;
@@ -498,7 +500,13 @@ impl Bits<'_> {
         Some(())
     }
 
-    fn first_bits(&mut self, scan: &Scan, table: &Table, nonzero: &mut u64, run: &mut u32) -> Option<()> {
+    fn walk_ac_first(
+        &mut self,
+        scan: &Scan,
+        table: &HuffmanTable,
+        nonzero: &mut u64,
+        run: &mut u32,
+    ) -> Option<()> {
         if *run > 0 {
             *run -= 1;
             return Some(());
@@ -523,7 +531,13 @@ impl Bits<'_> {
         Some(())
     }
 
-    fn more_bits(&mut self, scan: &Scan, table: &Table, nonzero: &mut u64, run: &mut u32) -> Option<()> {
+    fn walk_ac_refine(
+        &mut self,
+        scan: &Scan,
+        table: &HuffmanTable,
+        nonzero: &mut u64,
+        run: &mut u32,
+    ) -> Option<()> {
         let mut k = scan.first;
         while *run == 0 && k <= scan.last {
             let symbol = self.symbol(table)?;

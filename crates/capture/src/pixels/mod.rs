@@ -1,23 +1,23 @@
 //! Processing of a photo between its file and a network: decoding, removal of lens distortion, cropping, resizing.
 
 mod codec;
-mod fit;
 mod heif;
 mod jpeg;
 mod mask;
 mod metadata;
 mod planes;
 mod resample;
+mod resize_and_crop;
 mod undistort;
 
 #[cfg(feature = "chunks")]
 pub use codec::encoded_image_size;
 pub use codec::{DecodedPhoto, PHOTO_EXTENSIONS, decode_photo, encode_photo, read_image, read_image_size};
 pub(crate) use codec::{SUPPORTED_IMAGES, has_alpha_channel};
-pub use fit::{fit, source_region};
 pub use metadata::{exif_focal, is_equirectangular};
 pub use planes::{CHANNELS, Planes};
 pub use resample::{Region, Resampler};
+pub use resize_and_crop::{resize_and_crop, source_ranges};
 
 pub use mask::read_mask;
 pub(crate) use mask::{grey_to_rgb, multiply};

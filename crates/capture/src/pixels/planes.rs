@@ -75,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn planes_are_the_image() {
+    fn planes_round_trip() {
         let image = RgbImage::from_fn(7, 5, |x, y| Rgb([x as u8 * 30, y as u8 * 40, (x * y) as u8]));
         let planes = Planes::from_rgb(&image);
         assert_eq!(planes.to_rgb(), image);

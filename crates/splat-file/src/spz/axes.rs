@@ -26,7 +26,7 @@ impl Axes {
 
     /// Returns the axes with this number in the extension SPZ_ADOBE_coordinate_system: 1 to 8 are LDB, RDB, LUB, RUB, LDF, RDF, LUF and
     /// RUF, 0 is unspecified.
-    pub fn numbered(path: &Path, number: u32) -> Result<Self> {
+    pub fn from_code(path: &Path, number: u32) -> Result<Self> {
         let sign = |positive: bool| if positive { 1. } else { -1. };
         match number {
             0 => Ok(Axes::RUB),

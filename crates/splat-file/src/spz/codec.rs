@@ -60,8 +60,10 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         sh.extend(of_one.iter().zip(signs).map(|(colour, sign)| colour.map(|channel| sign * channel)));
     }
     let rotations = match version {
-        1 | 2 => streams.rotations.as_chunks().0.iter().map(|&bytes| first_three(bytes)).collect::<Vec<_>>(),
-        _ => streams.rotations.as_chunks().0.iter().map(|&bytes| smallest_three(bytes)).collect(),
+        1 | 2 => {
+            streams.rotations.as_chunks().0.iter().map(|&bytes| unpack_first_three(bytes)).collect::<Vec<_>>()
+        }
+        _ => streams.rotations.as_chunks().0.iter().map(|&bytes| unpack_smallest_three(bytes)).collect(),
     };
     let splat = Splat {
         means: coordinates.as_chunks().0.iter().map(|&mean| axes.position(mean)).collect(),
@@ -89,14 +91,14 @@ fn limits() -> ShLimits {
 }
 
 /// Unpacks a rotation from x, y and z; w isn't negative.
-fn first_three(bytes: [u8; 3]) -> [f32; 4] {
+fn unpack_first_three(bytes: [u8; 3]) -> [f32; 4] {
     let [x, y, z] = bytes.map(|byte| f64::from(byte) / 127.5 - 1.);
     let w = (1. - x * x - y * y - z * z).max(0.).sqrt();
     normalized([w, x, y, z].map(|part| part as f32))
 }
 
 /// Unpacks a rotation from all but the largest of x, y, z and w, whose index is in the upper two bits.
-fn smallest_three(bytes: [u8; 4]) -> [f32; 4] {
+fn unpack_smallest_three(bytes: [u8; 4]) -> [f32; 4] {
     let mut word = u32::from_le_bytes(bytes);
     let largest = (word >> 30) as usize;
     let mut parts = [0.; 4];

@@ -23,7 +23,7 @@ const MAX_EXTENSIONS: u64 = 1 << 16;
 const MAX_RATIO: u128 = 256;
 const MAX_SMALL: u128 = 1 << 20;
 /// Version that is written.
-const WRITTEN: u32 = 3;
+const WRITTEN_VERSION: u32 = 3;
 
 /// Streams in the file's order, each with the values of all Gaussians.
 pub struct Streams {
@@ -50,7 +50,7 @@ pub struct Description {
 
 impl Description {
     pub fn written(count: usize, sh_degree: usize, fractional_bits: u32) -> Self {
-        Description { version: WRITTEN, count, sh_degree, fractional_bits, axes: Axes::RUB }
+        Description { version: WRITTEN_VERSION, count, sh_degree, fractional_bits, axes: Axes::RUB }
     }
 
     /// Parses the part of the header that all versions have in common.
@@ -217,7 +217,7 @@ fn axes_of(path: &Path, mut extensions: &[u8]) -> Result<Axes> {
             return Err(Error::input(path, "an extension", found, format!("{length} bytes")));
         };
         if let (COORDINATE_SYSTEM, Some(number)) = (kind, contents.first_chunk()) {
-            axes = Axes::numbered(path, u32::from_le_bytes(*number))?;
+            axes = Axes::from_code(path, u32::from_le_bytes(*number))?;
         }
         extensions = after;
     }

@@ -50,7 +50,7 @@ fn repeats_have_no_seam() {
 }
 
 #[test]
-fn families_paint_numbers_and_sizes_of_this_world() {
+fn texture_families_draw_finite_pixels_of_plausible_size() {
     for (family, surface) in surfaces() {
         assert!(surface.canvas.pixels.iter().all(|pixel| pixel.is_finite()), "family {family}");
         assert!((0.02..25.).contains(&surface.repeat_metres), "family {family}: {} m", surface.repeat_metres);
@@ -92,7 +92,7 @@ fn mean_equals_a_sample_with_a_wide_footprint() {
 }
 
 #[test]
-fn samples_repeat_and_go_over_evenly() {
+fn samples_are_periodic_and_continuous_in_footprint() {
     let texture = Texture::draw(&mut ChaCha8Rng::seed_from_u64(8), Purpose::Floor);
     let mut random = ChaCha8Rng::seed_from_u64(9);
     for _ in 0..100 {

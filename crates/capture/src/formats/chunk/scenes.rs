@@ -5,9 +5,9 @@ use globalsplat_torch_file::{Archive, Array, Dtype, Id, UnknownGlobals, Value, V
 use std::ops::Range;
 
 /// Number of views that is always allowed. A chunk may refer to one image repeatedly, in a byte or two each time.
-const VIEWS: usize = 100_000;
-/// Minimum number of bytes of the file per view beyond [`VIEWS`]. An image with its description takes more.
-const BYTES_OF_VIEW: usize = 50;
+const ALWAYS_ALLOWED_VIEWS: usize = 100_000;
+/// Minimum number of bytes of the file per view beyond [`ALWAYS_ALLOWED_VIEWS`]. An image with its description takes more.
+const MIN_BYTES_PER_VIEW: usize = 50;
 
 /// A posed video.
 #[derive(Debug, Clone)]
@@ -33,7 +33,7 @@ impl Scene {
 /// Fails if the pickle uses anything that isn't allowed, or is not a list of scenes.
 pub(super) fn scenes(bytes: &[u8], archive: &Archive) -> Result<Vec<Scene>, String> {
     let values = unpickle(&mut &bytes[archive.pickle.clone()], UnknownGlobals::Refuse)?;
-    let most = VIEWS + bytes.len() / BYTES_OF_VIEW;
+    let most = ALWAYS_ALLOWED_VIEWS + bytes.len() / MIN_BYTES_PER_VIEW;
     scenes_of(&values, archive, most).map_err(|why| format!("unusable ({why})"))
 }
 

@@ -10,14 +10,14 @@ pub fn is_comment(line: &str) -> bool {
 }
 
 /// A line that is parsed word by word.
-pub struct Words<'a> {
+pub struct WordReader<'a> {
     pub file: &'a Path,
     /// Line number, starting at 1.
     pub number: usize,
     pub rest: &'a str,
 }
 
-impl Words<'_> {
+impl WordReader<'_> {
     pub fn parse<T: FromStr>(&mut self, name: &str, expected: &str) -> Result<T> {
         let trimmed = self.rest.trim_start();
         let (word, rest) = trimmed.split_at(trimmed.find(char::is_whitespace).unwrap_or(trimmed.len()));
@@ -29,13 +29,13 @@ impl Words<'_> {
 }
 
 /// A file's contents that are parsed value by value.
-pub struct Bytes<'a> {
+pub struct ByteReader<'a> {
     pub file: &'a Path,
     pub contents: &'a [u8],
     pub at: usize,
 }
 
-impl Bytes<'_> {
+impl ByteReader<'_> {
     pub fn left(&self) -> usize {
         self.contents.len() - self.at
     }

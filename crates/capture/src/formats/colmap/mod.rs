@@ -12,7 +12,7 @@ use super::{CaptureOpener, MASKS, folder_name};
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose, format_names};
 use crate::geometry::{Camera, ImageSize};
 use crate::lens::{COLMAP_MODELS, Lens, LensModel};
-use fields::{Bytes, Words, is_comment};
+use fields::{ByteReader, WordReader, is_comment};
 use glam::{DMat4, DQuat, DVec3};
 use globalsplat_files::{Error, Result, read_text};
 use std::collections::BTreeMap;
@@ -74,7 +74,7 @@ impl Model {
     }
 
     fn images(&self) -> Result<Vec<ImageEntry>> {
-        if self.is_text() { images_of_text(&self.images) } else { images_of_bytes(&self.images) }
+        if self.is_text() { read_images_text(&self.images) } else { read_images_binary(&self.images) }
     }
 }
 
@@ -163,8 +163,8 @@ fn read(
     purpose: Purpose,
 ) -> Result<Capture> {
     let entries = match model.is_text() {
-        true => cameras_of_text(&model.cameras)?,
-        false => cameras_of_bytes(&model.cameras)?,
+        true => read_cameras_text(&model.cameras)?,
+        false => read_cameras_binary(&model.cameras)?,
     };
     let mut cameras = BTreeMap::new();
     for camera in entries {
@@ -256,11 +256,11 @@ fn lens(file: &Path, entry: &CameraEntry) -> Result<(Camera, LensModel)> {
 }
 
 /// Reads lines of the form CAMERA_ID MODEL WIDTH HEIGHT PARAMS…
-fn cameras_of_text(file: &Path) -> Result<Vec<CameraEntry>> {
+fn read_cameras_text(file: &Path) -> Result<Vec<CameraEntry>> {
     let text = read_text(file)?;
     let mut cameras = vec![];
     for (number, line) in (1..).zip(text.lines()).filter(|(_, line)| !is_comment(line)) {
-        let mut words = Words { file, number, rest: line };
+        let mut words = WordReader { file, number, rest: line };
         let id = words.parse("CAMERA_ID", "a whole number")?;
         let model = words.parse("MODEL", "a camera model")?;
         let (width, height) =
@@ -275,7 +275,7 @@ fn cameras_of_text(file: &Path) -> Result<Vec<CameraEntry>> {
 }
 
 /// Reads pairs of lines: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then POINTS2D as X Y POINT3D_ID, which may be empty.
-fn images_of_text(file: &Path) -> Result<Vec<ImageEntry>> {
+fn read_images_text(file: &Path) -> Result<Vec<ImageEntry>> {
     let text = read_text(file)?;
     let mut images = vec![];
     let mut lines = (1..).zip(text.lines());
@@ -283,7 +283,7 @@ fn images_of_text(file: &Path) -> Result<Vec<ImageEntry>> {
         if is_comment(line) {
             continue;
         }
-        let mut words = Words { file, number, rest: line };
+        let mut words = WordReader { file, number, rest: line };
         let id = words.parse("IMAGE_ID", "a whole number")?;
         let mut quaternion = [0.; 4];
         for (value, name) in quaternion.iter_mut().zip(["QW", "QX", "QY", "QZ"]) {
@@ -309,12 +309,12 @@ fn images_of_text(file: &Path) -> Result<Vec<ImageEntry>> {
 }
 
 /// Reads the number of cameras (u64), then for each camera: id (u32), model (i32), width and height (u64), parameters (f64).
-fn cameras_of_bytes(file: &Path) -> Result<Vec<CameraEntry>> {
-    const SMALLEST: usize = 4 + 4 + 8 + 8 + 2 * 8;
+fn read_cameras_binary(file: &Path) -> Result<Vec<CameraEntry>> {
+    const MIN_ENTRY_BYTES: usize = 4 + 4 + 8 + 8 + 2 * 8;
     let contents = std::fs::read(file).map_err(Error::read(file))?;
-    let mut bytes = Bytes { file, contents: &contents, at: 0 };
+    let mut bytes = ByteReader { file, contents: &contents, at: 0 };
     let mut cameras = vec![];
-    for i in 0..bytes.count("the number of cameras", SMALLEST)? {
+    for i in 0..bytes.count("the number of cameras", MIN_ENTRY_BYTES)? {
         let id = u32::from_le_bytes(bytes.take(|| format!("the id of camera {i}, counted from 0,"))?);
         let number = i32::from_le_bytes(bytes.take(|| format!("model of camera {id}"))?);
         let model = usize::try_from(number).ok().and_then(|number| COLMAP_MODELS.get(number));
@@ -336,13 +336,13 @@ fn cameras_of_bytes(file: &Path) -> Result<Vec<CameraEntry>> {
 
 /// Reads the number of images (u64), then for each image: id (u32), quaternion and translation (f64), camera id (u32), name
 /// (terminated by a 0), and the number of its points (u64), each x, y (f64) and an id (u64).
-fn images_of_bytes(file: &Path) -> Result<Vec<ImageEntry>> {
+fn read_images_binary(file: &Path) -> Result<Vec<ImageEntry>> {
     const POINT: usize = 24;
-    const SMALLEST: usize = 4 + 7 * 8 + 4 + 1 + 8;
+    const MIN_ENTRY_BYTES: usize = 4 + 7 * 8 + 4 + 1 + 8;
     let contents = std::fs::read(file).map_err(Error::read(file))?;
-    let mut bytes = Bytes { file, contents: &contents, at: 0 };
+    let mut bytes = ByteReader { file, contents: &contents, at: 0 };
     let mut images = vec![];
-    for i in 0..bytes.count("the number of images", SMALLEST)? {
+    for i in 0..bytes.count("the number of images", MIN_ENTRY_BYTES)? {
         let id = u32::from_le_bytes(bytes.take(|| format!("the id of image {i}, counted from 0,"))?);
         let mut pose = [0.; 7];
         for value in &mut pose {

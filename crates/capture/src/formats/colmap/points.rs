@@ -1,6 +1,6 @@
 //! 3D points of a COLMAP model.
 
-use super::fields::{Bytes, Words, is_comment};
+use super::fields::{ByteReader, WordReader, is_comment};
 use crate::capture::Capture;
 use glam::DVec3;
 use globalsplat_files::{Error, Result, read_text};
@@ -26,18 +26,18 @@ pub fn read_points(capture: &Capture) -> Result<Vec<Point>> {
         images.file_name().and_then(|name| name.to_str()).and_then(|name| name.strip_prefix("images."));
     let file = images.with_file_name(format!("points3D.{}", form.unwrap_or_default()));
     match form {
-        Some("bin") if file.is_file() => of_bytes(&file),
-        Some("txt") if file.is_file() => of_text(&file),
+        Some("bin") if file.is_file() => read_points_binary(&file),
+        Some("txt") if file.is_file() => read_points_text(&file),
         _ => Ok(vec![]),
     }
 }
 
 /// Reads lines of the form POINT3D_ID X Y Z R G B ERROR, followed by the views that see the point.
-fn of_text(file: &Path) -> Result<Vec<Point>> {
+fn read_points_text(file: &Path) -> Result<Vec<Point>> {
     let text = read_text(file)?;
     let mut points = vec![];
     for (number, line) in (1..).zip(text.lines()).filter(|(_, line)| !is_comment(line)) {
-        let mut words = Words { file, number, rest: line };
+        let mut words = WordReader { file, number, rest: line };
         let id: u64 = words.parse("POINT3D_ID", "a whole number")?;
         let mut position = [0.; 3];
         for (value, name) in position.iter_mut().zip(["X", "Y", "Z"]) {
@@ -54,13 +54,13 @@ fn of_text(file: &Path) -> Result<Vec<Point>> {
 
 /// Reads the number of points (u64), then for each point: id (u64), position (f64), colour (u8), error (f64), and the number of
 /// views that see it (u64), each two ids (u32).
-fn of_bytes(file: &Path) -> Result<Vec<Point>> {
+fn read_points_binary(file: &Path) -> Result<Vec<Point>> {
     const VIEW: usize = 8;
-    const SMALLEST: usize = 8 + 3 * 8 + 3 + 8 + 8;
+    const MIN_ENTRY_BYTES: usize = 8 + 3 * 8 + 3 + 8 + 8;
     let contents = std::fs::read(file).map_err(Error::read(file))?;
-    let mut bytes = Bytes { file, contents: &contents, at: 0 };
+    let mut bytes = ByteReader { file, contents: &contents, at: 0 };
     let mut points = vec![];
-    for i in 0..bytes.count("the number of points", SMALLEST)? {
+    for i in 0..bytes.count("the number of points", MIN_ENTRY_BYTES)? {
         let id = u64::from_le_bytes(bytes.take(|| format!("the id of point {i}, counted from 0,"))?);
         let mut position = [0.; 3];
         for value in &mut position {

@@ -1,9 +1,9 @@
-// Edge-aware smoothness of the depths of an image, and its gradient (neighbours.h), a few rows at a time.
+// Edge-aware smoothness of the depths of an image, and its gradient (unevenness.h), a few rows at a time.
 #pragma once
 
-#include "neighbours.h"
 #include "simd.h"
 #include "types.h"
+#include "unevenness.h"
 
 namespace globalsplat::raster::GS_ISA {
 
@@ -14,7 +14,7 @@ struct SmoothRow {
 };
 
 template <class T>
-GS_INLINE void load_row(const DepthPlane<T>& plane, int row, const SmoothRow<T>& to) {
+GS_INLINE void load_row(const SmoothnessPlane<T>& plane, int row, const SmoothRow<T>& to) {
   constexpr int lanes = Simd<T>::lanes;
   const bool inside = row >= 0 && row < plane.height;
   const int64_t pixels = int64_t(plane.width) * plane.height, first = int64_t(row) * plane.width;
@@ -24,8 +24,8 @@ GS_INLINE void load_row(const DepthPlane<T>& plane, int row, const SmoothRow<T>&
     Vector<T> depth{}, grey{};
     if (left > 0) {
       const T* photo = plane.photo + first + i;
-      depth = load_some<T>(plane.depth + first + i, left);
-      grey = grey_of<T>(load_some<T>(photo, left), load_some<T>(photo + pixels, left), load_some<T>(photo + 2 * pixels, left));
+      depth = load_partial<T>(plane.depth + first + i, left);
+      grey = grey_of<T>(load_partial<T>(photo, left), load_partial<T>(photo + pixels, left), load_partial<T>(photo + 2 * pixels, left));
     }
     store<T>(to.depth + 1 + i, depth);
     store<T>(to.grey + 1 + i, grey);
@@ -33,9 +33,9 @@ GS_INLINE void load_row(const DepthPlane<T>& plane, int row, const SmoothRow<T>&
 }
 
 // Returns the sum over pairs whose first pixel is in the rows [begin, end). If requested, writes `factor` times the gradient of the sum
-// over all pairs at the pixels of these rows. `scratch` has fit_scratch_size(width) elements.
+// over all pairs at the pixels of these rows. `scratch` has loss_scratch_size(width) elements.
 template <class T>
-double unevenness(const DepthPlane<T>& plane, T factor, int begin, int end, T* scratch) {
+double unevenness(const SmoothnessPlane<T>& plane, T factor, int begin, int end, T* scratch) {
   using V = Vector<T>;
   constexpr int lanes = Simd<T>::lanes;
   const int stride = plane.width + 1 + 2 * lanes;
@@ -59,7 +59,7 @@ double unevenness(const DepthPlane<T>& plane, T factor, int begin, int end, T* s
       if (plane.gradient == nullptr) continue;
       pair(own, i);
       pair(above, i + 1);
-      store_some<T>(plane.gradient + int64_t(row) * plane.width + i, gradient * factor, plane.width - i);
+      store_partial<T>(plane.gradient + int64_t(row) * plane.width + i, gradient * factor, plane.width - i);
     }
   }
   return sum_of_lanes<T>(sum);

@@ -1,4 +1,4 @@
-#include "refusals.h"
+#include "injected_failures.h"
 
 #include <pthread.h>
 
@@ -47,22 +47,22 @@ void set_stack_size(size_t bytes) {
 
 }  // namespace
 
-void refuse_memory(int64_t n, bool all_after) {
+void fail_allocations(int64_t n, bool all_after) {
   refused = 0;
   refuses_all_after = all_after;
   calls_left = n;
 }
 
-int64_t allow_memory() {
+int64_t stop_failing_allocations() {
   calls_left = kNever;
   return refused;
 }
 
-int64_t blocks() { return given; }
+int64_t count_live_blocks() { return given; }
 
 // No address space can hold such a stack.
-void refuse_threads() { set_stack_size(size_t(1) << 60); }
-void allow_threads() { set_stack_size(size_t(8) << 20); }
+void fail_thread_creation() { set_stack_size(size_t(1) << 60); }
+void allow_thread_creation() { set_stack_size(size_t(8) << 20); }
 
 }  // namespace globalsplat::checks
 

@@ -10,7 +10,7 @@ namespace globalsplat::raster {
 
 // Rendered images and the photos to compare them with: `planes` planes [H, W] each. Both sides have at least 11 pixels.
 template <class T>
-struct FitJob {
+struct PhotometricJob {
   const T* pictures;
   const T* photos;
   int64_t planes;
@@ -21,15 +21,15 @@ struct FitJob {
 // (spec
 // 9.4). Writes the gradient with respect to the images, [planes, H, W], if it isn't null.
 template <class T>
-double photometric(const FitJob<T>& job, double l1_weight, double ssim_weight, T* gradient, int threads);
+double photometric(const PhotometricJob<T>& job, double l1_weight, double ssim_weight, T* gradient, int num_threads);
 
 // Returns the weights of SSIM's window in each direction, [11].
 template <class T>
 const T* ssim_window();
 
-// Computes `factor` · the mean unevenness of depths (neighbours.h) over all pairs of neighbouring pixels. Writes the gradient with respect
+// Computes `factor` · the mean unevenness of depths (unevenness.h) over all pairs of neighbouring pixels. Writes the gradient with respect
 // to the depths, [views, H, W], if `gradient` isn't null.
 template <class T>
-double depth_smoothness(const DepthJob<T>& job, double factor, T* gradient, int threads);
+double depth_smoothness(const SmoothnessJob<T>& job, double factor, T* gradient, int num_threads);
 
 }  // namespace globalsplat::raster

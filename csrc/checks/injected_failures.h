@@ -6,13 +6,13 @@
 namespace globalsplat::checks {
 
 // Makes the n-th call of `operator new` from now on fail, counted from 0 over all threads, or that and all later ones.
-void refuse_memory(int64_t n, bool all_after);
+void fail_allocations(int64_t n, bool all_after);
 // Ends the failures and returns the number of calls that failed.
-int64_t allow_memory();
+int64_t stop_failing_allocations();
 // Returns the number of blocks of `operator new` that are not freed.
-int64_t blocks();
+int64_t count_live_blocks();
 
-void refuse_threads();
-void allow_threads();
+void fail_thread_creation();
+void allow_thread_creation();
 
 }  // namespace globalsplat::checks

@@ -1,6 +1,6 @@
 """Analyses the cross-attention of scene tokens to a capture's photos.
 
-    python parity/what_is_read.py --weights models/tiny.safetensors --capture DIR     DIR has a cameras.json
+    python parity/attention_statistics.py --weights models/tiny.safetensors --capture DIR     DIR has a cameras.json
 
 The model is the parity checks' reference. Keys and values are linear in the normalized image tokens. For each, the
 table shows the contributions of the ray and colour channels: root mean square over patches and channels, after the mean
@@ -53,13 +53,13 @@ def perplexity(weights):
     return torch.exp(torch.special.entr(weights).sum(-1))
 
 
-def look(config, params, name, slots, memory, views):
+def print_row(config, params, name, slots, memory, views):
     """Prints a row about the cross-attention of one round of one stream, given its inputs."""
     ray_width, heads = config["dim_rays"], config["num_heads"]
     normed = layer_norm(params, f"{name}.mem_ln", memory)[0, 4:]  # patches only, without the registers
     apart = normed - normed.mean(0)
 
-    def made_of(layer, half):
+    def contribution(layer, half):
         return (apart[:, half] @ params[f"{name}.{layer}.weight"][:, half].T).square().mean().sqrt().item()
 
     rays, colours = slice(0, ray_width), slice(ray_width, None)
@@ -70,8 +70,8 @@ def look(config, params, name, slots, memory, views):
     scores = torch.einsum("qhc,khc->hqk", queries, keys) / keys.shape[-1] ** 0.5
     patches = perplexity(scores.softmax(-1)).median().item()
     in_view = perplexity(scores.unflatten(-1, (views, -1)).softmax(-1)).median().item()
-    made = [made_of(layer, half) for layer in ("mem_k", "mem_v") for half in (rays, colours)]
-    numbers = [f"{number:>12.3f}" for number in made] + [f"{number:>12.1f}" for number in (patches, in_view)]
+    contributions = [contribution(layer, half) for layer in ("mem_k", "mem_v") for half in (rays, colours)]
+    numbers = [f"{number:>12.3f}" for number in contributions] + [f"{number:>12.1f}" for number in (patches, in_view)]
     print(f"{name.removeprefix('slot_encoder.'):<14} {' '.join(numbers)}")
 
 
@@ -93,7 +93,7 @@ def main():
     read = reference.stream.read_memory
 
     def looked_at(params, name, slots, memory, *others):
-        look(config, params, name, slots, memory, inputs[0].shape[1])
+        print_row(config, params, name, slots, memory, inputs[0].shape[1])
         return read(params, name, slots, memory, *others)
 
     reference.stream.read_memory = looked_at

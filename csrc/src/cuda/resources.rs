@@ -2,7 +2,7 @@
 
 /// Resources that one kernel uses on one architecture.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct KernelUse {
+pub struct KernelResources {
     /// Name of the kernel in the source.
     pub name: String,
     /// Number of registers per thread, at most 255.
@@ -22,12 +22,12 @@ pub struct KernelUse {
 /// ptxas         .     0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads
 /// ptxas info    : Used 40 registers, used 0 barriers, 16384 bytes smem
 /// ```
-pub fn usage(log: &str) -> Vec<KernelUse> {
-    let mut kernels: Vec<KernelUse> = vec![];
+pub fn parse_resources(log: &str) -> Vec<KernelResources> {
+    let mut kernels: Vec<KernelResources> = vec![];
     for line in log.lines() {
         if let Some(name) = line.split_once("entry function '").and_then(|(_, rest)| rest.split('\'').next())
         {
-            kernels.push(KernelUse { name: name.into(), registers: 0, shared: 0, stack: 0, spills: 0 });
+            kernels.push(KernelResources { name: name.into(), registers: 0, shared: 0, stack: 0, spills: 0 });
         }
         let Some(kernel) = kernels.last_mut() else { continue };
         let (_, line) = line.rsplit_once(" : ").unwrap_or(("", line));
@@ -50,7 +50,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_log_is_understood() {
+    fn resources_are_parsed_from_a_log() {
         let log = "ptxas info    : 244 bytes gmem\n\
                    ptxas info    : Compiling entry function 'gs_blend' for 'sm_90'\n\
                    ptxas info    : Function properties for gs_blend\n\
@@ -59,13 +59,13 @@ mod tests {
                    ptxas info    : Compile time = 17.077 ms\n\
                    ptxas info    : Compiling entry function 'gs_list' for 'sm_90'\n\
                    ptxas info    : Used 20 registers, used 0 barriers, 400 bytes cmem[0]\n";
-        let of = |name: &str, registers, shared, stack, spills| KernelUse {
+        let of = |name: &str, registers, shared, stack, spills| KernelResources {
             name: name.into(),
             registers,
             shared,
             stack,
             spills,
         };
-        assert_eq!(usage(log), [of("gs_blend", 40, 16384, 608, 20), of("gs_list", 20, 0, 0, 0)]);
+        assert_eq!(parse_resources(log), [of("gs_blend", 40, 16384, 608, 20), of("gs_list", 20, 0, 0, 0)]);
     }
 }

@@ -1,7 +1,7 @@
-// Lists the tiles, and the 4×4 blocks of their pixels, that splats touch (kernels/reach.h).
+// Lists the tiles, and the 4×4 blocks of their pixels, that splats touch (kernels/touched_cells.h).
 #pragma once
 
-#include "reach.h"
+#include "touched_cells.h"
 #include "warp.h"
 
 namespace globalsplat::cuda {
@@ -16,7 +16,7 @@ extern "C" {
 __global__ void __launch_bounds__(kGaussianThreads)
     gs_cover(Call call, const Splat<float>* splats, uint32_t* group_pairs, uint32_t* of_tiles, uint32_t* first, uint64_t* keys,
              TileEntry* pairs) {
-  const int groups = parts(call.count, kWarp), group = int(blockIdx.x) * (int(blockDim.x) / kWarp) + warp();
+  const int groups = ceil_div(call.count, kWarp), group = int(blockIdx.x) * (int(blockDim.x) / kWarp) + warp();
   const int view = int(blockIdx.y);
   if (group >= groups) return;
   const Splat<float>* of_group = splats + int64_t(view) * call.count + group * kWarp;
@@ -24,9 +24,9 @@ __global__ void __launch_bounds__(kGaussianThreads)
   uint32_t& place = group_pairs[int64_t(view) * groups + group];
   const uint32_t pairs_before = first == nullptr ? 0 : place;
 
-  raster::lane::Box box{0, 0, 0, 0};
-  const bool any = i < call.count && raster::lane::box_of(of_group[lane()], call.grid, box);
-  const uint32_t candidates = any ? uint32_t(box.tiles()) : 0, end = prefix_sum(candidates), begin = end - candidates;
+  raster::lane::TileRange range{0, 0, 0, 0};
+  const bool any = i < call.count && raster::lane::compute_tile_range(of_group[lane()], call.grid, range);
+  const uint32_t candidates = any ? uint32_t(range.tiles()) : 0, end = prefix_sum(candidates), begin = end - candidates;
   const uint32_t total = __shfl_sync(kAll, end, kWarp - 1);
   uint32_t reached = 0, own_first = 0;
   for (uint32_t base = 0; base < total; base += kWarp) {
@@ -35,13 +35,13 @@ __global__ void __launch_bounds__(kGaussianThreads)
     for (int step = kWarp / 2; step > 0; step /= 2)
       if (__shfl_sync(kAll, end, owner + step - 1) <= candidate) owner += step;
     const uint32_t within = candidate - __shfl_sync(kAll, begin, owner);
-    const int width = __shfl_sync(kAll, box.width(), owner);
-    const int x = __shfl_sync(kAll, box.x0, owner) + int(within % uint32_t(width));
-    const int y = __shfl_sync(kAll, box.y0, owner) + int(within / uint32_t(width));
+    const int width = __shfl_sync(kAll, range.width(), owner);
+    const int x = __shfl_sync(kAll, range.x0, owner) + int(within % uint32_t(width));
+    const int y = __shfl_sync(kAll, range.y0, owner) + int(within / uint32_t(width));
     const Splat<float>& splat = of_group[owner];
     const uint32_t blocks =
         candidate < total
-            ? raster::lane::reached_cells(splat, x * raster::kTile, y * raster::kTile, raster::kBlock)
+            ? raster::lane::touched_cells(splat, x * raster::kTile, y * raster::kTile, raster::kBlock)
             : 0;
 
     const unsigned reaching = __ballot_sync(kAll, blocks != 0);
@@ -52,7 +52,7 @@ __global__ void __launch_bounds__(kGaussianThreads)
     if (blocks != 0) {
       const uint32_t slot = atomicAdd(&of_tiles[int64_t(view) * call.grid.tiles() + y * call.grid.columns + x], 1u);
       if (first != nullptr) {
-        const uint32_t record = pairs_before + reached + uint32_t(__popc(reaching & before()));
+        const uint32_t record = pairs_before + reached + uint32_t(__popc(reaching & lanemask_lt()));
         keys[slot] = key_of(__float_as_uint(splat.z), record);
         pairs[record] = {uint32_t(&splat - splats), record, blocks};
       }

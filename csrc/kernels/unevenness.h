@@ -1,5 +1,5 @@
-// Unevenness of depths between two neighbouring pixels, weighted down at edges of the photo; used by smooth.h and ../cuda/losses.h. With
-// depths a and b and the photo's grey values g and h at the two pixels:
+// Unevenness of depths between two neighbouring pixels, weighted down at edges of the photo; used by smoothness.h and ../cuda/losses.h.
+// With depths a and b and the photo's grey values g and h at the two pixels:
 //
 //   e^{−10 |g − h|} · 2 |a − b| / (a + b),    ∂/∂a = ± e^{−10 |g − h|} · 4b / (a + b)²
 //

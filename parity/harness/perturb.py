@@ -11,11 +11,11 @@ FACTOR = 1.001
 # Minimum change that zeroing a slice or swapping axes makes, relative to the tensor's norm.
 MIN_SHARE = 1e-2
 # Minimum change relative to the tolerance. It takes effect where the tolerance is wide.
-BEYOND = 2.0
+MIN_CHANGE_IN_TOLERANCES = 2.0
 THREADS = 2
 
 
-def disturbances(array, tolerance, is_zero, scale):
+def perturbations(array, tolerance, is_zero, scale):
     """Yields pairs of a description and a perturbed tensor; None stands for a missing tensor.
 
     If `is_zero`, the tensor should be zero, and its perturbation is relative to `scale`.
@@ -30,9 +30,9 @@ def disturbances(array, tolerance, is_zero, scale):
     if is_zero:
         yield "not zero", array + array.dtype.type(1e-3 * (scale or 1.0))
         return
-    factor = max(FACTOR, 1.0 + BEYOND * tolerance)
+    factor = max(FACTOR, 1.0 + MIN_CHANGE_IN_TOLERANCES * tolerance)
     yield f"times {factor:g}", array * array.dtype.type(factor)
-    share = max(MIN_SHARE, BEYOND * tolerance)
+    share = max(MIN_SHARE, MIN_CHANGE_IN_TOLERANCES * tolerance)
     yield from with_zeroed_slice(array, share)
     yield from with_swapped_axes(array, share)
 
@@ -65,20 +65,20 @@ def with_swapped_axes(array, share):
                 return
 
 
-def undetected(answer, expected, tolerance, doubtful=None):
+def find_undetected(answer, expected, tolerance, doubtful=None):
     """Perturbs a result that passes, one tensor at a time, and compares the perturbed tensor.
 
     Returns the number of perturbations and descriptions of those that still pass.
     """
     scale = gradient_scale(expected)
 
-    def disturb(name):
+    def perturb(name):
         # compare_tensor() computes in float64, so one conversion serves all perturbations.
         value = expected[name] if expected[name].dtype.kind == "i" else np.asarray(expected[name], dtype=np.float64)
         finding = compare_tensor(name, answer[name], value, tolerance, scale, doubtful)
         is_zero = finding.measure == "zero" or norm(value) == 0.0
         tried, missed = 0, []
-        for what, wrong in disturbances(answer[name], finding.tolerance, is_zero, scale):
+        for what, wrong in perturbations(answer[name], finding.tolerance, is_zero, scale):
             tried += 1
             if compare_tensor(name, wrong, value, tolerance, scale, doubtful).passed:
                 missed.append(f"{name}: {what}")
@@ -86,5 +86,5 @@ def undetected(answer, expected, tolerance, doubtful=None):
 
     # Threads save time because numpy releases the GIL. For a large model, these comparisons are most of the self-test's work.
     with ThreadPoolExecutor(THREADS) as pool:
-        found = list(pool.map(disturb, expected))
+        found = list(pool.map(perturb, expected))
     return sum(tried for tried, _ in found), [what for _, missed in found for what in missed]

@@ -30,20 +30,20 @@ struct Buffer {
 //   place(list, at, item)      stores the item at its position in the sorted list
 // Returns the start of every bucket for every list, followed by the end of the last one.
 template <class Count, class Each, class Place>
-std::vector<Buffer<uint32_t>> distribute(int threads, int64_t lists, int64_t chunks, int64_t buckets, const Count& count,
-                                         const Each& each, const Place& place) {
+std::vector<Buffer<uint32_t>> counting_sort(int num_threads, int64_t lists, int64_t chunks, int64_t buckets, const Count& count,
+                                            const Each& each, const Place& place) {
   std::vector<Buffer<uint32_t>> starts(lists), next(lists);
   for (int64_t list = 0; list < lists; ++list) {
     starts[size_t(list)] = Buffer<uint32_t>(size_t(buckets + 1));
     next[size_t(list)] = Buffer<uint32_t>(size_t(chunks * buckets));
   }
-  parallel_for(threads, lists * chunks, [&](int64_t task) {
+  parallel_for(num_threads, lists * chunks, [&](int64_t task) {
     const int64_t list = task / chunks, chunk = task % chunks;
     uint32_t* counts = next[size_t(list)].data.get() + chunk * buckets;
     std::memset(counts, 0, size_t(buckets) * sizeof(uint32_t));
     count(list, chunk, [&](int64_t bucket) { ++counts[bucket]; });
   });
-  parallel_for(threads, lists, [&](int64_t list) {
+  parallel_for(num_threads, lists, [&](int64_t list) {
     Buffer<uint32_t>&start = starts[size_t(list)], &at = next[size_t(list)];
     uint32_t sum = 0;
     for (int64_t bucket = 0; bucket < buckets; ++bucket) {
@@ -56,7 +56,7 @@ std::vector<Buffer<uint32_t>> distribute(int threads, int64_t lists, int64_t chu
     }
     start[size_t(buckets)] = sum;
   });
-  parallel_for(threads, lists * chunks, [&](int64_t task) {
+  parallel_for(num_threads, lists * chunks, [&](int64_t task) {
     const int64_t list = task / chunks, chunk = task % chunks;
     uint32_t* at = next[size_t(list)].data.get() + chunk * buckets;
     each(list, chunk, [&](int64_t bucket, const auto& item) { place(list, at[bucket]++, item); });
@@ -73,7 +73,7 @@ struct DepthItem {
 
 // Sorts every list of items by key with a stable radix sort, 11 bits at a time.
 template <class T>
-void sort_by_depth(int threads, std::vector<Buffer<DepthItem<T>>>& lists, int64_t chunks) {
+void sort_by_depth(int num_threads, std::vector<Buffer<DepthItem<T>>>& lists, int64_t chunks) {
   constexpr int kBits = 11;
   std::vector<Buffer<DepthItem<T>>> sorted(lists.size());
   for (size_t i = 0; i < lists.size(); ++i) sorted[i] = Buffer<DepthItem<T>>(lists[i].size);
@@ -84,8 +84,8 @@ void sort_by_depth(int threads, std::vector<Buffer<DepthItem<T>>>& lists, int64_
       const size_t end = items.size * size_t(chunk + 1) / size_t(chunks);
       for (size_t i = begin; i < end; ++i) visit(int64_t(items[i].key >> shift) & ((1 << kBits) - 1), items[i]);
     };
-    distribute(
-        threads, int64_t(lists.size()), chunks, int64_t(1) << kBits,
+    counting_sort(
+        num_threads, int64_t(lists.size()), chunks, int64_t(1) << kBits,
         [&](int64_t list, int64_t chunk, const auto& visit) {
           each(list, chunk, [&](int64_t bucket, const auto&) { visit(bucket); });
         },

@@ -13,16 +13,16 @@ inline Camera<T> camera_of(const T* w2c, const T* intrinsics) {
 }
 
 template <class T>
-inline Lens<T> lens_of(const Camera<T>& camera, int width, int height, double eps2d) {
-  Lens<T> lens{camera, width, height, T(eps2d), {}, 0, 0, 0, 0};
+inline ProjectionParams<T> make_projection_params(const Camera<T>& camera, int width, int height, double eps2d) {
+  ProjectionParams<T> params{camera, width, height, T(eps2d), {}, 0, 0, 0, 0};
   const T *r = camera.rotation, *t = camera.translation;
-  for (int k = 0; k < 3; ++k) lens.centre[k] = -(r[k] * t[0] + r[3 + k] * t[1] + r[6 + k] * t[2]);
+  for (int k = 0; k < 3; ++k) params.centre[k] = -(r[k] * t[0] + r[3 + k] * t[1] + r[6 + k] * t[2]);
   const T margin_x = T(kJacobianMargin) * width / camera.fx, margin_y = T(kJacobianMargin) * height / camera.fy;
-  lens.x_low = -camera.cx / camera.fx - margin_x;
-  lens.x_high = (width - camera.cx) / camera.fx + margin_x;
-  lens.y_low = -camera.cy / camera.fy - margin_y;
-  lens.y_high = (height - camera.cy) / camera.fy + margin_y;
-  return lens;
+  params.x_low = -camera.cx / camera.fx - margin_x;
+  params.x_high = (width - camera.cx) / camera.fx + margin_x;
+  params.y_low = -camera.cy / camera.fy - margin_y;
+  params.y_high = (height - camera.cy) / camera.fy + margin_y;
+  return params;
 }
 
 }  // namespace globalsplat::raster

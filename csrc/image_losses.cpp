@@ -1,4 +1,4 @@
-#include "fit.h"
+#include "image_losses.h"
 
 #include <ATen/ops/empty.h>
 #include <ATen/ops/empty_like.h>
@@ -6,11 +6,10 @@
 #include <ATen/ops/sum.h>
 #include <torch/csrc/autograd/custom_function.h>
 
-#include "cuda/fitting.h"
+#include "cuda/launch_losses.h"
 #include "cuda/torch_device.h"
-#include "globalsplat-csrc/src/fit.rs.h"
-#include "kernels/fit.h"
-#include "kernels/optim.h"
+#include "globalsplat-csrc/src/image_losses.rs.h"
+#include "kernels/image_losses.h"
 #include "threads.h"
 
 namespace globalsplat {
@@ -23,17 +22,17 @@ using torch::autograd::tensor_list;
 const Tensor& borrowed(size_t address) { return *reinterpret_cast<const Tensor*>(address); }
 
 template <class Body>
-auto by_type(const Tensor& t, Body body) {
+auto dispatch_by_type(const Tensor& t, Body body) {
   return t.scalar_type() == at::kDouble ? body(0.) : body(0.f);
 }
 
 // Returns a scalar loss, and saves the gradient of its argument, if requested; it has already been computed.
-Tensor with_gradient(AutogradContext* ctx, const Tensor& value, const Tensor& gradient) {
+Tensor save_gradient(AutogradContext* ctx, const Tensor& value, const Tensor& gradient) {
   if (gradient.defined()) ctx->save_for_backward({gradient});
   return value;
 }
 
-Tensor of_argument(AutogradContext* ctx, const Tensor& g) {
+Tensor input_gradient(AutogradContext* ctx, const Tensor& g) {
   const Tensor gradient = ctx->get_saved_variables()[0];
   // The incoming gradient is usually 1, because the loss itself is differentiated: skip the product. On a GPU this check would have to
   // wait.
@@ -47,14 +46,14 @@ T* data_or_null(const Tensor& t) {
 
 Tensor scalar(double value, const Tensor& like) { return at::empty({}, like.options()).fill_(value); }
 
-Tensor sum_of(const cuda::Parts& parts, const Tensor& like) {
+Tensor sum_of(const cuda::PartialSums& parts, const Tensor& like) {
   return cuda::tensor_of(parts.numbers.get(), {parts.count}, like.options().dtype(at::kDouble)).sum().to(like.scalar_type());
 }
 
 // Photometric loss of two contiguous tensors of one type and device: the CPU, or a GPU that our kernels support.
 struct PhotometricFunction : torch::autograd::Function<PhotometricFunction> {
   template <class T>
-  static raster::FitJob<T> job_of(const Tensor& picture, const Tensor& photo) {
+  static raster::PhotometricJob<T> job_of(const Tensor& picture, const Tensor& photo) {
     const int64_t height = picture.size(-2), width = picture.size(-1);
     return {picture.data_ptr<T>(), photo.data_ptr<T>(), picture.numel() / (height * width), int(width), int(height)};
   }
@@ -62,26 +61,26 @@ struct PhotometricFunction : torch::autograd::Function<PhotometricFunction> {
   static Tensor forward(AutogradContext* ctx, Tensor picture, Tensor photo, double l1_weight, double ssim_weight, bool differentiable) {
     const Tensor gradient = differentiable ? at::empty_like(picture) : Tensor();
     if (const auto device = cuda::kernel_device(picture)) {
-      const cuda::Parts parts =
+      const cuda::PartialSums parts =
           cuda::photometric(*device, job_of<float>(picture, photo), l1_weight, ssim_weight, data_or_null<float>(gradient));
-      return with_gradient(ctx, sum_of(parts, picture), gradient);
+      return save_gradient(ctx, sum_of(parts, picture), gradient);
     }
-    const double value = by_type(picture, [&](auto number) {
+    const double value = dispatch_by_type(picture, [&](auto number) {
       using T = decltype(number);
-      return raster::photometric<T>(job_of<T>(picture, photo), l1_weight, ssim_weight, data_or_null<T>(gradient), threads());
+      return raster::photometric<T>(job_of<T>(picture, photo), l1_weight, ssim_weight, data_or_null<T>(gradient), get_num_threads());
     });
-    return with_gradient(ctx, scalar(value, picture), gradient);
+    return save_gradient(ctx, scalar(value, picture), gradient);
   }
 
   static tensor_list backward(AutogradContext* ctx, tensor_list g) {
-    return {of_argument(ctx, g[0]), Tensor(), Tensor(), Tensor(), Tensor()};
+    return {input_gradient(ctx, g[0]), Tensor(), Tensor(), Tensor(), Tensor()};
   }
 };
 
 // Depth smoothness of contiguous tensors of one type and device: the CPU, or a GPU that our kernels support.
 struct SmoothnessFunction : torch::autograd::Function<SmoothnessFunction> {
   template <class T>
-  static raster::DepthJob<T> job_of(const Tensor& depths, const Tensor& photos) {
+  static raster::SmoothnessJob<T> job_of(const Tensor& depths, const Tensor& photos) {
     const int64_t height = depths.size(-2), width = depths.size(-1);
     return {depths.data_ptr<T>(), photos.data_ptr<T>(), depths.numel() / (height * width), int(width), int(height)};
   }
@@ -89,19 +88,19 @@ struct SmoothnessFunction : torch::autograd::Function<SmoothnessFunction> {
   static Tensor forward(AutogradContext* ctx, Tensor depths, Tensor photos, double factor, bool differentiable) {
     const Tensor gradient = differentiable ? at::empty_like(depths) : Tensor();
     if (const auto device = cuda::kernel_device(depths)) {
-      const cuda::Parts parts =
+      const cuda::PartialSums parts =
           cuda::depth_smoothness(*device, job_of<float>(depths, photos), factor, data_or_null<float>(gradient));
-      return with_gradient(ctx, sum_of(parts, depths), gradient);
+      return save_gradient(ctx, sum_of(parts, depths), gradient);
     }
-    const double value = by_type(depths, [&](auto number) {
+    const double value = dispatch_by_type(depths, [&](auto number) {
       using T = decltype(number);
-      return raster::depth_smoothness<T>(job_of<T>(depths, photos), factor, data_or_null<T>(gradient), threads());
+      return raster::depth_smoothness<T>(job_of<T>(depths, photos), factor, data_or_null<T>(gradient), get_num_threads());
     });
-    return with_gradient(ctx, scalar(value, depths), gradient);
+    return save_gradient(ctx, scalar(value, depths), gradient);
   }
 
   static tensor_list backward(AutogradContext* ctx, tensor_list g) {
-    return {of_argument(ctx, g[0]), Tensor(), Tensor(), Tensor()};
+    return {input_gradient(ctx, g[0]), Tensor(), Tensor(), Tensor()};
   }
 };
 
@@ -136,20 +135,6 @@ void depth_smoothness(size_t depths_address, size_t photos_address, double facto
   TORCH_CHECK(photos.sizes() == at::IntArrayRef(expected), "photos have shape ", photos.sizes(), ", expected ",
               at::IntArrayRef(expected));
   run<SmoothnessFunction>(depths, photos, out, factor);
-}
-
-void adam(const AdamArguments& of) {
-  const Tensor &value = borrowed(of.value), &gradient = borrowed(of.gradient);
-  const Tensor &first = borrowed(of.first), &second = borrowed(of.second);
-  for (const Tensor* t : {&value, &gradient, &first, &second})
-    TORCH_CHECK(t->device().is_cpu() && t->is_contiguous() && t->sizes() == value.sizes() &&
-                    t->scalar_type() == value.scalar_type() && (t->scalar_type() == at::kFloat || t->scalar_type() == at::kDouble),
-                "a parameter, its gradient and its moments must have one shape and type, be contiguous, and be on the CPU");
-  by_type(value, [&](auto number) {
-    using T = decltype(number);
-    const raster::AdamNumbers<T> numbers{value.data_ptr<T>(), gradient.data_ptr<T>(), first.data_ptr<T>(), second.data_ptr<T>()};
-    raster::adam<T>({of.rate, of.root, of.decay, of.beta1, of.beta2, of.epsilon}, numbers, value.numel(), threads());
-  });
 }
 
 }  // namespace globalsplat

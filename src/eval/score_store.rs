@@ -31,22 +31,22 @@ pub(super) struct StoredScores {
 
 /// Returns the paths of the files that an evaluation of the scenes `keys` writes into the folder `out`.
 pub fn evaluation_files<'a>(out: &Path, keys: impl IntoIterator<Item = &'a String>) -> Vec<PathBuf> {
-    let journal = Journal::new(out);
-    let of_scene = |key: &'a String| [journal.file(key), comparison_path(out, key)];
+    let store = ScoreStore::new(out);
+    let of_scene = |key: &'a String| [store.file(key), comparison_path(out, key)];
     let of_all = [IDENTITY, SCORES, TABLE].map(|name| out.join(name));
     keys.into_iter().flat_map(of_scene).chain(of_all).collect()
 }
 
 /// The folder `scenes` of an evaluation, which holds a file of scores per scene.
-pub(super) struct Journal {
+pub(super) struct ScoreStore {
     scenes: PathBuf,
 }
 
-impl Journal {
-    /// Opens the journal in the folder `out`, or creates it.
+impl ScoreStore {
+    /// Opens the store in the folder `out`, or creates it.
     ///
     /// # Errors
-    /// Fails if `out` holds files of another evaluation or a broken journal, or if it can't be written.
+    /// Fails if `out` holds files of another evaluation or a broken store, or if it can't be written.
     pub fn open(out: &Path, identity: &Identity) -> Result<Self> {
         let file = out.join(IDENTITY);
         // An evaluation writes `file` first, so without it these files belong to something else.
@@ -61,10 +61,10 @@ impl Journal {
                 "a folder of its own (choose another output folder)",
             ));
         }
-        let journal = Journal::new(out);
-        std::fs::create_dir_all(&journal.scenes).map_err(Error::write(&journal.scenes))?;
+        let store = ScoreStore::new(out);
+        std::fs::create_dir_all(&store.scenes).map_err(Error::write(&store.scenes))?;
         // If no scene has been scored yet, different settings do no harm.
-        let mut entries = std::fs::read_dir(&journal.scenes).map_err(Error::read(&journal.scenes))?;
+        let mut entries = std::fs::read_dir(&store.scenes).map_err(Error::read(&store.scenes))?;
         if entries.next().is_some()
             && let Ok(text) = std::fs::read(&file)
         {
@@ -73,7 +73,7 @@ impl Journal {
                 format!("{} on {} by {}, {width}×{height} pixels", of.method, of.dataset, of.index)
             };
             return match serde_json::from_slice::<Identity>(&text) {
-                Ok(found) if found == *identity => Ok(journal),
+                Ok(found) if found == *identity => Ok(store),
                 Ok(found) => {
                     let expected = format!("{} (choose another output folder)", wanted(identity));
                     Err(Error::input(&file, "the evaluation", format!("of {}", wanted(&found)), expected))
@@ -87,12 +87,12 @@ impl Journal {
             };
         }
         write_json(&file, identity)?;
-        Ok(journal)
+        Ok(store)
     }
 
-    /// Returns the journal in the folder `out`, without accessing the disk.
+    /// Returns the store in the folder `out`, without accessing the disk.
     pub fn new(out: &Path) -> Self {
-        Journal { scenes: out.join("scenes") }
+        ScoreStore { scenes: out.join("scenes") }
     }
 
     /// Returns the stored scores of scene `key`. Returns `None` if there are none, or if they can't be read.
@@ -105,7 +105,7 @@ impl Journal {
     ///
     /// # Errors
     /// Fails if the file can't be written.
-    pub fn keep(&self, key: &str, scores: &SceneScores, files: String) -> Result<()> {
+    pub fn write_scores(&self, key: &str, scores: &SceneScores, files: String) -> Result<()> {
         Ok(write_json(&self.file(key), &StoredScores { scores: scores.clone(), files: Some(files) })?)
     }
 

@@ -16,7 +16,7 @@ const LEVELS: usize = 32;
 const STACK: usize = (WIDTH - 1) * LEVELS + 1;
 
 /// Bounding volume hierarchy of triangles.
-pub(super) struct Tree {
+pub(super) struct Bvh {
     nodes: Vec<Node>,
     leaves: Vec<Leaf>,
     root: Child,
@@ -57,20 +57,21 @@ struct Ray {
     enters: [usize; 3],
 }
 
-impl Tree {
+impl Bvh {
     /// Builds the tree. Also returns, for every position in the tree, the index of its triangle, or `None`. There may be more
     /// positions than triangles.
-    pub fn new(triangles: &[Triangle]) -> (Tree, Vec<Option<usize>>) {
+    pub fn new(triangles: &[Triangle]) -> (Bvh, Vec<Option<usize>>) {
         let settings = BvhBuildParams { max_prims_per_leaf: WIDTH as u32, ..BvhBuildParams::fast_build() };
         let tree = build_bvh2_from_tris(triangles, settings, &mut Duration::default());
-        let mut build = Build { tree: &tree, triangles, places: vec![], nodes: vec![], leaves: vec![] };
-        let root = build.child(0, 1);
-        let Build { places, nodes, leaves, .. } = build;
-        (Tree { nodes, leaves, root }, places)
+        let mut builder =
+            BvhBuilder { tree: &tree, triangles, places: vec![], nodes: vec![], leaves: vec![] };
+        let root = builder.child(0, 1);
+        let BvhBuilder { places, nodes, leaves, .. } = builder;
+        (Bvh { nodes, leaves, root }, places)
     }
 
     /// Returns the first triangle from `origin` in the direction `towards` (unit) that is nearer than `limit`.
-    pub fn nearest(&self, origin: Vec3, towards: Vec3, limit: f32) -> Option<Hit> {
+    pub fn closest_hit(&self, origin: Vec3, towards: Vec3, limit: f32) -> Option<Hit> {
         let ray = Ray::new(origin, towards);
         let mut found = Hit { slot: usize::MAX, distance: limit };
         let mut stack = [(0., self.root); STACK];
@@ -83,7 +84,7 @@ impl Tree {
             }
             if child & LEAF != 0 {
                 let leaf = (child ^ LEAF) as usize;
-                let (distances, mask) = self.leaves[leaf].meet(&ray, found.distance);
+                let (distances, mask) = self.leaves[leaf].intersect(&ray, found.distance);
                 for lane in lanes(mask) {
                     if distances[lane] < found.distance {
                         found = Hit { slot: WIDTH * leaf + lane, distance: distances[lane] };
@@ -92,7 +93,7 @@ impl Tree {
                 continue;
             }
             let node = &self.nodes[child as usize];
-            let (entries, mask) = node.meet(&ray, found.distance);
+            let (entries, mask) = node.intersect(&ray, found.distance);
             let first = count;
             for lane in lanes(mask) {
                 // Keep the stack sorted with the nearest box last, because it is popped first.
@@ -109,7 +110,7 @@ impl Tree {
     }
 
     /// Returns `true` if the ray hits any triangle before `limit`.
-    pub fn is_blocked(&self, origin: Vec3, towards: Vec3, limit: f32) -> bool {
+    pub fn is_occluded(&self, origin: Vec3, towards: Vec3, limit: f32) -> bool {
         let ray = Ray::new(origin, towards);
         let mut stack = [self.root; STACK];
         let mut count = 1;
@@ -117,13 +118,13 @@ impl Tree {
             count -= 1;
             let child = stack[count];
             if child & LEAF != 0 {
-                if self.leaves[(child ^ LEAF) as usize].meet(&ray, limit).1 != 0 {
+                if self.leaves[(child ^ LEAF) as usize].intersect(&ray, limit).1 != 0 {
                     return true;
                 }
                 continue;
             }
             let node = &self.nodes[child as usize];
-            for lane in lanes(node.meet(&ray, limit).1) {
+            for lane in lanes(node.intersect(&ray, limit).1) {
                 stack[count] = node.children[lane];
                 count += 1;
             }
@@ -154,7 +155,7 @@ impl Ray {
 impl Node {
     /// Returns the distances at which the ray enters the boxes, and a mask of the boxes that it hits before `limit`.
     #[inline(always)]
-    fn meet(&self, ray: &Ray, limit: f32) -> ([f32; WIDTH], u32) {
+    fn intersect(&self, ray: &Ray, limit: f32) -> ([f32; WIDTH], u32) {
         let reach =
             |axis: usize, side: usize| (self.corners[side][axis] - ray.origin[axis]) * ray.inverse[axis];
         let [x, y, z] = ray.enters;
@@ -168,7 +169,7 @@ impl Leaf {
     /// Returns the ray's distances to the triangles, and a mask of those that it hits before `limit` (Möller and Trumbore, 1997).
     /// Triangles include their edges, so that there is no gap between adjacent ones.
     #[inline(always)]
-    fn meet(&self, ray: &Ray, limit: f32) -> ([f32; WIDTH], u32) {
+    fn intersect(&self, ray: &Ray, limit: f32) -> ([f32; WIDTH], u32) {
         let Leaf { corner, right, up } = self;
         let normal = cross(right, up);
         let scale = Vec4::ONE / dot(&normal, &ray.towards);
@@ -194,7 +195,7 @@ fn dot(a: &[Vec4; 3], b: &[Vec4; 3]) -> Vec4 {
 }
 
 /// Converter of a binary tree to one with four boxes per node.
-struct Build<'a> {
+struct BvhBuilder<'a> {
     tree: &'a Bvh2,
     triangles: &'a [Triangle],
     places: Vec<Option<usize>>,
@@ -202,7 +203,7 @@ struct Build<'a> {
     leaves: Vec<Leaf>,
 }
 
-impl Build<'_> {
+impl BvhBuilder<'_> {
     /// Converts node `index` of the binary tree, at depth `level`.
     fn child(&mut self, index: usize, level: usize) -> Child {
         assert!(level <= LEVELS, "triangles that no tree of {LEVELS} levels can sort");
@@ -224,7 +225,7 @@ impl Build<'_> {
             open.push(children + 1);
         }
         let number = self.nodes.len();
-        self.nodes.push(Node::around(open.iter().map(|&index| &self.tree.nodes[index])));
+        self.nodes.push(Node::from_bvh2_nodes(open.iter().map(|&index| &self.tree.nodes[index])));
         for (lane, &index) in open.iter().enumerate() {
             self.nodes[number].children[lane] = self.child(index, level + 1);
         }
@@ -250,7 +251,7 @@ impl Build<'_> {
 }
 
 impl Node {
-    fn around<'a>(nodes: impl Iterator<Item = &'a Bvh2Node>) -> Node {
+    fn from_bvh2_nodes<'a>(nodes: impl Iterator<Item = &'a Bvh2Node>) -> Node {
         // Empty boxes end before they begin, and no ray hits them.
         let mut boxes = [Aabb { min: Vec3A::splat(f32::MAX), max: Vec3A::splat(f32::MIN) }; WIDTH];
         for (known, node) in boxes.iter_mut().zip(nodes) {
@@ -292,7 +293,7 @@ mod tests {
                     Triangle { v0, v1, v2 }
                 })
                 .collect();
-            let (tree, places) = Tree::new(&triangles);
+            let (bvh, places) = Bvh::new(&triangles);
             let mut known: Vec<usize> = places.iter().flatten().copied().collect();
             known.sort();
             assert!(known.into_iter().eq(0..count), "every triangle has a place");
@@ -306,18 +307,18 @@ mod tests {
                 }
                 let limit = if i % 2 == 0 { f32::INFINITY } else { 6. };
                 let ray = Ray::new(origin, towards);
-                let nearest = tree.leaves.iter().flat_map(|leaf| {
-                    let (distances, mask) = leaf.meet(&ray, limit);
+                let nearest = bvh.leaves.iter().flat_map(|leaf| {
+                    let (distances, mask) = leaf.intersect(&ray, limit);
                     lanes(mask).map(move |lane| distances[lane])
                 });
                 let nearest = nearest.min_by(f32::total_cmp);
-                let found = tree.nearest(origin, towards, limit);
+                let found = bvh.closest_hit(origin, towards, limit);
                 assert_eq!(
                     found.map(|hit| hit.distance),
                     nearest,
                     "{count} triangles, from {origin} to {towards}"
                 );
-                assert_eq!(tree.is_blocked(origin, towards, limit), nearest.is_some());
+                assert_eq!(bvh.is_occluded(origin, towards, limit), nearest.is_some());
                 if let Some(hit) = found {
                     hits += 1;
                     let Triangle { v0, v1, v2 } = triangles[places[hit.slot].expect("a triangle")];
@@ -331,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_at_the_same_distance_from_all_sides_has_no_gaps() {
+    fn triangles_of_a_fan_have_no_gaps() {
         // A fan of triangles around a point, seen along every edge.
         let point = |i: usize| {
             let angle = i as f32 / 12. * std::f32::consts::TAU;
@@ -340,12 +341,14 @@ mod tests {
         let centre = Vec3A::new(0., 0.3, 0.);
         let fan: Vec<Triangle> =
             (0..12).map(|i| Triangle { v0: centre, v1: point(i), v2: point(i + 1) }).collect();
-        let (tree, _) = Tree::new(&fan);
+        let (bvh, _) = Bvh::new(&fan);
         for i in 0..12 * 50 {
             let at = centre.lerp(point(i / 50), (i % 50) as f32 / 51.);
             let origin = Vec3::from(at) + Vec3::Y;
-            assert!(tree.is_blocked(origin, Vec3::NEG_Y, 1.1), "a gap at {at}");
-            assert!((tree.nearest(origin, Vec3::NEG_Y, 9.).expect("a triangle").distance - 1.).abs() < 1e-5);
+            assert!(bvh.is_occluded(origin, Vec3::NEG_Y, 1.1), "a gap at {at}");
+            assert!(
+                (bvh.closest_hit(origin, Vec3::NEG_Y, 9.).expect("a triangle").distance - 1.).abs() < 1e-5
+            );
         }
     }
 }

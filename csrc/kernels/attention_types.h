@@ -43,19 +43,19 @@ struct AttentionHead {
 };
 
 // Functions that multiply bfloat16 matrices.
-struct Bf16Products {
+struct Bf16Gemm {
   // Computes c [m, n] = a [m, k] · b [k, n] in float32, or adds the product to c if `adds`. k is even, and pairs of b's rows are
   // interleaved: [k / 2, n, 2]. a_row, b_row and c_row are the strides between rows in elements; for b, half the stride between pairs of
   // rows.
   void (*multiply)(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row, int64_t c_row, bool adds, const Bf16* a,
                    const Bf16* b, float* c);
   // Releases the calling thread's hardware state, such as AMX tiles. Each task calls it after its last product.
-  void (*done)();
+  void (*release)();
 };
 
 // Output of the forward pass, and the gradient with respect to it.
 template <class Number>
-struct AttentionPast {
+struct AttentionOutputs {
   Rows<const Number> out, grad_out;
 };
 

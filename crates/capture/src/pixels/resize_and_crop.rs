@@ -1,4 +1,4 @@
-//! Fitting an image to the model's size (spec 9.2), with exact intrinsics.
+//! Resizing and cropping of an image to the model's size (spec 9.2), with exact intrinsics.
 
 use super::planes::Planes;
 use super::resample::{self, Region, Resampler};
@@ -10,7 +10,7 @@ use std::ops::Range;
 const WIDTH_MULTIPLE: f64 = 8.;
 
 /// The largest centred rectangle of a target aspect ratio in a camera's image, and the first resize.
-struct Cut {
+struct Crop {
     region: Region,
     /// Size of the rectangle after the first resize.
     size: ImageSize,
@@ -19,7 +19,7 @@ struct Cut {
     corner: (f64, f64),
 }
 
-impl Cut {
+impl Crop {
     fn of(camera: &Camera, size: ImageSize) -> Self {
         let (full_width, full_height) = (f64::from(camera.width), f64::from(camera.height));
         let scaled = full_width * f64::from(size.height) / full_height;
@@ -29,51 +29,52 @@ impl Cut {
 
         let aspect = f64::from(size.width) / height;
         // At least one pixel is left, however elongated the target size is.
-        let (cut_width, cut_height) =
+        let (crop_width, crop_height) =
             ((height * aspect).min(width).round().max(1.), (width / aspect).min(height).round().max(1.));
-        let (left, top) = (((width - cut_width) / 2.).floor(), ((height - cut_height) / 2.).floor());
-        Cut {
+        let (left, top) = (((width - crop_width) / 2.).floor(), ((height - crop_height) / 2.).floor());
+        Crop {
             // Only the part that is kept is resampled.
             region: Region {
                 left: left / scale_x,
                 top: top / scale_y,
-                width: cut_width / scale_x,
-                height: cut_height / scale_y,
+                width: crop_width / scale_x,
+                height: crop_height / scale_y,
             },
-            size: ImageSize { height: cut_height as u32, width: cut_width as u32 },
+            size: ImageSize { height: crop_height as u32, width: crop_width as u32 },
             scale: (scale_x, scale_y),
             corner: (left, top),
         }
     }
 }
 
-fn is_as_large(camera: &Camera, size: ImageSize) -> bool {
+fn has_size(camera: &Camera, size: ImageSize) -> bool {
     (camera.height, camera.width) == (size.height, size.width)
 }
 
-/// Returns the columns and rows of `camera`'s image that [`fit`] reads.
-pub fn source_region(camera: &Camera, size: ImageSize) -> [Range<usize>; 2] {
-    if is_as_large(camera, size) {
+/// Returns the columns and rows of `camera`'s image that [`resize_and_crop`] reads.
+pub fn source_ranges(camera: &Camera, size: ImageSize) -> [Range<usize>; 2] {
+    if has_size(camera, size) {
         return [0..camera.width as usize, 0..camera.height as usize];
     }
-    let cut = Cut::of(camera, size);
-    resample::source_region((camera.width, camera.height), cut.region, cut.size)
+    let crop = Crop::of(camera, size);
+    resample::source_ranges((camera.width, camera.height), crop.region, crop.size)
 }
 
 /// Resizes the image to the height of `size` with the aspect ratio kept (width rounded to a multiple of 8), cuts out the largest
 /// centred rectangle with the aspect ratio of `size`, and resizes again if the result doesn't have `size` yet.
-pub fn fit(image: &RgbImage, camera: &Camera, size: ImageSize) -> (Planes, Camera) {
-    if is_as_large(camera, size) {
+pub fn resize_and_crop(image: &RgbImage, camera: &Camera, size: ImageSize) -> (Planes, Camera) {
+    if has_size(camera, size) {
         return (Planes::from_rgb(image), *camera);
     }
-    let cut = Cut::of(camera, size);
-    let planes = resample(image, cut.region, cut.size);
-    let intrinsics = camera.intrinsics.resized(cut.scale.0, cut.scale.1).cropped(cut.corner.0, cut.corner.1);
+    let crop = Crop::of(camera, size);
+    let planes = resample(image, crop.region, crop.size);
+    let intrinsics =
+        camera.intrinsics.resized(crop.scale.0, crop.scale.1).cropped(crop.corner.0, crop.corner.1);
 
-    let (planes, intrinsics) = if cut.size == size {
+    let (planes, intrinsics) = if crop.size == size {
         (planes, intrinsics)
     } else {
-        let (width, height) = (f64::from(cut.size.width), f64::from(cut.size.height));
+        let (width, height) = (f64::from(crop.size.width), f64::from(crop.size.height));
         let region = Region { left: 0., top: 0., width, height };
         let scale = (f64::from(size.width) / width, f64::from(size.height) / height);
         (resample(&planes.to_rgb(), region, size), intrinsics.resized(scale.0, scale.1))
@@ -101,7 +102,7 @@ mod tests {
 
     #[test]
     fn a_wide_image_is_cut_to_a_square() {
-        let (image, fitted) = fit(&RgbImage::new(640, 360), &camera(640, 360), [256, 256].into());
+        let (image, fitted) = resize_and_crop(&RgbImage::new(640, 360), &camera(640, 360), [256, 256].into());
         assert_eq!(image.to_rgb().dimensions(), (256, 256));
         // 640×360 → 456×256 (455.1 rounded to a multiple of 8) → 256×256.
         let k = fitted.intrinsics;
@@ -111,7 +112,8 @@ mod tests {
 
     #[test]
     fn a_tall_image_is_cut_too() {
-        let (image, fitted) = fit(&RgbImage::new(1080, 1920), &camera(1080, 1920), [128, 192].into());
+        let (image, fitted) =
+            resize_and_crop(&RgbImage::new(1080, 1920), &camera(1080, 1920), [128, 192].into());
         assert_eq!(image.to_rgb().dimensions(), (192, 128));
         assert!((fitted.intrinsics.cx - 96.).abs() < 1e-9);
         assert!((fitted.intrinsics.cy - 64.).abs() < 1.); // cut at a whole pixel
@@ -120,10 +122,10 @@ mod tests {
     #[test]
     fn a_line_is_cut_out_of_a_square() {
         for size in [[1, 4000], [4000, 1], [11, 2000]] {
-            let (image, fitted) = fit(&RgbImage::new(40, 40), &camera(40, 40), size.into());
+            let (image, fitted) = resize_and_crop(&RgbImage::new(40, 40), &camera(40, 40), size.into());
             let (width, height) = image.to_rgb().dimensions();
             assert_eq!(([height, width], [fitted.height, fitted.width]), (size, size));
-            source_region(&camera(40, 40), size.into());
+            source_ranges(&camera(40, 40), size.into());
         }
     }
 
@@ -138,7 +140,7 @@ mod tests {
             }
         }
         let before = camera(640, 360);
-        let (fitted, after) = fit(&image, &before, [128, 128].into());
+        let (fitted, after) = resize_and_crop(&image, &before, [128, 128].into());
         let (mut weight, mut sx, mut sy) = (0., 0., 0.);
         for (px, py, p) in fitted.to_rgb().enumerate_pixels() {
             let v = f64::from(p.0[0]);

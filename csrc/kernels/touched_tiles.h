@@ -1,14 +1,14 @@
-// Lists the tiles that splats touch, and in each tile the blocks of 4×4 pixels that they touch, by the exact test in reach.h.
+// Lists the tiles that splats touch, and in each tile the blocks of 4×4 pixels that they touch, by the exact test in touched_cells.h.
 #pragma once
 
-#include "reach.h"
 #include "simd.h"
+#include "touched_cells.h"
 #include "types.h"
 
 namespace globalsplat::raster::GS_ISA {
 
 // A splat and a tile that it may touch; the exact test is still to be made. The values fit into 16 bits, because an image has at most 2^20
-// pixels per side and a call processes at most kCoverTask splats.
+// pixels per side and a call processes at most kSplatsPerTask splats.
 struct Candidate {
   uint16_t x, y;     // column and row of the tile
   uint16_t unused;
@@ -21,10 +21,10 @@ static_assert(sizeof(Candidate) == sizeof(TilePair));
 template <class T>
 GS_INLINE int64_t write_candidates(const Splat<T>& s, uint16_t index, const Grid& grid, int64_t capacity, Candidate* out,
                                    bool& full) {
-  Box box;
-  if (!box_of(s, grid, box)) return 0;
-  const auto [x0, x1, y0, y1] = box;
-  const int64_t tiles = box.tiles();
+  TileRange range;
+  if (!compute_tile_range(s, grid, range)) return 0;
+  const auto [x0, x1, y0, y1] = range;
+  const int64_t tiles = range.tiles();
   if ((full = capacity < (tiles < 4 ? 4 : tiles))) return 0;
   const auto candidate = [&](int x, int y) { return Candidate{uint16_t(x), uint16_t(y), 0, index}; };
   if (x1 - x0 < 2 && y1 - y0 < 2) {
@@ -41,7 +41,7 @@ GS_INLINE int64_t write_candidates(const Splat<T>& s, uint16_t index, const Grid
       // Mask of the cells within the bounding box.
       const uint32_t row_mask = (1u << (x1 - x < 3 ? x1 - x + 1 : 4)) - 1;
       const uint32_t mask = (row_mask * 0x1111u) & (y1 - y < 3 ? (1u << 4 * (y1 - y + 1)) - 1 : 0xFFFFu);
-      for (uint32_t cells = reached_cells(s, x * kTile, y * kTile, kTile) & mask; cells != 0; cells &= cells - 1) {
+      for (uint32_t cells = touched_cells(s, x * kTile, y * kTile, kTile) & mask; cells != 0; cells &= cells - 1) {
         const int cell = __builtin_ctz(cells);
         out[used++] = candidate(x + cell % 4, y + cell / 4);
       }
@@ -49,15 +49,15 @@ GS_INLINE int64_t write_candidates(const Splat<T>& s, uint16_t index, const Grid
   return used;
 }
 
-// Lists the tiles that the splats begin … end − 1 touch, splat by splat; they are at most kCoverTask splats. Appends the pairs to the
+// Lists the tiles that the splats begin … end − 1 touch, splat by splat; they are at most kSplatsPerTask splats. Appends the pairs to the
 // `used` existing ones and adds their number to `used`. The pairs of splat i start at pairs[first[i − begin]]. Stops before a splat whose
 // pairs might exceed `capacity`, and returns its index, or else `end`. For one splat, a capacity of max(4, number of tiles) always
 // suffices.
 template <class T>
-int64_t cover(const Splat<T>* splats, int64_t begin, int64_t end, const Grid& grid, TilePair* pairs, int64_t capacity,
-              int64_t& used, uint32_t* first) {
+int64_t list_touched_tiles(const Splat<T>* splats, int64_t begin, int64_t end, const Grid& grid, TilePair* pairs, int64_t capacity,
+                           int64_t& used, uint32_t* first) {
   // Ends of each splat's candidates and of its pairs. The pairs overwrite the candidates in `pairs`.
-  uint32_t candidates_end[kCoverTask], pairs_end[kCoverTask];
+  uint32_t candidates_end[kSplatsPerTask], pairs_end[kSplatsPerTask];
   const auto at = [&](int64_t k) { return pairs + used + k; };
   int64_t count = 0, stop = begin;
   for (bool full = false; stop < end; ++stop) {
@@ -71,7 +71,7 @@ int64_t cover(const Splat<T>* splats, int64_t begin, int64_t end, const Grid& gr
   for (int64_t k = 0; k < count; ++k) {
     Candidate c;
     __builtin_memcpy(&c, at(k), sizeof c);
-    const uint32_t blocks = reached_cells(splats[begin + c.splat], c.x * kTile, c.y * kTile, kBlock);
+    const uint32_t blocks = touched_cells(splats[begin + c.splat], c.x * kTile, c.y * kTile, kBlock);
     *at(kept) = {uint32_t(c.y * grid.columns + c.x), blocks};
     kept += blocks != 0;
     pairs_end[c.splat] = uint32_t(kept);

@@ -1,4 +1,4 @@
-#include "fitting.h"
+#include "launch_losses.h"
 
 #include <algorithm>
 #include <limits>
@@ -7,8 +7,8 @@
 namespace globalsplat::cuda {
 namespace {
 
-FitPlanes planes_of(const raster::FitJob<float>& job) {
-  FitPlanes planes{job.pictures, job.photos, job.width, job.height, {}};
+PhotometricPlanes planes_of(const raster::PhotometricJob<float>& job) {
+  PhotometricPlanes planes{job.pictures, job.photos, job.width, job.height, {}};
   std::copy_n(raster::ssim_window<float>(), raster::kWindow, planes.window);
   return planes;
 }
@@ -20,13 +20,14 @@ Blocks blocks_of(int64_t count) {
 }
 
 Blocks tiles_of(int64_t planes, int columns, int rows) {
-  return blocks_of(planes * parts(columns, kFitColumns) * parts(rows, kFitRows));
+  return blocks_of(planes * ceil_div(columns, kLossColumns) * ceil_div(rows, kLossRows));
 }
 
 }  // namespace
 
-Parts photometric(const Device& device, const raster::FitJob<float>& job, double l1_weight, double ssim_weight, float* gradient) {
-  const FitPlanes planes = planes_of(job);
+PartialSums photometric(const Device& device, const raster::PhotometricJob<float>& job, double l1_weight, double ssim_weight,
+                        float* gradient) {
+  const PhotometricPlanes planes = planes_of(job);
   const int columns = job.width - raster::kWindow + 1, rows = job.height - raster::kWindow + 1;
   const int64_t windows = int64_t(columns) * rows * job.planes, pixels = int64_t(job.width) * job.height * job.planes;
   const double each_window = ssim_weight / double(windows), each_pixel = l1_weight / double(pixels);
@@ -38,18 +39,18 @@ Parts photometric(const Device& device, const raster::FitJob<float>& job, double
       ssim_weight != 0 && gradient != nullptr ? device.allocate(size_t(3 * windows) * sizeof(float)) : Memory();
   auto* const of_block = static_cast<double*>(numbers.get());
   auto* const of_window = static_cast<float*>(slopes.get());
-  GS_LAUNCH(device, gs_ssim, of_windows, kFitThreads, planes, each_window, of_window, of_block);
-  GS_LAUNCH(device, gs_fit_gradient, of_pixels, kFitThreads, planes, of_window, each_pixel, float(each_window), gradient,
+  GS_LAUNCH(device, gs_ssim, of_windows, kLossThreads, planes, each_window, of_window, of_block);
+  GS_LAUNCH(device, gs_fit_gradient, of_pixels, kLossThreads, planes, of_window, each_pixel, float(each_window), gradient,
             of_block + of_windows.x);
   return {numbers, count};
 }
 
-Parts depth_smoothness(const Device& device, const raster::DepthJob<float>& job, double factor, float* gradient) {
+PartialSums depth_smoothness(const Device& device, const raster::SmoothnessJob<float>& job, double factor, float* gradient) {
   const int64_t width = job.width, height = job.height;
   const int64_t pairs = job.views * ((width - 1) * height + width * (height - 1));
-  const Blocks blocks = blocks_of((job.views * width * height + kFitThreads - 1) / kFitThreads);
+  const Blocks blocks = blocks_of((job.views * width * height + kLossThreads - 1) / kLossThreads);
   const Memory numbers = device.allocate(size_t(blocks.x) * sizeof(double));
-  GS_LAUNCH(device, gs_unevenness, blocks, kFitThreads, job, pairs > 0 ? factor / double(pairs) : 0, gradient,
+  GS_LAUNCH(device, gs_unevenness, blocks, kLossThreads, job, pairs > 0 ? factor / double(pairs) : 0, gradient,
             static_cast<double*>(numbers.get()));
   return {numbers, blocks.x};
 }

@@ -37,7 +37,7 @@ GS_INLINE Vector<T> similarity_of(const WindowMeans<T>& means, bool with_slopes,
   using V = Vector<T>;
   const V c1 = broadcast<T>(T(kSsimC1)), c2 = broadcast<T>(T(kSsimC2)), s = broadcast<T>(T(kSsimSample));
   const V m = means[0], n = means[1], squares = add_product(m, m, n * n);
-  const V like = add_product(m + m, n, c1), varied = add_product(s + s, take_product(m, n, means[4]), c2);
+  const V like = add_product(m + m, n, c1), varied = add_product(s + s, subtract_product(m, n, means[4]), c2);
   const V bright = squares + c1, variance = add_product(s, means[2] + means[3] - squares, c2);
   const V inverse = broadcast<T>(1) / (bright * variance);
   const V similarity = like * varied * inverse;

@@ -1,6 +1,6 @@
 //! Outdoor scenes: ground, and objects on it under the sky.
 
-use super::light::{Lamp, Sky};
+use super::light::{Light, Sky};
 use super::mesh::Mesh;
 use super::scene_builder::{SceneBuilder, standing};
 use super::shapes::height_field;
@@ -33,7 +33,7 @@ pub(super) fn landscape(builder: &mut SceneBuilder, sky: &Sky) -> CameraSpace {
     let height = move |x: f32, z: f32| {
         let far = (x * x + z * z).sqrt() / 40.;
         hills * noise.fractal(vec3(x / 9., 0., z / 9.), 3) * (0.2 + far)
-            + 0.4 * far * far * noise.at(vec3(x / 30., 5., z / 30.)) * 10.
+            + 0.4 * far * far * noise.sample(vec3(x / 30., 5., z / 30.)) * 10.
     };
     let ground = builder.material(Purpose::Ground);
     builder.add_mesh(height_field(vec2(160., 160.), 100, height), &ground, Affine3A::IDENTITY);
@@ -41,7 +41,7 @@ pub(super) fn landscape(builder: &mut SceneBuilder, sky: &Sky) -> CameraSpace {
         // A path or a street.
         let paving = builder.material(Purpose::Ground);
         let half = builder.within(0.5..3.);
-        let (bend, phase) = (builder.within(0. ..3.), builder.turn());
+        let (bend, phase) = (builder.within(0. ..3.), builder.angle());
         let way = Mesh::grid(4, 80, vec2(2. * half, 120.), |u, v| {
             let z = 60. - 120. * v;
             let x = bend * (0.08 * z + phase).sin() + (2. * u - 1.) * half;
@@ -50,9 +50,9 @@ pub(super) fn landscape(builder: &mut SceneBuilder, sky: &Sky) -> CameraSpace {
         builder.add_mesh(way, &paving, Affine3A::IDENTITY);
     }
     let spot = |builder: &mut SceneBuilder, least: f32, most: f32| {
-        let (far, turn) = (builder.scaled(least, most), builder.turn());
+        let (far, turn) = (builder.log_uniform(least, most), builder.angle());
         let (x, z) = (far * turn.cos(), far * turn.sin());
-        standing(vec3(x, height(x, z) - 0.02, z), builder.turn())
+        standing(vec3(x, height(x, z) - 0.02, z), builder.angle())
     };
     for _ in 0..builder.within(0..10) {
         let transform = spot(builder, 8., 60.);
@@ -67,7 +67,7 @@ pub(super) fn landscape(builder: &mut SceneBuilder, sky: &Sky) -> CameraSpace {
         things::bush(builder, transform);
     }
     for _ in 0..builder.within(0..10) {
-        let (transform, size) = (spot(builder, 1.5, 25.), builder.scaled(0.3, 3.));
+        let (transform, size) = (spot(builder, 1.5, 25.), builder.log_uniform(0.3, 3.));
         things::rock(builder, transform, size);
     }
     for _ in 0..builder.within(0..3) {
@@ -79,7 +79,11 @@ pub(super) fn landscape(builder: &mut SceneBuilder, sky: &Sky) -> CameraSpace {
         match builder.chance(0.4) {
             true => things::furniture(builder, transform),
             false => {
-                let size = vec3(builder.scaled(0.3, 4.), builder.scaled(0.3, 4.), builder.scaled(0.3, 4.));
+                let size = vec3(
+                    builder.log_uniform(0.3, 4.),
+                    builder.log_uniform(0.3, 4.),
+                    builder.log_uniform(0.3, 4.),
+                );
                 let count = builder.within(1..8);
                 things::heap(builder, size, transform, count);
             }
@@ -88,10 +92,10 @@ pub(super) fn landscape(builder: &mut SceneBuilder, sky: &Sky) -> CameraSpace {
     sun(builder, sky);
     let half = 0.5 * wide;
     CameraSpace {
-        least: vec3(-half, 0.3, -half),
-        most: vec3(half, 9., half),
-        eye: (1.2, 2.2),
-        roomy: 0.4,
+        min: vec3(-half, 0.3, -half),
+        max: vec3(half, 9., half),
+        eye_heights: (1.2, 2.2),
+        clearance: 0.4,
         walls: None,
     }
 }
@@ -106,9 +110,9 @@ pub(super) fn outside(builder: &mut SceneBuilder, size: Vec3) {
     builder.add_mesh(yard, &ground, Affine3A::IDENTITY);
     let reach = 0.5 * size.x.max(size.z);
     for _ in 0..builder.within(2..9) {
-        let (far, turn) = (reach + builder.scaled(3., 30.), builder.turn());
+        let (far, turn) = (reach + builder.log_uniform(3., 30.), builder.angle());
         let at = middle + far * vec3(turn.cos(), 0., turn.sin());
-        let transform = standing(at, builder.turn());
+        let transform = standing(at, builder.angle());
         match builder.within(0..4) {
             0 if far > reach + 9. => things::house(builder, transform),
             1 | 2 => {
@@ -125,10 +129,10 @@ fn sun(builder: &mut SceneBuilder, sky: &Sky) {
     if builder.chance(0.25) && cover > 0.6 {
         return;
     }
-    let (turn, height) = (builder.turn(), builder.within(0.15..2.));
+    let (turn, height) = (builder.angle(), builder.within(0.15..2.));
     let towards = vec3(turn.cos(), height, turn.sin()).normalize();
     let warm = vec3(1., 0.95, 0.88).lerp(vec3(1., 0.7, 0.45), (1. - towards.y).powi(3));
     let colour = builder.within(1. ..4.5) * (1.1 - cover) * warm;
     let spread = if cover > 0.5 { 0.3 } else { 0.02 };
-    builder.parts.lamps.push(Lamp::Sun { towards, spread, colour });
+    builder.contents.lights.push(Light::Sun { towards, spread, colour });
 }

@@ -53,13 +53,13 @@ impl Watchdog {
     /// # Errors
     /// Returns an error if the store can't be reached.
     pub fn begin(dist_env: &DistributedEnv, end: fn(Option<String>)) -> Result<Self> {
-        let serves = !dist_env.is_agent_store && dist_env.rank == 0;
+        let is_server = !dist_env.is_agent_store && dist_env.rank == 0;
         // A store that torchrun hosts is the same after a restart.
         let round = if dist_env.is_agent_store { dist_env.restarts } else { 0 };
         let store = ffi::connect(
             &dist_env.host,
             dist_env.port,
-            serves,
+            is_server,
             &format!("globalsplat/{round}"),
             CONNECT_TIMEOUT_SECONDS,
         );
@@ -70,15 +70,18 @@ impl Watchdog {
         })?;
         let (sender, receiver) = channel();
         let listening = Mutex::new(Some(sender));
-        let own =
-            Watchdog { store: store.another()?, dist_env: dist_env.clone(), listening: Mutex::default() };
+        let own = Watchdog {
+            store: store.clone_connection()?,
+            dist_env: dist_env.clone(),
+            listening: Mutex::default(),
+        };
         // Calls to a store whose machine is gone block, so another thread checks when the store last answered.
         let answered = Arc::new(Mutex::new(Some(Instant::now())));
         let last = answered.clone();
         let listen = move || {
             let mut others = PeerHeartbeats::new(&own.dist_env);
             loop {
-                match others.lost(&own.store) {
+                match others.exchange_heartbeats(&own.store) {
                     Some(why) => return end(own.claim_message(&why)),
                     None => *last.lock().expect("no thread panics here") = Some(Instant::now()),
                 }
@@ -167,14 +170,17 @@ impl PeerHeartbeats {
     }
 
     /// Sends a heartbeat. Returns the reason if the other ranks can't be reached any more.
-    fn lost(&mut self, store: &ffi::Store) -> Option<String> {
-        match self.listen(store) {
+    fn exchange_heartbeats(&mut self, store: &ffi::Store) -> Option<String> {
+        match self.try_exchange_heartbeats(store) {
             Ok(found) => found,
             Err(_) => Some("lost the connection to the rendezvous store: its host process has ended".into()),
         }
     }
 
-    fn listen(&mut self, store: &ffi::Store) -> std::result::Result<Option<String>, cxx::Exception> {
+    fn try_exchange_heartbeats(
+        &mut self,
+        store: &ffi::Store,
+    ) -> std::result::Result<Option<String>, cxx::Exception> {
         store.add(&key::beats(self.rank), 1)?;
         if store.add(key::FAILED, 0)? > 0 {
             // The rank that failed has already printed its error.

@@ -14,7 +14,7 @@ namespace globalsplat::raster::GS_ISA {
 // Returns bits that tell which cells of a 4×4 array the splat touches, bit 4·j + i for cell (i, j). Cells have size × size pixels, and the
 // first pixel is (x0, y0).
 template <class T>
-GS_INLINE uint32_t reached_cells(const Splat<T>& s, int x0, int y0, int size) {
+GS_INLINE uint32_t touched_cells(const Splat<T>& s, int x0, int y0, int size) {
   using V = Vector<T>;
   constexpr int lanes = Simd<T>::lanes;
   constexpr auto columns = [] {
@@ -38,13 +38,13 @@ GS_INLINE uint32_t reached_cells(const Splat<T>& s, int x0, int y0, int size) {
       return fma(p, p, r * r);
     };
     const V least = smaller(value(x_near, y), value(x, y_near));
-    bits |= uint32_t(lane_bits(at_most(least, broadcast<T>(s.reach)))) << first;
+    bits |= uint32_t(lane_bits(less_equal(least, broadcast<T>(s.reach)))) << first;
   }
   return bits;
 }
 
 // Range of tiles: columns x0 … x1 and rows y0 … y1.
-struct Box {
+struct TileRange {
   int x0, x1, y0, y1;
   int width() const { return x1 - x0 + 1; }
   int64_t tiles() const { return int64_t(width()) * (y1 - y0 + 1); }
@@ -52,12 +52,12 @@ struct Box {
 
 // Computes the range of tiles that overlap a splat's bounding box; returns false if there are none.
 template <class T>
-GS_INLINE bool box_of(const Splat<T>& s, const Grid& grid, Box& box) {
+GS_INLINE bool compute_tile_range(const Splat<T>& s, const Grid& grid, TileRange& range) {
   const T left = s.u - s.half_width, right = s.u + s.half_width;
   const T top = s.v - s.half_height, bottom = s.v + s.half_height;
   if (!(s.z > 0 && right > 0 && left < T(grid.width) && bottom > 0 && top < T(grid.height))) return false;
-  box = {left > 0 ? int(left) / kTile : 0, right < T(grid.width) ? int(right) / kTile : grid.columns - 1,
-         top > 0 ? int(top) / kTile : 0, bottom < T(grid.height) ? int(bottom) / kTile : grid.rows - 1};
+  range = {left > 0 ? int(left) / kTile : 0, right < T(grid.width) ? int(right) / kTile : grid.columns - 1,
+           top > 0 ? int(top) / kTile : 0, bottom < T(grid.height) ? int(bottom) / kTile : grid.rows - 1};
   return true;
 }
 
