@@ -180,8 +180,8 @@ fn basis_towards(camera: &Camera, mean: DVec3) -> [f64; BASES] {
     basis
 }
 
-/// Returns the weight of `camera` for a Gaussian: proportional to the number of pixels that it covers, and reduced by `OUTSIDE_WEIGHT` if its
-/// `radius` doesn't reach into the image. Returns `None` if its mean is nearer than `NEAR` or behind the camera.
+/// Returns the weight of `camera` for a Gaussian: proportional to the number of pixels that it covers, and reduced by `OUTSIDE_WEIGHT` if
+/// its `radius` doesn't reach into the image. Returns `None` if its mean is nearer than `NEAR` or behind the camera.
 fn weight(camera: &Camera, w2c: &DMat4, mean: DVec3, radius: f64) -> Option<f64> {
     let seen = w2c.transform_point3(mean);
     let (k, width, height) = (camera.intrinsics, f64::from(camera.width), f64::from(camera.height));
