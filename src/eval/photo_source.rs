@@ -62,7 +62,7 @@ impl LazyPhotos {
         match self {
             LazyPhotos::Loaded(views) => Ok(views[i].shallow_clone()),
             LazyPhotos::OnDisk { capture, indices, names, size } => {
-                let size = size.resized(&capture.cameras()[indices[i]]);
+                let size = size.resized(&capture.camera(indices[i]));
                 let view = load_views(capture, &indices[i..=i], size)?.remove(0);
                 Ok(View { name: names[i].clone(), ..view })
             }

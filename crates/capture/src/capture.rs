@@ -1,6 +1,6 @@
 //! The in-memory representation of a capture, common to all file formats.
 
-use crate::formats::find_masks;
+use crate::formats::find_masks_in;
 use crate::geometry::{Camera, ImageSize, check_pose, nearest_rigid_of_scaled};
 use crate::holdout::Holdout;
 use crate::image_source::ImageSource;
@@ -304,15 +304,10 @@ impl Capture {
     /// # Errors
     /// Fails if the folder can't be read or has no mask for any photo, or if a mask has another aspect ratio than its photo.
     pub fn with_masks(mut self, folder: &Path) -> Result<Self> {
-        std::fs::read_dir(folder).map_err(Error::read(folder))?;
         let names: Vec<&str> = self.frames.iter().map(|frame| frame.name.as_str()).collect();
-        let masks = find_masks(&[folder.to_owned()], &names);
+        let masks = find_masks_in(folder, &names)?;
         let without: Vec<&str> =
             names.iter().zip(&masks).filter(|(_, mask)| mask.is_none()).map(|(name, _)| *name).collect();
-        if without.len() == names.len() {
-            let expected = format!("{}.png", names[0]);
-            return Err(Error::input(folder, "the folder", "without a mask for any photo", expected));
-        }
         let line = (!without.is_empty()).then(|| {
             let (count, names) = (without.len(), format_names(without.iter().copied()));
             format!(
@@ -392,6 +387,11 @@ impl Capture {
     /// Returns the cameras of the views, at the sizes of the image files, or at that of the part of a photo that a view shows.
     pub fn cameras(&self) -> Vec<Camera> {
         self.views.iter().map(|view| view.camera).collect()
+    }
+
+    /// Returns the camera of view `index`.
+    pub fn camera(&self, index: usize) -> Camera {
+        self.views[index].camera
     }
 
     /// Returns `true` if any view has fewer pixels than `size` along a side. Fitting enlarges such a view, which adds no detail.

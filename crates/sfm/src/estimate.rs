@@ -4,8 +4,9 @@ use crate::colmap::{
     CAMERA_MODELS, Colmap, Command, ModelSummary, Outcome, exhaustive_pairs, read_models, sequential_pairs,
 };
 use crate::make_capture::VIDEO_FILE;
-use crate::photos::{FoundPhoto, MASKS, Photo, SkippedPhoto, find_photos, import_photos};
+use crate::photos::{FoundPhoto, Photo, SkippedPhoto, find_photos, import_photos};
 use crate::record::{FILE, Record};
+use globalsplat_capture::MASKS_FOLDER;
 use globalsplat_files::{Error, Result, write_atomically};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
@@ -443,7 +444,7 @@ impl Estimate<'_> {
             Some(parameters) => command.option("ImageReader.camera_params", parameters),
             None => command.option("ImageReader.default_focal_length_factor", focal),
         };
-        let masks = self.out.join(MASKS);
+        let masks = self.out.join(MASKS_FOLDER);
         let command = if masks.is_dir() { command.path("ImageReader.mask_path", &masks) } else { command };
         Ok(command
             .path("image_path", &self.images)

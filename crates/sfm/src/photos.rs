@@ -1,19 +1,15 @@
 //! Photos of a folder, checked and brought into a capture's folder of images.
 
 use globalsplat_capture::{
-    decode_photo, encode_photo, exif_focal, find_masks, is_equirectangular, list_photos, read_image_size,
-    read_mask,
+    MASKS_FOLDER, decode_photo, encode_photo, exif_focal, find_masks, find_masks_in, grey_to_rgb,
+    is_equirectangular, list_photos, read_image_size, read_mask,
 };
 use globalsplat_files::{Error, Result, checksum, write_atomically};
-use image::{Rgb, RgbImage};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::collections::{HashMap, HashSet};
 use std::fs;
 use std::path::{Path, PathBuf};
-
-/// Name of the folder of masks, among the photos of a user and in a capture.
-pub(crate) const MASKS: &str = "masks";
 
 /// Maximum difference between values of a photo that shows nothing, such as one taken with the lens cap on.
 const BLANK: u8 = 8;
@@ -80,7 +76,7 @@ pub(crate) struct ImportedPhotos {
 
 /// Brings the photos `found` in `source` into the folder `images`, by a hard link where the file system allows it. COLMAP
 /// reads pixels as they are stored: photos that EXIF says to rotate are written upright, and those that aren't JPEGs or PNGs are
-/// converted. Masks, which are files in `masks` or the opacity of a converted photo, are written to the folder [`MASKS`] beside `images`,
+/// converted. Masks, which are files in `masks` or the opacity of a converted photo, are written to the folder [`MASKS_FOLDER`] beside `images`,
 /// each of the size of its photo. Returns `None` if `on_photo`, which gets the number of photos that were looked at, returns `false`.
 ///
 /// # Errors
@@ -132,7 +128,7 @@ pub(crate) fn import_photos(
                         let expected = "an output whose images aren't the photos themselves";
                         return Err(Error::input(path, "the photo", found, expected));
                     }
-                    let target = images.with_file_name(MASKS).join(format!("{name}.png"));
+                    let target = images.with_file_name(MASKS_FOLDER).join(format!("{name}.png"));
                     match inspected.mask? {
                         Some(mask) => place(&path, Some(mask), &target)?,
                         // A run with other masks may have left one.
@@ -165,22 +161,18 @@ fn converted_name(name: &str, all_names: &HashSet<&str>) -> String {
     if all_names.contains(other.as_str()) { format!("{name}.jpg") } else { other }
 }
 
-/// Returns the masks of the photos `found`, by the photo's name: those in `masks`, or in the folder [`MASKS`] of `source`.
+/// Returns the masks of the photos `found`, by the photo's name: those in `masks`, or in the folder [`MASKS_FOLDER`] of `source`.
 fn find_mask_files<'a>(
     source: &Path,
     found: &'a [FoundPhoto],
     masks: Option<&Path>,
 ) -> Result<HashMap<&'a str, PathBuf>> {
     let names: Vec<&str> = found.iter().map(|photo| photo.name.as_str()).collect();
-    let folder = masks.map_or_else(|| source.join(MASKS), Path::to_owned);
-    let files = find_masks(std::slice::from_ref(&folder), &names);
-    let files: HashMap<_, _> =
-        names.iter().zip(files).filter_map(|(name, file)| Some((*name, file?))).collect();
-    if masks.is_some() && files.is_empty() {
-        let expected = format!("{}.png", names.first().unwrap_or(&"photo.jpg"));
-        return Err(Error::input(folder, "the folder", "without a mask for any photo", expected));
-    }
-    Ok(files)
+    let files = match masks {
+        Some(folder) => find_masks_in(folder, &names)?,
+        None => find_masks(&[source.join(MASKS_FOLDER)], &names),
+    };
+    Ok(names.into_iter().zip(files).filter_map(|(name, file)| Some((name, file?))).collect())
 }
 
 /// Returns a name that COLMAP's lists can hold, and that differs from `taken`, to which it is added.
@@ -240,10 +232,7 @@ fn inspect(path: &Path, mask: Option<&Path>) -> Result<Inspected, String> {
         (Some(file), _) => check_aspect(file, pixels.dimensions())
             .and_then(|()| read_mask(file, pixels.dimensions()))
             .map(Some),
-        (None, Some(alpha)) if !is_readable => {
-            let (width, height) = alpha.dimensions();
-            Ok(Some(RgbImage::from_fn(width, height, |x, y| Rgb([alpha.get_pixel(x, y)[0]; 3]))))
-        }
+        (None, Some(alpha)) if !is_readable => Ok(Some(grey_to_rgb(&alpha))),
         (None, _) => Ok(None),
     };
     let mask = levels.and_then(|levels| levels.map(|levels| encode_photo(&levels, false)).transpose());
@@ -287,7 +276,7 @@ fn place(source: &Path, contents: Option<Vec<u8>>, target: &Path) -> Result<()> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use image::{ImageFormat, Rgba, RgbaImage};
+    use image::{ImageFormat, Rgb, RgbImage, Rgba, RgbaImage};
 
     fn write_photo(path: &Path, seed: u8) {
         let photo = RgbImage::from_fn(16, 8, |x, y| image::Rgb([x as u8 * 9, y as u8 * 9, seed]));

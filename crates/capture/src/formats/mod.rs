@@ -17,7 +17,7 @@ pub use cameras_json::write_cameras_json;
 pub use chunk::{CHUNK_EXTENSION, CHUNK_INDEX_FILE, Chunk, camera_numbers};
 pub use colmap::{Point, read_points};
 pub use photo_folder::{PhotoList, list_photos};
-pub use photos::find_masks;
+pub use photos::{find_masks, find_masks_in};
 
 use crate::capture::{Capture, Purpose};
 use globalsplat_files::{Error, Result};
@@ -40,7 +40,7 @@ const FORMATS: &[Format] = &[
 ];
 
 /// Name of the folder of masks, beside or in the folder of photos.
-const MASKS: &str = "masks";
+pub const MASKS_FOLDER: &str = "masks";
 
 /// Description of the supported formats for error messages.
 const SUPPORTED_FORMATS: &str = "a cameras.json, a transforms.json or a transforms_train.json in it, a COLMAP model (cameras and images, both \

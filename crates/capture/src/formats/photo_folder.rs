@@ -1,6 +1,6 @@
 //! Folders of photos without poses.
 
-use super::MASKS;
+use super::MASKS_FOLDER;
 use super::natural::natural_order;
 use crate::capture::format_names;
 use crate::pixels::{PHOTO_EXTENSIONS, SUPPORTED_IMAGES, read_image_size};
@@ -68,7 +68,7 @@ fn collect_files(folder: &Path, files: &mut Vec<PathBuf>) -> Result<()> {
         }
         match entry.file_type().map_err(Error::read(entry.path()))?.is_dir() {
             false => files.push(entry.path()),
-            true if name == MASKS => {}
+            true if name == MASKS_FOLDER => {}
             true => collect_files(&entry.path(), files)?,
         }
     }

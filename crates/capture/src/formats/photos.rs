@@ -1,6 +1,7 @@
 //! Search for the photos that a capture's file names.
 
 use crate::pixels::PHOTO_EXTENSIONS;
+use globalsplat_files::{Error, Result};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -61,6 +62,20 @@ pub fn find_masks(folders: &[PathBuf], names: &[&str]) -> Vec<Option<PathBuf>> {
     let stems: Vec<String> = names.iter().map(stem).collect();
     let find = |names: &[String]| find_photos(folders, &names.iter().map(String::as_str).collect::<Vec<_>>());
     find(&names).into_iter().zip(find(&stems)).map(|(mask, by_stem)| mask.or(by_stem)).collect()
+}
+
+/// Looks for masks like [`find_masks`] in a folder that has to have some.
+///
+/// # Errors
+/// Fails if the folder can't be read or has no mask for any photo.
+pub fn find_masks_in(folder: &Path, names: &[&str]) -> Result<Vec<Option<PathBuf>>> {
+    std::fs::read_dir(folder).map_err(Error::read(folder))?;
+    let masks = find_masks(&[folder.to_owned()], names);
+    if masks.iter().all(Option::is_none) {
+        let expected = format!("{}.png", names.first().unwrap_or(&"photo.jpg"));
+        return Err(Error::input(folder, "the folder", "without a mask for any photo", expected));
+    }
+    Ok(masks)
 }
 
 /// Returns the name with `/` as the separator.

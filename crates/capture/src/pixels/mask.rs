@@ -33,7 +33,7 @@ pub fn read_mask(file: &Path, size: (u32, u32)) -> Result<RgbImage> {
 }
 
 /// Returns the image whose channels all are `image`.
-pub(crate) fn grey_to_rgb(image: &GrayImage) -> RgbImage {
+pub fn grey_to_rgb(image: &GrayImage) -> RgbImage {
     RgbImage::from_fn(image.width(), image.height(), |x, y| Rgb([image.get_pixel(x, y)[0]; 3]))
 }
 

@@ -19,6 +19,6 @@ pub use planes::{CHANNELS, Planes};
 pub use resample::{Region, Resampler};
 pub use resize_and_crop::{resize_and_crop, source_ranges};
 
-pub use mask::read_mask;
-pub(crate) use mask::{grey_to_rgb, multiply};
+pub(crate) use mask::multiply;
+pub use mask::{grey_to_rgb, read_mask};
 pub(crate) use undistort::{LookupTable, ViewPixels, undistort};

@@ -8,7 +8,7 @@ pub use points::{Point, read_points};
 
 use super::natural::natural_order;
 use super::photos::{find_masks, find_photos, portable};
-use super::{CaptureOpener, MASKS, folder_name};
+use super::{CaptureOpener, MASKS_FOLDER, folder_name};
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose, format_names};
 use crate::geometry::{Camera, ImageSize};
 use crate::lens::{COLMAP_MODELS, Lens, LensModel};
@@ -181,7 +181,7 @@ fn read(
     let photos = find_photos(&model.bases, &paths.iter().map(String::as_str).collect::<Vec<_>>());
     let masks = match purpose {
         Purpose::Photos => {
-            let folders: Vec<_> = model.bases.iter().map(|base| base.join(MASKS)).collect();
+            let folders: Vec<_> = model.bases.iter().map(|base| base.join(MASKS_FOLDER)).collect();
             find_masks(&folders, &images.iter().map(|image| image.name.as_str()).collect::<Vec<_>>())
         }
         Purpose::Cameras(_) => vec![None; images.len()],
