@@ -22,6 +22,18 @@ pub fn has_lpips() -> bool {
     has
 }
 
+/// Returns `true` if the program contains the viewer; otherwise, skips the test.
+pub fn has_viewer() -> bool {
+    let found = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("web/dist/page.js").exists();
+    if !found {
+        skip(
+            "the page's viewer",
+            "web/ isn't bundled; install Node.js 20 or newer with npm and run make build",
+        );
+    }
+    found
+}
+
 /// Returns the relative error ‖a − b‖ / ‖b‖.
 pub fn relative_error(a: &Tensor, b: &Tensor) -> f64 {
     assert_eq!(a.size(), b.size());

@@ -2,7 +2,7 @@
 //! coordinates, and bit-identical if the unit changes by a power of two (spec 2.5).
 
 use crate::common::program::{arg, globalsplat, refuse, room, succeed};
-use crate::common::{captures, skip};
+use crate::common::{captures, has_viewer};
 use glam::{DMat3, DMat4, DVec3};
 use globalsplat::data::{open_capture, write_cameras_json};
 use globalsplat::eval::psnr;
@@ -159,15 +159,6 @@ fn powers_of_two_change_no_bit() {
             assert!((&a.depth * factor).equal(&b.depth), "2^{exponent}");
         }
     }
-}
-
-/// Returns `true` if the program has the viewer of pages; skips the test otherwise.
-fn has_viewer() -> bool {
-    let has_viewer = run_json(&["doctor", "--json"])["viewer"] == true;
-    if !has_viewer {
-        skip("npm", "this program was built without the viewer");
-    }
-    has_viewer
 }
 
 /// A page has a local origin, and a unit that suits a browser's precision and the page's step sizes.

@@ -3,7 +3,7 @@
 
 use crate::common::browser::{Browser, Screenshots};
 use crate::common::program::{arg, command, refuse, room, succeed};
-use crate::common::{captures, skip};
+use crate::common::{captures, has_viewer};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use globalsplat::data::{load_views, open_capture};
@@ -20,18 +20,6 @@ use tch::{Kind, Tensor};
 const SIDE: u32 = 512;
 /// Minimum PSNR between the page's image and our own render, in dB.
 const LEAST: f64 = 25.;
-
-/// Returns `true` if the program contains the viewer; otherwise, skips the test.
-fn has_viewer() -> bool {
-    let found = Path::new(env!("CARGO_MANIFEST_DIR")).join("web/dist/page.js").exists();
-    if !found {
-        skip(
-            "the page's viewer",
-            "web/ isn't bundled; install Node.js 20 or newer with npm and run make build",
-        );
-    }
-    found
-}
 
 /// Page in a browser whose window is as large as the square photos, without animations.
 struct Shown {
