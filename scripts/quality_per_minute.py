@@ -18,6 +18,7 @@ import statistics
 from pathlib import Path
 
 from core_runs import row, told_once
+from refine_runs import refined
 
 # Quantiles of Student's t distribution for 95 % confidence, by the number of samples.
 STUDENT = {2: 12.71, 3: 4.30, 4: 3.18, 5: 2.78, 6: 2.57, 7: 2.45, 8: 2.36}
@@ -27,14 +28,6 @@ def scores(out, splat, folder, holdout, size):
     """Returns the scores of a splat on the held-out views."""
     file = out / f"{splat.stem}.scores.json"
     return told_once(file, "eval", "--splat", splat, "--scene", folder, "--holdout", holdout, "--size", size)
-
-
-def refined(out, name, folder, holdout, seconds, seed, arguments):
-    """Returns the splat that `refine` makes of a capture in `seconds` seconds, and its JSON output."""
-    file = out / f"{name}.{Path(folder).name}.{seconds:g}.{seed}.json"
-    splat = file.with_suffix(".ply")
-    command = ["refine", "--scene", folder, "--holdout", holdout, "--seconds", str(seconds), "--seed", str(seed)]
-    return splat, told_once(file, *command, "--out", splat, *arguments)
 
 
 def mean(values, digits):
@@ -71,8 +64,9 @@ def main():
             results = {name: [] for name, _ in [*variants, *arguments.peer]}
             for seed in range(arguments.seeds):
                 for name, more in variants:
-                    splat, told = refined(arguments.out, name, folder, holdout, seconds, seed, shlex.split(more))
-                    found = scores(arguments.out, splat, folder, holdout, arguments.size)
+                    file = arguments.out / f"{name}.{Path(folder).name}.{seconds:g}.{seed}.json"
+                    told = refined(file, folder, holdout, seconds, "--seed", str(seed), *shlex.split(more))
+                    found = scores(arguments.out, file.with_suffix(".ply"), folder, holdout, arguments.size)
                     results[name].append({"steps": told["steps"], **found})
                 for name, splats in arguments.peer:
                     splat = Path(splats) / f"{Path(folder).name}.{seconds:g}.{seed}.ply"

@@ -11,7 +11,7 @@ import argparse
 from pathlib import Path
 
 from core_runs import row
-from refine_runs import refined
+from refine_runs import SMALL, refined
 
 STARTS = {"nothing": "photos alone", "weights": "the shipped weights"}
 SECONDS = [2, 3, 5, 10, 20, 30, 60]
@@ -22,7 +22,7 @@ def curve(out, capture, start, seconds):
     """Returns [(seconds, PSNR)] of held-out views; the first entry is that of the initial splat."""
     folder, holdout, *views = capture
     more = ["--from", start, *(["--views", views[0]] if views else [])]
-    told = refined(out / f"{Path(folder).name}.{start}.json", folder, holdout, seconds, *more)
+    told = refined(out / f"{Path(folder).name}.{start}.json", folder, holdout, seconds, *SMALL, *more)
     return [(mark["seconds"], mark["psnr"]) for mark in told["held_out"]["curve"]]
 
 

@@ -14,7 +14,7 @@ import argparse
 from pathlib import Path
 
 from core_runs import row
-from refine_runs import refined
+from refine_runs import SMALL, refined
 
 WAYS = {
     "photos alone": ["--from", "nothing"],
@@ -38,7 +38,8 @@ def main():
             told = {}
             for way, options in WAYS.items():
                 file = arguments.out / f"{name}.{photos}.{way.replace(' ', '_')}.json"
-                told[way] = refined(file, folder, holdout, arguments.seconds, *options, "--views", str(photos))
+                more = [*SMALL, *options, "--views", str(photos)]
+                told[way] = refined(file, folder, holdout, arguments.seconds, *more)
             if any(one["photos"] < photos for one in told.values()):
                 continue  # the capture has fewer photos
             reached = [f"{told[way]['held_out']['after']['psnr']:.2f}" for way in WAYS]
