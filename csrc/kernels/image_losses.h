@@ -18,8 +18,7 @@ struct PhotometricJob {
 };
 
 // Computes `l1_weight` · mean |x − y| + `ssim_weight` · mean SSIM. Means are over all planes and over pixels, or windows that lie inside
-// (spec
-// 9.4). Writes the gradient with respect to the images, [planes, H, W], if it isn't null.
+// (spec 9.4). Writes the gradient with respect to the images, [planes, H, W], if it isn't null.
 template <class T>
 double photometric(const PhotometricJob<T>& job, double l1_weight, double ssim_weight, T* gradient, int num_threads);
 

@@ -202,18 +202,17 @@ fn parse_size(text: &str) -> Result<ImageSize, Error> {
 
 /// Parses the size of photos as `--size` takes it: the longer side, or a size that they are cropped and resized to.
 fn parse_photo_size(text: &str) -> Result<PhotoSize, Error> {
-    let least = MIN_SIDE..=16384;
-    let size = match text.parse() {
-        Ok(longest) => least.contains(&longest).then_some(PhotoSize::Within(longest)),
-        Err(_) => match parse_size(text) {
-            Ok(size) => (least.contains(&size.width) && least.contains(&size.height))
-                .then_some(PhotoSize::Exactly(size)),
-            Err(_) => None,
-        },
-    };
-    let expected =
-        format!("the longer side, as in 1600, or WxH, as in 640x480, with sides of {MIN_SIDE} to 16384");
-    size.ok_or_else(|| Error::request(format!("--size {text}: expected {expected}")))
+    let is_in_range = |side| (MIN_SIDE..=16384).contains(&side);
+    match (text.parse(), parse_size(text)) {
+        (Ok(longest), _) if is_in_range(longest) => Ok(PhotoSize::Within(longest)),
+        (_, Ok(size)) if is_in_range(size.width) && is_in_range(size.height) => Ok(PhotoSize::Exactly(size)),
+        _ => {
+            let expected = format!(
+                "the longer side, as in 1600, or WxH, as in 640x480, with sides of {MIN_SIDE} to 16384"
+            );
+            Err(Error::request(format!("--size {text}: expected {expected}")))
+        }
+    }
 }
 
 /// Parses the views that `--holdout` holds out.

@@ -92,10 +92,8 @@ impl Reconstruct {
         let started = process_age();
         let mut stopwatch = Stopwatch::default();
         let stop = StopRequest::install()?;
-        let scene = match self.scene.is_unposed() {
-            true => stopwatch.time("poses", || self.scene.path(self.masks.as_deref(), &self.out, &stop))?,
-            false => self.scene.path(self.masks.as_deref(), &self.out, &stop)?,
-        };
+        let path = || self.scene.path(self.masks.as_deref(), &self.out, &stop);
+        let scene = if self.scene.is_unposed() { stopwatch.time("poses", path)? } else { path()? };
         let loaded = stopwatch.time("weights", || model::load(self.weights.as_deref(), asked, device))?;
         let capture = stopwatch.time("photos", || open_masked_capture(&scene, self.masks.as_deref()))?;
         let mut inputs = InputFiles::default();

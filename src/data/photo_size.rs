@@ -3,7 +3,7 @@
 use crate::scene::{Camera, ImageSize};
 
 /// Minimum length in pixels of a photo's shorter side after downscaling.
-const MIN_SHORTER_SIDE: u32 = 32;
+pub(crate) const MIN_SHORTER_SIDE: u32 = 32;
 
 /// Size that the photos of a capture are loaded at.
 ///

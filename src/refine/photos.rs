@@ -1,7 +1,7 @@
 //! Photos that a splat is refined on, at several sizes.
 
 use super::view_selection::are_near_duplicates;
-use crate::data::{Capture, PhotoSize, View, ViewBatch, load_views, view_batch};
+use crate::data::{Capture, MIN_SHORTER_SIDE, PhotoSize, View, ViewBatch, load_views, view_batch};
 use crate::error::{Error, Result};
 use crate::scene::ImageSize;
 use glam::DMat4;
@@ -10,8 +10,6 @@ use rand::seq::index::sample;
 use std::collections::BTreeMap;
 use tch::{Device, Kind, Tensor};
 
-/// Minimum length of a photo's shorter side in pixels after halving.
-const LEAST_SIDE: u32 = 32;
 /// Minimum side of a photo in pixels: the side of the SSIM window (spec 9.4).
 pub const MIN_SIDE: u32 = 11;
 /// Number of photos that are read between two calls of `should_continue`.
@@ -147,7 +145,7 @@ impl Photos {
 /// Halves the width and height of the photos, or returns them unchanged if they would become too small.
 fn halved(batch: &ViewBatch) -> ViewBatch {
     let size = batch.images.size();
-    let (images, masks, intrinsics) = if size[3].min(size[4]) < 2 * i64::from(LEAST_SIDE) {
+    let (images, masks, intrinsics) = if size[3].min(size[4]) < 2 * i64::from(MIN_SHORTER_SIDE) {
         let masks = batch.masks.as_ref().map(Tensor::shallow_clone);
         (batch.images.shallow_clone(), masks, batch.intrinsics.shallow_clone())
     } else {

@@ -156,19 +156,26 @@ fn run_ffmpeg(encoded: &[u8]) -> std::result::Result<DynamicImage, String> {
 
 /// Decodes and rotates `encoded` by libheif's program, which has two names, or returns why it can't. Returns `None` if it isn't on the PATH.
 fn run_libheif(encoded: &[u8]) -> Option<std::result::Result<DynamicImage, String>> {
-    let run = |program: &str| {
-        let failed = |e: &dyn std::fmt::Display| format!("{program} failed: {e}");
-        let folder = tempfile::tempdir().map_err(|e| failed(&e))?;
+    let run = || {
+        let failed = |e| format!("libheif can't be given the image: {e}");
+        let folder = tempfile::tempdir().map_err(failed)?;
         let [heic, png] = ["photo.heic", "photo.png"].map(|name| folder.path().join(name));
-        std::fs::write(&heic, encoded).map_err(|e| failed(&e))?;
-        let output = Command::new(program).args([&heic, &png]).stdin(Stdio::null()).output();
-        let output = match output {
-            Err(e) if e.kind() == ErrorKind::NotFound => return Ok(None),
-            output => output.map_err(|e| failed(&e))?,
-        };
-        image::open(&png).map(Some).map_err(|_| failed(&String::from_utf8_lossy(&output.stderr).trim()))
+        std::fs::write(&heic, encoded).map_err(failed)?;
+        for program in ["heif-dec", "heif-convert"] {
+            match Command::new(program).args([&heic, &png]).stdin(Stdio::null()).output() {
+                Err(e) if e.kind() == ErrorKind::NotFound => {}
+                Err(e) => return Err(format!("{program} failed: {e}")),
+                Ok(output) => {
+                    let message = String::from_utf8_lossy(&output.stderr);
+                    return image::open(&png)
+                        .map(Some)
+                        .map_err(|_| format!("{program} failed: {}", message.trim()));
+                }
+            }
+        }
+        Ok(None)
     };
-    ["heif-dec", "heif-convert"].into_iter().find_map(|program| run(program).transpose())
+    run().transpose()
 }
 
 /// A part of a file.

@@ -40,16 +40,12 @@ impl Colmap {
         }
         let program = Self::new("colmap".into(), false);
         let python = python_programs().into_iter().find_map(|python| Self::new(python, true));
-        let newest = |found: [Option<Self>; 2]| {
-            found
-                .into_iter()
-                .flatten()
-                .max_by_key(|colmap| (colmap.check().is_ok(), parse_version(&colmap.version)))
-        };
-        let found = newest([program, python]).ok_or_else(|| {
+        let found = [program, python].into_iter().flatten();
+        let newest = found.max_by_key(|colmap| (colmap.check().is_ok(), parse_version(&colmap.version)));
+        let newest = newest.ok_or_else(|| {
             Error::request(format!("COLMAP, which finds the poses of photos, isn't installed ({GET})"))
         })?;
-        found.check().map(|()| found)
+        newest.check().map(|()| newest)
     }
 
     /// Returns the COLMAP at `path`, a `colmap` program or a Python that has pycolmap.
