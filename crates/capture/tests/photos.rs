@@ -489,6 +489,25 @@ fn heic_is_decoded_by_ffmpeg_or_libheif() {
     );
 }
 
+/// The search of the PATH fails otherwise if it was denied access on the way.
+#[cfg(unix)]
+#[test]
+fn heic_is_decoded_though_part_of_the_path_is_denied() {
+    let denied = tempfile::tempdir().unwrap();
+    for program in ["heif-dec", "heif-convert", "ffmpeg"] {
+        std::fs::write(denied.path().join(program), "not executable").unwrap();
+    }
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    let path =
+        std::env::join_paths([denied.path().to_owned()].into_iter().chain(std::env::split_paths(&path)));
+    let run = Command::new(std::env::current_exe().unwrap())
+        .args(["--exact", "heic_is_decoded_by_ffmpeg_or_libheif"])
+        .env("PATH", path.unwrap())
+        .output()
+        .unwrap();
+    assert!(run.status.success(), "{}", String::from_utf8_lossy(&run.stdout));
+}
+
 #[test]
 fn part_of_a_heic_is_not_taken_for_the_whole() {
     let Some(mut avif) = encode_avif() else { return };

@@ -163,7 +163,8 @@ fn run_libheif(encoded: &[u8]) -> Option<std::result::Result<DynamicImage, Strin
         std::fs::write(&heic, encoded).map_err(failed)?;
         for program in ["heif-dec", "heif-convert"] {
             match Command::new(program).args([&heic, &png]).stdin(Stdio::null()).output() {
-                Err(e) if e.kind() == ErrorKind::NotFound => {}
+                // A program in no folder of the PATH, some of which may not be accessed, is reported as one without permission.
+                Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::PermissionDenied) => {}
                 Err(e) => return Err(format!("{program} failed: {e}")),
                 Ok(output) => {
                     let message = String::from_utf8_lossy(&output.stderr);
