@@ -6,10 +6,11 @@ use std::{
 };
 
 /// Source files with the cxx bridges between Rust and C++.
-const BRIDGES: [&str; 12] = [
+const BRIDGES: [&str; 13] = [
     "src/attention.rs",
     "src/chunk.rs",
     "src/cuda.rs",
+    "src/depth_search.rs",
     "src/device.rs",
     "src/image_losses.rs",
     "src/linear.rs",
@@ -106,6 +107,7 @@ fn main() {
         .files([
             "kernels/raster.cpp",
             "kernels/multi_head_attention.cpp",
+            "kernels/depth_search.cpp",
             "kernels/image_losses.cpp",
             "kernels/optim.cpp",
             "kernels/parallel.cpp",

@@ -6,6 +6,7 @@
 #include "cpu/splat.cpp"
 #include "cuda/kernel_times.cpp"
 #include "cuda/splat.cpp"
+#include "depth_search.cpp"
 #include "device.cpp"
 #include "image_losses.cpp"
 #include "linear.cpp"

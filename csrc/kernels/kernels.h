@@ -43,6 +43,7 @@ struct Kernels {
   void (*attention_backward_bf16)(const AttentionHead<Bf16>&, const Bf16Gemm&, const PackedBf16Queries&, float* dq, Rows<Bf16> dk,
                                   Rows<Bf16> dv, float* scratch);
   void (*muon)(const MuonStep&, const MuonMatrix&, float* scratch);  // muon.h
+  void (*sweep_planes)(const PlaneSweep&, int begin, int end, const BestPlanes& out, float* scratch);  // plane_sweep.h
   int64_t (*multiply_adds)(int64_t rounds, float* out);
 
   template <class T>

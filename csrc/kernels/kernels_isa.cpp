@@ -4,6 +4,7 @@
 #include "blend.h"
 #include "kernels.h"
 #include "muon.h"
+#include "plane_sweep.h"
 #include "project.h"
 #include "smoothness.h"
 #include "ssim.h"
@@ -28,6 +29,7 @@ const Kernels table = {
     pack_queries_bf16,
     attention_backward_bf16,
     muon,
+    sweep_planes,
     multiply_adds,
 };
 

@@ -469,6 +469,19 @@ GS_INLINE Vector<float> load_partial<float>(const float* from, int count) {
 }
 #endif
 
+// Loads the element of each lane's index.
+GS_INLINE Vector<float> gather(const float* from, Simd<float>::bits index) {
+#if defined(__AVX512F__)
+  return _mm512_i32gather_ps((__m512i)index, from, 4);
+#elif defined(__AVX2__)
+  return _mm256_i32gather_ps(from, (__m256i)index, 4);
+#else
+  Vector<float> v;
+  for (int i = 0; i < Simd<float>::lanes; ++i) v[i] = from[index[i]];
+  return v;
+#endif
+}
+
 template <class T>
 GS_INLINE void store_partial(T* to, Vector<T> v, int count) {
   if (count >= Simd<T>::lanes) return store<T>(to, v);

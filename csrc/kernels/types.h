@@ -193,6 +193,49 @@ struct SmoothnessJob {
 // Returns the number of elements of scratch memory that a kernel needs for rows of this width.
 inline constexpr int loss_scratch_size(int width) { return 6 * (width + 33); }
 
+// Grey values of a photo whose depths are searched, or that is compared with it, and weights of its pixels; see plane_sweep.h. Row-major.
+struct SweepPhoto {
+  const float* grey;    // [H, W], both sides at least 9
+  const float* weight;  // [H, W], null if every pixel counts
+  int width, height;
+};
+
+// Photo that is compared. `to_pixels`, [3, 4], maps (column, row, 1, inverse depth) of the photo whose depths are searched to
+// (column · z, row · z, z) of this one. Coordinates are continuous: the centre of the first pixel is at ½.
+struct ComparedPhoto {
+  SweepPhoto photo;
+  float to_pixels[12];
+};
+
+// Search for the inverse depths of the pixels of `own`, among multiples of `step`.
+struct PlaneSweep {
+  SweepPhoto own;
+  const ComparedPhoto* others;
+  int count;  // of the others, at least 1
+  float step;
+};
+
+// Best plane of each pixel, and the correlation there, both [H, sweep_stride(W)].
+struct BestPlanes {
+  float* plane;
+  float* correlation;
+};
+
+// Side in pixels of the patches that are compared.
+inline constexpr int kPatch = 9;
+
+// Returns the stride between rows of a photo of this width, a multiple of every instruction set's vectors.
+inline constexpr int64_t sweep_stride(int width) { return (width + 15) / 16 * 16; }
+
+// Returns the number of photos, of those compared, whose correlations are averaged.
+inline constexpr int sweep_votes(int count) { return count < 2 ? 1 : count / 2; }
+
+// Returns the number of elements of scratch memory that the search needs.
+inline constexpr int64_t sweep_scratch_size(const PlaneSweep& sweep) {
+  const int64_t stride = sweep_stride(sweep.own.width);
+  return stride * (sweep.own.height * (2 + sweep_votes(sweep.count)) + kPatch * 8 + 6 + 1) + 6 * 32;
+}
+
 // Parameters of a step of Adam that all elements share; see adam.h.
 struct AdamStep {
   double step_size, bias_correction2_sqrt, decay;

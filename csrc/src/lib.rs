@@ -3,6 +3,7 @@
 pub mod attention;
 pub mod chunk;
 pub mod cuda;
+pub mod depth_search;
 pub mod device;
 pub mod image_losses;
 pub mod linear;

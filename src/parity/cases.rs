@@ -8,10 +8,11 @@ use crate::io::Weights;
 use crate::loss;
 use crate::model::{self, EncodedTokens, GlobalSplat, ModelConfig, Precision, RawOutputs, Stage};
 use crate::optim::Optimizer;
+use crate::refine::depth_search::{ComparedPhoto, search_depths};
 use crate::render::{self, Cameras};
 use crate::scene::{self, Gaussians};
 use crate::train;
-use glam::DMat4;
+use glam::{DMat4, DVec3};
 use image::RgbImage;
 use serde::de::DeserializeOwned;
 use std::path::Path;
@@ -72,6 +73,7 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
             request.input("photo")?,
             request.number("factor")?,
         )),
+        "depth_search" => depth_search(request),
         "sh_soft_cap" => loss_of(loss::sh_soft_cap(request.input("sh")?)),
         "decoder_regularization" => decoder_regularization(request),
         "lpips" => lpips(request),
@@ -339,6 +341,23 @@ fn scene_normalization(request: &Request) -> Result<Answer> {
         ("c2w", Tensor::from_slice(&rows).view([-1, 4, 4])),
         ("scale", Tensor::from_slice(&[normalization.world_from_normalized.scale])),
     ])
+}
+
+fn depth_search(request: &Request) -> Result<Answer> {
+    let (greys, matrices) = (request.input("others")?.unbind(0), request.input("to_pixels")?);
+    let weights = request.inputs.get("other_weights").map(|weights| weights.unbind(0));
+    let compared = |(index, grey)| {
+        let matrix = Vec::<f64>::try_from(matrices.get(index as i64).to_kind(Kind::Double).view([-1]))?;
+        let column = |i: usize| DVec3::new(matrix[i], matrix[4 + i], matrix[8 + i]);
+        let weight = weights.as_ref().map(|weights| &weights[index]);
+        Ok(ComparedPhoto { grey, weight, to_pixels: std::array::from_fn(column) })
+    };
+    let others = greys.iter().enumerate().map(compared).collect::<Result<Vec<_>>>()?;
+    let (step, planes) = (request.number("step")?, request.number("planes")?);
+    let (inverse_depth, correlation) =
+        search_depths(request.input("grey")?, request.inputs.get("weight"), &others, step, planes);
+    let image = |t: Tensor| t.unsqueeze(0).unsqueeze(0);
+    outputs([("inverse_depth", image(inverse_depth)), ("correlation", image(correlation))])
 }
 
 fn gaussians_and_cameras(request: &Request) -> Result<(Gaussians, Cameras)> {

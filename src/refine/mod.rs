@@ -5,6 +5,7 @@
 mod begin;
 mod config;
 mod corrections;
+pub(crate) mod depth_search;
 mod gaussian_optimizer;
 mod gaussian_params;
 mod options;
@@ -248,33 +249,40 @@ mod tests {
     }
 
     /// Refines a splat on `views`, which starts from the depths of `start`, and returns it.
-    fn refined(start: &[View], views: &[View], background: Option<MaskBackground>) -> Gaussians {
+    fn refined(start: &[View], views: &[View], background: Option<MaskBackground>, seed: u64) -> Gaussians {
         let _guard = num_threads::change();
         let config = RefineConfig::default();
-        let raw = gaussians_from_photos(start, &[], None, 400, 0, Device::Cpu, |_| true).expect("depths");
+        let raw = gaussians_from_photos(start, &[], None, 400, seed, Device::Cpu, |_| true).expect("depths");
         let depth = scene_depth(&raw.activate(), views).unwrap();
         let mut optimizer = GaussianOptimizer::new(&raw, depth, &config);
         let photos = Photos::new(views, config.levels(), Device::Cpu);
         let budget = Budget::Steps(400);
-        let task = Task { photos: &photos, depth, config: &config, budget, seed: 0, background };
+        let task = Task { photos: &photos, depth, config: &config, budget, seed, background };
         refine(&mut optimizer, &mut Corrections::none(), &task, |_| true).unwrap()
     }
 
-    /// A bright thing that moves through the photos costs a lot of quality on a view that isn't among them, and hardly any if it is masked
-    /// out.
+    /// A bright thing that moves through the photos costs a lot of quality on a view that isn't among them, and most of it is recovered if
+    /// it is masked out. A single seed can be off by decibels.
     #[test]
     fn a_mask_leaves_out_what_moves() {
-        let psnr = |mut views: Vec<View>, truth: &View| {
-            views.remove(3);
-            let splat = refined(&views, &views, None);
-            let scores = score_views("wall", &splat, std::slice::from_ref(truth), None, |_| true).unwrap();
-            scores.unwrap().psnr
-        };
+        const SEEDS: u64 = 4;
         let ([masked, clean], [unmasked, _]) = (wall(true), wall(false));
         let truth = clean[3].shallow_clone();
-        let [of_clean, of_masked, of_unmasked] = [clean, masked, unmasked].map(|views| psnr(views, &truth));
-        assert!(of_masked > of_clean - 0.3, "{of_masked} dB, {of_clean} dB without the square");
-        assert!(of_unmasked < of_clean - 1., "{of_unmasked} dB, {of_clean} dB without the square");
+        let mean_psnr = |mut views: Vec<View>| {
+            views.remove(3);
+            let psnr = |seed| {
+                let splat = refined(&views, &views, None, seed);
+                let scores =
+                    score_views("wall", &splat, std::slice::from_ref(&truth), None, |_| true).unwrap();
+                scores.unwrap().psnr
+            };
+            (0..SEEDS).map(psnr).sum::<f64>() / SEEDS as f64
+        };
+        let [of_clean, of_masked, of_unmasked] = [clean, masked, unmasked].map(mean_psnr);
+        let scores =
+            format!("{of_clean} dB without the square, {of_masked} dB masked, {of_unmasked} dB unmasked");
+        assert!(of_unmasked < of_clean - 3., "{scores}");
+        assert!(of_clean - of_masked < 0.25 * (of_clean - of_unmasked), "{scores}");
     }
 
     /// A random background removes what is under a mask; without a background, it stays.
@@ -290,7 +298,8 @@ mod tests {
         }
         let middle = [views[3].camera];
         let [ignored, random] = [None, Some(MaskBackground::Random)].map(|background| {
-            let alpha = render_views(&refined(&whole, &views, background), &middle).unwrap().remove(0).alpha;
+            let alpha =
+                render_views(&refined(&whole, &views, background, 0), &middle).unwrap().remove(0).alpha;
             let mean = |first: i64| alpha.narrow(1, first, SIDE / 2 - 4).mean(Kind::Double).double_value(&[]);
             [mean(0), mean(SIDE / 2 + 4)]
         });

@@ -1,13 +1,14 @@
 //! Depth estimation by a plane sweep (Collins 1996): finds for every pixel the depth at which its neighbourhood looks most alike in photos
 //! taken from other positions. It needs no weights and no points.
 
+use super::depth_search::{self, ComparedPhoto};
 use super::photos::pool_masked;
 use super::view_selection::{
     are_near_duplicates, at_octaves, extent, farthest_first, neighbours, projection,
 };
 use crate::data::{Point, View};
 use crate::scene::{Camera, Intrinsics};
-use glam::{DMat4, DVec3};
+use glam::{DMat3, DVec3};
 use tch::{Device, Kind, Tensor};
 
 /// Longer side in pixels of the images that are compared.
@@ -32,14 +33,6 @@ const OCTAVES: i32 = 9;
 const RESOLVED: f64 = 2.;
 /// Minimum fraction of the pixels that must agree on a depth.
 const MIN_AGREEING_FRACTION: f64 = 0.05;
-/// Side in pixels of the patches that are compared.
-const PATCH: i64 = 9;
-/// Constant that is added to variances, so that noise doesn't correlate.
-const LEAST_VARIANCE: f64 = 1e-4;
-/// Minimum product of the weights of two pixels that are compared.
-const MIN_COUNTED: f64 = 0.5;
-/// Minimum fraction of a patch that counts in both photos.
-const LEAST_MASS: f64 = 0.25;
 /// Correlation at or below which a depth has no weight.
 const UNSURE: f64 = 0.5;
 /// Correlation above which a depth is usually right.
@@ -70,7 +63,19 @@ pub struct DepthMap {
     pub counted: Option<Tensor>,
 }
 
-/// Downscaled photo on the device of the computation.
+impl DepthMap {
+    fn to_device(&self, device: Device) -> Self {
+        DepthMap {
+            camera: self.camera,
+            image: self.image.to_device(device),
+            depth: self.depth.to_device(device),
+            sure: self.sure.to_device(device),
+            counted: self.counted.as_ref().map(|counted| counted.to_device(device)),
+        }
+    }
+}
+
+/// Downscaled photo.
 struct SmallPhoto {
     camera: Camera,
     /// Colours, [3, h, w].
@@ -83,19 +88,16 @@ struct SmallPhoto {
 
 /// Computes depths for the pixels of the views. If there are many views, it processes a subset that together shows what all of them show,
 /// without near duplicates. `points` of the scene, if some are known, determine the nearest depth. `should_continue` is called before each
-/// view with the number of views that are done. If it returns `false`, the result has only these. The work is done on `device`, and the
-/// results are there.
+/// view with the number of views that are done. If it returns `false`, the result has only these. The results are on `device`.
 pub fn sweep(
     views: &[View],
     points: &[Point],
     device: Device,
     mut should_continue: impl FnMut(usize) -> bool,
 ) -> Vec<DepthMap> {
-    let small: Vec<SmallPhoto> =
-        views.iter().map(|view| SmallPhoto::from_view(view, LONGEST_SIDE, device)).collect();
+    let small: Vec<SmallPhoto> = views.iter().map(|view| SmallPhoto::from_view(view, LONGEST_SIDE)).collect();
     let cameras: Vec<Camera> = small.iter().map(|small| small.camera).collect();
-    let coarse: Vec<SmallPhoto> =
-        views.iter().map(|view| SmallPhoto::from_view(view, COARSE_SIDE, device)).collect();
+    let coarse: Vec<SmallPhoto> = views.iter().map(|view| SmallPhoto::from_view(view, COARSE_SIDE)).collect();
     let (mut depths, mut swept): (Vec<f64>, Vec<(usize, DepthMap)>) = (vec![], vec![]);
     for index in farthest_first(&cameras, MAX_DEPTH_MAPS) {
         if !should_continue(swept.len()) {
@@ -113,7 +115,7 @@ pub fn sweep(
         }
     }
     swept.sort_by_key(|(index, _)| *index);
-    swept.into_iter().map(|(_, swept)| swept).collect()
+    swept.into_iter().map(|(_, swept)| swept.to_device(device)).collect()
 }
 
 fn sweep_one(this: &SmallPhoto, others: &[&SmallPhoto], nearest: Option<f64>, depth: f64) -> DepthMap {
@@ -197,14 +199,14 @@ fn typical_depth(depths: &[f64], extent: f64) -> f64 {
 }
 
 impl SmallPhoto {
-    fn from_view(view: &View, longest_side: f64, device: Device) -> Self {
+    fn from_view(view: &View, longest_side: f64) -> Self {
         let (camera, side) = (view.camera, |pixels: u32| f64::from(pixels));
         let factor = (longest_side / side(camera.width.max(camera.height))).min(1.);
-        let resized = |pixels: u32| ((side(pixels) * factor).round() as i64).max(PATCH);
+        let resized = |pixels: u32| ((side(pixels) * factor).round() as i64).max(depth_search::PATCH);
         let (height, width) = (resized(camera.height), resized(camera.width));
         let pool = |t: &Tensor| t.unsqueeze(0).adaptive_avg_pool2d([height, width]).squeeze_dim(0);
-        let mask = view.mask.as_ref().map(|mask| mask.to_device(device));
-        let (image, weight) = pool_masked(&view.image.to_device(device), mask.as_ref(), pool);
+        let mask = view.mask.as_ref().map(|mask| mask.to_device(Device::Cpu));
+        let (image, weight) = pool_masked(&view.image.to_device(Device::Cpu), mask.as_ref(), pool);
         let grey = image.mean_dim([0].as_slice(), false, Kind::Float);
         let scale = (width as f64 / side(camera.width), height as f64 / side(camera.height));
         let intrinsics = camera.intrinsics.resized(scale.0, scale.1);
@@ -219,6 +221,27 @@ impl SmallPhoto {
     /// Returns the mask of the pixels with at least half of the largest weight, [h, w]; `None` if every pixel counts.
     fn counted(&self) -> Option<Tensor> {
         self.weight.as_ref().map(|weight| weight.ge_tensor(&(weight.max() * 0.5)))
+    }
+
+    /// Returns this photo for a comparison with one that `camera` has taken.
+    fn compared_with(&self, camera: &Camera) -> ComparedPhoto<'_> {
+        // A pixel at inverse depth w is at rotation · ray + w · translation in this camera, up to a factor.
+        let to_this = self.camera.c2w.inverse() * camera.c2w;
+        let rotation = DMat3::from_mat4(to_this);
+        let pixels_of =
+            |k: &Intrinsics| DMat3::from_cols_array(&[k.fx, 0., 0., 0., k.fy, 0., k.cx, k.cy, 1.]);
+        let pixels = pixels_of(&self.camera.intrinsics);
+        let to_pixels = pixels * rotation * pixels_of(&camera.intrinsics).inverse();
+        ComparedPhoto {
+            grey: &self.grey,
+            weight: self.weight.as_ref(),
+            to_pixels: [
+                to_pixels.x_axis,
+                to_pixels.y_axis,
+                to_pixels.z_axis,
+                pixels * to_this.w_axis.truncate(),
+            ],
+        }
     }
 
     fn centre(&self) -> DVec3 {
@@ -248,90 +271,18 @@ fn inverse_depths_of(points: &[Point], camera: &Camera) -> Option<Vec<f64>> {
 /// Returns for every pixel the inverse depth at which it looks most alike in the other photos, and the correlation there, both [h, w]. The
 /// candidates are `planes` inverse depths, evenly spaced from 0 to `nearest`.
 fn most_alike(this: &SmallPhoto, others: &[&SmallPhoto], nearest: f64, planes: i64) -> (Tensor, Tensor) {
-    let (size, options) = (this.size(), (Kind::Float, this.grey.device()));
     if others.is_empty() {
-        return (Tensor::full(size, nearest / 2., options), Tensor::zeros(size, options));
+        let options = (Kind::Float, Device::Cpu);
+        return (Tensor::full(this.size(), nearest / 2., options), Tensor::zeros(this.size(), options));
     }
-    let step = nearest / (planes - 1) as f64;
-    let planes = Tensor::linspace(0., nearest, planes, options).view([planes, 1]);
-    let own = this.grey.unsqueeze(0);
-    let (own_mean, own_variance) = mean_and_variance(&own, around);
-    let alike = |other: &&SmallPhoto| {
-        let (seen, seen_weight, inside) = warp(other, this, &planes);
-        let weights: Vec<&Tensor> = this.weight.iter().chain(&seen_weight).collect();
-        if weights.is_empty() {
-            let (mean, variance) = mean_and_variance(&seen, around);
-            let covariance = around(&(&seen * &own)) - mean * &own_mean;
-            return (covariance / (variance * &own_variance).sqrt()).where_scalarother(&inside, -1.);
-        }
-        // Windows are weighted by both masks.
-        let weight = weights.iter().fold(seen.ones_like(), |product, &weight| product * weight);
-        let mass = around(&weight);
-        let mean_of = |t: &Tensor| around(&(t * &weight)) / mass.clamp_min(LEAST_MASS);
-        let (mean, variance) = mean_and_variance(&seen, mean_of);
-        let (own_mean, own_variance) = mean_and_variance(&own, mean_of);
-        let covariance = mean_of(&(&seen * &own)) - mean * own_mean;
-        let counts = inside.logical_and(&weight.ge(MIN_COUNTED)).logical_and(&mass.ge(LEAST_MASS));
-        (covariance / (variance * own_variance).sqrt()).where_scalarother(&counts, -1.)
-    };
-    let correlations = Tensor::stack(&others.iter().map(alike).collect::<Vec<_>>(), 0);
-    let half = (others.len() as i64 / 2).max(1);
-    let (best, _) = correlations.topk(half, 0, true, false);
-    let (correlation, plane) = best.mean_dim([0].as_slice(), false, Kind::Float).max_dim(0, false);
-    (plane.to_kind(Kind::Float) * step, correlation)
-}
-
-/// Returns the values of `other` at the positions of the pixels of `this` on each of the planes, the weights there if `other` has a mask,
-/// and a mask of the positions that are inside the image of `other`, all [planes, h, w].
-fn warp(other: &SmallPhoto, this: &SmallPhoto, planes: &Tensor) -> (Tensor, Option<Tensor>, Tensor) {
-    let [height, width] = this.size();
-    let to_other: DMat4 = other.camera.c2w.inverse() * this.camera.c2w;
-    let rows = to_other.transpose().to_cols_array_2d();
-    // A pixel at inverse depth w is at rotation · ray + w · translation in the other camera, up to a factor.
-    let rays = rays(&this.camera.intrinsics, height, width, planes.device());
-    let coordinate = |row: [f64; 4]| {
-        let turned = &rays[0] * row[0] + &rays[1] * row[1] + &rays[2] * row[2]; // [h·w]
-        turned + planes * row[3]
-    };
-    let [x, y, z] = [rows[0], rows[1], rows[2]].map(coordinate);
-    let Intrinsics { fx, fy, cx, cy } = other.camera.intrinsics;
-    // Coordinates range from −1 to 1 across the image.
-    let u = (x / &z * fx + cx) * (2. / f64::from(other.camera.width)) - 1.;
-    let v = (y / &z * fy + cy) * (2. / f64::from(other.camera.height)) - 1.;
-    let count = planes.size()[0];
-    let volume = [count, height, width];
-    let inside = u.abs().le(1.).logical_and(&v.abs().le(1.)).logical_and(&z.gt(0.)).view(volume);
-    let grid = Tensor::stack(&[u, v], -1).view([1, count * height, width, 2]);
-    let (bilinear, at_the_border) = (0, 1);
-    let sample = |t: &Tensor| {
-        t.unsqueeze(0).unsqueeze(0).grid_sampler(&grid, bilinear, at_the_border, false).view(volume)
-    };
-    (sample(&other.grey), other.weight.as_ref().map(sample), inside)
-}
-
-/// Returns x, y and z of the pixels' rays with z = 1, [h·w] each.
-fn rays(intrinsics: &Intrinsics, height: i64, width: i64, device: Device) -> [Tensor; 3] {
-    let options = (Kind::Float, device);
-    let x = (Tensor::arange(width, options) + 0.5 - intrinsics.cx) / intrinsics.fx;
-    let y = (Tensor::arange(height, options) + 0.5 - intrinsics.cy) / intrinsics.fy;
-    let all =
-        |t: Tensor, shape: [i64; 2]| t.view(shape).expand([height, width], false).contiguous().view([-1]);
-    [all(x, [1, width]), all(y, [height, 1]), Tensor::ones([height * width], options)]
-}
-
-/// Returns the mean over the neighbourhood of every pixel, without the part outside the image: [.., h, w] to [.., h, w].
-fn around(t: &Tensor) -> Tensor {
-    let along = |t: &Tensor, window: [i64; 2]| {
-        t.avg_pool2d(window, 1, window.map(|side| side / 2), false, false, None)
-    };
-    along(&along(t, [PATCH, 1]), [1, PATCH])
-}
-
-/// Returns the mean and the variance in the neighbourhood of every pixel; `mean_of` computes means.
-fn mean_and_variance(t: &Tensor, mean_of: impl Fn(&Tensor) -> Tensor) -> (Tensor, Tensor) {
-    let mean = mean_of(t);
-    let variance = mean_of(&t.square()) - mean.square() + LEAST_VARIANCE;
-    (mean, variance)
+    let compared: Vec<ComparedPhoto> = others.iter().map(|other| other.compared_with(&this.camera)).collect();
+    depth_search::search_depths(
+        &this.grey,
+        this.weight.as_ref(),
+        &compared,
+        nearest / (planes - 1) as f64,
+        planes,
+    )
 }
 
 /// Replaces inverse depths of low correlation by those of reliable pixels around them, the nearest weighted most.
@@ -407,7 +358,7 @@ mod tests {
         let point = |i: i32| Point { position: DVec3::new(0.01 * f64::from(i), 0., 3.), colour: [0.; 3] };
         let points: Vec<Point> = (0..40).map(point).collect();
         let photos: Vec<SmallPhoto> =
-            views.iter().map(|view| SmallPhoto::from_view(view, LONGEST_SIDE, Device::Cpu)).collect();
+            views.iter().map(|view| SmallPhoto::from_view(view, LONGEST_SIDE)).collect();
         assert!((SceneDepth::of(1, &photos, &points).nearest.unwrap() - 1.3 / 3.).abs() < 1e-9);
         assert!(SceneDepth::of(1, &photos, &points[..20]).nearest.is_none());
         // A single photo has no measurable depth, and the result must not be NaN.

@@ -1,8 +1,10 @@
 """Cases of the preprocessing and augmentation of photos."""
 
 import numpy as np
+import reference.depth_search
 import reference.jitter
 import reference.resample
+import torch
 
 from ..draw import uniform
 from ..registry import Draw, by, case, reference_for
@@ -55,3 +57,51 @@ def jitter(rng):
 def jitter_reference(config, params, inputs):
     adjustments = [next(iter(adjustment.items())) for adjustment in config["adjustments"]]
     return {"image": reference.jitter.jitter(inputs["image"], adjustments)}
+
+
+@case
+def depth_search(rng):
+    """Photos of random patterns from cameras that look in about the same direction, some with weights, and one that faces away.
+
+    The kernel processes a vector of columns and eight planes at a time; the sizes are around multiples of these.
+    """
+    for size, other_size, count, planes, weighted in [
+        ((9, 9), (9, 9), 1, 2, ()),
+        ((20, 33), (27, 41), 2, 9, ()),
+        ((24, 32), (24, 32), 4, 16, ()),
+        ((19, 47), (24, 31), 5, 11, ("weight",)),
+        ((30, 17), (21, 50), 3, 8, ("other_weights",)),
+        ((26, 30), (26, 30), 4, 10, ("weight", "other_weights")),
+    ]:
+        inputs = {"grey": uniform(rng, 0.0, 1.0, *size), "others": uniform(rng, 0.0, 1.0, count, *other_size)}
+        shapes = {"weight": size, "other_weights": (count, *other_size)}
+        for name in weighted:
+            ramp = np.linspace(-0.5, 2.0, shapes[name][-1])
+            inputs[name] = np.clip(ramp + uniform(rng, -0.1, 0.1, *shapes[name]), 0.0, 1.0).astype(np.float32)
+        focal = float(max(size))
+        back = np.array([[1 / focal, 0, -0.5 * size[1] / focal], [0, 1 / focal, -0.5 * size[0] / focal], [0, 0, 1]])
+        there = np.array([[focal, 0, 0.5 * other_size[1]], [0, focal, 0.5 * other_size[0]], [0, 0, 1]])
+        matrices = []
+        for index in range(count):
+            rotation = np.eye(3) + 0.05 * rng.standard_normal((3, 3))
+            if index == 4:
+                rotation[2] *= -1
+            translation = 0.3 * rng.standard_normal((3, 1))
+            matrices.append(there @ np.hstack((rotation @ back, translation)))
+        inputs["to_pixels"] = np.stack(matrices).astype(np.float32)
+        config = {"step": 0.7 / (planes - 1), "planes": planes}
+        label = f"{by(*size)}, {count} of {by(*other_size)}, {planes} planes{''.join(f', {name}' for name in weighted)}"
+        doubles = {name: torch.tensor(value).double() for name, value in inputs.items()}
+        doubtful = search(config, doubles)[2].numpy()[None, None]
+        yield Draw(label, inputs, config, doubtful=doubtful)
+
+
+def search(config, inputs):
+    names = ("grey", "weight", "others", "other_weights", "to_pixels")
+    return reference.depth_search.search(*(inputs.get(name) for name in names), config["step"], config["planes"])
+
+
+@reference_for("depth_search")
+def depth_search_reference(config, params, inputs):
+    inverse_depth, correlation, _ = search(config, inputs)
+    return {"inverse_depth": inverse_depth[None, None], "correlation": correlation[None, None]}

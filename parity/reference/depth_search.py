@@ -1,0 +1,75 @@
+"""Plane sweep: the correlation of a photo with others that are warped onto planes at several depths."""
+
+import torch
+import torch.nn.functional as F
+
+PATCH = 9
+LEAST_VARIANCE = 1e-4
+LEAST_WEIGHT = 0.5
+LEAST_MASS = 0.25
+CLOSE = 1e-3  # distance from a threshold within which rounding may decide
+
+
+def patch_means(t):
+    """Returns the mean over the patch around each pixel, without the part outside the image: [..., H, W] to [..., H, W]."""
+    flat = t.reshape(-1, 1, *t.shape[-2:])
+    return F.avg_pool2d(flat, PATCH, 1, PATCH // 2, count_include_pad=False).reshape(t.shape)
+
+
+def sample(image, x, y):
+    """Returns the values of image [H, W] at continuous coordinates x and y; those at its border are repeated outside."""
+    height, width = image.shape
+    grid = torch.stack((2.0 * x / width - 1.0, 2.0 * y / height - 1.0), -1)
+    images = image.expand(len(x), 1, height, width)
+    return F.grid_sample(images, grid, padding_mode="border", align_corners=False).squeeze(1)
+
+
+def correlations(grey, weight, other, other_weight, to_pixels, inverse_depths):
+    """Returns the correlation of grey [H, W] with another photo on each plane, and a mask of close calls, [planes, H, W] each.
+
+    The weights are None if every pixel counts. A patch's correlation is -1 where the pixel isn't shown or has too
+    little weight.
+    """
+    height, width = grey.shape
+    rows, columns = (torch.arange(side, dtype=grey.dtype) + 0.5 for side in (height, width))
+    x, y, z = (
+        row[0] * columns + row[1] * rows[:, None] + row[2] + row[3] * inverse_depths[:, None, None] for row in to_pixels
+    )
+    x, y = x / z, y / z
+    shown = (z > 0.0) & (x >= 0.0) & (x <= other.shape[1]) & (y >= 0.0) & (y <= other.shape[0])
+    limits = [z, x, x - other.shape[1], y, y - other.shape[0]]
+    close = torch.stack([limit.abs() for limit in limits]).amin(0) < CLOSE
+    own, seen = grey.expand_as(x), sample(other, x, y)
+    product = torch.ones_like(seen)
+    if weight is not None:
+        product = product * weight
+    if other_weight is not None:
+        product = product * sample(other_weight, x, y)
+    mass = patch_means(product)
+    close |= ((product - LEAST_WEIGHT).abs() < CLOSE) | ((mass - LEAST_MASS).abs() < CLOSE)
+
+    def mean(t):
+        return patch_means(product * t) / mass.clamp_min(LEAST_MASS)
+
+    def variance(t):
+        return mean(t * t) - mean(t) ** 2 + LEAST_VARIANCE
+
+    covariance = mean(own * seen) - mean(own) * mean(seen)
+    counts = shown & (product >= LEAST_WEIGHT) & (mass >= LEAST_MASS)
+    return torch.where(counts, covariance / (variance(own) * variance(seen)).sqrt(), -1.0), close
+
+
+def search(grey, weight, others, other_weights, to_pixels, step, planes):
+    """Returns each pixel's best inverse depth, the correlation there, and a mask of the pixels where rounding may decide, [H, W] each."""
+    inverse_depths = step * torch.arange(planes, dtype=grey.dtype)
+    compared = [
+        correlations(grey, weight, other, None if other_weights is None else other_weights[k], to_pixels[k], inverse_depths)
+        for k, other in enumerate(others)
+    ]
+    stacked, close = (torch.stack(parts) for parts in zip(*compared, strict=True))
+    better_half = stacked.topk(max(len(compared) // 2, 1), 0).values.mean(0)
+    (first, second), planes_of = better_half.topk(2, 0)
+    # Planes without a photo that shows the pixel are equal; the first of them counts.
+    plane = torch.where(first > -1.0, planes_of[0], 0)
+    doubtful = close.flatten(0, 1).any(0) | ((first - second < CLOSE) & (first > -1.0))
+    return plane * step, first, doubtful

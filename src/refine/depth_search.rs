@@ -1,0 +1,57 @@
+//! Search for the depths of a photo's pixels: on planes at several depths, patches are compared with those of other photos. The kernel is
+//! `csrc/kernels/plane_sweep.h`.
+
+use crate::ffi::take_outputs;
+use glam::DVec3;
+use globalsplat_csrc::depth_search::{self as kernel, PhotoToCompare};
+use tch::Tensor;
+
+/// Side in pixels of the patches that are compared, the minimum of a photo's sides.
+pub const PATCH: i64 = 9;
+
+/// Photo that is compared with the one whose depths are searched.
+#[derive(Debug)]
+pub struct ComparedPhoto<'a> {
+    /// Grey values, [h, w].
+    pub grey: &'a Tensor,
+    /// Weight of each pixel, [h, w]; `None` if every pixel counts.
+    pub weight: Option<&'a Tensor>,
+    /// Columns of the matrix that maps (column, row, 1, inverse depth) of the photo whose depths are searched to
+    /// (column · z, row · z, z) of this one. The centre of the first pixel is at ½.
+    pub to_pixels: [DVec3; 4],
+}
+
+/// Returns the inverse depth at which each pixel of `grey` [h, w] looks most alike in the other photos, and the correlation there, both
+/// [h, w], float32 on the CPU. The candidates are the multiples 0 to `planes` − 1 of `step`.
+///
+/// The correlation is that of the patches around the pixel, weighted by the product of both photos' weights, on average over the better
+/// half of the photos. It is −1 for a photo that doesn't show the pixel, or in which less than half of it, or less than a quarter of the
+/// patch, counts.
+///
+/// # Panics
+/// Panics if there are no other photos or no planes, or if shapes don't fit.
+pub fn search_depths(
+    grey: &Tensor,
+    weight: Option<&Tensor>,
+    others: &[ComparedPhoto],
+    step: f64,
+    planes: i64,
+) -> (Tensor, Tensor) {
+    let address = |weight: Option<&Tensor>| weight.map_or(0, |weight| weight.as_ptr() as usize);
+    let others: Vec<PhotoToCompare> = others
+        .iter()
+        .map(|other| PhotoToCompare {
+            grey: other.grey.as_ptr() as usize,
+            weight: address(other.weight),
+            to_pixels: std::array::from_fn(|i| other.to_pixels[i % 4][i / 4] as f32),
+        })
+        .collect();
+    let (grey, weight) = (grey.as_ptr() as usize, address(weight));
+    let search = |out: &mut [usize]| unsafe {
+        kernel::search_depths(grey, weight, &others, step as f32, planes as i32, out)
+    };
+    // SAFETY: the tensors outlive the call, and on success the C++ side has stored two new tensors in `out`.
+    let done = unsafe { take_outputs(search) };
+    let [inverse_depth, correlation] = done.unwrap_or_else(|error| panic!("{error}"));
+    (inverse_depth, correlation)
+}
