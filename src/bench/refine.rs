@@ -62,7 +62,7 @@ pub fn bench_refine(
         w2c: cameras.w2c,
         intrinsics: cameras.intrinsics,
     });
-    let mut optimizer = GaussianOptimizer::new(&RawGaussians::from_gaussians(&gaussians), 1., config);
+    let mut optimizer = GaussianOptimizer::new(&RawGaussians::from_gaussians(&gaussians), 1., config, 0);
     let mut none = Corrections::none();
     let task = |steps| Task {
         photos: &photos,

@@ -138,6 +138,28 @@ impl Optimizer {
         Optimizer { epsilon, ..self }
     }
 
+    /// Replaces each parameter by the tensor of the same name in `parameters`, which has more elements along dimension `dim`. The moments of
+    /// the new elements, which follow the others, are zero.
+    ///
+    /// # Panics
+    /// Panics if a name is missing or if shapes don't fit.
+    pub(crate) fn extend<'a>(
+        &mut self,
+        parameters: impl IntoIterator<Item = (&'a str, &'a Tensor)>,
+        dim: i64,
+    ) {
+        let extended: BTreeMap<&str, &Tensor> = parameters.into_iter().collect();
+        for parameter in &mut self.parameters {
+            let value = extended[parameter.name.as_str()];
+            for moment in std::iter::once(&mut parameter.first).chain(&mut parameter.second) {
+                let zeros = value.zeros_like().detach();
+                zeros.narrow(dim, 0, moment.size()[dim as usize]).copy_(moment);
+                *moment = zeros;
+            }
+            parameter.value = value.shallow_clone();
+        }
+    }
+
     /// Sets the learning rates of the groups, in their order, from the next step on.
     pub fn set_learning_rates(&mut self, learning_rates: &[f64]) {
         for (group, &learning_rate) in self.groups.iter_mut().zip(learning_rates) {
@@ -179,6 +201,15 @@ impl Optimizer {
     /// Returns the running means of the gradients and of their squares, which the caller may change in place.
     pub fn moments(&self) -> impl Iterator<Item = &Tensor> {
         self.parameters.iter().flat_map(Parameter::moments).map(|(_, moment)| moment)
+    }
+
+    /// Returns the running mean of the squared gradients of the parameter `name`.
+    ///
+    /// # Panics
+    /// Panics if AdamW updates no parameter of that name.
+    pub(crate) fn squared_gradients(&self, name: &str) -> &Tensor {
+        let parameter = self.parameters.iter().find(|parameter| parameter.name == name);
+        parameter.and_then(|parameter| parameter.second.as_ref()).expect("a parameter of AdamW")
     }
 
     /// Sets the learning rate of every group, from the next step on.
@@ -390,6 +421,27 @@ mod tests {
         }
         assert!((weight.double_value(&[0]) - expected[0]).abs() < 1e-6);
         assert!((bias.double_value(&[0]) - expected[1]).abs() < 1e-6);
+    }
+
+    /// Elements of an extended parameter go on as they would alone, and the new ones begin without moments.
+    #[test]
+    fn extended_parameters_go_on() {
+        let alone = leaf(&[1., 2.]);
+        let (short, long) = (leaf(&[1., 2.]), leaf(&[0., 0., 5.]));
+        let mut adamws = [&alone, &short].map(|t| Optimizer::new(vec![group(&[("a", t)], 1e-2, 0.)]));
+        let step = |adamw: &mut Optimizer, leaf: &Tensor| {
+            adamw.zero_grad();
+            leaf.square().sum(Kind::Float).backward();
+            adamw.step().unwrap();
+        };
+        step(&mut adamws[0], &alone);
+        step(&mut adamws[1], &short);
+        tch::no_grad(|| long.narrow(0, 0, 2).copy_(&short));
+        adamws[1].extend([("a", &long)], 0);
+        assert_eq!(adamws[1].squared_gradients("a").double_value(&[2]), 0.);
+        step(&mut adamws[0], &alone);
+        step(&mut adamws[1], &long);
+        assert!(long.narrow(0, 0, 2).equal(&alone) && long.double_value(&[2]) < 5.);
     }
 
     /// Both implementations give the same values and moments after steps with clipped gradients. One parameter has no gradient at first.

@@ -10,8 +10,9 @@ use serde::{Deserialize, Serialize};
 pub struct RefineConfig {
     /// Number of views in a step.
     pub views: usize,
-    /// Fractions of the optimization at which the width and height of images double, up to the full size after the last fraction.
-    pub resolution_schedule: Vec<f64>,
+    /// Fractions of the optimization at which the width and height of images double, up to the full size after the last fraction. By
+    /// default there are two, which depend on the full size: images of 240 pixels or more show enough for most of the steps.
+    pub resolution_schedule: Option<Vec<f64>>,
     /// Final degree of the spherical harmonics.
     pub sh_degree: i64,
     /// Interval between increases of the degree of the spherical harmonics by one, as a fraction of the optimization.
@@ -44,8 +45,14 @@ pub struct RefineConfig {
     pub scale: f64,
     /// Weight of the loss [`crate::loss::depth_smoothness`].
     pub depth_smoothness_weight: f64,
+    /// Initial number of Gaussians from photos, as a fraction of the final one.
+    pub initial_gaussians: f64,
+    /// Fraction of the optimization after which the number of Gaussians no longer grows.
+    pub grow_until: f64,
     /// Number of steps between relocations of dead Gaussians; 0 disables relocation.
     pub relocate_every: u64,
+    /// Displacement of relocated Gaussians, in standard deviations of the Gaussian that they are moved onto.
+    pub spread: f64,
     /// Opacity at or below which a Gaussian is dead.
     pub prune_opacity: f64,
     /// Fraction of the optimization after which Gaussians are no longer relocated.
@@ -55,8 +62,8 @@ pub struct RefineConfig {
 impl Default for RefineConfig {
     fn default() -> Self {
         RefineConfig {
-            views: 2,
-            resolution_schedule: vec![0.03, 0.1],
+            views: 1,
+            resolution_schedule: None,
             sh_degree: 1,
             sh_every: 0.3,
             means: 2e-3,
@@ -73,7 +80,10 @@ impl Default for RefineConfig {
             opacity: 1e-3,
             scale: 0.,
             depth_smoothness_weight: 0.7,
-            relocate_every: 100,
+            initial_gaussians: 0.2,
+            grow_until: 0.6,
+            relocate_every: 50,
+            spread: 0.7,
             prune_opacity: 0.01,
             relocate_until: 0.8,
         }
@@ -96,6 +106,9 @@ const REMOVED: &str = "tokens";
 fn current_name(key: String) -> String {
     RENAMED.iter().find(|(former, _)| *former == key).map_or(key, |(_, current)| current.to_string())
 }
+
+/// Minimum longer side of photos, in pixels, that show enough detail for most of the steps.
+const DETAILED_SIDE: u32 = 240;
 
 /// Maximum number of photo sizes besides the full size.
 const MAX_SIZES: usize = 8;
@@ -143,12 +156,13 @@ impl RefineConfig {
         ];
         let weights = [self.opacity, self.scale, self.depth_smoothness_weight];
         let is_inner_fraction = |&fraction: &f64| 0. < fraction && fraction < 1.;
+        let schedule = self.resolution_schedule.as_deref().unwrap_or_default();
         // Comparisons with NaN are false, so NaN fails every rule.
         let rules = [
             (self.views >= 1, "1 or more"),
-            (self.resolution_schedule.len() <= MAX_SIZES, "8 sizes or fewer"),
-            (self.resolution_schedule.iter().all(is_inner_fraction), "numbers above 0 and below 1"),
-            (self.resolution_schedule.is_sorted_by(|a, b| a < b), "numbers that increase"),
+            (schedule.len() <= MAX_SIZES, "8 sizes or fewer"),
+            (schedule.iter().all(is_inner_fraction), "numbers above 0 and below 1"),
+            (schedule.is_sorted_by(|a, b| a < b), "numbers that increase"),
             ((0..=3).contains(&self.sh_degree), "0 to 3"),
             (0. < self.sh_every && self.sh_every.is_finite(), "a finite number above 0"),
             (rates.iter().all(|rate| (0. ..=10.).contains(rate)), "0 to 10"),
@@ -159,6 +173,9 @@ impl RefineConfig {
             ((0. ..=1.).contains(&self.ssim_weight), "0 to 1"),
             (weights.iter().all(|weight| (0. ..=1000.).contains(weight)), "0 to 1000"),
             ((0. ..1.).contains(&self.prune_opacity), "0 or more, below 1"),
+            (is_inner_fraction(&self.grow_until), "above 0 and below 1"),
+            (0. < self.initial_gaussians && self.initial_gaussians <= 1., "above 0, up to 1"),
+            ((0. ..=10.).contains(&self.spread), "0 to 10"),
             ((0. ..=1.).contains(&self.relocate_until), "0 to 1"),
         ];
         rules.into_iter().find(|(is_met, _)| !is_met).map_or(Ok(()), |(_, expected)| Err(expected))
@@ -166,12 +183,19 @@ impl RefineConfig {
 
     /// Returns the defaults for a start from a splat, which needs no small images and no opacity penalty.
     pub fn from_splat() -> Self {
-        RefineConfig { resolution_schedule: vec![], opacity: 0., ..Default::default() }
+        RefineConfig { resolution_schedule: Some(vec![]), opacity: 0., ..Default::default() }
     }
 
-    /// Returns the number of photo sizes, including the full size.
-    pub fn levels(&self) -> usize {
-        self.resolution_schedule.len() + 1
+    /// Returns the fractions of the optimization at which the width and height of photos double, up to `longest_side` pixels.
+    pub(super) fn schedule(&self, longest_side: u32) -> Vec<f64> {
+        let by_size = || {
+            // Small photos save time, but hide detail.
+            let part = |side: u32, of: [f64; 2]| of[usize::from(side >= DETAILED_SIDE)];
+            let (quarter, half) = (longest_side / 4, longest_side / 2);
+            let first = part(quarter, [0.03, 0.4]);
+            vec![first, part(half, [0.1, if quarter >= DETAILED_SIDE { 0.7 } else { 0.4 }])]
+        };
+        self.resolution_schedule.clone().unwrap_or_else(by_size)
     }
 }
 
@@ -205,6 +229,9 @@ mod tests {
             ("depth_smoothness_weight=-1", "expected 0 to 1000"),
             ("prune_opacity=1", "expected 0 or more, below 1"),
             ("relocate_until=nan", "expected 0 to 1"),
+            ("grow_until=1.0", "expected above 0 and below 1"),
+            ("initial_gaussians=0.0", "expected above 0, up to 1"),
+            ("spread=-1", "expected 0 to 10"),
             ("relocate_every=-1", "invalid"),
             ("views=", "expected KEY=VALUE"),
             ("", "expected KEY=VALUE"),
@@ -215,10 +242,18 @@ mod tests {
             assert!(message.starts_with(&format!("override {assignment}: ")), "{message}");
             assert!(message.contains(expected), "{message}");
         }
-        assert_eq!(with("resolution_schedule=[]").unwrap().levels(), 1);
+        assert_eq!(with("resolution_schedule=[]").unwrap().schedule(1024), [0.; 0]);
         assert_eq!(with("relocate_every=0").unwrap().relocate_every, 0);
         assert_eq!(RefineConfig::default().check(), Ok(()));
         assert_eq!(RefineConfig::from_splat().check(), Ok(()));
+    }
+
+    #[test]
+    fn most_steps_are_on_small_but_detailed_photos() {
+        let schedule = |side| RefineConfig::default().schedule(side);
+        assert_eq!(schedule(256), [0.03, 0.1]);
+        assert_eq!(schedule(512), [0.03, 0.4]);
+        assert_eq!(schedule(1024), [0.4, 0.7]);
     }
 
     #[test]

@@ -3,6 +3,9 @@
 use crate::scene::{Gaussians, RawGaussians};
 use tch::{Kind, Tensor};
 
+/// Opacity logit of Gaussians that wait for their relocation.
+const DEAD_LOGIT: f64 = -30.;
+
 /// Gaussians of one scene before activation. Colours are separate from the higher spherical harmonics, which have a smaller learning rate.
 #[derive(Debug)]
 pub struct GaussianParams {
@@ -37,6 +40,31 @@ impl GaussianParams {
             colours: leaf(raw.sh.narrow(2, 0, 1)),
             harmonics: leaf(higher),
         }
+    }
+
+    /// Returns these Gaussians and `count` more, which are copies of the first with hardly any opacity.
+    pub fn with_dead(&self, count: i64) -> Self {
+        let leaf = |t: &Tensor| {
+            let mut size = t.size();
+            size[1] = count;
+            let more = t.narrow(1, 0, 1).expand(&size, false);
+            Tensor::cat(&[t, &more], 1).detach().set_requires_grad(true)
+        };
+        let opacity_logits = leaf(&self.opacity_logits).set_requires_grad(false);
+        let _ = opacity_logits.narrow(1, self.count(), count).fill_(DEAD_LOGIT);
+        GaussianParams {
+            means: leaf(&self.means),
+            log_scales: leaf(&self.log_scales),
+            quaternions: leaf(&self.quaternions),
+            opacity_logits: opacity_logits.set_requires_grad(true),
+            colours: leaf(&self.colours),
+            harmonics: leaf(&self.harmonics),
+        }
+    }
+
+    /// Returns the number of Gaussians.
+    pub fn count(&self) -> i64 {
+        self.means.size()[1]
     }
 
     /// Returns the parameters with their names, in this order.

@@ -1,5 +1,4 @@
-//! Refinement of a splat on the photos that it has to match, in seconds. The optimization keeps the number of Gaussians.
-//! Without a splat, refinement starts from the depths on which the photos agree. [`RefineSession`] does all of it, from a capture to a
+//! Refinement of a splat on the photos that it has to match, in seconds. Without a splat, refinement starts from the depths on which the photos agree. [`RefineSession`] does all of it, from a capture to a
 //! splat and its scores.
 
 mod begin;
@@ -111,8 +110,7 @@ pub(crate) fn refine_timed(
         if is_over {
             break;
         }
-        let level = config.resolution_schedule.iter().filter(|&&part| progress >= part).count();
-        let (which, batch) = stopwatch.time("photos", || photos.draw(level, config.views, &mut random));
+        let (which, batch) = stopwatch.time("photos", || photos.draw(progress, config.views, &mut random));
         let gaussians = stopwatch.time("activation", || optimizer.gaussians(progress));
         let cameras = Cameras { w2c: corrections.w2c(&batch, &which), ..batch.cameras() };
         let mut pictures = stopwatch.time("render", || render(&gaussians, &cameras, DEFAULT_EPS2D))?;
@@ -254,8 +252,8 @@ mod tests {
         let config = RefineConfig::default();
         let raw = gaussians_from_photos(start, &[], None, 400, seed, Device::Cpu, |_| true).expect("depths");
         let depth = scene_depth(&raw.activate(), views).unwrap();
-        let mut optimizer = GaussianOptimizer::new(&raw, depth, &config);
-        let photos = Photos::new(views, config.levels(), Device::Cpu);
+        let mut optimizer = GaussianOptimizer::new(&raw, depth, &config, 0);
+        let photos = Photos::new(views, &config, Device::Cpu);
         let budget = Budget::Steps(400);
         let task = Task { photos: &photos, depth, config: &config, budget, seed, background };
         refine(&mut optimizer, &mut Corrections::none(), &task, |_| true).unwrap()
@@ -304,6 +302,30 @@ mod tests {
             [mean(0), mean(SIDE / 2 + 4)]
         });
         assert!(random[0] > 0.9 && random[1] < 0.1 && ignored[1] > 0.3, "{random:?}, {ignored:?}");
+    }
+
+    /// The number of Gaussians grows to the requested one, also if no relocation is due.
+    #[test]
+    fn the_number_of_gaussians_grows() {
+        let _guard = num_threads::change();
+        let [_, views] = wall(false);
+        let raw = gaussians_from_photos(&views, &[], None, 40, 0, Device::Cpu, |_| true).expect("depths");
+        let depth = scene_depth(&raw.activate(), &views).unwrap();
+        for relocate_every in [0, 3] {
+            let config = RefineConfig { relocate_every, ..RefineConfig::default() };
+            let photos = Photos::new(&views, &config, Device::Cpu);
+            let (budget, mut counts) = (Budget::Steps(20), vec![]);
+            let task = Task { photos: &photos, depth, config: &config, budget, seed: 0, background: None };
+            let mut optimizer = GaussianOptimizer::new(&raw, depth, &config, 90);
+            let splat = refine(&mut optimizer, &mut Corrections::none(), &task, |step| {
+                counts.push(step.gaussians().count());
+                true
+            });
+            assert_eq!((splat.unwrap().count(), counts[0]), (90, 40));
+            assert!(counts.is_sorted() && counts[12] == 90, "{counts:?}");
+            // Before the growth ends at step 12, Gaussians are only added with a relocation.
+            assert_eq!(counts[8] > 40 && counts[8] < 90, relocate_every > 0, "{counts:?}");
+        }
     }
 
     /// The splat is compared over the background: one that is empty matches a photo that is masked out.
@@ -362,7 +384,7 @@ mod tests {
         };
         let steps = |count| {
             let mut optimizer =
-                GaussianOptimizer::new(&RawGaussians::from_gaussians(&gaussians), 1., &config);
+                GaussianOptimizer::new(&RawGaussians::from_gaussians(&gaussians), 1., &config, 0);
             let mut corrections = Corrections::new(4, true, true, 1., &config, Device::Cpu);
             let _guard = num_threads::change();
             refine(&mut optimizer, &mut corrections, &task_of(count), |_| true).unwrap();

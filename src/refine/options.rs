@@ -40,7 +40,7 @@ impl MaskBackground {
     }
 }
 
-/// Default of the longer side of photos in pixels. Thousands of Gaussians can't show more detail, and more pixels take more time.
+/// Default of the longer side of photos in pixels, for the default number of Gaussians.
 const LONGEST_SIDE: u32 = 512;
 /// Maximum memory of the photos to match, unless their number is given. Smaller copies of them take as much again.
 const MAX_PHOTO_BYTES: u64 = 768 << 20;
@@ -48,6 +48,9 @@ const MAX_PHOTO_BYTES: u64 = 768 << 20;
 const MAX_HELD_OUT_BYTES: u64 = 256 << 20;
 /// Memory per pixel of a photo: three channels and a mask in float32.
 const BYTES_PER_PIXEL: u64 = 16;
+
+/// Minimum number of steps in which the number of Gaussians grows: with fewer, all are there from the start.
+const MIN_STEPS_TO_GROW: u64 = 500;
 
 /// Options of a session.
 #[derive(Debug, Clone)]
@@ -58,7 +61,7 @@ pub struct RefineOptions {
     pub budget: Budget,
     /// Start of a time budget; if it is `None`, the start of the session.
     pub started: Option<Instant>,
-    /// Number of Gaussians if the initial splat doesn't determine it.
+    /// Final number of Gaussians if the initial splat doesn't determine it. A session that is ended early may have fewer.
     pub gaussians: usize,
     /// Seed of the random numbers.
     pub seed: u64,
@@ -99,6 +102,15 @@ impl Default for RefineOptions {
 }
 
 impl RefineOptions {
+    /// Returns the size of the photos for a number of Gaussians: fewer can't show more detail, and more pixels take more time.
+    pub fn size_for(gaussians: usize) -> PhotoSize {
+        PhotoSize::Within(match gaussians {
+            ..=25_000 => LONGEST_SIDE,
+            25_001..=250_000 => 1024,
+            _ => 1600,
+        })
+    }
+
     /// Checks that every option is in its range.
     pub(super) fn check(&self) -> Result<()> {
         self.config.check().map_err(|expected| {
@@ -114,6 +126,14 @@ impl RefineOptions {
             return Err(Error::setting("the number of views", views, "2 or more"));
         }
         Ok(())
+    }
+
+    /// Returns the number of Gaussians to create from photos, from which their number grows to [`RefineOptions::gaussians`].
+    pub(super) fn initial_gaussians(&self) -> usize {
+        match self.budget {
+            Budget::Steps(..MIN_STEPS_TO_GROW) => self.gaussians,
+            _ => (self.gaussians as f64 * self.config.initial_gaussians).ceil() as usize,
+        }
     }
 
     /// Returns the indices of the photos to match and of the held-out views, and a warning if large captures have more than fit into memory.
@@ -192,6 +212,16 @@ mod tests {
         let asked = RefineOptions { views: Some(500), holdout: Holdout::None, ..options };
         let ([shown, held_out], warning) = asked.select_views(&capture);
         assert_eq!((shown.len(), held_out.len(), warning), (500, 0, None));
+    }
+
+    #[test]
+    fn the_number_of_gaussians_grows_if_there_is_time() {
+        let of = |budget, gaussians| {
+            RefineOptions { budget, gaussians, ..RefineOptions::default() }.initial_gaussians()
+        };
+        assert_eq!(of(Budget::Time(Duration::from_secs(1)), 16_384), 3277);
+        assert_eq!(of(Budget::Steps(500), 101), 21);
+        assert_eq!(of(Budget::Steps(499), 101), 101);
     }
 
     #[test]

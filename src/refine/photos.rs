@@ -1,5 +1,6 @@
 //! Photos that a splat is refined on, at several sizes.
 
+use super::config::RefineConfig;
 use super::view_selection::are_near_duplicates;
 use crate::data::{Capture, MIN_SHORTER_SIDE, PhotoSize, View, ViewBatch, load_views, view_batch};
 use crate::error::{Error, Result};
@@ -88,6 +89,8 @@ pub(super) fn distinct(photos: &[View], depth: f64) -> Vec<usize> {
 #[derive(Debug)]
 pub struct Photos {
     levels: Vec<Vec<Group>>,
+    /// Fractions of the optimization at which the next level begins.
+    schedule: Vec<f64>,
 }
 
 /// Group of photos of one size.
@@ -102,11 +105,13 @@ impl Photos {
     /// Creates photos from `views` at their own size only.
     pub(crate) fn from_batch(views: ViewBatch) -> Self {
         let indices = (0..views.images.size()[1] as usize).collect();
-        Photos { levels: vec![vec![Group { indices, views }]] }
+        Photos { levels: vec![vec![Group { indices, views }]], schedule: vec![] }
     }
 
-    /// Creates photos from `views`, at least one, at `levels` sizes, each half as wide and high as the next.
-    pub fn new(views: &[View], levels: usize, device: Device) -> Self {
+    /// Creates photos from `views`, at least one, at the sizes of `config`'s schedule, each half as wide and high as the next.
+    pub fn new(views: &[View], config: &RefineConfig, device: Device) -> Self {
+        let longest_side = views.iter().map(|view| view.camera.width.max(view.camera.height)).max();
+        let schedule = config.schedule(longest_side.unwrap_or(0));
         let mut groups: BTreeMap<(u32, u32), Vec<usize>> = BTreeMap::new();
         for (index, View { camera, .. }) in views.iter().enumerate() {
             groups.entry((camera.height, camera.width)).or_default().push(index);
@@ -118,7 +123,7 @@ impl Photos {
         };
         let whole = groups.into_values().map(group).collect();
         let mut sizes: Vec<Vec<Group>> = vec![whole];
-        for _ in 1..levels {
+        for _ in &schedule {
             let halves = sizes[sizes.len() - 1]
                 .iter()
                 .map(|group| Group { indices: group.indices.clone(), views: halved(&group.views) })
@@ -126,11 +131,12 @@ impl Photos {
             sizes.push(halves);
         }
         sizes.reverse();
-        Photos { levels: sizes }
+        Photos { levels: sizes, schedule }
     }
 
-    /// Draws up to `views` different photos of one size, at level `level` from the smallest. Returns their indices and the photos.
-    pub(super) fn draw(&self, level: usize, views: usize, random: &mut impl Rng) -> (Vec<i64>, ViewBatch) {
+    /// Draws up to `views` different photos of one size, at the level for `progress` from 0 to 1. Returns their indices and the photos.
+    pub(super) fn draw(&self, progress: f64, views: usize, random: &mut impl Rng) -> (Vec<i64>, ViewBatch) {
+        let level = self.schedule.iter().filter(|&&part| progress >= part).count();
         let groups = &self.levels[level.min(self.levels.len() - 1)];
         let count = |group: &Group| group.indices.len();
         let mut owners = groups.iter().flat_map(|group| (0..count(group)).map(move |_| group));

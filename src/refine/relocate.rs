@@ -8,21 +8,40 @@ use tch::{Kind, Tensor};
 
 /// Maximum number of copies of one Gaussian that the correction takes into account.
 const MAX_COPIES: usize = 50;
+/// Half of the width of the uniform distribution with a standard deviation of 1.
+const UNIT_SPREAD: f32 = 1.732_050_8;
 /// Minimum opacity after relocation.
 const MIN_OPACITY: f64 = 0.005;
 
-/// Moves every Gaussian whose opacity is at most `dead` onto another one, drawn with probability proportional to its opacity. Changes the
-/// opacities and scales of all Gaussians that then coincide so that together they look like the original one. Returns the indices of the
-/// changed Gaussians.
-pub fn relocate(leaves: &GaussianParams, dead: f64, random: &mut impl Rng) -> Vec<i64> {
-    let opacities = Vec::<f64>::try_from(leaves.opacity_logits.sigmoid().view([-1]).to_kind(Kind::Double))
-        .expect("numbers");
+/// Exponent of a Gaussian's sensitivity in the probability that another one moves onto it.
+const SENSITIVITY_POWER: f64 = 0.5;
+
+/// Moves every Gaussian whose opacity is at most `dead` onto another one, drawn with probability proportional to its opacity and to the root
+/// of its sensitivity: its size times the root of `squared_gradients`, the mean squares of the gradients of the means, [1, N, 3]. Changes the
+/// opacities and scales of all Gaussians that then coincide so that together they look like the original one. Then displaces the moved
+/// Gaussians within the original one, by `spread` of its standard deviations, so that they get different gradients. Returns the indices of
+/// the changed Gaussians.
+pub fn relocate(
+    leaves: &GaussianParams,
+    squared_gradients: &Tensor,
+    dead: f64,
+    spread: f64,
+    random: &mut impl Rng,
+) -> Vec<i64> {
+    let numbers = |t: Tensor| {
+        Vec::<f64>::try_from(t.view([-1]).to_kind(Kind::Double)).expect("one number per Gaussian")
+    };
+    let opacities = numbers(leaves.opacity_logits.sigmoid());
     let (gone, alive): (Vec<usize>, Vec<usize>) = (0..opacities.len()).partition(|&i| opacities[i] <= dead);
     if gone.is_empty() || alive.is_empty() {
         return vec![];
     }
-    let by_opacity = WeightedIndex::new(alive.iter().map(|&i| opacities[i])).expect("some are above 0");
-    let sources: Vec<usize> = gone.iter().map(|_| alive[by_opacity.sample(random)]).collect();
+    let sizes = leaves.log_scales.mean_dim([2].as_slice(), false, Kind::Double).exp();
+    let sensitivities =
+        numbers(squared_gradients.sum_dim_intlist([2].as_slice(), false, Kind::Double).sqrt() * sizes);
+    let weight = |&i: &usize| opacities[i] * sensitivities[i].powf(SENSITIVITY_POWER).max(f64::MIN_POSITIVE);
+    let by_weight = WeightedIndex::new(alive.iter().map(weight)).expect("some are above 0");
+    let sources: Vec<usize> = gone.iter().map(|_| alive[by_weight.sample(random)]).collect();
     let mut copies = vec![1usize; opacities.len()];
     sources.iter().for_each(|&source| copies[source] += 1);
     let mut changed: Vec<usize> = (0..copies.len()).filter(|&i| copies[i] > 1).collect();
@@ -38,19 +57,34 @@ pub fn relocate(leaves: &GaussianParams, dead: f64, random: &mut impl Rng) -> Ve
     let index = |of: &[usize]| {
         Tensor::from_slice(&of.iter().map(|&i| i as i64).collect::<Vec<_>>()).to_device(device)
     };
-    let numbers = |of: &[f32]| Tensor::from_slice(of).to_device(device);
+    let tensor = |of: &[f32]| Tensor::from_slice(of).to_device(device);
     let (to, from, at) = (index(&gone), index(&sources), index(&changed));
     tch::no_grad(|| {
         let count = changed.len() as i64;
-        let _ = leaves.opacity_logits.shallow_clone().index_copy_(1, &at, &numbers(&logits).view([1, count]));
-        let smaller = leaves.log_scales.index_select(1, &at) + numbers(&shrink).view([1, count, 1]);
+        let _ = leaves.opacity_logits.shallow_clone().index_copy_(1, &at, &tensor(&logits).view([1, count]));
+        let smaller = leaves.log_scales.index_select(1, &at) + tensor(&shrink).view([1, count, 1]);
         let _ = leaves.log_scales.shallow_clone().index_copy_(1, &at, &smaller);
         for (_, tensor) in leaves.named_parameters() {
             let _ = tensor.shallow_clone().index_copy_(1, &to, &tensor.index_select(1, &from));
         }
+        let offsets: Vec<f32> =
+            (0..3 * gone.len()).map(|_| random.random_range(-UNIT_SPREAD..UNIT_SPREAD)).collect();
+        let offsets =
+            tensor(&offsets).view([1, -1, 3]) * leaves.log_scales.index_select(1, &to).exp() * spread;
+        let moved = rotate(&leaves.quaternions.index_select(1, &to), &offsets);
+        let _ = leaves.means.shallow_clone().index_add_(1, &to, &moved);
     });
     changed.extend(gone);
     changed.into_iter().map(|i| i as i64).collect()
+}
+
+/// Rotates `vectors` [1, N, 3] by `quaternions` [1, N, 4] of any length.
+fn rotate(quaternions: &Tensor, vectors: &Tensor) -> Tensor {
+    let length = quaternions.square().sum_dim_intlist([2].as_slice(), true, Kind::Float).sqrt();
+    let unit = quaternions / length;
+    let (w, axis) = (unit.narrow(2, 0, 1), unit.narrow(2, 1, 3));
+    let twice = axis.cross(vectors, 2) * 2.;
+    vectors + &twice * w + axis.cross(&twice, 2)
 }
 
 /// Returns the integral of the opacity along a line through the centre of n coincident Gaussians of one opacity, in units of the standard
@@ -93,19 +127,32 @@ mod tests {
         }
     }
 
-    #[test]
-    fn dead_gaussians_go_where_others_are() {
+    /// Returns ten Gaussians in a row, of which the first four are dead.
+    fn ten_gaussians() -> GaussianParams {
         let options = (Kind::Float, tch::Device::Cpu);
         let logits: Vec<f32> = (0..10).map(|i| if i < 4 { -8. } else { 2. }).collect();
-        let raw = RawGaussians {
-            means: Tensor::arange(30, options).view([1, 10, 3]),
-            log_scales: Tensor::full([1, 10, 3], -3., options),
-            quaternions: Tensor::from_slice(&[1f32, 0., 0., 0.]).expand([1, 10, 4], false).contiguous(),
-            opacity_logits: Tensor::from_slice(&logits).view([1, 10]),
-            sh: Tensor::zeros([1, 10, 1, 3], options),
-        };
-        let leaves = GaussianParams::from_raw(&raw, 0);
-        let mut changed = relocate(&leaves, 0.01, &mut ChaCha8Rng::seed_from_u64(1));
+        GaussianParams::from_raw(
+            &RawGaussians {
+                means: Tensor::arange(30, options).view([1, 10, 3]),
+                log_scales: Tensor::from_slice(&[-3f32, -4., -5.]).expand([1, 10, 3], false).contiguous(),
+                // A quarter turn about z, at twice the length.
+                quaternions: Tensor::from_slice(&[1f32, 0., 0., 1.]).expand([1, 10, 4], false).contiguous(),
+                opacity_logits: Tensor::from_slice(&logits).view([1, 10]),
+                sh: Tensor::zeros([1, 10, 1, 3], options),
+            },
+            0,
+        )
+    }
+
+    fn random() -> ChaCha8Rng {
+        ChaCha8Rng::seed_from_u64(1)
+    }
+
+    #[test]
+    fn dead_gaussians_go_where_others_are() {
+        let leaves = ten_gaussians();
+        let still = leaves.means.zeros_like();
+        let mut changed = relocate(&leaves, &still, 0.01, 0., &mut random());
         let means: Vec<f64> = Vec::try_from(leaves.means.to_kind(Kind::Double).view([-1])).unwrap();
         for dead in 0..4 {
             let at = means[3 * dead];
@@ -119,6 +166,39 @@ mod tests {
         let before = changed.len();
         changed.dedup();
         assert_eq!(changed.len(), before);
-        assert!(relocate(&leaves, 0.01, &mut ChaCha8Rng::seed_from_u64(1)).is_empty());
+        assert!(relocate(&leaves, &still, 0.01, 0., &mut random()).is_empty());
+    }
+
+    #[test]
+    fn gaussians_move_onto_sensitive_ones() {
+        let leaves = ten_gaussians();
+        // The root of the sensitivity of the last is a million times that of the others.
+        let gradients = leaves.means.ones_like() * 1e-24;
+        let _ = gradients.narrow(1, 9, 1).fill_(1.);
+        let _ = relocate(&leaves, &gradients, 0.01, 0., &mut random());
+        for dead in 0..4 {
+            assert!(leaves.means.get(0).get(dead).equal(&leaves.means.get(0).get(9)), "{dead}");
+        }
+    }
+
+    #[test]
+    fn moved_gaussians_are_spread_within_the_original_one() {
+        let [together, apart] = [0., 0.5].map(|spread| {
+            let leaves = ten_gaussians();
+            let _ = relocate(&leaves, &leaves.means.zeros_like(), 0.01, spread, &mut random());
+            leaves
+        });
+        let moved = (&apart.means - &together.means).abs().get(0);
+        let scales = together.log_scales.exp().get(0);
+        assert!(moved.narrow(0, 4, 6).eq(0.).all().int64_value(&[]) == 1);
+        for dead in 0..4 {
+            let value = |t: &Tensor, axis: i64| t.double_value(&[dead, axis]);
+            // The turn exchanges x and y. Coordinates up to 30 are rounded to 2e-6.
+            for (axis, own) in [(0, 1), (1, 0), (2, 2)] {
+                let most = 0.5 * f64::from(UNIT_SPREAD) * value(&scales, own) + 4e-6;
+                let shift = value(&moved, axis);
+                assert!(0. < shift && shift < most, "{dead}, {axis}: {shift} of {most}");
+            }
+        }
     }
 }

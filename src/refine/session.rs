@@ -503,7 +503,9 @@ impl<'a> RefineSession<'a> {
             };
             !is_stopped && !is_late
         };
-        let RefineOptions { gaussians, seed, device, .. } = *self.options;
+        let RefineOptions { seed, device, .. } = *self.options;
+        let gaussians =
+            if known.is_some() { self.options.gaussians } else { self.options.initial_gaussians() };
         let made =
             gaussians_from_photos(&self.photos, &points, known, gaussians, seed, device, should_continue);
         self.is_stopped |= is_stopped;
@@ -521,11 +523,12 @@ impl<'a> RefineSession<'a> {
             }
         };
         let RefineOptions { correct_poses, correct_exposures, config, seed, device, .. } = self.options;
-        let mut optimizer = GaussianOptimizer::new(&raw, depth, config);
+        let final_count = if matches!(start, Start::Splat(..)) { 0 } else { self.options.gaussians as i64 };
+        let mut optimizer = GaussianOptimizer::new(&raw, depth, config, final_count);
         let count = self.photos.len();
         let mut corrections =
             Corrections::new(count, *correct_poses, *correct_exposures, depth, config, *device);
-        let photos = Photos::new(&self.photos, config.levels(), *device);
+        let photos = Photos::new(&self.photos, config, *device);
         let budget = match self.options.budget {
             Budget::Time(time) => {
                 let left = time.saturating_sub(self.reserve).saturating_sub(self.clock.elapsed());

@@ -225,7 +225,8 @@ fn an_interrupted_refinement_returns_its_gaussians() {
         let mut session = RefineSession::load(&capture, &options, move |event| !ends(&event))?;
         session.start(Initial::Photos)?;
         let result = session.run()?;
-        assert_eq!(result.gaussians.count(), 300);
+        // Their number has hardly begun to grow from a fifth.
+        assert_eq!(result.gaussians.count(), 60);
         assert_eq!(result.gaussians.means.isfinite().all().int64_value(&[]), 1);
         Ok::<u64, globalsplat::Error>(result.steps)
     };

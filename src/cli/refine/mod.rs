@@ -20,14 +20,15 @@ const MAX_SECONDS: f64 = 365. * 24. * 3600.;
 
 /// Optimize a splat on the photos of its scene, or create one from the photos alone.
 ///
-/// The Gaussians, whose number stays fixed, are optimized until their renders match the photos. Without --splat they are
-/// initialized where the depths of several photos agree; neither weights nor a GPU are needed. Ctrl-C ends the optimization
-/// early and writes the current splat.
+/// The Gaussians are optimized until their renders match the photos. Without --splat they are initialized where the depths of
+/// several photos agree, and their number grows to --gaussians; neither weights nor a GPU are needed. Ctrl-C ends the
+/// optimization early and writes the current splat.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat refine --scene captures/room --out room.ply\n  \
     globalsplat refine --photos photos/room --out room.ply\n  \
     globalsplat refine --splat room.ply --scene captures/room --out better.ply --seconds 30\n  \
-    globalsplat refine --scene captures/room --holdout every:8 --sheet views.png --out room.ply")]
+    globalsplat refine --scene captures/room --holdout every:8 --sheet views.png --out room.ply\n  \
+    globalsplat refine --scene captures/room --gaussians 100000 --seconds 240 --out room.ply")]
 pub struct Refine {
     /// Initial splat, in the capture's world coordinates: .ply, .compressed.ply, .spz or .splat
     #[arg(long, value_name = "FILE", conflicts_with = "gaussians")]
@@ -76,7 +77,7 @@ pub struct Refine {
     #[arg(long, value_name = "N")]
     views: Option<usize>,
     /// Size of the photos: the longer side to which larger ones are downscaled, as in 1600, or WxH, to which all are cropped and
-    /// resized; by default 512
+    /// resized; by default 512, with more than 25,000 Gaussians 1024, and with more than 250,000 1600
     #[arg(long, value_name = "N|WxH")]
     size: Option<String>,
     /// Also optimize a correction of each camera's pose
@@ -150,12 +151,13 @@ impl Refine {
 
     fn options(&self, holdout: Holdout) -> Result<RefineOptions> {
         let default = RefineOptions::default();
-        let size = self.size.as_deref().map_or(Ok(default.size), parse_photo_size)?;
+        let gaussians = self.gaussians as usize;
+        let size = self.size.as_deref().map_or(Ok(RefineOptions::size_for(gaussians)), parse_photo_size)?;
         let time = parse_time(self.seconds)?;
         Ok(RefineOptions {
             config: RefineConfig::with(&self.set, self.splat.is_some())?,
             budget: self.steps.map_or(time, Budget::Steps),
-            gaussians: self.gaussians as usize,
+            gaussians,
             seed: self.seed,
             holdout,
             views: self.views,
