@@ -37,6 +37,8 @@ const MAX_REPROJECTION_ERROR: f64 = 2.;
 
 /// Minimum number of photos with one camera for which the camera has separate focal lengths and tangential distortion.
 const OPENCV_PHOTOS: usize = 10;
+/// Minimum number of photos of a fisheye for which the lens's centre is estimated. Few photos can't tell it from a rotation of the camera.
+const CENTRE_PHOTOS: usize = 10;
 /// Focal length of photos without EXIF, relative to their longer side: that of a phone's or a camera's wide lens. The estimate may fail if
 /// it is far off.
 const FOCAL: f64 = 0.85;
@@ -510,10 +512,13 @@ impl Estimate<'_> {
         fs::create_dir(&partial).map_err(Error::write(&partial))?;
         let side = self.photos().iter().map(|photo| photo.width.max(photo.height)).max().unwrap_or(0);
         let reduction = (f64::from(side) / f64::from(MAX_SIDE)).max(1.);
+        let refines_centre =
+            is_fisheye(self.record.camera_model.as_deref()) && self.photos().len() >= CENTRE_PHOTOS;
         let mapper = Command::new("mapper")
             .path("image_path", &self.images)
             .path("output_path", &partial)
-            .option("Mapper.filter_max_reproj_error", MAX_REPROJECTION_ERROR * reduction);
+            .option("Mapper.filter_max_reproj_error", MAX_REPROJECTION_ERROR * reduction)
+            .option("Mapper.ba_refine_principal_point", refines_centre);
         let outcome = self.run(mapper, Step::Poses, 0, self.photos().len());
         // COLMAP's program fails with this message if it places no photo, which is reported in other words.
         let is_without_model = |why: &Error| why.to_string().contains("sparse model");
@@ -595,8 +600,12 @@ struct CameraGroups {
     single: Vec<Photo>,
 }
 
+fn is_fisheye(model: Option<&str>) -> bool {
+    FISHEYE_MODELS.iter().any(|(fisheye, ..)| model == Some(*fisheye))
+}
+
 fn group_by_camera(photos: &[Photo], model: Option<&str>) -> CameraGroups {
-    let is_fisheye = FISHEYE_MODELS.iter().any(|(fisheye, ..)| model == Some(*fisheye));
+    let is_fisheye = is_fisheye(model);
     let mut groups = BTreeMap::<_, Vec<Photo>>::new();
     for photo in photos {
         let focal = photo.focal.map(|focal| focal.round() as u64);

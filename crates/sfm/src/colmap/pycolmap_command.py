@@ -33,7 +33,9 @@ for name in list(options):
     if key == "single_camera_per_image":
         camera_mode = pycolmap.CameraMode.PER_IMAGE
     elif key:
-        setattr(sections[section], key, options[name])
+        # COLMAP's program groups the options of the pipeline with those of the mapper.
+        holder = sections[section] if hasattr(sections[section], key) else pipeline
+        setattr(holder, key, options[name])
 
 database = options["database_path"]
 if sys.argv[1] == "feature_extractor":
