@@ -39,7 +39,11 @@ pub fn relocate(
     let sizes = leaves.log_scales.mean_dim([2].as_slice(), false, Kind::Double).exp();
     let sensitivities =
         numbers(squared_gradients.sum_dim_intlist([2].as_slice(), false, Kind::Double).sqrt() * sizes);
-    let weight = |&i: &usize| opacities[i] * sensitivities[i].powf(SENSITIVITY_POWER).max(f64::MIN_POSITIVE);
+    let weight = |&i: &usize| {
+        let attraction = sensitivities[i].powf(SENSITIVITY_POWER);
+        let is_usable = attraction > 0. && attraction.is_finite();
+        opacities[i] * if is_usable { attraction } else { f64::MIN_POSITIVE }
+    };
     let by_weight = WeightedIndex::new(alive.iter().map(weight)).expect("some are above 0");
     let sources: Vec<usize> = gone.iter().map(|_| alive[by_weight.sample(random)]).collect();
     let mut copies = vec![1usize; opacities.len()];
@@ -175,6 +179,8 @@ mod tests {
         // The root of the sensitivity of the last is a million times that of the others.
         let gradients = leaves.means.ones_like() * 1e-24;
         let _ = gradients.narrow(1, 9, 1).fill_(1.);
+        // One whose gradients have overflowed attracts nothing.
+        let _ = gradients.narrow(1, 8, 1).fill_(f64::INFINITY);
         let _ = relocate(&leaves, &gradients, 0.01, 0., &mut random());
         for dead in 0..4 {
             assert!(leaves.means.get(0).get(dead).equal(&leaves.means.get(0).get(9)), "{dead}");
