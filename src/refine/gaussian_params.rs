@@ -44,21 +44,23 @@ impl GaussianParams {
 
     /// Returns these Gaussians and `count` more, which are copies of the first with hardly any opacity.
     pub fn with_dead(&self, count: i64) -> Self {
-        let leaf = |t: &Tensor| {
+        let leaf = |t: &Tensor, more: &Tensor| Tensor::cat(&[t, more], 1).detach().set_requires_grad(true);
+        let with_copies = |t: &Tensor| {
             let mut size = t.size();
             size[1] = count;
-            let more = t.narrow(1, 0, 1).expand(&size, false);
-            Tensor::cat(&[t, &more], 1).detach().set_requires_grad(true)
+            leaf(t, &t.narrow(1, 0, 1).expand(&size, false))
         };
-        let opacity_logits = leaf(&self.opacity_logits).set_requires_grad(false);
-        let _ = opacity_logits.narrow(1, self.count(), count).fill_(DEAD_LOGIT);
+        let logits = &self.opacity_logits;
         GaussianParams {
-            means: leaf(&self.means),
-            log_scales: leaf(&self.log_scales),
-            quaternions: leaf(&self.quaternions),
-            opacity_logits: opacity_logits.set_requires_grad(true),
-            colours: leaf(&self.colours),
-            harmonics: leaf(&self.harmonics),
+            means: with_copies(&self.means),
+            log_scales: with_copies(&self.log_scales),
+            quaternions: with_copies(&self.quaternions),
+            opacity_logits: leaf(
+                logits,
+                &Tensor::full([1, count], DEAD_LOGIT, (Kind::Float, logits.device())),
+            ),
+            colours: with_copies(&self.colours),
+            harmonics: with_copies(&self.harmonics),
         }
     }
 
