@@ -3,10 +3,10 @@
 use super::images::rgb_from_tensor;
 use crate::error::{Error, Result};
 use crate::scene::ImageSize;
-use globalsplat_files::PartialFile;
+use globalsplat_files::{PartialFile, is_program_missing};
 use image::RgbImage;
 use std::fs::File;
-use std::io::{BufWriter, ErrorKind, Read, Write};
+use std::io::{BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, Command, Stdio};
 use std::thread::JoinHandle;
@@ -169,9 +169,9 @@ fn not_encoded(path: &Path) -> impl FnOnce(gif::EncodingError) -> Error {
 pub fn find_ffmpeg() -> std::result::Result<String, String> {
     const GET: &str = "(Debian and Ubuntu: apt install ffmpeg; macOS: brew install ffmpeg)";
     let output = Command::new("ffmpeg").arg("-encoders").stdin(Stdio::null()).output();
-    let output = output.map_err(|e| match e.kind() {
-        ErrorKind::NotFound => format!("ffmpeg isn't on the PATH {GET}"),
-        _ => format!("the ffmpeg on the PATH can't be started: {e} {GET}"),
+    let output = output.map_err(|e| match is_program_missing(&e) {
+        true => format!("ffmpeg isn't on the PATH {GET}"),
+        false => format!("the ffmpeg on the PATH can't be started: {e} {GET}"),
     })?;
     if !String::from_utf8_lossy(&output.stdout).split_whitespace().any(|word| word == ENCODER) {
         return Err(format!("the ffmpeg on the PATH lacks {ENCODER} {GET}"));

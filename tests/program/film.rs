@@ -208,10 +208,15 @@ fn no_film(path: &Path, splat: &Path) -> (String, Option<i32>) {
 fn an_mp4_without_an_encoder_is_refused_before_anything_is_read() {
     let nothing = tempfile::tempdir().unwrap();
     let absent = Path::new("no_such_splat.ply");
-    let (message, code) = no_film(nothing.path(), absent);
-    assert_eq!(code, Some(2));
-    for part in ["film.mp4", "ffmpeg isn't on the PATH", "apt install ffmpeg", ".gif", "PNGs"] {
-        assert!(message.contains(part), "{part}: {message}");
+    // Like a folder that may not be entered, a file that may not be executed makes the search of the PATH fail with a lack of permission.
+    let denied = tempfile::tempdir().unwrap();
+    std::fs::write(denied.path().join("ffmpeg"), "not executable").unwrap();
+    for path in [nothing.path(), denied.path()] {
+        let (message, code) = no_film(path, absent);
+        assert_eq!(code, Some(2));
+        for part in ["film.mp4", "ffmpeg isn't on the PATH", "apt install ffmpeg", ".gif", "PNGs"] {
+            assert!(message.contains(part), "{part}: {message}");
+        }
     }
     let other = with_ffmpeg("echo ' V....D mpeg4  MPEG-4 part 2'");
     let (message, code) = no_film(other.path(), absent);

@@ -7,6 +7,7 @@ mod environment;
 mod error;
 mod inputs;
 mod keyed_path;
+mod program;
 mod text;
 
 pub use append::AppendFile;
@@ -19,4 +20,5 @@ pub use environment::expand_path;
 pub use error::{Error, Result, panic_message};
 pub use inputs::InputFiles;
 pub use keyed_path::split_keyed_path;
+pub use program::is_program_missing;
 pub use text::read_text;

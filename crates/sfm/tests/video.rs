@@ -465,10 +465,15 @@ fn a_missing_ffmpeg_is_reported() {
     const NAME: &str = "a_missing_ffmpeg_is_reported";
     let video = PathBuf::from(file!());
     let video = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests").join(video.file_name().unwrap());
-    if std::env::var_os("GLOBALSPLAT_TEST_PATH_IS_EMPTY").is_none() {
+    if std::env::var_os("GLOBALSPLAT_TEST_WITHOUT_FFMPEG").is_none() {
         let empty = tempfile::tempdir().unwrap();
-        let variables = [("PATH", empty.path()), ("GLOBALSPLAT_TEST_PATH_IS_EMPTY", empty.path())];
-        assert!(rerun_test(NAME, &variables).0);
+        // Like a folder that may not be entered, a file that may not be executed makes the search fail with a lack of permission.
+        let denied = tempfile::tempdir().unwrap();
+        fs::write(denied.path().join("ffprobe"), "not executable").unwrap();
+        for path in [empty.path(), denied.path()] {
+            let variables = [("PATH", path), ("GLOBALSPLAT_TEST_WITHOUT_FFMPEG", path)];
+            assert!(rerun_test(NAME, &variables).0);
+        }
         return;
     }
     for error in [extract(&video, Path::new("unused"), None).unwrap_err(), is_video(&video).unwrap_err()] {

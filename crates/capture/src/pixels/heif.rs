@@ -1,9 +1,9 @@
 //! HEIC and AVIF: files of boxes (ISO/IEC 14496-12, 23008-12). The size is read from them; programs on the PATH decode the pixels.
 
-use globalsplat_files::{Error, Result};
+use globalsplat_files::{Error, Result, is_program_missing};
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageFormat};
-use std::io::{ErrorKind, Write};
+use std::io::Write;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
@@ -122,9 +122,9 @@ fn run_ffmpeg(encoded: &[u8]) -> std::result::Result<DynamicImage, String> {
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .stderr(Stdio::piped());
-    let mut ffmpeg = command.spawn().map_err(|e| match e.kind() {
-        ErrorKind::NotFound => "ffmpeg isn't on the PATH".to_string(),
-        _ => format!("the ffmpeg on the PATH can't be started: {e}"),
+    let mut ffmpeg = command.spawn().map_err(|e| match is_program_missing(&e) {
+        true => "ffmpeg isn't on the PATH".to_string(),
+        false => format!("the ffmpeg on the PATH can't be started: {e}"),
     })?;
     let mut input = ffmpeg.stdin.take().expect("a pipe was asked for");
     let output = std::thread::scope(|scope| {
@@ -163,8 +163,7 @@ fn run_libheif(encoded: &[u8]) -> Option<std::result::Result<DynamicImage, Strin
         std::fs::write(&heic, encoded).map_err(failed)?;
         for program in ["heif-dec", "heif-convert"] {
             match Command::new(program).args([&heic, &png]).stdin(Stdio::null()).output() {
-                // A program in no folder of the PATH, some of which may not be accessed, is reported as one without permission.
-                Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::PermissionDenied) => {}
+                Err(e) if is_program_missing(&e) => {}
                 Err(e) => return Err(format!("{program} failed: {e}")),
                 Ok(output) => {
                     let message = String::from_utf8_lossy(&output.stderr);

@@ -1,10 +1,10 @@
 //! ffmpeg and ffprobe, run as processes.
 
 use super::grey::Grey;
-use globalsplat_files::{Error, Result};
+use globalsplat_files::{Error, Result, is_program_missing};
 use serde_json::Value;
 use std::ffi::OsString;
-use std::io::{BufRead, BufReader, ErrorKind};
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Command, Output, Stdio};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
@@ -314,9 +314,9 @@ fn run(video: &Path, mut command: Command) -> Result<Output> {
 fn not_started(video: &Path, program: &str) -> impl FnOnce(std::io::Error) -> Error {
     const GET: &str = "(Debian and Ubuntu: apt install ffmpeg; macOS: brew install ffmpeg)";
     let what = format!("{}: reading a video needs {program}", video.display());
-    move |e| match e.kind() {
-        ErrorKind::NotFound => Error::request(format!("{what}, which isn't on the PATH {GET}")),
-        _ => Error::failed_by(format!("{what}, which can't be started"))(e),
+    move |e| match is_program_missing(&e) {
+        true => Error::request(format!("{what}, which isn't on the PATH {GET}")),
+        false => Error::failed_by(format!("{what}, which can't be started"))(e),
     }
 }
 
