@@ -207,7 +207,11 @@ fn inspect(path: &Path, mask: Option<&Path>) -> Result<Inspected, String> {
         Error::Input { found, .. } => found,
         other => other.to_string(),
     };
-    let encoded = fs::read(path).map_err(|why| format!("unreadable ({why})"))?;
+    let encoded =
+        fs::read(path).map_err(|why| match path.to_string_lossy().contains(char::REPLACEMENT_CHARACTER) {
+            true => "named in another encoding than UTF-8".to_string(),
+            false => format!("unreadable ({why})"),
+        })?;
     let (width, height) = read_image_size(path).map_err(refuse)?;
     // Declaring the sides in the other order has the photo rotated if its EXIF says so.
     let decoded = decode_photo(&encoded, path, (height, width)).map_err(refuse)?;
@@ -310,6 +314,20 @@ mod tests {
         assert_eq!(skipped[..2], [("b/3.png", "identical to b/2.png"), ("black.png", "of a single colour")]);
         assert_eq!((skipped.len(), skipped[2].0), (3, "cut.png"));
         assert!(skipped[2].1.starts_with("undecodable ("), "{}", skipped[2].1);
+    }
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn photos_named_in_another_encoding_are_skipped() {
+        use std::os::unix::ffi::OsStrExt;
+        let folder = tempfile::tempdir().unwrap();
+        let (source, images) = (folder.path().join("photos"), folder.path().join("images"));
+        fs::create_dir_all(&source).unwrap();
+        write_photo(&source.join("é.png"), 1);
+        write_photo(&source.join(std::ffi::OsStr::from_bytes(b"\xe9.png")), 2);
+        let ImportedPhotos { photos, skipped } = import(&source, &images);
+        assert_eq!((photos.len(), photos[0].name.as_str()), (1, "é.png"));
+        assert_eq!((skipped.len(), skipped[0].reason.as_str()), (1, "named in another encoding than UTF-8"));
     }
 
     #[test]
