@@ -1,7 +1,8 @@
 //! Estimates the poses of the photos in a folder, step by step.
 
 use crate::colmap::{
-    CAMERA_MODELS, Colmap, Command, ModelSummary, Outcome, exhaustive_pairs, read_models, sequential_pairs,
+    CAMERA_MODELS, Colmap, Command, ModelSummary, Outcome, exhaustive_pairs, model_folders, read_models,
+    sequential_pairs,
 };
 use crate::make_capture::VIDEO_FILE;
 use crate::photos::{FoundPhoto, Photo, SkippedPhoto, find_photos, import_photos};
@@ -531,8 +532,31 @@ impl Estimate<'_> {
             }
             outcome => outcome?,
         };
+        if self.adjust_robustly(&partial, refines_centre)? == Outcome::Stopped {
+            return Ok(Outcome::Stopped);
+        }
         remove(&sparse)?;
         fs::rename(&partial, &sparse).map_err(Error::write(&sparse))?;
+        Ok(Outcome::Finished)
+    }
+
+    /// Adjusts the models in `sparse` with a loss that weighs wrong matches less than the squared errors by which COLMAP has placed the photos.
+    /// Does nothing without pycolmap.
+    fn adjust_robustly(&mut self, sparse: &Path, refines_centre: bool) -> Result<Outcome> {
+        if !self.colmap.is_python {
+            return Ok(Outcome::Finished);
+        }
+        let total = self.photos().len();
+        let placed = read_models(sparse)?.first().map_or(0, |model| model.names.len());
+        for folder in model_folders(sparse)? {
+            let adjustment = Command::new("bundle_adjuster")
+                .path("input_path", &folder)
+                .path("output_path", &folder)
+                .option("refine_principal_point", refines_centre);
+            if self.run(adjustment, Step::Poses, placed, total)? == Outcome::Stopped {
+                return Ok(Outcome::Stopped);
+            }
+        }
         Ok(Outcome::Finished)
     }
 

@@ -23,7 +23,7 @@ const PRINT_VERSION: &str = "import sys; sys.path = [p for p in sys.path if p]; 
 pub struct Colmap {
     pub(super) program: PathBuf,
     /// `true` if `program` is a Python that has pycolmap, `false` if it is COLMAP's own program.
-    pub(super) is_python: bool,
+    pub(crate) is_python: bool,
     version: String,
 }
 

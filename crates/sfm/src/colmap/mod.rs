@@ -8,7 +8,7 @@ mod pairs;
 pub use find::{Colmap, VARIABLE};
 
 pub(crate) use command::{Command, Outcome};
-pub(crate) use model::{ModelSummary, read_models};
+pub(crate) use model::{ModelSummary, model_folders, read_models};
 pub(crate) use pairs::{exhaustive_pairs, sequential_pairs};
 
 /// Camera models that COLMAP 4 estimates. Versions before 4 lack the last ones.

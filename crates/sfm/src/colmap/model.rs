@@ -2,7 +2,7 @@
 
 use globalsplat_files::{Error, Result};
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// What a COLMAP model contains.
 #[derive(Debug, Clone, PartialEq)]
@@ -20,15 +20,21 @@ pub(crate) struct ModelSummary {
 /// # Errors
 /// Returns an error if a model can't be read.
 pub(crate) fn read_models(sparse: &Path) -> Result<Vec<ModelSummary>> {
-    let mut models = vec![];
-    for entry in fs::read_dir(sparse).map_err(Error::read(sparse))? {
-        let folder = entry.map_err(Error::read(sparse))?.path();
-        if folder.join("images.bin").is_file() {
-            models.push(read_model(&folder)?);
-        }
-    }
+    let folders = model_folders(sparse)?;
+    let mut models = folders.iter().map(|folder| read_model(folder)).collect::<Result<Vec<_>>>()?;
     models.sort_by(|a, b| b.names.len().cmp(&a.names.len()).then_with(|| a.names.cmp(&b.names)));
     Ok(models)
+}
+
+/// Returns the folders in `sparse` that contain a model.
+///
+/// # Errors
+/// Returns an error if `sparse` can't be read.
+pub(crate) fn model_folders(sparse: &Path) -> Result<Vec<PathBuf>> {
+    let entries = fs::read_dir(sparse).map_err(Error::read(sparse))?;
+    let folders =
+        entries.map(|entry| Ok(entry.map_err(Error::read(sparse))?.path())).collect::<Result<Vec<_>>>()?;
+    Ok(folders.into_iter().filter(|folder| folder.join("images.bin").is_file()).collect())
 }
 
 /// Reads `images.bin` and `points3D.bin`, which COLMAP documents in "Output Format".

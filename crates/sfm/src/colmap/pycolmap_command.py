@@ -61,5 +61,17 @@ elif sys.argv[1] == "mapper":
     pycolmap.incremental_mapping(
         database, options["image_path"], options["output_path"], options=pipeline
     )
+elif sys.argv[1] == "bundle_adjuster":
+    # A robust loss, for which COLMAP's own program has no option. Its scale, in terms of the median error, suits errors that are mostly
+    # normally distributed.
+    model = pycolmap.Reconstruction(options["input_path"])
+    errors = sorted(point.error for point in model.points3D.values())
+    adjustment = pycolmap.BundleAdjustmentOptions()
+    adjustment.refine_principal_point = options["refine_principal_point"]
+    solver = getattr(adjustment, "ceres", adjustment)
+    solver.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    solver.loss_function_scale = 2 * errors[len(errors) // 2] if errors else 1
+    pycolmap.bundle_adjustment(model, adjustment)
+    model.write_binary(options["output_path"])
 else:
     sys.exit(f"unknown command {sys.argv[1]}")
