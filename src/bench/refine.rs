@@ -4,7 +4,9 @@ use super::{TimingStats, synthetic_scene};
 use crate::data::ViewBatch;
 use crate::device::Stopwatch;
 use crate::error::Result;
-use crate::refine::{Budget, Corrections, GaussianOptimizer, Photos, RefineConfig, Task, refine_timed};
+use crate::refine::{
+    Budget, Corrections, GaussianOptimizer, Photos, Reached, RefineConfig, Task, refine_timed,
+};
 use crate::render::cpu::stage_times;
 use crate::render::{DEFAULT_EPS2D, render};
 use crate::scene::{ImageSize, RawGaussians};
@@ -71,6 +73,7 @@ pub fn bench_refine(
         budget: Budget::Steps(steps),
         seed: 0,
         background: None,
+        reached: Reached::default(),
     };
     refine_timed(&mut optimizer, &mut none, &task(WARM_UP), &mut Stopwatch::default(), |_| true)?;
 

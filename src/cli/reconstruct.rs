@@ -74,9 +74,25 @@ impl Reconstruct {
         let budget = parse_time(seconds)?;
         let device = device::parse(&self.device)?;
         let options = RefineOptions { budget, holdout, views: self.views, device, ..Default::default() };
+        let (gaussians, size) = (Some(options.gaussians), Some(options.size));
         let initial = InitialFile::Model(self.weights);
         let Reconstruct { scene, masks, out, local_origin, json, .. } = self;
-        RefineJob { scene, masks, out, initial, options, local_origin, sheet: None, lpips: false, json }.run()
+        RefineJob {
+            scene,
+            masks,
+            out,
+            initial,
+            options,
+            gaussians,
+            size,
+            local_origin,
+            resume: false,
+            log: None,
+            sheet: None,
+            lpips: false,
+            json,
+        }
+        .run()
     }
 
     pub fn run(self) -> Result<()> {

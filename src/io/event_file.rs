@@ -10,10 +10,10 @@
 //! ```
 
 use super::images::rgb_from_tensor;
-use crate::error::Result;
+use crate::error::{Error, Result};
 use globalsplat_capture::encode_photo;
 use globalsplat_files::AppendFile;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 use tch::Tensor;
 
@@ -23,6 +23,25 @@ const VERSION: &str = "brain.Event:2";
 const START: u64 = 1;
 /// Value of `Image.colorspace` for RGB.
 const RGB: u64 = 3;
+
+/// Folder of event files in the folder of a run.
+const FOLDER: &str = "tensorboard";
+/// Prefix of the names of our files. A number follows, because TensorBoard reads the files of a folder in the order of their names.
+const PREFIX: &str = "events.out.tfevents.";
+
+/// Returns the number in the name of one of our files.
+fn number_of(file: &Path) -> Option<u64> {
+    file.file_name()?.to_str()?.strip_prefix(PREFIX)?.parse().ok()
+}
+
+/// Returns the event files of the folder `run`, oldest first. The list is empty if there are none or if they can't be listed.
+pub fn event_files(run: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(run.join(FOLDER)).into_iter().flatten().flatten();
+    let mut files: Vec<_> =
+        entries.filter_map(|entry| Some((number_of(&entry.path())?, entry.path()))).collect();
+    files.sort();
+    files.into_iter().map(|(_, file)| file).collect()
+}
 
 /// A file of events, written by one process.
 #[derive(Debug)]
@@ -37,6 +56,21 @@ impl EventFile {
     /// Returns an error if the file can't be opened.
     pub fn create(path: &Path) -> Result<Self> {
         Ok(EventFile { file: AppendFile::open(path)? })
+    }
+
+    /// Creates the next file of the run in the folder `run`, in its folder `tensorboard`.
+    ///
+    /// # Errors
+    /// Returns an error if a folder or the file can't be created.
+    pub fn create_for(run: &Path) -> Result<Self> {
+        let folder = run.join(FOLDER);
+        std::fs::create_dir_all(&folder).map_err(Error::write(&folder))?;
+        let mut number = 0;
+        for entry in std::fs::read_dir(&folder).map_err(Error::read(&folder))? {
+            let of = number_of(&entry.map_err(Error::read(&folder))?.path());
+            number = number.max(of.map_or(0, |of| of + 1));
+        }
+        EventFile::create(&folder.join(format!("{PREFIX}{number:010}")))
     }
 
     /// Writes the first records of the file: the version, and a session start that invalidates events of `step` and later steps in earlier

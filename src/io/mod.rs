@@ -16,6 +16,9 @@ mod video;
 mod weights;
 mod weights_file;
 
+/// Name of the metrics file of a run, which has one line for every step and every validation.
+pub const METRICS_FILE: &str = "metrics.jsonl";
+
 pub use globalsplat_files::{
     InputFiles, check_regular, check_writable_dir, check_writable_file, checksum, write_atomically,
 };
@@ -43,7 +46,7 @@ pub(crate) use globalsplat_files::{
     AppendFile, expand_path, read_text, recover_dirs, remove_dir, replace_dir, write_json,
 };
 
-pub(crate) use event_file::EventFile;
+pub(crate) use event_file::{EventFile, event_files};
 pub(crate) use event_reader::{EventReader, read_event_image};
 pub(crate) use globalsplat_capture::{PHOTO_EXTENSIONS, read_image_size};
 pub(crate) use images::{enlarge, shrink, subsample, write_jpeg};

@@ -2,12 +2,17 @@
 //! a few parameters per photo.
 
 use super::config::RefineConfig;
+use super::state::RefineState;
 use crate::data::{View, ViewBatch};
 use crate::error::Result;
 use crate::optim::{Optimizer, ParameterGroup, Rule};
 use glam::{DMat4, DQuat, DVec3};
 use serde::Serialize;
+use std::collections::BTreeMap;
 use tch::{Device, Kind, Tensor};
+
+/// Beginning of the names of the corrections' tensors in a state.
+const STATE: &str = "corrections.";
 
 /// Learned pose and exposure corrections of every photo. The mean over all photos is 0 for both, as a scene that is moved or brightened as
 /// a whole is the same scene.
@@ -68,6 +73,34 @@ impl Corrections {
         let (groups, rates) = groups.into_iter().flatten().unzip();
         let optimizer = Optimizer::new(groups);
         Corrections { poses, exposures, optimizer, rates, rates_end: config.lr_final_factor, depth }
+    }
+
+    /// Continues with the values and moments in `state`, if it has corrections of the same kinds.
+    ///
+    /// # Errors
+    /// Returns an error if a tensor is missing or has another shape.
+    pub(super) fn load_state(&mut self, state: &RefineState) -> Result<()> {
+        let tensors = state.tensors_of(STATE);
+        let values = self.values();
+        if !values.iter().all(|(name, value)| tensors.get(name).is_some_and(|t| t.size() == value.size())) {
+            return Ok(());
+        }
+        for (name, value) in values {
+            tch::no_grad(|| value.shallow_clone().copy_(&tensors[&name]));
+        }
+        self.optimizer.load_state(state.file(), &tensors)
+    }
+
+    /// Adds the values and their moments to `tensors`.
+    pub(super) fn add_to_state(&self, tensors: &mut BTreeMap<String, Tensor>) {
+        let all = self.values().into_iter().chain(self.optimizer.state());
+        tensors.extend(all.map(|(name, t)| (format!("{STATE}{name}"), t)));
+    }
+
+    /// Returns the values that are learned, by name.
+    fn values(&self) -> Vec<(String, Tensor)> {
+        let named = [("value.poses", &self.poses), ("value.exposures", &self.exposures)];
+        named.into_iter().filter_map(|(name, t)| Some((name.to_string(), t.as_ref()?.detach()))).collect()
     }
 
     /// Returns the corrected world-to-camera matrices of the photos `which`, [1, C, 4, 4], from their uncorrected poses in `views`;

@@ -3,12 +3,16 @@
 use super::config::RefineConfig;
 use super::gaussian_params::GaussianParams;
 use super::relocate::relocate;
+use super::state::{Record, RefineState};
 use crate::error::Result;
 use crate::optim::{Optimizer, ParameterGroup, Rule};
 use crate::scene::{Gaussians, RawGaussians};
 use rand_chacha::ChaCha8Rng;
-use tch::Tensor;
+use std::collections::BTreeMap;
+use tch::{Device, Tensor};
 
+/// Beginning of the names of this optimizer's tensors in a state.
+const STATE: &str = "gaussians.";
 /// Adam's ε, added to the root of the second moments. It is small because gradients of single Gaussians are small.
 const EPSILON: f64 = 1e-15;
 
@@ -21,6 +25,8 @@ pub struct GaussianOptimizer {
     depth: f64,
     /// Initial and final degree of the spherical harmonics.
     degrees: [i64; 2],
+    /// Degree that the last step used.
+    degree: i64,
     /// Initial and final number of Gaussians.
     counts: [i64; 2],
 }
@@ -34,19 +40,71 @@ impl GaussianOptimizer {
         let leaves = GaussianParams::from_raw(raw, degrees[1]);
         let optimizer = Optimizer::new(leaves.named_parameters().map(alone).into()).with_epsilon(EPSILON);
         let counts = [leaves.count(), leaves.count().max(count)];
-        GaussianOptimizer { leaves, optimizer, config: config.clone(), depth, degrees, counts }
+        GaussianOptimizer { leaves, optimizer, config: config.clone(), depth, degrees, degree: first, counts }
+    }
+
+    /// Creates the optimizer that `state` was made of, on `device`. The Gaussians grow to at least `count`.
+    ///
+    /// # Errors
+    /// Returns an error if a tensor is missing or has another shape than the others.
+    pub(super) fn from_state(
+        state: &RefineState,
+        config: &RefineConfig,
+        count: i64,
+        device: Device,
+    ) -> Result<Self> {
+        let Record { depth, first_count, degrees, degree, .. } = state.record;
+        let leaves =
+            GaussianParams::from_named(|name| state.tensor(&format!("{STATE}value.{name}")), device)?;
+        let mut optimizer = Optimizer::new(leaves.named_parameters().map(alone).into()).with_epsilon(EPSILON);
+        optimizer.load_state(state.file(), &state.tensors_of(STATE))?;
+        let counts = [first_count, leaves.count().max(count)];
+        Ok(GaussianOptimizer { leaves, optimizer, config: config.clone(), depth, degrees, degree, counts })
+    }
+
+    /// Adds the parameters and their moments to `tensors`.
+    pub(super) fn add_to_state(&self, tensors: &mut BTreeMap<String, Tensor>) {
+        let values = self.leaves.named_parameters().map(|(name, t)| (format!("value.{name}"), t.detach()));
+        tensors.extend(
+            values.into_iter().chain(self.optimizer.state()).map(|(name, t)| (format!("{STATE}{name}"), t)),
+        );
+    }
+
+    /// Returns the number of Gaussians.
+    pub(super) fn count(&self) -> i64 {
+        self.leaves.count()
+    }
+
+    /// Returns the number of Gaussians at the start.
+    pub(super) fn first_count(&self) -> i64 {
+        self.counts[0]
+    }
+
+    /// Returns the degrees of the spherical harmonics at the start and at the end, and the present one.
+    pub(super) fn degrees(&self) -> ([i64; 2], i64) {
+        (self.degrees, self.degree)
     }
 
     /// Returns the Gaussians, differentiable with respect to the parameters. `progress` goes from 0 to 1.
     pub fn gaussians(&self, progress: f64) -> Gaussians {
+        self.leaves.activate(self.degree_at(progress))
+    }
+
+    /// Returns the degree of the spherical harmonics, at least the one that an earlier step used.
+    fn degree_at(&self, progress: f64) -> i64 {
         let [first, last] = self.degrees;
-        self.leaves.activate((first + (progress / self.config.sh_every) as i64).min(last))
+        (first + (progress / self.config.sh_every) as i64).min(last).max(self.degree)
     }
 
     /// Returns the number of Gaussians that there should be, which grows exponentially.
     fn count_at(&self, progress: f64) -> i64 {
         let [first, last] = self.counts.map(|count| count as f64);
         (first * (last / first).powf((progress / self.config.grow_until).min(1.))) as i64
+    }
+
+    /// Returns the learning rate of the means, in units of the scene's depth.
+    pub(super) fn means_learning_rate(&self, progress: f64) -> f64 {
+        self.config.means * self.config.means_end.powf(progress)
     }
 
     /// Clears the gradients.
@@ -60,10 +118,10 @@ impl GaussianOptimizer {
     /// Returns an error if a GPU fails.
     pub(super) fn step(&mut self, progress: f64, step: u64, random: &mut ChaCha8Rng) -> Result<()> {
         let config = &self.config;
-        let (means, others) = (config.means_end.powf(progress), config.lr_final_factor.powf(progress));
+        let others = config.lr_final_factor.powf(progress);
         // The order is that of `GaussianParams::named_parameters`.
         self.optimizer.set_learning_rates(&[
-            config.means * self.depth * means,
+            self.means_learning_rate(progress) * self.depth,
             config.log_scales * others,
             config.quaternions * others,
             config.opacity_logits * others,
@@ -71,6 +129,7 @@ impl GaussianOptimizer {
             config.colours * config.harmonics * others,
         ]);
         self.optimizer.step()?;
+        self.degree = self.degree_at(progress);
         let missing = self.count_at(progress) - self.leaves.count();
         let is_due = config.relocate_every > 0 && (step + 1).is_multiple_of(config.relocate_every);
         // With few steps, no relocation may be due after the growth has ended.

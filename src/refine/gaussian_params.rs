@@ -1,7 +1,8 @@
 //! Parameters of the Gaussians that are optimized.
 
+use crate::error::{Error, Result};
 use crate::scene::{Gaussians, RawGaussians};
-use tch::{Kind, Tensor};
+use tch::{Device, Kind, Tensor};
 
 /// Opacity logit of Gaussians that wait for their relocation.
 const DEAD_LOGIT: f64 = -30.;
@@ -40,6 +41,24 @@ impl GaussianParams {
             colours: leaf(raw.sh.narrow(2, 0, 1)),
             harmonics: leaf(higher),
         }
+    }
+
+    /// Creates parameters from the tensors that `of` returns for their names, which are copied to `device`.
+    ///
+    /// # Errors
+    /// Returns the first error of `of`.
+    pub fn from_named<'a>(of: impl Fn(&str) -> Result<&'a Tensor>, device: Device) -> Result<Self> {
+        let leaf = |name: &str| {
+            Ok::<_, Error>(of(name)?.to_device(device).to_kind(Kind::Float).copy().set_requires_grad(true))
+        };
+        Ok(GaussianParams {
+            means: leaf("means")?,
+            log_scales: leaf("log_scales")?,
+            quaternions: leaf("quaternions")?,
+            opacity_logits: leaf("opacity_logits")?,
+            colours: leaf("colours")?,
+            harmonics: leaf("harmonics")?,
+        })
     }
 
     /// Returns these Gaussians and `count` more, which are copies of the first with hardly any opacity.

@@ -7,11 +7,13 @@ mod corrections;
 pub(crate) mod depth_search;
 mod gaussian_optimizer;
 mod gaussian_params;
+mod log;
 mod options;
 mod patches;
 mod photos;
 mod relocate;
 mod session;
+mod state;
 mod sweep;
 mod view_selection;
 
@@ -19,10 +21,12 @@ pub use begin::gaussians_from_photos;
 pub use config::RefineConfig;
 pub use corrections::{Correction, Corrections};
 pub use gaussian_optimizer::GaussianOptimizer;
+pub use log::RefineLog;
 pub use options::{Budget, MaskBackground, RefineOptions};
 pub use patches::{PatchScores, Patches};
 pub use photos::{MIN_SIDE, Photos, load_photos};
-pub use session::{EvalPoint, Initial, RefineEvent, RefineResult, RefineSession};
+pub use session::{EvalPoint, Initial, RefineEvent, RefineMetrics, RefineResult, RefineSession};
+pub use state::{Reached, RefineState};
 
 use crate::data::{View, ViewBatch};
 use crate::device::Stopwatch;
@@ -45,12 +49,28 @@ pub struct RefineStep<'a> {
     /// Time that the steps took, without the work between them.
     pub elapsed: Duration,
     optimizer: &'a GaussianOptimizer,
+    loss: &'a Tensor,
 }
 
 impl RefineStep<'_> {
     /// Returns a copy of the current Gaussians.
     pub fn gaussians(&self) -> Gaussians {
         tch::no_grad(|| self.optimizer.gaussians(1.)).map(Tensor::copy)
+    }
+
+    /// Returns the number of Gaussians.
+    pub fn count(&self) -> i64 {
+        self.optimizer.count()
+    }
+
+    /// Returns the learning rate of the means, in units of the scene's depth.
+    fn means_learning_rate(&self) -> f64 {
+        self.optimizer.means_learning_rate(self.progress)
+    }
+
+    /// Returns the loss of the step. On a GPU this waits for the step.
+    pub fn loss(&self) -> f64 {
+        self.loss.double_value(&[])
     }
 }
 
@@ -69,10 +89,12 @@ pub struct Task<'a> {
     pub seed: u64,
     /// Background of masked pixels; `None` ignores them.
     pub background: Option<MaskBackground>,
+    /// Where an earlier optimization has ended that this one continues. The budget includes its steps and its time.
+    pub reached: Reached,
 }
 
 /// Optimizes the Gaussians of `optimizer` and the `corrections` of the photos. `on_step` is called after every step and ends the work if it
-/// returns `false`. Returns the final Gaussians.
+/// returns `false`. Returns the final Gaussians, and where it has ended.
 ///
 /// # Errors
 /// Fails if rendering fails.
@@ -81,7 +103,7 @@ pub fn refine(
     corrections: &mut Corrections,
     task: &Task,
     on_step: impl FnMut(&RefineStep) -> bool,
-) -> Result<Gaussians> {
+) -> Result<(Gaussians, Reached)> {
     refine_timed(optimizer, corrections, task, &mut Stopwatch::default(), on_step)
 }
 
@@ -92,19 +114,21 @@ pub(crate) fn refine_timed(
     task: &Task,
     stopwatch: &mut Stopwatch,
     mut on_step: impl FnMut(&RefineStep) -> bool,
-) -> Result<Gaussians> {
-    let Task { photos, depth, config, budget, seed, background } = *task;
+) -> Result<(Gaussians, Reached)> {
+    let Task { photos, depth, config, budget, seed, background, reached } = *task;
     let _threads = KernelThreads::take();
     let mut random = ChaCha8Rng::seed_from_u64(seed);
+    random.set_word_pos(reached.random);
     let (begun, mut elapsed, mut last) = (Instant::now(), Duration::ZERO, Duration::ZERO);
-    for step in 0.. {
+    let mut steps = reached.steps;
+    for step in reached.steps.. {
         let start = Instant::now();
         let (progress, is_over) = match budget {
             Budget::Steps(steps) => (step as f64 / steps as f64, step >= steps),
             Budget::Time(time) => {
-                let gone = begun.elapsed();
+                let gone = reached.time + begun.elapsed();
                 // A step that would not end in time is not started.
-                (gone.as_secs_f64() / time.as_secs_f64(), step > 0 && gone + last > time)
+                (gone.as_secs_f64() / time.as_secs_f64(), step > reached.steps && gone + last > time)
             }
         };
         if is_over {
@@ -128,11 +152,13 @@ pub(crate) fn refine_timed(
         })?;
         last = start.elapsed();
         elapsed += last;
-        if !on_step(&RefineStep { step: step + 1, progress, elapsed, optimizer }) {
+        steps = step + 1;
+        if !on_step(&RefineStep { step: steps, progress, elapsed, optimizer, loss: &loss }) {
             break;
         }
     }
-    Ok(tch::no_grad(|| optimizer.gaussians(1.)))
+    let reached = Reached { steps, time: reached.time + begun.elapsed(), random: random.get_word_pos() };
+    Ok((tch::no_grad(|| optimizer.gaussians(1.)), reached))
 }
 
 /// Returns the loss: the difference between rendered images and photos, plus the regularization of the Gaussians. Masked pixels of the
@@ -255,8 +281,16 @@ mod tests {
         let mut optimizer = GaussianOptimizer::new(&raw, depth, &config, 0);
         let photos = Photos::new(views, &config, Device::Cpu);
         let budget = Budget::Steps(400);
-        let task = Task { photos: &photos, depth, config: &config, budget, seed, background };
-        refine(&mut optimizer, &mut Corrections::none(), &task, |_| true).unwrap()
+        let task = Task {
+            photos: &photos,
+            depth,
+            config: &config,
+            budget,
+            seed,
+            background,
+            reached: Reached::default(),
+        };
+        refine(&mut optimizer, &mut Corrections::none(), &task, |_| true).unwrap().0
     }
 
     /// A bright thing that moves through the photos costs a lot of quality on a view that isn't among them, and most of it is recovered if
@@ -315,13 +349,21 @@ mod tests {
             let config = RefineConfig { relocate_every, ..RefineConfig::default() };
             let photos = Photos::new(&views, &config, Device::Cpu);
             let (budget, mut counts) = (Budget::Steps(20), vec![]);
-            let task = Task { photos: &photos, depth, config: &config, budget, seed: 0, background: None };
+            let task = Task {
+                photos: &photos,
+                depth,
+                config: &config,
+                budget,
+                seed: 0,
+                background: None,
+                reached: Reached::default(),
+            };
             let mut optimizer = GaussianOptimizer::new(&raw, depth, &config, 90);
             let splat = refine(&mut optimizer, &mut Corrections::none(), &task, |step| {
                 counts.push(step.gaussians().count());
                 true
             });
-            assert_eq!((splat.unwrap().count(), counts[0]), (90, 40));
+            assert_eq!((splat.unwrap().0.count(), counts[0]), (90, 40));
             assert!(counts.is_sorted() && counts[12] == 90, "{counts:?}");
             // Before the growth ends at step 12, Gaussians are only added with a relocation.
             assert_eq!(counts[8] > 40 && counts[8] < 90, relocate_every > 0, "{counts:?}");
@@ -381,6 +423,7 @@ mod tests {
             budget: Budget::Steps(steps),
             seed: 0,
             background: None,
+            reached: Reached::default(),
         };
         let steps = |count| {
             let mut optimizer =

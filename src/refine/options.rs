@@ -40,8 +40,18 @@ impl MaskBackground {
     }
 }
 
+/// Number of Gaussians that one core can optimize in one second of a time budget.
+const GAUSSIANS_PER_CORE_SECOND: f64 = 400.;
+/// Minimum number of pixels, in all photos together, for each Gaussian.
+const PIXELS_PER_GAUSSIAN: u64 = 24;
+/// Number of Gaussians of the paper's main model, the minimum of [`RefineOptions::gaussians_for`].
+const MIN_GAUSSIANS: usize = 16_384;
+/// Maximum of [`RefineOptions::gaussians_for`].
+const MAX_GAUSSIANS: usize = 1_000_000;
 /// Default of the longer side of photos in pixels, for the default number of Gaussians.
 const LONGEST_SIDE: u32 = 512;
+/// Longer side of photos in pixels for a large number of Gaussians.
+const LARGEST_SIDE: u32 = 1600;
 /// Maximum memory of the photos to match, unless their number is given. Smaller copies of them take as much again.
 const MAX_PHOTO_BYTES: u64 = 768 << 20;
 /// Maximum memory of the held-out views.
@@ -88,7 +98,7 @@ impl Default for RefineOptions {
             config: RefineConfig::default(),
             budget: Budget::Time(Duration::from_secs(60)),
             started: None,
-            gaussians: 16_384,
+            gaussians: MIN_GAUSSIANS,
             seed: 0,
             holdout: Holdout::None,
             views: None,
@@ -102,12 +112,27 @@ impl Default for RefineOptions {
 }
 
 impl RefineOptions {
+    /// Returns a number of Gaussians that suits the time budget, the number of cores, and the photos of `capture`. Without a time budget it
+    /// depends on nothing.
+    pub fn gaussians_for(&self, capture: &Capture) -> usize {
+        let Budget::Time(time) = self.budget else { return MIN_GAUSSIANS };
+        let cores = std::thread::available_parallelism().map_or(1., |cores| cores.get() as f64);
+        let by_time = GAUSSIANS_PER_CORE_SECOND * cores * time.as_secs_f64();
+        let (cameras, (shown, _)) = (capture.cameras(), capture.split(self.holdout));
+        let pixels = |&index: &usize| {
+            let ImageSize { height, width } = PhotoSize::Within(LARGEST_SIDE).of(&cameras[index]);
+            u64::from(height) * u64::from(width)
+        };
+        let by_pixels = shown.iter().map(pixels).sum::<u64>() / PIXELS_PER_GAUSSIAN;
+        (by_time.min(by_pixels as f64) as usize).clamp(MIN_GAUSSIANS, MAX_GAUSSIANS)
+    }
+
     /// Returns the size of the photos for a number of Gaussians: fewer can't show more detail, and more pixels take more time.
     pub fn size_for(gaussians: usize) -> PhotoSize {
         PhotoSize::Within(match gaussians {
             ..=25_000 => LONGEST_SIDE,
             25_001..=250_000 => 1024,
-            _ => 1600,
+            _ => LARGEST_SIDE,
         })
     }
 
@@ -222,6 +247,32 @@ mod tests {
         assert_eq!(of(Budget::Time(Duration::from_secs(1)), 16_384), 3277);
         assert_eq!(of(Budget::Steps(500), 101), 21);
         assert_eq!(of(Budget::Steps(499), 101), 101);
+    }
+
+    #[test]
+    fn the_number_of_gaussians_suits_time_and_photos() {
+        let capture = |width: u32, count: i32| {
+            let k = f64::from(width);
+            let intrinsics = Intrinsics { fx: k, fy: k, cx: k / 2., cy: k / 2. };
+            let camera = |index: i32| {
+                let c2w = DMat4::from_translation(DVec3::X * f64::from(index));
+                Camera { intrinsics, c2w, width, height: width }
+            };
+            let cameras: Vec<Camera> = (0..count).map(camera).collect();
+            Capture::from_source("walk".into(), "".into(), &cameras, Arc::new(NoImages)).unwrap()
+        };
+        let of = |budget, capture: &Capture| {
+            RefineOptions { budget, ..RefineOptions::default() }.gaussians_for(capture)
+        };
+        let time = |seconds| Budget::Time(Duration::from_secs(seconds));
+        let (large, small) = (capture(1000, 50), capture(256, 9));
+        let minute = of(time(60), &large);
+        assert!((16_384..=1_000_000).contains(&minute));
+        assert!(of(time(120), &large) == (2 * minute).min(1_000_000) || minute == 16_384, "{minute}");
+        assert_eq!([of(time(1), &large), of(time(100_000), &large)], [16_384, 1_000_000]);
+        // A Gaussian for 24 pixels.
+        assert_eq!(of(time(100_000), &small), 256 * 256 * 9 / 24);
+        assert_eq!(of(Budget::Steps(100_000), &large), 16_384);
     }
 
     #[test]

@@ -7,6 +7,7 @@ use super::gaussian_optimizer::GaussianOptimizer;
 use super::options::{Budget, RefineOptions};
 use super::patches::{PatchScores, Patches};
 use super::photos::{Photos, distinct, load_photos};
+use super::state::{Reached, Record, RefineState};
 use super::{Task, refine, scene_depth};
 use crate::data::{Capture, Point, View, read_points};
 use crate::error::{Error, Result};
@@ -15,6 +16,7 @@ use crate::io::Splat;
 use crate::reconstruct::{LoadedModel, reconstruct, spread_over_path};
 use crate::scene::{Camera, Gaussians, LocalFrame, RawGaussians};
 use serde::Serialize;
+use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 use tch::Tensor;
 
@@ -31,6 +33,8 @@ const MAX_WHOLE_SCORING_SHARE: f64 = 0.05;
 /// Estimated time for writing the splat and ending the program: a constant, and the time per Gaussian.
 const WRITING_TIME: Duration = Duration::from_millis(200);
 const WRITING_TIME_PER_GAUSSIAN: Duration = Duration::from_micros(2);
+/// Number of steps between metrics.
+const METRICS_EVERY: u64 = 50;
 /// Maximum number of photos that LPIPS compares if no views are held out.
 const LPIPS_PHOTOS: usize = 8;
 /// Fractions of the optimization at which the held-out views are scored.
@@ -45,6 +49,9 @@ pub enum Initial<'a> {
     Splat(&'a Splat),
     /// Reconstruction of the photos by a model. It sees [`RefineOptions::views`] of them, or the number in its configuration.
     Model(&'a LoadedModel),
+    /// State of an earlier refinement of the same capture, which continues. The time and the steps of [`RefineOptions::budget`] include those of
+    /// the earlier refinement.
+    State(&'a RefineState),
 }
 
 /// Progress event of a session.
@@ -66,6 +73,10 @@ pub enum RefineEvent<'a> {
         /// Most recent PSNR on patches of the held-out views, in dB.
         psnr: Option<f64>,
     },
+    /// Metrics of a step that was just done, every 50 steps.
+    Measured(&'a RefineMetrics),
+    /// Held-out views were scored on patches.
+    Scored(&'a EvalPoint),
     /// Whole views are being scored; the value is the number of views that are done.
     Scoring(usize),
     /// Warning to print, a sentence: photos that were left out, missing depth information, or too little time. The callback's answer to it
@@ -73,8 +84,23 @@ pub enum RefineEvent<'a> {
     Warning(&'a str),
 }
 
+/// Metrics of a step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RefineMetrics {
+    /// Number of steps done.
+    pub step: u64,
+    /// Time on the session's clock, in seconds.
+    pub seconds: f64,
+    /// Loss of the step's photos.
+    pub loss: f64,
+    /// Number of Gaussians.
+    pub gaussians: i64,
+    /// Learning rate of the means, in units of the scene's depth.
+    pub learning_rate: f64,
+}
+
 /// Scores of the held-out views at one time during the optimization.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct EvalPoint {
     /// Time on the session's clock, in seconds.
     pub seconds: f64,
@@ -102,6 +128,8 @@ pub struct RefineResult {
     pub steps: u64,
     /// Start and end of the optimization on the session's clock, in seconds.
     pub seconds: [f64; 2],
+    /// State from which [`Initial::State`] continues; `None` if the final Gaussians are the initial ones.
+    pub state: Option<RefineState>,
     /// Scores on patches of the photos before and after the optimization.
     pub shown: [PatchScores; 2],
     /// Scores on patches of the held-out views during the optimization.
@@ -116,6 +144,7 @@ enum Start<'a> {
     Photos(RawGaussians),
     Splat(&'a Splat, RawGaussians),
     Model(Gaussians),
+    State(&'a RefineState),
 }
 
 /// Refinement session: the photos and the state computed from them, in the local frame of the capture's cameras. Call
@@ -285,6 +314,7 @@ impl<'a> RefineSession<'a> {
                 let local = Gaussians::from_splat(splat).to_local(&self.frame, splat.origin);
                 Start::Splat(splat, RawGaussians::from_gaussians(&local.to_device(self.options.device)))
             }
+            Initial::State(state) => Start::State(state),
             Initial::Model(loaded) => {
                 let data = &loaded.config.data;
                 let all: Vec<usize> = (0..self.photos.len()).collect();
@@ -310,9 +340,20 @@ impl<'a> RefineSession<'a> {
         let gaussians = match &start {
             Start::Photos(raw) | Start::Splat(_, raw) => raw.activate(),
             Start::Model(gaussians) => gaussians.map(Tensor::shallow_clone),
+            Start::State(state) => {
+                let optimizer =
+                    GaussianOptimizer::from_state(state, &self.options.config, 0, self.options.device)?;
+                tch::no_grad(|| optimizer.gaussians(1.))
+            }
         };
-        let depth = scene_depth(&gaussians, &self.photos)?;
+        let depth = match &start {
+            Start::State(state) => state.record.depth,
+            _ => scene_depth(&gaussians, &self.photos)?,
+        };
         warnings.extend(self.leave_out_near_duplicates(depth));
+        if let Start::State(state) = &start {
+            self.check_state(state)?;
+        }
         warnings.iter().for_each(|line| self.warn(line));
         self.start = Some((start, gaussians.map(Tensor::shallow_clone), depth));
         Ok(gaussians)
@@ -342,10 +383,11 @@ impl<'a> RefineSession<'a> {
             self.add_eval_point(&initial)?;
         }
         let begun = self.clock.elapsed().as_secs_f64();
-        let (gaussians, learned) = if self.is_stopped {
-            (initial.map(Tensor::shallow_clone), Corrections::none())
+        let (gaussians, learned, state) = if self.is_stopped {
+            (initial.map(Tensor::shallow_clone), Corrections::none(), None)
         } else {
-            self.optimize(&start, depth)?
+            let (gaussians, learned, state) = self.optimize(&start, depth)?;
+            (gaussians, learned, Some(state))
         };
         let ended = self.clock.elapsed().as_secs_f64();
         let after = patches.corrected(&learned).score(&gaussians)?.expect("photos");
@@ -362,6 +404,7 @@ impl<'a> RefineSession<'a> {
             initial,
             gaussians,
             is_initial,
+            state: state.filter(|_| !is_initial),
             corrections,
             steps: self.steps,
             seconds: [begun, ended],
@@ -461,6 +504,16 @@ impl<'a> RefineSession<'a> {
         self.photos.iter().map(|photo| photo.camera).collect()
     }
 
+    fn photo_names(&self) -> Vec<String> {
+        self.photos.iter().map(|photo| photo.name.clone()).collect()
+    }
+
+    /// Returns the origin and the scale of the frame.
+    fn frame_numbers(&self) -> [f64; 4] {
+        let [x, y, z] = self.frame.origin.to_array();
+        [x, y, z, self.frame.scale]
+    }
+
     fn are_in_one_place(&self) -> bool {
         let centre = |view: &View| view.camera.c2w.w_axis;
         self.photos.iter().all(|view| centre(view) == centre(&self.photos[0]))
@@ -513,34 +566,43 @@ impl<'a> RefineSession<'a> {
     }
 
     /// Optimizes the Gaussians of `start`, and the corrections of the photos. `depth` is the depth of these Gaussians.
-    fn optimize(&mut self, start: &Start, depth: f64) -> Result<(Gaussians, Corrections)> {
-        let (raw, depth) = match start {
-            Start::Photos(raw) | Start::Splat(_, raw) => (raw.shallow_clone(), depth),
+    fn optimize(&mut self, start: &Start, depth: f64) -> Result<(Gaussians, Corrections, RefineState)> {
+        let RefineOptions { correct_poses, correct_exposures, config, seed, device, .. } = self.options;
+        let final_count = if matches!(start, Start::Splat(..)) { 0 } else { self.options.gaussians as i64 };
+        let (mut optimizer, depth) = match start {
+            Start::Photos(raw) | Start::Splat(_, raw) => {
+                (GaussianOptimizer::new(raw, depth, config, final_count), depth)
+            }
             Start::Model(gaussians) => {
                 let raw = self.filled(gaussians)?;
                 let depth = scene_depth(&raw.activate(), &self.photos)?;
-                (raw, depth)
+                (GaussianOptimizer::new(&raw, depth, config, final_count), depth)
+            }
+            Start::State(state) => {
+                (GaussianOptimizer::from_state(state, config, final_count, *device)?, depth)
             }
         };
-        let RefineOptions { correct_poses, correct_exposures, config, seed, device, .. } = self.options;
-        let final_count = if matches!(start, Start::Splat(..)) { 0 } else { self.options.gaussians as i64 };
-        let mut optimizer = GaussianOptimizer::new(&raw, depth, config, final_count);
         let count = self.photos.len();
         let mut corrections =
             Corrections::new(count, *correct_poses, *correct_exposures, depth, config, *device);
+        let (mut reached, mut earlier) = (Reached::default(), Duration::ZERO);
+        if let Start::State(state) = start {
+            corrections.load_state(state)?;
+            (reached, earlier) = (state.record.reached, state.record.total);
+        }
         let photos = Photos::new(&self.photos, config, *device);
         let budget = match self.options.budget {
             Budget::Time(time) => {
-                let left = time.saturating_sub(self.reserve).saturating_sub(self.clock.elapsed());
-                Budget::Time(left.max(MIN_TIME.min(time)))
+                let used = self.reserve + self.clock.elapsed() + earlier;
+                Budget::Time(reached.time + time.saturating_sub(used).max(MIN_TIME.min(time)))
             }
             steps => steps,
         };
         let background = self.options.mask_background;
-        let task = Task { photos: &photos, depth, config, budget, seed: *seed, background };
+        let task = Task { photos: &photos, depth, config, budget, seed: *seed, background, reached };
         let mut marks = EVAL_FRACTIONS.iter().peekable();
         let (mut is_due, mut failure) = (false, None);
-        let gaussians = refine(&mut optimizer, &mut corrections, &task, |at| {
+        let (gaussians, reached) = refine(&mut optimizer, &mut corrections, &task, |at| {
             self.steps = at.step;
             while marks.next_if(|&&mark| at.progress >= mark).is_some() {
                 is_due = true;
@@ -549,14 +611,59 @@ impl<'a> RefineSession<'a> {
                 is_due = false;
                 failure = self.add_eval_point(&at.gaussians()).err();
             }
+            if at.step.is_multiple_of(METRICS_EVERY) {
+                let metrics = RefineMetrics {
+                    step: at.step,
+                    seconds: self.clock.elapsed().as_secs_f64(),
+                    loss: at.loss(),
+                    gaussians: at.count(),
+                    learning_rate: at.means_learning_rate(),
+                };
+                self.is_stopped |= !(self.on_event)(RefineEvent::Measured(&metrics));
+            }
             let psnr = self.curve.last().map(|point| point.scores.psnr);
             self.is_stopped |= !(self.on_event)(RefineEvent::Optimizing { steps: self.steps, psnr });
             failure.is_none() && !self.is_stopped
         })?;
-        match failure {
-            Some(error) => Err(error),
-            None => Ok((gaussians, corrections)),
+        if let Some(error) = failure {
+            return Err(error);
         }
+        let mut tensors = BTreeMap::new();
+        optimizer.add_to_state(&mut tensors);
+        corrections.add_to_state(&mut tensors);
+        let (degrees, degree) = optimizer.degrees();
+        let record = Record {
+            photos: self.photo_names(),
+            frame: self.frame_numbers(),
+            reached,
+            total: earlier + self.clock.elapsed(),
+            depth,
+            first_count: optimizer.first_count(),
+            degrees,
+            degree,
+        };
+        Ok((gaussians, corrections, RefineState::new(record, tensors)))
+    }
+
+    /// Returns an error if `state` is that of other photos or cameras, or if the budget has been used up already.
+    fn check_state(&self, state: &RefineState) -> Result<()> {
+        let Record { photos, frame, reached, total, .. } = &state.record;
+        if *frame != self.frame_numbers() || *photos != self.photo_names() {
+            let found = format!("that of another refinement, {} photos", photos.len());
+            let expected =
+                format!("that of the {} photos of this one, with the same poses", self.photos.len());
+            return Err(Error::input(state.file(), "the list of photos", found, expected));
+        }
+        let (used, expected) = match self.options.budget {
+            Budget::Steps(steps) if steps <= reached.steps => {
+                (format!("{} steps", reached.steps), "more steps in all")
+            }
+            Budget::Time(time) if time <= *total => {
+                (format!("{:.0} s", total.as_secs_f64()), "more time in all")
+            }
+            _ => return Ok(()),
+        };
+        Err(Error::input(state.file(), "the refinement", format!("one of {used} already"), expected))
     }
 
     /// Fills up to the requested number of Gaussians with new ones at the depths on which the photos agree. They also replace Gaussians
@@ -582,7 +689,9 @@ impl<'a> RefineSession<'a> {
         let begun = Instant::now();
         if let Some(scores) = self.patches_held_out.score(gaussians)? {
             let seconds = self.clock.elapsed().as_secs_f64();
-            self.curve.push(EvalPoint { seconds, steps: self.steps, scores });
+            let point = EvalPoint { seconds, steps: self.steps, scores };
+            self.is_stopped |= !(self.on_event)(RefineEvent::Scored(&point));
+            self.curve.push(point);
         }
         self.last_scoring = begun.elapsed();
         self.scoring += self.last_scoring;

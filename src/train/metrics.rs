@@ -1,5 +1,6 @@
 //! Metrics of a run, written to `metrics.jsonl`: one line for every step and for every validation.
 
+use super::METRICS_FILE;
 use super::step_report::StepReport;
 use super::validator::Score;
 use crate::error::{Error, Result};
@@ -8,9 +9,6 @@ use crate::loss::Term;
 use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::Path;
-
-/// Name of the metrics file, which has one line for every step and every validation.
-pub const METRICS_FILE: &str = "metrics.jsonl";
 
 /// Returns the values that describe a step, with their names, except the terms of its loss.
 pub(super) fn progress(report: &StepReport, samples_per_second: f64) -> [(&'static str, f64); 7] {

@@ -1,19 +1,20 @@
 //! Training run, from its current state to the last step, with checkpoints on the way.
 
+use super::METRICS_FILE;
 use super::checkpoint::{
     Validation, add_checkpoints, best_score, check, keep_best, latest_checkpoint, list_checkpoints,
     prune_checkpoints, recover,
 };
 use super::is_due;
 use super::lock::RunLock;
-use super::metrics::{METRICS_FILE, Metrics};
+use super::metrics::Metrics;
 use super::step_report::StepReport;
-use super::tensorboard::{TensorBoard, event_files};
+use super::tensorboard::TensorBoard;
 use super::trainer::Trainer;
 use super::validator::{Score, Validator};
 use crate::config::{TrainConfig, changed_keys};
 use crate::error::{Error, Result};
-use crate::io::{InputFiles, write_atomically};
+use crate::io::{InputFiles, event_files, write_atomically};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 

@@ -5,12 +5,14 @@ use crate::common::formats::{Format, rewrite, write_points};
 use crate::common::program::{arg, command, refuse, room, succeed};
 use crate::common::{captures, fox};
 use glam::DVec3;
-use globalsplat::data::{load_all_views, open_capture, read_points};
+use globalsplat::data::{Capture, Holdout, PhotoSize, load_all_views, open_capture, read_points};
 use globalsplat::io::{read_splat, write_splat};
 use globalsplat::refine::{
-    Budget, Initial, RefineEvent, RefineOptions, RefineSession, gaussians_from_photos,
+    Budget, Initial, RefineConfig, RefineEvent, RefineOptions, RefineResult, RefineSession, RefineState,
+    gaussians_from_photos,
 };
 use globalsplat::scene::Gaussians;
+use globalsplat::train::WatchedRun;
 use serde_json::Value;
 use std::path::Path;
 use tch::Kind;
@@ -240,6 +242,110 @@ fn an_interrupted_refinement_returns_its_gaussians() {
     assert_eq!(steps(|event| *event == RefineEvent::Starting(2)).unwrap(), 0);
     let tenth = |event: &RefineEvent| matches!(event, RefineEvent::Optimizing { steps: 10, .. });
     assert_eq!(steps(tenth).unwrap(), 10);
+}
+
+/// A refinement that continues from the state of a stopped one ends with the bytes of one without a break.
+#[test]
+fn a_continued_refinement_equals_one_without_a_break() {
+    let (folder, room) = room();
+    let capture = open_capture(&room).unwrap();
+    // Enough steps for the number of Gaussians to grow, before and after the break.
+    let options = |steps| RefineOptions {
+        config: RefineConfig { sh_every: 0.2, ..RefineConfig::default() },
+        budget: Budget::Steps(steps),
+        gaussians: 300,
+        correct_poses: true,
+        correct_exposures: true,
+        size: PhotoSize::Within(48),
+        ..RefineOptions::default()
+    };
+    let whole = options(500);
+    // Returns the result of a session that is ended after `ends_at` steps.
+    fn run(
+        capture: &Capture,
+        options: &RefineOptions,
+        initial: Initial,
+        ends_at: u64,
+    ) -> globalsplat::Result<RefineResult> {
+        let is_end = move |event: RefineEvent| matches!(event, RefineEvent::Optimizing { steps, .. } if steps == ends_at);
+        let mut session = RefineSession::load(capture, options, move |event| !is_end(event))?;
+        session.start(initial)?;
+        session.run()
+    }
+    let unbroken = run(&capture, &whole, Initial::Photos, 500).unwrap();
+    let file = folder.path().join("room.state.safetensors");
+    let stopped = run(&capture, &whole, Initial::Photos, 170).unwrap();
+    stopped.state.unwrap().write(&file).unwrap();
+    let state = RefineState::read(&file).unwrap();
+    assert_eq!((state.steps(), state.count()), (170, stopped.gaussians.count() as usize));
+    assert!((61..300).contains(&state.count()), "{}", state.count());
+    let continued = run(&capture, &whole, Initial::State(&state), 500).unwrap();
+    assert_eq!((continued.steps, continued.corrections.len()), (500, unbroken.corrections.len()));
+    assert!(continued.splat == unbroken.splat);
+
+    // What doesn't fit is refused in a sentence.
+    let refusal = |options: &RefineOptions| {
+        let error = run(&capture, options, Initial::State(&state), 0).unwrap_err();
+        assert!(error.is_request(), "{error}");
+        error.to_string().replace(&format!("{}/", folder.path().display()), "")
+    };
+    assert_eq!(
+        refusal(&options(170)),
+        "room.state.safetensors: the refinement is one of 170 steps already, expected more steps in all"
+    );
+    let others = RefineOptions { holdout: Holdout::Every { every: 4, first: 0 }, ..whole.clone() };
+    let message = refusal(&others);
+    assert!(
+        message.starts_with("room.state.safetensors: the list of photos is that of another refinement, "),
+        "{message}"
+    );
+    write_splat(&folder.path().join("a.ply"), &unbroken.splat).unwrap();
+    let error = RefineState::read(&folder.path().join("a.ply")).unwrap_err();
+    assert!(error.is_request(), "{error}");
+}
+
+/// The program continues a refinement and logs it for `watch` and TensorBoard.
+#[test]
+fn a_refinement_is_continued_and_logged() {
+    let (folder, room) = room();
+    let (out, log) = (folder.path().join("a.ply"), folder.path().join("log"));
+    let refine = |steps: &str| {
+        let arguments =
+            ["refine", "--scene", arg(&room), "--out", arg(&out), "--gaussians", "200", "--size", "48"];
+        let more = ["--holdout", "every:4", "--steps", steps, "--resume", "--log", arg(&log), "--json"];
+        command(&[&arguments[..], &more].concat()).output().unwrap()
+    };
+    let lines = || -> Vec<Value> {
+        let text = std::fs::read_to_string(log.join("metrics.jsonl")).unwrap();
+        text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+    };
+    let steps_with = |key: &str| -> Vec<u64> {
+        lines()
+            .iter()
+            .filter(|line| line.get(key).is_some())
+            .map(|line| line["step"].as_u64().unwrap())
+            .collect()
+    };
+    let first = refine("120");
+    assert!(first.status.success(), "{}", String::from_utf8_lossy(&first.stderr));
+    assert_eq!(steps_with("loss"), [49, 99]);
+    let state = RefineState::read(&folder.path().join("a.state.safetensors")).unwrap();
+    assert_eq!((state.steps(), state.count()), (120, 200));
+
+    let second = refine("200");
+    assert_eq!(serde_json::from_slice::<Value>(&second.stdout).unwrap()["steps"], 200);
+    let message = String::from_utf8_lossy(&second.stderr);
+    assert!(message.contains("a.state.safetensors: continues after 120 steps"), "{message}");
+    assert_eq!(steps_with("loss"), [49, 99, 149, 199]);
+    assert!(!steps_with("validation").is_empty());
+    let watched = WatchedRun::open(&log).unwrap().refresh().unwrap();
+    assert_eq!(serde_json::to_value(&watched).unwrap()["step"], 200);
+    let third = refine("200");
+    let message = String::from_utf8_lossy(&third.stderr);
+    assert!(
+        third.status.code() == Some(2) && message.contains("the refinement is one of 200 steps already"),
+        "{message}"
+    );
 }
 
 /// A capture scaled by a power of two gives bit-identical results up to the scale; one in any other unit, or far from the

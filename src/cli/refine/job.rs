@@ -6,20 +6,27 @@ use super::super::signals::StopRequest;
 use super::super::{memory, model, open_masked_capture, report_downscaling, splat_out, warn};
 use super::report::print_result;
 use anyhow::Result;
-use globalsplat::data::Capture;
+use globalsplat::data::{Capture, PhotoSize};
 use globalsplat::eval::process_age;
 use globalsplat::io::{
-    InputFiles, check_writable_png, check_writable_splat, read_splat, splat_files, weights_files,
+    InputFiles, check_writable_dir, check_writable_file, check_writable_png, check_writable_splat,
+    read_splat, splat_files, weights_files,
 };
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::spread_over_path;
-use globalsplat::refine::{Budget, Initial, RefineEvent, RefineOptions, RefineSession};
+use globalsplat::refine::{
+    Budget, Initial, RefineEvent, RefineLog, RefineOptions, RefineSession, RefineState,
+};
 use globalsplat::scene::{Camera, LocalFrame};
+use std::cell::RefCell;
 use std::path::PathBuf;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// Maximum number of cameras for which a splat's colours are fitted to the range of its file format.
 const FITTED_CAMERAS: usize = 64;
+
+/// Estimated time for writing the state of an optimization, per Gaussian.
+const STATE_TIME_PER_GAUSSIAN: Duration = Duration::from_micros(1);
 
 /// Source of the initial Gaussians.
 pub enum InitialFile {
@@ -37,7 +44,16 @@ pub struct RefineJob {
     pub masks: Option<PathBuf>,
     pub out: PathBuf,
     pub initial: InitialFile,
+    /// Options, of which the number of Gaussians and the size of the photos are replaced by the following ones.
     pub options: RefineOptions,
+    /// Number of Gaussians; if it is `None`, one that suits the time, the machine and the photos.
+    pub gaussians: Option<usize>,
+    /// Size of the photos; if it is `None`, one that suits the number of Gaussians.
+    pub size: Option<PhotoSize>,
+    /// `true` to continue from the state beside the output, if there is one, and to write it.
+    pub resume: bool,
+    /// Folder of the log.
+    pub log: Option<PathBuf>,
     pub local_origin: bool,
     pub sheet: Option<PathBuf>,
     pub lpips: bool,
@@ -54,6 +70,13 @@ impl RefineJob {
         if let Some(sheet) = &self.sheet {
             check_writable_png(sheet)?;
         }
+        let state_file = RefineState::path_for(&self.out);
+        if self.resume {
+            check_writable_file(&state_file)?;
+        }
+        if let Some(log) = &self.log {
+            check_writable_dir(log)?;
+        }
         let stop = StopRequest::install()?;
         let path = self.scene.path(self.masks.as_deref(), &self.out, &stop)?;
         // The time budget begins after the poses of photos are found.
@@ -64,8 +87,13 @@ impl RefineJob {
         self.options.started = Some(clock);
         let capture = open_masked_capture(&path, self.masks.as_deref())?;
         self.check_outputs(&capture)?;
-        let (mut splat, mut loaded) = (None, None);
+        let (mut splat, mut loaded, mut state) = (None, None, None);
         let initial = match &self.initial {
+            _ if self.resume && state_file.exists() => {
+                let state = state.insert(RefineState::read(&state_file)?);
+                eprintln!("{}: continues after {} steps", state_file.display(), state.steps());
+                Initial::State(state)
+            }
             InitialFile::Photos => Initial::Photos,
             InitialFile::Splat(path) => {
                 let splat = splat.insert(read_splat(path)?);
@@ -77,16 +105,29 @@ impl RefineJob {
                 Initial::Model(loaded.insert(load?))
             }
         };
+        let chosen = self.choose_sizes(&capture, &initial);
         let bar = Bar { bar: bar_of(&self.options.budget), budget: self.options.budget, clock };
+        let steps = if let Initial::State(state) = initial { state.steps() } else { 0 };
+        let log = self.log.as_ref().map(|folder| RefineLog::create(folder, steps)).transpose()?;
+        let log = RefCell::new(log);
         let on_event = |event: RefineEvent| {
             bar.tell(event);
+            write_event(&mut log.borrow_mut(), event);
             !stop.is_requested()
         };
         let mut session = RefineSession::load(&capture, &self.options, on_event)?;
+        if let Some(line) = chosen {
+            bar.bar.suspend(|| eprintln!("{line}"));
+        }
         // Depths of a subset of the photos are enough for an initial splat, too.
         stop.set_ends_at_once(matches!(initial, Initial::Model(_)));
         let gaussians = session.start(initial)?;
         stop.set_ends_at_once(false);
+        if self.resume {
+            session.reserve(
+                STATE_TIME_PER_GAUSSIAN * gaussians.count().max(self.options.gaussians as i64) as u32,
+            );
+        }
         if self.sheet.is_some() {
             session.reserve_for_contact_sheet(&gaussians)?;
         }
@@ -100,6 +141,9 @@ impl RefineJob {
         let spread: Vec<Camera> = spread.into_iter().map(|index| cameras[index]).collect();
         let origin = self.local_origin.then(|| LocalFrame::from_cameras(&cameras).origin);
         splat_out::write_for(&self.out, &result.splat, &spread, origin)?;
+        if let (true, Some(state)) = (self.resume, &result.state) {
+            state.write(&state_file)?;
+        }
         let held_out = session.score_held_out(&result)?;
         if let Some(sheet) = &self.sheet {
             if stop.is_requested() {
@@ -111,6 +155,23 @@ impl RefineJob {
         let lpips = if self.lpips { session.score_lpips(&result)? } else { None };
         print_result(&self.out, self.json, &session, &result, held_out.as_ref(), lpips.as_ref());
         Ok(())
+    }
+
+    /// Sets the number of Gaussians and the size of the photos. Returns a line about what was chosen.
+    fn choose_sizes(&mut self, capture: &Capture, initial: &Initial) -> Option<String> {
+        let gaussians = match initial {
+            Initial::Splat(splat) => splat.len().max(1),
+            Initial::State(state) if matches!(self.initial, InitialFile::Splat(_)) => state.count(),
+            _ => self.gaussians.unwrap_or_else(|| self.options.gaussians_for(capture)),
+        };
+        let size = self.size.unwrap_or(RefineOptions::size_for(gaussians));
+        self.options = RefineOptions { gaussians, size, ..self.options.clone() };
+        let (None, Initial::Photos, PhotoSize::Within(side)) = (self.gaussians, initial, size) else {
+            return None;
+        };
+        Some(format!(
+            "{gaussians} Gaussians, photos of at most {side} pixels; --gaussians and --size set others"
+        ))
     }
 
     /// Returns an error if an output would replace an input, except the initial splat.
@@ -126,6 +187,20 @@ impl RefineJob {
         }
         inputs.add_all(splat_files(&self.out));
         Ok(self.sheet.iter().try_for_each(|sheet| inputs.check_file(sheet))?)
+    }
+}
+
+/// Writes metrics and scores to the log, if there is one. If that fails, says so and ends the log.
+fn write_event(log: &mut Option<RefineLog>, event: RefineEvent) {
+    let Some(open) = log else { return };
+    let written = match event {
+        RefineEvent::Measured(metrics) => open.log_step(metrics),
+        RefineEvent::Scored(point) => open.log_scores(point),
+        _ => return,
+    };
+    if let Err(why) = written {
+        eprintln!("{why}; the log ends here");
+        *log = None;
     }
 }
 
@@ -152,7 +227,7 @@ impl Bar {
                 Some(psnr) => format!("{steps} steps, held out {psnr:.2} dB"),
                 None => format!("{steps} steps"),
             },
-            RefineEvent::Scoring(_) => return,
+            RefineEvent::Scoring(_) | RefineEvent::Measured(_) | RefineEvent::Scored(_) => return,
             RefineEvent::Warning(line) => return self.bar.suspend(|| eprintln!("{line}")),
         };
         self.bar.set_message(message);

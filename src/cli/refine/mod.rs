@@ -17,6 +17,8 @@ use std::time::Duration;
 
 /// Maximum of `--seconds`: a year.
 const MAX_SECONDS: f64 = 365. * 24. * 3600.;
+/// Maximum of `--gaussians`.
+const MAX_GAUSSIANS: usize = 10_000_000;
 
 /// Optimize a splat on the photos of its scene, or create one from the photos alone.
 ///
@@ -54,13 +56,18 @@ pub struct Refine {
     /// Output splat: .ply, .compressed.ply, .spz or .splat
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
+    /// Write the state of the optimization beside the splat, as in room.state.safetensors, and continue from it if it is there:
+    /// --seconds and --steps include those of the earlier runs
+    #[arg(long)]
+    resume: bool,
     /// Write coordinates relative to the centre of the cameras, which is stored in a file beside the splat: far from the
     /// world's origin, as in UTM coordinates, float32 loses detail
     #[arg(long)]
     local_origin: bool,
-    /// Number of Gaussians, not allowed with --splat; a model's reconstruction may have more
-    #[arg(long, value_name = "N", default_value_t = RefineOptions::default().gaussians as u32, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
-    gaussians: u32,
+    /// Number of Gaussians, not allowed with --splat; a model's reconstruction may have more. auto: 16384 to 1000000, by --seconds,
+    /// the number of cores and the photos; 16384 with --steps
+    #[arg(long, value_name = "N|auto", default_value = "auto", value_parser = parse_gaussians)]
+    gaussians: GaussianCount,
     /// Total time in seconds, from the start of the program to its end
     #[arg(long, value_name = "S", default_value_t = 60., conflicts_with = "steps")]
     seconds: f64,
@@ -86,6 +93,10 @@ pub struct Refine {
     /// Also optimize a correction of each photo's exposure and white balance
     #[arg(long)]
     correct_exposures: bool,
+    /// Also write curves of the loss and the scores to a folder: metrics.jsonl and tensorboard, which `globalsplat watch` and
+    /// TensorBoard show during the optimization
+    #[arg(long, value_name = "DIR")]
+    log: Option<PathBuf>,
     /// Also write an image: photo, render and depth side by side, a row per held-out view, or else per view
     #[arg(long, value_name = "FILE.png")]
     sheet: Option<PathBuf>,
@@ -137,8 +148,25 @@ impl Refine {
             None if needs_model => InitialFile::Model(self.weights),
             None => InitialFile::Photos,
         };
-        let Refine { scene, masks, out, sheet, local_origin, lpips, json, .. } = self;
-        RefineJob { scene, masks, out, initial, options, local_origin, sheet, lpips, json }.run()
+        let size = self.size.as_deref().map(parse_photo_size).transpose()?;
+        let GaussianCount(gaussians) = self.gaussians;
+        let Refine { scene, masks, out, resume, log, sheet, local_origin, lpips, json, .. } = self;
+        RefineJob {
+            scene,
+            masks,
+            out,
+            initial,
+            options,
+            gaussians,
+            size,
+            resume,
+            log,
+            local_origin,
+            sheet,
+            lpips,
+            json,
+        }
+        .run()
     }
 
     fn needs_model(&self) -> Result<bool> {
@@ -151,13 +179,10 @@ impl Refine {
 
     fn options(&self, holdout: Holdout) -> Result<RefineOptions> {
         let default = RefineOptions::default();
-        let gaussians = self.gaussians as usize;
-        let size = self.size.as_deref().map_or(Ok(RefineOptions::size_for(gaussians)), parse_photo_size)?;
         let time = parse_time(self.seconds)?;
         Ok(RefineOptions {
             config: RefineConfig::with(&self.set, self.splat.is_some())?,
             budget: self.steps.map_or(time, Budget::Steps),
-            gaussians,
             seed: self.seed,
             holdout,
             views: self.views,
@@ -168,10 +193,21 @@ impl Refine {
                 Background::White => MaskBackground::White,
                 Background::Random => MaskBackground::Random,
             }),
-            size,
             device: device::parse(&self.device)?,
             ..default
         })
+    }
+}
+
+/// Number of Gaussians, or `None` to choose it.
+#[derive(Debug, Clone, Copy)]
+struct GaussianCount(Option<usize>);
+
+fn parse_gaussians(text: &str) -> Result<GaussianCount, String> {
+    match text.parse() {
+        _ if text == "auto" => Ok(GaussianCount(None)),
+        Ok(count) if (1..=MAX_GAUSSIANS).contains(&count) => Ok(GaussianCount(Some(count))),
+        _ => Err(format!("expected 1 to {MAX_GAUSSIANS}, or auto")),
     }
 }
 

@@ -1,8 +1,7 @@
 //! Contents of a run's event files: its images, the times of its steps, and the steps at which it was started or resumed.
 
-use super::super::tensorboard::event_files;
 use crate::error::Result;
-use crate::io::{EventReader, read_event_image};
+use crate::io::{EventReader, event_files, read_event_image};
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
 

@@ -1,0 +1,122 @@
+//! State of a refinement, from which another one continues.
+
+use crate::error::{Error, Result};
+use crate::io::{read_weights, write_weights};
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, HashMap};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+use tch::Tensor;
+
+/// Key of the metadata under which the file has the [`Record`].
+const RECORD: &str = "refinement";
+
+/// How far an optimization has come.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Reached {
+    /// Number of steps done.
+    pub steps: u64,
+    /// Time that the optimization took.
+    pub time: Duration,
+    /// Position in the sequence of random numbers.
+    pub random: u128,
+}
+
+/// What a state has besides tensors.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct Record {
+    /// Names of the photos that were matched.
+    pub photos: Vec<String>,
+    /// Origin and scale of the local frame that the Gaussians are in.
+    pub frame: [f64; 4],
+    /// Where the optimization has ended.
+    pub reached: Reached,
+    /// Total time, with reading the photos and everything else.
+    pub total: Duration,
+    /// Depth of the scene, the unit of lengths.
+    pub depth: f64,
+    /// Number of Gaussians at the start of the optimization.
+    pub first_count: i64,
+    /// Degree of the spherical harmonics at the start and at the end of the optimization.
+    pub degrees: [i64; 2],
+    /// Degree that the last step used.
+    pub degree: i64,
+}
+
+/// State of a refinement: parameters of the Gaussians and of the corrections, the moments of their optimizers, and how far the optimization
+/// has come. It is valid for the capture, the photos and the corrections that it was made with.
+#[derive(Debug)]
+pub struct RefineState {
+    pub(super) record: Record,
+    /// Parameters and moments, by names that begin with `gaussians.` or `corrections.`.
+    pub(super) tensors: BTreeMap<String, Tensor>,
+    /// File for error messages.
+    file: PathBuf,
+}
+
+impl RefineState {
+    pub(super) fn new(record: Record, tensors: BTreeMap<String, Tensor>) -> Self {
+        RefineState { record, tensors, file: PathBuf::new() }
+    }
+
+    /// Returns the path of the state that belongs to the splat at `path`: `room.state.safetensors` for `room.ply`.
+    pub fn path_for(splat: &Path) -> PathBuf {
+        splat.with_extension("state.safetensors")
+    }
+
+    /// Reads a state.
+    ///
+    /// # Errors
+    /// Returns an error if the file can't be read or isn't a state.
+    pub fn read(path: &Path) -> Result<Self> {
+        let weights = read_weights(path)?;
+        let record = weights.metadata.get(RECORD).and_then(|text| serde_json::from_str(text).ok());
+        let record = record.ok_or_else(|| {
+            Error::input(
+                path,
+                format!("the metadata {RECORD}"),
+                "missing or invalid",
+                "that of a refinement's state",
+            )
+        })?;
+        Ok(RefineState { record, tensors: weights.tensors, file: path.to_owned() })
+    }
+
+    /// Writes the state to a safetensors file, atomically.
+    ///
+    /// # Errors
+    /// Returns an error if the file can't be written.
+    pub fn write(&self, path: &Path) -> Result<()> {
+        let record = serde_json::to_string(&self.record).expect("numbers and names");
+        write_weights(path, &self.tensors, HashMap::from([(RECORD.into(), record)]))
+    }
+
+    /// Returns the number of steps that led to the state.
+    pub fn steps(&self) -> u64 {
+        self.record.reached.steps
+    }
+
+    /// Returns the number of Gaussians.
+    pub fn count(&self) -> usize {
+        self.tensors.get("gaussians.value.means").map_or(0, |means| means.size()[1] as usize)
+    }
+
+    /// Returns the tensor with this name.
+    pub(super) fn tensor(&self, name: &str) -> Result<&Tensor> {
+        self.tensors.get(name).ok_or_else(|| {
+            Error::input(&self.file, format!("tensor {name}"), "missing", "that of a refinement's state")
+        })
+    }
+
+    /// Returns the tensors whose names begin with `prefix`, without it.
+    pub(super) fn tensors_of(&self, prefix: &str) -> BTreeMap<String, Tensor> {
+        let without = |(name, tensor): (&String, &Tensor)| {
+            Some((name.strip_prefix(prefix)?.to_string(), tensor.shallow_clone()))
+        };
+        self.tensors.iter().filter_map(without).collect()
+    }
+
+    pub(super) fn file(&self) -> &Path {
+        &self.file
+    }
+}
