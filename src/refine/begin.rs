@@ -29,8 +29,8 @@ struct IsotropicGaussian {
 /// Creates `count` Gaussians at the depths on which the photos agree, and at `points` of the scene, if some are known. The size of each
 /// matches the part of the images that it covers. Those of the `known` Gaussians, at most `count`, that don't contradict the photos are
 /// kept. At least two views are required. `should_continue` is called before each photo with the number of photos that are done. If it
-/// returns `false`, Gaussians are created from the photos that are done, or `None` is returned if there are none. Depths are computed on
-/// `device`, and the Gaussians are returned there.
+/// returns `false`, Gaussians are created from the photos that are done, or `None` is returned if there are none. The result also has the
+/// depths. It is on `device`.
 pub fn gaussians_from_photos(
     views: &[View],
     points: &[Point],
@@ -39,17 +39,21 @@ pub fn gaussians_from_photos(
     seed: u64,
     device: Device,
     should_continue: impl FnMut(usize) -> bool,
-) -> Option<RawGaussians> {
+) -> Option<(RawGaussians, Vec<DepthMap>)> {
     let depth_maps = sweep(views, points, device, should_continue);
     if depth_maps.is_empty() {
         return None;
     }
-    let Some(known) = known else {
-        return Some(sample_gaussians(&depth_maps, points, count, seed).to_device(device));
+    let sampled = |count: usize| sample_gaussians(&depth_maps, points, count, seed).to_device(device);
+    let gaussians = match known {
+        None => sampled(count),
+        Some(known) => {
+            let kept = known.select(&supported(known, &depth_maps)).to_device(device);
+            let left = count.saturating_sub(kept.means.size()[1] as usize);
+            kept.concat(&sampled(left))
+        }
     };
-    let kept = known.select(&supported(known, &depth_maps)).to_device(device);
-    let left = count.saturating_sub(kept.means.size()[1] as usize);
-    Some(kept.concat(&sample_gaussians(&depth_maps, points, left, seed).to_device(device)))
+    Some((gaussians, depth_maps))
 }
 
 /// Returns the indices of the Gaussians that the photos support. A Gaussian must not be in front of a depth that a photo is sure of, and at
@@ -200,6 +204,7 @@ mod tests {
         };
         let options = (Kind::Float, Device::Cpu);
         let wall = |x: f64, sure_columns: i64| DepthMap {
+            photo: String::new(),
             camera: camera(x),
             image: Tensor::zeros([3, 16, 16], options),
             depth: Tensor::full([16, 16], 4., options),
@@ -230,6 +235,7 @@ mod tests {
     fn masked_pixels_start_no_gaussians() {
         let options = (Kind::Float, Device::Cpu);
         let map = |counted: Option<Tensor>| DepthMap {
+            photo: String::new(),
             camera: Camera {
                 intrinsics: Intrinsics { fx: 8., fy: 8., cx: 8., cy: 8. },
                 c2w: DMat4::IDENTITY,
@@ -278,7 +284,7 @@ mod tests {
         };
         let views = [view(0.), view(0.2)];
         let begun = |known: Option<&RawGaussians>, count: usize, seed: u64| {
-            gaussians_from_photos(&views, &[], known, count, seed, Device::Cpu, |_| true).expect("depths")
+            gaussians_from_photos(&views, &[], known, count, seed, Device::Cpu, |_| true).expect("depths").0
         };
         let known = begun(None, 50, 1);
         let filled = begun(Some(&known), 80, 2);

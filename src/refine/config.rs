@@ -17,7 +17,7 @@ pub struct RefineConfig {
     pub sh_degree: i64,
     /// Interval between increases of the degree of the spherical harmonics by one, as a fraction of the optimization.
     pub sh_every: f64,
-    /// Initial learning rate of the means, in scene depths.
+    /// Initial learning rate of the means, in scene depths, for up to 16,384 Gaussians. For N it is multiplied by (16,384 / N)^0.75.
     pub means: f64,
     /// Final learning rate of the means, relative to the initial one. The decay is exponential.
     pub means_end: f64,
@@ -45,6 +45,9 @@ pub struct RefineConfig {
     pub scale: f64,
     /// Weight of the loss [`crate::loss::depth_smoothness`].
     pub depth_smoothness_weight: f64,
+    /// Initial weight of the relative difference between rendered depths and those on which the photos agree. It falls to 0 in the first half
+    /// of the optimization.
+    pub depth_weight: f64,
     /// Initial number of Gaussians from photos, as a fraction of the final one.
     pub initial_gaussians: f64,
     /// Fraction of the optimization after which the number of Gaussians no longer grows.
@@ -68,7 +71,7 @@ impl Default for RefineConfig {
             sh_every: 0.3,
             means: 2e-3,
             means_end: 0.02,
-            log_scales: 1e-2,
+            log_scales: 2e-2,
             quaternions: 2e-3,
             opacity_logits: 3e-2,
             colours: 5e-3,
@@ -80,6 +83,7 @@ impl Default for RefineConfig {
             opacity: 1e-3,
             scale: 0.,
             depth_smoothness_weight: 0.7,
+            depth_weight: 1.,
             initial_gaussians: 0.2,
             grow_until: 0.6,
             relocate_every: 50,
@@ -154,7 +158,7 @@ impl RefineConfig {
             self.poses,
             self.exposures,
         ];
-        let weights = [self.opacity, self.scale, self.depth_smoothness_weight];
+        let weights = [self.opacity, self.scale, self.depth_smoothness_weight, self.depth_weight];
         let is_inner_fraction = |&fraction: &f64| 0. < fraction && fraction < 1.;
         let schedule = self.resolution_schedule.as_deref().unwrap_or_default();
         // Comparisons with NaN are false, so NaN fails every rule.
@@ -184,6 +188,11 @@ impl RefineConfig {
     /// Returns the defaults for a start from a splat, which needs no small images and no opacity penalty.
     pub fn from_splat() -> Self {
         RefineConfig { resolution_schedule: Some(vec![]), opacity: 0., ..Default::default() }
+    }
+
+    /// Returns the weight of known depths, which falls to 0 in the first half: later the photos decide.
+    pub(super) fn depth_weight_at(&self, progress: f64) -> f64 {
+        self.depth_weight * (1. - 2. * progress).max(0.)
     }
 
     /// Returns the fractions of the optimization at which the width and height of photos double, up to `longest_side` pixels.

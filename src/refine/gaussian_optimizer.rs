@@ -2,6 +2,7 @@
 
 use super::config::RefineConfig;
 use super::gaussian_params::GaussianParams;
+use super::options::MIN_GAUSSIANS;
 use super::relocate::relocate;
 use super::state::{Record, RefineState};
 use crate::error::Result;
@@ -13,6 +14,8 @@ use tch::{Device, Tensor};
 
 /// Beginning of the names of this optimizer's tensors in a state.
 const STATE: &str = "gaussians.";
+/// Exponent with which the learning rate of the means falls with the number of Gaussians above [`MIN_GAUSSIANS`].
+const MEANS_POWER: f64 = 0.75;
 /// Adam's ε, added to the root of the second moments. It is small because gradients of single Gaussians are small.
 const EPSILON: f64 = 1e-15;
 
@@ -102,9 +105,11 @@ impl GaussianOptimizer {
         (first * (last / first).powf((progress / self.config.grow_until).min(1.))) as i64
     }
 
-    /// Returns the learning rate of the means, in units of the scene's depth.
+    /// Returns the learning rate of the means, in units of the scene's depth. Many Gaussians are small, so they move less.
     pub(super) fn means_learning_rate(&self, progress: f64) -> f64 {
-        self.config.means * self.config.means_end.powf(progress)
+        let relative_count = self.counts[1] as f64 / MIN_GAUSSIANS as f64;
+        let by_count = relative_count.max(1.).powf(-MEANS_POWER);
+        self.config.means * by_count * self.config.means_end.powf(progress)
     }
 
     /// Clears the gradients.

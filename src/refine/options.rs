@@ -45,7 +45,7 @@ const GAUSSIANS_PER_CORE_SECOND: f64 = 400.;
 /// Minimum number of pixels, in all photos together, for each Gaussian.
 const PIXELS_PER_GAUSSIAN: u64 = 24;
 /// Number of Gaussians of the paper's main model, the minimum of [`RefineOptions::gaussians_for`].
-const MIN_GAUSSIANS: usize = 16_384;
+pub(super) const MIN_GAUSSIANS: usize = 16_384;
 /// Maximum of [`RefineOptions::gaussians_for`].
 const MAX_GAUSSIANS: usize = 1_000_000;
 /// Default of the longer side of photos in pixels, for the default number of Gaussians.

@@ -1,6 +1,8 @@
 //! Photos that a splat is refined on, at several sizes.
 
 use super::config::RefineConfig;
+use super::known_depths::KnownDepths;
+use super::sweep::DepthMap;
 use super::view_selection::are_near_duplicates;
 use crate::data::{Capture, MIN_SHORTER_SIDE, PhotoSize, View, ViewBatch, load_views, view_batch};
 use crate::error::{Error, Result};
@@ -99,17 +101,43 @@ struct Group {
     /// Indices among all photos.
     indices: Vec<usize>,
     views: ViewBatch,
+    /// Known depths of each.
+    depths: Vec<Option<KnownDepths>>,
+}
+
+/// Photos of a step.
+#[derive(Debug)]
+pub(super) struct Drawn<'a> {
+    /// Indices among all photos.
+    pub which: Vec<i64>,
+    pub views: ViewBatch,
+    /// Known depths of each.
+    pub depths: Vec<Option<&'a KnownDepths>>,
+}
+
+impl Group {
+    /// Creates a group of photos, some of which have a map in `depth_maps` at their index among all photos.
+    fn new(indices: Vec<usize>, views: ViewBatch, depth_maps: &[Option<&DepthMap>]) -> Self {
+        let (size, device) = (views.images.size(), views.images.device());
+        let known =
+            |&index: &usize| depth_maps[index].map(|map| KnownDepths::new(map, size[4], size[3], device));
+        Group { depths: indices.iter().map(known).collect(), indices, views }
+    }
 }
 
 impl Photos {
     /// Creates photos from `views` at their own size only.
     pub(crate) fn from_batch(views: ViewBatch) -> Self {
-        let indices = (0..views.images.size()[1] as usize).collect();
-        Photos { levels: vec![vec![Group { indices, views }]], schedule: vec![] }
+        let count = views.images.size()[1] as usize;
+        let group = Group::new((0..count).collect(), views, &vec![None; count]);
+        Photos { levels: vec![vec![group]], schedule: vec![] }
     }
 
-    /// Creates photos from `views`, at least one, at the sizes of `config`'s schedule, each half as wide and high as the next.
-    pub fn new(views: &[View], config: &RefineConfig, device: Device) -> Self {
+    /// Creates photos from `views`, at least one, at the sizes of `config`'s schedule, each half as wide and high as the next. Depths of
+    /// some of them are known from `depth_maps`.
+    pub fn new(views: &[View], depth_maps: &[DepthMap], config: &RefineConfig, device: Device) -> Self {
+        let map_of = |view: &View| depth_maps.iter().find(|map| map.photo == view.name);
+        let depth_maps: Vec<Option<&DepthMap>> = views.iter().map(map_of).collect();
         let longest_side = views.iter().map(|view| view.camera.width.max(view.camera.height)).max();
         let schedule = config.schedule(longest_side.unwrap_or(0));
         let mut groups: BTreeMap<(u32, u32), Vec<usize>> = BTreeMap::new();
@@ -119,14 +147,14 @@ impl Photos {
         let group = |indices: Vec<usize>| {
             let (views, poses): (Vec<&View>, Vec<DMat4>) =
                 indices.iter().map(|&i| (&views[i], views[i].camera.c2w)).unzip();
-            Group { indices, views: view_batch(&views, &poses, device) }
+            Group::new(indices, view_batch(&views, &poses, device), &depth_maps)
         };
         let whole = groups.into_values().map(group).collect();
         let mut sizes: Vec<Vec<Group>> = vec![whole];
         for _ in &schedule {
             let halves = sizes[sizes.len() - 1]
                 .iter()
-                .map(|group| Group { indices: group.indices.clone(), views: halved(&group.views) })
+                .map(|group| Group::new(group.indices.clone(), halved(&group.views), &depth_maps))
                 .collect();
             sizes.push(halves);
         }
@@ -134,8 +162,8 @@ impl Photos {
         Photos { levels: sizes, schedule }
     }
 
-    /// Draws up to `views` different photos of one size, at the level for `progress` from 0 to 1. Returns their indices and the photos.
-    pub(super) fn draw(&self, progress: f64, views: usize, random: &mut impl Rng) -> (Vec<i64>, ViewBatch) {
+    /// Draws up to `views` different photos of one size, at the level for `progress` from 0 to 1.
+    pub(super) fn draw(&self, progress: f64, views: usize, random: &mut impl Rng) -> Drawn<'_> {
         let level = self.schedule.iter().filter(|&&part| progress >= part).count();
         let groups = &self.levels[level.min(self.levels.len() - 1)];
         let count = |group: &Group| group.indices.len();
@@ -144,7 +172,11 @@ impl Photos {
         let group = owners.nth(of).expect("a number below the sum");
         let mut chosen = sample(random, count(group), views.min(count(group))).into_vec();
         chosen.sort_unstable();
-        (chosen.iter().map(|&k| group.indices[k] as i64).collect(), group.views.select(&chosen))
+        Drawn {
+            which: chosen.iter().map(|&k| group.indices[k] as i64).collect(),
+            views: group.views.select(&chosen),
+            depths: chosen.iter().map(|&k| group.depths[k].as_ref()).collect(),
+        }
     }
 }
 

@@ -8,6 +8,7 @@ use super::options::{Budget, RefineOptions};
 use super::patches::{PatchScores, Patches};
 use super::photos::{Photos, distinct, load_photos};
 use super::state::{Reached, Record, RefineState};
+use super::sweep::DepthMap;
 use super::{Task, refine, scene_depth};
 use crate::data::{Capture, Point, View, read_points};
 use crate::error::{Error, Result};
@@ -195,6 +196,8 @@ pub struct RefineSession<'a> {
     scored: Vec<View>,
     start: Option<(Start<'a>, Gaussians, f64)>,
     near_duplicates: usize,
+    /// Depths of some photos, if Gaussians were created from them.
+    depth_maps: Vec<DepthMap>,
     reserve: Duration,
     scoring: Duration,
     last_scoring: Duration,
@@ -256,6 +259,7 @@ impl<'a> RefineSession<'a> {
             scored: vec![],
             start: None,
             near_duplicates: 0,
+            depth_maps: vec![],
             reserve: Duration::ZERO,
             scoring: Duration::ZERO,
             last_scoring: Duration::ZERO,
@@ -314,7 +318,12 @@ impl<'a> RefineSession<'a> {
                 let local = Gaussians::from_splat(splat).to_local(&self.frame, splat.origin);
                 Start::Splat(splat, RawGaussians::from_gaussians(&local.to_device(self.options.device)))
             }
-            Initial::State(state) => Start::State(state),
+            Initial::State(state) => {
+                if state.record.has_depths {
+                    let _ = self.gaussians_from_photos(None)?.ok_or_else(stopped)?;
+                }
+                Start::State(state)
+            }
             Initial::Model(loaded) => {
                 let data = &loaded.config.data;
                 let all: Vec<usize> = (0..self.photos.len()).collect();
@@ -562,7 +571,10 @@ impl<'a> RefineSession<'a> {
         let made =
             gaussians_from_photos(&self.photos, &points, known, gaussians, seed, device, should_continue);
         self.is_stopped |= is_stopped;
-        Ok(made)
+        Ok(made.map(|(gaussians, depth_maps)| {
+            self.depth_maps = depth_maps;
+            gaussians
+        }))
     }
 
     /// Optimizes the Gaussians of `start`, and the corrections of the photos. `depth` is the depth of these Gaussians.
@@ -590,7 +602,7 @@ impl<'a> RefineSession<'a> {
             corrections.load_state(state)?;
             (reached, earlier) = (state.record.reached, state.record.total);
         }
-        let photos = Photos::new(&self.photos, config, *device);
+        let photos = Photos::new(&self.photos, &self.depth_maps, config, *device);
         let budget = match self.options.budget {
             Budget::Time(time) => {
                 let used = self.reserve + self.clock.elapsed() + earlier;
@@ -638,6 +650,7 @@ impl<'a> RefineSession<'a> {
             reached,
             total: earlier + self.clock.elapsed(),
             depth,
+            has_depths: !self.depth_maps.is_empty(),
             first_count: optimizer.first_count(),
             degrees,
             degree,

@@ -35,6 +35,8 @@ pub(super) struct Record {
     pub total: Duration,
     /// Depth of the scene, the unit of lengths.
     pub depth: f64,
+    /// `true` if the plane sweep's depths were used.
+    pub has_depths: bool,
     /// Number of Gaussians at the start of the optimization.
     pub first_count: i64,
     /// Degree of the spherical harmonics at the start and at the end of the optimization.

@@ -51,6 +51,8 @@ const ROOM: f64 = 1.3;
 /// Downscaled photo with a depth for every pixel.
 #[derive(Debug)]
 pub struct DepthMap {
+    /// Name of the photo.
+    pub photo: String,
     /// Camera at the size of the downscaled photo.
     pub camera: Camera,
     /// Downscaled photo, [3, h, w].
@@ -66,6 +68,7 @@ pub struct DepthMap {
 impl DepthMap {
     fn to_device(&self, device: Device) -> Self {
         DepthMap {
+            photo: self.photo.clone(),
             camera: self.camera,
             image: self.image.to_device(device),
             depth: self.depth.to_device(device),
@@ -111,7 +114,8 @@ pub fn sweep(
         if swept.iter().all(is_new) {
             let others = neighbours(index, &cameras, depth);
             let others: Vec<&SmallPhoto> = others.into_iter().map(|other| &small[other]).collect();
-            swept.push((index, sweep_one(&small[index], &others, nearest, depth)));
+            let photo = views[index].name.clone();
+            swept.push((index, DepthMap { photo, ..sweep_one(&small[index], &others, nearest, depth) }));
         }
     }
     swept.sort_by_key(|(index, _)| *index);
@@ -128,6 +132,7 @@ fn sweep_one(this: &SmallPhoto, others: &[&SmallPhoto], nearest: Option<f64>, de
     let (inverse, correlation) = most_alike(this, others, nearest, PLANES);
     let counted = this.counted();
     DepthMap {
+        photo: String::new(),
         camera: this.camera,
         image: this.image.shallow_clone(),
         depth: filled(&inverse, &correlation, counted.as_ref()).clamp_min(nearest / FARTHEST).reciprocal(),

@@ -480,7 +480,7 @@ fn colmap_points_initialize_gaussians() {
         }
         // Half of the Gaussians are at points, the others on pixels.
         let views = load_all_views(&capture, None).unwrap();
-        let raw = gaussians_from_photos(&views, &points, None, 1000, 0, tch::Device::Cpu, |_| true)
+        let (raw, _) = gaussians_from_photos(&views, &points, None, 1000, 0, tch::Device::Cpu, |_| true)
             .expect("depths");
         let begun: Vec<f64> = Vec::try_from(raw.means.to_kind(Kind::Double).view([-1])).unwrap();
         let at_points = begun

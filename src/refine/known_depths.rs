@@ -1,0 +1,109 @@
+//! Loss between rendered depths and those that the plane sweep has found.
+
+use super::sweep::DepthMap;
+use tch::{Device, Kind, Tensor};
+
+/// Relative difference from which a depth pulls no more: either it is wrong, or the pixel shows something that the depth doesn't belong to.
+const MAX_DIFFERENCE: f64 = 0.5;
+
+/// Depths of a photo at pixels on which the photos agree.
+#[derive(Debug)]
+pub(super) struct KnownDepths {
+    /// Indices of the pixels in the photo, row by row, [K].
+    pixels: Tensor,
+    /// Their depths, [K].
+    depths: Tensor,
+    /// Fraction of the map's pixels that these are.
+    share: f64,
+}
+
+impl KnownDepths {
+    /// Returns the depths of `map` on which the photos agree, at the pixels of a photo of `width`×`height` in which the centres of the map's
+    /// pixels are.
+    pub fn new(map: &DepthMap, width: i64, height: i64, device: Device) -> Self {
+        let size = map.depth.size();
+        // The pixel of the photo, along one side, in which the centre of each of the map's pixels is.
+        let along = |count: i64, side: i64| {
+            let centres = Tensor::arange(count, (Kind::Double, Device::Cpu)) + 0.5;
+            (centres * (side as f64 / count as f64)).floor().to_kind(Kind::Int64)
+        };
+        let pixels = along(size[0], height).unsqueeze(1) * width + along(size[1], width).unsqueeze(0);
+        let on_cpu = |t: &Tensor| t.to_device(Device::Cpu);
+        let sure = match &map.counted {
+            Some(counted) => on_cpu(&map.sure).logical_and(&on_cpu(counted)),
+            None => on_cpu(&map.sure),
+        };
+        let pixels = pixels.masked_select(&sure);
+        KnownDepths {
+            share: pixels.numel() as f64 / sure.numel() as f64,
+            pixels: pixels.to_device(device),
+            depths: on_cpu(&map.depth).masked_select(&sure).to_device(device),
+        }
+    }
+
+    /// Returns the mean over the map's pixels of 2 |a − b| / (a + b) for rendered depths `rendered` [H, W] a and known ones b, limited to
+    /// [`MAX_DIFFERENCE`] and counted as 0 where no depth is known. Differentiable with respect to the rendered depths in the numerator.
+    pub fn loss(&self, rendered: &Tensor) -> Tensor {
+        let rendered = rendered.reshape([-1]).index_select(0, &self.pixels);
+        let difference = (&rendered - &self.depths).abs() / (rendered.detach() + &self.depths) * 2.;
+        difference.clamp_max(MAX_DIFFERENCE).sum(Kind::Float)
+            * (self.share / self.pixels.numel().max(1) as f64)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::{Camera, Intrinsics};
+    use glam::DMat4;
+
+    /// Returns a map of 2×2 pixels at depths 1 to 4, of which the last isn't sure and the first doesn't count.
+    fn map() -> DepthMap {
+        let options = (Kind::Float, Device::Cpu);
+        let truths = |values: [bool; 4]| Tensor::from_slice(&values).view([2, 2]);
+        DepthMap {
+            photo: String::new(),
+            camera: Camera {
+                intrinsics: Intrinsics { fx: 2., fy: 2., cx: 1., cy: 1. },
+                c2w: DMat4::IDENTITY,
+                width: 2,
+                height: 2,
+            },
+            image: Tensor::zeros([3, 2, 2], options),
+            depth: Tensor::from_slice(&[1f32, 2., 3., 4.]).view([2, 2]),
+            sure: truths([true, true, true, false]),
+            counted: Some(truths([false, true, true, true])),
+        }
+    }
+
+    #[test]
+    fn sure_depths_pull_where_their_pixels_are() {
+        let known = KnownDepths::new(&map(), 6, 4, Device::Cpu);
+        // In a photo of 6×4 pixels the centres of the map's pixels are in columns 1 and 4, and in rows 1 and 3.
+        let rendered = Tensor::full([4, 6], 9., (Kind::Float, Device::Cpu));
+        let put = |row: i64, column: i64, depth: f64| {
+            let _ = rendered.get(row).get(column).fill_(depth);
+        };
+        put(1, 4, 2.5);
+        put(3, 1, 3.);
+        let rendered = rendered.set_requires_grad(true);
+        let loss = known.loss(&rendered);
+        loss.backward();
+        // 2 · 0.5 / 4.5 at one of the map's four pixels, 0 at another, and none at the others.
+        assert!((loss.double_value(&[]) - 2. * 0.5 / 4.5 / 4.).abs() < 1e-6);
+        let gradient = rendered.grad();
+        assert!((gradient.double_value(&[1, 4]) - 2. / 4.5 / 4.).abs() < 1e-6);
+        assert_eq!(gradient.abs().sum(Kind::Double).double_value(&[]), gradient.double_value(&[1, 4]));
+    }
+
+    #[test]
+    fn depths_that_are_far_off_pull_nothing() {
+        let known = KnownDepths::new(&map(), 2, 2, Device::Cpu);
+        let rendered = Tensor::full([2, 2], 30., (Kind::Float, Device::Cpu)).set_requires_grad(true);
+        let loss = known.loss(&rendered);
+        loss.backward();
+        // Two of four pixels at the limit.
+        assert!((loss.double_value(&[]) - MAX_DIFFERENCE / 2.).abs() < 1e-6);
+        assert_eq!(rendered.grad().abs().sum(Kind::Double).double_value(&[]), 0.);
+    }
+}
