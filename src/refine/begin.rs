@@ -1,6 +1,7 @@
 //! Initial Gaussians from photos, or from photos and points.
 
-use super::sweep::{DepthMap, sweep};
+use super::depth_map::DepthMap;
+use super::sweep::sweep;
 use super::view_selection::projection;
 use crate::data::{Point, View};
 use crate::scene::{RawGaussians, SH_C0};

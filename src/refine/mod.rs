@@ -4,6 +4,7 @@
 mod begin;
 mod config;
 mod corrections;
+mod depth_map;
 pub(crate) mod depth_search;
 mod gaussian_optimizer;
 mod gaussian_params;
@@ -21,6 +22,7 @@ mod view_selection;
 pub use begin::gaussians_from_photos;
 pub use config::RefineConfig;
 pub use corrections::{Correction, Corrections};
+pub use depth_map::DepthMap;
 pub use gaussian_optimizer::GaussianOptimizer;
 pub use log::RefineLog;
 pub use options::{Budget, MaskBackground, RefineOptions};

@@ -1,8 +1,8 @@
 //! Photos that a splat is refined on, at several sizes.
 
 use super::config::RefineConfig;
+use super::depth_map::DepthMap;
 use super::known_depths::KnownDepths;
-use super::sweep::DepthMap;
 use super::view_selection::are_near_duplicates;
 use crate::data::{Capture, MIN_SHORTER_SIDE, PhotoSize, View, ViewBatch, load_views, view_batch};
 use crate::error::{Error, Result};

@@ -3,12 +3,12 @@
 
 use super::begin::gaussians_from_photos;
 use super::corrections::{Correction, Corrections};
+use super::depth_map::DepthMap;
 use super::gaussian_optimizer::GaussianOptimizer;
 use super::options::{Budget, RefineOptions};
 use super::patches::{PatchScores, Patches};
 use super::photos::{Photos, distinct, load_photos};
 use super::state::{Reached, Record, RefineState};
-use super::sweep::DepthMap;
 use super::{Task, refine, scene_depth};
 use crate::data::{Capture, Point, View, read_points};
 use crate::error::{Error, Result};

@@ -1,6 +1,7 @@
 //! Depth estimation by a plane sweep (Collins 1996): finds for every pixel the depth at which its neighbourhood looks most alike in photos
 //! taken from other positions. It needs no weights and no points.
 
+use super::depth_map::DepthMap;
 use super::depth_search::{self, ComparedPhoto};
 use super::photos::pool_masked;
 use super::view_selection::{
@@ -47,36 +48,6 @@ const MIN_POINTS: usize = 30;
 const NEARER: f64 = 0.02;
 /// Ratio of the depth of the nearest remaining point to that of the nearest plane.
 const ROOM: f64 = 1.3;
-
-/// Downscaled photo with a depth for every pixel.
-#[derive(Debug)]
-pub struct DepthMap {
-    /// Name of the photo.
-    pub photo: String,
-    /// Camera at the size of the downscaled photo.
-    pub camera: Camera,
-    /// Downscaled photo, [3, h, w].
-    pub image: Tensor,
-    /// Depth along the camera's axis, [h, w].
-    pub depth: Tensor,
-    /// Mask of the pixels on whose depth the photos agree, [h, w]. Other depths come from pixels around them.
-    pub sure: Tensor,
-    /// Mask of the pixels that count, [h, w], at least one; `None` if all do. The depths of the others are meaningless.
-    pub counted: Option<Tensor>,
-}
-
-impl DepthMap {
-    fn to_device(&self, device: Device) -> Self {
-        DepthMap {
-            photo: self.photo.clone(),
-            camera: self.camera,
-            image: self.image.to_device(device),
-            depth: self.depth.to_device(device),
-            sure: self.sure.to_device(device),
-            counted: self.counted.as_ref().map(|counted| counted.to_device(device)),
-        }
-    }
-}
 
 /// Downscaled photo.
 struct SmallPhoto {
