@@ -13,35 +13,43 @@ pub(super) struct KnownDepths {
     pixels: Tensor,
     /// Their depths, [K].
     depths: Tensor,
-    /// Fraction of the map's pixels that these are.
+    /// Fraction of the compared pixels that these are.
     share: f64,
 }
 
 impl KnownDepths {
     /// Returns the depths of `map` on which the photos agree, at the pixels of a photo of `width`×`height` in which the centres of the map's
-    /// pixels are.
+    /// pixels are. If the photo has fewer pixels, each gets one of the depths.
     pub fn new(map: &DepthMap, width: i64, height: i64, device: Device) -> Self {
         let size = map.depth.size();
         // The pixel of the photo, along one side, in which the centre of each of the map's pixels is.
-        let along = |count: i64, side: i64| {
-            let centres = Tensor::arange(count, (Kind::Double, Device::Cpu)) + 0.5;
-            (centres * (side as f64 / count as f64)).floor().to_kind(Kind::Int64)
+        let along = |count: i64, side: i64| -> Vec<i64> {
+            (0..count).map(|i| ((i as f64 + 0.5) * side as f64 / count as f64) as i64).collect()
         };
-        let pixels = along(size[0], height).unsqueeze(1) * width + along(size[1], width).unsqueeze(0);
-        let on_cpu = |t: &Tensor| t.to_device(Device::Cpu);
-        let sure = match &map.counted {
-            Some(counted) => on_cpu(&map.sure).logical_and(&on_cpu(counted)),
-            None => on_cpu(&map.sure),
-        };
-        let pixels = pixels.masked_select(&sure);
+        let (rows, columns) = (along(size[0], height), along(size[1], width));
+        let is_first = |along: &[i64], i: usize| i == 0 || along[i] != along[i - 1];
+        let truths = |t: &Tensor| Vec::<bool>::try_from(t.contiguous().view([-1])).expect("truths");
+        let (sure, counted) = (truths(&map.sure), map.counted.as_ref().map(truths));
+        let depth = Vec::<f32>::try_from(map.depth.contiguous().view([-1])).expect("numbers");
+        let (mut pixels, mut depths, mut all) = (vec![], vec![], 0);
+        for (y, &row) in rows.iter().enumerate().filter(|&(y, _)| is_first(&rows, y)) {
+            for (x, &column) in columns.iter().enumerate().filter(|&(x, _)| is_first(&columns, x)) {
+                let at = y * columns.len() + x;
+                all += 1;
+                if sure[at] && counted.as_ref().is_none_or(|counted| counted[at]) {
+                    pixels.push(row * width + column);
+                    depths.push(depth[at]);
+                }
+            }
+        }
         KnownDepths {
-            share: pixels.numel() as f64 / sure.numel() as f64,
-            pixels: pixels.to_device(device),
-            depths: on_cpu(&map.depth).masked_select(&sure).to_device(device),
+            share: pixels.len() as f64 / f64::from(all),
+            pixels: Tensor::from_slice(&pixels).to_device(device),
+            depths: Tensor::from_slice(&depths).to_device(device),
         }
     }
 
-    /// Returns the mean over the map's pixels of 2 |a − b| / (a + b) for rendered depths `rendered` [H, W] a and known ones b, limited to
+    /// Returns the mean over the compared pixels of 2 |a − b| / (a + b) for rendered depths `rendered` [H, W] a and known ones b, limited to
     /// [`MAX_DIFFERENCE`] and counted as 0 where no depth is known. Differentiable with respect to the rendered depths in the numerator.
     pub fn loss(&self, rendered: &Tensor) -> Tensor {
         let rendered = rendered.reshape([-1]).index_select(0, &self.pixels);
@@ -94,6 +102,14 @@ mod tests {
         let gradient = rendered.grad();
         assert!((gradient.double_value(&[1, 4]) - 2. / 4.5 / 4.).abs() < 1e-6);
         assert_eq!(gradient.abs().sum(Kind::Double).double_value(&[]), gradient.double_value(&[1, 4]));
+    }
+
+    #[test]
+    fn each_pixel_of_a_small_photo_gets_one_depth() {
+        let known = KnownDepths::new(&map(), 1, 2, Device::Cpu);
+        // The first column has depths 1, which doesn't count, and 3.
+        assert_eq!((Vec::<i64>::try_from(&known.pixels).unwrap(), known.share), (vec![1], 0.5));
+        assert_eq!(known.depths.double_value(&[0]), 3.);
     }
 
     #[test]

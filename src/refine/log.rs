@@ -6,6 +6,9 @@ use crate::io::{AppendFile, EventFile, METRICS_FILE, write_atomically};
 use serde_json::{Value, json};
 use std::path::Path;
 
+/// File that is in the folder of a training run.
+const TRAINING_FILE: &str = "config.toml";
+
 /// Log in the folder of a run: `metrics.jsonl`, with a line for some of the steps and one for each score, and event files in `tensorboard`.
 #[derive(Debug)]
 pub struct RefineLog {
@@ -18,8 +21,11 @@ impl RefineLog {
     /// `steps` is 0, and continued otherwise.
     ///
     /// # Errors
-    /// Returns an error if a file can't be written.
+    /// Returns an error if the folder has the log of a training, or if a file can't be written.
     pub fn create(run: &Path, steps: u64) -> Result<Self> {
+        if run.join(TRAINING_FILE).exists() {
+            return Err(Error::input(run, "the log", "a folder of a training run", "another folder"));
+        }
         std::fs::create_dir_all(run).map_err(Error::write(run))?;
         let file = run.join(METRICS_FILE);
         if steps == 0 {

@@ -148,12 +148,9 @@ pub(crate) fn refine_timed(
         let background = background.map(|background| background.colour(&mut random));
         let loss = stopwatch.time("loss", || {
             let loss = loss(&gaussians, &pictures, &batch, background, config, depth);
-            match known_depths_loss(&pictures.depth, &known) {
-                Some(difference) if config.depth_weight_at(progress) > 0. => {
-                    loss + difference * config.depth_weight_at(progress)
-                }
-                _ => loss,
-            }
+            let weight = config.depth_weight_at(progress);
+            let difference = (weight > 0.).then(|| known_depths_loss(&pictures.depth, &known)).flatten();
+            difference.map_or(loss.shallow_clone(), |difference| loss + difference * weight)
         });
         stopwatch.time("backward", || {
             optimizer.zero_grad();
