@@ -31,7 +31,7 @@ struct IsotropicGaussian {
 /// matches the part of the images that it covers. Those of the `known` Gaussians, at most `count`, that don't contradict the photos are
 /// kept. At least two views are required. `should_continue` is called before each photo with the number of photos that are done. If it
 /// returns `false`, Gaussians are created from the photos that are done, or `None` is returned if there are none. The result also has the
-/// depths. It is on `device`.
+/// depths. The Gaussians are on `device`.
 pub fn gaussians_from_photos(
     views: &[View],
     points: &[Point],
@@ -41,7 +41,7 @@ pub fn gaussians_from_photos(
     device: Device,
     should_continue: impl FnMut(usize) -> bool,
 ) -> Option<(RawGaussians, Vec<DepthMap>)> {
-    let depth_maps = sweep(views, points, device, should_continue);
+    let depth_maps = sweep(views, points, should_continue);
     if depth_maps.is_empty() {
         return None;
     }
@@ -63,9 +63,8 @@ fn supported(raw: &RawGaussians, depth_maps: &[DepthMap]) -> Vec<i64> {
     let means =
         Vec::<f64>::try_from(raw.means.to_kind(Kind::Double).contiguous().view([-1])).expect("numbers");
     let map = |of: &DepthMap| {
-        let depth = Vec::<f32>::try_from(of.depth.contiguous().view([-1])).expect("numbers");
-        let sure = Vec::<bool>::try_from(of.sure.contiguous().view([-1])).expect("truths");
-        (projection(&of.camera), of.camera.width as usize, depth, sure, counted(of))
+        let width = of.camera.width as usize;
+        (projection(&of.camera), width, of.depths(), of.sure_pixels(), of.counted_pixels())
     };
     let maps: Vec<_> = depth_maps.iter().map(map).collect();
     let holds = |mean: DVec3| {
@@ -87,16 +86,10 @@ fn supported(raw: &RawGaussians, depth_maps: &[DepthMap]) -> Vec<i64> {
     (0..means.len() / 3).filter(|&i| holds(DVec3::from_slice(&means[3 * i..]))).map(|i| i as i64).collect()
 }
 
-/// Returns for every pixel whether it counts; `None` if all do.
-fn counted(of: &DepthMap) -> Option<Vec<bool>> {
-    let counted = of.counted.as_ref()?;
-    Some(Vec::<bool>::try_from(counted.contiguous().view([-1])).expect("truths"))
-}
-
 /// Returns `points` without those that photos show only where they are masked out.
 fn points_that_count<'a>(points: &'a [Point], depth_maps: &[DepthMap]) -> Vec<&'a Point> {
-    let maps: Vec<_> =
-        depth_maps.iter().map(|of| (projection(&of.camera), of.camera.width as usize, counted(of))).collect();
+    let map = |of: &DepthMap| (projection(&of.camera), of.camera.width as usize, of.counted_pixels());
+    let maps: Vec<_> = depth_maps.iter().map(map).collect();
     let counts = |point: &&Point| {
         let mut places = maps.iter().filter_map(|(seen, width, counted)| {
             let [u, v, _] = seen(point.position)?;
@@ -151,9 +144,9 @@ fn sample_pixels(
     balls: &mut Vec<IsotropicGaussian>,
 ) {
     let (width, height) = (of.camera.width as usize, of.camera.height as usize);
-    let numbers = |t: &Tensor| Vec::<f32>::try_from(t.contiguous().view([-1])).expect("numbers");
-    let (depth, image, k) = (numbers(&of.depth), numbers(&of.image), of.camera.intrinsics);
-    let counted = counted(of).map(|counted| (0..counted.len()).filter(|&i| counted[i]).collect::<Vec<_>>());
+    let (depth, image, k) = (of.depths(), of.colours(), of.camera.intrinsics);
+    let counted =
+        of.counted_pixels().map(|counted| (0..counted.len()).filter(|&i| counted[i]).collect::<Vec<_>>());
     for _ in 0..count {
         let (u, v) = match &counted {
             Some(counted) => {
@@ -197,20 +190,14 @@ mod tests {
     /// image.
     #[test]
     fn gaussians_that_contradict_photos_are_removed() {
-        let camera = |x: f64| Camera {
-            intrinsics: Intrinsics { fx: 8., fy: 8., cx: 8., cy: 8. },
-            c2w: DMat4::from_translation(DVec3::new(x, 0., 0.)),
-            width: 16,
-            height: 16,
-        };
         let options = (Kind::Float, Device::Cpu);
         let wall = |x: f64, sure_columns: i64| DepthMap {
-            photo: String::new(),
-            camera: camera(x),
-            image: Tensor::zeros([3, 16, 16], options),
-            depth: Tensor::full([16, 16], 4., options),
+            camera: Camera {
+                c2w: DMat4::from_translation(DVec3::new(x, 0., 0.)),
+                ..DepthMap::flat(16, 16, 4.).camera
+            },
             sure: Tensor::arange(16, options).lt(sure_columns as f64).expand([16, 16], false).contiguous(),
-            counted: None,
+            ..DepthMap::flat(16, 16, 4.)
         };
         let depth_maps = [wall(0., 16), wall(0.5, 8)];
         let kept = |means: &[[f64; 3]]| {
@@ -235,19 +222,7 @@ mod tests {
     #[test]
     fn masked_pixels_start_no_gaussians() {
         let options = (Kind::Float, Device::Cpu);
-        let map = |counted: Option<Tensor>| DepthMap {
-            photo: String::new(),
-            camera: Camera {
-                intrinsics: Intrinsics { fx: 8., fy: 8., cx: 8., cy: 8. },
-                c2w: DMat4::IDENTITY,
-                width: 16,
-                height: 16,
-            },
-            image: Tensor::zeros([3, 16, 16], options),
-            depth: Tensor::full([16, 16], 4., options),
-            sure: Tensor::zeros([16, 16], (Kind::Bool, Device::Cpu)),
-            counted,
-        };
+        let map = |counted: Option<Tensor>| DepthMap { counted, ..DepthMap::flat(16, 16, 4.) };
         let right = Tensor::arange(16, options).ge(8.).expand([16, 16], false).contiguous();
         let point = |x: f64| Point { position: DVec3::new(x, 0., 4.), colour: [0.5; 3] };
         let points = [point(-1.), point(1.), point(-9.)];

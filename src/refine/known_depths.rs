@@ -28,9 +28,7 @@ impl KnownDepths {
         };
         let (rows, columns) = (along(size[0], height), along(size[1], width));
         let is_first = |along: &[i64], i: usize| i == 0 || along[i] != along[i - 1];
-        let truths = |t: &Tensor| Vec::<bool>::try_from(t.contiguous().view([-1])).expect("truths");
-        let (sure, counted) = (truths(&map.sure), map.counted.as_ref().map(truths));
-        let depth = Vec::<f32>::try_from(map.depth.contiguous().view([-1])).expect("numbers");
+        let (depth, sure, counted) = (map.depths(), map.sure_pixels(), map.counted_pixels());
         let (mut pixels, mut depths, mut all) = (vec![], vec![], 0);
         for (y, &row) in rows.iter().enumerate().filter(|&(y, _)| is_first(&rows, y)) {
             for (x, &column) in columns.iter().enumerate().filter(|&(x, _)| is_first(&columns, x)) {
@@ -62,25 +60,15 @@ impl KnownDepths {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::{Camera, Intrinsics};
-    use glam::DMat4;
 
     /// Returns a map of 2×2 pixels at depths 1 to 4, of which the last isn't sure and the first doesn't count.
     fn map() -> DepthMap {
-        let options = (Kind::Float, Device::Cpu);
         let truths = |values: [bool; 4]| Tensor::from_slice(&values).view([2, 2]);
         DepthMap {
-            photo: String::new(),
-            camera: Camera {
-                intrinsics: Intrinsics { fx: 2., fy: 2., cx: 1., cy: 1. },
-                c2w: DMat4::IDENTITY,
-                width: 2,
-                height: 2,
-            },
-            image: Tensor::zeros([3, 2, 2], options),
             depth: Tensor::from_slice(&[1f32, 2., 3., 4.]).view([2, 2]),
             sure: truths([true, true, true, false]),
             counted: Some(truths([false, true, true, true])),
+            ..DepthMap::flat(2, 2, 1.)
         }
     }
 

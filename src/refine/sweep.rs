@@ -51,6 +51,7 @@ const ROOM: f64 = 1.3;
 
 /// Downscaled photo.
 struct SmallPhoto {
+    name: String,
     camera: Camera,
     /// Colours, [3, h, w].
     image: Tensor,
@@ -62,11 +63,10 @@ struct SmallPhoto {
 
 /// Computes depths for the pixels of the views. If there are many views, it processes a subset that together shows what all of them show,
 /// without near duplicates. `points` of the scene, if some are known, determine the nearest depth. `should_continue` is called before each
-/// view with the number of views that are done. If it returns `false`, the result has only these. The results are on `device`.
+/// view with the number of views that are done. If it returns `false`, the result has only these.
 pub fn sweep(
     views: &[View],
     points: &[Point],
-    device: Device,
     mut should_continue: impl FnMut(usize) -> bool,
 ) -> Vec<DepthMap> {
     let small: Vec<SmallPhoto> = views.iter().map(|view| SmallPhoto::from_view(view, LONGEST_SIDE)).collect();
@@ -85,12 +85,11 @@ pub fn sweep(
         if swept.iter().all(is_new) {
             let others = neighbours(index, &cameras, depth);
             let others: Vec<&SmallPhoto> = others.into_iter().map(|other| &small[other]).collect();
-            let photo = views[index].name.clone();
-            swept.push((index, DepthMap { photo, ..sweep_one(&small[index], &others, nearest, depth) }));
+            swept.push((index, sweep_one(&small[index], &others, nearest, depth)));
         }
     }
     swept.sort_by_key(|(index, _)| *index);
-    swept.into_iter().map(|(_, swept)| swept.to_device(device)).collect()
+    swept.into_iter().map(|(_, swept)| swept).collect()
 }
 
 fn sweep_one(this: &SmallPhoto, others: &[&SmallPhoto], nearest: Option<f64>, depth: f64) -> DepthMap {
@@ -103,7 +102,7 @@ fn sweep_one(this: &SmallPhoto, others: &[&SmallPhoto], nearest: Option<f64>, de
     let (inverse, correlation) = most_alike(this, others, nearest, PLANES);
     let counted = this.counted();
     DepthMap {
-        photo: String::new(),
+        photo: this.name.clone(),
         camera: this.camera,
         image: this.image.shallow_clone(),
         depth: filled(&inverse, &correlation, counted.as_ref()).clamp_min(nearest / FARTHEST).reciprocal(),
@@ -187,6 +186,7 @@ impl SmallPhoto {
         let scale = (width as f64 / side(camera.width), height as f64 / side(camera.height));
         let intrinsics = camera.intrinsics.resized(scale.0, scale.1);
         SmallPhoto {
+            name: view.name.clone(),
             camera: Camera { intrinsics, width: width as u32, height: height as u32, ..camera },
             image,
             grey,
@@ -313,7 +313,7 @@ mod tests {
             let _ = mask.narrow(2, 0, 24).zero_();
             View { image, mask: Some(mask), ..view.shallow_clone() }
         });
-        for swept in sweep(&masked, &[], Device::Cpu, |_| true) {
+        for swept in sweep(&masked, &[], |_| true) {
             let off = (&swept.depth / depth - 1.).abs();
             let counted = swept.counted.unwrap();
             assert_eq!(counted.sum(Kind::Int64).int64_value(&[]), 64 * 40);
@@ -326,7 +326,7 @@ mod tests {
             assert_eq!(sure(0, 24), 0.);
             assert!(sure(24, 40) > 0.6, "{}", sure(24, 40));
         }
-        for swept in sweep(&views, &[], Device::Cpu, |_| true) {
+        for swept in sweep(&views, &[], |_| true) {
             let off = (swept.depth / depth - 1.).abs().median().double_value(&[]);
             assert!(off < 0.02, "{off}");
         }
@@ -338,7 +338,7 @@ mod tests {
         assert!((SceneDepth::of(1, &photos, &points).nearest.unwrap() - 1.3 / 3.).abs() < 1e-9);
         assert!(SceneDepth::of(1, &photos, &points[..20]).nearest.is_none());
         // A single photo has no measurable depth, and the result must not be NaN.
-        let alone = sweep(&views[..1], &[], Device::Cpu, |_| true);
+        let alone = sweep(&views[..1], &[], |_| true);
         assert!(alone[0].depth.isfinite().all().int64_value(&[]) == 1);
     }
 }
