@@ -2,7 +2,7 @@
 //! a few parameters per photo.
 
 use super::config::RefineConfig;
-use super::state::RefineState;
+use super::state::{CORRECTIONS, RefineState};
 use crate::data::{View, ViewBatch};
 use crate::error::Result;
 use crate::optim::{Optimizer, ParameterGroup, Rule};
@@ -10,9 +10,6 @@ use glam::{DMat4, DQuat, DVec3};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use tch::{Device, Kind, Tensor};
-
-/// Beginning of the names of the corrections' tensors in a state.
-const STATE: &str = "corrections.";
 
 /// Learned pose and exposure corrections of every photo. The mean over all photos is 0 for both, as a scene that is moved or brightened as
 /// a whole is the same scene.
@@ -80,7 +77,7 @@ impl Corrections {
     /// # Errors
     /// Returns an error if a tensor is missing or has another shape.
     pub(super) fn load_state(&mut self, state: &RefineState) -> Result<()> {
-        let tensors = state.tensors_of(STATE);
+        let tensors = state.tensors_of(CORRECTIONS);
         let values = self.values();
         if !values.iter().all(|(name, value)| tensors.get(name).is_some_and(|t| t.size() == value.size())) {
             return Ok(());
@@ -94,7 +91,7 @@ impl Corrections {
     /// Adds the values and their moments to `tensors`.
     pub(super) fn add_to_state(&self, tensors: &mut BTreeMap<String, Tensor>) {
         let all = self.values().into_iter().chain(self.optimizer.state());
-        tensors.extend(all.map(|(name, t)| (format!("{STATE}{name}"), t)));
+        tensors.extend(all.map(|(name, t)| (format!("{CORRECTIONS}{name}"), t)));
     }
 
     /// Returns the values that are learned, by name.

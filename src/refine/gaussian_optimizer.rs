@@ -4,7 +4,7 @@ use super::config::RefineConfig;
 use super::gaussian_params::GaussianParams;
 use super::options::MIN_GAUSSIANS;
 use super::relocate::relocate;
-use super::state::{Record, RefineState};
+use super::state::{GAUSSIANS, Growth, Record, RefineState};
 use crate::error::Result;
 use crate::optim::{Optimizer, ParameterGroup, Rule};
 use crate::scene::{Gaussians, RawGaussians};
@@ -12,8 +12,6 @@ use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeMap;
 use tch::{Device, Tensor};
 
-/// Beginning of the names of this optimizer's tensors in a state.
-const STATE: &str = "gaussians.";
 /// Exponent with which the learning rate of the means falls with the number of Gaussians above [`MIN_GAUSSIANS`].
 const MEANS_POWER: f64 = 0.75;
 /// Adam's ε, added to the root of the second moments. It is small because gradients of single Gaussians are small.
@@ -26,12 +24,9 @@ pub struct GaussianOptimizer {
     optimizer: Optimizer,
     config: RefineConfig,
     depth: f64,
-    /// Initial and final degree of the spherical harmonics.
-    degrees: [i64; 2],
-    /// Degree that the last step used.
-    degree: i64,
-    /// Initial and final number of Gaussians.
-    counts: [i64; 2],
+    growth: Growth,
+    /// Final number of Gaussians.
+    last_count: i64,
 }
 
 impl GaussianOptimizer {
@@ -42,8 +37,9 @@ impl GaussianOptimizer {
         let degrees = [first, first.max(config.sh_degree)];
         let leaves = GaussianParams::from_raw(raw, degrees[1]);
         let optimizer = Optimizer::new(leaves.named_parameters().map(alone).into()).with_epsilon(EPSILON);
-        let counts = [leaves.count(), leaves.count().max(count)];
-        GaussianOptimizer { leaves, optimizer, config: config.clone(), depth, degrees, degree: first, counts }
+        let growth = Growth { first_count: leaves.count(), degrees, degree: first };
+        let last_count = leaves.count().max(count);
+        GaussianOptimizer { leaves, optimizer, config: config.clone(), depth, growth, last_count }
     }
 
     /// Creates the optimizer that `state` was made of, on `device`. The Gaussians grow to at least `count`.
@@ -56,20 +52,23 @@ impl GaussianOptimizer {
         count: i64,
         device: Device,
     ) -> Result<Self> {
-        let Record { depth, first_count, degrees, degree, .. } = state.record;
+        let Record { depth, growth, .. } = state.record;
         let leaves =
-            GaussianParams::from_named(|name| state.tensor(&format!("{STATE}value.{name}")), device)?;
+            GaussianParams::from_named(|name| state.tensor(&format!("{GAUSSIANS}value.{name}")), device)?;
         let mut optimizer = Optimizer::new(leaves.named_parameters().map(alone).into()).with_epsilon(EPSILON);
-        optimizer.load_state(state.file(), &state.tensors_of(STATE))?;
-        let counts = [first_count, leaves.count().max(count)];
-        Ok(GaussianOptimizer { leaves, optimizer, config: config.clone(), depth, degrees, degree, counts })
+        optimizer.load_state(state.file(), &state.tensors_of(GAUSSIANS))?;
+        let last_count = leaves.count().max(count);
+        Ok(GaussianOptimizer { leaves, optimizer, config: config.clone(), depth, growth, last_count })
     }
 
     /// Adds the parameters and their moments to `tensors`.
     pub(super) fn add_to_state(&self, tensors: &mut BTreeMap<String, Tensor>) {
         let values = self.leaves.named_parameters().map(|(name, t)| (format!("value.{name}"), t.detach()));
         tensors.extend(
-            values.into_iter().chain(self.optimizer.state()).map(|(name, t)| (format!("{STATE}{name}"), t)),
+            values
+                .into_iter()
+                .chain(self.optimizer.state())
+                .map(|(name, t)| (format!("{GAUSSIANS}{name}"), t)),
         );
     }
 
@@ -78,14 +77,9 @@ impl GaussianOptimizer {
         self.leaves.count()
     }
 
-    /// Returns the number of Gaussians at the start.
-    pub(super) fn first_count(&self) -> i64 {
-        self.counts[0]
-    }
-
-    /// Returns the degrees of the spherical harmonics at the start and at the end, and the present one.
-    pub(super) fn degrees(&self) -> ([i64; 2], i64) {
-        (self.degrees, self.degree)
+    /// Returns how the Gaussians have grown.
+    pub(super) fn growth(&self) -> Growth {
+        self.growth
     }
 
     /// Returns the Gaussians, differentiable with respect to the parameters. `progress` goes from 0 to 1.
@@ -95,19 +89,19 @@ impl GaussianOptimizer {
 
     /// Returns the degree of the spherical harmonics, at least the one that an earlier step used.
     fn degree_at(&self, progress: f64) -> i64 {
-        let [first, last] = self.degrees;
-        (first + (progress / self.config.sh_every) as i64).min(last).max(self.degree)
+        let [first, last] = self.growth.degrees;
+        (first + (progress / self.config.sh_every) as i64).min(last).max(self.growth.degree)
     }
 
     /// Returns the number of Gaussians that there should be, which grows exponentially.
     fn count_at(&self, progress: f64) -> i64 {
-        let [first, last] = self.counts.map(|count| count as f64);
+        let [first, last] = [self.growth.first_count, self.last_count].map(|count| count as f64);
         (first * (last / first).powf((progress / self.config.grow_until).min(1.))) as i64
     }
 
     /// Returns the learning rate of the means, in units of the scene's depth. Many Gaussians are small, so they move less.
     pub(super) fn means_learning_rate(&self, progress: f64) -> f64 {
-        let relative_count = self.counts[1] as f64 / MIN_GAUSSIANS as f64;
+        let relative_count = self.last_count as f64 / MIN_GAUSSIANS as f64;
         let by_count = relative_count.max(1.).powf(-MEANS_POWER);
         self.config.means * by_count * self.config.means_end.powf(progress)
     }
@@ -134,7 +128,7 @@ impl GaussianOptimizer {
             config.colours * config.harmonics * others,
         ]);
         self.optimizer.step()?;
-        self.degree = self.degree_at(progress);
+        self.growth.degree = self.degree_at(progress);
         let missing = self.count_at(progress) - self.leaves.count();
         let is_due = config.relocate_every > 0 && (step + 1).is_multiple_of(config.relocate_every);
         // With few steps, no relocation may be due after the growth has ended.

@@ -125,8 +125,8 @@ pub(crate) fn refine_timed(
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     random.set_word_pos(reached.random);
     let (begun, mut elapsed, mut last) = (Instant::now(), Duration::ZERO, Duration::ZERO);
-    let mut steps = reached.steps;
-    for step in reached.steps.. {
+    let mut step = reached.steps;
+    loop {
         let start = Instant::now();
         let (progress, is_over) = match budget {
             Budget::Steps(steps) => (step as f64 / steps as f64, step >= steps),
@@ -150,7 +150,10 @@ pub(crate) fn refine_timed(
             let loss = loss(&gaussians, &pictures, &batch, background, config, depth);
             let weight = config.depth_weight_at(progress);
             let difference = (weight > 0.).then(|| known_depths_loss(&pictures.depth, &known)).flatten();
-            difference.map_or(loss.shallow_clone(), |difference| loss + difference * weight)
+            match difference {
+                Some(difference) => loss + difference * weight,
+                None => loss,
+            }
         });
         stopwatch.time("backward", || {
             optimizer.zero_grad();
@@ -163,12 +166,13 @@ pub(crate) fn refine_timed(
         })?;
         last = start.elapsed();
         elapsed += last;
-        steps = step + 1;
-        if !on_step(&RefineStep { step: steps, progress, elapsed, optimizer, loss: &loss }) {
+        step += 1;
+        if !on_step(&RefineStep { step, progress, elapsed, optimizer, loss: &loss }) {
             break;
         }
     }
-    let reached = Reached { steps, time: reached.time + begun.elapsed(), random: random.get_word_pos() };
+    let reached =
+        Reached { steps: step, time: reached.time + begun.elapsed(), random: random.get_word_pos() };
     Ok((tch::no_grad(|| optimizer.gaussians(1.)), reached))
 }
 

@@ -145,7 +145,7 @@ enum Start<'a> {
     Photos(RawGaussians),
     Splat(&'a Splat, RawGaussians),
     Model(Gaussians),
-    State(&'a RefineState),
+    State(&'a RefineState, Box<GaussianOptimizer>),
 }
 
 /// Refinement session: the photos and the state computed from them, in the local frame of the capture's cameras. Call
@@ -322,7 +322,9 @@ impl<'a> RefineSession<'a> {
                 if state.record.has_depths {
                     let _ = self.gaussians_from_photos(None)?.ok_or_else(stopped)?;
                 }
-                Start::State(state)
+                let RefineOptions { config, gaussians, device, .. } = self.options;
+                let optimizer = GaussianOptimizer::from_state(state, config, *gaussians as i64, *device)?;
+                Start::State(state, optimizer.into())
             }
             Initial::Model(loaded) => {
                 let data = &loaded.config.data;
@@ -349,18 +351,15 @@ impl<'a> RefineSession<'a> {
         let gaussians = match &start {
             Start::Photos(raw) | Start::Splat(_, raw) => raw.activate(),
             Start::Model(gaussians) => gaussians.map(Tensor::shallow_clone),
-            Start::State(state) => {
-                let optimizer =
-                    GaussianOptimizer::from_state(state, &self.options.config, 0, self.options.device)?;
-                tch::no_grad(|| optimizer.gaussians(1.))
-            }
+            // The optimization changes the parameters in place.
+            Start::State(_, optimizer) => tch::no_grad(|| optimizer.gaussians(1.)).map(Tensor::copy),
         };
         let depth = match &start {
-            Start::State(state) => state.record.depth,
+            Start::State(state, _) => state.record.depth,
             _ => scene_depth(&gaussians, &self.photos)?,
         };
         warnings.extend(self.leave_out_near_duplicates(depth));
-        if let Start::State(state) = &start {
+        if let Start::State(state, _) = &start {
             self.check_state(state)?;
         }
         warnings.iter().for_each(|line| self.warn(line));
@@ -391,11 +390,12 @@ impl<'a> RefineSession<'a> {
         if matches!(start, Start::Model(..)) {
             self.add_eval_point(&initial)?;
         }
+        let initial_splat = if let Start::Splat(splat, _) = start { Some(splat) } else { None };
         let begun = self.clock.elapsed().as_secs_f64();
         let (gaussians, learned, state) = if self.is_stopped {
             (initial.map(Tensor::shallow_clone), Corrections::none(), None)
         } else {
-            let (gaussians, learned, state) = self.optimize(&start, depth)?;
+            let (gaussians, learned, state) = self.optimize(start, depth)?;
             (gaussians, learned, Some(state))
         };
         let ended = self.clock.elapsed().as_secs_f64();
@@ -404,8 +404,8 @@ impl<'a> RefineSession<'a> {
         let asked = self.options.correct_poses || self.options.correct_exposures;
         let corrections = if asked && !is_initial { learned.report(&self.photos) } else { vec![] };
         let gaussians = if is_initial { initial.map(Tensor::shallow_clone) } else { gaussians };
-        let splat = match start {
-            Start::Splat(splat, _) if is_initial => Splat { warnings: vec![], ..splat.clone() },
+        let splat = match initial_splat {
+            Some(splat) if is_initial => Splat { warnings: vec![], ..splat.clone() },
             _ => gaussians.to_world_units(&self.frame).to_splat(self.frame.origin)?,
         };
         Ok(RefineResult {
@@ -578,34 +578,32 @@ impl<'a> RefineSession<'a> {
     }
 
     /// Optimizes the Gaussians of `start`, and the corrections of the photos. `depth` is the depth of these Gaussians.
-    fn optimize(&mut self, start: &Start, depth: f64) -> Result<(Gaussians, Corrections, RefineState)> {
+    fn optimize(&mut self, start: Start, depth: f64) -> Result<(Gaussians, Corrections, RefineState)> {
         let RefineOptions { correct_poses, correct_exposures, config, seed, device, .. } = self.options;
         let final_count = if matches!(start, Start::Splat(..)) { 0 } else { self.options.gaussians as i64 };
-        let (mut optimizer, depth) = match start {
+        let (mut optimizer, depth, earlier) = match start {
             Start::Photos(raw) | Start::Splat(_, raw) => {
-                (GaussianOptimizer::new(raw, depth, config, final_count), depth)
+                (GaussianOptimizer::new(&raw, depth, config, final_count), depth, None)
             }
             Start::Model(gaussians) => {
-                let raw = self.filled(gaussians)?;
+                let raw = self.filled(&gaussians)?;
                 let depth = scene_depth(&raw.activate(), &self.photos)?;
-                (GaussianOptimizer::new(&raw, depth, config, final_count), depth)
+                (GaussianOptimizer::new(&raw, depth, config, final_count), depth, None)
             }
-            Start::State(state) => {
-                (GaussianOptimizer::from_state(state, config, final_count, *device)?, depth)
-            }
+            Start::State(state, optimizer) => (*optimizer, depth, Some(state)),
         };
         let count = self.photos.len();
         let mut corrections =
             Corrections::new(count, *correct_poses, *correct_exposures, depth, config, *device);
-        let (mut reached, mut earlier) = (Reached::default(), Duration::ZERO);
-        if let Start::State(state) = start {
+        let (mut reached, mut earlier_total) = (Reached::default(), Duration::ZERO);
+        if let Some(state) = earlier {
             corrections.load_state(state)?;
-            (reached, earlier) = (state.record.reached, state.record.total);
+            (reached, earlier_total) = (state.record.reached, state.record.total);
         }
         let photos = Photos::new(&self.photos, &self.depth_maps, config, *device);
         let budget = match self.options.budget {
             Budget::Time(time) => {
-                let used = self.reserve + self.clock.elapsed() + earlier;
+                let used = self.reserve + self.clock.elapsed() + earlier_total;
                 Budget::Time(reached.time + time.saturating_sub(used).max(MIN_TIME.min(time)))
             }
             steps => steps,
@@ -643,17 +641,14 @@ impl<'a> RefineSession<'a> {
         let mut tensors = BTreeMap::new();
         optimizer.add_to_state(&mut tensors);
         corrections.add_to_state(&mut tensors);
-        let (degrees, degree) = optimizer.degrees();
         let record = Record {
             photos: self.photo_names(),
             frame: self.frame_numbers(),
             reached,
-            total: earlier + self.clock.elapsed(),
+            total: earlier_total + self.clock.elapsed(),
             depth,
             has_depths: !self.depth_maps.is_empty(),
-            first_count: optimizer.first_count(),
-            degrees,
-            degree,
+            growth: optimizer.growth(),
         };
         Ok((gaussians, corrections, RefineState::new(record, tensors)))
     }

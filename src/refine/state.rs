@@ -8,6 +8,10 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tch::Tensor;
 
+/// Beginning of the names of the tensors of the Gaussians' optimizer.
+pub(super) const GAUSSIANS: &str = "gaussians.";
+/// Beginning of the names of the tensors of the corrections.
+pub(super) const CORRECTIONS: &str = "corrections.";
 /// Key of the metadata under which the file has the [`Record`].
 const RECORD: &str = "refinement";
 
@@ -37,6 +41,13 @@ pub(super) struct Record {
     pub depth: f64,
     /// `true` if the plane sweep's depths were used.
     pub has_depths: bool,
+    /// How the Gaussians have grown.
+    pub growth: Growth,
+}
+
+/// Growth of the Gaussians' number and of their spherical harmonics.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub(super) struct Growth {
     /// Number of Gaussians at the start of the optimization.
     pub first_count: i64,
     /// Degree of the spherical harmonics at the start and at the end of the optimization.
@@ -50,7 +61,7 @@ pub(super) struct Record {
 #[derive(Debug)]
 pub struct RefineState {
     pub(super) record: Record,
-    /// Parameters and moments, by names that begin with `gaussians.` or `corrections.`.
+    /// Parameters and moments, by names that begin with [`GAUSSIANS`] or [`CORRECTIONS`].
     pub(super) tensors: BTreeMap<String, Tensor>,
     /// File for error messages.
     file: PathBuf,
@@ -100,7 +111,7 @@ impl RefineState {
 
     /// Returns the number of Gaussians.
     pub fn count(&self) -> usize {
-        self.tensors.get("gaussians.value.means").map_or(0, |means| means.size()[1] as usize)
+        self.tensors.get(&format!("{GAUSSIANS}value.means")).map_or(0, |means| means.size()[1] as usize)
     }
 
     /// Returns the tensor with this name.
