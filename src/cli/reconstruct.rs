@@ -1,6 +1,6 @@
 use super::capture::SceneSource;
 use super::memory::keep_during;
-use super::refine::{InitialFile, RefineJob, parse_time};
+use super::refine::{InitialFile, RefineJob, Reports, parse_time};
 use super::signals::StopRequest;
 use super::{check_views, device, model, open_masked_capture, parse_holdout, print_json, splat_out};
 use anyhow::Result;
@@ -77,6 +77,7 @@ impl Reconstruct {
         let (gaussians, size) = (Some(options.gaussians), Some(options.size));
         let initial = InitialFile::Model(self.weights);
         let Reconstruct { scene, masks, out, local_origin, json, .. } = self;
+        let (resume, reports) = (false, Reports::default());
         RefineJob {
             scene,
             masks,
@@ -85,11 +86,9 @@ impl Reconstruct {
             options,
             gaussians,
             size,
+            resume,
             local_origin,
-            resume: false,
-            log: None,
-            sheet: None,
-            lpips: false,
+            reports,
             json,
         }
         .run()

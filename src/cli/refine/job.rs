@@ -6,6 +6,7 @@ use super::super::signals::StopRequest;
 use super::super::{memory, model, open_masked_capture, report_downscaling, splat_out, warn};
 use super::report::print_result;
 use anyhow::Result;
+use clap::Args;
 use globalsplat::data::{Capture, PhotoSize};
 use globalsplat::eval::process_age;
 use globalsplat::io::{
@@ -52,12 +53,24 @@ pub struct RefineJob {
     pub size: Option<PhotoSize>,
     /// `true` to continue from the state beside the output, if there is one, and to write it.
     pub resume: bool,
-    /// Folder of the log.
-    pub log: Option<PathBuf>,
     pub local_origin: bool,
-    pub sheet: Option<PathBuf>,
-    pub lpips: bool,
+    pub reports: Reports,
     pub json: bool,
+}
+
+/// What a refinement reports besides its result.
+#[derive(Default, Args)]
+pub struct Reports {
+    /// Also write curves of the loss and the scores to a folder: metrics.jsonl and tensorboard, which `globalsplat watch` and
+    /// TensorBoard show during the optimization
+    #[arg(long, value_name = "DIR")]
+    log: Option<PathBuf>,
+    /// Also write an image: photo, render and depth side by side, a row per held-out view, or else per view
+    #[arg(long, value_name = "FILE.png")]
+    sheet: Option<PathBuf>,
+    /// Also score by LPIPS, before and after, if its weights are found; this takes additional time, after the splat is written
+    #[arg(long)]
+    lpips: bool,
 }
 
 impl RefineJob {
@@ -67,14 +80,14 @@ impl RefineJob {
         memory::keep();
         check_writable_splat(&self.out)?;
         splat_out::check_origin(&self.out, self.local_origin)?;
-        if let Some(sheet) = &self.sheet {
+        if let Some(sheet) = &self.reports.sheet {
             check_writable_png(sheet)?;
         }
         let state_file = RefineState::path_for(&self.out);
         if self.resume {
             check_writable_file(&state_file)?;
         }
-        if let Some(log) = &self.log {
+        if let Some(log) = &self.reports.log {
             check_writable_dir(log)?;
         }
         let stop = StopRequest::install()?;
@@ -108,7 +121,7 @@ impl RefineJob {
         let chosen = self.choose_sizes(&capture, &initial);
         let bar = Bar { bar: bar_of(&self.options.budget), budget: self.options.budget, clock };
         let steps = if let Initial::State(state) = initial { state.steps() } else { 0 };
-        let log = self.log.as_ref().map(|folder| RefineLog::create(folder, steps)).transpose()?;
+        let log = self.reports.log.as_ref().map(|folder| RefineLog::create(folder, steps)).transpose()?;
         let log = RefCell::new(log);
         let on_event = |event: RefineEvent| {
             bar.tell(event);
@@ -128,7 +141,7 @@ impl RefineJob {
                 STATE_TIME_PER_GAUSSIAN * gaussians.count().max(self.options.gaussians as i64) as u32,
             );
         }
-        if self.sheet.is_some() {
+        if self.reports.sheet.is_some() {
             session.reserve_for_contact_sheet(&gaussians)?;
         }
         let result = session.run()?;
@@ -145,14 +158,14 @@ impl RefineJob {
             state.write(&state_file)?;
         }
         let held_out = session.score_held_out(&result)?;
-        if let Some(sheet) = &self.sheet {
+        if let Some(sheet) = &self.reports.sheet {
             if stop.is_requested() {
                 eprintln!("{}: stopped before it was written", sheet.display());
             } else {
                 report_downscaling(sheet, session.contact_sheet(&result)?.write(sheet)?);
             }
         }
-        let lpips = if self.lpips { session.score_lpips(&result)? } else { None };
+        let lpips = if self.reports.lpips { session.score_lpips(&result)? } else { None };
         print_result(&self.out, self.json, &session, &result, held_out.as_ref(), lpips.as_ref());
         Ok(())
     }
@@ -186,7 +199,7 @@ impl RefineJob {
             inputs.add_all(splat_files(splat));
         }
         inputs.add_all(splat_files(&self.out));
-        Ok(self.sheet.iter().try_for_each(|sheet| inputs.check_file(sheet))?)
+        Ok(self.reports.sheet.iter().try_for_each(|sheet| inputs.check_file(sheet))?)
     }
 }
 

@@ -3,7 +3,7 @@
 mod job;
 mod report;
 
-pub use job::{InitialFile, RefineJob};
+pub use job::{InitialFile, RefineJob, Reports};
 
 use super::capture::SceneSource;
 use super::{check_former_option, check_views, device, parse_holdout, parse_photo_size};
@@ -93,16 +93,8 @@ pub struct Refine {
     /// Also optimize a correction of each photo's exposure and white balance
     #[arg(long)]
     correct_exposures: bool,
-    /// Also write curves of the loss and the scores to a folder: metrics.jsonl and tensorboard, which `globalsplat watch` and
-    /// TensorBoard show during the optimization
-    #[arg(long, value_name = "DIR")]
-    log: Option<PathBuf>,
-    /// Also write an image: photo, render and depth side by side, a row per held-out view, or else per view
-    #[arg(long, value_name = "FILE.png")]
-    sheet: Option<PathBuf>,
-    /// Also score by LPIPS, before and after, if its weights are found; this takes additional time, after the splat is written
-    #[arg(long)]
-    lpips: bool,
+    #[command(flatten)]
+    reports: Reports,
     /// Override a setting of the method, as in views=4; docs/refine.md lists them
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -150,7 +142,7 @@ impl Refine {
         };
         let size = self.size.as_deref().map(parse_photo_size).transpose()?;
         let GaussianCount(gaussians) = self.gaussians;
-        let Refine { scene, masks, out, resume, log, sheet, local_origin, lpips, json, .. } = self;
+        let Refine { scene, masks, out, resume, local_origin, reports, json, .. } = self;
         RefineJob {
             scene,
             masks,
@@ -160,10 +152,8 @@ impl Refine {
             gaussians,
             size,
             resume,
-            log,
             local_origin,
-            sheet,
-            lpips,
+            reports,
             json,
         }
         .run()
