@@ -16,6 +16,8 @@ mod video;
 mod weights;
 mod weights_file;
 
+/// Name of the file that has a training run's configuration, with every key written out.
+pub const CONFIG_FILE: &str = "config.toml";
 /// Name of the metrics file of a run, which has one line for every step and every validation.
 pub const METRICS_FILE: &str = "metrics.jsonl";
 

@@ -2,12 +2,9 @@
 
 use super::session::{EvalPoint, RefineMetrics};
 use crate::error::{Error, Result};
-use crate::io::{AppendFile, EventFile, METRICS_FILE, write_atomically};
+use crate::io::{AppendFile, CONFIG_FILE, EventFile, METRICS_FILE, write_atomically};
 use serde_json::{Value, json};
 use std::path::Path;
-
-/// File that is in the folder of a training run.
-const TRAINING_FILE: &str = "config.toml";
 
 /// Log in the folder of a run: `metrics.jsonl`, with a line for some of the steps and one for each score, and event files in `tensorboard`.
 #[derive(Debug)]
@@ -23,7 +20,7 @@ impl RefineLog {
     /// # Errors
     /// Returns an error if the folder has the log of a training, or if a file can't be written.
     pub fn create(run: &Path, steps: u64) -> Result<Self> {
-        if run.join(TRAINING_FILE).exists() {
+        if run.join(CONFIG_FILE).exists() {
             return Err(Error::input(run, "the log", "a folder of a training run", "another folder"));
         }
         std::fs::create_dir_all(run).map_err(Error::write(run))?;

@@ -23,11 +23,11 @@ mod trainer;
 mod validator;
 mod watch;
 
-pub use crate::io::METRICS_FILE;
+pub use crate::io::{CONFIG_FILE, METRICS_FILE};
 pub use checkpoint::{CheckpointSummary, MODEL_FILE, best_checkpoint, latest_checkpoint, list_checkpoints};
 pub use memory_estimate::{MemoryEstimate, largest_fitting_batch};
 pub use metrics::Curves;
-pub use run::{CONFIG_FILE, Event, Outcome, Resume, add_run_inputs, retry_on_disk_full, run};
+pub use run::{Event, Outcome, Resume, add_run_inputs, retry_on_disk_full, run};
 pub use step_report::StepReport;
 pub use trainer::Trainer;
 pub use validator::{Score, Validator};

@@ -1,6 +1,5 @@
 //! Training run, from its current state to the last step, with checkpoints on the way.
 
-use super::METRICS_FILE;
 use super::checkpoint::{
     Validation, add_checkpoints, best_score, check, keep_best, latest_checkpoint, list_checkpoints,
     prune_checkpoints, recover,
@@ -12,14 +11,12 @@ use super::step_report::StepReport;
 use super::tensorboard::TensorBoard;
 use super::trainer::Trainer;
 use super::validator::{Score, Validator};
+use super::{CONFIG_FILE, METRICS_FILE};
 use crate::config::{TrainConfig, changed_keys};
 use crate::error::{Error, Result};
 use crate::io::{InputFiles, event_files, write_atomically};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
-
-/// Name of the file that has the run's configuration, with every key written out.
-pub const CONFIG_FILE: &str = "config.toml";
 
 /// Starting point of a run.
 #[derive(Debug, Clone, PartialEq, Eq)]

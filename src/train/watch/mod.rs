@@ -4,11 +4,10 @@ mod events;
 mod new_lines;
 mod series;
 
-use super::METRICS_FILE;
 use super::checkpoint::{CheckpointSummary, checkpoint_summaries};
 use super::lock::RunLock;
 use super::metrics::Line;
-use super::run::CONFIG_FILE;
+use super::{CONFIG_FILE, METRICS_FILE};
 use crate::error::{Error, Result};
 use events::Events;
 use new_lines::{FileChange, NewLines};
