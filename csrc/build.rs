@@ -100,7 +100,7 @@ fn main() {
         .flag("-isystem")
         .flag(format!("{include}/torch/csrc/api/include"))
         .includes([".", "kernels"])
-        .files(["torch.cpp", "nccl.cpp"])
+        .file("torch.cpp")
         .compile("globalsplat_torch");
 
     cpp()

@@ -6,7 +6,9 @@
 #include <ATen/ops/zeros.h>
 #include <torch/csrc/autograd/function_hook.h>
 #include <torch/csrc/autograd/variable.h>
+#include <torch/csrc/distributed/c10d/Backend.hpp>
 #include <torch/csrc/distributed/c10d/PrefixStore.hpp>
+#include <torch/csrc/distributed/c10d/Store.hpp>
 #include <torch/csrc/distributed/c10d/TCPStore.hpp>
 #include <torch/csrc/distributed/c10d/Types.hpp>
 
@@ -43,6 +45,7 @@ c10::intrusive_ptr<c10d::Work> start_one_at_a_time(const Start& start) {
 }  // namespace
 
 Store::Store(c10::intrusive_ptr<c10d::Store> store) : store_(std::move(store)) {}
+Store::~Store() = default;
 
 std::unique_ptr<Store> Store::clone_connection() const { return std::make_unique<Store>(store_->clone()); }
 
@@ -77,6 +80,9 @@ std::unique_ptr<ProcessGroup> new_gloo_group([[maybe_unused]] const Store& store
 }
 
 ProcessGroup::ProcessGroup(Ranks ranks) : ranks_(std::move(ranks)) {}
+ProcessGroup::~ProcessGroup() = default;
+
+void ProcessGroup::shut_down() const { ranks_->shutdown(); }
 
 void ProcessGroup::all_reduce(size_t tensor) const {
   const at::NoGradGuard no_grad;

@@ -2,9 +2,7 @@
 // backward pass still runs. All of it uses libtorch's c10d, and Rust calls it through cxx. Tensors are passed as addresses of live tensors.
 #pragma once
 
-#include <ATen/core/Tensor.h>
-#include <torch/csrc/distributed/c10d/Backend.hpp>
-#include <torch/csrc/distributed/c10d/Store.hpp>
+#include <c10/util/intrusive_ptr.h>
 
 #include <cstddef>
 #include <cstdint>
@@ -14,6 +12,15 @@
 
 #include "rust/cxx.h"
 
+// The bridge to Rust includes this header, and c10d's own take seconds to parse.
+namespace at {
+class Tensor;
+}
+namespace c10d {
+class Backend;
+class Store;
+}  // namespace c10d
+
 namespace globalsplat {
 
 using Ranks = c10::intrusive_ptr<c10d::Backend>;
@@ -22,6 +29,7 @@ using Ranks = c10::intrusive_ptr<c10d::Backend>;
 class Store {
  public:
   explicit Store(c10::intrusive_ptr<c10d::Store> store);
+  ~Store();
 
   // Opens another connection, for another thread.
   std::unique_ptr<Store> clone_connection() const;
@@ -47,6 +55,7 @@ bool has_nccl();
 class ProcessGroup {
  public:
   explicit ProcessGroup(Ranks ranks);
+  ~ProcessGroup();
 
   // Replaces a tensor by its sum over all ranks. Work on a GPU is enqueued, not waited for.
   void all_reduce(size_t tensor) const;
@@ -57,7 +66,7 @@ class ProcessGroup {
   void all_gather(size_t tensor, rust::Slice<size_t> out) const;
 
   // Waits for pending work. To be called on all ranks after the last successful collective; otherwise NCCL aborts.
-  void shut_down() const { ranks_->shutdown(); }
+  void shut_down() const;
 
   const Ranks& ranks() const { return ranks_; }
 

@@ -10,6 +10,7 @@
 #include "device.cpp"
 #include "image_losses.cpp"
 #include "linear.cpp"
+#include "nccl.cpp"
 #include "ops.cpp"
 #include "optim.cpp"
 #include "processor.cpp"
