@@ -13,7 +13,7 @@ use tch::Device;
 
 /// Returns photos of a small room, at the model's image size.
 fn photos_of(room: &Path, model: &LoadedModel) -> Vec<View> {
-    write_room(room, 3, 8, [96, 96].into()).unwrap();
+    write_room(room, 3, 6, [96, 96].into()).unwrap();
     let capture = open_capture(room).unwrap();
     load_context(&capture, Holdout::None, None, model.config.data.image_size).unwrap()
 }

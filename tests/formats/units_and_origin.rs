@@ -142,7 +142,7 @@ fn powers_of_two_change_no_bit() {
     let (plain, pictures) = made(&room, "plain");
     let cameras = open_capture(&room).unwrap().cameras();
     let seen = SplatRenderer::from_splat(&ground_truth).render(&cameras).unwrap();
-    for exponent in [-20, -3, 5, 20] {
+    for exponent in [-20, 5] {
         let factor = f64::from(exponent).exp2();
         let scene = of(&format!("scene{exponent}"));
         let to = to_place((factor, [0.; 3]));
@@ -303,7 +303,8 @@ fn real_captures_score_the_same_anywhere() {
     let of = |name: &str| folder.path().join(name);
     let score = |scene: &Path, name: &str| {
         let splat = of(name);
-        succeed(&["reconstruct", "--scene", arg(scene), "--out", arg(&splat), "--local-origin"]);
+        let reconstruct = ["reconstruct", "--scene", arg(scene), "--views", "6", "--local-origin"];
+        succeed(&[&reconstruct[..], &["--out", arg(&splat)]].concat());
         let pictures = of(&format!("{name}.pictures"));
         succeed(&["render", "--splat", arg(&splat), "--scene", arg(scene), "--out", arg(&pictures)]);
         pictures
