@@ -8,7 +8,7 @@ use globalsplat::data::{resize_and_crop, tensor_from_planes};
 use globalsplat::eval::psnr;
 use globalsplat::io::{read_image, tile_horizontally, write_png};
 use globalsplat::loss::{mse, ssim};
-use globalsplat::optim::{Optimizer, ParameterGroup, Rule};
+use globalsplat::optim::{Optimizer, ParameterGroup, UpdateRule};
 use globalsplat::render::{Cameras, DEFAULT_EPS2D, render};
 use globalsplat::scene::{Camera, ImageSize, Intrinsics, RawGaussians};
 use globalsplat::{Error, Result};
@@ -96,7 +96,7 @@ fn groups(gaussians: &RawGaussians) -> Vec<ParameterGroup> {
         _ => 3e-2,
     };
     let group = |(name, t): (&str, &Tensor)| ParameterGroup {
-        rule: Rule::AdamW,
+        rule: UpdateRule::AdamW,
         parameters: vec![(name.into(), t.shallow_clone())],
         learning_rate: learning_rate(name),
         weight_decay: 0.,

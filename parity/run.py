@@ -19,7 +19,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from harness.areas import CASES
-from harness.document import document
+from harness.document import format_document
 from harness.exchange import ProgramError, program
 from harness.runner import run_cases
 from harness.table import as_json, self_test_report, table
@@ -125,7 +125,7 @@ def main(argv=None):
         undetected = sum(len(result.missed) for result in results)
         print(self_test_report(results))
     if options.markdown:
-        options.markdown.write_text(document(results, command(options), options.device), encoding="utf-8")
+        options.markdown.write_text(format_document(results, command(options), options.device), encoding="utf-8")
     if options.json:
         about = {"seed": options.seed, "repeat": options.repeat, "device": options.device}
         options.json.write_text(json.dumps(as_json(results, **about), indent=1) + "\n")

@@ -1,12 +1,15 @@
 #!/usr/bin/env python3
-"""Compares the full model with its four ablations, and with bf16: equal small budget, several seeds, mean ± deviation.
+"""Compares the full model with its four ablations, and with bf16, with equal small budgets and several seeds.
+
+Prints mean ± standard deviation.
 
     .venv/bin/python scripts/ablations.py [--out OUT] [--seeds 3] [--only VARIANT ...]
 
 Renders four synthetic scenes, and trains each variant on two thirds of every video's frames; the held-out third scores
 it. The model is that of configs/tiny.toml, with larger patches, fewer scene tokens and the paper's consistency loss.
 Runs are in OUT (by default runs/ablations), as many in parallel as there are cores. Prints two Markdown tables: final
-scores and learning curves. The same command resumes where it was stopped, and does not repeat completed runs.
+scores and learning curves. The same command resumes where it was stopped, and does not repeat completed runs. After a
+change to configs/tiny.toml, or to the settings, variants or scenes in this file, OUT must be another folder.
 """
 
 import argparse
@@ -47,6 +50,8 @@ SETTINGS = [
     "train.checkpoint_every=400",
     "train.validate_every=0",
 ]
+# Options of the scenes that all runs train on.
+SYNTH_OPTIONS = ["--scenes", "4", "--frames", "12", "--size", "64", "--seed", "5"]
 VARIANTS = {
     "full model": [],
     "Plücker only": ["model.camera_code=false"],
@@ -64,18 +69,27 @@ def run_folder(out, name, seed):
     return out / f"{name.replace(' ', '_').replace(',', '')}_{seed}"
 
 
-def curve(out, name, seeds):
+def format_recipe():
+    """Returns the text that determines every result: the configuration, with the other settings as comments."""
+    variants = [f"{name}: {settings}" for name, settings in VARIANTS.items()]
+    lines = [*SETTINGS, *variants, f"synth {' '.join(SYNTH_OPTIONS)}"]
+    return CONFIG.read_text() + "".join(f"# {line}\n" for line in lines)
+
+
+def read_curve(out, name, seeds):
     """Returns the number of steps, and the training PSNR in dB of each of PARTS equal parts of the runs.
 
     The PSNR is averaged over a part's steps and the seeds.
     """
     parts = [[] for _ in range(PARTS)]
     for seed in range(seeds):
-        lines = (run_folder(out, name, seed) / "metrics.jsonl").read_text().splitlines()
-        steps = [line for line in map(json.loads, lines) if "mse" in line and not line["skipped"]]
-        for line in steps:
-            parts[line["step"] * PARTS // (steps[-1]["step"] + 1)].append(line["psnr"])
-    return steps[-1]["step"] + 1, [statistics.mean(part) for part in parts]
+        text = (run_folder(out, name, seed) / "metrics.jsonl").read_text()
+        lines = [json.loads(line) for line in text.splitlines()]
+        lines = [line for line in lines if "validation" not in line and not line["skipped"]]
+        steps = lines[-1]["step"] + 1
+        for line in lines:
+            parts[line["step"] * PARTS // steps].append(line["psnr"])
+    return steps, [statistics.mean(part) for part in parts]
 
 
 def main():
@@ -86,23 +100,21 @@ def main():
     arguments = parser.parse_args()
     out, seeds = arguments.out.absolute(), arguments.seeds
     out.mkdir(parents=True, exist_ok=True)
-    recipe = CONFIG.read_text() + "".join(f"# {setting}\n" for setting in SETTINGS)
-    kept = out / "recipe.toml"
-    if kept.exists() and kept.read_text() != recipe:
-        sys.exit(f"{kept} is not the recipe as it is now: choose another OUT")
-    kept.write_text(recipe)
-    worlds = out / "worlds"
-    if not (worlds / "evaluation_index.json").is_file():
-        command = [PROGRAM, "synth", "--out", worlds, "--scenes", "4", "--frames", "12", "--size", "64", "--seed", "5"]
-        subprocess.run(command, check=True, stdout=sys.stderr)
+    recipe, saved_recipe = format_recipe(), out / "recipe.toml"
+    if saved_recipe.exists() and saved_recipe.read_text() != recipe:
+        sys.exit(f"{saved_recipe} differs from the current recipe: choose another OUT")
+    saved_recipe.write_text(recipe)
+    scenes = out / "scenes"
+    if not (scenes / "evaluation_index.json").is_file():
+        subprocess.run([PROGRAM, "synth", "--out", scenes, *SYNTH_OPTIONS], check=True, stdout=sys.stderr)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
 
         def run(name, seed):
             settings = [*SETTINGS, *VARIANTS[name], f"train.seed={seed}"]
-            return train(run_folder(out, name, seed), CONFIG, settings, GLOBALSPLAT_WORLDS=str(worlds))
+            return train(run_folder(out, name, seed), CONFIG, settings, GLOBALSPLAT_WORLDS=str(scenes))
 
         results = {name: [pool.submit(run, name, seed) for seed in range(seeds)] for name in arguments.only}
-        row("variant", "held-out PSNR, dB", "SSIM", "seconds of a core")
+        row("variant", "held-out PSNR, dB", "SSIM", "CPU seconds")
         row(*["---"] * 4)
         for name in arguments.only:
             try:
@@ -114,14 +126,16 @@ def main():
             seconds = statistics.mean(run["core_seconds"] for run in runs)
             spread = f"{statistics.mean(psnr):.2f} ± {statistics.stdev(psnr):.2f}" if seeds > 1 else f"{psnr[0]:.2f}"
             row(name, spread, f"{statistics.mean(ssim):.4f}", f"{seconds:.0f}")
-    nearest = runs[0]["held_out"]
-    row("the nearest photo shown", f"{nearest['nearest_photo_psnr']:.2f}", f"{nearest['nearest_photo_ssim']:.4f}", "")
+    # All runs have the same values, because the baseline depends on the photos alone.
+    held_out = runs[0]["held_out"]
+    psnr, ssim = held_out["nearest_photo_psnr"], held_out["nearest_photo_ssim"]
+    row("nearest context photo (baseline)", f"{psnr:.2f}", f"{ssim:.4f}", "")
 
     print()
     for position, name in enumerate(arguments.only):
-        steps, psnr = curve(out, name, seeds)
+        steps, psnr = read_curve(out, name, seeds)
         if position == 0:
-            row("PSNR in training, to step", *(str(steps * (part + 1) // PARTS) for part in range(PARTS)))
+            row("training PSNR (dB), up to step", *(str(steps * (part + 1) // PARTS) for part in range(PARTS)))
             row(*["---"] * (PARTS + 1))
         row(name, *(f"{value:.2f}" for value in psnr))
 

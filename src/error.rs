@@ -8,7 +8,9 @@ pub use globalsplat_files::panic_message;
 /// Result type of the library.
 pub type Result<T> = std::result::Result<T, Error>;
 
-/// Error of the library. [`Error::is_request`] distinguishes a wrong request from work that failed.
+/// Error of the library. [`Error::is_invalid_request`] distinguishes an invalid request from work that failed.
+///
+/// `Display` shows one sentence with all causes: the text of a [`source`](StdError::source) is part of the message.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
@@ -54,13 +56,13 @@ impl Error {
         globalsplat_files::Error::input(file, field, found, expected).into()
     }
 
-    /// Returns the error of an invalid setting: `field` is `found`, expected `expected`.
+    /// Returns the error of an invalid setting: `name` is `found`, expected `expected`.
     pub fn setting(
-        field: impl std::fmt::Display,
+        name: impl std::fmt::Display,
         found: impl std::fmt::Display,
         expected: impl std::fmt::Display,
     ) -> Self {
-        globalsplat_files::Error::setting(field, found, expected).into()
+        globalsplat_files::Error::setting(name, found, expected).into()
     }
 
     /// Returns the error of an invalid request that isn't a single setting.
@@ -73,11 +75,11 @@ impl Error {
         globalsplat_files::Error::failed(message).into()
     }
 
-    /// Returns a closure for `map_err` that wraps the error of another library: "`what`: its message".
-    pub fn failed_by<E: StdError + Send + Sync + 'static>(
-        what: impl std::fmt::Display,
+    /// Returns a closure for `map_err` that wraps an error as [`globalsplat_files::Error::Failed`] with the message "`context`: error".
+    pub fn failed_with_context<E: StdError + Send + Sync + 'static>(
+        context: impl std::fmt::Display,
     ) -> impl FnOnce(E) -> Self {
-        move |source| globalsplat_files::Error::failed_by(what)(source).into()
+        move |source| globalsplat_files::Error::failed_with_context(context)(source).into()
     }
 
     /// Returns a closure for `map_err` that wraps an I/O error of reading `path`.
@@ -92,9 +94,10 @@ impl Error {
         move |source| globalsplat_files::Error::write(path)(source).into()
     }
 
-    /// Returns `true` if a write failed because the disk was full, which may be temporary.
-    pub fn is_disk_full(&self) -> bool {
-        matches!(self, Error::Files(error) if error.is_disk_full())
+    /// Returns `true` if a write failed because the disk, the quota or the file-size limit (`ulimit -f`) is exhausted; the limit may be
+    /// raised while the program waits.
+    pub fn is_out_of_space(&self) -> bool {
+        matches!(self, Error::Files(error) if error.is_out_of_space())
     }
 
     /// Returns `true` if a file could not be written.
@@ -107,8 +110,8 @@ impl Error {
         matches!(self, Error::Distributed { .. })
     }
 
-    /// Returns `true` if the request was wrong (exit code 2), `false` if the work failed (exit code 1).
-    pub fn is_request(&self) -> bool {
-        matches!(self, Error::Files(error) if error.is_request())
+    /// Returns `true` if the request was invalid (exit code 2), `false` if the work failed (exit code 1).
+    pub fn is_invalid_request(&self) -> bool {
+        matches!(self, Error::Files(error) if error.is_invalid_request())
     }
 }

@@ -202,16 +202,16 @@ def poses(rng, *batch, turn=0.15, move=0.4):
     return pose
 
 
-def ring(count, tilt):
+def ring(count, elevation):
     """Returns camera-to-world matrices [count, 4, 4], float64, of cameras that look at the origin.
 
-    They are evenly spaced on a circle at distance 1 from the origin, elevated by the angle `tilt`.
+    They are evenly spaced on a circle at distance 1 from the origin, elevated by the angle `elevation` in radians.
     """
     pose = np.zeros((count, 4, 4))
     for i, turn in enumerate(2 * np.pi * np.arange(count) / count):
         level, below = np.array([np.sin(turn), 0.0, np.cos(turn)]), np.array([0.0, 1.0, 0.0])
-        down = np.cos(tilt) * below + np.sin(tilt) * level
-        forward = np.cos(tilt) * level - np.sin(tilt) * below
+        down = np.cos(elevation) * below + np.sin(elevation) * level
+        forward = np.cos(elevation) * level - np.sin(elevation) * below
         pose[i, :3, :3] = np.stack([np.cross(down, forward), down, forward], axis=-1)
         pose[i, :3, 3] = -forward
     pose[:, 3, 3] = 1.0

@@ -20,7 +20,7 @@ from harness.areas import CASES  # noqa: E402
 from harness.close_calls import closest, decisions_of_lpips  # noqa: E402
 from harness.compare import compare, compare_tensor  # noqa: E402
 from harness.perturb import find_undetected  # noqa: E402
-from harness.document import document  # noqa: E402
+from harness.document import format_document  # noqa: E402
 from harness.evaluate import Evaluation, answer_files  # noqa: E402
 from harness.runner import generator, run_cases, prepare_cases  # noqa: E402
 from harness.table import as_json, table  # noqa: E402
@@ -337,8 +337,8 @@ def test_the_document_has_results_but_no_paths(tmp_path, capsys):
     said = capsys.readouterr().out
     tried = re.search(r"(\d+) perturbed", said)[1]
     words = " ".join(written[0].split())
-    assert "2 draws of 1 case, none failed" in words and "mistakes are 2 times it." in words
-    assert f"Of {tried} wrong answers every one was noticed." in words
+    assert "2 draws of 1 case, none failed" in words and "at least 2 times the tolerance." in words
+    assert f"Of {tried} perturbed results, all were rejected." in words
     assert "\n\n    python parity/run.py --only 'ms?' --seed 1 --self-test --markdown parity.md\n\n" in written[0]
     assert "| mse | 2 | " in written[0] and "## Tolerances" not in written[0] and "## Failures" not in written[0]
 
@@ -353,14 +353,14 @@ def test_document_describes_failures():
 
     names = ["mse", "resample", "subsets"]
     results = list(run_cases(names, 0, spoiled, self_test=names))
-    text = document(results, "the command", "cpu")
+    text = format_document(results, "the command", "cpu")
     assert re.search(r"\| mse \| 2 \| \*\*1e-02 of 1e-05\*\* \|", text) and "\n- FAIL mse (seed 0), " in text
     assert "| subsets | 8 | exact |  |" in text and "- exact: " in text
     assert "\n- `resample`: results are rounded to 8 bits" in text
     missed = [dataclasses.replace(result, missed=["out.image: times 1.001"]) for result in results[-1:]]
-    assert "1 were not noticed:" in " ".join(document(missed, "the command", "cpu").split())
+    assert "1 were accepted:" in " ".join(format_document(missed, "the command", "cpu").split())
     unheld = [dataclasses.replace(result, tried=0) for result in results]
-    assert "wrong answers" not in document(unheld, "the command", "cpu")
+    assert "perturbed results" not in format_document(unheld, "the command", "cpu")
 
 
 def test_wrong_requests(tmp_path, capsys):

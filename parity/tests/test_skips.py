@@ -12,7 +12,7 @@ TESTS = {
     "test_module": "import pytest\npytest.importorskip('no_such_module')\n",
     "test_function": "import pytest\ndef test(): pytest.skip('golden tensors: nowhere')\n",
     "test_mark": "import pytest\n@pytest.mark.skip(reason='golden tensors: nowhere')\ndef test(): pass\n",
-    "test_expected": "import pytest\n@pytest.mark.xfail\ndef test(): assert False\n",
+    "test_xfail": "import pytest\n@pytest.mark.xfail\ndef test(): assert False\n",
     "test_passes": "def test(): pass\n",
 }
 
@@ -26,6 +26,7 @@ def run(folder, *command, **variables):
 
 
 def run_pytest(folder, *arguments, **variables):
+    # Loads parity/tests/conftest.py, which is on PYTHONPATH.
     options = ["-m", "pytest", "-q", "-p", "conftest", "-p", "no:cacheprovider", "--continue-on-collection-errors"]
     return run(folder, sys.executable, *options, *arguments, **variables)
 
@@ -55,7 +56,7 @@ def test_skips_fail_if_not_allowed(tests):
     assert result.stdout.count("no test may be skipped, but this was: golden tensors: nowhere") >= 2
 
 
-def test_missing_goldens_fail_but_a_missing_folder_skips(tmp_path):
+def test_missing_golden_files_fail_but_a_missing_golden_folder_skips(tmp_path):
     encoder = [REPOSITORY / "parity" / "tests" / "test_reference.py", "-k", "test_encoder"]
     result = run_pytest(tmp_path, *encoder, GLOBALSPLAT_GOLDEN=str(tmp_path))
     assert result.returncode == 1 and "2 failed" in result.stdout, result.stdout

@@ -90,8 +90,8 @@ pub fn bench_attention(
             }
         }
     }
-    let gflops = |operations: f64, spread: &TimingStats| 1e-6 * operations / spread.least;
-    let product_gflops = peak.gflops(TimingStats::from_milliseconds(product).least);
+    let gflops = |operations: f64, spread: &TimingStats| 1e-6 * operations / spread.min;
+    let product_gflops = peak.gflops(TimingStats::from_milliseconds(product).min);
     // Two products forward, five backward.
     let one = 2. * queries as f64 * keys as f64 * width as f64;
     let row = |pass, by, products: f64, milliseconds| {

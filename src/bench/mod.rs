@@ -16,7 +16,7 @@ pub use attention::{AttentionReport, AttentionRow, bench_attention};
 pub use loader::{LoaderReport, StageMilliseconds, bench_loader, synthetic_videos};
 pub use model::{ModelReport, bench_model};
 pub use parts::Part;
-pub use raster::{RasterReport, bench_raster, synthetic_scene};
+pub use raster::{RasterReport, bench_raster, synthetic_gaussians};
 pub use refine::{RefineReport, bench_refine};
 pub use synth::{SynthReport, bench_synth};
 pub use train::{DistributedCost, TrainReport, bench_train};
@@ -32,7 +32,8 @@ pub struct TimingStats {
     /// Median of the measurements.
     pub median: f64,
     /// Minimum of the measurements.
-    pub least: f64,
+    #[serde(rename = "least")]
+    pub min: f64,
     /// 75th percentile of the measurements, which shows the influence of other load on the machine.
     pub upper_quartile: f64,
 }
@@ -87,6 +88,6 @@ impl TimingStats {
     fn from_milliseconds(mut milliseconds: Vec<f64>) -> Self {
         milliseconds.sort_by(f64::total_cmp);
         let at = |share: f64| milliseconds[((milliseconds.len() - 1) as f64 * share).round() as usize];
-        TimingStats { median: at(0.5), least: at(0.), upper_quartile: at(0.75) }
+        TimingStats { median: at(0.5), min: at(0.), upper_quartile: at(0.75) }
     }
 }

@@ -81,7 +81,7 @@ pub fn bench_model(
         let watched = parts.record(device, forward)?;
         passes.push(unwatched.unwrap_or(watched));
     }
-    let peak_gflops = peak.gflops(TimingStats::from_milliseconds(products).least);
+    let peak_gflops = peak.gflops(TimingStats::from_milliseconds(products).min);
     Ok(ModelReport {
         views: config.data.context_views,
         size: config.data.image_size.into(),

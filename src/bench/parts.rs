@@ -74,7 +74,7 @@ impl PartRecorder {
     pub fn into_stats(self, peak_gflops: f64) -> Vec<Part> {
         let part = |sum: Sum| {
             let milliseconds = TimingStats::from_milliseconds(sum.milliseconds);
-            let share_of_peak = 1e-6 * sum.flops / milliseconds.least / peak_gflops;
+            let share_of_peak = 1e-6 * sum.flops / milliseconds.min / peak_gflops;
             let [gflop, backward_gflop, gigabytes] =
                 [sum.flops, sum.backward_flops, sum.bytes].map(|of| 1e-9 * of);
             Part { name: sum.name, milliseconds, gflop, backward_gflop, gigabytes, share_of_peak }

@@ -1,8 +1,7 @@
 //! Benchmark of the rasterizer: from tensors of Gaussians to images, and back to gradients.
 
 use super::{Measured, Section, TimingStats};
-use crate::device::Stopwatch;
-use crate::device::{peak_memory_bytes_on, reset_peak_memory, resident_memory_bytes};
+use crate::device::{Stopwatch, peak_memory_bytes_on, reset_peak_memory, resident_memory_bytes};
 use crate::error::Result;
 use crate::render::cpu::{StageTimes, count_pairs, multiply_add_peak, simd_level, stage_times};
 use crate::render::cuda::{kernel_times, measure_kernels};
@@ -12,6 +11,7 @@ use glam::{DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
+use std::f64::consts::TAU;
 use tch::{Device, Kind, Tensor, no_grad};
 
 /// Results of [`bench_raster`]. All times are milliseconds per view.
@@ -35,11 +35,12 @@ pub struct RasterReport {
     pub forward: TimingStats,
     /// Time of a call that records gradients and of its backward pass.
     pub forward_backward: TimingStats,
-    /// Stages on the CPU, or kernels on a GPU, in the order of execution. All launches of a kernel are added up.
+    /// Stages on the CPU, of the call with gradients, or kernels on a GPU, in the order of execution. All launches of a kernel are added
+    /// up.
     pub stages: Vec<Section>,
     /// Comparison of a GPU's results with the CPU's.
     #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub against_cpu: Vec<Agreement>,
+    pub against_cpu: Vec<TensorComparison>,
     /// Number of pairs to blend, per view.
     pub pairs: Pairs,
     /// Blending throughput, on the CPU only.
@@ -51,14 +52,16 @@ pub struct RasterReport {
 
 /// Comparison of one tensor of a GPU's results with the CPU's.
 #[derive(Debug, Serialize)]
-pub struct Agreement {
+pub struct TensorComparison {
     /// Name of the tensor, such as `rgb` or `gradient of means`.
     pub tensor: &'static str,
     /// Number of elements.
-    pub numbers: i64,
+    #[serde(rename = "numbers")]
+    pub elements: i64,
     /// Number of elements that aren't bit-identical.
-    pub other_bits: i64,
-    /// Norm of the differences, divided by the norm of the CPU's values.
+    #[serde(rename = "other_bits")]
+    pub differing_elements: i64,
+    /// Relative L2 difference; NaN or infinite if the CPU's tensor is zero.
     pub relative_difference: f64,
 }
 
@@ -100,6 +103,11 @@ const FORWARD_OPERATIONS: f64 = 38.;
 /// reciprocal 8, and the ten sums 19.
 const BACKWARD_OPERATIONS: f64 = 66.;
 
+/// Name of the stage of [`StageTimes::blend`].
+const BLEND: &str = "blend";
+/// Name of the stage of [`StageTimes::blend_backward`].
+const BLEND_BACKWARD: &str = "blend backward";
+
 /// Duration of the multiply-add measurement, in seconds.
 const PEAK_SECONDS: f64 = 0.2;
 
@@ -114,6 +122,7 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
     reset_peak_memory(device);
     let memory_before = match device {
         Device::Cpu => resident_memory_bytes(),
+        // Right after the reset, the GPU's peak is its current use.
         _ => peak_memory_bytes_on(device),
     };
     let (mut forward, mut forward_backward) = (vec![], vec![]);
@@ -122,9 +131,9 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
     for round in 0..=repeats {
         let mut watch = Stopwatch::new(device);
         watch.time("forward", || no_grad(|| render(gaussians, cameras, DEFAULT_EPS2D)))?;
-        let leaves = gaussians.map(|t| t.detach().set_requires_grad(true));
-        let pictures = watch.time("with gradients", || render(&leaves, cameras, DEFAULT_EPS2D))?;
-        let objective = sum_of_pictures(&pictures);
+        let parameters = gaussians.map(|t| t.detach().set_requires_grad(true));
+        let output = watch.time("with gradients", || render(&parameters, cameras, DEFAULT_EPS2D))?;
+        let objective = sum_of_images(&output);
         watch.time("with gradients", || objective.backward());
         if round > 0 {
             let sections = watch.sections()?;
@@ -147,7 +156,7 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
             let rates = rates(&stages, &pairs);
             (stages, Some(rates), vec![])
         }
-        _ => (kernels(gaussians, cameras, repeats)?, None, against_cpu(gaussians, cameras)?),
+        _ => (time_kernels(gaussians, cameras, repeats)?, None, compare_with_cpu(gaussians, cameras)?),
     };
     Ok(RasterReport {
         simd: simd_level()?,
@@ -171,58 +180,60 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
 }
 
 /// Returns an objective that depends on every element of every image.
-fn sum_of_pictures(pictures: &RenderOutput) -> Tensor {
-    let [rgb, alpha, depth] = [&pictures.rgb, &pictures.alpha, &pictures.depth].map(|t| t.sum(Kind::Float));
+fn sum_of_images(output: &RenderOutput) -> Tensor {
+    let [rgb, alpha, depth] = [&output.rgb, &output.alpha, &output.depth].map(|t| t.sum(Kind::Float));
     rgb + alpha + depth
 }
 
 /// Times each kernel of a GPU. It makes calls of its own, because events around every launch slow a call down.
-fn kernels(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) -> Result<Vec<Section>> {
+fn time_kernels(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) -> Result<Vec<Section>> {
     let views = (cameras.w2c.size()[0] * cameras.w2c.size()[1]) as f64;
     let mut measured = Measured::default();
-    for _ in 0..repeats {
+    let result: Result<()> = (0..repeats).try_for_each(|_| {
         measure_kernels(true);
-        pictures_and_gradients(gaussians, cameras)?;
+        render_with_gradients(gaussians, cameras)?;
         for time in kernel_times()? {
             measured.add_section(time.kernel.into(), time.milliseconds / views);
         }
-    }
+        Ok(())
+    });
     measure_kernels(false);
+    result?;
     Ok(measured.sections())
 }
 
 /// Compares the images and gradients of a GPU with the CPU's.
-fn against_cpu(gaussians: &Gaussians, cameras: &Cameras) -> Result<Vec<Agreement>> {
-    let here = pictures_and_gradients(gaussians, cameras)?;
-    let cpu = pictures_and_gradients(&gaussians.to_device(Device::Cpu), &cameras.to_device(Device::Cpu))?;
-    let agreement = |((tensor, here), (_, cpu)): (&(&'static str, Tensor), &(&'static str, Tensor))| {
-        let here = here.to_device(Device::Cpu);
+fn compare_with_cpu(gaussians: &Gaussians, cameras: &Cameras) -> Result<Vec<TensorComparison>> {
+    let gpu = render_with_gradients(gaussians, cameras)?;
+    let cpu = render_with_gradients(&gaussians.to_device(Device::Cpu), &cameras.to_device(Device::Cpu))?;
+    let compare = |((tensor, gpu), (_, cpu)): (&(&'static str, Tensor), &(&'static str, Tensor))| {
+        let gpu = gpu.to_device(Device::Cpu);
         let bits = |t: &Tensor| t.contiguous().view_dtype(Kind::Int);
-        Agreement {
+        TensorComparison {
             tensor,
-            numbers: cpu.numel() as i64,
-            other_bits: bits(&here).not_equal_tensor(&bits(cpu)).sum(Kind::Int64).int64_value(&[]),
-            relative_difference: (&here - cpu).norm().double_value(&[]) / cpu.norm().double_value(&[]),
+            elements: cpu.numel() as i64,
+            differing_elements: bits(&gpu).not_equal_tensor(&bits(cpu)).sum(Kind::Int64).int64_value(&[]),
+            relative_difference: (&gpu - cpu).norm().double_value(&[]) / cpu.norm().double_value(&[]),
         }
     };
-    Ok(here.iter().zip(&cpu).map(agreement).collect())
+    Ok(gpu.iter().zip(&cpu).map(compare).collect())
 }
 
 /// Renders the images, and computes the gradients of the sum of all images.
-fn pictures_and_gradients(gaussians: &Gaussians, cameras: &Cameras) -> Result<Vec<(&'static str, Tensor)>> {
-    let leaves = gaussians.map(|t| t.detach().set_requires_grad(true));
-    let pictures = render(&leaves, cameras, DEFAULT_EPS2D)?;
-    sum_of_pictures(&pictures).backward();
-    let RenderOutput { rgb, alpha, depth } = pictures;
+fn render_with_gradients(gaussians: &Gaussians, cameras: &Cameras) -> Result<Vec<(&'static str, Tensor)>> {
+    let parameters = gaussians.map(|t| t.detach().set_requires_grad(true));
+    let output = render(&parameters, cameras, DEFAULT_EPS2D)?;
+    sum_of_images(&output).backward();
+    let RenderOutput { rgb, alpha, depth } = output;
     Ok(vec![
         ("rgb", rgb.detach()),
         ("alpha", alpha.detach()),
         ("depth", depth.detach()),
-        ("gradient of means", leaves.means.grad()),
-        ("gradient of scales", leaves.scales.grad()),
-        ("gradient of quaternions", leaves.quaternions.grad()),
-        ("gradient of opacities", leaves.opacities.grad()),
-        ("gradient of sh", leaves.sh.grad()),
+        ("gradient of means", parameters.means.grad()),
+        ("gradient of scales", parameters.scales.grad()),
+        ("gradient of quaternions", parameters.quaternions.grad()),
+        ("gradient of opacities", parameters.opacities.grad()),
+        ("gradient of sh", parameters.sh.grad()),
     ])
 }
 
@@ -235,39 +246,40 @@ fn sections(stages: &[StageTimes], per_view: impl Fn(f64) -> f64) -> Vec<Section
         stage("project", |t| t.project),
         stage("sort", |t| t.sort),
         stage("bin", |t| t.bin),
-        stage("blend", |t| t.blend),
-        stage("blend backward", |t| t.blend_backward),
+        stage(BLEND, |t| t.blend),
+        stage(BLEND_BACKWARD, |t| t.blend_backward),
         stage("project backward", |t| t.project_backward),
     ]
 }
 
 fn rates(stages: &[Section], pairs: &Pairs) -> Rates {
     let peak = multiply_add_peak(PEAK_SECONDS);
-    let rate = |stage: &Section, operations: f64| {
+    let rate = |name: &str, operations: f64| {
+        let stage = stages.iter().find(|stage| stage.name == name).expect("every stage has a section");
         let per_second = pairs.contributing / (stage.milliseconds.median * 1e-3);
         Rate { gpairs_per_second: per_second * 1e-9, share_of_peak: per_second * operations / peak }
     };
     Rates {
         peak_gflops: peak * 1e-9,
-        blend: rate(&stages[3], FORWARD_OPERATIONS),
-        blend_backward: rate(&stages[4], BACKWARD_OPERATIONS),
+        blend: rate(BLEND, FORWARD_OPERATIONS),
+        blend_backward: rate(BLEND_BACKWARD, BACKWARD_OPERATIONS),
     }
 }
 
 /// Returns a synthetic scene that resembles a trained one, and `views` cameras that move past it, from a fixed seed. Projected sizes,
 /// elongations and opacities follow the published 16K splats. With more Gaussians each is smaller, so that they cover the same area.
-pub fn synthetic_scene(count: usize, views: usize, size: ImageSize) -> (Gaussians, Cameras) {
+pub fn synthetic_gaussians(count: usize, views: usize, size: ImageSize) -> (Gaussians, Cameras) {
     let mut random = ChaCha8Rng::seed_from_u64(0);
     let (width, height) = (f64::from(size.width), f64::from(size.height));
     let focal = 0.9 * width.max(height);
-    let finer = (16_384. / count.max(1) as f64).sqrt();
+    let scale_factor = (16_384. / count.max(1) as f64).sqrt();
     let [mut means, mut scales, mut quaternions, mut opacities, mut sh] = [(); 5].map(|()| Vec::<f32>::new());
     for _ in 0..count {
         let z = 3. * (0.4 * normal(&mut random)).exp();
         let (x, y) = (random.random_range(-0.55..0.55) * width, random.random_range(-0.55..0.55) * height);
         means.extend([x / focal * z, y / focal * z, z].map(|v| v as f32));
         for (median, spread) in [(0.0044, 0.75), (0.0065, 0.6), (0.0116, 0.55)] {
-            scales.push((finer * median * z * (spread * normal(&mut random)).exp()) as f32);
+            scales.push((scale_factor * median * z * (spread * normal(&mut random)).exp()) as f32);
         }
         quaternions.extend((0..4).map(|_| normal(&mut random) as f32));
         opacities.push((0.98 * random.random::<f64>().powf(1.35)) as f32);
@@ -281,10 +293,11 @@ pub fn synthetic_scene(count: usize, views: usize, size: ImageSize) -> (Gaussian
         opacities: Tensor::from_slice(&opacities).view([1, n]),
         sh: Tensor::from_slice(&sh).view([1, n, 16, 3]),
     };
-    (gaussians, walk(views, focal, width, height))
+    (gaussians, camera_path(views, focal, width, height))
 }
 
-fn walk(views: usize, focal: f64, width: f64, height: f64) -> Cameras {
+/// Returns `views` cameras that move sideways and forward while they turn.
+fn camera_path(views: usize, focal: f64, width: f64, height: f64) -> Cameras {
     let (mut w2c, mut intrinsics) = (vec![], vec![]);
     for i in 0..views {
         let t = i as f64 / (views.max(2) - 1) as f64 - 0.5;
@@ -308,6 +321,6 @@ fn walk(views: usize, focal: f64, width: f64, height: f64) -> Cameras {
 
 /// Samples a standard normal value with the Box-Muller transform.
 fn normal(random: &mut impl Rng) -> f64 {
-    let (radius, angle) = (1. - random.random::<f64>(), random.random::<f64>());
-    (-2. * radius.ln()).sqrt() * (std::f64::consts::TAU * angle).cos()
+    let (u, v) = (1. - random.random::<f64>(), random.random::<f64>());
+    (-2. * u.ln()).sqrt() * (TAU * v).cos()
 }

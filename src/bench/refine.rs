@@ -1,6 +1,6 @@
 //! Benchmark of a refinement step: the time of its parts, and the share of rendering.
 
-use super::{TimingStats, synthetic_scene};
+use super::{TimingStats, synthetic_gaussians};
 use crate::data::ViewBatch;
 use crate::device::Stopwatch;
 use crate::error::Result;
@@ -53,7 +53,7 @@ pub fn bench_refine(
     steps: u64,
     device: Device,
 ) -> Result<RefineReport> {
-    let (gaussians, cameras) = synthetic_scene(count, PHOTOS, size);
+    let (gaussians, cameras) = synthetic_gaussians(count, PHOTOS, size);
     let (gaussians, cameras) = (gaussians.to_device(device), cameras.to_device(device));
     let pictures = tch::no_grad(|| render(&gaussians, &cameras, DEFAULT_EPS2D))?;
     let c2w = cameras.w2c.inverse();

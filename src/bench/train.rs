@@ -122,19 +122,12 @@ pub fn bench_train(
     tch::set_num_threads(threads / slices_at_once as i32);
     let products = (0..=PRODUCTS).map(|_| peak.time()).skip(1).collect::<Result<Vec<_>>>();
     tch::set_num_threads(threads);
-    let peak_gflops = peak.gflops(TimingStats::from_milliseconds(products?).least);
+    let peak_gflops = peak.gflops(TimingStats::from_milliseconds(products?).min);
     let (milliseconds, sections) = measured.into_stats();
     let waited = sections.iter().find(|section| section.name == COMMUNICATION);
     let together = waited.map(|waited| {
         let scenes_per_second = 1e3 * (ranks * scenes.len()) as f64 / milliseconds.median;
-        measure_distributed_cost(
-            trainer,
-            &scenes,
-            steps,
-            &upload,
-            scenes_per_second,
-            waited.milliseconds.least,
-        )
+        measure_distributed_cost(trainer, &scenes, steps, &upload, scenes_per_second, waited.milliseconds.min)
     });
     Ok(TrainReport {
         scenes: scenes.len(),

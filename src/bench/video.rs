@@ -46,7 +46,7 @@ fn encode(frame: &RgbImage) -> Result<Vec<u8>> {
     let mut encoder = Encoder::new(&mut bytes, QUALITY);
     encoder.set_sampling_factor(SamplingFactor::R_4_2_0);
     let encoded = encoder.encode(frame.as_raw(), WIDTH as u16, HEIGHT as u16, ColorType::Rgb);
-    encoded.map_err(Error::failed_by("a frame can't be encoded"))?;
+    encoded.map_err(Error::failed_with_context("a frame can't be encoded"))?;
     Ok(bytes)
 }
 

@@ -6,7 +6,7 @@ use super::{device, memory, open_capture, parse_size, print_json, progress, warn
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use globalsplat::bench::{
-    RasterReport, TimingStats, bench_loader, bench_raster, bench_synth, synthetic_scene, synthetic_videos,
+    RasterReport, TimingStats, bench_loader, bench_raster, bench_synth, synthetic_gaussians, synthetic_videos,
 };
 use globalsplat::data::{DataConfig, TrainingScenes, load_all_views, view_batch};
 use globalsplat::error::Error;
@@ -121,7 +121,7 @@ impl Raster {
                 let gaussians = gaussians.to_local(&frame, splat.origin);
                 (gaussians, view_batch(&views, &poses, Device::Cpu).cameras())
             }
-            _ => synthetic_scene(self.gaussians, self.cameras, parse_size(&self.size)?),
+            _ => synthetic_gaussians(self.gaussians, self.cameras, parse_size(&self.size)?),
         };
         let gaussians = gaussians.to_device(device);
         let cameras = cameras.to_device(device);
@@ -217,7 +217,7 @@ impl Raster {
         let bar = progress::bar((GAUSSIANS.len() * SIZES.len()) as u64, "scenes");
         for count in GAUSSIANS {
             for (width, height) in SIZES {
-                let (gaussians, cameras) = synthetic_scene(count, 1, ImageSize { width, height });
+                let (gaussians, cameras) = synthetic_gaussians(count, 1, ImageSize { width, height });
                 let (gaussians, cameras) = (gaussians.to_device(device), cameras.to_device(device));
                 reports.push(bench_raster(&gaussians, &cameras, self.repeats as usize)?);
                 bar.inc(1);
@@ -259,17 +259,20 @@ fn print_report(r: &RasterReport) {
     );
     println!("{:<18} {:>8} {:>8} {:>8}", "ms per view", "median", "min", "p75");
     let row = |name: &str, s: &TimingStats| {
-        println!("{name:<18} {:>8.3} {:>8.3} {:>8.3}", s.median, s.least, s.upper_quartile);
+        println!("{name:<18} {:>8.3} {:>8.3} {:>8.3}", s.median, s.min, s.upper_quartile);
     };
     row("forward", &r.forward);
     row("forward+backward", &r.forward_backward);
     for stage in &r.stages {
         row(&format!("  {}", stage.name), &stage.milliseconds);
     }
-    for agreement in &r.against_cpu {
+    for comparison in &r.against_cpu {
         println!(
-            "{:<24} {} of {} numbers have other bits than the CPU's, relative difference {:.1e}",
-            agreement.tensor, agreement.other_bits, agreement.numbers, agreement.relative_difference
+            "{:<24} {} of {} elements differ from the CPU's, relative difference {:.1e}",
+            comparison.tensor,
+            comparison.differing_elements,
+            comparison.elements,
+            comparison.relative_difference
         );
     }
     let millions = |n: f64| n * 1e-6;

@@ -77,13 +77,13 @@ fn print_report(r: &AttentionReport, asked: &Attention) {
     );
     println!(
         "{:<10} {:<22} {:>10} {:>10} {:>10} {:>9}",
-        "ms a call", "", "median", "least", "GFLOP/s", "share"
+        "ms a call", "", "median", "min", "GFLOP/s", "share"
     );
     for row in &r.rows {
         let (ms, share) = (&row.milliseconds, 1e2 * row.share);
         println!(
             "{:<10} {:<22} {:>10.2} {:>10.2} {:>10.1} {share:>7.1} %",
-            row.pass, row.by, ms.median, ms.least, row.gflops
+            row.pass, row.by, ms.median, ms.min, row.gflops
         );
     }
 }

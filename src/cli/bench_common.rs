@@ -18,7 +18,7 @@ pub fn print_sections(title: &str, sections: &[Section], (name, whole): (&str, &
     println!("{title:<18} {:>10} {:>10} {:>10} {:>7}", "median", "min", "p75", "share");
     let row = |name: &str, s: &TimingStats| {
         let share = 1e2 * s.median / whole.median;
-        println!("{name:<18} {:>10.1} {:>10.1} {:>10.1} {share:>5.1} %", s.median, s.least, s.upper_quartile);
+        println!("{name:<18} {:>10.1} {:>10.1} {:>10.1} {share:>5.1} %", s.median, s.min, s.upper_quartile);
     };
     sections.iter().for_each(|section| row(&section.name, &section.milliseconds));
     row(name, whole);
@@ -28,7 +28,7 @@ pub fn print_sections(title: &str, sections: &[Section], (name, whole): (&str, &
 pub fn print_parts(title: &str, parts: &[Part], whole: &TimingStats) {
     println!(
         "{title:<20} {:>9} {:>9} {:>7} {:>9} {:>7} {:>13}",
-        "median", "least", "share", "GFLOP", "GB", "of the peak"
+        "median", "min", "share", "GFLOP", "GB", "of the peak"
     );
     for part in parts {
         let of_peak = match part.gflop > 0. {
@@ -43,5 +43,5 @@ pub fn print_parts(title: &str, parts: &[Part], whole: &TimingStats) {
 /// Prints the line of one part: its median and minimum time in milliseconds, its share of `whole`, and `rest`.
 pub fn print_part(name: &str, s: &TimingStats, whole: &TimingStats, rest: &str) {
     let share = 1e2 * s.median / whole.median;
-    println!("{name:<20} {:>9.1} {:>9.1} {share:>5.1} % {rest}", s.median, s.least);
+    println!("{name:<20} {:>9.1} {:>9.1} {share:>5.1} % {rest}", s.median, s.min);
 }

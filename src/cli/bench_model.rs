@@ -62,7 +62,7 @@ fn print_report(r: &ModelReport, asked: &Model) {
     print_parts("ms per pass", &r.parts, &r.milliseconds);
     let [flop, bytes] = [|part: &Part| part.gflop, |part: &Part| part.gigabytes]
         .map(|of| r.parts.iter().map(of).sum::<f64>());
-    let of_peak = 1e5 * flop / r.milliseconds.least / r.peak_gflops;
+    let of_peak = 1e5 * flop / r.milliseconds.min / r.peak_gflops;
     print_part(
         "pass",
         &r.milliseconds,

@@ -56,7 +56,7 @@ fn print_report(r: &RefineReport) {
         println!("{name:<28} {milliseconds:>10.2}");
     }
     let s = &r.milliseconds;
-    println!("{:<28} {:>10.2} median, {:.2} min, {:.2} p75", "step", s.median, s.least, s.upper_quartile);
+    println!("{:<28} {:>10.2} median, {:.2} min, {:.2} p75", "step", s.median, s.min, s.upper_quartile);
     if let Some(share) = r.other_share {
         println!("all but rendering: {:.0} %", 1e2 * share);
     }

@@ -148,7 +148,7 @@ fn print_report(r: &TrainReport) {
     println!(
         "{forward:.0} GFLOP forward and {backward:.0} for gradients: {:.1} % of the {:.0} GFLOP/s that a product of large matrices \
          reaches in {}",
-        1e5 * (forward + backward) / r.milliseconds.least / r.peak_gflops,
+        1e5 * (forward + backward) / r.milliseconds.min / r.peak_gflops,
         r.peak_gflops,
         r.precision
     );

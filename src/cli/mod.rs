@@ -162,7 +162,7 @@ pub fn main() -> ExitCode {
             let error = error.downcast::<globalsplat_files::Error>().map(Error::from);
             let error = error.or_else(|other| other.downcast::<Error>()).ok();
             tell(&message, error.as_ref().is_some_and(Error::is_distributed));
-            if error.as_ref().is_some_and(Error::is_request) { WRONG_REQUEST } else { FAILED }
+            if error.as_ref().is_some_and(Error::is_invalid_request) { WRONG_REQUEST } else { FAILED }
         }
         Err(panic) => {
             tell(&format!("internal error (please report): {}", panic_message(&*panic)), false);
@@ -177,8 +177,8 @@ pub fn main() -> ExitCode {
 const PRINTING: &str = "failed printing to stdout: ";
 
 /// Prints an error to standard error. Errors from below the program's own checks are reworded for the user.
-fn tell(message: &str, others_are_lost: bool) {
-    let Some(message) = ranks::message_to_print(message, others_are_lost) else { return };
+fn tell(message: &str, is_secondary: bool) {
+    let Some(message) = ranks::message_to_print(message, is_secondary) else { return };
     if message.contains("DefaultCPUAllocator") || message.contains("std::bad_alloc") {
         eprintln!("globalsplat: out of memory");
     } else if let Some((_, why)) = message.split_once(PRINTING) {

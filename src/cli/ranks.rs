@@ -15,7 +15,7 @@ pub fn join(name: &str) -> Result<(ProcessGroup, Device)> {
     let Some(dist_env) = DistributedEnv::from_env()? else {
         return Ok((ProcessGroup::single(), device::parse(name)?));
     };
-    let watch = Watchdog::begin(&dist_env, |why| {
+    let watch = Watchdog::start(&dist_env, |why| {
         why.iter().for_each(|why| eprintln!("globalsplat: {why}"));
         // Work that waits for a hung rank is abandoned.
         // SAFETY: nothing runs after it.
@@ -63,9 +63,10 @@ pub fn refuse() -> Result<()> {
 }
 
 /// Returns the error message that this process should print, or `None` if another process reports it.
-pub fn message_to_print(message: &str, others_are_lost: bool) -> Option<String> {
+/// `is_secondary` is `true` for a failed collective, which is usually the consequence of another rank's error.
+pub fn message_to_print(message: &str, is_secondary: bool) -> Option<String> {
     match WATCH.get() {
-        Some(watch) => watch.message_to_print(message, others_are_lost),
+        Some(watch) => watch.message_to_print(message, is_secondary),
         None => Some(message.into()),
     }
 }

@@ -158,7 +158,7 @@ impl Gif {
 fn not_encoded(path: &Path) -> impl FnOnce(gif::EncodingError) -> Error {
     move |e| match e {
         gif::EncodingError::Io(e) => Error::write(path)(e),
-        e => Error::failed_by(format_args!("{}: the video can't be encoded", path.display()))(e),
+        e => Error::failed_with_context(format_args!("{}: the video can't be encoded", path.display()))(e),
     }
 }
 
@@ -249,7 +249,7 @@ impl Mp4 {
         // Ctrl-C must reach only this program, which then ends ffmpeg.
         #[cfg(unix)]
         std::os::unix::process::CommandExt::process_group(&mut command, 0);
-        let mut ffmpeg = command.spawn().map_err(Error::failed_by("ffmpeg can't be started"))?;
+        let mut ffmpeg = command.spawn().map_err(Error::failed_with_context("ffmpeg can't be started"))?;
         let input = ffmpeg.stdin.take();
         let mut errors = ffmpeg.stderr.take().expect("a pipe was asked for");
         let said = std::thread::spawn(move || {

@@ -121,7 +121,7 @@ impl Stored {
             other => return Err(Error::failed(format!("tensors of type {other} are not stored"))),
         };
         TensorView::new(dtype, self.shape.clone(), &self.bytes)
-            .map_err(Error::failed_by("weights can't be serialized"))
+            .map_err(Error::failed_with_context("weights can't be serialized"))
     }
 }
 

@@ -42,7 +42,7 @@ impl Growth {
     pub fn convert(&self, name: &str, weights: &Tensor) -> Tensor {
         match name {
             "ray_patch_embeds.1.weight" | "rgb_patch_embeds.1.weight" => {
-                for_smaller_patches(weights, self.from.patch_size, self.patch_size_ratio)
+                shrink_patch_weights(weights, self.from.patch_size, self.patch_size_ratio)
             }
             "scene_tokens" if self.latent_ratio > 1 => {
                 let (m, d) = weights.size2().expect("[M, d]");
@@ -51,17 +51,17 @@ impl Growth {
                     &Tensor::randn([self.latent_ratio * m, d], (weights.kind(), weights.device())),
                 )
             }
-            "gaussian_decoder.geo_param_readout.bias" => shared_opacities(weights, self.latent_ratio),
+            "gaussian_decoder.geo_param_readout.bias" => split_opacity_bias(weights, self.latent_ratio),
             _ => weights.shallow_clone(),
         }
     }
 }
 
-/// Converts patch weights [d, p·p·C] for patches of `patch` × `patch` pixels to patches of 1 / `times` the edge. The result gives for a
-/// small patch what `weights` give for the same patch enlarged (spec 3.4).
-pub(crate) fn for_smaller_patches(weights: &Tensor, patch: i64, times: i64) -> Tensor {
-    let (d, edge) = (weights.size()[0], patch / times);
-    let pixels = weights.view([d, edge, times, edge, times, -1]);
+/// Converts patch weights [d, p·p·C] for patches of `patch` × `patch` pixels to patches of 1 / `patch_size_ratio` the edge. The result
+/// gives for a small patch what `weights` give for the same patch enlarged (spec 3.4).
+pub(crate) fn shrink_patch_weights(weights: &Tensor, patch: i64, patch_size_ratio: i64) -> Tensor {
+    let (d, edge) = (weights.size()[0], patch / patch_size_ratio);
+    let pixels = weights.view([d, edge, patch_size_ratio, edge, patch_size_ratio, -1]);
     pixels.sum_dim_intlist([2i64, 4].as_slice(), false, None::<Kind>).view([d, -1])
 }
 
@@ -73,7 +73,7 @@ pub(crate) fn repeat_scene_tokens(tokens: &Tensor, noise: &Tensor) -> Tensor {
 
 /// Shifts the opacity logits in the parameter head's bias, [10·K], so that `latent_ratio` overlapping Gaussians, of which each was half
 /// opaque, together cover half of what is behind them (spec 4.7).
-pub(crate) fn shared_opacities(bias: &Tensor, latent_ratio: i64) -> Tensor {
+pub(crate) fn split_opacity_bias(bias: &Tensor, latent_ratio: i64) -> Tensor {
     let shift = bias.zeros_like();
     let shared = ((1. / latent_ratio as f64).exp2() - 1.).ln();
     let _ = shift.view([-1, PARAMETERS]).select(1, OPACITY).fill_(shared);
@@ -99,7 +99,7 @@ mod tests {
             let enlarged =
                 small.repeat_interleave_self_int(times, 2, None).repeat_interleave_self_int(times, 3, None);
             let expected = patchify(&enlarged, patch).linear(&weights, None::<&Tensor>);
-            let of_small = for_smaller_patches(&weights, patch, times);
+            let of_small = shrink_patch_weights(&weights, patch, times);
             let found = patchify(&small, edge).linear(&of_small, None::<&Tensor>);
             let error = ((&found - &expected).norm() / expected.norm()).double_value(&[]);
             assert!(found.size() == [1, 2, 6, 5] && error < 1e-9, "{patch}, {times}: {error:.1e}");

@@ -43,7 +43,7 @@ pub(crate) use attention::{attention, attention_libtorch};
 pub(crate) use camera_code::CameraCode;
 pub(crate) use decoder::{Decoder, MAX_SCALE};
 pub(crate) use encoder::Encoder;
-pub(crate) use growth::{for_smaller_patches, repeat_scene_tokens, shared_opacities};
+pub(crate) use growth::{repeat_scene_tokens, shrink_patch_weights, split_opacity_bias};
 pub(crate) use merge::Candidates;
 pub(crate) use mixer::Mixer;
 pub(crate) use rotation::{quaternion_from_6d, rotation_matrix_from_6d};

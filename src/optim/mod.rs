@@ -4,6 +4,6 @@ mod address;
 mod muon;
 mod optimizer;
 
-pub use optimizer::{Optimizer, ParameterGroup, Rule};
+pub use optimizer::{Optimizer, ParameterGroup, UpdateRule};
 
 pub(crate) use optimizer::zero_grad;

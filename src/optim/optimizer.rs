@@ -17,7 +17,7 @@ const CLIP_EPS: f64 = 1e-6;
 
 /// Update rule of a parameter group.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Rule {
+pub enum UpdateRule {
     /// AdamW: each element is updated by running means of its gradient and of the gradient's square.
     AdamW,
     /// Muon: each matrix is updated along the (semi-)orthogonal matrix nearest to the running mean of its gradients.
@@ -31,7 +31,7 @@ pub enum Rule {
 #[derive(Debug)]
 pub struct ParameterGroup {
     /// Update rule.
-    pub rule: Rule,
+    pub rule: UpdateRule,
     /// Leaf tensors that require gradients, with their names. No other group uses these names.
     pub parameters: Vec<(String, Tensor)>,
     /// Learning rate: the approximate size of a step.
@@ -96,7 +96,7 @@ pub(crate) fn zero_grad<'a>(leaves: impl IntoIterator<Item = &'a Tensor>) {
 /// Settings that the parameters of a group share.
 #[derive(Debug, Clone, Copy)]
 struct Settings {
-    rule: Rule,
+    rule: UpdateRule,
     learning_rate: f64,
     weight_decay: f64,
 }
@@ -122,7 +122,7 @@ impl Optimizer {
         for (group, of) in groups.into_iter().enumerate() {
             for (name, value) in of.parameters {
                 let zeros = || value.zeros_like().detach();
-                let (first, second) = (zeros(), (of.rule == Rule::AdamW).then(zeros));
+                let (first, second) = (zeros(), (of.rule == UpdateRule::AdamW).then(zeros));
                 let parameter = Parameter { name: name.clone(), value, first, second, group, shard_index: 0 };
                 assert!(parameters.insert(name, parameter).is_none(), "each parameter once");
             }
@@ -263,9 +263,9 @@ impl Optimizer {
         let is_here = self.parameters.iter().all(|p| p.value.device() == Device::Cpu);
         for group in 0..self.groups.len() {
             match self.groups[group].rule {
-                Rule::AdamW if is_here => self.update_on_the_cpu(group),
-                Rule::AdamW => self.update_fused(group)?,
-                Rule::Muon { parts } => self.update_matrices(group, parts),
+                UpdateRule::AdamW if is_here => self.update_on_the_cpu(group),
+                UpdateRule::AdamW => self.update_fused(group)?,
+                UpdateRule::Muon { parts } => self.update_matrices(group, parts),
             }
         }
         Ok(())
@@ -389,7 +389,7 @@ mod tests {
 
     fn group(parameters: &[(&str, &Tensor)], learning_rate: f64, weight_decay: f64) -> ParameterGroup {
         let parameters = parameters.iter().map(|(name, t)| (name.to_string(), t.shallow_clone())).collect();
-        ParameterGroup { rule: Rule::AdamW, parameters, learning_rate, weight_decay }
+        ParameterGroup { rule: UpdateRule::AdamW, parameters, learning_rate, weight_decay }
     }
 
     /// Two implementations of a step: [`Optimizer::step`], which uses our own kernel for tensors on the CPU, and libtorch's fused kernel.

@@ -180,11 +180,12 @@ fn tokens(request: &Request) -> Result<Answer> {
 }
 
 fn growth(request: &Request) -> Result<Answer> {
-    let (patch, times) = (request.number("patch_size")?, request.number("times")?);
+    let (patch, patch_size_ratio) = (request.number("patch_size")?, request.number("patch_size_ratio")?);
+    let patch_weights = request.input("patch_weights")?;
     outputs([
-        ("patch_weights", model::for_smaller_patches(request.input("patch_weights")?, patch, times)),
+        ("patch_weights", model::shrink_patch_weights(patch_weights, patch, patch_size_ratio)),
         ("scene_tokens", model::repeat_scene_tokens(request.input("scene_tokens")?, request.input("noise")?)),
-        ("bias", model::shared_opacities(request.input("bias")?, request.number("copies")?)),
+        ("bias", model::split_opacity_bias(request.input("bias")?, request.number("latent_ratio")?)),
     ])
 }
 

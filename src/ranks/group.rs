@@ -186,7 +186,7 @@ impl ProcessGroup {
         let value = lengths.iter().enumerate().map(|(rank, &length)| {
             let bytes = &all[rank * longest..][..length as usize];
             rmp_serde::from_slice(bytes)
-                .map_err(Error::failed_by(format_args!("can't decode the value of rank {rank}")))
+                .map_err(Error::failed_with_context(format_args!("can't decode the value of rank {rank}")))
         });
         value.collect()
     }

@@ -5,7 +5,7 @@ use super::config::RefineConfig;
 use super::state::{CORRECTIONS, RefineState};
 use crate::data::{View, ViewBatch};
 use crate::error::Result;
-use crate::optim::{Optimizer, ParameterGroup, Rule};
+use crate::optim::{Optimizer, ParameterGroup, UpdateRule};
 use glam::{DMat4, DQuat, DVec3};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -62,7 +62,7 @@ impl Corrections {
         let group = |name: &str, t: &Option<Tensor>, rate: f64| {
             let parameters = vec![(name.into(), t.as_ref()?.shallow_clone())];
             Some((
-                ParameterGroup { rule: Rule::AdamW, parameters, learning_rate: 0., weight_decay: 0. },
+                ParameterGroup { rule: UpdateRule::AdamW, parameters, learning_rate: 0., weight_decay: 0. },
                 rate,
             ))
         };

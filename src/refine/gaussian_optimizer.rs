@@ -6,7 +6,7 @@ use super::options::MIN_GAUSSIANS;
 use super::relocate::relocate;
 use super::state::{GAUSSIANS, Growth, Record, RefineState};
 use crate::error::Result;
-use crate::optim::{Optimizer, ParameterGroup, Rule};
+use crate::optim::{Optimizer, ParameterGroup, UpdateRule};
 use crate::scene::{Gaussians, RawGaussians};
 use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeMap;
@@ -135,7 +135,7 @@ impl GaussianOptimizer {
         let is_late = missing > 0 && progress >= config.grow_until;
         if is_due && progress < config.relocate_until || is_late {
             if missing > 0 {
-                self.leaves = self.leaves.with_dead(missing);
+                self.leaves = self.leaves.append_dead(missing);
                 self.optimizer.extend(self.leaves.named_parameters(), 1);
             }
             let squared_gradients = self.optimizer.squared_gradients("means");
@@ -153,5 +153,5 @@ impl GaussianOptimizer {
 /// Returns a parameter group with one parameter, whose learning rate is set before each step.
 fn alone((name, t): (&str, &Tensor)) -> ParameterGroup {
     let parameters = vec![(name.into(), t.shallow_clone())];
-    ParameterGroup { rule: Rule::AdamW, parameters, learning_rate: 0., weight_decay: 0. }
+    ParameterGroup { rule: UpdateRule::AdamW, parameters, learning_rate: 0., weight_decay: 0. }
 }

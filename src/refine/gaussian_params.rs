@@ -7,79 +7,83 @@ use tch::{Device, Kind, Tensor};
 /// Opacity logit of Gaussians that wait for their relocation.
 const DEAD_LOGIT: f64 = -30.;
 
-/// Gaussians of one scene before activation. Colours are separate from the higher spherical harmonics, which have a smaller learning rate.
+/// Gaussians of one scene before activation. Spherical harmonics of degree 0 are separate from the others, which have a smaller learning
+/// rate.
 #[derive(Debug)]
 pub struct GaussianParams {
     /// Means, [1, N, 3].
     pub means: Tensor,
-    /// Logarithms of scales, [1, N, 3].
+    /// Natural logarithms of the scales, [1, N, 3].
     pub log_scales: Tensor,
-    /// Quaternions, [1, N, 4].
+    /// Quaternions (w, x, y, z), not normalized, [1, N, 4].
     pub quaternions: Tensor,
-    /// Logits of opacities, [1, N].
+    /// Logits of the opacities, [1, N].
     pub opacity_logits: Tensor,
-    /// Spherical harmonics of degree 0, [1, N, 1, 3].
-    pub colours: Tensor,
-    /// Spherical harmonics of higher degrees, [1, N, (degree + 1)² − 1, 3].
-    pub harmonics: Tensor,
+    /// Spherical harmonics coefficients of degree 0, [1, N, 1, 3].
+    pub sh0: Tensor,
+    /// Spherical harmonics coefficients of degrees 1 and above, [1, N, (degree + 1)² − 1, 3].
+    pub sh_rest: Tensor,
 }
 
 impl GaussianParams {
-    /// Copies `raw` to new parameters, with spherical harmonics up to `degree`, which is at least that of `raw`.
+    /// Copies `raw` into float32 leaf tensors that require gradients. Coefficients up to `degree`, at least the degree of `raw`, are added
+    /// as zeros.
     pub fn from_raw(raw: &RawGaussians, degree: i64) -> Self {
-        let leaf = |t: Tensor| t.detach().to_kind(Kind::Float).copy().set_requires_grad(true);
+        let parameter = |t: Tensor| t.detach().to_kind(Kind::Float).copy().set_requires_grad(true);
         let size = raw.sh.size();
         let bases = (degree + 1).pow(2);
-        let higher = Tensor::zeros([1, size[1], bases - 1, 3], (Kind::Float, raw.sh.device()));
-        let known = size[2] - 1;
-        higher.narrow(2, 0, known).copy_(&raw.sh.narrow(2, 1, known));
+        let sh_rest = Tensor::zeros([1, size[1], bases - 1, 3], (Kind::Float, raw.sh.device()));
+        let raw_count = size[2] - 1;
+        sh_rest.narrow(2, 0, raw_count).copy_(&raw.sh.narrow(2, 1, raw_count));
         GaussianParams {
-            means: leaf(raw.means.shallow_clone()),
-            log_scales: leaf(raw.log_scales.shallow_clone()),
-            quaternions: leaf(raw.quaternions.shallow_clone()),
-            opacity_logits: leaf(raw.opacity_logits.shallow_clone()),
-            colours: leaf(raw.sh.narrow(2, 0, 1)),
-            harmonics: leaf(higher),
+            means: parameter(raw.means.shallow_clone()),
+            log_scales: parameter(raw.log_scales.shallow_clone()),
+            quaternions: parameter(raw.quaternions.shallow_clone()),
+            opacity_logits: parameter(raw.opacity_logits.shallow_clone()),
+            sh0: parameter(raw.sh.narrow(2, 0, 1)),
+            sh_rest: parameter(sh_rest),
         }
     }
 
-    /// Creates parameters from the tensors that `of` returns for their names, which are copied to `device`.
+    /// Creates parameters from the tensors that `tensor` returns for their names, which are copied to `device`.
     ///
     /// # Errors
-    /// Returns the first error of `of`.
-    pub fn from_named<'a>(of: impl Fn(&str) -> Result<&'a Tensor>, device: Device) -> Result<Self> {
-        let leaf = |name: &str| {
-            Ok::<_, Error>(of(name)?.to_device(device).to_kind(Kind::Float).copy().set_requires_grad(true))
+    /// Returns the first error of `tensor`.
+    pub fn from_named<'a>(tensor: impl Fn(&str) -> Result<&'a Tensor>, device: Device) -> Result<Self> {
+        let parameter = |name: &str| {
+            let t = tensor(name)?.to_device(device).to_kind(Kind::Float).copy();
+            Ok::<_, Error>(t.set_requires_grad(true))
         };
         Ok(GaussianParams {
-            means: leaf("means")?,
-            log_scales: leaf("log_scales")?,
-            quaternions: leaf("quaternions")?,
-            opacity_logits: leaf("opacity_logits")?,
-            colours: leaf("colours")?,
-            harmonics: leaf("harmonics")?,
+            means: parameter("means")?,
+            log_scales: parameter("log_scales")?,
+            quaternions: parameter("quaternions")?,
+            opacity_logits: parameter("opacity_logits")?,
+            sh0: parameter("colours")?,
+            sh_rest: parameter("harmonics")?,
         })
     }
 
-    /// Returns these Gaussians and `count` more, which are copies of the first with hardly any opacity.
-    pub fn with_dead(&self, count: i64) -> Self {
-        let leaf = |t: &Tensor, more: &Tensor| Tensor::cat(&[t, more], 1).detach().set_requires_grad(true);
-        let with_copies = |t: &Tensor| {
+    /// Returns these Gaussians followed by `count` copies of the first one with almost no opacity (sigmoid(−30)), which the next relocation
+    /// moves. Requires at least one Gaussian.
+    pub fn append_dead(&self, count: i64) -> Self {
+        let append = |t: &Tensor, more: &Tensor| Tensor::cat(&[t, more], 1).detach().set_requires_grad(true);
+        let append_copies = |t: &Tensor| {
             let mut size = t.size();
             size[1] = count;
-            leaf(t, &t.narrow(1, 0, 1).expand(&size, false))
+            append(t, &t.narrow(1, 0, 1).expand(&size, false))
         };
         let logits = &self.opacity_logits;
         GaussianParams {
-            means: with_copies(&self.means),
-            log_scales: with_copies(&self.log_scales),
-            quaternions: with_copies(&self.quaternions),
-            opacity_logits: leaf(
+            means: append_copies(&self.means),
+            log_scales: append_copies(&self.log_scales),
+            quaternions: append_copies(&self.quaternions),
+            opacity_logits: append(
                 logits,
                 &Tensor::full([1, count], DEAD_LOGIT, (Kind::Float, logits.device())),
             ),
-            colours: with_copies(&self.colours),
-            harmonics: with_copies(&self.harmonics),
+            sh0: append_copies(&self.sh0),
+            sh_rest: append_copies(&self.sh_rest),
         }
     }
 
@@ -88,33 +92,32 @@ impl GaussianParams {
         self.means.size()[1]
     }
 
-    /// Returns the parameters with their names, in this order.
+    /// Returns the parameters with their names in a state file, in the order of the fields, by which learning rates are set.
     pub fn named_parameters(&self) -> [(&'static str, &Tensor); 6] {
         [
             ("means", &self.means),
             ("log_scales", &self.log_scales),
             ("quaternions", &self.quaternions),
             ("opacity_logits", &self.opacity_logits),
-            ("colours", &self.colours),
-            ("harmonics", &self.harmonics),
+            ("colours", &self.sh0),
+            ("harmonics", &self.sh_rest),
         ]
     }
 
-    /// Returns the activated Gaussians, with spherical harmonics up to `degree`; differentiable.
+    /// Returns the activated Gaussians, with spherical harmonics up to `degree`; differentiable. `degree` is at most the stored one.
     pub fn activate(&self, degree: i64) -> Gaussians {
         self.raw(degree).activate()
     }
 
     fn raw(&self, degree: i64) -> RawGaussians {
         let sh = match degree {
-            0 => self.colours.shallow_clone(),
+            0 => self.sh0.shallow_clone(),
             _ => {
-                let known = (degree + 1).pow(2) - 1;
-                let harmonics = match self.harmonics.size()[2] == known {
-                    true => self.harmonics.shallow_clone(),
-                    false => self.harmonics.narrow(2, 0, known),
-                };
-                Tensor::cat(&[&self.colours, &harmonics], 2)
+                let used_count = (degree + 1).pow(2) - 1;
+                // The gradient of a part takes another pass over memory.
+                let is_part = used_count < self.sh_rest.size()[2];
+                let used = if is_part { &self.sh_rest.narrow(2, 0, used_count) } else { &self.sh_rest };
+                Tensor::cat(&[&self.sh0, used], 2)
             }
         };
         RawGaussians {

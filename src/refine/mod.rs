@@ -257,7 +257,7 @@ pub fn scene_depth(gaussians: &Gaussians, views: &[View]) -> Result<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bench::synthetic_scene;
+    use crate::bench::synthetic_gaussians;
     use crate::device::num_threads;
     use crate::eval::score_views;
     use crate::scene::{ImageSize, Intrinsics, RawGaussians};
@@ -401,7 +401,7 @@ mod tests {
     /// The splat is compared over the background: one that is empty matches a photo that is masked out.
     #[test]
     fn masked_pixels_have_the_background_s_colour() {
-        let (gaussians, cameras) = synthetic_scene(40, 1, ImageSize { width: 32, height: 24 });
+        let (gaussians, cameras) = synthetic_gaussians(40, 1, ImageSize { width: 32, height: 24 });
         let pictures = render(&gaussians, &cameras, DEFAULT_EPS2D).unwrap();
         let config = RefineConfig { opacity: 0., ..RefineConfig::default() };
         let loss_of = |alpha: f64, masked: bool, background: [f32; 3]| {
@@ -429,7 +429,7 @@ mod tests {
     /// the device only where memory for (splat, tile) pairs is allocated.
     #[test]
     fn a_step_makes_only_expected_device_copies() {
-        let (gaussians, cameras) = synthetic_scene(40, 4, ImageSize { width: 32, height: 24 });
+        let (gaussians, cameras) = synthetic_gaussians(40, 4, ImageSize { width: 32, height: 24 });
         let pictures = render(&gaussians, &cameras, DEFAULT_EPS2D).unwrap();
         let c2w = cameras.w2c.inverse();
         let intrinsics = cameras.intrinsics.shallow_clone();

@@ -287,7 +287,7 @@ mod tests {
             (RefineOptions { views: Some(1), ..default() }, "number of views is 1"),
         ] {
             let error = options.check().unwrap_err();
-            assert!(error.is_request() && error.to_string().contains(expected), "{error}");
+            assert!(error.is_invalid_request() && error.to_string().contains(expected), "{error}");
         }
     }
 }

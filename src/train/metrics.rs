@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use std::path::Path;
 
 /// Returns the values that describe a step, with their names, except the terms of its loss.
-pub(super) fn progress(report: &StepReport, samples_per_second: f64) -> [(&'static str, f64); 7] {
+pub(super) fn step_values(report: &StepReport, samples_per_second: f64) -> [(&'static str, f64); 7] {
     [
         ("loss", report.losses.total),
         ("psnr", report.psnr()),
@@ -28,10 +28,10 @@ pub(super) fn loss_terms(report: &StepReport) -> [(&'static str, f64); Term::ALL
     Term::ALL.map(|term| (term.name(), report.losses[term]))
 }
 
-/// Values read from a line, which is that of a step or, if it has `validation`, of a validation after that step. Values that weren't finite
-/// are missing.
+/// Record read from one line of `metrics.jsonl`: a training step, or a validation if `validation` is set; `step` is then the last step
+/// before it. Values that weren't finite are `None`.
 #[derive(Debug, Default, Deserialize)]
-pub(super) struct Line {
+pub(super) struct MetricsRecord {
     pub step: u64,
     #[serde(default)]
     pub skipped: bool,
@@ -45,37 +45,37 @@ pub(super) struct Line {
     /// Names of the scenes of a skipped step.
     #[serde(default)]
     pub scenes: Vec<String>,
-    pub validation: Option<ValidationLine>,
+    pub validation: Option<ValidationRecord>,
 }
 
 /// Scores of a validation.
 #[derive(Debug, Deserialize)]
-pub(super) struct ValidationLine {
+pub(super) struct ValidationRecord {
     pub psnr: Option<f64>,
 }
 
 /// Writer of `metrics.jsonl`.
 #[derive(Debug)]
-pub(super) struct Metrics {
+pub(super) struct MetricsWriter {
     file: AppendFile,
-    /// Step before the last validation in the file.
-    validated: Option<u64>,
+    /// Last step before the latest validation in the file.
+    last_validated_step: Option<u64>,
 }
 
-impl Metrics {
+impl MetricsWriter {
     /// Opens the file of a run that continues after `step` steps. Removes the lines of later steps, which a stopped run wrote after the
     /// checkpoint that it continues from.
     pub fn open(path: &Path, step: u64) -> Result<Self> {
-        let mut validated = None;
+        let mut last_validated_step = None;
         if path.is_file() {
             let text = std::fs::read_to_string(path).map_err(Error::read(path))?;
             let mut kept = String::new();
             for line in text.lines() {
                 let line_value: Value = serde_json::from_str(line).unwrap_or_default();
-                if let Some(of) = line_value["step"].as_u64().filter(|of| *of < step) {
+                if let Some(line_step) = line_value["step"].as_u64().filter(|line_step| *line_step < step) {
                     kept.extend([line, "\n"]);
                     if line_value["validation"].is_object() {
-                        validated = validated.max(Some(of));
+                        last_validated_step = last_validated_step.max(Some(line_step));
                     }
                 }
             }
@@ -85,12 +85,13 @@ impl Metrics {
                 })?;
             }
         }
-        Ok(Metrics { file: AppendFile::open(path)?, validated })
+        Ok(MetricsWriter { file: AppendFile::open(path)?, last_validated_step })
     }
 
+    /// Appends the record of a step.
     pub fn log_step(&mut self, report: &StepReport, samples_per_second: f64) -> Result<()> {
         let mut line = json!({ "step": report.step, "skipped": report.skipped });
-        for (name, value) in progress(report, samples_per_second).into_iter().chain(loss_terms(report)) {
+        for (name, value) in step_values(report, samples_per_second).into_iter().chain(loss_terms(report)) {
             line[name] = value.into();
         }
         line["stage"] = report.stage.index.into();
@@ -100,20 +101,20 @@ impl Metrics {
         self.append(&line)
     }
 
-    /// Writes the scores of a validation after step `step`.
+    /// Appends the record of a validation after step `step`.
     pub fn log_validation(&mut self, step: u64, score: &Score) -> Result<()> {
         let Score { psnr, ssim, scenes, stage, .. } = score;
         let validation = json!({
             "psnr": psnr, "ssim": ssim, "scenes": scenes, "stage": stage.index, "mix": stage.mix,
         });
         self.append(&json!({ "step": step, "validation": validation }))?;
-        self.validated = Some(step);
+        self.last_validated_step = Some(step);
         Ok(())
     }
 
-    /// Returns the step before the last validation in the file.
-    pub fn last_validation(&self) -> Option<u64> {
-        self.validated
+    /// Returns the last step before the latest validation in the file.
+    pub fn last_validated_step(&self) -> Option<u64> {
+        self.last_validated_step
     }
 
     fn append(&mut self, line: &Value) -> Result<()> {
@@ -124,35 +125,37 @@ impl Metrics {
 /// Training curves of a run, read from its metrics.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Curves {
-    /// PSNR of training views, in dB: the last of several consecutive steps, and the mean over these steps.
+    /// PSNR of training views: (step, PSNR in dB) pairs; each averages consecutive steps and carries the last of them. Skipped steps are
+    /// left out.
     pub training: Vec<(u64, f64)>,
-    /// PSNR of held-out views, in dB: the last step before each validation, and its score.
+    /// PSNR of held-out views: (step, PSNR in dB) pairs; the step is the last one before the validation.
     pub held_out: Vec<(u64, f64)>,
 }
 
 impl Curves {
-    /// Reads the curves of the run in the folder `run`. The training curve has at most `parts` points.
+    /// Reads the curves of the run in the folder `run`. The training curve has at most `max_points` points; `max_points` is above 0.
     ///
     /// # Errors
     /// Returns an error if the metrics can't be read or have no step.
-    pub fn read(run: &Path, parts: u64) -> Result<Self> {
+    pub fn read(run: &Path, max_points: u64) -> Result<Self> {
         let path = run.join(METRICS_FILE);
         let text = std::fs::read_to_string(&path).map_err(Error::read(&path))?;
-        let lines = text.lines().filter_map(|line| serde_json::from_str::<Line>(line).ok());
+        let records = text.lines().filter_map(|line| serde_json::from_str::<MetricsRecord>(line).ok());
         let (mut steps, mut held_out) = (vec![], vec![]);
-        for line in lines {
-            match line.validation {
-                Some(validation) => held_out.extend(validation.psnr.map(|psnr| (line.step, psnr))),
-                None => steps.extend(line.psnr.map(|psnr| (line.step, psnr))),
+        for record in records {
+            match record.validation {
+                Some(validation) => held_out.extend(validation.psnr.map(|psnr| (record.step, psnr))),
+                None if record.skipped => {}
+                None => steps.extend(record.psnr.map(|psnr| (record.step, psnr))),
             }
         }
         if steps.is_empty() {
-            return Err(Error::input(&path, "the metrics", "no step", "one step or more"));
+            return Err(Error::input(&path, "the number of steps", 0, "1 or more"));
         }
         let mean = |part: &[(u64, f64)]| {
             (part[part.len() - 1].0, part.iter().map(|step| step.1).sum::<f64>() / part.len() as f64)
         };
-        let training = steps.chunks(steps.len().div_ceil(parts as usize)).map(mean).collect();
+        let training = steps.chunks(steps.len().div_ceil(max_points as usize)).map(mean).collect();
         Ok(Curves { training, held_out })
     }
 }
@@ -166,13 +169,15 @@ mod tests {
         let run = tempfile::tempdir().unwrap();
         let step = |step: u64| format!("{{\"step\": {step}, \"psnr\": {}.0}}\n", 10 + step);
         let mut text: String = (0..5).map(step).collect();
-        // A skipped step has no value, and the last line may be incomplete.
-        text += "{\"step\": 5, \"psnr\": null}\n{\"step\": 4, \"validation\": {\"psnr\": 8.5}}\n{\"step\": 6, \"ps";
+        // A skipped step is left out, even if only its gradient wasn't finite. The last line may be incomplete.
+        text += "{\"step\": 5, \"skipped\": true, \"psnr\": 99.0}\n{\"step\": 6, \"skipped\": true, \"psnr\": null}\n";
+        text += "{\"step\": 4, \"validation\": {\"psnr\": 8.5}}\n{\"step\": 7, \"ps";
         std::fs::write(run.path().join(METRICS_FILE), text).unwrap();
         let curves = Curves::read(run.path(), 2).unwrap();
         assert_eq!(curves.training, [(2, 11.), (4, 13.5)]);
         assert_eq!(curves.held_out, [(4, 8.5)]);
         std::fs::write(run.path().join(METRICS_FILE), "").unwrap();
-        assert!(Curves::read(run.path(), 2).unwrap_err().to_string().contains("no step"));
+        let error = Curves::read(run.path(), 2).unwrap_err().to_string();
+        assert!(error.ends_with("the number of steps is 0, expected 1 or more"), "{error}");
     }
 }

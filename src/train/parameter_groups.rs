@@ -1,7 +1,7 @@
 //! Parameter groups of a network: weight decay and update rule of each weight.
 
 use crate::config::{OptimizerKind, TrainConfig};
-use crate::optim::{ParameterGroup, Rule};
+use crate::optim::{ParameterGroup, UpdateRule};
 use tch::{Tensor, nn};
 
 /// Suffix of the weights of self-attention's queries, keys and values, which are one layer.
@@ -24,10 +24,10 @@ pub fn parameter_groups(vs: &nn::VarStore, config: &TrainConfig) -> Vec<Paramete
         weight_decay,
     };
     vec![
-        group(Rule::AdamW, decaying, config.weight_decay),
-        group(Rule::AdamW, others, 0.),
-        group(Rule::Muon { parts: 1 }, matrices, config.weight_decay),
-        group(Rule::Muon { parts: 3 }, threefold, config.weight_decay),
+        group(UpdateRule::AdamW, decaying, config.weight_decay),
+        group(UpdateRule::AdamW, others, 0.),
+        group(UpdateRule::Muon { parts: 1 }, matrices, config.weight_decay),
+        group(UpdateRule::Muon { parts: 3 }, threefold, config.weight_decay),
     ]
 }
 
@@ -93,7 +93,7 @@ mod tests {
         assert_eq!(counts(&muon)[2..], [2 + 2 * 9 + 2, 2]);
         assert_eq!(counts(&muon).iter().sum::<usize>(), counts(&adamw).iter().sum::<usize>());
         for (group, parts) in muon[2..].iter().zip([1, 3]) {
-            assert_eq!((group.rule, group.weight_decay), (Rule::Muon { parts }, 1e-6));
+            assert_eq!((group.rule, group.weight_decay), (UpdateRule::Muon { parts }, 1e-6));
             for (name, value) in &group.parameters {
                 assert!(name.starts_with("slot_encoder.") && value.dim() == 2, "{name}");
                 assert_eq!(value.size()[0] == 3 * value.size()[1], parts == 3, "{name}");

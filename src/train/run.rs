@@ -6,7 +6,7 @@ use super::checkpoint::{
 };
 use super::is_due;
 use super::lock::RunLock;
-use super::metrics::Metrics;
+use super::metrics::MetricsWriter;
 use super::step_report::StepReport;
 use super::tensorboard::TensorBoard;
 use super::trainer::Trainer;
@@ -86,7 +86,7 @@ pub fn run(
             "this rank has {found} held-out scenes, expected {expected}, as the first one"
         )));
     }
-    let validated = begun.as_ref().map(|(logger, _)| logger.metrics.last_validation());
+    let validated = begun.as_ref().map(|(logger, _)| logger.metrics.last_validated_step());
     let validated = trainer.group.broadcast_object(validated)?;
     let saved = begun.as_ref().map(|(_, saved)| saved.clone());
     let saved = trainer.group.broadcast_object(saved)?;
@@ -123,7 +123,7 @@ fn check_output_folder(out: &Path) -> Result<()> {
 /// Files that a run writes beside its checkpoints.
 struct RunLogger {
     _lock: RunLock,
-    metrics: Metrics,
+    metrics: MetricsWriter,
     tensorboard: TensorBoard,
     /// PSNR of the best checkpoint, in dB.
     best: Option<f64>,
@@ -158,7 +158,8 @@ impl RunLogger {
                 writer.write_all(toml.as_bytes()).map_err(Error::write(&config))
             })
         })?;
-        let metrics = retry_on_disk_full(on_event, || Metrics::open(&out.join(METRICS_FILE), trainer.step))?;
+        let metrics =
+            retry_on_disk_full(on_event, || MetricsWriter::open(&out.join(METRICS_FILE), trainer.step))?;
         let mut tensorboard =
             retry_on_disk_full(on_event, || TensorBoard::create(out, trainer.config.train.log_every))?;
         retry_on_disk_full(on_event, || tensorboard.start(trainer.step))?;
@@ -407,7 +408,7 @@ pub fn retry_on_disk_full<T>(
     let mut waited = false;
     loop {
         match write() {
-            Err(e) if e.is_disk_full() => {
+            Err(e) if e.is_out_of_space() => {
                 if !waited {
                     on_event(Event::Notice(format!(
                         "training paused: {e}; it resumes when there is disk space"

@@ -1,7 +1,7 @@
 //! TensorBoard log of a run in `RUN/tensorboard`, with one file for every time that the run was started or resumed.
 
 use super::is_due;
-use super::metrics::{loss_terms, progress};
+use super::metrics::{loss_terms, step_values};
 use super::step_report::StepReport;
 use super::validator::Score;
 use crate::error::Result;
@@ -32,9 +32,9 @@ impl TensorBoard {
             return Ok(());
         }
         let tagged = |group: &'static str| move |(name, value)| (format!("{group}/{name}"), value);
-        let progress = progress(report, samples_per_second).map(tagged("train"));
+        let values = step_values(report, samples_per_second).map(tagged("train"));
         let terms = loss_terms(report).map(tagged("loss"));
-        self.file.write_scalars(report.step, &[&progress[..], &terms].concat())
+        self.file.write_scalars(report.step, &[&values[..], &terms].concat())
     }
 
     pub fn log_picture(&mut self, report: &StepReport) -> Result<()> {

@@ -286,7 +286,7 @@ fn a_continued_refinement_equals_one_without_a_break() {
     // What doesn't fit is refused in a sentence.
     let refusal = |options: &RefineOptions| {
         let error = run(&capture, options, Initial::State(&state), 0).unwrap_err();
-        assert!(error.is_request(), "{error}");
+        assert!(error.is_invalid_request(), "{error}");
         error.to_string().replace(&format!("{}/", folder.path().display()), "")
     };
     assert_eq!(
@@ -301,7 +301,7 @@ fn a_continued_refinement_equals_one_without_a_break() {
     );
     write_splat(&folder.path().join("a.ply"), &unbroken.splat).unwrap();
     let error = RefineState::read(&folder.path().join("a.ply")).unwrap_err();
-    assert!(error.is_request(), "{error}");
+    assert!(error.is_invalid_request(), "{error}");
 }
 
 /// The program continues a refinement and logs it for `watch` and TensorBoard.

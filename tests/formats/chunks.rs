@@ -169,7 +169,7 @@ fn pack_and_inspect_report_their_results() {
 
 fn refusal(bytes: Vec<u8>) -> String {
     let error = Chunk::parse(Path::new("chunk.torch"), bytes).expect_err("a refusal");
-    assert!(error.is_request(), "{error}");
+    assert!(error.is_invalid_request(), "{error}");
     error.to_string()
 }
 

@@ -381,7 +381,8 @@ fn instruction_sets_agree() {
         if globalsplat::render::cpu::simd_level().is_err() {
             std::process::exit(UNSUPPORTED);
         }
-        let (g, c) = globalsplat::bench::synthetic_scene(16384, 12, ImageSize { width: 256, height: 256 });
+        let (g, c) =
+            globalsplat::bench::synthetic_gaussians(16384, 12, ImageSize { width: 256, height: 256 });
         let g = leaves(&of_any_length(&g));
         let p = draw(&g, &c);
         objective(&p).backward();

@@ -18,7 +18,7 @@ fn refused(format: Format, file: &str, change: impl FnOnce(&mut Vec<u8>), parts:
     change(&mut bytes);
     std::fs::write(&path, bytes).unwrap();
     let error = open_capture(&room).expect_err("a capture that can't be right");
-    assert!(error.is_request(), "exit code 2: {error:?}");
+    assert!(error.is_invalid_request(), "exit code 2: {error:?}");
     let error = error.to_string();
     assert_eq!(error.lines().count(), 1, "one sentence: {error}");
     for part in parts.iter().chain([&arg(&path)]) {
@@ -257,7 +257,7 @@ fn open_changed(name: &str, changes: impl Fn(&[u8]) -> Vec<Vec<u8>>) -> (TempDir
     let open = |path: &Path, bytes: Vec<u8>| {
         std::fs::write(path, bytes).unwrap();
         open_capture(&room).err().map(|error| {
-            assert!(error.is_request() && error.to_string().contains("sparse/0/"), "{error}");
+            assert!(error.is_invalid_request() && error.to_string().contains("sparse/0/"), "{error}");
             error.to_string()
         })
     };

@@ -1,4 +1,4 @@
-//! The documentation: reference pages are those that the code gives, links lead somewhere, and the book lists every page.
+//! Checks of the documentation: reference pages match the code, links resolve, and docs/SUMMARY.md lists every page.
 //!
 //! `GLOBALSPLAT_WRITE_REFERENCE=1 cargo test --release --test program book` writes the reference pages.
 
@@ -9,9 +9,15 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// Pages outside of `docs`.
-const OTHER_PAGES: [&str; 5] =
-    ["README.md", "CONTRIBUTING.md", "models/README.md", "csrc/README.md", "csrc/cuda/README.md"];
+/// Pages outside of `docs` and `crates`.
+const OTHER_PAGES: [&str; 6] = [
+    "README.md",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "models/README.md",
+    "csrc/README.md",
+    "csrc/cuda/README.md",
+];
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -35,10 +41,12 @@ fn help(command: &[String]) -> String {
     let output = Command::new(env!("CARGO_BIN_EXE_globalsplat"))
         .args(command)
         .arg("--help")
-        // The width to which help is wrapped.
+        // Help would otherwise wrap to the caller's terminal width.
         .env_remove("COLUMNS")
         .output()
         .expect("a program that starts");
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "globalsplat {} --help: {errors}", command.join(" "));
     String::from_utf8(output.stdout).expect("text")
 }
 
@@ -57,9 +65,9 @@ fn subcommands(help: &str) -> Vec<String> {
 fn append_command(page: &mut String, command: &[String]) {
     let text = help(command);
     let lines: Vec<&str> = text.trim_end().lines().map(str::trim_end).collect();
-    let marks = "#".repeat(command.len().clamp(1, 2) + 1);
+    let heading = "#".repeat(command.len().clamp(1, 2) + 1);
     page.push_str(&format!(
-        "\n{marks} globalsplat {}\n\n```text\n{}\n```\n",
+        "\n{heading} globalsplat {}\n\n```text\n{}\n```\n",
         command.join(" "),
         lines.join("\n")
     ));
@@ -69,9 +77,9 @@ fn append_command(page: &mut String, command: &[String]) {
 }
 
 #[test]
-fn the_page_of_commands_is_their_help() {
+fn commands_page_matches_help() {
     let mut page = String::from(
-        "# Commands\n\nThe help of every command, as the program prints it. A test holds this page to the program.\n",
+        "# Commands\n\nThe help of every command, as the program prints it. A test checks that this page is current.\n",
     );
     let names = subcommands(&help(&[]));
     assert!(names.len() > 10, "{names:?}");
@@ -88,7 +96,7 @@ struct Key {
 }
 
 /// Returns the public fields of a struct in `source`, with their doc comments.
-fn keys(source: &str, name: &str) -> Vec<Key> {
+fn parse_keys(source: &str, name: &str) -> Vec<Key> {
     let body = source.split(&format!("pub struct {name} {{\n")).nth(1).expect("a struct");
     let (mut keys, mut text) = (vec![], String::new());
     for line in body.lines().map(str::trim).take_while(|line| *line != "}") {
@@ -119,14 +127,14 @@ fn table(keys: &[Key], defaults: &toml::Table) -> String {
 }
 
 #[test]
-fn the_page_of_the_configuration_is_its_source() {
+fn configuration_page_matches_source() {
     let defaults: toml::Table = Config::default().to_toml().parse().expect("TOML");
     let section = |path: &[&str]| {
         path.iter().fold(&defaults, |table, name| table[*name].as_table().expect("a section")).clone()
     };
     let mut page = String::from(
         "# Configuration\n\nA configuration is a TOML file with these sections. Unknown keys are errors. `--set section.key=value` overrides a \
-         key. The files in `configs/` are examples. A test holds this page to the code.\n",
+         key. The files in `configs/` are examples. A test checks that this page is current.\n",
     );
     for (path, file, name) in [
         (&["model"][..], "src/model/config.rs", "ModelConfig"),
@@ -139,24 +147,27 @@ fn the_page_of_the_configuration_is_its_source() {
         page.push_str(&format!(
             "\n## [{}]\n\n{}",
             path.join("."),
-            table(&keys(&read(file), name), &section(path))
+            table(&parse_keys(&read(file), name), &section(path))
         ));
     }
     let refine = toml::Table::try_from(RefineConfig::default()).expect("plain values");
     page.push_str(&format!(
         "\n## refine\n\n`globalsplat refine --set key=value` changes these.\n\n{}",
-        table(&keys(&read("src/refine/config.rs"), "RefineConfig"), &refine)
+        table(&parse_keys(&read("src/refine/config.rs"), "RefineConfig"), &refine)
     ));
     check_or_write("docs/configuration.md", &page);
 }
 
 /// Returns every page, relative to the repository's root.
 fn pages() -> Vec<PathBuf> {
-    let docs =
-        fs::read_dir(root().join("docs")).expect("a folder").map(|entry| entry.expect("a file").path());
-    let docs = docs.filter(|path| path.extension().is_some_and(|ending| ending == "md"));
-    let docs = docs.map(|path| path.strip_prefix(root()).expect("a path below").to_path_buf());
-    docs.chain(OTHER_PAGES.map(PathBuf::from)).collect()
+    let entries = |folder: &'static str| {
+        let entries = fs::read_dir(root().join(folder)).expect("a folder");
+        entries.map(move |entry| Path::new(folder).join(entry.expect("a file").file_name()))
+    };
+    let docs = entries("docs").filter(|path| path.extension().is_some_and(|ending| ending == "md"));
+    let readmes = entries("crates").map(|folder| folder.join("README.md"));
+    let readmes = readmes.filter(|page| root().join(page).is_file());
+    docs.chain(readmes).chain(OTHER_PAGES.map(PathBuf::from)).collect()
 }
 
 /// Returns the anchors of a page's headings, as GitHub and mdBook make them.
@@ -183,7 +194,7 @@ fn links(text: &str) -> Vec<String> {
 }
 
 #[test]
-fn links_lead_somewhere() {
+fn links_resolve() {
     let mut count = 0;
     for page in pages() {
         let text = read(&page);
@@ -212,7 +223,7 @@ fn the_book_lists_every_page() {
     assert_eq!(listed, docs);
 }
 
-/// The door is short.
+/// README.md is an overview of at most 600 words.
 #[test]
 fn the_readme_has_600_words_at_most() {
     assert!(read("README.md").split_whitespace().count() <= 600);

@@ -175,6 +175,9 @@ fn environment_variables_are_filled_in() {
     assert_eq!(paths("${PATH}/a").unwrap(), [PathBuf::from(format!("{value}/a"))]);
     assert_eq!(paths("${GLOBALSPLAT_NO_SUCH:-b}/c").unwrap(), [PathBuf::from("b/c")]);
     assert!(
-        paths("${GLOBALSPLAT_NO_SUCH}/c").unwrap_err().to_string().contains("GLOBALSPLAT_NO_SUCH is not set")
+        paths("${GLOBALSPLAT_NO_SUCH}/c")
+            .unwrap_err()
+            .to_string()
+            .contains("GLOBALSPLAT_NO_SUCH is unset or empty")
     );
 }

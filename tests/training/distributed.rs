@@ -582,6 +582,23 @@ fn an_error_is_printed_once() {
     }
 }
 
+/// The first rank hosts the store, and waits for the other one after its failure. That must not change its exit code.
+#[test]
+fn an_invalid_request_that_only_the_first_rank_detects_exits_with_2() {
+    let Some(_turn) = turn() else { return };
+    let (folder, config) = data(2);
+    let run = folder.path().join("run");
+    fs::create_dir(&run).unwrap();
+    fs::write(run.join("config.toml"), "").unwrap();
+    let ended = Started::by_environment(2, &text(&train(&config, &run, &[]))).end();
+    assert_eq!((ended[0].code, ended[1].code), (Some(2), Some(1)), "{}{}", ended[0].err, ended[1].err);
+    let [sentence] = sentences(&ended[0].err)[..] else { panic!("one sentence: {}", ended[0].err) };
+    assert!(
+        sentence.contains("config.toml that no run wrote") && sentences(&ended[1].err).is_empty(),
+        "{sentence}"
+    );
+}
+
 #[test]
 fn ranks_with_different_training_are_refused() {
     let Some(_turn) = turn() else { return };

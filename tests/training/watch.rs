@@ -182,10 +182,11 @@ fn appended_and_rewritten_metrics_are_followed() {
     add(r#"{"step": 6, "loss": 0.5, "psnr": 3"#);
     assert_eq!(watch.state()["step"], STEPS);
     add(
-        "1.5}\n{\"step\": 7, \"skipped\": true, \"loss\": null, \"psnr\": null, \"scenes\": [\"a\", \"b\", \"c\", \"d\"]}\n",
+        "1.5}\n{\"step\": 7, \"skipped\": true, \"loss\": null, \"psnr\": 3.5, \"scenes\": [\"a\", \"b\", \"c\", \"d\"]}\n",
     );
     let state = watch.state();
     assert_eq!([&state["step"], &state["curves"]["psnr"][STEPS]], [&json!(8), &json!([6, 31.5])]);
+    assert_eq!(state["curves"]["psnr"].as_array().map(Vec::len), Some(STEPS + 1), "without the skipped step");
     let message = notices(&state);
     assert!(
         message.starts_with("1 step was skipped") && message.ends_with("step 7, and showed a, b, c, 1 more"),
@@ -442,8 +443,9 @@ fn a_browser_shows_it_and_follows_the_run() {
     browser.open_served(&format!("http://127.0.0.1:{}/", watch.port));
     wait_for(&mut browser, SHOWN, |shown| shown["points"] == STEPS);
     let mut file = OpenOptions::new().append(true).open(run.join("metrics.jsonl")).unwrap();
-    file.write_all(b"{\"step\": 6, \"psnr\": 20.5, \"skipped\": true, \"scenes\": [\"<img src=x>\"]}\n")
-        .unwrap();
+    let step = r#"{"step": 6, "psnr": 20.5}"#;
+    let skipped = r#"{"step": 7, "psnr": 3.5, "skipped": true, "scenes": ["<img src=x>"]}"#;
+    file.write_all(format!("{step}\n{skipped}\n").as_bytes()).unwrap();
     let shown = wait_for(&mut browser, SHOWN, |shown| shown["points"] == STEPS + 1);
     assert!(shown["notices"].as_str().unwrap().ends_with("showed <img src=x>"), "{shown}");
     assert_eq!(browser.errors(), [&json!(null); 0]);

@@ -348,7 +348,7 @@ fn the_first_format_that_can_be_read_is_taken() {
     );
     std::fs::write(folder.path().join("sparse/0/cameras.txt"), "nonsense").unwrap();
     let error = open_capture(folder.path()).unwrap_err();
-    assert!(error.is_request());
+    assert!(error.is_invalid_request());
     for part in
         ["none of its formats can be read", "cameras.json: the file", "cameras.txt: CAMERA_ID in line 1"]
     {

@@ -278,7 +278,7 @@ fn probe(file: &Path, named: &Path) -> Result<()> {
 fn refused(e: Error) -> Error {
     match e {
         // Disk space may become available later.
-        full if full.is_disk_full() => full,
+        full if full.is_out_of_space() => full,
         Error::Write { .. } => Error::request(e.to_string()),
         other => other,
     }
@@ -434,7 +434,8 @@ fn unless_missing(removed: io::Result<()>) -> io::Result<()> {
     }
 }
 
-fn parent_of(path: &Path) -> &Path {
+/// Returns the folder of `path`; for a bare file name, `.`.
+pub(crate) fn parent_of(path: &Path) -> &Path {
     path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
@@ -536,7 +537,7 @@ mod tests {
             assert_eq!(names(root.path()), [name]);
             fs::remove_file(file).unwrap();
         }
-        assert!(check_writable_file(&root.path().join("x".repeat(256))).unwrap_err().is_request());
+        assert!(check_writable_file(&root.path().join("x".repeat(256))).unwrap_err().is_invalid_request());
     }
 
     #[cfg(unix)]
@@ -576,7 +577,7 @@ mod tests {
             for error in [check_writable_file(&path).unwrap_err(), write(&path, "new").unwrap_err()] {
                 assert!(error.to_string().contains(found), "{error}");
             }
-            assert!(check_writable_file(&path).unwrap_err().is_request());
+            assert!(check_writable_file(&path).unwrap_err().is_invalid_request());
         }
         for file in ["fifo", "below/file"] {
             assert!(check_writable_dir(&at(file)).unwrap_err().to_string().contains("the name of a folder"));

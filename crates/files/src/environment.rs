@@ -4,26 +4,74 @@ use crate::{Error, Result};
 use std::ffi::OsString;
 use std::path::PathBuf;
 
-/// Returns the path that `text` names, with `${NAME}` and `${NAME:-default}` expanded. An empty variable counts as unset.
+/// Returns `text` with `${NAME}` and `${NAME:-default}` replaced by environment variables. An empty variable counts as unset. A default
+/// can't contain `}` or another variable; an unclosed `${` stays as it is.
 ///
 /// # Errors
 /// Returns an error if a variable is unset and has no default.
 pub fn expand_path(text: &str) -> Result<PathBuf> {
-    expand(text).map(PathBuf::from)
+    expand(text, |name| std::env::var_os(name)).map(PathBuf::from)
 }
 
-fn expand(text: &str) -> Result<OsString> {
-    let Some((before, rest)) = text.split_once("${") else { return Ok(text.into()) };
-    let Some((inside, after)) = rest.split_once('}') else { return Ok(text.into()) };
-    let (name, default) = match inside.split_once(":-") {
-        Some((name, default)) => (name, Some(OsString::from(default))),
-        None => (inside, None),
-    };
-    let value = std::env::var_os(name).filter(|v| !v.is_empty()).or(default);
-    let value = value.ok_or_else(|| {
-        Error::request(format!(
-            "{text}: the environment variable {name} is not set, expected it or a path in its place"
-        ))
-    })?;
-    Ok([before.into(), value, expand(after)?].into_iter().collect())
+/// Returns `text` with variables replaced by the values that `lookup` returns.
+fn expand(text: &str, lookup: impl Fn(&str) -> Option<OsString>) -> Result<OsString> {
+    let (mut expanded, mut rest) = (OsString::new(), text);
+    while let Some((before, opened)) = rest.split_once("${") {
+        let Some((inside, after)) = opened.split_once('}') else { break };
+        let (name, default) = match inside.split_once(":-") {
+            Some((name, default)) => (name, Some(OsString::from(default))),
+            None => (inside, None),
+        };
+        let value = lookup(name).filter(|value| !value.is_empty()).or(default);
+        let value = value.ok_or_else(|| {
+            Error::request(format!(
+                "{text}: the environment variable {name} is unset or empty, \
+                 expected a value or a default, as in ${{NAME:-DEFAULT}}"
+            ))
+        })?;
+        expanded.push(before);
+        expanded.push(value);
+        rest = after;
+    }
+    expanded.push(rest);
+    Ok(expanded)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn expand_known(text: &str) -> Result<OsString> {
+        expand(text, |name| match name {
+            "DATA" => Some("/mnt/data".into()),
+            "EMPTY" => Some("".into()),
+            _ => None,
+        })
+    }
+
+    #[test]
+    fn variables_and_defaults_are_expanded() {
+        for (text, expected) in [
+            ("", ""),
+            ("data/re10k", "data/re10k"),
+            ("${DATA}/re10k", "/mnt/data/re10k"),
+            ("a${DATA}b${DATA}c", "a/mnt/datab/mnt/datac"),
+            ("${DATA:-data}/${EMPTY:-re10k}/${UNSET:-}x", "/mnt/data/re10k/x"),
+            ("${DATA}/${DATA", "/mnt/data/${DATA"),
+            ("$DATA/{x}", "$DATA/{x}"),
+        ] {
+            assert_eq!(expand_known(text).expect("all variables"), expected, "{text}");
+        }
+    }
+
+    #[test]
+    fn an_unset_variable_is_reported_with_the_whole_text() {
+        for (text, name) in [("data/${DATA}/x/${UNSET}/y", "UNSET"), ("${DATA}${EMPTY}", "EMPTY")] {
+            let expected = format!(
+                "{text}: the environment variable {name} is unset or empty, \
+                 expected a value or a default, as in ${{NAME:-DEFAULT}}"
+            );
+            assert_eq!(expand_known(text).expect_err("an unset variable").to_string(), expected);
+        }
+    }
 }

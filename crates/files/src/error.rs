@@ -7,7 +7,9 @@ use std::path::{Path, PathBuf};
 /// Result type of the crates that read and write files.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// Error of reading, checking or writing files. [`Error::is_request`] distinguishes a wrong request from work that failed.
+/// Error of reading, checking or writing files. [`Error::is_invalid_request`] distinguishes an invalid request from work that failed.
+///
+/// `Display` shows one sentence with all causes: the text of a [`source`](StdError::source) is part of the message.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
@@ -24,10 +26,10 @@ pub enum Error {
         expected: String,
     },
     /// Invalid setting.
-    #[error("{field} is {found}, expected {expected}")]
+    #[error("{name} is {found}, expected {expected}")]
     Setting {
         /// Name of the setting.
-        field: String,
+        name: String,
         /// Its value.
         found: String,
         /// Value or values that were expected.
@@ -60,7 +62,7 @@ pub enum Error {
     Failed {
         /// Description of the failed work and the reason, in one sentence.
         message: String,
-        /// Error that caused the failure, if another library reported one. The message includes its text.
+        /// Error that caused the failure, if another library reported one.
         source: Option<Box<dyn StdError + Send + Sync>>,
     },
 }
@@ -81,14 +83,14 @@ impl Error {
         }
     }
 
-    /// Returns an [`Error::Setting`]: the setting `field` is `found`, expected `expected`.
+    /// Returns an [`Error::Setting`]: the setting `name` is `found`, expected `expected`.
     pub fn setting(
-        field: impl std::fmt::Display,
+        name: impl std::fmt::Display,
         found: impl std::fmt::Display,
         expected: impl std::fmt::Display,
     ) -> Self {
-        let (field, found, expected) = (field.to_string(), found.to_string(), expected.to_string());
-        Error::Setting { field, found, expected }
+        let (name, found, expected) = (name.to_string(), found.to_string(), expected.to_string());
+        Error::Setting { name, found, expected }
     }
 
     /// Returns an [`Error::Request`].
@@ -101,11 +103,14 @@ impl Error {
         Error::Failed { message: message.into(), source: None }
     }
 
-    /// Returns a closure for `map_err` that wraps the error of another library in an [`Error::Failed`]: "`what`: its message".
-    pub fn failed_by<E: StdError + Send + Sync + 'static>(
-        what: impl std::fmt::Display,
+    /// Returns a closure for `map_err` that wraps an error as [`Error::Failed`] with the message "`context`: error".
+    pub fn failed_with_context<E: StdError + Send + Sync + 'static>(
+        context: impl std::fmt::Display,
     ) -> impl FnOnce(E) -> Self {
-        move |source| Error::Failed { message: format!("{what}: {source}"), source: Some(Box::new(source)) }
+        move |source| Error::Failed {
+            message: format!("{context}: {source}"),
+            source: Some(Box::new(source)),
+        }
     }
 
     /// Returns a closure for `map_err` that wraps an I/O error in [`Error::Read`].
@@ -120,14 +125,15 @@ impl Error {
         move |source| Error::Write { path, source }
     }
 
-    /// Returns `true` if a write failed because the disk was full, which may be temporary.
-    pub fn is_disk_full(&self) -> bool {
+    /// Returns `true` if a write failed because the disk, the quota or the file-size limit (`ulimit -f`) is exhausted; the limit may be
+    /// raised while the program waits.
+    pub fn is_out_of_space(&self) -> bool {
         use std::io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
         matches!(self, Error::Write { source, .. } if matches!(source.kind(), StorageFull | QuotaExceeded | FileTooLarge))
     }
 
-    /// Returns `true` if the request was wrong, `false` if the work failed. Programs of this project exit with code 2 and 1.
-    pub fn is_request(&self) -> bool {
+    /// Returns `true` if the request was invalid (exit code 2), `false` if the work failed (exit code 1).
+    pub fn is_invalid_request(&self) -> bool {
         match self {
             Error::Input { .. } | Error::Setting { .. } | Error::Request { .. } => true,
             // The file itself is fine if there was too little memory to map it.
@@ -151,7 +157,7 @@ mod tests {
     #[test]
     fn errors_keep_their_sources() {
         let denied = || std::io::Error::from(std::io::ErrorKind::PermissionDenied);
-        let error = Error::failed_by("room.ply: the encoder failed")(denied());
+        let error = Error::failed_with_context("room.ply: the encoder failed")(denied());
         assert_eq!(error.to_string(), format!("room.ply: the encoder failed: {}", denied()));
         for error in [error, Error::read("room.ply")(denied()), Error::write("room.ply")(denied())] {
             let source = error.source().and_then(|source| source.downcast_ref::<std::io::Error>());

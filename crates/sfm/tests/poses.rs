@@ -92,7 +92,7 @@ fn poses_are_those_of_the_scene_and_a_stopped_estimate_continues() {
     // Other photos don't replace a capture.
     std::fs::remove_file(photos.join("05.png")).unwrap();
     let error = estimate_poses(&photos, &out, &sequential, &colmap, &mut |_| true).unwrap_err();
-    assert!(error.is_request() && error.to_string().contains("other or changed photos"), "{error}");
+    assert!(error.is_invalid_request() && error.to_string().contains("other or changed photos"), "{error}");
 }
 
 #[test]
@@ -136,7 +136,7 @@ fn photos_that_share_nothing_are_an_error() {
     for count in [4, 2] {
         let options = PoseOptions::default();
         let error = estimate_poses(&photos, &out, &options, &colmap, &mut |_| true).unwrap_err();
-        assert!(!error.is_request(), "{error}");
+        assert!(!error.is_invalid_request(), "{error}");
         let error = error.to_string();
         assert!(error.starts_with(&format!("COLMAP placed none of the {count} photos: ")), "{error}");
         assert_eq!(error.lines().count(), 1);

@@ -28,7 +28,7 @@ fn bad_requests_are_refused_in_one_sentence() {
     let at = |name: &str| folder.path().join(name);
     let refusal = |photos: &str, out: &str, options: PoseOptions| {
         let error = estimate_poses(&at(photos), &at(out), &options, &colmap, &mut |_| true).unwrap_err();
-        assert!(error.is_request(), "{error}");
+        assert!(error.is_invalid_request(), "{error}");
         error.to_string().replace(&format!("{}/", folder.path().display()), "")
     };
     let plain = PoseOptions::default;
@@ -69,7 +69,7 @@ fn bad_requests_are_refused_in_one_sentence() {
     let capture_refusal = |source: &str| {
         let options = CaptureOptions::default();
         let error = make_capture(&at(source), &at("new"), &options, &colmap, |_| true).unwrap_err();
-        assert!(error.is_request(), "{error}");
+        assert!(error.is_invalid_request(), "{error}");
         error.to_string().replace(&format!("{}/", folder.path().display()), "")
     };
     assert_eq!(

@@ -376,7 +376,7 @@ fn a_stopped_call_changes_nothing() {
             progress.pass != pass || progress.done < done
         });
         let error = stopped.unwrap_err();
-        assert!(!error.is_request());
+        assert!(!error.is_invalid_request());
         assert!(error.to_string().ends_with("video.mkv: stopped before all frames were written"), "{error}");
         assert!(!folder.exists() || names(&folder).is_empty());
     }
@@ -438,14 +438,14 @@ fn what_is_no_video_is_refused() {
         ("folder", "the path is no file, expected a video".into(), false),
     ] {
         let error = extract(&at(name), &at("frames"), None).unwrap_err();
-        assert!(error.is_request(), "{error}");
+        assert!(error.is_invalid_request(), "{error}");
         let (error, start) = (error.to_string(), format!("{}: ", at(name).display()));
         assert!(error.starts_with(&start) && error.ends_with(&expected), "{error}");
         assert_eq!(is_video(&at(name)).unwrap(), has_moving_pictures, "{name}");
     }
     for error in [extract(&at("none"), &at("frames"), None).unwrap_err(), is_video(&at("none")).unwrap_err()]
     {
-        assert!(error.is_request());
+        assert!(error.is_invalid_request());
         assert!(error.to_string().contains("none can't be read: "), "{error}");
     }
     for frames in [0, 2001] {
@@ -477,7 +477,7 @@ fn a_missing_ffmpeg_is_reported() {
         return;
     }
     for error in [extract(&video, Path::new("unused"), None).unwrap_err(), is_video(&video).unwrap_err()] {
-        assert!(error.is_request());
+        assert!(error.is_invalid_request());
         let missing = "video.rs: reading a video needs ffprobe, which isn't on the PATH (Debian and Ubuntu: apt install ffmpeg; ";
         assert!(error.to_string().contains(missing), "{error}");
     }

@@ -112,7 +112,7 @@ fn numbers_that_a_format_cannot_store_are_refused() {
         for splat in changed {
             let error = write_splat(&path, &splat).unwrap_err();
             assert_says(&error.to_string(), &["numbers that aren't finite"]);
-            assert!(!error.is_request());
+            assert!(!error.is_invalid_request());
         }
     }
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);

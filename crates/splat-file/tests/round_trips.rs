@@ -208,7 +208,7 @@ fn files_are_recognized() {
     assert!(!is_splat_name(Path::new("a.obj")));
     for (name, message) in [("a.obj", "the ending is .obj"), ("a", "the ending is missing")] {
         let error = write_splat(&folder.path().join(name), &splat).unwrap_err();
-        assert!(error.is_request());
+        assert!(error.is_invalid_request());
         assert_says(&error.to_string(), &[message, "expected .ply, .compressed.ply, .spz or .splat"]);
     }
 }

@@ -51,7 +51,7 @@ const LEAF: Child = 1 << 31;
 /// A ray, prepared for tests against boxes.
 struct Ray {
     origin: [Vec4; 3],
-    towards: [Vec4; 3],
+    direction: [Vec4; 3],
     inverse: [Vec4; 3],
     /// Index of the corner by which the ray enters, for each axis.
     enters: [usize; 3],
@@ -70,9 +70,9 @@ impl Bvh {
         (Bvh { nodes, leaves, root }, places)
     }
 
-    /// Returns the first triangle from `origin` in the direction `towards` (unit) that is nearer than `limit`.
-    pub fn closest_hit(&self, origin: Vec3, towards: Vec3, limit: f32) -> Option<Hit> {
-        let ray = Ray::new(origin, towards);
+    /// Returns the first triangle along the ray from `origin` in `direction` (unit) that is nearer than `limit`.
+    pub fn closest_hit(&self, origin: Vec3, direction: Vec3, limit: f32) -> Option<Hit> {
+        let ray = Ray::new(origin, direction);
         let mut found = Hit { slot: usize::MAX, distance: limit };
         let mut stack = [(0., self.root); STACK];
         let mut count = 1;
@@ -110,8 +110,8 @@ impl Bvh {
     }
 
     /// Returns `true` if the ray hits any triangle before `limit`.
-    pub fn is_occluded(&self, origin: Vec3, towards: Vec3, limit: f32) -> bool {
-        let ray = Ray::new(origin, towards);
+    pub fn is_occluded(&self, origin: Vec3, direction: Vec3, limit: f32) -> bool {
+        let ray = Ray::new(origin, direction);
         let mut stack = [self.root; STACK];
         let mut count = 1;
         while count > 0 {
@@ -143,12 +143,12 @@ fn lanes(mut mask: u32) -> impl Iterator<Item = usize> {
 }
 
 impl Ray {
-    fn new(origin: Vec3, towards: Vec3) -> Self {
+    fn new(origin: Vec3, direction: Vec3) -> Self {
         // The inverse must stay finite: infinity times a distance of zero is NaN.
-        let inverse = towards.map(|d| 1. / if d.abs() < 1e-20 { 1e-20f32.copysign(d) } else { d });
+        let inverse = direction.map(|d| 1. / if d.abs() < 1e-20 { 1e-20f32.copysign(d) } else { d });
         let splat = |v: Vec3| v.to_array().map(Vec4::splat);
-        let enters = towards.to_array().map(|d| usize::from(d.is_sign_negative()));
-        Ray { origin: splat(origin), towards: splat(towards), inverse: splat(inverse), enters }
+        let enters = direction.to_array().map(|d| usize::from(d.is_sign_negative()));
+        Ray { origin: splat(origin), direction: splat(direction), inverse: splat(inverse), enters }
     }
 }
 
@@ -172,9 +172,9 @@ impl Leaf {
     fn intersect(&self, ray: &Ray, limit: f32) -> ([f32; WIDTH], u32) {
         let Leaf { corner, right, up } = self;
         let normal = cross(right, up);
-        let scale = Vec4::ONE / dot(&normal, &ray.towards);
+        let scale = Vec4::ONE / dot(&normal, &ray.direction);
         let way: [Vec4; 3] = std::array::from_fn(|axis| corner[axis] - ray.origin[axis]);
-        let across = cross(&way, &ray.towards);
+        let across = cross(&way, &ray.direction);
         let (u, v) = (scale * dot(up, &across), -scale * dot(right, &across));
         let distance = scale * dot(&normal, &way);
         // NaN also gives `false`: the ray is parallel to the triangle, or the lane is empty.
@@ -301,29 +301,29 @@ mod tests {
             for i in 0..4000 {
                 let mut vector =
                     |size: f32| Vec3::from_array([(); 3].map(|()| random.random_range(-size..size)));
-                let (origin, mut towards) = (vector(14.), vector(1.).normalize());
+                let (origin, mut direction) = (vector(14.), vector(1.).normalize());
                 if i % 5 == 0 {
-                    towards = Vec3::AXES[i % 3] * [1., -1.][i / 5 % 2];
+                    direction = Vec3::AXES[i % 3] * [1., -1.][i / 5 % 2];
                 }
                 let limit = if i % 2 == 0 { f32::INFINITY } else { 6. };
-                let ray = Ray::new(origin, towards);
+                let ray = Ray::new(origin, direction);
                 let nearest = bvh.leaves.iter().flat_map(|leaf| {
                     let (distances, mask) = leaf.intersect(&ray, limit);
                     lanes(mask).map(move |lane| distances[lane])
                 });
                 let nearest = nearest.min_by(f32::total_cmp);
-                let found = bvh.closest_hit(origin, towards, limit);
+                let found = bvh.closest_hit(origin, direction, limit);
                 assert_eq!(
                     found.map(|hit| hit.distance),
                     nearest,
-                    "{count} triangles, from {origin} to {towards}"
+                    "{count} triangles, from {origin} along {direction}"
                 );
-                assert_eq!(bvh.is_occluded(origin, towards, limit), nearest.is_some());
+                assert_eq!(bvh.is_occluded(origin, direction, limit), nearest.is_some());
                 if let Some(hit) = found {
                     hits += 1;
                     let Triangle { v0, v1, v2 } = triangles[places[hit.slot].expect("a triangle")];
                     let (point, normal) =
-                        (Vec3A::from(origin + hit.distance * towards), (v1 - v0).cross(v2 - v0));
+                        (Vec3A::from(origin + hit.distance * direction), (v1 - v0).cross(v2 - v0));
                     assert!((point - v0).dot(normal.normalize()).abs() < 1e-3, "it isn't there");
                 }
             }

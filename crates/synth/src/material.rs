@@ -13,23 +13,31 @@ pub(super) struct Material {
     /// Colour factor on the texture.
     pub tint: Vec3,
     /// Emitted light, as a factor on the texture.
-    pub glow: f32,
+    pub emission: f32,
     /// Share of light that is mirrored at perpendicular incidence. The rest is scattered.
-    pub mirror: f32,
+    pub mirror_reflectance: f32,
     /// Strength of highlights.
-    pub gloss: f32,
+    pub specular: f32,
     /// Exponent of highlights. Larger values give smaller highlights.
-    pub polish: f32,
+    pub shininess: f32,
 }
 
 impl Material {
     /// Creates a matte material with `texture` at its natural size.
     pub fn matte(texture: Arc<Texture>) -> Material {
         let repeats = Affine2::from_scale(Vec2::splat(1. / texture.repeat_metres));
-        Material { texture, repeats, tint: Vec3::ONE, glow: 0., mirror: 0., gloss: 0., polish: 1. }
+        Material {
+            texture,
+            repeats,
+            tint: Vec3::ONE,
+            emission: 0.,
+            mirror_reflectance: 0.,
+            specular: 0.,
+            shininess: 1.,
+        }
     }
 
-    /// Returns the reflectance at `uv` metres along the surface, blurred over `footprint` metres.
+    /// Returns the diffuse reflectance at `uv` metres along the surface, blurred over `footprint` metres.
     pub fn reflectance(&self, uv: Vec2, footprint: f32) -> Vec3 {
         let scale = self.repeats.matrix2.determinant().abs().sqrt();
         // The v axis points up on surfaces and down in images.

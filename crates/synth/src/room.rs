@@ -298,14 +298,14 @@ fn light(builder: &mut SceneBuilder, size: Vec3, sky: &mut Sky, has_openings: bo
                 colour,
             });
             let mut glass = builder.material(Purpose::Ceiling);
-            glass.glow = 3.;
+            glass.emission = 3.;
             let panel = cuboid(vec3(2. * half.x, 0.03, 2. * half.y), 0.);
             builder.add_mesh(panel, &glass, Affine3A::from_translation(at - 0.03 * Vec3::Y));
         } else {
             let below = builder.within(0.2..(0.35 * size.y));
             let (radius, at) = (builder.within(0.05..0.2), at - below * Vec3::Y);
             let mut glass = builder.material(Purpose::Ceiling);
-            glass.glow = 3.;
+            glass.emission = 3.;
             let ball = superellipsoid(Vec3::splat(2. * radius), [1., 1.], 8);
             builder.add_mesh(ball, &glass, Affine3A::from_translation(at));
             let cord = builder.material(Purpose::Thing);

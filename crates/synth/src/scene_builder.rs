@@ -98,10 +98,10 @@ impl SceneBuilder {
             _ => 0.05,
         };
         if self.chance(glossy) {
-            material.gloss = self.log_uniform(0.02, 0.3);
-            material.polish = self.log_uniform(8., 300.);
+            material.specular = self.log_uniform(0.02, 0.3);
+            material.shininess = self.log_uniform(8., 300.);
             if self.chance(0.3) {
-                material.mirror = self.log_uniform(0.02, 0.12);
+                material.mirror_reflectance = self.log_uniform(0.02, 0.12);
             }
         }
         material

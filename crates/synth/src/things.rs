@@ -324,8 +324,8 @@ pub(super) fn bed(builder: &mut SceneBuilder, transform: Affine3A) {
 /// Adds a lamp of `height` metres: a shade on a stand, which glows if the lamp is on.
 pub(super) fn lamp(builder: &mut SceneBuilder, transform: Affine3A, height: f32) {
     let (stand, mut shade) = (builder.material(Purpose::Thing), builder.material(Purpose::Thing));
-    shade.glow = if builder.chance(0.6) { builder.within(0.5..2.5) } else { 0. };
-    shade.gloss = 0.;
+    shade.emission = if builder.chance(0.6) { builder.within(0.5..2.5) } else { 0. };
+    shade.specular = 0.;
     let wide = (0.3 * height).min(0.25) * builder.within(0.7..1.3);
     let foot =
         [vec2(0., 0.), vec2(0.5 * wide, 0.), vec2(0.5 * wide, 0.02), vec2(0.012, 0.03), vec2(0.012, height)];
@@ -338,7 +338,7 @@ pub(super) fn lamp(builder: &mut SceneBuilder, transform: Affine3A, height: f32)
 /// Adds leaves on arching stems, up to `reach` metres long.
 pub(super) fn leaves(builder: &mut SceneBuilder, transform: Affine3A, reach: f32, count: usize) {
     let mut material = builder.material(Purpose::Foliage);
-    material.mirror = 0.;
+    material.mirror_reflectance = 0.;
     let mut all = Mesh::default();
     let slim = builder.within(0.06..0.35);
     let droop = builder.within(-0.3..1.2);
@@ -395,7 +395,7 @@ pub(super) fn mirror(builder: &mut SceneBuilder, transform: Affine3A) {
         transform * at(0., -0.5 * size.y - 0.04, 0.015),
     );
     let mut glass = builder.material(Purpose::Ceiling);
-    (glass.mirror, glass.gloss) = (0.9, 0.);
+    (glass.mirror_reflectance, glass.specular) = (0.9, 0.);
     let sheet = Mesh::rectangle((-0.5 * size).extend(0.032), vec3(size.x, 0., 0.), vec3(0., size.y, 0.), 0.5);
     builder.add_mesh(sheet, &glass, transform);
 }
@@ -522,7 +522,7 @@ pub(super) fn house(builder: &mut SceneBuilder, transform: Affine3A) {
 fn window_glass(builder: &mut SceneBuilder) -> Material {
     let mut glass = builder.material(Purpose::Ceiling);
     glass.tint = Vec3::splat(builder.within(0.03..0.25));
-    glass.mirror = builder.within(0.05..0.3);
+    glass.mirror_reflectance = builder.within(0.05..0.3);
     glass
 }
 

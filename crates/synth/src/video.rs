@@ -78,7 +78,7 @@ impl Video {
 
     /// Returns the number of triangles in the scene.
     pub fn triangles(&self) -> usize {
-        self.tracer.triangles()
+        self.tracer.triangle_count()
     }
 
     /// Renders image `index`.
@@ -122,7 +122,7 @@ impl Video {
                 let jitter = vec2(random.uniform(), random.uniform());
                 let at = vec2(x as f32, y as f32) + (cell + jitter) / RAYS as f32;
                 let on_light = vec2(random.uniform(), random.uniform());
-                let choice = SampleChoice { turn: sample as usize, on_light };
+                let choice = SampleChoice { sample_index: sample as usize, on_light };
                 let Some(ray) = towards(at) else { continue };
                 let radiance = self.tracer.trace(eye, ray, spread, choice);
                 // Clamp the radiance, so that a ray that hits a lamp doesn't dominate its pixel.
@@ -216,7 +216,7 @@ fn mean_light(tracer: &Tracer, cameras: &[Camera]) -> Vec3 {
         for i in 0..SIDE * SIDE {
             let cell = vec2((i % SIDE) as f32 + 0.5, (i / SIDE) as f32 + 0.5) / SIDE as f32;
             let at = cell * vec2(camera.width as f32, camera.height as f32);
-            let choice = SampleChoice { turn: i, on_light: Vec2::splat(0.5) };
+            let choice = SampleChoice { sample_index: i, on_light: Vec2::splat(0.5) };
             let radiance = tracer.trace(eye, towards(camera, at), 0.05, choice);
             sum += radiance.max(Vec3::splat(0.01)).map(f32::ln);
         }

@@ -81,7 +81,7 @@ pub fn write_checkpoint(
         }
         add("version", VERSION)
     })();
-    let failed = |e: ZipError| Error::failed_by(path.display())(e);
+    let failed = |e: ZipError| Error::failed_with_context(path.display())(e);
     written.map_err(failed)?;
     let bytes = zip.finish().map_err(failed)?.into_inner();
     write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))

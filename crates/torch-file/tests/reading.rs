@@ -99,7 +99,7 @@ fn files_that_were_cut_off_are_refused() {
     for (name, bytes) in FILES {
         for length in 0..bytes.len() {
             let error = TorchFile::parse(Path::new(name), &bytes[..length]).expect_err(name);
-            assert!(error.is_request() && error.to_string().starts_with(name), "{error}");
+            assert!(error.is_invalid_request() && error.to_string().starts_with(name), "{error}");
         }
     }
 }

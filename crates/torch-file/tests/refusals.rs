@@ -162,7 +162,7 @@ fn tensors_stay_inside_their_storages() {
 fn archives_that_inflate_are_refused() {
     let refusal = |bytes: &[u8]| {
         let error = Archive::parse(Path::new("a.pt"), bytes).expect_err("a refusal");
-        assert!(error.is_request(), "{error}");
+        assert!(error.is_invalid_request(), "{error}");
         error.to_string()
     };
     let pickle = b"\x80\x02}.";

@@ -8,25 +8,26 @@ from ..registry import Draw, case, reference_for
 
 @case
 def growth(rng):
-    """Patches of 1/2, 1/3 and 1/4 of the edge, up to four scene tokens for one; one draw keeps both unchanged."""
-    for patch, times, copies, channels in [(4, 2, 2, 3), (9, 3, 3, 6), (8, 4, 4, 3), (5, 1, 1, 3)]:
+    """Patch edges divided by 2, 3 and 4, and up to four copies of each scene token; one draw changes neither."""
+    for patch, patch_size_ratio, latent_ratio, channels in [(4, 2, 2, 3), (9, 3, 3, 6), (8, 4, 4, 3), (5, 1, 1, 3)]:
         width, latents, candidates = 7, 5, 4
         inputs = {
             "patch_weights": normal(rng, width, patch * patch * channels),
             "scene_tokens": normal(rng, latents, width),
-            "noise": normal(rng, copies * latents, width),
+            "noise": normal(rng, latent_ratio * latents, width),
             "bias": normal(rng, 10 * candidates),
         }
-        label = f"patch {patch} to {patch // times}, {latents} tokens to {copies * latents}"
-        yield Draw(label, inputs, {"patch_size": patch, "times": times, "copies": copies}, differentiate=tuple(inputs))
+        label = f"patch {patch} to {patch // patch_size_ratio}, {latents} tokens to {latent_ratio * latents}"
+        config = {"patch_size": patch, "patch_size_ratio": patch_size_ratio, "latent_ratio": latent_ratio}
+        yield Draw(label, inputs, config, differentiate=tuple(inputs))
 
 
 @reference_for("growth")
 def growth_reference(config, params, inputs):
     return {
-        "patch_weights": reference.growth.for_smaller_patches(
-            inputs["patch_weights"], config["patch_size"], config["times"]
+        "patch_weights": reference.growth.shrink_patch_weights(
+            inputs["patch_weights"], config["patch_size"], config["patch_size_ratio"]
         ),
-        "scene_tokens": reference.growth.more_tokens(inputs["scene_tokens"], inputs["noise"]),
-        "bias": reference.growth.shared_opacities(inputs["bias"], config["copies"]),
+        "scene_tokens": reference.growth.repeat_scene_tokens(inputs["scene_tokens"], inputs["noise"]),
+        "bias": reference.growth.split_opacity_bias(inputs["bias"], config["latent_ratio"]),
     }

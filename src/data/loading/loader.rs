@@ -5,7 +5,7 @@ use super::bad_data::{BadData, BadDataLog, BadSceneReport, Fault};
 use super::group_cache::{CachedGroup, GroupCache};
 use super::order::{Order, SceneIndex};
 use super::sample::{Batch, PendingBatch};
-use super::sampler::{choose_views, context_views};
+use super::sampler::{choose_views, draw_context_count};
 use super::scene::{LoadTimes, LoadedScene};
 use super::scenes::SceneGroups;
 use super::shard::BatchShard;
@@ -155,7 +155,7 @@ impl DataLoader {
                 }
             };
             let spawned = std::thread::Builder::new().name(format!("loader-{thread}")).spawn(work);
-            let spawned = spawned.map_err(Error::failed_by("a loading thread can't be started"))?;
+            let spawned = spawned.map_err(Error::failed_with_context("a loading thread can't be started"))?;
             loader.receivers.push(receiver);
             loader.threads.push(spawned);
         }
@@ -275,7 +275,7 @@ impl Shared {
         let mut random = ChaCha8Rng::seed_from_u64(self.seed);
         random.set_stream(sample);
         state.times = LoadTimes::default();
-        let views = context_views(&self.config, self.seed, step);
+        let context_count = draw_context_count(&self.config, self.seed, step);
         let (first, groups) = self.order.locate(sample);
         for group in groups {
             let start = Instant::now();
@@ -302,7 +302,13 @@ impl Shared {
                     shuffled = usize::MAX;
                 }
                 let scene_index = SceneIndex { group, scene: turns[turn] };
-                match self.load_scene(scene_index, scenes.get(scene_index.scene), views, &mut random, state) {
+                match self.load_scene(
+                    scene_index,
+                    scenes.get(scene_index.scene),
+                    context_count,
+                    &mut random,
+                    state,
+                ) {
                     Ok(scene) => return Ok(scene),
                     Err((fault, why)) => self.bad_data_log.add(fault, std::iter::once(scene_index), why)?,
                 }
@@ -315,7 +321,7 @@ impl Shared {
         &self,
         scene_index: SceneIndex,
         capture: Option<&Result<Capture>>,
-        context: usize,
+        context_count: usize,
         random: &mut impl Rng,
         state: &mut WorkerState,
     ) -> std::result::Result<LoadedScene, (Fault, String)> {
@@ -330,7 +336,7 @@ impl Shared {
         let cameras = capture.cameras();
         let (shown, _) = capture.split(config.holdout);
         let centres: Vec<DVec3> = shown.iter().map(|&view| cameras[view].c2w.w_axis.truncate()).collect();
-        let views = choose_views(config, context, &centres, random).ok_or_else(|| {
+        let views = choose_views(config, context_count, &centres, random).ok_or_else(|| {
             let why = format!("{} training views, expected {} or more", shown.len(), config.window[0]);
             (Fault::Short, format!("{}: {why} (data.window)", capture.file().display()))
         })?;

@@ -6,8 +6,8 @@ use rand::seq::index;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// Seed modifier that separates the numbers of views from other random draws.
-const COUNT_KEY: u64 = 0x7669_6577_5f63_6e74;
+/// XORed with the seed for drawing the number of context views.
+const CONTEXT_COUNT_SEED: u64 = 0x7669_6577_5f63_6e74;
 
 /// Indices of chosen views in a video, ascending.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -18,21 +18,21 @@ pub struct ChosenViews {
     pub target: Vec<usize>,
 }
 
-/// Returns the number of context views of every scene in step `step`.
-pub fn context_views(config: &DataConfig, seed: u64, step: u64) -> usize {
+/// Draws the number of context views of every scene in step `step`.
+pub fn draw_context_count(config: &DataConfig, seed: u64, step: u64) -> usize {
     if config.min_context_views == 0 {
         return config.context_views;
     }
-    let mut random = ChaCha8Rng::seed_from_u64(seed ^ COUNT_KEY);
+    let mut random = ChaCha8Rng::seed_from_u64(seed ^ CONTEXT_COUNT_SEED);
     random.set_stream(step);
     random.random_range(config.min_context_views..=config.context_views)
 }
 
-/// Chooses `context` context views and the target views from a random window of a video with camera centres `centres`. Returns
-/// `None` if the video is shorter than the shortest window. The numbers of views must not exceed that window's length.
+/// Draws a random window of the video whose camera centres are `centres`, and from it `context_count` context views and the target views.
+/// Returns `None` if the video is shorter than the shortest window. The numbers of views must not exceed that window's length.
 pub fn choose_views(
     config: &DataConfig,
-    context: usize,
+    context_count: usize,
     centres: &[DVec3],
     random: &mut impl Rng,
 ) -> Option<ChosenViews> {
@@ -42,36 +42,40 @@ pub fn choose_views(
     }
     let length = random.random_range(shortest..=longest).min(centres.len());
     let start = random.random_range(0..=centres.len() - length);
-    let context = match config.sampling {
-        Sampling::Uniform => uniform(length, context, random),
-        Sampling::Farthest => farthest(&centres[start..][..length], context, random),
+    let context_positions = match config.sampling {
+        Sampling::Uniform => sample_uniform(length, context_count, random),
+        Sampling::Farthest => sample_farthest(&centres[start..][..length], context_count, random),
     };
-    let target = uniform(length, config.target_views, random);
+    let target_positions = sample_uniform(length, config.target_views, random);
     let in_video = |mut positions: Vec<usize>| {
         positions.sort_unstable();
         positions.iter_mut().for_each(|position| *position += start);
         positions
     };
-    Some(ChosenViews { context: in_video(context), target: in_video(target) })
+    Some(ChosenViews { context: in_video(context_positions), target: in_video(target_positions) })
 }
 
-fn uniform(length: usize, count: usize, random: &mut impl Rng) -> Vec<usize> {
+/// Draws `count` different positions below `length`, all equally likely.
+fn sample_uniform(length: usize, count: usize, random: &mut impl Rng) -> Vec<usize> {
     index::sample(random, length, count).into_vec()
 }
 
-fn farthest(centres: &[DVec3], count: usize, random: &mut impl Rng) -> Vec<usize> {
+/// Farthest point sampling: draws the first of `count` positions at random; each of the others is the one whose centre is farthest from the
+/// nearest chosen centre.
+fn sample_farthest(centres: &[DVec3], count: usize, random: &mut impl Rng) -> Vec<usize> {
+    assert!(count <= centres.len());
     let mut chosen = vec![random.random_range(0..centres.len())];
     // Squared distance of each frame to the nearest chosen one; below 0 for chosen frames.
-    let mut distances = vec![f64::INFINITY; centres.len()];
+    let mut squared_distances = vec![f64::INFINITY; centres.len()];
     while chosen.len() < count {
         let last = chosen[chosen.len() - 1];
-        for (distance, centre) in distances.iter_mut().zip(centres) {
-            *distance = distance.min(centre.distance_squared(centres[last]));
+        for (squared_distance, centre) in squared_distances.iter_mut().zip(centres) {
+            *squared_distance = squared_distance.min(centre.distance_squared(centres[last]));
         }
-        distances[last] = -1.;
+        squared_distances[last] = -1.;
         // Take the first of equally distant frames, so that the result is the same on every machine.
-        let next = (0..centres.len()).rev().max_by(|&a, &b| distances[a].total_cmp(&distances[b]));
-        chosen.push(next.expect("more frames than views"));
+        let farthest = |&a: &usize, &b: &usize| squared_distances[a].total_cmp(&squared_distances[b]);
+        chosen.extend((0..centres.len()).rev().max_by(farthest));
     }
     chosen
 }
@@ -79,8 +83,6 @@ fn farthest(centres: &[DVec3], count: usize, random: &mut impl Rng) -> Vec<usize
 #[cfg(test)]
 mod tests {
     use super::*;
-    use rand::SeedableRng;
-    use rand_chacha::ChaCha8Rng;
 
     fn config(sampling: Sampling) -> DataConfig {
         DataConfig { window: [40, 220], target_views: 12, sampling, ..Default::default() }
@@ -104,10 +106,10 @@ mod tests {
                 assert_eq!((views.context.len(), views.target.len()), (24, 12));
                 assert!(is_ascending(&views.context) && is_ascending(&views.target));
                 let all = || views.context.iter().chain(&views.target);
-                let (first, end) = (*all().min().unwrap(), *all().max().unwrap());
-                shortest = shortest.min(end - first + 1);
-                longest = longest.max(end - first + 1);
-                last = last.max(end);
+                let (first_view, last_view) = (*all().min().unwrap(), *all().max().unwrap());
+                shortest = shortest.min(last_view - first_view + 1);
+                longest = longest.max(last_view - first_view + 1);
+                last = last.max(last_view);
             }
             assert!((24..=40).contains(&shortest), "{shortest}");
             assert!((200..=220).contains(&longest), "{longest}");
@@ -118,14 +120,14 @@ mod tests {
     #[test]
     fn context_view_counts_are_drawn_per_step() {
         let config = DataConfig { context_views: 12, min_context_views: 4, ..Default::default() };
-        let counts: Vec<usize> = (0..2000).map(|step| context_views(&config, 0, step)).collect();
+        let counts: Vec<usize> = (0..2000).map(|step| draw_context_count(&config, 0, step)).collect();
         for count in 4..=12 {
-            let share = counts.iter().filter(|&&drawn| drawn == count).count();
-            assert!((160..=290).contains(&share), "{count}: {share}");
+            let occurrences = counts.iter().filter(|&&drawn| drawn == count).count();
+            assert!((160..=290).contains(&occurrences), "{count}: {occurrences}");
         }
         assert!(counts.iter().all(|count| (4..=12).contains(count)));
         let always = DataConfig { min_context_views: 0, ..config };
-        assert!((0..20).all(|step| context_views(&always, 0, step) == 12));
+        assert!((0..20).all(|step| draw_context_count(&always, 0, step) == 12));
     }
 
     #[test]

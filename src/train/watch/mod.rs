@@ -6,7 +6,7 @@ mod series;
 
 use super::checkpoint::{CheckpointSummary, checkpoint_summaries};
 use super::lock::RunLock;
-use super::metrics::Line;
+use super::metrics::MetricsRecord;
 use super::{CONFIG_FILE, METRICS_FILE};
 use crate::error::{Error, Result};
 use events::Events;
@@ -60,7 +60,8 @@ pub struct RunState {
     pub best: Option<CheckpointSummary>,
 }
 
-/// Curves of at most some hundred points. A point is the last of several consecutive steps, and the mean of the values of these steps.
+/// Curves of at most some hundred (step, value) points. Each averages consecutive steps and carries the last of them. Skipped steps are
+/// left out.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RunCurves {
     /// PSNR of training views, in dB.
@@ -81,38 +82,39 @@ struct MetricsHistory {
     loss: Series,
     learning_rate: Series,
     speeds: VecDeque<f64>,
-    last: Option<Line>,
+    last: Option<MetricsRecord>,
     skipped: u64,
-    last_skipped: Option<Line>,
+    last_skipped: Option<MetricsRecord>,
     unreadable: u64,
 }
 
 impl MetricsHistory {
     fn add(&mut self, line: &[u8]) {
-        let Ok(line) = serde_json::from_slice::<Line>(line) else {
+        let Ok(record) = serde_json::from_slice::<MetricsRecord>(line) else {
             self.unreadable += 1;
             return;
         };
-        let step = line.step;
-        if let Some(validation) = line.validation {
+        let step = record.step;
+        if let Some(validation) = record.validation {
             validation.psnr.into_iter().for_each(|psnr| self.held_out.push(step, psnr));
             return;
         }
-        for (series, value) in [
-            (&mut self.psnr, line.psnr),
-            (&mut self.loss, line.loss),
-            (&mut self.learning_rate, line.learning_rate),
-        ] {
-            value.into_iter().for_each(|value| series.push(step, value));
-        }
-        self.speeds.extend(line.samples_per_second);
+        self.speeds.extend(record.samples_per_second);
         self.speeds.drain(..self.speeds.len().saturating_sub(RECENT));
-        if line.skipped {
+        if record.skipped {
             self.skipped += 1;
-            self.last_skipped =
-                Some(Line { scenes: line.scenes.clone(), ..Line { step, ..Line::default() } });
+            let scenes = record.scenes.clone();
+            self.last_skipped = Some(MetricsRecord { step, scenes, ..MetricsRecord::default() });
+        } else {
+            for (series, value) in [
+                (&mut self.psnr, record.psnr),
+                (&mut self.loss, record.loss),
+                (&mut self.learning_rate, record.learning_rate),
+            ] {
+                value.into_iter().for_each(|value| series.push(step, value));
+            }
         }
-        self.last = Some(line);
+        self.last = Some(record);
     }
 
     /// Returns the mean speed of the latest steps in samples per second: the harmonic mean, because the times of steps add up.
@@ -222,7 +224,7 @@ impl WatchedRun {
             )),
             Some(_) => {}
         }
-        if let Some(Line { step, scenes, .. }) = &self.metrics.last_skipped {
+        if let Some(MetricsRecord { step, scenes, .. }) = &self.metrics.last_skipped {
             let short = |name: &String| name.chars().take(NAMED.1).collect::<String>();
             let mut names: Vec<String> = scenes.iter().take(NAMED.0).map(short).collect();
             if scenes.len() > NAMED.0 {

@@ -81,9 +81,17 @@ struct Cameras {
 #[derive(Arbitrary)]
 struct View {
     name: Name,
-    /// Intrinsics that replace those of the photo.
-    intrinsics: Option<Vec<Vec<Number>>>,
+    intrinsics: Intrinsics,
     pose: Pose,
+}
+
+#[derive(Arbitrary)]
+enum Intrinsics {
+    /// Intrinsics of the photo.
+    Photo,
+    /// fx, fy, cx and cy.
+    Pinhole([Number; 4]),
+    Rows(Vec<Vec<Number>>),
 }
 
 /// Reads a generated `cameras.json`.
@@ -92,8 +100,12 @@ pub fn cameras(bytes: &[u8]) {
     let side = f64::from(SIDE);
     let view = |View { name, intrinsics, pose }: &View| {
         let intrinsics = match intrinsics {
-            None => json!([[side, 0, side / 2.], [0, side, side / 2.], [0, 0, 1]]),
-            Some(rows) => Pose::Rows(rows.clone()).json(),
+            Intrinsics::Photo => json!([[side, 0, side / 2.], [0, side, side / 2.], [0, 0, 1]]),
+            Intrinsics::Pinhole(numbers) => {
+                let [fx, fy, cx, cy] = numbers.each_ref().map(|number| number.json());
+                json!([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+            }
+            Intrinsics::Rows(rows) => Pose::Rows(rows.clone()).json(),
         };
         json!({"image": name.text("images/"), "intrinsic": intrinsics, "c2w": pose.json()})
     };

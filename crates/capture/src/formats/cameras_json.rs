@@ -1,9 +1,9 @@
 //! Reader and writer of `cameras.json` folders: {"image_shape": [H, W], "views": [{"image", "intrinsic" 3×3 in pixels, "c2w" 4×4}]}
-//! (spec 10.2).
+//! (spec 10.2). `c2w` is the camera-to-world matrix, row by row, of a camera with OpenCV axes: x right, y down, z forward.
 
 use super::json::replace_nan_with_null;
 use super::photos::{find_photos, portable};
-use super::{CaptureOpener, file_in, folder_name};
+use super::{CaptureOpener, file_in, folder_name, parent_folder};
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
 use crate::geometry::{Camera, Intrinsics, pose_to_rows};
 use crate::lens::LensModel;
@@ -15,37 +15,42 @@ use std::path::Path;
 /// File name that identifies a capture of this format.
 const FILE_NAME: &str = "cameras.json";
 
+/// Maximum deviation of an intrinsic matrix from one without skew and with the last row [0, 0, 1], per entry. Rounding of computed
+/// matrices is below it.
+const INTRINSIC_TOLERANCE: f64 = 1e-6;
+
 #[derive(Serialize, Deserialize)]
-struct File {
+struct CamerasFile {
     image_shape: [u32; 2],
     views: Vec<ViewEntry>,
 }
 
 #[derive(Serialize, Deserialize)]
 struct ViewEntry {
+    /// Path of the photo, relative to the file's folder. It may be absent in a camera path, which needs no photos.
     #[serde(default)]
     image: String,
-    intrinsic: Vec<Vec<Number>>,
-    c2w: Vec<Vec<Number>>,
+    intrinsic: Vec<Vec<NullableNumber>>,
+    c2w: Vec<Vec<NullableNumber>>,
 }
 
 /// A number or null. Python writes NaN and Infinity, which JSON lacks: they are read as null, and the checks on cameras report
 /// them.
-type Number = Option<f64>;
+type NullableNumber = Option<f64>;
 
 /// Recognizes a folder that contains a `cameras.json`, or that file itself.
 pub(super) fn find(path: &Path) -> Option<CaptureOpener> {
-    let itself = path.is_file() && path.file_name().is_some_and(|name| name == FILE_NAME);
-    let file = if itself { path.to_owned() } else { file_in(path, FILE_NAME)? };
+    let is_cameras_file = path.is_file() && path.file_name().is_some_and(|name| name == FILE_NAME);
+    let file = if is_cameras_file { path.to_owned() } else { file_in(path, FILE_NAME)? };
     Some(Box::new(move |purpose| read(&file, purpose)))
 }
 
-/// Reads the capture that `file` describes. Views keep the order of the file, whatever their names. Views with a missing photo are
-/// left out.
+/// Reads the capture that `file` describes. Views keep the order of the file. For [`Purpose::Photos`], views whose photo is missing
+/// are left out and reported as a warning; for [`Purpose::Cameras`], photos need not exist.
 pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
     let parsed = parse(file)?;
-    let root = file.parent().unwrap_or(Path::new("."));
-    let cameras = cameras(file, &parsed)?;
+    let root = parent_folder(file);
+    let cameras = to_cameras(file, &parsed)?;
     let names: Vec<&str> = parsed.views.iter().map(|view| view.image.as_str()).collect();
     let photos = find_photos(&[root.to_owned()], &names);
     let (mut frames, mut changes) = (vec![], Changes::default());
@@ -71,26 +76,34 @@ pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
     Capture::new(folder_name(root), file.to_owned(), frames, changes, purpose)
 }
 
-/// Writes a `cameras.json` at `file`. `images` are paths relative to its folder. All cameras must have the same size.
+/// Writes a `cameras.json` at `file`. `images` are the photos of `cameras`, as paths relative to the file's folder.
 ///
 /// # Errors
 /// Fails if the file can't be written.
+///
+/// # Panics
+/// Panics if the numbers of images and cameras differ, or the cameras' image sizes do.
 pub fn write_cameras_json(file: &Path, images: &[String], cameras: &[Camera]) -> Result<()> {
+    assert_eq!(images.len(), cameras.len(), "each camera needs one image");
+    let image_shape = cameras.first().map_or([0, 0], |camera| [camera.height, camera.width]);
+    assert!(
+        cameras.iter().all(|camera| [camera.height, camera.width] == image_shape),
+        "all cameras must have the same image size"
+    );
     let views = images.iter().zip(cameras).map(|(image, camera)| ViewEntry {
         image: image.clone(),
         intrinsic: rows(&camera.intrinsics.to_rows(), 3),
         c2w: rows(&pose_to_rows(&camera.c2w), 4),
     });
-    let image_shape = cameras.first().map_or([0, 0], |camera| [camera.height, camera.width]);
-    let contents = File { image_shape, views: views.collect() };
+    let contents = CamerasFile { image_shape, views: views.collect() };
     write_json(file, &contents)
 }
 
-fn rows(values: &[f64], width: usize) -> Vec<Vec<Number>> {
+fn rows(values: &[f64], width: usize) -> Vec<Vec<NullableNumber>> {
     values.chunks(width).map(|row| row.iter().copied().map(Some).collect()).collect()
 }
 
-fn parse(file: &Path) -> Result<File> {
+fn parse(file: &Path) -> Result<CamerasFile> {
     let text = read_text(file)?;
     serde_json::from_str(&replace_nan_with_null(&text)).map_err(|e| {
         let expected = "{\"image_shape\": [H, W], \"views\": [{\"image\", \"intrinsic\", \"c2w\"}]}";
@@ -98,17 +111,17 @@ fn parse(file: &Path) -> Result<File> {
     })
 }
 
-fn cameras(file: &Path, parsed: &File) -> Result<Vec<Camera>> {
+fn to_cameras(file: &Path, parsed: &CamerasFile) -> Result<Vec<Camera>> {
     let [height, width] = parsed.image_shape;
     if width == 0 || height == 0 {
         return Err(Error::input(
             file,
             "image_shape",
             format!("[{height}, {width}]"),
-            "a height and a width",
+            "a height and a width above 0",
         ));
     }
-    let matrix = |rows: &[Vec<Number>], size: usize, field: String| -> Result<Vec<f64>> {
+    let matrix = |rows: &[Vec<NullableNumber>], size: usize, field: String| -> Result<Vec<f64>> {
         if rows.len() != size || rows.iter().any(|row| row.len() != size) {
             let found =
                 format!("{} rows of {:?} numbers", rows.len(), rows.iter().map(Vec::len).collect::<Vec<_>>());
@@ -122,13 +135,18 @@ fn cameras(file: &Path, parsed: &File) -> Result<Vec<Camera>> {
         .enumerate()
         .map(|(i, view)| {
             let k = matrix(&view.intrinsic, 3, format!("intrinsic of view {i}"))?;
+            let deviations = [k[1], k[3], k[6], k[7], k[8] - 1.];
+            // NaN exceeds the tolerance, too.
+            let is_within_tolerance =
+                deviations.iter().all(|deviation| deviation.abs() <= INTRINSIC_TOLERANCE);
+            if !is_within_tolerance {
+                let found = format!("{:?}", k.chunks(3).collect::<Vec<_>>());
+                let expected = "no skew and [0, 0, 1] as the last row";
+                return Err(Error::input(file, format!("intrinsic of view {i}"), found, expected));
+            }
             let c2w = matrix(&view.c2w, 4, format!("c2w of view {i}"))?;
-            Ok(Camera {
-                intrinsics: Intrinsics { fx: k[0], fy: k[4], cx: k[2], cy: k[5] },
-                c2w: DMat4::from_cols_slice(&c2w).transpose(),
-                width,
-                height,
-            })
+            let intrinsics = Intrinsics { fx: k[0], fy: k[4], cx: k[2], cy: k[5] };
+            Ok(Camera { intrinsics, c2w: DMat4::from_cols_slice(&c2w).transpose(), width, height })
         })
         .collect()
 }

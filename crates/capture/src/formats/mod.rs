@@ -57,6 +57,11 @@ fn file_in(path: &Path, name: &str) -> Option<PathBuf> {
     Some(path.join(name)).filter(|file| file.is_file())
 }
 
+/// Returns the folder of `file`, or "." if the path is a name alone: an empty path isn't a folder for the file system.
+fn parent_folder(file: &Path) -> &Path {
+    file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
 /// Opens the capture at `path`. The format is recognized by the files on disk, in this order:
 ///
 /// 1. `CHUNK.torch#KEY`, a scene of a RealEstate10K-style chunk, or `CHUNK.torch` if it holds a single scene;
@@ -102,7 +107,7 @@ fn open_for(path: &Path, purpose: Purpose) -> Result<Capture> {
                 let lines = refusals.iter().map(|why| format!("{why}; {taken} is read instead"));
                 return Ok(capture.with_warnings(lines.collect()));
             }
-            Err(why) if why.is_request() => refusals.push(why),
+            Err(why) if why.is_invalid_request() => refusals.push(why),
             Err(why) => return Err(why),
         }
     }
@@ -187,5 +192,17 @@ impl CaptureFolders {
             }
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_parent_of_a_name_alone_is_the_working_folder() {
+        assert_eq!(parent_folder(Path::new("cameras.json")), Path::new("."));
+        assert_eq!(parent_folder(Path::new("room/cameras.json")), Path::new("room"));
+        assert_eq!(parent_folder(Path::new("/cameras.json")), Path::new("/"));
     }
 }

@@ -6,7 +6,7 @@
 use super::json::replace_nan_with_null;
 use super::natural::natural_order;
 use super::photos::{find_photos, portable};
-use super::{CaptureOpener, file_in, folder_name};
+use super::{CaptureOpener, file_in, folder_name, parent_folder};
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
 use crate::geometry::{Camera, ImageSize, Intrinsics, nearest_rigid_of_scaled};
 use crate::lens::{COLMAP_MODELS, Distortion, Lens, LensModel, equirectangular_intrinsics};
@@ -63,8 +63,8 @@ const FAMILIES: [&[&str]; 2] = [
 /// `transforms….json`.
 pub(super) fn find(path: &Path) -> Option<CaptureOpener> {
     let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
-    let itself = path.is_file() && name.starts_with("transforms") && name.ends_with(".json");
-    let file = if itself { Some(path.to_owned()) } else { file_in(path, FILE_NAME) };
+    let is_transforms_file = path.is_file() && name.starts_with("transforms") && name.ends_with(".json");
+    let file = if is_transforms_file { Some(path.to_owned()) } else { file_in(path, FILE_NAME) };
     if let Some(file) = file {
         return Some(Box::new(move |purpose| read(&file, purpose)));
     }
@@ -92,7 +92,8 @@ pub(super) fn find(path: &Path) -> Option<CaptureOpener> {
 /// Reads the capture that `file` describes.
 pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
     let (frames, changes, lists) = read_frames(file, purpose)?;
-    let new = |frames| Capture::new(folder_name(root(file)), file.to_owned(), frames, changes, purpose);
+    let new =
+        |frames| Capture::new(folder_name(parent_folder(file)), file.to_owned(), frames, changes, purpose);
     let Lists { train, test, unread } = lists;
     // A camera path consists of all frames in order.
     if matches!(purpose, Purpose::Cameras(_)) || test.is_empty() {
@@ -147,10 +148,6 @@ impl Lists {
     }
 }
 
-fn root(file: &Path) -> &Path {
-    file.parent().unwrap_or(Path::new("."))
-}
-
 /// Reads the frames that `file` describes, ordered by name, with numbers in names compared by value. Frames with a missing image
 /// are left out, as nerfstudio and instant-ngp do: users delete photos after the poses were computed.
 fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Lists)> {
@@ -168,8 +165,8 @@ fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Li
         .map(|(index, frame)| Fields { file, index, frame, shared: &json, purpose })
         .collect();
     let names = fields.iter().map(Fields::file_path).collect::<Result<Vec<_>>>()?;
-    let mut bases = vec![root(file).to_owned()];
-    bases.extend(root(file).canonicalize().ok().and_then(|root| Some(root.parent()?.to_owned())));
+    let mut bases = vec![parent_folder(file).to_owned()];
+    bases.extend(parent_folder(file).canonicalize().ok().and_then(|root| Some(root.parent()?.to_owned())));
     let photos = find_photos(&bases, &names);
     let masks = match purpose {
         Purpose::Photos => find_named_masks(&bases, &fields, &photos)?,
@@ -182,7 +179,7 @@ fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Li
                 frames.push(Frame { mask, ..fields.frame(photo, name, &mut changes)? });
             }
             (None, Purpose::Cameras(_)) => {
-                frames.push(fields.frame(root(file).join(name), name, &mut changes)?)
+                frames.push(fields.frame(parent_folder(file).join(name), name, &mut changes)?)
             }
             (None, Purpose::Photos) => changes.missing.push(name.to_string()),
         }

@@ -7,8 +7,8 @@
 use super::{Camera, Similarity};
 use glam::{DMat4, DVec3};
 
-/// Relative rounding error of float64: smaller distances, relative to the largest coordinate, are ignored.
-const ROUNDING: f64 = 1e-14;
+/// Distances at most this fraction of the largest coordinate are treated as rounding errors.
+const MIN_RELATIVE_DISTANCE: f64 = 1e-14;
 
 /// A coordinate frame with the axes of the world: local = (world − origin) / scale.
 ///
@@ -26,22 +26,23 @@ impl LocalFrame {
     /// Typical distance from the origin in local units. The near plane, 0.01 local units (spec 6.2), is 1/1600 of it.
     const TYPICAL_DISTANCE: f64 = 16.;
 
-    /// Returns the frame of a capture, computed from its camera centres. The origin is their median along each axis, and the median
-    /// distance of the others from it is 16 local units. If all cameras are at one position, a local unit is a world unit.
+    /// Returns the frame of a capture, computed from its camera centres. The origin is their median along each axis. A local unit is
+    /// 1/16 of the median distance of the cameras from it, without those at the origin. If all cameras are at one position, a local
+    /// unit is a world unit.
     pub fn from_cameras(cameras: &[Camera]) -> Self {
         let centres: Vec<DVec3> = cameras.iter().map(|camera| camera.c2w.w_axis.truncate()).collect();
         Self::from_spheres(&centres, &vec![0.; centres.len()])
     }
 
-    /// Returns the frame of spheres, such as Gaussians, at `points` with `radii`. The origin is the median of the points along each axis.
-    /// 16 local units are the median of a sphere's distance from it plus its radius. If the spheres have no extent, or there are none,
-    /// a local unit is a world unit.
+    /// Returns the frame of spheres with centres `points` and `radii`, in world units and of equal length. The origin is the median
+    /// along each axis. A local unit is 1/16 of the median reach, a sphere's distance from the origin plus its radius. It is a world unit
+    /// if there are no spheres or they have no extent.
     pub fn from_spheres(points: &[DVec3], radii: &[f64]) -> Self {
         let along = |axis: usize| median(points.iter().map(|point| point[axis]).collect());
         let origin = DVec3::from_array([0, 1, 2].map(|axis| along(axis).unwrap_or(0.)));
         let largest = points.iter().map(|point| point.abs().max_element()).fold(0., f64::max);
         let reaches = points.iter().zip(radii).map(|(point, radius)| point.distance(origin) + radius);
-        let typical = median(reaches.filter(|reach| *reach > ROUNDING * largest).collect());
+        let typical = median(reaches.filter(|reach| *reach > MIN_RELATIVE_DISTANCE * largest).collect());
         LocalFrame { origin, scale: typical.map_or(1., |typical| typical / Self::TYPICAL_DISTANCE) }
     }
 
@@ -70,7 +71,8 @@ impl LocalFrame {
         with_centre(c2l, self.point_to_world(c2l.w_axis.truncate()))
     }
 
-    /// Converts a camera in world coordinates to local coordinates.
+    /// Converts a camera in world coordinates to local coordinates. Camera coordinates, and so depths, are then in local units; the
+    /// pose stays rigid.
     pub fn camera_to_local(&self, camera: &Camera) -> Camera {
         Camera { c2w: self.pose_to_local(&camera.c2w), ..*camera }
     }
@@ -133,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn local_coordinates_keep_what_float32_loses_far_away() {
+    fn local_coordinates_are_independent_of_origin_and_unit() {
         let plain = LocalFrame::from_cameras(&cameras(1., DVec3::ZERO));
         for (factor, offset) in [(1e-6, DVec3::ZERO), (1e6, DVec3::ZERO), (1., DVec3::new(1e8, -3e7, 55.))] {
             let frame = LocalFrame::from_cameras(&cameras(factor, offset));
@@ -145,7 +147,7 @@ mod tests {
         }
     }
 
-    /// The unit is independent of long rests, at exactly one position or with jitter, and of a misplaced camera.
+    /// Neither many frames from a resting camera nor a misplaced camera change the unit by a factor of two.
     #[test]
     fn rests_and_outliers_do_not_set_the_scale() {
         let plain = cameras(1., DVec3::ZERO);

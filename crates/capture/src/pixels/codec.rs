@@ -93,7 +93,7 @@ pub fn encode_photo(pixels: &RgbImage, as_jpeg: bool) -> Result<Vec<u8>> {
         true => pixels.write_with_encoder(JpegEncoder::new_with_quality(&mut bytes, QUALITY)),
         false => pixels.write_to(&mut bytes, ImageFormat::Png),
     };
-    encoded.map_err(Error::failed_by("an image can't be encoded"))?;
+    encoded.map_err(Error::failed_with_context("an image can't be encoded"))?;
     Ok(bytes.into_inner())
 }
 

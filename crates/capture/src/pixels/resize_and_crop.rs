@@ -6,21 +6,23 @@ use crate::geometry::{Camera, ImageSize};
 use image::RgbImage;
 use std::ops::Range;
 
-/// Divisor of the width after the first resize.
+/// The first resize rounds the width to a multiple of this, at least one (spec 9.2).
 const WIDTH_MULTIPLE: f64 = 8.;
 
 /// The largest centred rectangle of a target aspect ratio in a camera's image, and the first resize.
 struct Crop {
+    /// The rectangle, in pixels of the source image.
     region: Region,
     /// Size of the rectangle after the first resize.
     size: ImageSize,
-    /// Scale of the first resize along x and y. `corner` is the top left corner of the rectangle after it.
+    /// Scale of the first resize along x and y.
     scale: (f64, f64),
+    /// Top left corner after the first resize, in whole pixels.
     corner: (f64, f64),
 }
 
 impl Crop {
-    fn of(camera: &Camera, size: ImageSize) -> Self {
+    fn new(camera: &Camera, size: ImageSize) -> Self {
         let (full_width, full_height) = (f64::from(camera.width), f64::from(camera.height));
         let scaled = full_width * f64::from(size.height) / full_height;
         let width = ((scaled / WIDTH_MULTIPLE).round() * WIDTH_MULTIPLE).max(WIDTH_MULTIPLE);
@@ -29,8 +31,8 @@ impl Crop {
 
         let aspect = f64::from(size.width) / height;
         // At least one pixel is left, however elongated the target size is.
-        let (crop_width, crop_height) =
-            ((height * aspect).min(width).round().max(1.), (width / aspect).min(height).round().max(1.));
+        let crop_width = f64::from(size.width).min(width).max(1.);
+        let crop_height = (width / aspect).min(height).round().max(1.);
         let (left, top) = (((width - crop_width) / 2.).floor(), ((height - crop_height) / 2.).floor());
         Crop {
             // Only the part that is kept is resampled.
@@ -56,18 +58,19 @@ pub fn source_ranges(camera: &Camera, size: ImageSize) -> [Range<usize>; 2] {
     if has_size(camera, size) {
         return [0..camera.width as usize, 0..camera.height as usize];
     }
-    let crop = Crop::of(camera, size);
+    let crop = Crop::new(camera, size);
     resample::source_ranges((camera.width, camera.height), crop.region, crop.size)
 }
 
 /// Resizes the image to the height of `size` with the aspect ratio kept (width rounded to a multiple of 8), cuts out the largest
-/// centred rectangle with the aspect ratio of `size`, and resizes again if the result doesn't have `size` yet.
+/// centred rectangle with the aspect ratio of `size`, and resizes again if the result doesn't have `size` yet. Returns the planes,
+/// `[3, H, W]`, and the camera with adjusted intrinsics; an image of `size` already is returned unchanged.
 pub fn resize_and_crop(image: &RgbImage, camera: &Camera, size: ImageSize) -> (Planes, Camera) {
     if has_size(camera, size) {
         return (Planes::from_rgb(image), *camera);
     }
-    let crop = Crop::of(camera, size);
-    let planes = resample(image, crop.region, crop.size);
+    let crop = Crop::new(camera, size);
+    let planes = resample_planes(image, crop.region, crop.size);
     let intrinsics =
         camera.intrinsics.resized(crop.scale.0, crop.scale.1).cropped(crop.corner.0, crop.corner.1);
 
@@ -77,12 +80,12 @@ pub fn resize_and_crop(image: &RgbImage, camera: &Camera, size: ImageSize) -> (P
         let (width, height) = (f64::from(crop.size.width), f64::from(crop.size.height));
         let region = Region { left: 0., top: 0., width, height };
         let scale = (f64::from(size.width) / width, f64::from(size.height) / height);
-        (resample(&planes.to_rgb(), region, size), intrinsics.resized(scale.0, scale.1))
+        (resample_planes(&planes.to_rgb(), region, size), intrinsics.resized(scale.0, scale.1))
     };
     (planes, Camera { intrinsics, c2w: camera.c2w, width: size.width, height: size.height })
 }
 
-fn resample(image: &RgbImage, region: Region, size: ImageSize) -> Planes {
+fn resample_planes(image: &RgbImage, region: Region, size: ImageSize) -> Planes {
     let mut planes = Planes::new(size.width, size.height);
     Resampler::default().resample(image, region, size, planes.bytes_mut());
     planes
@@ -130,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn augmentation_keeps_the_rays_of_pixels() {
+    fn resizing_keeps_the_rays_of_pixels() {
         // A bright dot on black keeps its ray. The dot's position in the fitted image is its centroid.
         let (x, y) = (300u32, 200u32);
         let mut image = RgbImage::new(640, 360);

@@ -80,7 +80,7 @@ impl Command {
         log: &Path,
         on_count: &mut dyn FnMut(Option<usize>) -> bool,
     ) -> Result<Outcome> {
-        let failed_start = || Error::failed_by(format!("{colmap} can't be started"));
+        let failed_start = || Error::failed_with_context(format!("{colmap} can't be started"));
         let mut command = process::Command::new(&colmap.program);
         if colmap.is_python {
             command.args(["-c", PYTHON, self.name, &Value::Object(self.options.clone()).to_string()]);
@@ -120,7 +120,7 @@ impl Command {
                 return Ok(Outcome::Stopped);
             }
         }
-        let status = child.0.wait().map_err(Error::failed_by(colmap))?;
+        let status = child.0.wait().map_err(Error::failed_with_context(colmap))?;
         if status.success() {
             return Ok(Outcome::Finished);
         }

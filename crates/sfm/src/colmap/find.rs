@@ -145,7 +145,7 @@ mod tests {
     #[test]
     fn a_program_that_is_named_but_missing_is_an_error() {
         let error = Colmap::at(Path::new("/no/such/python3")).unwrap_err();
-        assert!(error.is_request());
+        assert!(error.is_invalid_request());
         assert_eq!(
             error.to_string(),
             "/no/such/python3: the program is a Python without pycolmap, expected a colmap program or a Python with \

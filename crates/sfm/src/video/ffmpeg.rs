@@ -51,7 +51,7 @@ pub(super) fn probe(path: &Path) -> Result<Result<Probe>> {
         return no_video(&format!("not readable by ffmpeg ({why})"));
     }
     let found: Value = serde_json::from_slice(&output.stdout)
-        .map_err(Error::failed_by(format!("{}: ffprobe failed", path.display())))?;
+        .map_err(Error::failed_with_context(format!("{}: ffprobe failed", path.display())))?;
     let text = |value: &Value| value.as_str().unwrap_or_default().to_owned();
     let number = |value: &Value| value.as_str().and_then(|text| text.parse::<f64>().ok()).unwrap_or(0.);
 
@@ -245,8 +245,10 @@ pub(super) struct Pass<'a> {
 impl Pass<'_> {
     /// Returns the next image of [`Converter::decode_small`]; `None` at the end of the video.
     pub(super) fn next_frame(&mut self) -> Result<Option<Grey>> {
-        Grey::read(&mut self.stdout)
-            .map_err(Error::failed_by(format!("{}: no frames from ffmpeg", self.converter.video.display())))
+        Grey::read(&mut self.stdout).map_err(Error::failed_with_context(format!(
+            "{}: no frames from ffmpeg",
+            self.converter.video.display()
+        )))
     }
 
     /// Returns the next frames of [`Converter::write`], which may be none after 0.1 s; `None` at the end.
@@ -263,7 +265,7 @@ impl Pass<'_> {
     /// # Errors
     /// Returns the first error that ffmpeg reports if it fails.
     pub(super) fn finish(mut self) -> Result<()> {
-        let status = self.child.wait().map_err(Error::failed_by("ffmpeg failed"))?;
+        let status = self.child.wait().map_err(Error::failed_with_context("ffmpeg failed"))?;
         let error = self.error.take().and_then(|error| error.join().ok().flatten());
         match status.success() {
             true => Ok(()),
@@ -316,7 +318,7 @@ fn not_started(video: &Path, program: &str) -> impl FnOnce(std::io::Error) -> Er
     let what = format!("{}: reading a video needs {program}", video.display());
     move |e| match is_program_missing(&e) {
         true => Error::request(format!("{what}, which isn't on the PATH {GET}")),
-        false => Error::failed_by(format!("{what}, which can't be started"))(e),
+        false => Error::failed_with_context(format!("{what}, which can't be started"))(e),
     }
 }
 

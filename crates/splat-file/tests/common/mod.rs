@@ -75,7 +75,7 @@ pub fn assert_says(error: &str, parts: &[&str]) {
 /// Returns the one-sentence error with which the file at `path` is refused, as a wrong request.
 pub fn refused_file(path: &Path) -> String {
     let error = read_splat(path).expect_err("an invalid file");
-    assert!(error.is_request(), "{error}");
+    assert!(error.is_invalid_request(), "{error}");
     let text = error.to_string();
     assert_eq!(text.lines().count(), 1, "one sentence: {text}");
     text

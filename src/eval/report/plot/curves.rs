@@ -12,8 +12,8 @@ use maud::{PreEscaped, html};
 use std::path::Path;
 
 const MARGINS: Margins = Margins::NAMED;
-/// Number of intervals of a run over which the training scores are averaged.
-const PARTS: u64 = 60;
+/// Maximum number of points of the training curve.
+const MAX_POINTS: u64 = 60;
 
 /// Draws the curves of the run in the folder `run` into `path`, a self-contained SVG. `nearest` is the score of showing the nearest photo,
 /// for comparison.
@@ -21,7 +21,7 @@ const PARTS: u64 = 60;
 /// # Errors
 /// Fails if the metrics can't be read or the file can't be written.
 pub fn write_curves(path: &Path, run: &Path, nearest: Option<f64>) -> Result<()> {
-    let Curves { training, held_out } = Curves::read(run, PARTS)?;
+    let Curves { training, held_out } = Curves::read(run, MAX_POINTS)?;
     let last = training.iter().chain(&held_out).map(|point| point.0).fold(0, u64::max) as f64;
     let (worst, best) = bounds(training.iter().chain(&held_out).map(|point| point.1).chain(nearest));
     let x = Axis::linear(0., last, MARGINS.left, WIDTH - MARGINS.right);
