@@ -148,7 +148,7 @@ impl Eval {
         let mut sheet = self.sheet.as_ref().map(|_| ContactSheet::new(output.scene.target.len()));
         let scores = score_output(&mut output, &perceptual, |ground_truth, picture, _| {
             let row = sheet.as_mut().zip(picture.rendered.as_ref());
-            row.map_or(Ok(()), |(sheet, rendered)| sheet.add(&ground_truth.image, rendered))
+            row.map_or(Ok(()), |(sheet, rendered)| sheet.add(&ground_truth.image.to_float(), rendered))
         })?;
         let scene = &output.scene;
         // For a model, also score the trivial baselines that use only the input photos.

@@ -70,6 +70,17 @@ pub fn install_failure_handlers() {
     globalsplat_csrc::render::disable_stack_traces();
 }
 
+/// Makes the process return large tensors to the system when they are freed, until [`keep`] is called. This is for work that converts many
+/// photos: what it keeps of each would leave gaps between them in which no large tensor fits, several times as much as it keeps.
+pub fn return_large_tensors() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    // SAFETY: the call sets a parameter of the allocator, and by that keeps glibc from raising it.
+    unsafe {
+        const LARGE: libc::c_int = 1 << 20;
+        libc::mallopt(libc::M_MMAP_THRESHOLD, LARGE);
+    }
+}
+
 /// Makes the process keep freed memory, for commands that allocate the same sizes again and again: the system zeroes every page
 /// that it hands out, which takes up to a sixth of a training step and a tenth of a step of refinement. By default glibc
 /// returns the memory of large tensors to the system.

@@ -163,6 +163,6 @@ impl Synth {
 fn sheet_row(capture: &Capture) -> Result<Tensor, Error> {
     let shown: Vec<usize> = (0..SHEET.1).map(|i| i * (capture.len() - 1) / (SHEET.1 - 1)).collect();
     let pictures: Vec<Tensor> =
-        load_views(capture, &shown, None)?.into_iter().map(|view| view.image).collect();
+        load_views(capture, &shown, None)?.into_iter().map(|view| view.image.to_float()).collect();
     Ok(tile_horizontally(&pictures))
 }

@@ -27,15 +27,14 @@ pub struct ViewBatch {
 ///
 /// `poses` (camera-to-world) replace the views' own poses, for example with normalized ones.
 pub fn view_batch<V: Borrow<View>>(views: &[V], poses: &[DMat4], device: Device) -> ViewBatch {
-    let images: Vec<&Tensor> = views.iter().map(|view| &view.borrow().image).collect();
-    let stack = |planes: &[&Tensor]| Tensor::stack(planes, 0).unsqueeze(0).to_device(device);
+    let images: Vec<Tensor> = views.iter().map(|view| view.borrow().image.to_float()).collect();
+    let stack = |planes: &[Tensor]| Tensor::stack(planes, 0).unsqueeze(0).to_device(device);
     let masks = views.iter().any(|view| view.borrow().mask.is_some()).then(|| {
         let mask = |view: &V| match &view.borrow().mask {
-            Some(mask) => mask.shallow_clone(),
-            None => ones_like_mask(&view.borrow().image),
+            Some(mask) => mask.to_float(),
+            None => ones_like_mask(&view.borrow().image.to_float()),
         };
-        let masks: Vec<Tensor> = views.iter().map(mask).collect();
-        stack(&masks.iter().collect::<Vec<_>>())
+        stack(&views.iter().map(mask).collect::<Vec<_>>())
     });
     ViewBatch::with_images(stack(&images), masks, &[view_matrices(&cameras_at(views, poses), device)])
 }
@@ -51,7 +50,7 @@ pub(crate) fn cameras_at<V: Borrow<View>>(views: &[V], poses: &[DMat4]) -> Vec<C
 }
 
 /// Returns the tensors c2w, w2c and intrinsics of one scene, `[1, V, …]` each.
-pub(super) fn view_matrices(cameras: &[Camera], device: Device) -> [Tensor; 3] {
+pub(crate) fn view_matrices(cameras: &[Camera], device: Device) -> [Tensor; 3] {
     let count = cameras.len() as i64;
     let matrices = |rows: Vec<f64>, size: i64| {
         Tensor::from_slice(&rows).view([1, count, size, size]).to_kind(Kind::Float).to_device(device)

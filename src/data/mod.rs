@@ -9,11 +9,12 @@ mod dataset;
 mod jitter;
 mod loading;
 mod photo_size;
+mod pixels;
 mod polyphase;
 mod view;
 
-pub(crate) use batch::cameras_at;
 pub use batch::{ViewBatch, view_batch};
+pub(crate) use batch::{cameras_at, view_matrices};
 pub use chunk_writer::ChunkWriter;
 pub use config::{DataConfig, JitterConfig, Sampling};
 pub use dataset::{Dataset, OpenGroup, SceneGroup, Split};
@@ -27,6 +28,7 @@ pub use loading::{
 };
 pub(crate) use photo_size::MIN_SHORTER_SIDE;
 pub use photo_size::PhotoSize;
+pub use pixels::Pixels;
 pub use polyphase::polyphase;
 pub use view::{View, load_all_views, load_views, tensor_from_planes};
 

@@ -1,5 +1,6 @@
 //! Decomposition of a photo into several smaller views, each of which holds a share of its pixels (spec 9.8).
 
+use super::pixels::Pixels;
 use super::view::View;
 use crate::error::{Error, Result};
 use crate::scene::Camera;
@@ -20,11 +21,14 @@ pub fn polyphase(photo: &View, phase: u32) -> Result<Vec<View>> {
     let every = |dim: i64, first: u32, image: &tch::Tensor| {
         image.slice(dim, i64::from(first), None::<i64>, i64::from(phase))
     };
+    let part = |pixels: &Pixels, row: u32, column: u32| {
+        pixels.map(|pixels| every(2, column, &every(1, row, pixels)))
+    };
     let starts = (0..phase).flat_map(|row| (0..phase).map(move |column| (row, column)));
     let view = |(row, column): (u32, u32)| View {
         name: photo.name.clone(),
-        image: every(2, column, &every(1, row, &photo.image)),
-        mask: photo.mask.as_ref().map(|mask| every(2, column, &every(1, row, mask))),
+        image: part(&photo.image, row, column),
+        mask: photo.mask.as_ref().map(|mask| part(mask, row, column)),
         camera: Camera {
             intrinsics: intrinsics.strided(phase.into(), column.into(), row.into()),
             c2w,
@@ -53,7 +57,7 @@ mod tests {
         let c2w = DMat4::from_translation(DVec3::new(0.4, -0.8, 0.3)) * turned;
         let image = Tensor::arange(3 * height * width, (Kind::Float, Device::Cpu)).view([3, height, width]);
         let camera = Camera { intrinsics, c2w, width: width as u32, height: height as u32 };
-        View { name: "images/000.png".into(), image, mask: None, camera }
+        View { name: "images/000.png".into(), image: image.into(), mask: None, camera }
     }
 
     /// Returns the view, row and column of photo pixel (`y`, `x`) for this `phase`.
@@ -75,15 +79,15 @@ mod tests {
                 assert_eq!((view.camera.width, view.camera.height), (36 / phase, 24 / phase));
                 assert_eq!(view.image.size(), [3, i64::from(24 / phase), i64::from(36 / phase)]);
                 assert!(view.camera.c2w == photo.camera.c2w && view.name == photo.name);
-                seen.extend(Vec::<f32>::try_from(view.image.contiguous().view(-1)).unwrap());
+                seen.extend(Vec::<f32>::try_from(view.image.to_float().contiguous().view(-1)).unwrap());
             }
             seen.sort_by(f32::total_cmp);
             assert!(seen.iter().enumerate().all(|(i, &value)| value == i as f32), "each pixel once");
             for (y, x) in (0..24).flat_map(|y| (0..36).map(move |x| (y, x))) {
                 let (view, i, j) = place(phase as usize, y, x);
                 let View { image, camera, .. } = &views[view];
-                let value = image.double_value(&[1, i as i64, j as i64]);
-                assert_eq!(value, photo.image.double_value(&[1, y as i64, x as i64]));
+                let value = image.to_float().double_value(&[1, i as i64, j as i64]);
+                assert_eq!(value, photo.image.to_float().double_value(&[1, y as i64, x as i64]));
                 let (found, expected) = (ray(camera.intrinsics, i, j), ray(photo.camera.intrinsics, y, x));
                 let off = (0..2).map(|axis| (found[axis] - expected[axis]).abs()).fold(0., f64::max);
                 assert!(off < 1e-12, "phase {phase}: the ray of ({y}, {x}) is {off} off");

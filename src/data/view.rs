@@ -1,5 +1,6 @@
 //! A photo as a tensor, and its camera.
 
+use super::pixels::Pixels;
 use crate::error::Result;
 use crate::io::rgb_from_tensor;
 use crate::scene::{Camera, ImageSize};
@@ -12,10 +13,10 @@ use tch::{Kind, Tensor};
 pub struct View {
     /// Name of the image in the capture.
     pub name: String,
-    /// Pixels, `[3, H, W]`, values in [0, 1].
-    pub image: Tensor,
+    /// Colours, `[3, H, W]`.
+    pub image: Pixels,
     /// Weight of each pixel, `[1, H, W]`: 1 where the pixel counts, 0 where it is masked out. `None` if every pixel counts.
-    pub mask: Option<Tensor>,
+    pub mask: Option<Pixels>,
     /// Camera at the size of `image`.
     pub camera: Camera,
 }
@@ -23,23 +24,21 @@ pub struct View {
 impl From<Photo> for View {
     fn from(Photo { name, image, mask, camera }: Photo) -> Self {
         let (height, width) = image.size();
-        let mask = mask.map(|mask| {
-            Tensor::from_slice(&mask).view([1, height as i64, width as i64]).to_kind(Kind::Float) / 255.
-        });
-        View { name, image: tensor_from_planes(&image), mask, camera }
+        let mask = mask.map(|mask| Tensor::from_slice(&mask).view([1, height as i64, width as i64]).into());
+        View { name, image: levels(&image).into(), mask, camera }
     }
 }
 
 impl View {
     /// Returns a copy that shares the pixels.
     pub fn shallow_clone(&self) -> Self {
-        let mask = self.mask.as_ref().map(Tensor::shallow_clone);
+        let mask = self.mask.as_ref().map(Pixels::shallow_clone);
         View { name: self.name.clone(), image: self.image.shallow_clone(), mask, camera: self.camera }
     }
 
     /// Returns the fraction of the pixels that count, the mean weight of the mask; `None` if every pixel counts.
     pub fn pixel_fraction(&self) -> Option<f64> {
-        self.mask.as_ref().map(|mask| mask.mean(Kind::Double).double_value(&[]))
+        self.mask.as_ref().map(|mask| mask.to_float().mean(Kind::Double).double_value(&[]))
     }
 
     /// Returns `true` if no pixel counts.
@@ -52,14 +51,14 @@ impl View {
     /// # Errors
     /// Fails if libtorch rejects the image because of its shape.
     pub fn fitted(&self, size: ImageSize) -> Result<Self> {
-        let (planes, camera) = resize_and_crop(&rgb_from_tensor(&self.image)?, &self.camera, size);
-        let fit_mask = |mask: &Tensor| -> Result<Tensor> {
-            let (planes, _) =
-                resize_and_crop(&rgb_from_tensor(&mask.expand([3, -1, -1], false))?, &self.camera, size);
-            Ok(tensor_from_planes(&planes).narrow(0, 0, 1))
+        let (planes, camera) = resize_and_crop(&rgb_from_tensor(&self.image.to_float())?, &self.camera, size);
+        let fit_mask = |mask: &Pixels| -> Result<Pixels> {
+            let mask = rgb_from_tensor(&mask.to_float().expand([3, -1, -1], false))?;
+            let (planes, _) = resize_and_crop(&mask, &self.camera, size);
+            Ok(levels(&planes).narrow(0, 0, 1).contiguous().into())
         };
         let mask = self.mask.as_ref().map(fit_mask).transpose()?;
-        Ok(View { name: self.name.clone(), image: tensor_from_planes(&planes), mask, camera })
+        Ok(View { name: self.name.clone(), image: levels(&planes).into(), mask, camera })
     }
 }
 
@@ -79,13 +78,15 @@ pub fn load_all_views(capture: &Capture, size: Option<ImageSize>) -> Result<Vec<
     load_views(capture, &(0..capture.len()).collect::<Vec<_>>(), size)
 }
 
+/// Converts an image to a tensor of 8-bit levels, `[3, H, W]`.
+fn levels(planes: &Planes) -> Tensor {
+    let (height, width) = planes.size();
+    Tensor::from_slice(planes.as_bytes()).view([CHANNELS as i64, height as i64, width as i64])
+}
+
 /// Converts an image to a float tensor, `[3, H, W]`, values in [0, 1].
 pub fn tensor_from_planes(planes: &Planes) -> Tensor {
-    let (height, width) = planes.size();
-    let bytes = Tensor::from_slice(planes.as_bytes());
-    let mut values = bytes.view([CHANNELS as i64, height as i64, width as i64]).to_kind(Kind::Float);
-    // Divide in place: a second copy of a photo of 16 million pixels takes 192 MB.
-    values.divide_scalar_(255.)
+    Pixels::from(levels(planes)).to_float()
 }
 
 #[cfg(test)]

@@ -28,7 +28,7 @@ impl ContactSheet {
     pub fn render(gaussians: &Gaussians, views: &[View]) -> Result<Self> {
         let mut sheet = ContactSheet::new(views.len());
         for view in views {
-            sheet.add(&view.image, &render_views(gaussians, &[view.camera])?[0].to_host())?;
+            sheet.add(&view.image.to_float(), &render_views(gaussians, &[view.camera])?[0].to_host())?;
         }
         Ok(sheet)
     }

@@ -81,10 +81,13 @@ fn distance(lpips: Option<&Lpips>, image: &Tensor, ground_truth: &View) -> Optio
         return None;
     }
     let prepare = |image: &Tensor| image.to_device(lpips.device()).clamp(0., 1.);
-    let (image, photo) = (prepare(image), prepare(&ground_truth.image));
+    let (image, photo) = (prepare(image), prepare(&ground_truth.image.to_float()));
     let distance = |image: &Tensor| tch::no_grad(|| lpips.distance(image, &photo)).double_value(&[]);
     Some(match &ground_truth.mask {
-        Some(mask) => distance(&fill_masked(&image, &photo, &prepare(mask))) / mean_weight(mask),
+        Some(mask) => {
+            let mask = mask.to_float();
+            distance(&fill_masked(&image, &photo, &prepare(&mask))) / mean_weight(&mask)
+        }
         None => distance(&image),
     })
 }

@@ -2,7 +2,7 @@
 
 use super::metrics::{SSIM_WINDOW, masked_psnr, masked_ssim, mean_weight};
 use super::photo_source::LazyPhotos;
-use crate::data::View;
+use crate::data::{Pixels, View};
 use crate::error::{Error, Result};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -84,13 +84,15 @@ pub(super) fn score_view(image: &Tensor, view: &View) -> Result<ViewScore> {
             view.name
         )));
     }
-    let pixel_fraction = view.mask.as_ref().map(mean_weight);
+    let mask = view.mask.as_ref().map(Pixels::to_float);
+    let pixel_fraction = mask.as_ref().map(mean_weight);
     if pixel_fraction == Some(0.) {
         let why = format!("{} is masked out as a whole, expected pixels that can be scored", view.name);
         return Err(Error::request(why));
     }
-    let psnr = masked_psnr(image, &view.image, view.mask.as_ref());
-    let ssim = masked_ssim(image, &view.image, view.mask.as_ref());
+    let photo = view.image.to_float();
+    let psnr = masked_psnr(image, &photo, mask.as_ref());
+    let ssim = masked_ssim(image, &photo, mask.as_ref());
     let image = view.name.clone();
     Ok(ViewScore { image, psnr, ssim, lpips_vgg: None, lpips_alex: None, pixel_fraction })
 }
@@ -131,9 +133,9 @@ impl Baselines {
     /// # Errors
     /// Fails if photos differ in size or can't be read.
     pub fn compute(scene: &str, context: &LazyPhotos, target: &LazyPhotos) -> Result<Self> {
-        let mut sum = context.load(0)?.image.copy();
+        let mut sum = context.load(0)?.image.to_float().copy();
         for i in 1..context.len() {
-            sum += context.load(i)?.image;
+            sum += context.load(i)?.image.to_float();
         }
         let mean = sum / context.len() as f64;
         let mut means = vec![];
@@ -167,7 +169,7 @@ pub(super) fn nearest_context_baseline(
         let nearest = context.load(nearest.expect("a context view"))?;
         let view = target.load(i)?;
         if !view.is_masked_out() {
-            scores.push(score_view(&nearest.image, &view)?);
+            scores.push(score_view(&nearest.image.to_float(), &view)?);
         }
     }
     Ok(CaptureScores::from_views(scene, scores, None))
@@ -185,7 +187,7 @@ mod tests {
         let intrinsics = Intrinsics { fx: 16., fy: 16., cx: 8., cy: 8. };
         let view = |at: f64, grey: f64| View {
             name: String::new(),
-            image: Tensor::full([3, 16, 16], grey, (Kind::Float, Device::Cpu)),
+            image: Tensor::full([3, 16, 16], grey, (Kind::Float, Device::Cpu)).into(),
             mask: None,
             camera: Camera { intrinsics, c2w: DMat4::from_translation(DVec3::X * at), width: 8, height: 8 },
         };

@@ -352,7 +352,8 @@ impl DatasetEvaluation<'_> {
         let mut worst: Option<(f64, Tensor)> = None;
         let scores = score_output(&mut output, perceptual, |ground_truth, picture, score| {
             if worst.as_ref().is_none_or(|(psnr, _)| score.psnr.total_cmp(psnr).is_lt()) {
-                let image = comparison_image(&ground_truth.image, &picture.rgb, picture.rendered.as_ref());
+                let photo = ground_truth.image.to_float();
+                let image = comparison_image(&photo, &picture.rgb, picture.rendered.as_ref());
                 worst = Some((score.psnr, image));
             }
             Ok(())

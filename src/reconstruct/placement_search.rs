@@ -85,8 +85,8 @@ fn error_of(gaussians: &Gaussians, photos: &[View], poses: &[DMat4]) -> Result<f
     let error = |(made, photo): (&RenderedView, &View)| {
         let there = |t: &Tensor| t.to_device(made.rgb.device());
         let error = match &photo.mask {
-            Some(mask) => masked_mse(&made.rgb, &there(&photo.image), &there(mask)),
-            None => mse(&made.rgb, &there(&photo.image)),
+            Some(mask) => masked_mse(&made.rgb, &there(&photo.image.to_float()), &there(&mask.to_float())),
+            None => mse(&made.rgb, &there(&photo.image.to_float())),
         };
         error.double_value(&[])
     };

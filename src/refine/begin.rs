@@ -253,7 +253,7 @@ mod tests {
             };
             View {
                 name: String::new(),
-                image: Tensor::zeros([3, 32, 32], (Kind::Float, Device::Cpu)),
+                image: Tensor::zeros([3, 32, 32], (Kind::Float, Device::Cpu)).into(),
                 mask: None,
                 camera,
             }

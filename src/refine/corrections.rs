@@ -3,7 +3,7 @@
 
 use super::config::RefineConfig;
 use super::state::{CORRECTIONS, RefineState};
-use crate::data::{View, ViewBatch};
+use crate::data::{Pixels, View, ViewBatch};
 use crate::error::Result;
 use crate::optim::{Optimizer, ParameterGroup, UpdateRule};
 use glam::{DMat4, DQuat, DVec3};
@@ -145,8 +145,9 @@ impl Corrections {
         camera.c2w = DMat4::from_quat(quaternion(&numbers)) * camera.c2w;
         camera.c2w.w_axis = centre.extend(1.);
         let gain = Tensor::from_slice(&numbers[6..9]).exp().to_kind(Kind::Float).view([3, 1, 1]);
-        let mask = view.mask.as_ref().map(Tensor::shallow_clone);
-        View { name: view.name.clone(), image: &view.image / gain, mask, camera }
+        let mask = view.mask.as_ref().map(Pixels::shallow_clone);
+        let image = (view.image.to_float() / gain).into();
+        View { name: view.name.clone(), image, mask, camera }
     }
 
     /// Returns the learned correction of each of `photos`.
@@ -212,7 +213,7 @@ mod tests {
         let camera = Camera { c2w, intrinsics, width: 8, height: 8 };
         View {
             name: index.to_string(),
-            image: Tensor::full([3, 8, 8], 0.5, (Kind::Float, Device::Cpu)),
+            image: Tensor::full([3, 8, 8], 0.5, (Kind::Float, Device::Cpu)).into(),
             mask: None,
             camera,
         }
@@ -242,7 +243,7 @@ mod tests {
             let apart = (w2c.select(0, 0).select(0, index as i64) - rows).abs().max().double_value(&[]);
             assert!(apart < 1e-6, "camera {index} is {apart} off");
             // The photo divided by its exposure, times the rendered image multiplied by the exposure.
-            let product = &view.image * images.select(0, 0).select(0, index as i64);
+            let product = view.image.to_float() * images.select(0, 0).select(0, index as i64);
             assert!((product - 0.25).abs().max().double_value(&[]) < 1e-6);
         }
         let report = learned.report(&views);

@@ -281,7 +281,7 @@ mod tests {
             let c2w = DMat4::from_translation(DVec3::X * at);
             let camera = Camera { intrinsics, c2w, width: SIDE as u32, height: SIDE as u32 };
             let image = wave.expand([3, SIDE, SIDE], false).contiguous();
-            View { name: index.to_string(), image, mask: None, camera }
+            View { name: index.to_string(), image: image.into(), mask: None, camera }
         };
         let clean: Vec<View> = (0..7).map(view).collect();
         let blobs = clean.iter().enumerate().map(|(index, view)| {
@@ -289,10 +289,10 @@ mod tests {
                 let (row, column) = (7 * index as i64, 23 * index as i64 % 48);
                 t.narrow(1, row, 16).narrow(2, column, 16)
             };
-            let (image, mask) = (view.image.copy(), Tensor::ones([1, SIDE, SIDE], options));
+            let (image, mask) = (view.image.to_float().copy(), Tensor::ones([1, SIDE, SIDE], options));
             let _ = square(&image).fill_(1.);
             let _ = square(&mask).fill_(0.);
-            View { image, mask: is_masked.then_some(mask), ..view.shallow_clone() }
+            View { image: image.into(), mask: is_masked.then(|| mask.into()), ..view.shallow_clone() }
         });
         [blobs.collect(), clean]
     }
@@ -352,7 +352,7 @@ mod tests {
             let end = SIDE / 2 - (index as i64 - 3) * 4;
             let mask = Tensor::ones([1, SIDE, SIDE], (Kind::Float, Device::Cpu));
             let _ = mask.narrow(2, end, SIDE - end).zero_();
-            view.mask = Some(mask);
+            view.mask = Some(mask.into());
         }
         let middle = [views[3].camera];
         let [ignored, random] = [None, Some(MaskBackground::Random)].map(|background| {

@@ -52,12 +52,12 @@ const MAX_GAUSSIANS: usize = 1_000_000;
 const LONGEST_SIDE: u32 = 512;
 /// Longer side of photos in pixels for a large number of Gaussians.
 const LARGEST_SIDE: u32 = 1600;
-/// Maximum memory of the photos to match, unless their number is given. Smaller copies of them take as much again.
-const MAX_PHOTO_BYTES: u64 = 768 << 20;
+/// Maximum memory of the photos to match, unless their number is given. Smaller copies of them take a third as much again.
+const MAX_PHOTO_BYTES: u64 = 1280 << 20;
 /// Maximum memory of the held-out views.
 const MAX_HELD_OUT_BYTES: u64 = 256 << 20;
-/// Memory per pixel of a photo: three channels and a mask in float32.
-const BYTES_PER_PIXEL: u64 = 16;
+/// Memory per pixel of a photo: three channels and a mask, a byte each.
+const BYTES_PER_PIXEL: u64 = 4;
 
 /// Minimum number of steps in which the number of Gaussians grows: with fewer, all are there from the start.
 const MIN_STEPS_TO_GROW: u64 = 500;
@@ -224,13 +224,17 @@ mod tests {
         };
         let cameras: Vec<Camera> = (0..2000).map(camera).collect();
         let capture = Capture::from_source("walk".into(), "".into(), &cameras, Arc::new(NoImages)).unwrap();
-        let options = RefineOptions { holdout: Holdout::Every { every: 8, first: 0 }, ..Default::default() };
+        let options = RefineOptions {
+            holdout: Holdout::Every { every: 8, first: 0 },
+            size: PhotoSize::Within(1024),
+            ..Default::default()
+        };
         let ([shown, held_out], warning) = options.select_views(&capture);
-        // 512×384 pixels of 16 bytes each.
-        let each = 16 * 512 * 384;
-        assert_eq!((shown.len(), held_out.len()), ((768 << 20) / each, (256 << 20) / each));
+        // 1024×768 pixels of 4 bytes each.
+        let each = 4 * 1024 * 768;
+        assert_eq!((shown.len(), held_out.len()), ((1280 << 20) / each, (256 << 20) / each));
         let line = warning.unwrap();
-        assert!(line.starts_with("walk: 256 of 1750 photos are matched and 85 of 250 scored"), "{line}");
+        assert!(line.starts_with("walk: 426 of 1750 photos are matched and 85 of 250 scored"), "{line}");
         let small = RefineOptions { size: PhotoSize::Exactly([96, 128].into()), ..options.clone() };
         let ([shown, held_out], warning) = small.select_views(&capture);
         assert_eq!((shown.len(), held_out.len(), warning), (1750, 250, None));

@@ -1,7 +1,7 @@
 //! Scores on a few pixels, cheap enough to compute during the optimization.
 
 use super::corrections::Corrections;
-use crate::data::View;
+use crate::data::{Pixels, View};
 use crate::error::Result;
 use crate::loss::{masked_mse, masked_photometric, psnr_of_mse, ssim};
 use crate::render::render_views;
@@ -59,10 +59,10 @@ impl Patches {
         let pictures = render_views(gaussians, &cameras)?;
         let exact = |t: &Tensor| t.to_device(Device::Cpu).to_kind(Kind::Double).clamp(0., 1.);
         let scores = pictures.iter().zip(&self.views).map(|(picture, view)| {
-            let (picture, photo) = (exact(&picture.rgb), exact(&view.image));
+            let (picture, photo) = (exact(&picture.rgb), exact(&view.image.to_float()));
             let (mse, ssim) = match &view.mask {
                 Some(mask) => {
-                    let mask = exact(mask);
+                    let mask = exact(&mask.to_float());
                     (masked_mse(&picture, &photo, &mask), masked_photometric(&picture, &photo, &mask, 0., 1.))
                 }
                 None => ((&picture - &photo).square().mean(Kind::Double), ssim(&picture, &photo)),
@@ -81,7 +81,7 @@ fn patch(view: &View, place: [f64; 2]) -> View {
     let Camera { width, height, intrinsics, .. } = view.camera;
     let [wide, high] = [width, height].map(|side| side.min(SIDE));
     let free = [width - wide, height - high];
-    let counted = view.mask.as_ref().map(|mask| mask.select(0, 0).gt(0.).nonzero());
+    let counted = view.mask.as_ref().map(|mask| mask.to_float().select(0, 0).gt(0.).nonzero());
     let [left, top] = match counted.filter(|counted| counted.numel() > 0) {
         Some(counted) => {
             let pixel = counted.get((counted.size()[0] as f64 * place[1]).floor() as i64);
@@ -90,7 +90,9 @@ fn patch(view: &View, place: [f64; 2]) -> View {
         }
         None => [0, 1].map(|axis| (f64::from(free[axis]) * place[axis]).floor() as i64),
     };
-    let cut = |image: &Tensor| image.narrow(1, top, high.into()).narrow(2, left, wide.into()).contiguous();
+    let cut = |pixels: &Pixels| {
+        pixels.map(|image| image.narrow(1, top, high.into()).narrow(2, left, wide.into()).contiguous())
+    };
     let intrinsics = intrinsics.cropped(left as f64, top as f64);
     let camera = Camera { intrinsics, width: wide, height: high, ..view.camera };
     View { name: view.name.clone(), image: cut(&view.image), mask: view.mask.as_ref().map(cut), camera }
@@ -118,7 +120,7 @@ mod tests {
         let intrinsics = Intrinsics { fx: 200., fy: 190., cx: 100., cy: 80. };
         let camera = Camera { intrinsics, c2w: DMat4::IDENTITY, width: 210, height: 170 };
         let image = render_views(&gaussians, &[camera]).unwrap().remove(0).rgb;
-        let view = View { name: String::new(), image, mask: None, camera };
+        let view = View { name: String::new(), image: image.into(), mask: None, camera };
         let views: Vec<View> = (0..20).map(|_| view.shallow_clone()).collect();
         let patches = Patches::from_views(&views);
         assert_eq!(patches.views.len(), 7);

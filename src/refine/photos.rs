@@ -4,10 +4,9 @@ use super::config::RefineConfig;
 use super::depth_map::DepthMap;
 use super::known_depths::KnownDepths;
 use super::view_selection::are_near_duplicates;
-use crate::data::{Capture, MIN_SHORTER_SIDE, PhotoSize, View, ViewBatch, load_views, view_batch};
+use crate::data::{Capture, MIN_SHORTER_SIDE, PhotoSize, Pixels, View, ViewBatch, load_views, view_matrices};
 use crate::error::{Error, Result};
-use crate::scene::ImageSize;
-use glam::DMat4;
+use crate::scene::{Camera, ImageSize};
 use rand::Rng;
 use rand::seq::index::sample;
 use std::collections::BTreeMap;
@@ -66,8 +65,11 @@ pub(super) fn distinct(photos: &[View], depth: f64) -> Vec<usize> {
             let side = |pixels: u32| ((f64::from(pixels) * factor).round() as i64).max(1);
             // A photo with another mask shows something else.
             let image = match mask {
-                Some(mask) => Tensor::cat(&[image * mask, mask.shallow_clone()], 0),
-                None => image.shallow_clone(),
+                Some(mask) => {
+                    let mask = mask.to_float();
+                    Tensor::cat(&[image.to_float() * &mask, mask], 0)
+                }
+                None => image.to_float(),
             };
             image.unsqueeze(0).adaptive_avg_pool2d([side(camera.height), side(camera.width)])
         })
@@ -100,8 +102,13 @@ pub struct Photos {
 struct Group {
     /// Indices among all photos.
     indices: Vec<usize>,
-    views: ViewBatch,
-    /// Known depths of each.
+    /// Image of each photo, [3, H, W].
+    images: Vec<Pixels>,
+    /// Mask of each photo, [1, H, W]; `None` if every pixel of all photos counts.
+    masks: Option<Vec<Pixels>>,
+    /// Camera-to-world and world-to-camera matrices [1, V, 4, 4], and intrinsics [1, V, 3, 3].
+    matrices: [Tensor; 3],
+    /// Known depths of each photo.
     depths: Vec<Option<KnownDepths>>,
 }
 
@@ -117,19 +124,95 @@ pub(super) struct Drawn<'a> {
 
 impl Group {
     /// Creates a group of photos, some of which have a map in `depth_maps` at their index among all photos.
-    fn new(indices: Vec<usize>, views: ViewBatch, depth_maps: &[Option<&DepthMap>]) -> Self {
-        let (size, device) = (views.images.size(), views.images.device());
+    fn new(
+        indices: Vec<usize>,
+        images: Vec<Pixels>,
+        masks: Option<Vec<Pixels>>,
+        matrices: [Tensor; 3],
+        depth_maps: &[Option<&DepthMap>],
+    ) -> Self {
+        let (size, device) = (images[0].size(), matrices[0].device());
         let known =
-            |&index: &usize| depth_maps[index].map(|map| KnownDepths::new(map, size[4], size[3], device));
-        Group { depths: indices.iter().map(known).collect(), indices, views }
+            |&index: &usize| depth_maps[index].map(|map| KnownDepths::new(map, size[2], size[1], device));
+        Group { depths: indices.iter().map(known).collect(), indices, images, masks, matrices }
+    }
+
+    /// Creates a group of `views` of one size on `device`, which have the indices `indices` among all photos.
+    fn from_views(
+        indices: Vec<usize>,
+        views: &[&View],
+        depth_maps: &[Option<&DepthMap>],
+        device: Device,
+    ) -> Self {
+        let images: Vec<Pixels> = views.iter().map(|view| view.image.to_device(device)).collect();
+        let mask = |view: &&View| match &view.mask {
+            Some(mask) => mask.to_device(device),
+            None => {
+                let size = [1, view.camera.height.into(), view.camera.width.into()];
+                Tensor::full(size, 255, (Kind::Uint8, device)).into()
+            }
+        };
+        let has_masks = views.iter().any(|view| view.mask.is_some());
+        let masks = has_masks.then(|| views.iter().map(mask).collect());
+        let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
+        Group::new(indices, images, masks, view_matrices(&cameras, device), depth_maps)
+    }
+
+    /// Returns the photos at `positions` as a batch.
+    fn select(&self, positions: &[usize]) -> ViewBatch {
+        let stack = |pixels: &[Pixels]| {
+            let chosen: Vec<Tensor> = positions.iter().map(|&view| pixels[view].to_float()).collect();
+            Tensor::stack(&chosen, 0).unsqueeze(0)
+        };
+        // An index tensor would have to be copied to the device first.
+        let [c2w, w2c, intrinsics] = self.matrices.each_ref().map(|matrices| {
+            let chosen: Vec<Tensor> = positions.iter().map(|&view| matrices.select(1, view as i64)).collect();
+            Tensor::stack(&chosen, 1)
+        });
+        let masks = self.masks.as_deref().map(stack);
+        ViewBatch { images: stack(&self.images), masks, c2w, w2c, intrinsics }
+    }
+
+    /// Returns the photos at half their width and height, or as they are if they would become too small. Pixels are rounded to 8 bits.
+    fn halved(&self, depth_maps: &[Option<&DepthMap>]) -> Self {
+        let size = self.images[0].size();
+        let [c2w, w2c, intrinsics] = self.matrices.each_ref().map(Tensor::shallow_clone);
+        if size[1].min(size[2]) < 2 * i64::from(MIN_SHORTER_SIDE) {
+            let clones = |pixels: &[Pixels]| pixels.iter().map(Pixels::shallow_clone).collect();
+            let (images, masks) = (clones(&self.images), self.masks.as_deref().map(clones));
+            return Group::new(self.indices.clone(), images, masks, [c2w, w2c, intrinsics], depth_maps);
+        }
+        let half = |t: &Tensor| t.unsqueeze(0).avg_pool2d(2, 2, 0, false, true, None).squeeze_dim(0);
+        // Small tensors that are allocated between larger ones, which are freed, would leave gaps in memory where no larger one fits.
+        let allocate = |channels: i64| -> Vec<Pixels> {
+            let count = self.images.len() as i64;
+            let shape = [count, channels, size[1] / 2, size[2] / 2];
+            let levels = Tensor::empty(shape, (Kind::Uint8, c2w.device()));
+            (0..count).map(|index| levels.get(index).into()).collect()
+        };
+        let (mut images, mut masks) = (allocate(3), self.masks.as_ref().map(|_| allocate(1)));
+        for (index, image) in self.images.iter().enumerate() {
+            let mask = self.masks.as_ref().map(|masks| masks[index].to_float());
+            let (image, mask) = pool_masked(&image.to_float(), mask.as_ref(), half);
+            images[index].set(&image);
+            if let (Some(masks), Some(mask)) = (&mut masks, mask) {
+                masks[index].set(&mask);
+            }
+        }
+        let intrinsics = intrinsics.copy();
+        let _ = intrinsics.narrow(2, 0, 2).g_mul_scalar_(0.5);
+        Group::new(self.indices.clone(), images, masks, [c2w, w2c, intrinsics], depth_maps)
     }
 }
 
 impl Photos {
     /// Creates photos from `views` at their own size only.
     pub(crate) fn from_batch(views: ViewBatch) -> Self {
-        let count = views.images.size()[1] as usize;
-        let group = Group::new((0..count).collect(), views, &vec![None; count]);
+        let count = views.images.size()[1];
+        let images = (0..count).map(|view| views.images.get(0).get(view).into()).collect();
+        let matrices = [views.c2w, views.w2c, views.intrinsics];
+        let group =
+            Group::new((0..count as usize).collect(), images, None, matrices, &vec![None; count as usize]);
         Photos { levels: vec![vec![group]], schedule: vec![] }
     }
 
@@ -145,17 +228,13 @@ impl Photos {
             groups.entry((camera.height, camera.width)).or_default().push(index);
         }
         let group = |indices: Vec<usize>| {
-            let (views, poses): (Vec<&View>, Vec<DMat4>) =
-                indices.iter().map(|&i| (&views[i], views[i].camera.c2w)).unzip();
-            Group::new(indices, view_batch(&views, &poses, device), &depth_maps)
+            let views: Vec<&View> = indices.iter().map(|&i| &views[i]).collect();
+            Group::from_views(indices, &views, &depth_maps, device)
         };
         let whole = groups.into_values().map(group).collect();
         let mut sizes: Vec<Vec<Group>> = vec![whole];
         for _ in &schedule {
-            let halves = sizes[sizes.len() - 1]
-                .iter()
-                .map(|group| Group::new(group.indices.clone(), halved(&group.views), &depth_maps))
-                .collect();
+            let halves = sizes[sizes.len() - 1].iter().map(|group| group.halved(&depth_maps)).collect();
             sizes.push(halves);
         }
         sizes.reverse();
@@ -174,26 +253,10 @@ impl Photos {
         chosen.sort_unstable();
         Drawn {
             which: chosen.iter().map(|&k| group.indices[k] as i64).collect(),
-            views: group.views.select(&chosen),
+            views: group.select(&chosen),
             depths: chosen.iter().map(|&k| group.depths[k].as_ref()).collect(),
         }
     }
-}
-
-/// Halves the width and height of the photos, or returns them unchanged if they would become too small.
-fn halved(batch: &ViewBatch) -> ViewBatch {
-    let size = batch.images.size();
-    let (images, masks, intrinsics) = if size[3].min(size[4]) < 2 * i64::from(MIN_SHORTER_SIDE) {
-        let masks = batch.masks.as_ref().map(Tensor::shallow_clone);
-        (batch.images.shallow_clone(), masks, batch.intrinsics.shallow_clone())
-    } else {
-        let intrinsics = batch.intrinsics.copy();
-        let _ = intrinsics.narrow(2, 0, 2).g_mul_scalar_(0.5);
-        let half = |t: &Tensor| t.squeeze_dim(0).avg_pool2d(2, 2, 0, false, true, None).unsqueeze(0);
-        let (images, masks) = pool_masked(&batch.images, batch.masks.as_ref(), half);
-        (images, masks, intrinsics)
-    };
-    ViewBatch { images, masks, intrinsics, c2w: batch.c2w.shallow_clone(), w2c: batch.w2c.shallow_clone() }
 }
 
 /// Downscales images [.., 3, H, W] and their masks [.., 1, H, W] by `pool`. Colours are means over the pixels that count.

@@ -180,8 +180,8 @@ impl SmallPhoto {
         let resized = |pixels: u32| ((side(pixels) * factor).round() as i64).max(depth_search::PATCH);
         let (height, width) = (resized(camera.height), resized(camera.width));
         let pool = |t: &Tensor| t.unsqueeze(0).adaptive_avg_pool2d([height, width]).squeeze_dim(0);
-        let mask = view.mask.as_ref().map(|mask| mask.to_device(Device::Cpu));
-        let (image, weight) = pool_masked(&view.image.to_device(Device::Cpu), mask.as_ref(), pool);
+        let mask = view.mask.as_ref().map(|mask| mask.to_float().to_device(Device::Cpu));
+        let (image, weight) = pool_masked(&view.image.to_float().to_device(Device::Cpu), mask.as_ref(), pool);
         let grey = image.mean_dim([0].as_slice(), false, Kind::Float);
         let scale = (width as f64 / side(camera.width), height as f64 / side(camera.height));
         let intrinsics = camera.intrinsics.resized(scale.0, scale.1);
@@ -300,7 +300,7 @@ mod tests {
             let camera = Camera { intrinsics, c2w, width: side, height: side };
             View {
                 name: String::new(),
-                image: wave.expand([3, 64, 64], false).contiguous(),
+                image: wave.expand([3, 64, 64], false).contiguous().into(),
                 mask: None,
                 camera,
             }
@@ -308,10 +308,10 @@ mod tests {
         let views = [view(-0.5), view(0.), view(0.5)];
         // A mask of the left half, where the photos show something else.
         let masked = views.each_ref().map(|view| {
-            let (image, mask) = (view.image.copy(), Tensor::ones([1, 64, 64], options));
+            let (image, mask) = (view.image.to_float().copy(), Tensor::ones([1, 64, 64], options));
             image.narrow(2, 0, 24).copy_(&Tensor::rand([3, 64, 24], options));
             let _ = mask.narrow(2, 0, 24).zero_();
-            View { image, mask: Some(mask), ..view.shallow_clone() }
+            View { image: image.into(), mask: Some(mask.into()), ..view.shallow_clone() }
         });
         for swept in sweep(&masked, &[], |_| true) {
             let off = (&swept.depth / depth - 1.).abs();

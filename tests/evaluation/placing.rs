@@ -29,8 +29,10 @@ fn reconstruct_at_scales(photos: &[View], model: &mut LoadedModel, extents: &[f6
 fn psnr(made: &Reconstruction, photos: &[View]) -> f64 {
     let cameras: Vec<_> = photos.iter().map(|photo| photo.camera).collect();
     let pictures = render_views(&made.in_world(), &cameras).unwrap();
-    let errors =
-        pictures.iter().zip(photos).map(|(made, photo)| mse(&made.rgb, &photo.image).double_value(&[]));
+    let errors = pictures
+        .iter()
+        .zip(photos)
+        .map(|(made, photo)| mse(&made.rgb, &photo.image.to_float()).double_value(&[]));
     psnr_of_mse(errors.sum::<f64>() / photos.len() as f64)
 }
 

@@ -240,7 +240,7 @@ fn videos_are_data_like_any_other() {
     for (a, b) in views(&written).iter().zip(&views(&named)) {
         assert!((a.camera.c2w - b.camera.c2w).abs_diff_eq(glam::DMat4::ZERO, 1e-5));
         // The written photos are JPEGs of high quality.
-        let apart = (&a.image - &b.image).abs().mean(tch::Kind::Double).double_value(&[]);
+        let apart = (a.image.to_float() - b.image.to_float()).abs().mean(tch::Kind::Double).double_value(&[]);
         assert!(apart < 0.02, "{apart}");
     }
 }
@@ -260,7 +260,7 @@ fn pictures_that_a_user_names_are_seen() {
         let data = Dataset::open(data, Split::Test).unwrap();
         let first = |capture: Capture| {
             let view = load_views(&capture, &[0], None).unwrap().remove(0);
-            let channel = |index| -> tch::Tensor { view.image.select(0, index) };
+            let channel = |index| -> tch::Tensor { view.image.to_float().select(0, index) };
             let excess = channel(0).minimum(&channel(2)) - channel(1) * 2.;
             excess.gt(0.1).sum(tch::Kind::Int64).int64_value(&[]) as f64
         };

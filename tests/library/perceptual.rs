@@ -101,7 +101,7 @@ fn lpips_in_bf16_is_float32_s() {
     if let Some(captures) = crate::common::captures() {
         let capture = open_capture(&captures[0]).expect("a capture");
         let views = load_context(&capture, Holdout::None, Some(2), [SIDE, SIDE].into()).expect("views");
-        ground_truths.push(("a photo", views[0].image.to_kind(Kind::Float).unsqueeze(0).unsqueeze(0)));
+        ground_truths.push(("a photo", views[0].image.to_float().unsqueeze(0).unsqueeze(0)));
     }
     for (kind, network) in
         [(PerceptualKind::LpipsVgg, LpipsNetwork::Vgg16), (PerceptualKind::LpipsAlex, LpipsNetwork::AlexNet)]

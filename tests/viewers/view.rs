@@ -128,7 +128,7 @@ fn expected(capture: &Path, splat: &Path, index: usize) -> (Tensor, Tensor) {
     let view = load_views(&open_capture(capture).unwrap(), &[index], Some(size)).unwrap().remove(0);
     let own =
         render_views(&Gaussians::from_splat(&read_splat(splat).unwrap()), &[view.camera]).unwrap().remove(0);
-    (own.rgb.clamp(0., 1.), view.image)
+    (own.rgb.clamp(0., 1.), view.image.to_float())
 }
 
 /// Returns the mean distance of an image's pixels from the nearest depth colour.

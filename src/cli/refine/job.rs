@@ -77,7 +77,7 @@ impl RefineJob {
     pub fn run(mut self) -> Result<()> {
         let age = process_age().unwrap_or_default();
         let now = Instant::now();
-        memory::keep();
+        memory::return_large_tensors();
         check_writable_splat(&self.out)?;
         splat_out::check_origin(&self.out, self.local_origin)?;
         if let Some(sheet) = &self.reports.sheet {
@@ -144,6 +144,7 @@ impl RefineJob {
         if self.reports.sheet.is_some() {
             session.reserve_for_contact_sheet(&gaussians)?;
         }
+        memory::keep();
         let result = session.run()?;
         bar.bar.finish_and_clear();
         if result.is_initial && result.steps > 0 {

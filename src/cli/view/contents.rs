@@ -120,7 +120,7 @@ fn photographed(capture: &Capture, frame: &LocalFrame) -> Result<Vec<PageCamera>
     let indices = (0..count).map(|i| i * (capture.len() - 1) / (count - 1).max(1));
     let photographed = |index: usize| {
         let view = load_views(capture, &[index], shrunk(&cameras[index]))?.remove(0);
-        let jpeg = encode_photo(&rgb_from_tensor(&view.image)?, true)?;
+        let jpeg = encode_photo(&rgb_from_tensor(&view.image.to_float())?, true)?;
         let photo = format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg));
         Ok(PageCamera::new(view.name, &frame.camera_to_local(&view.camera), Some(photo)))
     };
