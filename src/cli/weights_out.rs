@@ -5,7 +5,7 @@ use anyhow::Result;
 use clap::{Args, ValueEnum};
 use globalsplat::Error;
 use globalsplat::config::Config;
-use globalsplat::io::{InputFiles, check_writable_file, shard_index, write_sharded};
+use globalsplat::io::{InputFiles, check_writable_file, parent_of, shard_index, write_sharded};
 use globalsplat::model::Stage;
 use globalsplat::reconstruct::{ModelDtype, model_weights, save_checkpoint};
 use serde_json::{Value, json};
@@ -57,7 +57,7 @@ impl WeightsOut {
         // Shards have their index in the file name.
         let Some(index) = shard_index(&self.out) else { return Ok(()) };
         let stem = format!("{}-", self.out.file_stem().unwrap_or_default().to_string_lossy());
-        let beside = index.parent().and_then(|folder| folder.read_dir().ok());
+        let beside = parent_of(&index).read_dir().ok();
         let beside = beside.into_iter().flatten().flatten();
         let shards = beside.filter(|file| file.file_name().to_string_lossy().starts_with(&stem));
         let mut shards = shards.map(|file| file.path()).chain([index.clone()]);

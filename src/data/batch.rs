@@ -32,7 +32,10 @@ pub fn view_batch<V: Borrow<View>>(views: &[V], poses: &[DMat4], device: Device)
     let masks = views.iter().any(|view| view.borrow().mask.is_some()).then(|| {
         let mask = |view: &V| match &view.borrow().mask {
             Some(mask) => mask.to_float(),
-            None => ones_like_mask(&view.borrow().image.to_float()),
+            None => {
+                let size = view.borrow().image.size();
+                Tensor::ones([1, size[1], size[2]], (Kind::Float, Device::Cpu))
+            }
         };
         stack(&views.iter().map(mask).collect::<Vec<_>>())
     });

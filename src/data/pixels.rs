@@ -2,29 +2,44 @@
 
 use tch::{Device, Kind, Tensor};
 
-/// Pixels of a photo or of its mask, `[C, H, W]`: floats, or the 8-bit levels of a file, which take a quarter of the memory.
+/// Pixels of a photo or of its mask, `[C, H, W]`: floats, nominally in [0, 1], or the 8-bit levels of a file, which take a quarter of the
+/// memory.
 #[derive(Debug)]
 pub struct Pixels(Tensor);
 
 impl From<Tensor> for Pixels {
-    /// Takes floats in [0, 1], or levels from 0 to 255 of kind `Uint8`.
+    /// Takes floats, or levels from 0 to 255 of kind `Uint8`.
+    ///
+    /// # Panics
+    /// If the tensor has another kind.
     fn from(values: Tensor) -> Self {
+        assert!(matches!(values.kind(), Kind::Float | Kind::Uint8), "pixels are floats or 8-bit levels");
         Pixels(values)
     }
 }
 
 impl Pixels {
-    /// Returns the pixels as floats in [0, 1]. Floats are not copied.
+    /// Returns the pixels as floats; level 255 becomes 1. Floats are not copied.
     pub fn to_float(&self) -> Tensor {
-        match self.0.kind() {
-            // Divide in place: a second copy of a photo of 16 million pixels takes 192 MB.
-            Kind::Uint8 => self.0.to_kind(Kind::Float).divide_scalar_(255.),
-            _ => self.0.shallow_clone(),
+        to_float(&self.0)
+    }
+
+    /// Returns the pixels of several images of one size as floats, `[N, C, H, W]`.
+    pub(crate) fn stack(images: &[&Pixels]) -> Tensor {
+        let is_of_levels = images.iter().all(|image| image.0.kind() == Kind::Uint8);
+        match is_of_levels {
+            true => to_float(&Tensor::stack(&images.iter().map(|image| &image.0).collect::<Vec<_>>(), 0)),
+            false => Tensor::stack(&images.iter().map(|image| image.to_float()).collect::<Vec<_>>(), 0),
         }
     }
 
-    /// Overwrites 8-bit levels with floats in [0, 1], rounded to the nearest level.
-    pub(crate) fn set(&mut self, floats: &Tensor) {
+    /// Returns 8-bit levels that are not initialized, of a size [C, H, W].
+    pub(crate) fn empty(size: &[i64], device: Device) -> Self {
+        Pixels(Tensor::empty(size, (Kind::Uint8, device)))
+    }
+
+    /// Overwrites 8-bit levels with floats, limited to [0, 1] and rounded to the nearest level.
+    pub(crate) fn copy_from_floats(&mut self, floats: &Tensor) {
         assert_eq!(self.0.kind(), Kind::Uint8, "floats would not be rounded");
         self.0.copy_(&(floats.clamp(0., 1.) * 255.).round_());
     }
@@ -46,7 +61,17 @@ impl Pixels {
 
     /// Returns the pixels after `change`, which doesn't change their values, such as taking a part of them.
     pub(crate) fn map(&self, change: impl FnOnce(&Tensor) -> Tensor) -> Self {
-        Pixels(change(&self.0))
+        let changed = change(&self.0);
+        assert_eq!(changed.kind(), self.0.kind(), "values would change their meaning");
+        Pixels(changed)
+    }
+}
+
+fn to_float(values: &Tensor) -> Tensor {
+    match values.kind() {
+        // Divide in place: a second copy of a photo of 16 million pixels takes 192 MB.
+        Kind::Uint8 => values.to_kind(Kind::Float).divide_scalar_(255.),
+        _ => values.shallow_clone(),
     }
 }
 
@@ -61,7 +86,12 @@ mod tests {
         assert_eq!((floats.kind(), floats.double_value(&[0, 15, 15])), (Kind::Float, 1.));
         assert!(Pixels::from(floats.shallow_clone()).to_float().equal(&floats));
         let mut rounded = Pixels::from(levels.zeros_like());
-        rounded.set(&(floats + 0.4 / 255.));
+        rounded.copy_from_floats(&(floats + 0.4 / 255.));
         assert!(rounded.0.equal(&levels));
+        let floats = rounded.to_float();
+        let mixed = Pixels::from(floats.shallow_clone());
+        for images in [[&rounded, &rounded], [&rounded, &mixed]] {
+            assert!(Pixels::stack(&images).equal(&Tensor::stack(&[&floats, &floats], 0)));
+        }
     }
 }

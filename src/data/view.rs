@@ -25,7 +25,7 @@ impl From<Photo> for View {
     fn from(Photo { name, image, mask, camera }: Photo) -> Self {
         let (height, width) = image.size();
         let mask = mask.map(|mask| Tensor::from_slice(&mask).view([1, height as i64, width as i64]).into());
-        View { name, image: levels(&image).into(), mask, camera }
+        View { name, image: byte_tensor(&image).into(), mask, camera }
     }
 }
 
@@ -55,10 +55,10 @@ impl View {
         let fit_mask = |mask: &Pixels| -> Result<Pixels> {
             let mask = rgb_from_tensor(&mask.to_float().expand([3, -1, -1], false))?;
             let (planes, _) = resize_and_crop(&mask, &self.camera, size);
-            Ok(levels(&planes).narrow(0, 0, 1).contiguous().into())
+            Ok(byte_tensor(&planes).narrow(0, 0, 1).copy().into())
         };
         let mask = self.mask.as_ref().map(fit_mask).transpose()?;
-        Ok(View { name: self.name.clone(), image: levels(&planes).into(), mask, camera })
+        Ok(View { name: self.name.clone(), image: byte_tensor(&planes).into(), mask, camera })
     }
 }
 
@@ -79,14 +79,14 @@ pub fn load_all_views(capture: &Capture, size: Option<ImageSize>) -> Result<Vec<
 }
 
 /// Converts an image to a tensor of 8-bit levels, `[3, H, W]`.
-fn levels(planes: &Planes) -> Tensor {
+fn byte_tensor(planes: &Planes) -> Tensor {
     let (height, width) = planes.size();
     Tensor::from_slice(planes.as_bytes()).view([CHANNELS as i64, height as i64, width as i64])
 }
 
 /// Converts an image to a float tensor, `[3, H, W]`, values in [0, 1].
 pub fn tensor_from_planes(planes: &Planes) -> Tensor {
-    Pixels::from(levels(planes)).to_float()
+    Pixels::from(byte_tensor(planes)).to_float()
 }
 
 #[cfg(test)]

@@ -22,7 +22,8 @@ const CONNECT_TIMEOUT_SECONDS: i64 = 300;
 /// Time that a rank waits when it only sees a failed collective, so that the rank that caused the failure can print its error first.
 const REPORT_GRACE: Duration = Duration::from_secs(2);
 
-/// Function that ends the process when the other ranks can't be reached, with the message if this rank is to print it.
+/// Function that ends the process when another rank has failed or is lost, or when the store can't be reached. It gets the message if this
+/// rank is to print it.
 type OnLost = fn(Option<String>) -> !;
 
 /// Watchdog of a rank: sends its heartbeats, checks those of others, and prints an error if no other rank has printed one.
@@ -62,8 +63,8 @@ mod key {
 }
 
 impl Watchdog {
-    /// Connects to the store and starts the heartbeat threads. `on_lost` is called on one of them when the other ranks can't be reached,
-    /// with the message if this rank is to print it.
+    /// Connects to the store and starts the heartbeat threads. `on_lost` is called on one of them when another rank has failed or is
+    /// lost, or when the store can't be reached.
     ///
     /// # Errors
     /// Returns an error if the store can't be reached.
@@ -140,7 +141,8 @@ impl Watchdog {
     }
 
     /// Announces that this rank ends, so that the others don't report it as lost. If `failed`, the others end too. A rank that hosts the
-    /// store then waits: at most 4 s after a failure, otherwise until all ranks have left, at most 25 s.
+    /// store then waits: at most 4 s after a failure, otherwise until all ranks have left, at most 25 s. After a failure it first waits for
+    /// the heartbeat thread, which may be in a call to the store.
     pub fn leave(&self, failed: bool) {
         let thread = self.heartbeat_thread.lock().expect("no thread panics here").take();
         let Some(HeartbeatThread { stop_sender, handle }) = thread else { return };

@@ -92,8 +92,8 @@ pub(super) fn distinct(photos: &[View], depth: f64) -> Vec<usize> {
 /// Photos at several sizes, from the smallest to the full size. Photos of one size are grouped.
 #[derive(Debug)]
 pub struct Photos {
-    levels: Vec<Vec<Group>>,
-    /// Fractions of the optimization at which the next level begins.
+    sizes: Vec<Vec<Group>>,
+    /// Fractions of the optimization at which the next size begins.
     schedule: Vec<f64>,
 }
 
@@ -161,8 +161,8 @@ impl Group {
     /// Returns the photos at `positions` as a batch.
     fn select(&self, positions: &[usize]) -> ViewBatch {
         let stack = |pixels: &[Pixels]| {
-            let chosen: Vec<Tensor> = positions.iter().map(|&view| pixels[view].to_float()).collect();
-            Tensor::stack(&chosen, 0).unsqueeze(0)
+            let chosen: Vec<&Pixels> = positions.iter().map(|&view| &pixels[view]).collect();
+            Pixels::stack(&chosen).unsqueeze(0)
         };
         // An index tensor would have to be copied to the device first.
         let [c2w, w2c, intrinsics] = self.matrices.each_ref().map(|matrices| {
@@ -194,9 +194,9 @@ impl Group {
         for (index, image) in self.images.iter().enumerate() {
             let mask = self.masks.as_ref().map(|masks| masks[index].to_float());
             let (image, mask) = pool_masked(&image.to_float(), mask.as_ref(), half);
-            images[index].set(&image);
+            images[index].copy_from_floats(&image);
             if let (Some(masks), Some(mask)) = (&mut masks, mask) {
-                masks[index].set(&mask);
+                masks[index].copy_from_floats(&mask);
             }
         }
         let intrinsics = intrinsics.copy();
@@ -208,12 +208,19 @@ impl Group {
 impl Photos {
     /// Creates photos from `views` at their own size only.
     pub(crate) fn from_batch(views: ViewBatch) -> Self {
+        assert!(views.masks.is_none(), "no masks are expected here");
         let count = views.images.size()[1];
-        let images = (0..count).map(|view| views.images.get(0).get(view).into()).collect();
+        let image = |view: i64| {
+            let image = views.images.get(0).get(view);
+            let mut pixels = Pixels::empty(&image.size(), image.device());
+            pixels.copy_from_floats(&image);
+            pixels
+        };
+        let images = (0..count).map(image).collect();
         let matrices = [views.c2w, views.w2c, views.intrinsics];
         let group =
             Group::new((0..count as usize).collect(), images, None, matrices, &vec![None; count as usize]);
-        Photos { levels: vec![vec![group]], schedule: vec![] }
+        Photos { sizes: vec![vec![group]], schedule: vec![] }
     }
 
     /// Creates photos from `views`, at least one, at the sizes of `config`'s schedule, each half as wide and high as the next. Depths of
@@ -238,13 +245,13 @@ impl Photos {
             sizes.push(halves);
         }
         sizes.reverse();
-        Photos { levels: sizes, schedule }
+        Photos { sizes, schedule }
     }
 
-    /// Draws up to `views` different photos of one size, at the level for `progress` from 0 to 1.
+    /// Draws up to `views` different photos of one size, the size for `progress` from 0 to 1.
     pub(super) fn draw(&self, progress: f64, views: usize, random: &mut impl Rng) -> Drawn<'_> {
-        let level = self.schedule.iter().filter(|&&part| progress >= part).count();
-        let groups = &self.levels[level.min(self.levels.len() - 1)];
+        let size = self.schedule.iter().filter(|&&part| progress >= part).count();
+        let groups = &self.sizes[size.min(self.sizes.len() - 1)];
         let count = |group: &Group| group.indices.len();
         let mut owners = groups.iter().flat_map(|group| (0..count(group)).map(move |_| group));
         let of = random.random_range(0..groups.iter().map(count).sum::<usize>());
@@ -269,4 +276,46 @@ pub(super) fn pool_masked(
     let Some(masks) = masks else { return (pool(images), None) };
     let weights = pool(masks);
     (pool(&(images * masks)) / weights.clamp_min(LEAST), Some(weights))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Intrinsics;
+    use glam::DMat4;
+
+    /// Smaller copies are means of four pixels, or of those that count, rounded to 8 bits; photos stay as they were read.
+    #[test]
+    fn photos_are_halved_and_kept_as_bytes() {
+        let options = (Kind::Float, Device::Cpu);
+        let (height, width) = (2 * i64::from(MIN_SHORTER_SIDE), 2 * i64::from(MIN_SHORTER_SIDE) + 6);
+        let levels = Tensor::randint(256, [3, height, width], (Kind::Uint8, Device::Cpu));
+        let mask = Tensor::ones([1, height, width], options);
+        let _ = mask.narrow(2, 0, 7).zero_();
+        let (k, size) = (f64::from(MIN_SHORTER_SIDE), (width as u32, height as u32));
+        let intrinsics = Intrinsics { fx: k, fy: k, cx: k, cy: k };
+        let camera = Camera { intrinsics, c2w: DMat4::IDENTITY, width: size.0, height: size.1 };
+        for mask in [None, Some(mask)] {
+            let view = View {
+                name: String::new(),
+                image: levels.shallow_clone().into(),
+                mask: mask.as_ref().map(|mask| mask.shallow_clone().into()),
+                camera,
+            };
+            let photos = Photos::new(&[view], &[], &RefineConfig::default(), Device::Cpu);
+            let [half, whole] = [1, 2].map(|size| photos.sizes[size][0].select(&[0]));
+            assert!(whole.images.equal(&(&levels / 255.).view([1, 1, 3, height, width])));
+            let halves = |t: &Tensor| t.unsqueeze(0).avg_pool2d(2, 2, 0, false, true, None).squeeze_dim(0);
+            let expected = pool_masked(&(&levels / 255.), mask.as_ref(), halves);
+            let off = |found: &Tensor, expected: &Tensor| {
+                (found.get(0).get(0) - expected).abs().max().double_value(&[]) * 255.
+            };
+            let off_image = off(&half.images, &expected.0);
+            assert!(off_image > 0.1 && off_image < 0.501, "{off_image} levels");
+            if let Some(expected) = expected.1 {
+                assert!(off(&half.masks.unwrap(), &expected) < 0.501);
+            }
+            assert_eq!(half.intrinsics.double_value(&[0, 0, 0, 2]), k / 2.);
+        }
+    }
 }

@@ -125,8 +125,8 @@ impl MetricsWriter {
 /// Training curves of a run, read from its metrics.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Curves {
-    /// PSNR of training views: (step, PSNR in dB) pairs; each averages consecutive steps and carries the last of them. Skipped steps are
-    /// left out.
+    /// PSNR of training views: (step, PSNR in dB) pairs, each the mean over consecutive steps, at the last of them. Skipped steps are left
+    /// out.
     pub training: Vec<(u64, f64)>,
     /// PSNR of held-out views: (step, PSNR in dB) pairs; the step is the last one before the validation.
     pub held_out: Vec<(u64, f64)>,
@@ -150,7 +150,7 @@ impl Curves {
             }
         }
         if steps.is_empty() {
-            return Err(Error::input(&path, "the number of steps", 0, "1 or more"));
+            return Err(Error::input(&path, "the number of steps with a PSNR", 0, "1 or more"));
         }
         let mean = |part: &[(u64, f64)]| {
             (part[part.len() - 1].0, part.iter().map(|step| step.1).sum::<f64>() / part.len() as f64)
@@ -178,6 +178,6 @@ mod tests {
         assert_eq!(curves.held_out, [(4, 8.5)]);
         std::fs::write(run.path().join(METRICS_FILE), "").unwrap();
         let error = Curves::read(run.path(), 2).unwrap_err().to_string();
-        assert!(error.ends_with("the number of steps is 0, expected 1 or more"), "{error}");
+        assert!(error.ends_with("the number of steps with a PSNR is 0, expected 1 or more"), "{error}");
     }
 }

@@ -435,7 +435,7 @@ fn unless_missing(removed: io::Result<()>) -> io::Result<()> {
 }
 
 /// Returns the folder of `path`; for a bare file name, `.`.
-pub(crate) fn parent_of(path: &Path) -> &Path {
+pub fn parent_of(path: &Path) -> &Path {
     path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
@@ -461,6 +461,13 @@ mod tests {
 
     fn write(path: &Path, text: &str) -> Result<()> {
         write_atomically(path, |writer| writer.write_all(text.as_bytes()).map_err(Error::write(path)))
+    }
+
+    #[test]
+    fn the_parent_of_a_name_alone_is_the_working_folder() {
+        assert_eq!(parent_of(Path::new("cameras.json")), Path::new("."));
+        assert_eq!(parent_of(Path::new("room/cameras.json")), Path::new("room"));
+        assert_eq!(parent_of(Path::new("/cameras.json")), Path::new("/"));
     }
 
     #[test]

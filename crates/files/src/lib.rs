@@ -12,7 +12,7 @@ mod text;
 
 pub use append::AppendFile;
 pub use atomic::{
-    PartialFile, check_regular, check_writable_dir, check_writable_file, recover_dirs, remove_dir,
+    PartialFile, check_regular, check_writable_dir, check_writable_file, parent_of, recover_dirs, remove_dir,
     replace_dir, write_atomically, write_json, write_temporary,
 };
 pub use checksum::checksum;

@@ -21,6 +21,7 @@ use globalsplat::refine::{
 use globalsplat::scene::{Camera, LocalFrame};
 use std::cell::RefCell;
 use std::path::PathBuf;
+use std::sync::Once;
 use std::time::{Duration, Instant};
 
 /// Maximum number of cameras for which a splat's colours are fitted to the range of its file format.
@@ -123,7 +124,11 @@ impl RefineJob {
         let steps = if let Initial::State(state) = initial { state.steps() } else { 0 };
         let log = self.reports.log.as_ref().map(|folder| RefineLog::create(folder, steps)).transpose()?;
         let log = RefCell::new(log);
+        let keeps_memory = Once::new();
         let on_event = |event: RefineEvent| {
+            if matches!(event, RefineEvent::Optimizing { .. }) {
+                keeps_memory.call_once(memory::keep);
+            }
             bar.tell(event);
             write_event(&mut log.borrow_mut(), event);
             !stop.is_requested()
@@ -144,7 +149,6 @@ impl RefineJob {
         if self.reports.sheet.is_some() {
             session.reserve_for_contact_sheet(&gaussians)?;
         }
-        memory::keep();
         let result = session.run()?;
         bar.bar.finish_and_clear();
         if result.is_initial && result.steps > 0 {

@@ -60,8 +60,8 @@ pub struct RunState {
     pub best: Option<CheckpointSummary>,
 }
 
-/// Curves of at most some hundred (step, value) points. Each averages consecutive steps and carries the last of them. Skipped steps are
-/// left out.
+/// Curves of at most some hundred (step, value) points, each the mean over consecutive steps, at the last of them. Skipped steps are left
+/// out.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RunCurves {
     /// PSNR of training views, in dB.

@@ -76,41 +76,36 @@ impl Pose {
 struct Cameras {
     shape: Option<[Number; 2]>,
     views: Vec<View>,
+    /// Intrinsics fx, fy, cx and cy of the first views, which are rarely refused.
+    pinholes: Vec<[Number; 4]>,
 }
 
 #[derive(Arbitrary)]
 struct View {
     name: Name,
-    intrinsics: Intrinsics,
+    /// Intrinsics that replace those of the photo.
+    intrinsics: Option<Vec<Vec<Number>>>,
     pose: Pose,
-}
-
-#[derive(Arbitrary)]
-enum Intrinsics {
-    /// Intrinsics of the photo.
-    Photo,
-    /// fx, fy, cx and cy.
-    Pinhole([Number; 4]),
-    Rows(Vec<Vec<Number>>),
 }
 
 /// Reads a generated `cameras.json`.
 pub fn cameras(bytes: &[u8]) {
     let Ok(made) = Cameras::arbitrary(&mut Unstructured::new(bytes)) else { return };
     let side = f64::from(SIDE);
-    let view = |View { name, intrinsics, pose }: &View| {
-        let intrinsics = match intrinsics {
-            Intrinsics::Photo => json!([[side, 0, side / 2.], [0, side, side / 2.], [0, 0, 1]]),
-            Intrinsics::Pinhole(numbers) => {
+    let view = |(index, View { name, intrinsics, pose }): (usize, &View)| {
+        let intrinsics = match (made.pinholes.get(index), intrinsics) {
+            (Some(numbers), _) => {
                 let [fx, fy, cx, cy] = numbers.each_ref().map(|number| number.json());
                 json!([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
             }
-            Intrinsics::Rows(rows) => Pose::Rows(rows.clone()).json(),
+            (None, None) => json!([[side, 0, side / 2.], [0, side, side / 2.], [0, 0, 1]]),
+            (None, Some(rows)) => Pose::Rows(rows.clone()).json(),
         };
         json!({"image": name.text("images/"), "intrinsic": intrinsics, "c2w": pose.json()})
     };
     let shape = made.shape.map_or(json!([SIDE, SIDE]), |shape| json!(shape.map(Number::json)));
-    let json = json!({"image_shape": shape, "views": made.views.iter().map(view).collect::<Vec<_>>()});
+    let json =
+        json!({"image_shape": shape, "views": made.views.iter().enumerate().map(view).collect::<Vec<_>>()});
     let file = file("made_cameras", "cameras.json", json.to_string().as_bytes());
     let _ = open_capture(&file).map(|capture| load(&capture));
     let _ = read_camera_path(&file, None);

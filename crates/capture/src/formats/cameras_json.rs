@@ -3,21 +3,23 @@
 
 use super::json::replace_nan_with_null;
 use super::photos::{find_photos, portable};
-use super::{CaptureOpener, file_in, folder_name, parent_folder};
+use super::{CaptureOpener, file_in, folder_name};
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
 use crate::geometry::{Camera, Intrinsics, pose_to_rows};
 use crate::lens::LensModel;
 use glam::DMat4;
-use globalsplat_files::{Error, Result, read_text, write_json};
+use globalsplat_files::{Error, Result, parent_of, read_text, write_json};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
 /// File name that identifies a capture of this format.
 const FILE_NAME: &str = "cameras.json";
 
-/// Maximum deviation of an intrinsic matrix from one without skew and with the last row [0, 0, 1], per entry. Rounding of computed
-/// matrices is below it.
-const INTRINSIC_TOLERANCE: f64 = 1e-6;
+/// Maximum skew of an intrinsic matrix, relative to its larger focal length. Less than that moves no pixel as far as usual errors of poses
+/// do, and is ignored.
+const MAX_SKEW: f64 = 1e-3;
+/// Maximum rounding error in the last row of an intrinsic matrix.
+const MAX_ROUNDING: f64 = 1e-6;
 
 #[derive(Serialize, Deserialize)]
 struct CamerasFile {
@@ -49,7 +51,7 @@ pub(super) fn find(path: &Path) -> Option<CaptureOpener> {
 /// are left out and reported as a warning; for [`Purpose::Cameras`], photos need not exist.
 pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
     let parsed = parse(file)?;
-    let root = parent_folder(file);
+    let root = parent_of(file);
     let cameras = to_cameras(file, &parsed)?;
     let names: Vec<&str> = parsed.views.iter().map(|view| view.image.as_str()).collect();
     let photos = find_photos(&[root.to_owned()], &names);
@@ -135,11 +137,10 @@ fn to_cameras(file: &Path, parsed: &CamerasFile) -> Result<Vec<Camera>> {
         .enumerate()
         .map(|(i, view)| {
             let k = matrix(&view.intrinsic, 3, format!("intrinsic of view {i}"))?;
-            let deviations = [k[1], k[3], k[6], k[7], k[8] - 1.];
-            // NaN exceeds the tolerance, too.
-            let is_within_tolerance =
-                deviations.iter().all(|deviation| deviation.abs() <= INTRINSIC_TOLERANCE);
-            if !is_within_tolerance {
+            let are_within = |values: &[f64], most: f64| values.iter().all(|value| value.abs() <= most);
+            // NaN is within nothing.
+            let has_skew = !are_within(&[k[1], k[3]], MAX_SKEW * k[0].abs().max(k[4].abs()));
+            if has_skew || !are_within(&[k[6], k[7], k[8] - 1.], MAX_ROUNDING) {
                 let found = format!("{:?}", k.chunks(3).collect::<Vec<_>>());
                 let expected = "no skew and [0, 0, 1] as the last row";
                 return Err(Error::input(file, format!("intrinsic of view {i}"), found, expected));

@@ -57,11 +57,6 @@ fn file_in(path: &Path, name: &str) -> Option<PathBuf> {
     Some(path.join(name)).filter(|file| file.is_file())
 }
 
-/// Returns the folder of `file`, or "." if the path is a name alone: an empty path isn't a folder for the file system.
-fn parent_folder(file: &Path) -> &Path {
-    file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
-}
-
 /// Opens the capture at `path`. The format is recognized by the files on disk, in this order:
 ///
 /// 1. `CHUNK.torch#KEY`, a scene of a RealEstate10K-style chunk, or `CHUNK.torch` if it holds a single scene;
@@ -192,17 +187,5 @@ impl CaptureFolders {
             }
         }
         Ok(())
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_parent_of_a_name_alone_is_the_working_folder() {
-        assert_eq!(parent_folder(Path::new("cameras.json")), Path::new("."));
-        assert_eq!(parent_folder(Path::new("room/cameras.json")), Path::new("room"));
-        assert_eq!(parent_folder(Path::new("/cameras.json")), Path::new("/"));
     }
 }

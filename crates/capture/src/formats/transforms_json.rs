@@ -6,13 +6,13 @@
 use super::json::replace_nan_with_null;
 use super::natural::natural_order;
 use super::photos::{find_photos, portable};
-use super::{CaptureOpener, file_in, folder_name, parent_folder};
+use super::{CaptureOpener, file_in, folder_name};
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
 use crate::geometry::{Camera, ImageSize, Intrinsics, nearest_rigid_of_scaled};
 use crate::lens::{COLMAP_MODELS, Distortion, Lens, LensModel, equirectangular_intrinsics};
 use crate::pixels::read_image_size;
 use glam::{DMat4, DVec4};
-use globalsplat_files::{Error, Result, read_text};
+use globalsplat_files::{Error, Result, parent_of, read_text};
 use serde_json::Value;
 use std::collections::HashSet;
 use std::f64::consts::PI;
@@ -92,8 +92,7 @@ pub(super) fn find(path: &Path) -> Option<CaptureOpener> {
 /// Reads the capture that `file` describes.
 pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
     let (frames, changes, lists) = read_frames(file, purpose)?;
-    let new =
-        |frames| Capture::new(folder_name(parent_folder(file)), file.to_owned(), frames, changes, purpose);
+    let new = |frames| Capture::new(folder_name(parent_of(file)), file.to_owned(), frames, changes, purpose);
     let Lists { train, test, unread } = lists;
     // A camera path consists of all frames in order.
     if matches!(purpose, Purpose::Cameras(_)) || test.is_empty() {
@@ -165,8 +164,8 @@ fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Li
         .map(|(index, frame)| Fields { file, index, frame, shared: &json, purpose })
         .collect();
     let names = fields.iter().map(Fields::file_path).collect::<Result<Vec<_>>>()?;
-    let mut bases = vec![parent_folder(file).to_owned()];
-    bases.extend(parent_folder(file).canonicalize().ok().and_then(|root| Some(root.parent()?.to_owned())));
+    let mut bases = vec![parent_of(file).to_owned()];
+    bases.extend(parent_of(file).canonicalize().ok().and_then(|root| Some(root.parent()?.to_owned())));
     let photos = find_photos(&bases, &names);
     let masks = match purpose {
         Purpose::Photos => find_named_masks(&bases, &fields, &photos)?,
@@ -179,7 +178,7 @@ fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Li
                 frames.push(Frame { mask, ..fields.frame(photo, name, &mut changes)? });
             }
             (None, Purpose::Cameras(_)) => {
-                frames.push(fields.frame(parent_folder(file).join(name), name, &mut changes)?)
+                frames.push(fields.frame(parent_of(file).join(name), name, &mut changes)?)
             }
             (None, Purpose::Photos) => changes.missing.push(name.to_string()),
         }
