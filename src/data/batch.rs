@@ -1,5 +1,6 @@
 //! Batches of views: images and cameras as the tensors that the model and the renderer take.
 
+use super::pixels::Pixels;
 use super::view::View;
 use crate::model::IMAGENET_MEAN;
 use crate::render::Cameras;
@@ -27,17 +28,11 @@ pub struct ViewBatch {
 ///
 /// `poses` (camera-to-world) replace the views' own poses, for example with normalized ones.
 pub fn view_batch<V: Borrow<View>>(views: &[V], poses: &[DMat4], device: Device) -> ViewBatch {
-    let images: Vec<Tensor> = views.iter().map(|view| view.borrow().image.to_float()).collect();
-    let stack = |planes: &[Tensor]| Tensor::stack(planes, 0).unsqueeze(0).to_device(device);
+    let stack = |pixels: &[&Pixels]| Pixels::stack(pixels).unsqueeze(0).to_device(device);
+    let images: Vec<&Pixels> = views.iter().map(|view| &view.borrow().image).collect();
     let masks = views.iter().any(|view| view.borrow().mask.is_some()).then(|| {
-        let mask = |view: &V| match &view.borrow().mask {
-            Some(mask) => mask.to_float(),
-            None => {
-                let size = view.borrow().image.size();
-                Tensor::ones([1, size[1], size[2]], (Kind::Float, Device::Cpu))
-            }
-        };
-        stack(&views.iter().map(mask).collect::<Vec<_>>())
+        let masks: Vec<Pixels> = views.iter().map(|view| view.borrow().mask_or_ones()).collect();
+        stack(&masks.iter().collect::<Vec<_>>())
     });
     ViewBatch::with_images(stack(&images), masks, &[view_matrices(&cameras_at(views, poses), device)])
 }
@@ -45,6 +40,12 @@ pub fn view_batch<V: Borrow<View>>(views: &[V], poses: &[DMat4], device: Device)
 /// Returns the mask of `images` [.., 3, H, W] whose every pixel counts, [.., 1, H, W].
 fn ones_like_mask(images: &Tensor) -> Tensor {
     images.narrow(-3, 0, 1).ones_like()
+}
+
+/// Returns the views at `positions` of a tensor `[B, V, …]`.
+pub(crate) fn select_views(t: &Tensor, positions: &[usize]) -> Tensor {
+    // An index tensor would have to be copied to the device first.
+    Tensor::stack(&positions.iter().map(|&view| t.select(1, view as i64)).collect::<Vec<_>>(), 1)
 }
 
 /// Returns the cameras of `views` with `poses` in place of their own poses.
@@ -109,10 +110,7 @@ impl ViewBatch {
 
     /// Returns the views at `positions` of every scene.
     pub fn select(&self, positions: &[usize]) -> Self {
-        // An index tensor would have to be copied to the device first.
-        let select = |t: &Tensor| {
-            Tensor::stack(&positions.iter().map(|&view| t.select(1, view as i64)).collect::<Vec<_>>(), 1)
-        };
+        let select = |t: &Tensor| select_views(t, positions);
         ViewBatch {
             images: select(&self.images),
             masks: self.masks.as_ref().map(select),

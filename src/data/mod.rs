@@ -14,7 +14,7 @@ mod polyphase;
 mod view;
 
 pub use batch::{ViewBatch, view_batch};
-pub(crate) use batch::{cameras_at, view_matrices};
+pub(crate) use batch::{cameras_at, select_views, view_matrices};
 pub use chunk_writer::ChunkWriter;
 pub use config::{DataConfig, JitterConfig, Sampling};
 pub use dataset::{Dataset, OpenGroup, SceneGroup, Split};

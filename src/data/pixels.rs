@@ -21,21 +21,29 @@ impl From<Tensor> for Pixels {
 impl Pixels {
     /// Returns the pixels as floats; level 255 becomes 1. Floats are not copied.
     pub fn to_float(&self) -> Tensor {
-        to_float(&self.0)
+        match self.0.kind() {
+            // Divide in place: a second copy of a photo of 16 million pixels takes 192 MB.
+            Kind::Uint8 => self.0.to_kind(Kind::Float).divide_scalar_(255.),
+            _ => self.0.shallow_clone(),
+        }
     }
 
     /// Returns the pixels of several images of one size as floats, `[N, C, H, W]`.
     pub(crate) fn stack(images: &[&Pixels]) -> Tensor {
         let is_of_levels = images.iter().all(|image| image.0.kind() == Kind::Uint8);
         match is_of_levels {
-            true => to_float(&Tensor::stack(&images.iter().map(|image| &image.0).collect::<Vec<_>>(), 0)),
+            true => {
+                Pixels(Tensor::stack(&images.iter().map(|image| &image.0).collect::<Vec<_>>(), 0)).to_float()
+            }
             false => Tensor::stack(&images.iter().map(|image| image.to_float()).collect::<Vec<_>>(), 0),
         }
     }
 
-    /// Returns 8-bit levels that are not initialized, of a size [C, H, W].
-    pub(crate) fn empty(size: &[i64], device: Device) -> Self {
-        Pixels(Tensor::empty(size, (Kind::Uint8, device)))
+    /// Returns `count` images of 8-bit levels that are not initialized, of a size [C, H, W], in one allocation: small tensors that are
+    /// allocated one by one between larger ones, which are freed, would leave gaps in memory where no larger one fits.
+    pub(crate) fn allocate(count: i64, [channels, height, width]: [i64; 3], device: Device) -> Vec<Self> {
+        let levels = Tensor::empty([count, channels, height, width], (Kind::Uint8, device));
+        (0..count).map(|index| Pixels(levels.get(index))).collect()
     }
 
     /// Overwrites 8-bit levels with floats, limited to [0, 1] and rounded to the nearest level.
@@ -64,14 +72,6 @@ impl Pixels {
         let changed = change(&self.0);
         assert_eq!(changed.kind(), self.0.kind(), "values would change their meaning");
         Pixels(changed)
-    }
-}
-
-fn to_float(values: &Tensor) -> Tensor {
-    match values.kind() {
-        // Divide in place: a second copy of a photo of 16 million pixels takes 192 MB.
-        Kind::Uint8 => values.to_kind(Kind::Float).divide_scalar_(255.),
-        _ => values.shallow_clone(),
     }
 }
 

@@ -6,7 +6,7 @@ use crate::io::rgb_from_tensor;
 use crate::scene::{Camera, ImageSize};
 use globalsplat_capture::{CHANNELS, Capture, Photo, Planes, resize_and_crop};
 use rayon::prelude::*;
-use tch::{Kind, Tensor};
+use tch::{Device, Kind, Tensor};
 
 /// A photo and its camera.
 #[derive(Debug)]
@@ -34,6 +34,15 @@ impl View {
     pub fn shallow_clone(&self) -> Self {
         let mask = self.mask.as_ref().map(Pixels::shallow_clone);
         View { name: self.name.clone(), image: self.image.shallow_clone(), mask, camera: self.camera }
+    }
+
+    /// Returns the mask, in which every pixel counts if the view has none.
+    pub(crate) fn mask_or_ones(&self) -> Pixels {
+        let ones = || {
+            let size = self.image.size();
+            Tensor::full([1, size[1], size[2]], 255, (Kind::Uint8, Device::Cpu)).into()
+        };
+        self.mask.as_ref().map_or_else(ones, Pixels::shallow_clone)
     }
 
     /// Returns the fraction of the pixels that count, the mean weight of the mask; `None` if every pixel counts.

@@ -4,7 +4,9 @@ use super::config::RefineConfig;
 use super::depth_map::DepthMap;
 use super::known_depths::KnownDepths;
 use super::view_selection::are_near_duplicates;
-use crate::data::{Capture, MIN_SHORTER_SIDE, PhotoSize, Pixels, View, ViewBatch, load_views, view_matrices};
+use crate::data::{
+    Capture, MIN_SHORTER_SIDE, PhotoSize, Pixels, View, ViewBatch, load_views, select_views, view_matrices,
+};
 use crate::error::{Error, Result};
 use crate::scene::{Camera, ImageSize};
 use rand::Rng;
@@ -145,15 +147,9 @@ impl Group {
         device: Device,
     ) -> Self {
         let images: Vec<Pixels> = views.iter().map(|view| view.image.to_device(device)).collect();
-        let mask = |view: &&View| match &view.mask {
-            Some(mask) => mask.to_device(device),
-            None => {
-                let size = [1, view.camera.height.into(), view.camera.width.into()];
-                Tensor::full(size, 255, (Kind::Uint8, device)).into()
-            }
-        };
         let has_masks = views.iter().any(|view| view.mask.is_some());
-        let masks = has_masks.then(|| views.iter().map(mask).collect());
+        let masks =
+            has_masks.then(|| views.iter().map(|view| view.mask_or_ones().to_device(device)).collect());
         let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
         Group::new(indices, images, masks, view_matrices(&cameras, device), depth_maps)
     }
@@ -164,11 +160,8 @@ impl Group {
             let chosen: Vec<&Pixels> = positions.iter().map(|&view| &pixels[view]).collect();
             Pixels::stack(&chosen).unsqueeze(0)
         };
-        // An index tensor would have to be copied to the device first.
-        let [c2w, w2c, intrinsics] = self.matrices.each_ref().map(|matrices| {
-            let chosen: Vec<Tensor> = positions.iter().map(|&view| matrices.select(1, view as i64)).collect();
-            Tensor::stack(&chosen, 1)
-        });
+        let [c2w, w2c, intrinsics] =
+            self.matrices.each_ref().map(|matrices| select_views(matrices, positions));
         let masks = self.masks.as_deref().map(stack);
         ViewBatch { images: stack(&self.images), masks, c2w, w2c, intrinsics }
     }
@@ -183,12 +176,9 @@ impl Group {
             return Group::new(self.indices.clone(), images, masks, [c2w, w2c, intrinsics], depth_maps);
         }
         let half = |t: &Tensor| t.unsqueeze(0).avg_pool2d(2, 2, 0, false, true, None).squeeze_dim(0);
-        // Small tensors that are allocated between larger ones, which are freed, would leave gaps in memory where no larger one fits.
-        let allocate = |channels: i64| -> Vec<Pixels> {
-            let count = self.images.len() as i64;
-            let shape = [count, channels, size[1] / 2, size[2] / 2];
-            let levels = Tensor::empty(shape, (Kind::Uint8, c2w.device()));
-            (0..count).map(|index| levels.get(index).into()).collect()
+        let allocate = |channels: i64| {
+            let shape = [channels, size[1] / 2, size[2] / 2];
+            Pixels::allocate(self.images.len() as i64, shape, c2w.device())
         };
         let (mut images, mut masks) = (allocate(3), self.masks.as_ref().map(|_| allocate(1)));
         for (index, image) in self.images.iter().enumerate() {
@@ -209,17 +199,14 @@ impl Photos {
     /// Creates photos from `views` at their own size only.
     pub(crate) fn from_batch(views: ViewBatch) -> Self {
         assert!(views.masks.is_none(), "no masks are expected here");
-        let count = views.images.size()[1];
-        let image = |view: i64| {
-            let image = views.images.get(0).get(view);
-            let mut pixels = Pixels::empty(&image.size(), image.device());
-            pixels.copy_from_floats(&image);
-            pixels
-        };
-        let images = (0..count).map(image).collect();
+        let (size, device) = (views.images.size(), views.images.device());
+        let mut images = Pixels::allocate(size[1], [size[2], size[3], size[4]], device);
+        for (index, image) in images.iter_mut().enumerate() {
+            image.copy_from_floats(&views.images.get(0).get(index as i64));
+        }
         let matrices = [views.c2w, views.w2c, views.intrinsics];
         let group =
-            Group::new((0..count as usize).collect(), images, None, matrices, &vec![None; count as usize]);
+            Group::new((0..images.len()).collect(), images, None, matrices, &vec![None; size[1] as usize]);
         Photos { sizes: vec![vec![group]], schedule: vec![] }
     }
 

@@ -10,7 +10,7 @@ use crate::pixels::{
     has_alpha_channel, multiply, read_image_size, read_mask, resize_and_crop, source_ranges, undistort,
 };
 use glam::{DMat4, DVec4};
-use globalsplat_files::{Error, InputFiles, Result, split_keyed_path};
+use globalsplat_files::{Error, InputFiles, Result, parent_of, split_keyed_path};
 use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 use std::borrow::Cow;
@@ -435,7 +435,7 @@ impl Capture {
         inputs.add(&described);
         // A COLMAP model consists of several files.
         let form = described.extension().filter(|form| *form == "bin" || *form == "txt");
-        let siblings = form.and_then(|_| std::fs::read_dir(described.parent()?).ok());
+        let siblings = form.and_then(|_| std::fs::read_dir(parent_of(&described)).ok());
         for sibling in siblings.into_iter().flatten().flatten() {
             if Path::new(&sibling.file_name()).extension() == form {
                 inputs.add(&sibling.path());

@@ -4,7 +4,7 @@ use globalsplat_capture::{
     MASKS_FOLDER, decode_photo, encode_photo, exif_focal, find_masks, find_masks_in, grey_to_rgb,
     is_equirectangular, list_photos, read_image_size, read_mask,
 };
-use globalsplat_files::{Error, Result, checksum, write_atomically};
+use globalsplat_files::{Error, Result, checksum, parent_of, write_atomically};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::collections::{HashMap, HashSet};
@@ -264,7 +264,7 @@ fn check_aspect(file: &Path, size: (u32, u32)) -> Result<()> {
 /// Writes `contents` to `target`, or links `target` to the file `source`, copying it if it can't be linked.
 fn place(source: &Path, contents: Option<Vec<u8>>, target: &Path) -> Result<()> {
     let source = source.canonicalize().map_err(Error::read(source))?;
-    let folder = target.parent().unwrap_or(target);
+    let folder = parent_of(target);
     fs::create_dir_all(folder).map_err(Error::write(folder))?;
     if let Some(contents) = contents {
         return write_atomically(target, |writer| writer.write_all(&contents).map_err(Error::write(target)));
