@@ -1,10 +1,11 @@
 //! Initial Gaussians from photos, or from photos and points.
 
 use super::depth_map::DepthMap;
-use super::sweep::sweep;
+use super::exposures::{ExposureCorrection, LogGains};
+use super::sweep::{Sweep, sweep};
 use super::view_selection::projection;
 use crate::data::{Point, View};
-use crate::scene::{RawGaussians, SH_C0};
+use crate::scene::{Camera, RawGaussians, SH_C0};
 use glam::DVec3;
 use rand::seq::index::sample;
 use rand::{Rng, SeedableRng};
@@ -27,34 +28,53 @@ struct IsotropicGaussian {
     colour: [f32; 3],
 }
 
+/// What photos alone tell about a scene.
+#[derive(Debug)]
+pub struct InitialScene {
+    /// Initial Gaussians, on the CPU.
+    pub gaussians: RawGaussians,
+    /// Depths of some photos.
+    pub depth_maps: Vec<DepthMap>,
+    /// Logarithms of the gains of red, green and blue of each photo, if exposures are to be corrected. Their mean is 0.
+    pub log_exposures: Option<Vec<[f64; 3]>>,
+}
+
 /// Creates `count` Gaussians at the depths on which the photos agree, and at `points` of the scene, if some are known. The size of each
 /// matches the part of the images that it covers. Those of the `known` Gaussians, at most `count`, that don't contradict the photos are
 /// kept. At least two views are required. `should_continue` is called before each photo with the number of photos that are done. If it
-/// returns `false`, Gaussians are created from the photos that are done, or `None` is returned if there are none. The result also has the
-/// depths. The Gaussians are on `device`.
+/// returns `false`, Gaussians are created from the photos that are done, or `None` is returned if there are none.
 pub fn gaussians_from_photos(
     views: &[View],
     points: &[Point],
     known: Option<&RawGaussians>,
     count: usize,
     seed: u64,
-    device: Device,
+    exposures: ExposureCorrection,
     should_continue: impl FnMut(usize) -> bool,
-) -> Option<(RawGaussians, Vec<DepthMap>)> {
-    let depth_maps = sweep(views, points, should_continue);
+) -> Option<InitialScene> {
+    let Sweep { mut depth_maps, log_exposures } = sweep(views, points, should_continue);
     if depth_maps.is_empty() {
         return None;
     }
-    let sampled = |count: usize| sample_gaussians(&depth_maps, points, count, seed).to_device(device);
+    let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
+    let is_corrected = exposures.applies(&log_exposures, &cameras);
+    let log_exposures: Option<Vec<LogGains>> = is_corrected.then_some(log_exposures);
+    for (view, gains) in views.iter().zip(log_exposures.iter().flatten()) {
+        if let Some(map) = depth_maps.iter_mut().find(|map| map.photo == view.name) {
+            map.image =
+                &map.image / Tensor::from_slice(&gains.map(f64::exp)).to_kind(Kind::Float).view([3, 1, 1]);
+        }
+    }
+    let sampled = |count: usize| sample_gaussians(&depth_maps, points, count, seed);
     let gaussians = match known {
         None => sampled(count),
         Some(known) => {
-            let kept = known.select(&supported(known, &depth_maps)).to_device(device);
+            let kept = known.select(&supported(known, &depth_maps)).to_device(Device::Cpu);
             let left = count.saturating_sub(kept.means.size()[1] as usize);
             kept.concat(&sampled(left))
         }
     };
-    Some((gaussians, depth_maps))
+    Some(InitialScene { gaussians, depth_maps, log_exposures })
 }
 
 /// Returns the indices of the Gaussians that the photos support. A Gaussian must not be in front of a depth that a photo is sure of, and at
@@ -183,7 +203,7 @@ fn raw(balls: &[IsotropicGaussian]) -> RawGaussians {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::{Camera, Intrinsics};
+    use crate::scene::Intrinsics;
     use glam::DMat4;
 
     /// Gaussians that contradict the photos are removed. Two cameras are sure of a wall at depth 4, the second only in the left half of its
@@ -260,7 +280,8 @@ mod tests {
         };
         let views = [view(0.), view(0.2)];
         let begun = |known: Option<&RawGaussians>, count: usize, seed: u64| {
-            gaussians_from_photos(&views, &[], known, count, seed, Device::Cpu, |_| true).expect("depths").0
+            let off = ExposureCorrection::Off;
+            gaussians_from_photos(&views, &[], known, count, seed, off, |_| true).expect("depths").gaussians
         };
         let known = begun(None, 50, 1);
         let filled = begun(Some(&known), 80, 2);
@@ -268,6 +289,7 @@ mod tests {
         // No photo is sure of a depth, as all pixels are black, so all known Gaussians stay.
         assert!(filled.means.narrow(1, 0, 50).equal(&known.means));
         assert_eq!(begun(Some(&known), 50, 2).means.size(), [1, 50, 3]);
-        assert!(gaussians_from_photos(&views, &[], None, 50, 1, Device::Cpu, |_| false).is_none());
+        let auto = ExposureCorrection::Auto;
+        assert!(gaussians_from_photos(&views, &[], None, 50, 1, auto, |_| false).is_none());
     }
 }

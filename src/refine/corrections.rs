@@ -42,23 +42,27 @@ pub struct Correction {
 impl Corrections {
     /// Creates corrections without parameters, which learn nothing.
     pub fn none() -> Self {
-        Corrections::new(0, false, false, 1., &RefineConfig::default(), Device::Cpu)
+        Corrections::new(0, false, None, 1., &RefineConfig::default(), Device::Cpu)
     }
 
-    /// Creates zero corrections of `photos` photos. `poses` and `exposures` select what is learned. `depth` is the depth of the scene, the
-    /// unit of lengths; `device` is the device of the photos.
+    /// Creates corrections of `photos` photos. Poses are learned from zero if `poses` is `true`, and exposures if there are initial
+    /// `exposures`, the logarithms of the gains of red, green and blue of each photo. `depth` is the depth of the scene, the unit of lengths;
+    /// `device` is the device of the photos.
     pub fn new(
         photos: usize,
         poses: bool,
-        exposures: bool,
+        exposures: Option<&[[f64; 3]]>,
         depth: f64,
         config: &RefineConfig,
         device: Device,
     ) -> Self {
         let options = (Kind::Float, device);
-        let leaf = |numbers: i64| Tensor::zeros([photos as i64, numbers], options).set_requires_grad(true);
-        let poses = poses.then(|| leaf(6));
-        let exposures = exposures.then(|| leaf(3));
+        let poses = poses.then(|| Tensor::zeros([photos as i64, 6], options).set_requires_grad(true));
+        let exposures = exposures.map(|gains| {
+            assert_eq!(gains.len(), photos, "an exposure for each photo");
+            let gains = Tensor::from_slice(gains.as_flattened()).view([photos as i64, 3]);
+            gains.to_device(device).to_kind(Kind::Float).set_requires_grad(true)
+        });
         let group = |name: &str, t: &Option<Tensor>, rate: f64| {
             let parameters = vec![(name.into(), t.as_ref()?.shallow_clone())];
             Some((
@@ -119,6 +123,11 @@ impl Corrections {
             Some(exposures) => rgb * of(exposures, which).exp().view([1, -1, 3, 1, 1]),
             None => rgb,
         }
+    }
+
+    /// Returns `true` if there are any.
+    pub(super) fn are_any(&self) -> bool {
+        self.poses.is_some() || self.exposures.is_some()
     }
 
     /// Clears the gradients.
@@ -225,7 +234,8 @@ mod tests {
         let views = [view(0), view(1), view(2)];
         let poses: Vec<DMat4> = views.iter().map(|view| view.camera.c2w).collect();
         let batch = view_batch(&views, &poses, Device::Cpu);
-        let learned = Corrections::new(3, true, true, 2., &RefineConfig::default(), Device::Cpu);
+        let learned =
+            Corrections::new(3, true, Some(&[[0.; 3]; 3]), 2., &RefineConfig::default(), Device::Cpu);
         let put = |t: &Option<Tensor>, values: &[f32]| {
             tch::no_grad(|| t.as_ref().unwrap().shallow_clone().view([-1]).copy_(&Tensor::from_slice(values)))
         };

@@ -6,6 +6,7 @@ mod config;
 mod corrections;
 mod depth_map;
 pub(crate) mod depth_search;
+mod exposures;
 mod gaussian_optimizer;
 mod gaussian_params;
 mod known_depths;
@@ -15,14 +16,16 @@ mod patches;
 mod photos;
 mod relocate;
 mod session;
+mod small_photo;
 mod state;
 mod sweep;
 mod view_selection;
 
-pub use begin::gaussians_from_photos;
+pub use begin::{InitialScene, gaussians_from_photos};
 pub use config::RefineConfig;
 pub use corrections::{Correction, Corrections};
 pub use depth_map::DepthMap;
+pub use exposures::ExposureCorrection;
 pub use gaussian_optimizer::GaussianOptimizer;
 pub use log::RefineLog;
 pub use options::{Budget, MaskBackground, RefineOptions};
@@ -301,8 +304,9 @@ mod tests {
     fn refined(start: &[View], views: &[View], background: Option<MaskBackground>, seed: u64) -> Gaussians {
         let _guard = num_threads::change();
         let config = RefineConfig::default();
+        let off = ExposureCorrection::Off;
         let raw =
-            gaussians_from_photos(start, &[], None, 400, seed, Device::Cpu, |_| true).expect("depths").0;
+            gaussians_from_photos(start, &[], None, 400, seed, off, |_| true).expect("depths").gaussians;
         let depth = scene_depth(&raw.activate(), views).unwrap();
         let mut optimizer = GaussianOptimizer::new(&raw, depth, &config, 0);
         let photos = Photos::new(views, &[], &config, Device::Cpu);
@@ -371,7 +375,8 @@ mod tests {
     fn the_number_of_gaussians_grows() {
         let _guard = num_threads::change();
         let [_, views] = wall(false);
-        let raw = gaussians_from_photos(&views, &[], None, 40, 0, Device::Cpu, |_| true).expect("depths").0;
+        let off = ExposureCorrection::Off;
+        let raw = gaussians_from_photos(&views, &[], None, 40, 0, off, |_| true).expect("depths").gaussians;
         let depth = scene_depth(&raw.activate(), &views).unwrap();
         for relocate_every in [0, 3] {
             let config = RefineConfig { relocate_every, ..RefineConfig::default() };
@@ -456,7 +461,7 @@ mod tests {
         let steps = |count| {
             let mut optimizer =
                 GaussianOptimizer::new(&RawGaussians::from_gaussians(&gaussians), 1., &config, 0);
-            let mut corrections = Corrections::new(4, true, true, 1., &config, Device::Cpu);
+            let mut corrections = Corrections::new(4, true, Some(&[[0.; 3]; 4]), 1., &config, Device::Cpu);
             let _guard = num_threads::change();
             refine(&mut optimizer, &mut corrections, &task_of(count), |_| true).unwrap();
         };

@@ -1,6 +1,7 @@
 //! Options of a refinement session.
 
 use super::config::RefineConfig;
+use super::exposures::ExposureCorrection;
 use crate::data::{Capture, Holdout, PhotoSize};
 use crate::error::{Error, Result};
 use crate::reconstruct::spread_over_path;
@@ -81,8 +82,9 @@ pub struct RefineOptions {
     pub views: Option<usize>,
     /// Learns corrections of the camera poses if `true`.
     pub correct_poses: bool,
-    /// Learns the exposure of each photo relative to the others if `true`.
-    pub correct_exposures: bool,
+    /// Whether the exposure of each photo relative to the others is measured and learned. [`ExposureCorrection::Auto`] does nothing if the
+    /// Gaussians don't start from photos.
+    pub correct_exposures: ExposureCorrection,
     /// Background that masked pixels have in the optimization. If it is `None`, the optimization ignores masked pixels.
     pub mask_background: Option<MaskBackground>,
     /// Size of the photos.
@@ -103,7 +105,7 @@ impl Default for RefineOptions {
             holdout: Holdout::None,
             views: None,
             correct_poses: false,
-            correct_exposures: false,
+            correct_exposures: ExposureCorrection::Auto,
             mask_background: None,
             size: PhotoSize::Within(LONGEST_SIDE),
             device: Device::Cpu,

@@ -1,14 +1,15 @@
 //! Refinement session from a capture to Gaussians: reads the photos, creates the initial Gaussians, optimizes them, and scores them on a
 //! few pixels during the optimization. All of it shares one budget and uses a local frame of the capture (spec 2.5).
 
-use super::begin::gaussians_from_photos;
+use super::begin::{InitialScene, gaussians_from_photos};
 use super::corrections::{Correction, Corrections};
 use super::depth_map::DepthMap;
+use super::exposures::{ExposureCorrection, LogGains};
 use super::gaussian_optimizer::GaussianOptimizer;
 use super::options::{Budget, RefineOptions};
 use super::patches::{PatchScores, Patches};
 use super::photos::{Photos, distinct, load_photos};
-use super::state::{Reached, Record, RefineState};
+use super::state::{Record, RefineState};
 use super::{Task, refine, scene_depth};
 use crate::data::{Capture, Point, View, read_points};
 use crate::error::{Error, Result};
@@ -198,6 +199,8 @@ pub struct RefineSession<'a> {
     near_duplicates: usize,
     /// Depths of some photos, if Gaussians were created from them.
     depth_maps: Vec<DepthMap>,
+    /// Initial exposures of the photos, if they are corrected.
+    log_exposures: Option<Vec<LogGains>>,
     reserve: Duration,
     scoring: Duration,
     last_scoring: Duration,
@@ -260,6 +263,7 @@ impl<'a> RefineSession<'a> {
             start: None,
             near_duplicates: 0,
             depth_maps: vec![],
+            log_exposures: None,
             reserve: Duration::ZERO,
             scoring: Duration::ZERO,
             last_scoring: Duration::ZERO,
@@ -322,7 +326,10 @@ impl<'a> RefineSession<'a> {
                 if state.record.has_depths {
                     let _ = self.gaussians_from_photos(None)?.ok_or_else(stopped)?;
                 }
-                let RefineOptions { config, gaussians, device, .. } = self.options;
+                let RefineOptions { config, gaussians, correct_exposures, device, .. } = self.options;
+                if *correct_exposures == ExposureCorrection::Auto {
+                    self.log_exposures = state.has_exposures().then(|| self.equal_exposures());
+                }
                 let optimizer = GaussianOptimizer::from_state(state, config, *gaussians as i64, *device)?;
                 Start::State(state, optimizer.into())
             }
@@ -348,6 +355,9 @@ impl<'a> RefineSession<'a> {
                 Start::Photos(self.gaussians_from_photos(None)?.ok_or_else(stopped)?)
             }
         };
+        if self.options.correct_exposures == ExposureCorrection::On && self.log_exposures.is_none() {
+            self.log_exposures = Some(self.equal_exposures());
+        }
         let gaussians = match &start {
             Start::Photos(raw) | Start::Splat(_, raw) => raw.activate(),
             Start::Model(gaussians) => gaussians.map(Tensor::shallow_clone),
@@ -386,7 +396,8 @@ impl<'a> RefineSession<'a> {
             self.warn(&line);
         }
         let patches = Patches::from_views(&self.photos);
-        let before = patches.score(&initial)?.expect("photos");
+        let state = if let Start::State(state, _) = &start { Some(*state) } else { None };
+        let before = patches.corrected(&self.corrections(state, depth)?).score(&initial)?.expect("photos");
         if matches!(start, Start::Model(..)) {
             self.add_eval_point(&initial)?;
         }
@@ -401,8 +412,8 @@ impl<'a> RefineSession<'a> {
         let ended = self.clock.elapsed().as_secs_f64();
         let after = patches.corrected(&learned).score(&gaussians)?.expect("photos");
         let is_initial = after.psnr.is_nan() || after.psnr < before.psnr;
-        let asked = self.options.correct_poses || self.options.correct_exposures;
-        let corrections = if asked && !is_initial { learned.report(&self.photos) } else { vec![] };
+        let corrections =
+            if learned.are_any() && !is_initial { learned.report(&self.photos) } else { vec![] };
         let gaussians = if is_initial { initial.map(Tensor::shallow_clone) } else { gaussians };
         let splat = match initial_splat {
             Some(splat) if is_initial => Splat { warnings: vec![], ..splat.clone() },
@@ -541,6 +552,8 @@ impl<'a> RefineSession<'a> {
         for (photo, is_kept) in photos.into_iter().zip(is_kept) {
             if is_kept { self.photos.push(photo) } else { left_out.push(photo.name) }
         }
+        let kept = |all: Vec<LogGains>| keep.iter().map(|&index| all[index]).collect();
+        self.log_exposures = self.log_exposures.take().map(kept);
         self.near_duplicates = left_out.len();
         let (count, all) = (left_out.len(), left_out.len() + self.photos.len());
         Some(format!(
@@ -565,21 +578,44 @@ impl<'a> RefineSession<'a> {
             };
             !is_stopped && !is_late
         };
-        let RefineOptions { seed, device, .. } = *self.options;
-        let gaussians =
-            if known.is_some() { self.options.gaussians } else { self.options.initial_gaussians() };
+        let RefineOptions { seed, correct_exposures: correction, .. } = *self.options;
+        let count = if known.is_some() { self.options.gaussians } else { self.options.initial_gaussians() };
         let made =
-            gaussians_from_photos(&self.photos, &points, known, gaussians, seed, device, should_continue);
+            gaussians_from_photos(&self.photos, &points, known, count, seed, correction, should_continue);
         self.is_stopped |= is_stopped;
-        Ok(made.map(|(gaussians, depth_maps)| {
-            self.depth_maps = depth_maps;
-            gaussians
-        }))
+        let Some(InitialScene { gaussians, depth_maps, log_exposures }) = made else { return Ok(None) };
+        self.depth_maps = depth_maps;
+        self.log_exposures = log_exposures;
+        if let (ExposureCorrection::Auto, Some(gains)) = (correction, &self.log_exposures) {
+            let of = |gain: &LogGains| (gain.iter().sum::<f64>() / 3.).exp();
+            let (least, most) = gains.iter().map(of).fold((f64::MAX, 0f64), |(a, b), c| (a.min(c), b.max(c)));
+            self.warn(&format!(
+                "{}: the photos have different exposures, {least:.2} to {most:.2} times the mean, which are corrected",
+                self.capture.name
+            ));
+        }
+        Ok(Some(gaussians.to_device(self.options.device)))
+    }
+
+    /// Returns the exposures of photos that don't differ.
+    fn equal_exposures(&self) -> Vec<LogGains> {
+        vec![[0.; 3]; self.photos.len()]
+    }
+
+    /// Returns the corrections with which the optimization begins, those of `state` if it continues from one.
+    fn corrections(&self, state: Option<&RefineState>, depth: f64) -> Result<Corrections> {
+        let RefineOptions { correct_poses, config, device, .. } = self.options;
+        let (count, exposures) = (self.photos.len(), self.log_exposures.as_deref());
+        let mut corrections = Corrections::new(count, *correct_poses, exposures, depth, config, *device);
+        if let Some(state) = state {
+            corrections.load_state(state)?;
+        }
+        Ok(corrections)
     }
 
     /// Optimizes the Gaussians of `start`, and the corrections of the photos. `depth` is the depth of these Gaussians.
     fn optimize(&mut self, start: Start, depth: f64) -> Result<(Gaussians, Corrections, RefineState)> {
-        let RefineOptions { correct_poses, correct_exposures, config, seed, device, .. } = self.options;
+        let RefineOptions { config, seed, device, .. } = self.options;
         let final_count = if matches!(start, Start::Splat(..)) { 0 } else { self.options.gaussians as i64 };
         let (mut optimizer, depth, earlier) = match start {
             Start::Photos(raw) | Start::Splat(_, raw) => {
@@ -592,14 +628,9 @@ impl<'a> RefineSession<'a> {
             }
             Start::State(state, optimizer) => (*optimizer, depth, Some(state)),
         };
-        let count = self.photos.len();
-        let mut corrections =
-            Corrections::new(count, *correct_poses, *correct_exposures, depth, config, *device);
-        let (mut reached, mut earlier_total) = (Reached::default(), Duration::ZERO);
-        if let Some(state) = earlier {
-            corrections.load_state(state)?;
-            (reached, earlier_total) = (state.record.reached, state.record.total);
-        }
+        let mut corrections = self.corrections(earlier, depth)?;
+        let (reached, earlier_total) =
+            earlier.map_or_else(Default::default, |state| (state.record.reached, state.record.total));
         let photos = Photos::new(&self.photos, &self.depth_maps, config, *device);
         let budget = match self.options.budget {
             Budget::Time(time) => {

@@ -72,6 +72,11 @@ impl RefineState {
         RefineState { record, tensors, file: PathBuf::new() }
     }
 
+    /// Returns `true` if it has corrections of exposures.
+    pub(super) fn has_exposures(&self) -> bool {
+        self.tensors.contains_key(&format!("{CORRECTIONS}value.exposures"))
+    }
+
     /// Returns the path of the state that belongs to the splat at `path`: `room.state.safetensors` for `room.ply`.
     pub fn path_for(splat: &Path) -> PathBuf {
         splat.with_extension("state.safetensors")

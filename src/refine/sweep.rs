@@ -3,13 +3,13 @@
 
 use super::depth_map::DepthMap;
 use super::depth_search::{self, ComparedPhoto};
-use super::photos::pool_masked;
+use super::exposures::{LogGains, measure_exposures};
+use super::small_photo::SmallPhoto;
 use super::view_selection::{
     are_near_duplicates, at_octaves, extent, farthest_first, neighbours, projection,
 };
 use crate::data::{Point, View};
-use crate::scene::{Camera, Intrinsics};
-use glam::{DMat3, DVec3};
+use crate::scene::Camera;
 use tch::{Device, Kind, Tensor};
 
 /// Longer side in pixels of the images that are compared.
@@ -49,26 +49,22 @@ const NEARER: f64 = 0.02;
 /// Ratio of the depth of the nearest remaining point to that of the nearest plane.
 const ROOM: f64 = 1.3;
 
-/// Downscaled photo.
-struct SmallPhoto {
-    name: String,
-    camera: Camera,
-    /// Colours, [3, h, w].
-    image: Tensor,
-    /// Mean over the colour channels, [h, w].
-    grey: Tensor,
-    /// Weight of each pixel, [h, w]; `None` if every pixel counts.
-    weight: Option<Tensor>,
+/// Result of a plane sweep.
+pub(super) struct Sweep {
+    /// Depths of some of the views, in their order.
+    pub depth_maps: Vec<DepthMap>,
+    /// Exposures of all views relative to each other.
+    pub log_exposures: Vec<LogGains>,
 }
 
-/// Computes depths for the pixels of the views. If there are many views, it processes a subset that together shows what all of them show,
+/// Computes depths for the pixels of the views, and the views' exposures. If there are many views, it processes a subset that together shows what all of them show,
 /// without near duplicates. `points` of the scene, if some are known, determine the nearest depth. `should_continue` is called before each
-/// view with the number of views that are done. If it returns `false`, the result has only these.
-pub fn sweep(
+/// view with the number of views that are done. If it returns `false`, only these get depths.
+pub(super) fn sweep(
     views: &[View],
     points: &[Point],
     mut should_continue: impl FnMut(usize) -> bool,
-) -> Vec<DepthMap> {
+) -> Sweep {
     let small: Vec<SmallPhoto> = views.iter().map(|view| SmallPhoto::from_view(view, LONGEST_SIDE)).collect();
     let cameras: Vec<Camera> = small.iter().map(|small| small.camera).collect();
     let coarse: Vec<SmallPhoto> = views.iter().map(|view| SmallPhoto::from_view(view, COARSE_SIDE)).collect();
@@ -89,7 +85,8 @@ pub fn sweep(
         }
     }
     swept.sort_by_key(|(index, _)| *index);
-    swept.into_iter().map(|(_, swept)| swept).collect()
+    let log_exposures = measure_exposures(&small, &swept);
+    Sweep { depth_maps: swept.into_iter().map(|(_, map)| map).collect(), log_exposures }
 }
 
 fn sweep_one(this: &SmallPhoto, others: &[&SmallPhoto], nearest: Option<f64>, depth: f64) -> DepthMap {
@@ -173,62 +170,6 @@ fn typical_depth(depths: &[f64], extent: f64) -> f64 {
     }
 }
 
-impl SmallPhoto {
-    fn from_view(view: &View, longest_side: f64) -> Self {
-        let (camera, side) = (view.camera, |pixels: u32| f64::from(pixels));
-        let factor = (longest_side / side(camera.width.max(camera.height))).min(1.);
-        let resized = |pixels: u32| ((side(pixels) * factor).round() as i64).max(depth_search::PATCH);
-        let (height, width) = (resized(camera.height), resized(camera.width));
-        let pool = |t: &Tensor| t.unsqueeze(0).adaptive_avg_pool2d([height, width]).squeeze_dim(0);
-        let mask = view.mask.as_ref().map(|mask| mask.to_float().to_device(Device::Cpu));
-        let (image, weight) = pool_masked(&view.image.to_float().to_device(Device::Cpu), mask.as_ref(), pool);
-        let grey = image.mean_dim([0].as_slice(), false, Kind::Float);
-        let scale = (width as f64 / side(camera.width), height as f64 / side(camera.height));
-        let intrinsics = camera.intrinsics.resized(scale.0, scale.1);
-        SmallPhoto {
-            name: view.name.clone(),
-            camera: Camera { intrinsics, width: width as u32, height: height as u32, ..camera },
-            image,
-            grey,
-            weight: weight.map(|weight| weight.squeeze_dim(0)),
-        }
-    }
-
-    /// Returns the mask of the pixels with at least half of the largest weight, [h, w]; `None` if every pixel counts.
-    fn counted(&self) -> Option<Tensor> {
-        self.weight.as_ref().map(|weight| weight.ge_tensor(&(weight.max() * 0.5)))
-    }
-
-    /// Returns this photo for a comparison with one that `camera` has taken.
-    fn compared_with(&self, camera: &Camera) -> ComparedPhoto<'_> {
-        // A pixel at inverse depth w is at rotation · ray + w · translation in this camera, up to a factor.
-        let to_this = self.camera.c2w.inverse() * camera.c2w;
-        let rotation = DMat3::from_mat4(to_this);
-        let pixels_of =
-            |k: &Intrinsics| DMat3::from_cols_array(&[k.fx, 0., 0., 0., k.fy, 0., k.cx, k.cy, 1.]);
-        let pixels = pixels_of(&self.camera.intrinsics);
-        let to_pixels = pixels * rotation * pixels_of(&camera.intrinsics).inverse();
-        ComparedPhoto {
-            grey: &self.grey,
-            weight: self.weight.as_ref(),
-            to_pixels: [
-                to_pixels.x_axis,
-                to_pixels.y_axis,
-                to_pixels.z_axis,
-                pixels * to_this.w_axis.truncate(),
-            ],
-        }
-    }
-
-    fn centre(&self) -> DVec3 {
-        self.camera.c2w.w_axis.truncate()
-    }
-
-    fn size(&self) -> [i64; 2] {
-        [i64::from(self.camera.height), i64::from(self.camera.width)]
-    }
-}
-
 /// Returns the inverse depth of the nearest plane, chosen so that its pixels move by `LARGEST_MOVE` in the nearest photo.
 fn nearest_of_cameras(this: &SmallPhoto, other: &SmallPhoto) -> f64 {
     let baseline = other.centre().distance(this.centre());
@@ -283,7 +224,8 @@ fn filled(inverse: &Tensor, correlation: &Tensor, counted: Option<&Tensor>) -> T
 #[cfg(test)]
 mod tests {
     use super::*;
-    use glam::DMat4;
+    use crate::scene::Intrinsics;
+    use glam::{DMat4, DVec3};
 
     /// Depths of a plane are found: a wave pattern at depth 4, seen by three cameras in a row.
     #[test]
@@ -313,7 +255,7 @@ mod tests {
             let _ = mask.narrow(2, 0, 24).zero_();
             View { image: image.into(), mask: Some(mask.into()), ..view.shallow_clone() }
         });
-        for swept in sweep(&masked, &[], |_| true) {
+        for swept in sweep(&masked, &[], |_| true).depth_maps {
             let off = (&swept.depth / depth - 1.).abs();
             let counted = swept.counted.unwrap();
             assert_eq!(counted.sum(Kind::Int64).int64_value(&[]), 64 * 40);
@@ -326,7 +268,7 @@ mod tests {
             assert_eq!(sure(0, 24), 0.);
             assert!(sure(24, 40) > 0.6, "{}", sure(24, 40));
         }
-        for swept in sweep(&views, &[], |_| true) {
+        for swept in sweep(&views, &[], |_| true).depth_maps {
             let off = (swept.depth / depth - 1.).abs().median().double_value(&[]);
             assert!(off < 0.02, "{off}");
         }
@@ -338,7 +280,7 @@ mod tests {
         assert!((SceneDepth::of(1, &photos, &points).nearest.unwrap() - 1.3 / 3.).abs() < 1e-9);
         assert!(SceneDepth::of(1, &photos, &points[..20]).nearest.is_none());
         // A single photo has no measurable depth, and the result must not be NaN.
-        let alone = sweep(&views[..1], &[], |_| true);
+        let alone = sweep(&views[..1], &[], |_| true).depth_maps;
         assert!(alone[0].depth.isfinite().all().int64_value(&[]) == 1);
     }
 }

@@ -39,14 +39,26 @@ pub fn extent(cameras: &[Camera]) -> f64 {
     cameras.iter().map(|camera| distance(camera, &cameras[0])).fold(0., f64::max)
 }
 
-/// Returns up to `count` indices of `cameras` by farthest-point sampling. Distances are sums of the distance in units of the extent of all
-/// cameras and the angle between axes in radians. The first index is 0.
-pub fn farthest_first(cameras: &[Camera], count: usize) -> Vec<usize> {
+/// Returns the measure of how far apart two cameras are: the sum of their distance in units of the extent of all `cameras`, and the angle
+/// between their axes in radians.
+fn separation(cameras: &[Camera]) -> impl Fn(&Camera, &Camera) -> f64 + use<> {
     let extent = extent(cameras);
-    let apart = |a: &Camera, b: &Camera| {
+    move |a, b| {
         let moved = if extent > 0. { distance(a, b) / extent } else { 0. };
         moved + turn(a, b)
-    };
+    }
+}
+
+/// Returns the camera with the smallest [`separation`] from camera `index`; `None` if there is no other.
+pub fn nearest_to(index: usize, cameras: &[Camera]) -> Option<usize> {
+    let apart = separation(cameras);
+    let from = |other: &usize| apart(&cameras[*other], &cameras[index]);
+    (0..cameras.len()).filter(|&other| other != index).min_by(|a, b| from(a).total_cmp(&from(b)))
+}
+
+/// Returns up to `count` indices of `cameras` by farthest-point sampling with [`separation`]. The first index is 0.
+pub fn farthest_first(cameras: &[Camera], count: usize) -> Vec<usize> {
+    let apart = separation(cameras);
     let mut chosen = vec![];
     let mut nearest = vec![f64::INFINITY; cameras.len()];
     while chosen.len() < count.min(cameras.len()) {

@@ -8,8 +8,8 @@ use glam::DVec3;
 use globalsplat::data::{Capture, Holdout, PhotoSize, load_all_views, open_capture, read_points};
 use globalsplat::io::{read_splat, write_splat};
 use globalsplat::refine::{
-    Budget, Initial, RefineConfig, RefineEvent, RefineOptions, RefineResult, RefineSession, RefineState,
-    gaussians_from_photos,
+    Budget, ExposureCorrection, Initial, RefineConfig, RefineEvent, RefineOptions, RefineResult,
+    RefineSession, RefineState, gaussians_from_photos,
 };
 use globalsplat::scene::Gaussians;
 use globalsplat::train::WatchedRun;
@@ -255,7 +255,7 @@ fn a_continued_refinement_equals_one_without_a_break() {
         budget: Budget::Steps(steps),
         gaussians: 300,
         correct_poses: true,
-        correct_exposures: true,
+        correct_exposures: ExposureCorrection::On,
         size: PhotoSize::Within(48),
         ..RefineOptions::default()
     };
@@ -480,9 +480,9 @@ fn colmap_points_initialize_gaussians() {
         }
         // Half of the Gaussians are at points, the others on pixels.
         let views = load_all_views(&capture, None).unwrap();
-        let (raw, _) = gaussians_from_photos(&views, &points, None, 1000, 0, tch::Device::Cpu, |_| true)
-            .expect("depths");
-        let begun: Vec<f64> = Vec::try_from(raw.means.to_kind(Kind::Double).view([-1])).unwrap();
+        let off = ExposureCorrection::Off;
+        let scene = gaussians_from_photos(&views, &points, None, 1000, 0, off, |_| true).expect("depths");
+        let begun: Vec<f64> = Vec::try_from(scene.gaussians.means.to_kind(Kind::Double).view([-1])).unwrap();
         let at_points = begun
             .chunks(3)
             .filter(|mean| points.iter().any(|p| p.position.distance(DVec3::from_slice(mean)) < 1e-5));

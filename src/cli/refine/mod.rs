@@ -11,7 +11,7 @@ use anyhow::Result;
 use clap::{Args, ValueEnum};
 use globalsplat::data::Holdout;
 use globalsplat::error::Error;
-use globalsplat::refine::{Budget, MaskBackground, RefineConfig, RefineOptions};
+use globalsplat::refine::{Budget, ExposureCorrection, MaskBackground, RefineConfig, RefineOptions};
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -90,9 +90,17 @@ pub struct Refine {
     /// Also optimize a correction of each camera's pose
     #[arg(long)]
     correct_poses: bool,
-    /// Also optimize a correction of each photo's exposure and white balance
-    #[arg(long)]
-    correct_exposures: bool,
+    /// Also optimize a correction of each photo's exposure and white balance. auto: if photos next to each other differ, which is
+    /// measured in photos only, not with --splat; without a value: on
+    #[arg(
+        long,
+        value_name = "WHEN",
+        default_value = "auto",
+        default_missing_value = "on",
+        num_args = 0..=1,
+        require_equals = true
+    )]
+    correct_exposures: WhenToCorrect,
     #[command(flatten)]
     reports: Reports,
     /// Override a setting of the method, as in views=4; docs/refine.md lists them
@@ -113,6 +121,17 @@ enum From {
     Nothing,
     /// A model's reconstruction, and pixels for the Gaussians that it lacks to --gaussians
     Weights,
+}
+
+/// When exposures are corrected.
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum WhenToCorrect {
+    /// Never
+    Off,
+    /// If photos next to each other differ
+    Auto,
+    /// Always
+    On,
 }
 
 /// Background of masked pixels.
@@ -177,7 +196,11 @@ impl Refine {
             holdout,
             views: self.views,
             correct_poses: self.correct_poses,
-            correct_exposures: self.correct_exposures,
+            correct_exposures: match self.correct_exposures {
+                WhenToCorrect::Off => ExposureCorrection::Off,
+                WhenToCorrect::Auto => ExposureCorrection::Auto,
+                WhenToCorrect::On => ExposureCorrection::On,
+            },
             mask_background: self.mask_background.map(|background| match background {
                 Background::Black => MaskBackground::Black,
                 Background::White => MaskBackground::White,

@@ -1,0 +1,258 @@
+//! Exposures of photos relative to each other, measured where photos show the same surface, as panoramas are balanced (Brown and Lowe 2007).
+
+use super::depth_map::DepthMap;
+use super::small_photo::SmallPhoto;
+use super::view_selection::{nearest_to, projection};
+use crate::scene::Camera;
+use glam::DVec3;
+use std::ops::Range;
+use tch::Tensor;
+
+/// Maximum number of a photo's points at which other photos are compared with it.
+const MAX_POINTS: usize = 1000;
+/// Minimum number of points that two photos have to share.
+const MIN_POINTS: usize = 50;
+/// Values of a photo that are neither so dark that their ratios are inexact nor saturated.
+const USABLE: Range<f32> = 0.05..0.95;
+/// Maximum relative difference of a point's depth from the depth of the photo that shows it: farther points are occluded.
+const SAME_SURFACE: f64 = 0.1;
+/// Spread of the logarithms of the ratios of pixels that show the same. A larger one comes from pixels that don't.
+const NOISE: f64 = 0.02;
+/// Weight with which an exposure is assumed to be average, relative to that of the best comparison. It decides where photos share nothing.
+const PRIOR: f64 = 1e-3;
+/// Root mean square of the logarithms of gains below which a correction changes nothing visible.
+const MIN_DIFFERENCE: f64 = 0.02;
+
+/// Natural logarithms of the gains of red, green and blue.
+pub(super) type LogGains = [f64; 3];
+
+/// Whether photos get their own exposure.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum ExposureCorrection {
+    /// No photo does.
+    Off,
+    /// All photos do if the exposures of nearby photos differ, as far as this can be measured. Where the exposure changes gradually from photo
+    /// to photo, a splat without corrections shows it, too, and is closer to photos in between.
+    #[default]
+    Auto,
+    /// All photos do.
+    On,
+}
+
+/// Photo that points are compared with.
+struct Exposed<'a> {
+    photo: &'a SmallPhoto,
+    colours: Vec<f32>,
+    counted: Option<Vec<bool>>,
+    /// Depth of each pixel on which the photos agree, infinity for others; `None` if the photo has no depth map.
+    depths: Option<Vec<f32>>,
+}
+
+/// Ratio of the exposures of two photos.
+struct Ratio {
+    log: LogGains,
+    /// Weight of the comparison, at most 1.
+    weight: f64,
+}
+
+/// Measures the exposures of `photos`, whose mean is 0. `depth_maps` are the depths of some of them, with their indices.
+pub(super) fn measure_exposures(photos: &[SmallPhoto], depth_maps: &[(usize, DepthMap)]) -> Vec<LogGains> {
+    let mut exposed: Vec<Exposed> = photos.iter().map(Exposed::new).collect();
+    for (index, map) in depth_maps {
+        let depths = map.depths().into_iter().zip(map.sure_pixels());
+        let known = depths.map(|(depth, is_sure)| if is_sure { depth } else { f32::INFINITY });
+        exposed[*index].depths = Some(known.collect());
+    }
+    // Ratios of all photos to each photo that has a depth map.
+    let ratios = depth_maps.iter().map(|(index, _)| {
+        let points = exposed[*index].points();
+        exposed.iter().map(|photo| photo.ratio_to(&points)).collect()
+    });
+    let ratios: Vec<Vec<Option<Ratio>>> = ratios.collect();
+    let indices: Vec<usize> = depth_maps.iter().map(|(index, _)| *index).collect();
+    let of_maps = balance(&ratios, &indices);
+    let gains = (0..photos.len()).map(|photo| match indices.binary_search(&photo) {
+        Ok(row) => of_maps[row],
+        Err(_) => {
+            let (mut sums, mut weights) = ([0.; 3], PRIOR);
+            for (row, gains) in ratios.iter().zip(&of_maps) {
+                let Some(Ratio { log, weight }) = &row[photo] else { continue };
+                weights += weight;
+                (0..3).for_each(|c| sums[c] += weight * (gains[c] + log[c]));
+            }
+            sums.map(|sum| sum / weights)
+        }
+    });
+    let gains: Vec<LogGains> = gains.collect();
+    let mean = [0, 1, 2].map(|c| gains.iter().map(|gain| gain[c]).sum::<f64>() / gains.len() as f64);
+    gains.iter().map(|gain| [0, 1, 2].map(|c| gain[c] - mean[c])).collect()
+}
+
+impl ExposureCorrection {
+    /// Returns whether photos with these exposures get a correction.
+    pub(super) fn applies(self, gains: &[LogGains], cameras: &[Camera]) -> bool {
+        match self {
+            ExposureCorrection::Off => false,
+            ExposureCorrection::Auto => are_uneven(gains, cameras),
+            ExposureCorrection::On => true,
+        }
+    }
+}
+
+/// Returns whether the exposures of nearby photos differ more from each other than from the mean.
+fn are_uneven(gains: &[LogGains], cameras: &[Camera]) -> bool {
+    let squares = |a: LogGains, b: LogGains| (0..3).map(|c| (a[c] - b[c]).powi(2)).sum::<f64>();
+    let from_mean: f64 = gains.iter().map(|&gain| squares(gain, [0.; 3])).sum();
+    let nearest = (0..gains.len()).filter_map(|index| Some((index, nearest_to(index, cameras)?)));
+    let from_nearest: f64 = nearest.map(|(index, other)| squares(gains[index], gains[other])).sum();
+    from_mean > 3. * gains.len() as f64 * MIN_DIFFERENCE.powi(2) && from_nearest > from_mean
+}
+
+/// Returns the gains of the photos `indices` that fit their ratios best, by weighted least squares. `ratios` has the ratios of all photos to
+/// each of these.
+fn balance(ratios: &[Vec<Option<Ratio>>], indices: &[usize]) -> Vec<LogGains> {
+    let n = indices.len();
+    let (mut matrix, mut right) = (vec![0.; n * n], vec![0.; n * 3]);
+    for (i, row) in ratios.iter().enumerate() {
+        matrix[i * n + i] += PRIOR;
+        for (j, &photo) in indices.iter().enumerate() {
+            // The gain of photo j minus that of photo i is their ratio.
+            let Some(Ratio { log, weight }) = &row[photo] else { continue };
+            for (row, sign) in [(i, -1.), (j, 1.)] {
+                matrix[row * n + i] -= sign * weight;
+                matrix[row * n + j] += sign * weight;
+                (0..3).for_each(|c| right[row * 3 + c] += sign * weight * log[c]);
+            }
+        }
+    }
+    let of = |values: &[f64], columns: usize| Tensor::from_slice(values).view([n as i64, columns as i64]);
+    let solution = Tensor::linalg_solve(&of(&matrix, n), &of(&right, 3), true);
+    let numbers = Vec::<f64>::try_from(solution.contiguous().view([-1])).expect("numbers");
+    numbers.chunks_exact(3).map(|gain| [gain[0], gain[1], gain[2]]).collect()
+}
+
+impl<'a> Exposed<'a> {
+    fn new(photo: &'a SmallPhoto) -> Self {
+        let colours = Vec::try_from(photo.image.contiguous().view([-1])).expect("numbers");
+        let truths = |t: Tensor| Vec::try_from(t.contiguous().view([-1])).expect("truths");
+        Exposed { photo, colours, counted: photo.counted().map(truths), depths: None }
+    }
+
+    /// Returns the colour of a pixel that counts and is neither too dark nor too bright.
+    fn colour(&self, pixel: usize) -> Option<[f32; 3]> {
+        let [h, w] = self.photo.size().map(|side| side as usize);
+        let colour = [0, 1, 2].map(|c| self.colours[c * h * w + pixel]);
+        let is_counted = self.counted.as_ref().is_none_or(|counted| counted[pixel]);
+        (is_counted && colour.iter().all(|value| USABLE.contains(value))).then_some(colour)
+    }
+
+    /// Returns points of the surfaces that the photo shows, and their colours. Requires a depth map.
+    fn points(&self) -> Vec<(DVec3, [f32; 3])> {
+        let Camera { intrinsics: k, c2w, width, .. } = self.photo.camera;
+        let depths = self.depths.as_ref().expect("depths");
+        let point = |(pixel, &depth): (usize, &f32)| {
+            let colour = self.colour(pixel).filter(|_| depth.is_finite())?;
+            let [u, v] = [pixel as u32 % width, pixel as u32 / width].map(|side| f64::from(side) + 0.5);
+            let seen = DVec3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.) * f64::from(depth);
+            Some((c2w.transform_point3(seen), colour))
+        };
+        let points: Vec<_> = depths.iter().enumerate().filter_map(point).collect();
+        let every = points.len().div_ceil(MAX_POINTS).max(1);
+        points.into_iter().step_by(every).collect()
+    }
+
+    /// Returns the median ratio of this photo's colours to those of `points`; `None` if it shows too few of them.
+    fn ratio_to(&self, points: &[(DVec3, [f32; 3])]) -> Option<Ratio> {
+        let project = projection(&self.photo.camera);
+        let mut logs: [Vec<f32>; 3] = Default::default();
+        for (point, colour) in points {
+            let Some([u, v, z]) = project(*point) else { continue };
+            let pixel = v as usize * self.photo.camera.width as usize + u as usize;
+            let is_surface = |depths: &Vec<f32>| (z / f64::from(depths[pixel]) - 1.).abs() < SAME_SURFACE;
+            if let Some(shown) = self.colour(pixel).filter(|_| self.depths.as_ref().is_none_or(is_surface)) {
+                (0..3).for_each(|c| logs[c].push((shown[c] / colour[c]).ln()));
+            }
+        }
+        let count = logs[0].len();
+        if count < MIN_POINTS {
+            return None;
+        }
+        let (mut log, mut spread) = ([0.; 3], 0.);
+        for (log, logs) in log.iter_mut().zip(&mut logs) {
+            let middle = median(logs);
+            logs.iter_mut().for_each(|log| *log = (*log - middle).abs());
+            *log = f64::from(middle);
+            spread += f64::from(median(logs)) / 3.;
+        }
+        Some(Ratio { log, weight: count as f64 / MAX_POINTS as f64 / (1. + (spread / NOISE).powi(2)) })
+    }
+}
+
+fn median(values: &mut [f32]) -> f32 {
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f32::total_cmp).1
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::data::View;
+    use crate::scene::Intrinsics;
+    use glam::DMat4;
+    use tch::{Device, Kind};
+
+    const SIDE: u32 = 64;
+    const DEPTH: f64 = 4.;
+
+    /// Returns the view of a camera at `x` on a wall with a wave pattern, multiplied by `gains`.
+    fn wall(x: f64, gains: [f64; 3]) -> View {
+        let (side, options) = (f64::from(SIDE), (Kind::Float, Device::Cpu));
+        let axis = |offset: f64| (Tensor::arange(64, options) + 0.5 - side / 2.) / side * DEPTH + offset;
+        let (u, v) = (axis(x).view([1, -1]), axis(0.).view([-1, 1]));
+        let wave = ((&u * 5.).sin() * (&v * 4.).cos()) * 0.2 + 0.4;
+        let gains = Tensor::from_slice(&gains).to_kind(Kind::Float).view([3, 1, 1]);
+        let intrinsics = Intrinsics { fx: side, fy: side, cx: side / 2., cy: side / 2. };
+        let c2w = DMat4::from_translation(DVec3::X * x);
+        let camera = Camera { intrinsics, c2w, width: SIDE, height: SIDE };
+        View { name: x.to_string(), image: (wave * gains).into(), mask: None, camera }
+    }
+
+    /// Gains are measured of photos with and without a depth map, and 0 is assumed for one that shares nothing with the others.
+    #[test]
+    fn exposures_are_measured() {
+        let gains = [[1., 1., 1.], [0.8, 0.9, 1.1], [1.3, 1.2, 1.4], [1., 1., 1.]];
+        let views: Vec<View> = [-0.5, 0., 0.5, 90.].into_iter().zip(gains).map(|(x, g)| wall(x, g)).collect();
+        let photos: Vec<SmallPhoto> = views.iter().map(|view| SmallPhoto::from_view(view, 128.)).collect();
+        let map = |index: usize| {
+            let map = DepthMap { camera: photos[index].camera, ..DepthMap::flat(SIDE, SIDE, DEPTH) };
+            (index, map)
+        };
+        let found = measure_exposures(&photos, &[map(0), map(2)]);
+        for c in 0..3 {
+            let logs = gains.map(|gain: [f64; 3]| gain[c].ln());
+            // Photos 0 to 2 are around 0, as photo 3 is.
+            let mean = (logs[0] + logs[2]) / 2.;
+            let expected = [logs[0] - mean, logs[1] - mean, logs[2] - mean, 0.];
+            let all = expected.iter().sum::<f64>() / 4.;
+            for (found, expected) in found.iter().zip(expected) {
+                assert!((found[c] - (expected - all)).abs() < 0.01, "{} is not {}", found[c], expected - all);
+            }
+        }
+    }
+
+    /// Exposures are corrected if neighbours differ, and neither if they change gradually nor if the differences are invisible.
+    #[test]
+    fn uneven_exposures_are_recognized() {
+        let cameras: Vec<Camera> = (0..9).map(|x| wall(f64::from(x), [1.; 3]).camera).collect();
+        let auto = |of: fn(usize) -> f64| {
+            let gains: Vec<LogGains> = (0..9).map(|index| [of(index); 3]).collect();
+            ExposureCorrection::Auto.applies(&gains, &cameras)
+        };
+        assert!(auto(|index| [0.1, -0.2, 0.1][index % 3]));
+        assert!(!auto(|index| [0.01, -0.02, 0.01][index % 3]));
+        assert!(!auto(|index| 0.1 * (index as f64 - 4.)));
+        let equal = [[0.; 3]; 9];
+        assert!(ExposureCorrection::On.applies(&equal, &cameras));
+        assert!(!ExposureCorrection::Off.applies(&[[0.5; 3], [-0.5; 3]], &cameras[..2]));
+    }
+}
