@@ -58,7 +58,7 @@ pub struct RefineConfig {
     pub spread: f64,
     /// Opacity at or below which a Gaussian is dead.
     pub prune_opacity: f64,
-    /// Fraction of the optimization after which Gaussians are no longer relocated.
+    /// Fraction of the optimization after which Gaussians are no longer relocated, and their parameters are averaged.
     pub relocate_until: f64,
 }
 
@@ -76,7 +76,7 @@ impl Default for RefineConfig {
             opacity_logits: 3e-2,
             colours: 5e-3,
             harmonics: 0.1,
-            lr_final_factor: 0.2,
+            lr_final_factor: 0.6,
             poses: 5e-4,
             exposures: 5e-3,
             ssim_weight: 0.4,

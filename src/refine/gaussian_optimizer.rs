@@ -14,6 +14,8 @@ use tch::{Device, Tensor};
 
 /// Exponent with which the learning rate of the means falls with the number of Gaussians above [`MIN_GAUSSIANS`].
 const MEANS_POWER: f64 = 0.75;
+/// Minimum weight of a step in the average of the parameters: the average reaches back about a hundred steps.
+const MIN_AVERAGE_WEIGHT: f64 = 0.01;
 /// Adam's ε, added to the root of the second moments. It is small because gradients of single Gaussians are small.
 const EPSILON: f64 = 1e-15;
 
@@ -27,6 +29,8 @@ pub struct GaussianOptimizer {
     growth: Growth,
     /// Final number of Gaussians.
     last_count: i64,
+    /// Average of the parameters over the last steps, once no Gaussian is moved any more.
+    average: Option<GaussianParams>,
 }
 
 impl GaussianOptimizer {
@@ -37,9 +41,17 @@ impl GaussianOptimizer {
         let degrees = [first, first.max(config.sh_degree)];
         let leaves = GaussianParams::from_raw(raw, degrees[1]);
         let optimizer = Optimizer::new(leaves.named_parameters().map(alone).into()).with_epsilon(EPSILON);
-        let growth = Growth { first_count: leaves.count(), degrees, degree: first };
+        let growth = Growth { first_count: leaves.count(), degrees, degree: first, averaged: 0 };
         let last_count = leaves.count().max(count);
-        GaussianOptimizer { leaves, optimizer, config: config.clone(), depth, growth, last_count }
+        GaussianOptimizer {
+            leaves,
+            optimizer,
+            config: config.clone(),
+            depth,
+            growth,
+            last_count,
+            average: None,
+        }
     }
 
     /// Creates the optimizer that `state` was made of, on `device`. The Gaussians grow to at least `count`.
@@ -53,23 +65,33 @@ impl GaussianOptimizer {
         device: Device,
     ) -> Result<Self> {
         let Record { depth, growth, .. } = state.record;
-        let leaves =
-            GaussianParams::from_named(|name| state.tensor(&format!("{GAUSSIANS}value.{name}")), device)?;
+        let params = |kind: &str| {
+            GaussianParams::from_named(|name| state.tensor(&format!("{GAUSSIANS}{kind}.{name}")), device)
+        };
+        let leaves = params("value")?;
+        let average = if growth.averaged > 0 { Some(params("average")?) } else { None };
         let mut optimizer = Optimizer::new(leaves.named_parameters().map(alone).into()).with_epsilon(EPSILON);
         optimizer.load_state(state.file(), &state.tensors_of(GAUSSIANS))?;
         let last_count = leaves.count().max(count);
-        Ok(GaussianOptimizer { leaves, optimizer, config: config.clone(), depth, growth, last_count })
+        Ok(GaussianOptimizer {
+            leaves,
+            optimizer,
+            config: config.clone(),
+            depth,
+            growth,
+            last_count,
+            average,
+        })
     }
 
-    /// Adds the parameters and their moments to `tensors`.
+    /// Adds the parameters, their moments and their averages to `tensors`.
     pub(super) fn add_to_state(&self, tensors: &mut BTreeMap<String, Tensor>) {
-        let values = self.leaves.named_parameters().map(|(name, t)| (format!("value.{name}"), t.detach()));
-        tensors.extend(
-            values
-                .into_iter()
-                .chain(self.optimizer.state())
-                .map(|(name, t)| (format!("{GAUSSIANS}{name}"), t)),
-        );
+        let named = |kind: &str, params: &GaussianParams| {
+            params.named_parameters().map(|(name, t)| (format!("{kind}.{name}"), t.detach()))
+        };
+        let averages = self.average.iter().flat_map(|average| named("average", average));
+        let all = named("value", &self.leaves).into_iter().chain(self.optimizer.state()).chain(averages);
+        tensors.extend(all.map(|(name, t)| (format!("{GAUSSIANS}{name}"), t)));
     }
 
     /// Returns the number of Gaussians.
@@ -85,6 +107,12 @@ impl GaussianOptimizer {
     /// Returns the Gaussians, differentiable with respect to the parameters. `progress` goes from 0 to 1.
     pub fn gaussians(&self, progress: f64) -> Gaussians {
         self.leaves.activate(self.degree_at(progress))
+    }
+
+    /// Returns the Gaussians that the optimization has arrived at, not differentiable: the average over the last steps if there is one.
+    pub(super) fn result(&self) -> Gaussians {
+        let params = self.average.as_ref().unwrap_or(&self.leaves);
+        tch::no_grad(|| params.activate(self.degree_at(1.))).map(Tensor::copy)
     }
 
     /// Returns the degree of the spherical harmonics, at least the one that an earlier step used.
@@ -145,8 +173,25 @@ impl GaussianOptimizer {
             for moment in self.optimizer.moments() {
                 let _ = moment.shallow_clone().index_fill_(1, &changed, 0.);
             }
+            (self.average, self.growth.averaged) = (None, 0);
+        } else if progress >= config.relocate_until {
+            self.update_average();
         }
         Ok(())
+    }
+
+    /// Adds the parameters to their average.
+    fn update_average(&mut self) {
+        let average = self.average.get_or_insert_with(|| self.leaves.copy());
+        self.growth.averaged += 1;
+        let weight = (1. / self.growth.averaged as f64).max(MIN_AVERAGE_WEIGHT);
+        tch::no_grad(|| {
+            for ((_, average), (_, t)) in
+                average.named_parameters().iter().zip(self.leaves.named_parameters())
+            {
+                let _ = average.shallow_clone().lerp_(t, weight);
+            }
+        });
     }
 }
 

@@ -64,6 +64,19 @@ impl GaussianParams {
         })
     }
 
+    /// Returns a copy that requires no gradients.
+    pub fn copy(&self) -> Self {
+        let copy = |t: &Tensor| t.detach().copy();
+        GaussianParams {
+            means: copy(&self.means),
+            log_scales: copy(&self.log_scales),
+            quaternions: copy(&self.quaternions),
+            opacity_logits: copy(&self.opacity_logits),
+            sh0: copy(&self.sh0),
+            sh_rest: copy(&self.sh_rest),
+        }
+    }
+
     /// Returns these Gaussians followed by `count` copies of the first one with almost no opacity (sigmoid(−30)), which the next relocation
     /// moves. Requires at least one Gaussian.
     pub fn append_dead(&self, count: i64) -> Self {

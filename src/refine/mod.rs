@@ -63,7 +63,7 @@ pub struct RefineStep<'a> {
 impl RefineStep<'_> {
     /// Returns a copy of the current Gaussians.
     pub fn gaussians(&self) -> Gaussians {
-        tch::no_grad(|| self.optimizer.gaussians(1.)).map(Tensor::copy)
+        self.optimizer.result()
     }
 
     /// Returns the number of Gaussians.
@@ -176,7 +176,7 @@ pub(crate) fn refine_timed(
     }
     let reached =
         Reached { steps: step, time: reached.time + begun.elapsed(), random: random.get_word_pos() };
-    Ok((tch::no_grad(|| optimizer.gaussians(1.)), reached))
+    Ok((optimizer.result(), reached))
 }
 
 /// Returns the loss: the difference between rendered images and photos, plus the regularization of the Gaussians. Masked pixels of the

@@ -361,8 +361,7 @@ impl<'a> RefineSession<'a> {
         let gaussians = match &start {
             Start::Photos(raw) | Start::Splat(_, raw) => raw.activate(),
             Start::Model(gaussians) => gaussians.map(Tensor::shallow_clone),
-            // The optimization changes the parameters in place.
-            Start::State(_, optimizer) => tch::no_grad(|| optimizer.gaussians(1.)).map(Tensor::copy),
+            Start::State(_, optimizer) => optimizer.result(),
         };
         let depth = match &start {
             Start::State(state, _) => state.record.depth,

@@ -54,6 +54,9 @@ pub(super) struct Growth {
     pub degrees: [i64; 2],
     /// Degree that the last step used.
     pub degree: i64,
+    /// Number of steps in the average of the parameters.
+    #[serde(default)]
+    pub averaged: u64,
 }
 
 /// State of a refinement: parameters of the Gaussians and of the corrections, the moments of their optimizers, and how far the optimization
