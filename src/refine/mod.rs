@@ -12,13 +12,13 @@ mod gaussian_params;
 mod known_depths;
 mod log;
 mod options;
-mod patches;
 mod photos;
 mod relocate;
 mod session;
 mod small_photo;
 mod state;
 mod sweep;
+mod view_sample;
 mod view_selection;
 
 pub use begin::{InitialScene, gaussians_from_photos};
@@ -29,10 +29,10 @@ pub use exposures::ExposureCorrection;
 pub use gaussian_optimizer::GaussianOptimizer;
 pub use log::RefineLog;
 pub use options::{Budget, MaskBackground, RefineOptions};
-pub use patches::{PatchScores, Patches};
 pub use photos::{MIN_SIDE, Photos, load_photos};
 pub use session::{EvalPoint, Initial, RefineEvent, RefineMetrics, RefineResult, RefineSession};
 pub use state::{Reached, RefineState};
+pub use view_sample::{SampleScores, ViewSample};
 
 use self::known_depths::KnownDepths;
 use self::photos::Drawn;

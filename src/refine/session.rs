@@ -7,9 +7,9 @@ use super::depth_map::DepthMap;
 use super::exposures::{ExposureCorrection, LogGains};
 use super::gaussian_optimizer::GaussianOptimizer;
 use super::options::{Budget, RefineOptions};
-use super::patches::{PatchScores, Patches};
 use super::photos::{Photos, distinct, load_photos};
 use super::state::{Record, RefineState};
+use super::view_sample::{SampleScores, ViewSample};
 use super::{Task, refine, scene_depth};
 use crate::data::{Capture, Point, View, read_points};
 use crate::error::{Error, Result};
@@ -72,12 +72,12 @@ pub enum RefineEvent<'a> {
     Optimizing {
         /// Number of steps done.
         steps: u64,
-        /// Most recent PSNR on patches of the held-out views, in dB.
+        /// Most recent PSNR of a sample of the held-out views, in dB.
         psnr: Option<f64>,
     },
     /// Metrics of a step that was just done, every 50 steps.
     Measured(&'a RefineMetrics),
-    /// Held-out views were scored on patches.
+    /// A sample of the held-out views was scored.
     Scored(&'a EvalPoint),
     /// Whole views are being scored; the value is the number of views that are done.
     Scoring(usize),
@@ -108,9 +108,9 @@ pub struct EvalPoint {
     pub seconds: f64,
     /// Number of steps done.
     pub steps: u64,
-    /// Scores of the patches.
+    /// Scores of the sample.
     #[serde(flatten)]
-    pub scores: PatchScores,
+    pub scores: SampleScores,
 }
 
 /// Result of a session.
@@ -132,9 +132,9 @@ pub struct RefineResult {
     pub seconds: [f64; 2],
     /// State from which [`Initial::State`] continues; `None` if the final Gaussians are the initial ones.
     pub state: Option<RefineState>,
-    /// Scores on patches of the photos before and after the optimization.
-    pub shown: [PatchScores; 2],
-    /// Scores on patches of the held-out views during the optimization.
+    /// Scores of a sample of the photos before and after the optimization.
+    pub shown: [SampleScores; 2],
+    /// Scores of a sample of the held-out views during the optimization.
     pub curve: Vec<EvalPoint>,
     /// Scores of the initial Gaussians on whole held-out views; `None` if there are none, or if the callback ended the scoring.
     /// [`RefineSession::score_held_out`] also scores the final Gaussians.
@@ -192,7 +192,7 @@ pub struct RefineSession<'a> {
     frame: LocalFrame,
     photos: Vec<View>,
     held_out: Vec<View>,
-    patches_held_out: Patches,
+    held_out_sample: ViewSample,
     /// Held-out views that there is time to score as a whole.
     scored: Vec<View>,
     start: Option<(Start<'a>, Gaussians, f64)>,
@@ -256,7 +256,7 @@ impl<'a> RefineSession<'a> {
             on_event: Box::new(on_event),
             is_stopped: false,
             frame,
-            patches_held_out: Patches::from_views(&held_out),
+            held_out_sample: ViewSample::of(&held_out),
             photos,
             held_out,
             scored: vec![],
@@ -376,7 +376,7 @@ impl<'a> RefineSession<'a> {
         Ok(gaussians)
     }
 
-    /// Scores the result of [`RefineSession::start`] on the held-out views, optimizes it, and scores patches of the photos before and
+    /// Scores the result of [`RefineSession::start`] on the held-out views, optimizes it, and scores a sample of the photos before and
     /// after.
     ///
     /// # Errors
@@ -394,9 +394,11 @@ impl<'a> RefineSession<'a> {
         if let Some(line) = self.late_start_warning() {
             self.warn(&line);
         }
-        let patches = Patches::from_views(&self.photos);
+        let begun_scoring = Instant::now();
+        let sample = ViewSample::of(&self.photos);
         let state = if let Start::State(state, _) = &start { Some(*state) } else { None };
-        let before = patches.corrected(&self.corrections(state, depth)?).score(&initial)?.expect("photos");
+        let before = sample.corrected(&self.corrections(state, depth)?).score(&initial)?.expect("photos");
+        self.reserve(begun_scoring.elapsed());
         if matches!(start, Start::Model(..)) {
             self.add_eval_point(&initial)?;
         }
@@ -409,7 +411,7 @@ impl<'a> RefineSession<'a> {
             (gaussians, learned, Some(state))
         };
         let ended = self.clock.elapsed().as_secs_f64();
-        let after = patches.corrected(&learned).score(&gaussians)?.expect("photos");
+        let after = sample.corrected(&learned).score(&gaussians)?.expect("photos");
         let is_initial = after.psnr.is_nan() || after.psnr < before.psnr;
         let corrections =
             if learned.are_any() && !is_initial { learned.report(&self.photos) } else { vec![] };
@@ -722,10 +724,10 @@ impl<'a> RefineSession<'a> {
         scoring.as_secs_f64() <= MAX_SCORING_SHARE * self.clock.elapsed().as_secs_f64()
     }
 
-    /// Scores patches of the held-out views, if there are any, and appends the scores to the curve.
+    /// Scores the sample of the held-out views, if there are any, and appends the scores to the curve.
     fn add_eval_point(&mut self, gaussians: &Gaussians) -> Result<()> {
         let begun = Instant::now();
-        if let Some(scores) = self.patches_held_out.score(gaussians)? {
+        if let Some(scores) = self.held_out_sample.score(gaussians)? {
             let seconds = self.clock.elapsed().as_secs_f64();
             let point = EvalPoint { seconds, steps: self.steps, scores };
             self.is_stopped |= !(self.on_event)(RefineEvent::Scored(&point));

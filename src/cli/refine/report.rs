@@ -2,7 +2,7 @@
 
 use super::super::print_json;
 use globalsplat::eval::CaptureScores;
-use globalsplat::refine::{Correction, PatchScores, RefineResult, RefineSession};
+use globalsplat::refine::{Correction, RefineResult, RefineSession, SampleScores};
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -24,7 +24,7 @@ pub fn print_result(
     let scores =
         |psnr: f64, ssim: f64, lpips: Option<f64>| json!({ "psnr": psnr, "ssim": ssim, "lpips_vgg": lpips });
     if is_json {
-        let of = |scores_of: &PatchScores, lpips| scores(scores_of.psnr, scores_of.ssim, lpips);
+        let of = |scores_of: &SampleScores, lpips| scores(scores_of.psnr, scores_of.ssim, lpips);
         let mut object = json!({
             "splat": out.to_string_lossy(), "gaussians": count, "photos": photos, "near_duplicates": session.near_duplicates(),
             "steps": steps, "seconds": ended, "begin_seconds": begun, "corrections": corrections,
@@ -48,7 +48,7 @@ pub fn print_result(
     let row = |name: String, [before, after]: [f64; 2], ssim: f64| {
         println!("{name:<24} {before:>14.2} {after:>8.2} {ssim:>8.4}");
     };
-    row(format!("{photos} photos, patches"), [before.psnr, after.psnr], after.ssim);
+    row(format!("{photos} photos, sampled"), [before.psnr, after.psnr], after.ssim);
     if let Some([before, after]) = held_out {
         let (scored, all) = (after.views.len(), session.held_out().len());
         let of_all = if scored < all { format!(" of {all}") } else { String::new() };

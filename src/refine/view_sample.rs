@@ -1,0 +1,110 @@
+//! Scores on a few views, cheap enough to compute during the optimization.
+
+use super::corrections::Corrections;
+use crate::data::View;
+use crate::error::Result;
+use crate::loss::{masked_mse, masked_photometric, psnr_of_mse, ssim};
+use crate::render::render_views;
+use crate::scene::{Camera, Gaussians};
+use serde::Serialize;
+use tch::{Kind, Tensor};
+
+/// Maximum number of views in a sample.
+const MAX_VIEWS: usize = 8;
+/// Minimum number of views in a sample, if there are as many.
+const MIN_VIEWS: usize = 2;
+/// Maximum number of pixels of all views in a sample, if there are more than [`MIN_VIEWS`].
+const MAX_PIXELS: u64 = 1_200_000;
+
+/// Evenly spread views of all. They are scored as a whole: a part of an image has other borders, near which large Gaussians are projected
+/// differently.
+#[derive(Debug)]
+pub struct ViewSample {
+    /// Indices among all views.
+    indices: Vec<usize>,
+    views: Vec<View>,
+}
+
+/// Mean scores of a sample.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct SampleScores {
+    /// PSNR in dB.
+    pub psnr: f64,
+    /// SSIM, as scikit-image computes it.
+    pub ssim: f64,
+}
+
+impl ViewSample {
+    /// Chooses up to eight of `views`, fewer if they are large.
+    pub fn of(views: &[View]) -> Self {
+        let pixels = |view: &View| u64::from(view.camera.width) * u64::from(view.camera.height);
+        let largest = views.iter().map(pixels).max().unwrap_or(1);
+        let count = ((MAX_PIXELS / largest) as usize).clamp(MIN_VIEWS, MAX_VIEWS);
+        let every = views.len().div_ceil(count).max(1);
+        let indices: Vec<usize> = (0..views.len()).step_by(every).collect();
+        let views = indices.iter().map(|&index| views[index].shallow_clone());
+        ViewSample { views: views.collect(), indices }
+    }
+
+    /// Returns the sample with the learned corrections of its photos applied.
+    pub(super) fn corrected(&self, corrections: &Corrections) -> Self {
+        let views = self.indices.iter().zip(&self.views).map(|(&index, view)| corrections.apply(index, view));
+        ViewSample { indices: self.indices.clone(), views: views.collect() }
+    }
+
+    /// Scores a splat in float32; returns `None` if there are no views.
+    ///
+    /// # Errors
+    /// Fails if rendering fails.
+    pub fn score(&self, gaussians: &Gaussians) -> Result<Option<SampleScores>> {
+        let cameras: Vec<Camera> = self.views.iter().map(|view| view.camera).collect();
+        let pictures = render_views(gaussians, &cameras)?;
+        let scores = pictures.iter().zip(&self.views).map(|(picture, view)| {
+            let valid = |t: &Tensor| t.to_device(picture.rgb.device()).clamp(0., 1.);
+            let (picture, photo) = (picture.rgb.clamp(0., 1.), valid(&view.image.to_float()));
+            let (mse, ssim) = match &view.mask {
+                Some(mask) => {
+                    let mask = valid(&mask.to_float());
+                    (masked_mse(&picture, &photo, &mask), masked_photometric(&picture, &photo, &mask, 0., 1.))
+                }
+                None => ((&picture - &photo).square().mean(Kind::Double), ssim(&picture, &photo)),
+            };
+            [psnr_of_mse(mse.double_value(&[])), ssim.double_value(&[])]
+        });
+        let count = self.views.len() as f64;
+        let sums = scores.reduce(|a, b| [a[0] + b[0], a[1] + b[1]]);
+        Ok(sums.map(|[psnr, ssim]| SampleScores { psnr: psnr / count, ssim: ssim / count }))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Intrinsics;
+    use glam::DMat4;
+    use tch::Device;
+
+    #[test]
+    fn a_sample_has_few_pixels_and_its_scores_are_those_of_the_views() {
+        let gaussians = Gaussians {
+            means: Tensor::from_slice(&[0f32, 0., 3.]).view([1, 1, 3]),
+            scales: Tensor::full([1, 1, 3], 0.5, (Kind::Float, Device::Cpu)),
+            quaternions: Tensor::from_slice(&[1f32, 0., 0., 0.]).view([1, 1, 4]),
+            opacities: Tensor::full([1, 1], 0.7, (Kind::Float, Device::Cpu)),
+            sh: Tensor::ones([1, 1, 1, 3], (Kind::Float, Device::Cpu)),
+        };
+        let views = |width: u32, height: u32, count: usize| -> Vec<View> {
+            let intrinsics = Intrinsics { fx: 200., fy: 190., cx: 100., cy: 80. };
+            let camera = Camera { intrinsics, c2w: DMat4::IDENTITY, width, height };
+            let image = render_views(&gaussians, &[camera]).unwrap().remove(0).rgb;
+            let view = View { name: String::new(), image: (image + 0.01).into(), mask: None, camera };
+            (0..count).map(|_| view.shallow_clone()).collect()
+        };
+        let small = ViewSample::of(&views(210, 170, 20));
+        assert_eq!(small.indices, [0, 3, 6, 9, 12, 15, 18]);
+        assert_eq!(ViewSample::of(&views(1000, 600, 9)).indices, [0, 5]);
+        let scores = small.score(&gaussians).unwrap().unwrap();
+        assert!((scores.psnr - 40.).abs() < 0.01 && scores.ssim > 0.9, "{scores:?}");
+        assert!(ViewSample::of(&[]).score(&gaussians).unwrap().is_none());
+    }
+}
