@@ -26,10 +26,11 @@ from refine_runs import refined
 STUDENT = {2: 12.71, 3: 4.30, 4: 3.18, 5: 2.78, 6: 2.57, 7: 2.45, 8: 2.36}
 
 
-def synthetic(out, count):
-    """Makes `count` synthetic captures of 48 photos of 512×512, and returns their names."""
-    folder = out / "synthetic"
-    told("synth", "--out", folder, "--scenes", str(count), "--frames", "48", "--size", "512")
+def make_synthetic_captures(out, count):
+    """Makes `count` synthetic captures of 48 photos of 512×512, unless they are there, and returns their names."""
+    folder = out / f"synthetic_{count}"
+    if not (folder / "index.json").is_file():
+        told("synth", "--out", folder, "--scenes", str(count), "--frames", "48", "--size", "512")
     chunks = json.loads((folder / "index.json").read_text())
     return [f"{folder / chunk}#{key}" for key, chunk in sorted(chunks.items())]
 
@@ -67,8 +68,8 @@ def main():
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     variants = arguments.variant or [("default", "")]
-    made = synthetic(arguments.out, arguments.synthetic) if arguments.synthetic else []
-    captures = [*arguments.capture, *([name] for name in made)]
+    synthetic = make_synthetic_captures(arguments.out, arguments.synthetic) if arguments.synthetic else []
+    captures = [*arguments.capture, *([name] for name in synthetic)]
     if not captures:
         parser.error("expected --capture or --synthetic")
     row("capture", "method", "time", "steps", "Gaussians", "PSNR, dB", "SSIM", "LPIPS")
@@ -80,9 +81,9 @@ def main():
             for seed in range(arguments.seeds):
                 for name, more in variants:
                     file = arguments.out / f"{name}.{capture_name}.{seconds:g}.{seed}.json"
-                    done = refined(file, folder, holdout, seconds, "--seed", str(seed), *shlex.split(more))
+                    output = refined(file, folder, holdout, seconds, "--seed", str(seed), *shlex.split(more))
                     found = scores(arguments.out, file.with_suffix(".ply"), folder, holdout, arguments.size)
-                    results[name].append({"steps": done["steps"], **found})
+                    results[name].append({"steps": output["steps"], **found})
                 for name, splats in arguments.peer:
                     splat = Path(splats) / f"{capture_name}.{seconds:g}.{seed}.ply"
                     if splat.is_file():

@@ -2,10 +2,10 @@
 
 use super::depth_map::DepthMap;
 use super::exposures::{ExposureCorrection, LogGains};
-use super::sweep::{Sweep, sweep};
+use super::sweep::{PlaneSweepOutput, sweep};
 use super::view_selection::projection;
 use crate::data::{Point, View};
-use crate::scene::{Camera, RawGaussians, SH_C0};
+use crate::scene::{RawGaussians, SH_C0};
 use glam::DVec3;
 use rand::seq::index::sample;
 use rand::{Rng, SeedableRng};
@@ -28,7 +28,7 @@ struct IsotropicGaussian {
     colour: [f32; 3],
 }
 
-/// What photos alone tell about a scene.
+/// Initial state of a scene from photos alone.
 #[derive(Debug)]
 pub struct InitialScene {
     /// Initial Gaussians, on the CPU.
@@ -52,19 +52,18 @@ pub fn gaussians_from_photos(
     exposures: ExposureCorrection,
     should_continue: impl FnMut(usize) -> bool,
 ) -> Option<InitialScene> {
-    let Sweep { mut depth_maps, log_exposures } = sweep(views, points, should_continue);
+    let PlaneSweepOutput { photos, mut depth_maps } = sweep(views, points, should_continue);
     if depth_maps.is_empty() {
         return None;
     }
-    let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
-    let is_corrected = exposures.applies(&log_exposures, &cameras);
-    let log_exposures: Option<Vec<LogGains>> = is_corrected.then_some(log_exposures);
-    for (view, gains) in views.iter().zip(log_exposures.iter().flatten()) {
-        if let Some(map) = depth_maps.iter_mut().find(|map| map.photo == view.name) {
-            map.image =
-                &map.image / Tensor::from_slice(&gains.map(f64::exp)).to_kind(Kind::Float).view([3, 1, 1]);
+    let log_exposures: Option<Vec<LogGains>> = exposures.measure(&photos, &depth_maps);
+    if let Some(gains) = &log_exposures {
+        for (index, map) in &mut depth_maps {
+            let gains = Tensor::from_slice(&gains[*index].map(f64::exp)).to_kind(Kind::Float);
+            map.image = &map.image / gains.view([3, 1, 1]);
         }
     }
+    let depth_maps: Vec<DepthMap> = depth_maps.into_iter().map(|(_, map)| map).collect();
     let sampled = |count: usize| sample_gaussians(&depth_maps, points, count, seed);
     let gaussians = match known {
         None => sampled(count),
@@ -203,7 +202,7 @@ fn raw(balls: &[IsotropicGaussian]) -> RawGaussians {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::Intrinsics;
+    use crate::scene::{Camera, Intrinsics};
     use glam::DMat4;
 
     /// Gaussians that contradict the photos are removed. Two cameras are sure of a wall at depth 4, the second only in the left half of its

@@ -31,11 +31,12 @@ pub struct RefineConfig {
     pub colours: f64,
     /// Learning rate of the higher spherical harmonics, relative to that of the colours.
     pub harmonics: f64,
-    /// Final value of all other learning rates, relative to the initial ones. The decay is exponential.
+    /// Final value of all other learning rates of Gaussians, relative to the initial ones. The decay is exponential.
     pub lr_final_factor: f64,
-    /// Learning rate of the cameras' rotations, in radians, and translations, in scene depths, if poses are corrected.
+    /// Initial learning rate of the cameras' rotations, in radians, and translations, in scene depths, if poses are corrected. It falls to a
+    /// fifth.
     pub poses: f64,
-    /// Learning rate of the logarithms of exposures, if exposures are corrected.
+    /// Initial learning rate of the logarithms of exposures, if exposures are corrected. It falls to a fifth.
     pub exposures: f64,
     /// Weight of the loss 1 − SSIM. The weight of the L1 loss is one minus this.
     pub ssim_weight: f64,

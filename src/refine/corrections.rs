@@ -11,6 +11,9 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use tch::{Device, Kind, Tensor};
 
+/// Final learning rates, relative to the initial ones. Single steps are noisy, and corrections are not averaged.
+const FINAL_RATE: f64 = 0.2;
+
 /// Learned pose and exposure corrections of every photo. The mean over all photos is 0 for both, as a scene that is moved or brightened as
 /// a whole is the same scene.
 #[derive(Debug)]
@@ -22,7 +25,6 @@ pub struct Corrections {
     exposures: Option<Tensor>,
     optimizer: Optimizer,
     rates: Vec<f64>,
-    rates_end: f64,
     depth: f64,
 }
 
@@ -48,6 +50,9 @@ impl Corrections {
     /// Creates corrections of `photos` photos. Poses are learned from zero if `poses` is `true`, and exposures if there are initial
     /// `exposures`, the logarithms of the gains of red, green and blue of each photo. `depth` is the depth of the scene, the unit of lengths;
     /// `device` is the device of the photos.
+    ///
+    /// # Panics
+    /// Panics if the number of exposures isn't `photos`.
     pub fn new(
         photos: usize,
         poses: bool,
@@ -73,23 +78,23 @@ impl Corrections {
         let groups = [group("poses", &poses, config.poses), group("exposures", &exposures, config.exposures)];
         let (groups, rates) = groups.into_iter().flatten().unzip();
         let optimizer = Optimizer::new(groups);
-        Corrections { poses, exposures, optimizer, rates, rates_end: config.lr_final_factor, depth }
+        Corrections { poses, exposures, optimizer, rates, depth }
     }
 
-    /// Continues with the values and moments in `state`, if it has corrections of the same kinds.
+    /// Continues with the values in `state`, and with its moments if it has corrections of all kinds that are learned.
     ///
     /// # Errors
     /// Returns an error if a tensor is missing or has another shape.
     pub(super) fn load_state(&mut self, state: &RefineState) -> Result<()> {
         let tensors = state.tensors_of(CORRECTIONS);
-        let values = self.values();
-        if !values.iter().all(|(name, value)| tensors.get(name).is_some_and(|t| t.size() == value.size())) {
-            return Ok(());
+        let mut are_all_known = true;
+        for (name, value) in self.values() {
+            match tensors.get(&name).filter(|t| t.size() == value.size()) {
+                Some(known) => tch::no_grad(|| value.shallow_clone().copy_(known)),
+                None => are_all_known = false,
+            }
         }
-        for (name, value) in values {
-            tch::no_grad(|| value.shallow_clone().copy_(&tensors[&name]));
-        }
-        self.optimizer.load_state(state.file(), &tensors)
+        if are_all_known { self.optimizer.load_state(state.file(), &tensors) } else { Ok(()) }
     }
 
     /// Adds the values and their moments to `tensors`.
@@ -126,7 +131,7 @@ impl Corrections {
     }
 
     /// Returns `true` if there are any.
-    pub(super) fn are_any(&self) -> bool {
+    pub(super) fn has_any(&self) -> bool {
         self.poses.is_some() || self.exposures.is_some()
     }
 
@@ -140,13 +145,13 @@ impl Corrections {
     /// # Errors
     /// Returns an error if a GPU fails.
     pub(super) fn step(&mut self, progress: f64) -> Result<()> {
-        let left = self.rates_end.powf(progress);
+        let left = FINAL_RATE.powf(progress);
         let rates: Vec<f64> = self.rates.iter().map(|rate| rate * left).collect();
         self.optimizer.set_learning_rates(&rates);
         self.optimizer.step()
     }
 
-    /// Returns photo `index`, or a crop of it, with the corrected camera and with the exposure of the splat.
+    /// Returns photo `index` with the corrected camera and with the exposure of the splat.
     pub fn apply(&self, index: usize, view: &View) -> View {
         let numbers = self.numbers(index);
         let mut camera = view.camera;

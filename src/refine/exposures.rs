@@ -16,9 +16,10 @@ const MIN_POINTS: usize = 50;
 const USABLE: Range<f32> = 0.05..0.95;
 /// Maximum relative difference of a point's depth from the depth of the photo that shows it: farther points are occluded.
 const SAME_SURFACE: f64 = 0.1;
-/// Spread of the logarithms of the ratios of pixels that show the same. A larger one comes from pixels that don't.
+/// Median absolute deviation of the logarithms of ratios at which the weight of a comparison is halved.
 const NOISE: f64 = 0.02;
-/// Weight with which an exposure is assumed to be average, relative to that of the best comparison. It decides where photos share nothing.
+/// Weight of the prior that the logarithm of a gain is 0, relative to a comparison at [`MAX_POINTS`] points. It decides where photos share
+/// nothing.
 const PRIOR: f64 = 1e-3;
 /// Root mean square of the logarithms of gains below which a correction changes nothing visible.
 const MIN_DIFFERENCE: f64 = 0.02;
@@ -26,21 +27,21 @@ const MIN_DIFFERENCE: f64 = 0.02;
 /// Natural logarithms of the gains of red, green and blue.
 pub(super) type LogGains = [f64; 3];
 
-/// Whether photos get their own exposure.
+/// Condition for the correction of exposures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ExposureCorrection {
-    /// No photo does.
+    /// Never corrects exposures.
     Off,
-    /// All photos do if the exposures of nearby photos differ, as far as this can be measured. Where the exposure changes gradually from photo
-    /// to photo, a splat without corrections shows it, too, and is closer to photos in between.
+    /// Corrects the exposures of all photos if those of neighbouring photos differ. Where the exposure changes gradually from photo to photo, a
+    /// splat without corrections shows it, too, and is closer to photos in between.
     #[default]
     Auto,
-    /// All photos do.
+    /// Always corrects exposures.
     On,
 }
 
 /// Photo that points are compared with.
-struct Exposed<'a> {
+struct ExposedPhoto<'a> {
     photo: &'a SmallPhoto,
     colours: Vec<f32>,
     counted: Option<Vec<bool>>,
@@ -56,8 +57,8 @@ struct Ratio {
 }
 
 /// Measures the exposures of `photos`, whose mean is 0. `depth_maps` are the depths of some of them, with their indices.
-pub(super) fn measure_exposures(photos: &[SmallPhoto], depth_maps: &[(usize, DepthMap)]) -> Vec<LogGains> {
-    let mut exposed: Vec<Exposed> = photos.iter().map(Exposed::new).collect();
+fn measure_exposures(photos: &[SmallPhoto], depth_maps: &[(usize, DepthMap)]) -> Vec<LogGains> {
+    let mut exposed: Vec<ExposedPhoto> = photos.iter().map(ExposedPhoto::new).collect();
     for (index, map) in depth_maps {
         let depths = map.depths().into_iter().zip(map.sure_pixels());
         let known = depths.map(|(depth, is_sure)| if is_sure { depth } else { f32::INFINITY });
@@ -89,13 +90,18 @@ pub(super) fn measure_exposures(photos: &[SmallPhoto], depth_maps: &[(usize, Dep
 }
 
 impl ExposureCorrection {
-    /// Returns whether photos with these exposures get a correction.
-    pub(super) fn applies(self, gains: &[LogGains], cameras: &[Camera]) -> bool {
-        match self {
-            ExposureCorrection::Off => false,
-            ExposureCorrection::Auto => are_uneven(gains, cameras),
-            ExposureCorrection::On => true,
+    /// Measures the exposures of `photos` like [`measure_exposures`]; returns `None` if they are not to be corrected.
+    pub(super) fn measure(
+        self,
+        photos: &[SmallPhoto],
+        depth_maps: &[(usize, DepthMap)],
+    ) -> Option<Vec<LogGains>> {
+        if self == ExposureCorrection::Off {
+            return None;
         }
+        let gains = measure_exposures(photos, depth_maps);
+        let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
+        (self == ExposureCorrection::On || are_uneven(&gains, &cameras)).then_some(gains)
     }
 }
 
@@ -105,7 +111,8 @@ fn are_uneven(gains: &[LogGains], cameras: &[Camera]) -> bool {
     let from_mean: f64 = gains.iter().map(|&gain| squares(gain, [0.; 3])).sum();
     let nearest = (0..gains.len()).filter_map(|index| Some((index, nearest_to(index, cameras)?)));
     let from_nearest: f64 = nearest.map(|(index, other)| squares(gains[index], gains[other])).sum();
-    from_mean > 3. * gains.len() as f64 * MIN_DIFFERENCE.powi(2) && from_nearest > from_mean
+    let count = gains.len() as f64;
+    from_mean > 3. * count * MIN_DIFFERENCE.powi(2) && from_nearest * (count - 1.) > from_mean * count
 }
 
 /// Returns the gains of the photos `indices` that fit their ratios best, by weighted least squares. `ratios` has the ratios of all photos to
@@ -131,11 +138,11 @@ fn balance(ratios: &[Vec<Option<Ratio>>], indices: &[usize]) -> Vec<LogGains> {
     numbers.chunks_exact(3).map(|gain| [gain[0], gain[1], gain[2]]).collect()
 }
 
-impl<'a> Exposed<'a> {
+impl<'a> ExposedPhoto<'a> {
     fn new(photo: &'a SmallPhoto) -> Self {
         let colours = Vec::try_from(photo.image.contiguous().view([-1])).expect("numbers");
         let truths = |t: Tensor| Vec::try_from(t.contiguous().view([-1])).expect("truths");
-        Exposed { photo, colours, counted: photo.counted().map(truths), depths: None }
+        ExposedPhoto { photo, colours, counted: photo.counted().map(truths), depths: None }
     }
 
     /// Returns the colour of a pixel that counts and is neither too dark nor too bright.
@@ -244,15 +251,18 @@ mod tests {
     #[test]
     fn uneven_exposures_are_recognized() {
         let cameras: Vec<Camera> = (0..9).map(|x| wall(f64::from(x), [1.; 3]).camera).collect();
-        let auto = |of: fn(usize) -> f64| {
+        let is_uneven = |of: fn(usize) -> f64| {
             let gains: Vec<LogGains> = (0..9).map(|index| [of(index); 3]).collect();
-            ExposureCorrection::Auto.applies(&gains, &cameras)
+            are_uneven(&gains, &cameras)
         };
-        assert!(auto(|index| [0.1, -0.2, 0.1][index % 3]));
-        assert!(!auto(|index| [0.01, -0.02, 0.01][index % 3]));
-        assert!(!auto(|index| 0.1 * (index as f64 - 4.)));
-        let equal = [[0.; 3]; 9];
-        assert!(ExposureCorrection::On.applies(&equal, &cameras));
-        assert!(!ExposureCorrection::Off.applies(&[[0.5; 3], [-0.5; 3]], &cameras[..2]));
+        assert!(is_uneven(|index| [0.1, -0.2, 0.1][index % 3]));
+        assert!(!is_uneven(|index| [0.01, -0.02, 0.01][index % 3]));
+        assert!(!is_uneven(|index| 0.1 * (index as f64 - 4.)));
+        // Two and three photos, and photos that are each there twice.
+        assert!(are_uneven(&[[0.5; 3], [-0.5; 3]], &cameras[..2]));
+        assert!(!are_uneven(&[[0.5; 3], [0.; 3], [-0.5; 3]], &cameras[..3]));
+        let twice = |index: usize| cameras[index / 2];
+        let gains: Vec<LogGains> = (0..18).map(|index| [[0.1, -0.2, 0.1][index / 2 % 3]; 3]).collect();
+        assert!(are_uneven(&gains, &(0..18).map(twice).collect::<Vec<Camera>>()));
     }
 }

@@ -5,7 +5,7 @@ use super::gaussian_params::GaussianParams;
 use super::options::MIN_GAUSSIANS;
 use super::relocate::relocate;
 use super::state::{GAUSSIANS, Growth, Record, RefineState};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::optim::{Optimizer, ParameterGroup, UpdateRule};
 use crate::scene::{Gaussians, RawGaussians};
 use rand_chacha::ChaCha8Rng;
@@ -41,7 +41,7 @@ impl GaussianOptimizer {
         let degrees = [first, first.max(config.sh_degree)];
         let leaves = GaussianParams::from_raw(raw, degrees[1]);
         let optimizer = Optimizer::new(leaves.named_parameters().map(alone).into()).with_epsilon(EPSILON);
-        let growth = Growth { first_count: leaves.count(), degrees, degree: first, averaged: 0 };
+        let growth = Growth { first_count: leaves.count(), degrees, degree: first, averaged_steps: 0 };
         let last_count = leaves.count().max(count);
         GaussianOptimizer {
             leaves,
@@ -69,7 +69,17 @@ impl GaussianOptimizer {
             GaussianParams::from_named(|name| state.tensor(&format!("{GAUSSIANS}{kind}.{name}")), device)
         };
         let leaves = params("value")?;
-        let average = if growth.averaged > 0 { Some(params("average")?) } else { None };
+        let average = if growth.averaged_steps > 0 { Some(params("average")?.copy()) } else { None };
+        let sizes = |params: &GaussianParams| params.named_parameters().map(|(_, t)| t.size());
+        if let Some(found) = average.as_ref().map(sizes).filter(|found| *found != sizes(&leaves)) {
+            let expected = format!("those of the parameters, {:?}", sizes(&leaves));
+            return Err(Error::input(
+                state.file(),
+                "the sizes of the averages",
+                format!("{found:?}"),
+                expected,
+            ));
+        }
         let mut optimizer = Optimizer::new(leaves.named_parameters().map(alone).into()).with_epsilon(EPSILON);
         optimizer.load_state(state.file(), &state.tensors_of(GAUSSIANS))?;
         let last_count = leaves.count().max(count);
@@ -109,8 +119,8 @@ impl GaussianOptimizer {
         self.leaves.activate(self.degree_at(progress))
     }
 
-    /// Returns the Gaussians that the optimization has arrived at, not differentiable: the average over the last steps if there is one.
-    pub(super) fn result(&self) -> Gaussians {
+    /// Returns the average of the Gaussians over the last steps if there is one, else the current ones; not differentiable.
+    pub(super) fn averaged_gaussians(&self) -> Gaussians {
         let params = self.average.as_ref().unwrap_or(&self.leaves);
         tch::no_grad(|| params.activate(self.degree_at(1.))).map(Tensor::copy)
     }
@@ -173,8 +183,11 @@ impl GaussianOptimizer {
             for moment in self.optimizer.moments() {
                 let _ = moment.shallow_clone().index_fill_(1, &changed, 0.);
             }
-            (self.average, self.growth.averaged) = (None, 0);
-        } else if progress >= config.relocate_until {
+        }
+        // A refinement that continues with more steps has an average that isn't over its last steps.
+        if progress < config.relocate_until || is_late {
+            (self.average, self.growth.averaged_steps) = (None, 0);
+        } else {
             self.update_average();
         }
         Ok(())
@@ -183,8 +196,8 @@ impl GaussianOptimizer {
     /// Adds the parameters to their average.
     fn update_average(&mut self) {
         let average = self.average.get_or_insert_with(|| self.leaves.copy());
-        self.growth.averaged += 1;
-        let weight = (1. / self.growth.averaged as f64).max(MIN_AVERAGE_WEIGHT);
+        self.growth.averaged_steps += 1;
+        let weight = (1. / self.growth.averaged_steps as f64).max(MIN_AVERAGE_WEIGHT);
         tch::no_grad(|| {
             for ((_, average), (_, t)) in
                 average.named_parameters().iter().zip(self.leaves.named_parameters())

@@ -32,7 +32,7 @@ pub use options::{Budget, MaskBackground, RefineOptions};
 pub use photos::{MIN_SIDE, Photos, load_photos};
 pub use session::{EvalPoint, Initial, RefineEvent, RefineMetrics, RefineResult, RefineSession};
 pub use state::{Reached, RefineState};
-pub use view_sample::{SampleScores, ViewSample};
+pub use view_sample::SampleScores;
 
 use self::known_depths::KnownDepths;
 use self::photos::Drawn;
@@ -61,9 +61,9 @@ pub struct RefineStep<'a> {
 }
 
 impl RefineStep<'_> {
-    /// Returns a copy of the current Gaussians.
+    /// Returns a copy of the Gaussians, averaged over the last steps near the end of the optimization.
     pub fn gaussians(&self) -> Gaussians {
-        self.optimizer.result()
+        self.optimizer.averaged_gaussians()
     }
 
     /// Returns the number of Gaussians.
@@ -176,7 +176,7 @@ pub(crate) fn refine_timed(
     }
     let reached =
         Reached { steps: step, time: reached.time + begun.elapsed(), random: random.get_word_pos() };
-    Ok((optimizer.result(), reached))
+    Ok((optimizer.averaged_gaussians(), reached))
 }
 
 /// Returns the loss: the difference between rendered images and photos, plus the regularization of the Gaussians. Masked pixels of the

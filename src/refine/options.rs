@@ -82,8 +82,8 @@ pub struct RefineOptions {
     pub views: Option<usize>,
     /// Learns corrections of the camera poses if `true`.
     pub correct_poses: bool,
-    /// Whether the exposure of each photo relative to the others is measured and learned. [`ExposureCorrection::Auto`] does nothing if the
-    /// Gaussians don't start from photos.
+    /// Condition for learning a gain of red, green and blue of each photo. It begins with exposures that are measured together with depths;
+    /// without depths, as with [`super::Initial::Splat`], [`ExposureCorrection::Auto`] corrects nothing.
     pub correct_exposures: ExposureCorrection,
     /// Background that masked pixels have in the optimization. If it is `None`, the optimization ignores masked pixels.
     pub mask_background: Option<MaskBackground>,

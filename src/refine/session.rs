@@ -81,7 +81,7 @@ pub enum RefineEvent<'a> {
     Scored(&'a EvalPoint),
     /// Whole views are being scored; the value is the number of views that are done.
     Scoring(usize),
-    /// Warning to print, a sentence: photos that were left out, missing depth information, or too little time. The callback's answer to it
+    /// Warning to print, a sentence: photos that were left out, exposures that are corrected, missing depth information, or too little time. The callback's answer to it
     /// is ignored.
     Warning(&'a str),
 }
@@ -134,6 +134,8 @@ pub struct RefineResult {
     pub state: Option<RefineState>,
     /// Scores of a sample of the photos before and after the optimization.
     pub shown: [SampleScores; 2],
+    /// Number of photos in this sample.
+    pub shown_photos: usize,
     /// Scores of a sample of the held-out views during the optimization.
     pub curve: Vec<EvalPoint>,
     /// Scores of the initial Gaussians on whole held-out views; `None` if there are none, or if the callback ended the scoring.
@@ -256,7 +258,7 @@ impl<'a> RefineSession<'a> {
             on_event: Box::new(on_event),
             is_stopped: false,
             frame,
-            held_out_sample: ViewSample::of(&held_out),
+            held_out_sample: ViewSample::small(&held_out),
             photos,
             held_out,
             scored: vec![],
@@ -352,7 +354,9 @@ impl<'a> RefineSession<'a> {
                     let line = "the photos were all taken from one position, so that depth can't be estimated: everything is placed at one distance";
                     warnings.push(format!("{}: {line}", self.capture.name));
                 }
-                Start::Photos(self.gaussians_from_photos(None)?.ok_or_else(stopped)?)
+                let gaussians = self.gaussians_from_photos(None)?.ok_or_else(stopped)?;
+                warnings.extend(self.exposure_warning());
+                Start::Photos(gaussians)
             }
         };
         if self.options.correct_exposures == ExposureCorrection::On && self.log_exposures.is_none() {
@@ -361,7 +365,7 @@ impl<'a> RefineSession<'a> {
         let gaussians = match &start {
             Start::Photos(raw) | Start::Splat(_, raw) => raw.activate(),
             Start::Model(gaussians) => gaussians.map(Tensor::shallow_clone),
-            Start::State(_, optimizer) => optimizer.result(),
+            Start::State(_, optimizer) => optimizer.averaged_gaussians(),
         };
         let depth = match &start {
             Start::State(state, _) => state.record.depth,
@@ -391,14 +395,16 @@ impl<'a> RefineSession<'a> {
         let held_out_before = self.score_whole(&initial, &self.scored_views(), None)?;
         let count = initial.count().max(self.options.gaussians as i64);
         self.reserve(scoring.elapsed() + WRITING_TIME + WRITING_TIME_PER_GAUSSIAN * count as u32);
+        let begun_scoring = Instant::now();
+        let sample = ViewSample::large(&self.photos);
+        let state = if let Start::State(state, _) = &start { Some(*state) } else { None };
+        let before = sample.corrected(&self.corrections(state, depth)?).score(&initial)?.expect("photos");
+        let time = begun_scoring.elapsed();
+        self.reserve(time);
+        self.last_scoring = time.mul_f64(self.held_out_sample.len() as f64 / sample.len() as f64);
         if let Some(line) = self.late_start_warning() {
             self.warn(&line);
         }
-        let begun_scoring = Instant::now();
-        let sample = ViewSample::of(&self.photos);
-        let state = if let Start::State(state, _) = &start { Some(*state) } else { None };
-        let before = sample.corrected(&self.corrections(state, depth)?).score(&initial)?.expect("photos");
-        self.reserve(begun_scoring.elapsed());
         if matches!(start, Start::Model(..)) {
             self.add_eval_point(&initial)?;
         }
@@ -414,7 +420,7 @@ impl<'a> RefineSession<'a> {
         let after = sample.corrected(&learned).score(&gaussians)?.expect("photos");
         let is_initial = after.psnr.is_nan() || after.psnr < before.psnr;
         let corrections =
-            if learned.are_any() && !is_initial { learned.report(&self.photos) } else { vec![] };
+            if learned.has_any() && !is_initial { learned.report(&self.photos) } else { vec![] };
         let gaussians = if is_initial { initial.map(Tensor::shallow_clone) } else { gaussians };
         let splat = match initial_splat {
             Some(splat) if is_initial => Splat { warnings: vec![], ..splat.clone() },
@@ -429,6 +435,7 @@ impl<'a> RefineSession<'a> {
             corrections,
             steps: self.steps,
             seconds: [begun, ended],
+            shown_photos: sample.len(),
             shown: if is_initial { [before; 2] } else { [before, after] },
             curve: std::mem::take(&mut self.curve),
             held_out_before,
@@ -587,15 +594,20 @@ impl<'a> RefineSession<'a> {
         let Some(InitialScene { gaussians, depth_maps, log_exposures }) = made else { return Ok(None) };
         self.depth_maps = depth_maps;
         self.log_exposures = log_exposures;
-        if let (ExposureCorrection::Auto, Some(gains)) = (correction, &self.log_exposures) {
-            let of = |gain: &LogGains| (gain.iter().sum::<f64>() / 3.).exp();
-            let (least, most) = gains.iter().map(of).fold((f64::MAX, 0f64), |(a, b), c| (a.min(c), b.max(c)));
-            self.warn(&format!(
-                "{}: the photos have different exposures, {least:.2} to {most:.2} times the mean, which are corrected",
-                self.capture.name
-            ));
-        }
         Ok(Some(gaussians.to_device(self.options.device)))
+    }
+
+    /// Returns a line that says that exposures are corrected, if this was not requested.
+    fn exposure_warning(&self) -> Option<String> {
+        let gains = self.log_exposures.as_ref()?;
+        let factors = gains.as_flattened().iter().map(|gain| gain.exp());
+        let [min, max] = [factors.clone().fold(f64::MAX, f64::min), factors.fold(0., f64::max)];
+        (self.options.correct_exposures == ExposureCorrection::Auto).then(|| {
+            format!(
+                "{}: the exposures of neighbouring photos differ, and all are corrected: {min:.2} to {max:.2} times the average",
+                self.capture.name
+            )
+        })
     }
 
     /// Returns the exposures of photos that don't differ.
@@ -715,7 +727,11 @@ impl<'a> RefineSession<'a> {
         }
         // Higher spherical harmonics are added later, for all Gaussians at the same time.
         raw.sh = raw.sh.narrow(2, 0, 1);
-        Ok(self.gaussians_from_photos(Some(&raw))?.unwrap_or(raw))
+        let filled = self.gaussians_from_photos(Some(&raw))?.unwrap_or(raw);
+        if let Some(line) = self.exposure_warning() {
+            self.warn(&line);
+        }
+        Ok(filled)
     }
 
     /// Returns `true` if another scoring keeps the total time of scoring below its maximum fraction of the time since the clock began.

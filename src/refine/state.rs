@@ -56,7 +56,7 @@ pub(super) struct Growth {
     pub degree: i64,
     /// Number of steps in the average of the parameters.
     #[serde(default)]
-    pub averaged: u64,
+    pub averaged_steps: u64,
 }
 
 /// State of a refinement: parameters of the Gaussians and of the corrections, the moments of their optimizers, and how far the optimization

@@ -3,7 +3,6 @@
 
 use super::depth_map::DepthMap;
 use super::depth_search::{self, ComparedPhoto};
-use super::exposures::{LogGains, measure_exposures};
 use super::small_photo::SmallPhoto;
 use super::view_selection::{
     are_near_duplicates, at_octaves, extent, farthest_first, neighbours, projection,
@@ -50,21 +49,21 @@ const NEARER: f64 = 0.02;
 const ROOM: f64 = 1.3;
 
 /// Result of a plane sweep.
-pub(super) struct Sweep {
-    /// Depths of some of the views, in their order.
-    pub depth_maps: Vec<DepthMap>,
-    /// Exposures of all views relative to each other.
-    pub log_exposures: Vec<LogGains>,
+pub(super) struct PlaneSweepOutput {
+    /// All views, downscaled.
+    pub photos: Vec<SmallPhoto>,
+    /// Depths of some of the views, with the views' indices, in their order.
+    pub depth_maps: Vec<(usize, DepthMap)>,
 }
 
-/// Computes depths for the pixels of the views, and the views' exposures. If there are many views, it processes a subset that together shows what all of them show,
+/// Computes depths for the pixels of the views. If there are many views, it processes a subset that together shows what all of them show,
 /// without near duplicates. `points` of the scene, if some are known, determine the nearest depth. `should_continue` is called before each
 /// view with the number of views that are done. If it returns `false`, only these get depths.
 pub(super) fn sweep(
     views: &[View],
     points: &[Point],
     mut should_continue: impl FnMut(usize) -> bool,
-) -> Sweep {
+) -> PlaneSweepOutput {
     let small: Vec<SmallPhoto> = views.iter().map(|view| SmallPhoto::from_view(view, LONGEST_SIDE)).collect();
     let cameras: Vec<Camera> = small.iter().map(|small| small.camera).collect();
     let coarse: Vec<SmallPhoto> = views.iter().map(|view| SmallPhoto::from_view(view, COARSE_SIDE)).collect();
@@ -85,8 +84,7 @@ pub(super) fn sweep(
         }
     }
     swept.sort_by_key(|(index, _)| *index);
-    let log_exposures = measure_exposures(&small, &swept);
-    Sweep { depth_maps: swept.into_iter().map(|(_, map)| map).collect(), log_exposures }
+    PlaneSweepOutput { photos: small, depth_maps: swept }
 }
 
 fn sweep_one(this: &SmallPhoto, others: &[&SmallPhoto], nearest: Option<f64>, depth: f64) -> DepthMap {
@@ -255,7 +253,7 @@ mod tests {
             let _ = mask.narrow(2, 0, 24).zero_();
             View { image: image.into(), mask: Some(mask.into()), ..view.shallow_clone() }
         });
-        for swept in sweep(&masked, &[], |_| true).depth_maps {
+        for (_, swept) in sweep(&masked, &[], |_| true).depth_maps {
             let off = (&swept.depth / depth - 1.).abs();
             let counted = swept.counted.unwrap();
             assert_eq!(counted.sum(Kind::Int64).int64_value(&[]), 64 * 40);
@@ -268,7 +266,7 @@ mod tests {
             assert_eq!(sure(0, 24), 0.);
             assert!(sure(24, 40) > 0.6, "{}", sure(24, 40));
         }
-        for swept in sweep(&views, &[], |_| true).depth_maps {
+        for (_, swept) in sweep(&views, &[], |_| true).depth_maps {
             let off = (swept.depth / depth - 1.).abs().median().double_value(&[]);
             assert!(off < 0.02, "{off}");
         }
@@ -281,6 +279,6 @@ mod tests {
         assert!(SceneDepth::of(1, &photos, &points[..20]).nearest.is_none());
         // A single photo has no measurable depth, and the result must not be NaN.
         let alone = sweep(&views[..1], &[], |_| true).depth_maps;
-        assert!(alone[0].depth.isfinite().all().int64_value(&[]) == 1);
+        assert!(alone[0].1.depth.isfinite().all().int64_value(&[]) == 1);
     }
 }

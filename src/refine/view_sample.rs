@@ -11,15 +11,15 @@ use tch::{Kind, Tensor};
 
 /// Maximum number of views in a sample.
 const MAX_VIEWS: usize = 8;
-/// Minimum number of views in a sample, if there are as many.
+/// Minimum number of views in a small sample, if there are as many.
 const MIN_VIEWS: usize = 2;
-/// Maximum number of pixels of all views in a sample, if there are more than [`MIN_VIEWS`].
+/// Maximum number of pixels of all views in a small sample, if there are more than [`MIN_VIEWS`].
 const MAX_PIXELS: u64 = 1_200_000;
 
 /// Evenly spread views of all. They are scored as a whole: a part of an image has other borders, near which large Gaussians are projected
 /// differently.
 #[derive(Debug)]
-pub struct ViewSample {
+pub(super) struct ViewSample {
     /// Indices among all views.
     indices: Vec<usize>,
     views: Vec<View>,
@@ -35,15 +35,28 @@ pub struct SampleScores {
 }
 
 impl ViewSample {
-    /// Chooses up to eight of `views`, fewer if they are large.
-    pub fn of(views: &[View]) -> Self {
+    /// Chooses up to eight of `views`, fewer if they are large, to be scored several times.
+    pub fn small(views: &[View]) -> Self {
         let pixels = |view: &View| u64::from(view.camera.width) * u64::from(view.camera.height);
         let largest = views.iter().map(pixels).max().unwrap_or(1);
-        let count = ((MAX_PIXELS / largest) as usize).clamp(MIN_VIEWS, MAX_VIEWS);
+        ViewSample::spread(views, ((MAX_PIXELS / largest) as usize).clamp(MIN_VIEWS, MAX_VIEWS))
+    }
+
+    /// Chooses up to eight of `views`.
+    pub fn large(views: &[View]) -> Self {
+        ViewSample::spread(views, MAX_VIEWS)
+    }
+
+    fn spread(views: &[View], count: usize) -> Self {
         let every = views.len().div_ceil(count).max(1);
         let indices: Vec<usize> = (0..views.len()).step_by(every).collect();
         let views = indices.iter().map(|&index| views[index].shallow_clone());
         ViewSample { views: views.collect(), indices }
+    }
+
+    /// Returns the number of views.
+    pub fn len(&self) -> usize {
+        self.views.len()
     }
 
     /// Returns the sample with the learned corrections of its photos applied.
@@ -100,11 +113,13 @@ mod tests {
             let view = View { name: String::new(), image: (image + 0.01).into(), mask: None, camera };
             (0..count).map(|_| view.shallow_clone()).collect()
         };
-        let small = ViewSample::of(&views(210, 170, 20));
+        let small = ViewSample::small(&views(210, 170, 20));
         assert_eq!(small.indices, [0, 3, 6, 9, 12, 15, 18]);
-        assert_eq!(ViewSample::of(&views(1000, 600, 9)).indices, [0, 5]);
+        let large = views(1000, 600, 9);
+        assert_eq!(ViewSample::small(&large).indices, [0, 5]);
+        assert_eq!(ViewSample::large(&large).indices, [0, 2, 4, 6, 8]);
         let scores = small.score(&gaussians).unwrap().unwrap();
         assert!((scores.psnr - 40.).abs() < 0.01 && scores.ssim > 0.9, "{scores:?}");
-        assert!(ViewSample::of(&[]).score(&gaussians).unwrap().is_none());
+        assert!(ViewSample::small(&[]).score(&gaussians).unwrap().is_none());
     }
 }

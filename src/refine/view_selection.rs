@@ -49,11 +49,11 @@ fn separation(cameras: &[Camera]) -> impl Fn(&Camera, &Camera) -> f64 + use<> {
     }
 }
 
-/// Returns the camera with the smallest [`separation`] from camera `index`; `None` if there is no other.
+/// Returns the camera with the smallest [`separation`] from camera `index` above that of near duplicates; `None` if there is none.
 pub fn nearest_to(index: usize, cameras: &[Camera]) -> Option<usize> {
     let apart = separation(cameras);
     let from = |other: &usize| apart(&cameras[*other], &cameras[index]);
-    (0..cameras.len()).filter(|&other| other != index).min_by(|a, b| from(a).total_cmp(&from(b)))
+    (0..cameras.len()).filter(|other| from(other) > NEAR_DUPLICATE).min_by(|a, b| from(a).total_cmp(&from(b)))
 }
 
 /// Returns up to `count` indices of `cameras` by farthest-point sampling with [`separation`]. The first index is 0.

@@ -494,6 +494,38 @@ fn colmap_points_initialize_gaussians() {
     }
 }
 
+/// Exposures of photos that differ from their neighbours are measured and corrected, unless this is turned off.
+#[test]
+fn uneven_exposures_are_corrected_from_photos() {
+    let (folder, room) = room();
+    let cameras: Value = serde_json::from_slice(&std::fs::read(room.join("cameras.json")).unwrap()).unwrap();
+    let gain = |index: usize| [0.8f32, 1.1, 0.95][index % 3];
+    let views = cameras["views"].as_array().unwrap();
+    for (index, view) in views.iter().enumerate() {
+        let photo = room.join(view["image"].as_str().unwrap());
+        let picture = image::open(&photo).unwrap().to_rgb8();
+        image::RgbImage::from_fn(picture.width(), picture.height(), |x, y| {
+            image::Rgb(picture.get_pixel(x, y).0.map(|v| (f32::from(v) * gain(index)).round() as u8))
+        })
+        .save(&photo)
+        .unwrap();
+    }
+    let out = folder.path().join("a.ply");
+    let refined = |more: &[&str]| {
+        let base = ["refine", "--scene", arg(&room), "--out", arg(&out), "--json", "--steps", "20"];
+        run_json(&[&base[..], more].concat())
+    };
+    let corrected = refined(&[]);
+    let photos = corrected["corrections"].as_array().unwrap();
+    assert_eq!(photos.len(), views.len());
+    for index in 1..photos.len() {
+        let exposure = |index: usize| number(&corrected, &format!("/corrections/{index}/exposure/1"));
+        let (found, expected) = (exposure(index) / exposure(0), f64::from(gain(index) / gain(0)));
+        assert!((found / expected - 1.).abs() < 0.05, "photo {index}: {found} is not {expected}");
+    }
+    assert_eq!(refined(&["--correct-exposures=off"])["corrections"], serde_json::json!([]));
+}
+
 /// Small pose errors and exposure differences are estimated, for a room whose splat is known.
 #[test]
 fn pose_and_exposure_errors_are_corrected() {

@@ -90,8 +90,8 @@ pub struct Refine {
     /// Also optimize a correction of each camera's pose
     #[arg(long)]
     correct_poses: bool,
-    /// Also optimize a correction of each photo's exposure and white balance. auto: if photos next to each other differ, which is
-    /// measured in photos only, not with --splat; without a value: on
+    /// Also optimize a gain of red, green and blue for each photo. auto: if the exposures of neighbouring photos differ, which is
+    /// measured together with depths, never with --splat; without a value: on
     #[arg(
         long,
         value_name = "WHEN",
@@ -123,12 +123,12 @@ enum From {
     Weights,
 }
 
-/// When exposures are corrected.
+/// Condition for the correction of exposures.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum WhenToCorrect {
     /// Never
     Off,
-    /// If photos next to each other differ
+    /// If the exposures of neighbouring photos differ
     Auto,
     /// Always
     On,

@@ -48,7 +48,9 @@ pub fn print_result(
     let row = |name: String, [before, after]: [f64; 2], ssim: f64| {
         println!("{name:<24} {before:>14.2} {after:>8.2} {ssim:>8.4}");
     };
-    row(format!("{photos} photos, sampled"), [before.psnr, after.psnr], after.ssim);
+    let sampled = result.shown_photos;
+    let of_photos = if sampled < photos { format!("{sampled} of ") } else { String::new() };
+    row(format!("{of_photos}{photos} photos"), [before.psnr, after.psnr], after.ssim);
     if let Some([before, after]) = held_out {
         let (scored, all) = (after.views.len(), session.held_out().len());
         let of_all = if scored < all { format!(" of {all}") } else { String::new() };
@@ -66,10 +68,11 @@ pub fn print_result(
 fn describe_corrections(corrected: &[Correction]) -> Option<String> {
     let largest = |number: fn(&Correction) -> f64| corrected.iter().map(number).reduce(f64::max);
     let factor = |of: &Correction| of.exposure.map(|gain| gain.max(1. / gain)).into_iter().fold(1., f64::max);
-    Some(format!(
-        "corrected at most by: {:.2}° and {:.4} of the scene's depth (cameras), a factor of {:.3} (exposures)",
-        largest(|of| of.degrees)?,
-        largest(|of| of.depths)?,
-        largest(factor)?,
-    ))
+    let (degrees, depths, factor) = (largest(|of| of.degrees)?, largest(|of| of.depths)?, largest(factor)?);
+    let cameras = format!("{degrees:.2}° and {depths:.4} of the scene's depth (cameras)");
+    let exposures = format!("a factor of {factor:.3} (exposures)");
+    let kinds = [(degrees > 0. || depths > 0., cameras), (factor > 1., exposures)];
+    let changed: Vec<String> =
+        kinds.into_iter().filter(|(is_any, _)| *is_any).map(|(_, line)| line).collect();
+    (!changed.is_empty()).then(|| format!("corrected at most by: {}", changed.join(", ")))
 }
