@@ -33,8 +33,8 @@ pub struct RefineConfig {
     pub harmonics: f64,
     /// Final value of all other learning rates of Gaussians, relative to the initial ones. The decay is exponential.
     pub lr_final_factor: f64,
-    /// Initial learning rate of the cameras' rotations, in radians, and translations, in scene depths, if poses are corrected. It falls to a
-    /// fifth.
+    /// Initial learning rate of the cameras' rotations, in radians, and translations, in scene depths, if poses are corrected, for photos of up
+    /// to 256 pixels. For N pixels it is multiplied by 256 / N. It falls to a fifth.
     pub poses: f64,
     /// Initial learning rate of the logarithms of exposures, if exposures are corrected. It falls to a fifth.
     pub exposures: f64,
@@ -111,6 +111,9 @@ const REMOVED: &str = "tokens";
 fn current_name(key: String) -> String {
     RENAMED.iter().find(|(former, _)| *former == key).map_or(key, |(_, current)| current.to_string())
 }
+
+/// Longer side of photos, in pixels, from which the learning rate of poses falls.
+const POSES_SIDE: f64 = 256.;
 
 /// Minimum longer side of photos, in pixels, that show enough detail for most of the steps.
 const DETAILED_SIDE: u32 = 240;
@@ -189,6 +192,11 @@ impl RefineConfig {
     /// Returns the defaults for a start from a splat, which needs no small images and no opacity penalty.
     pub fn from_splat() -> Self {
         RefineConfig { resolution_schedule: Some(vec![]), opacity: 0., ..Default::default() }
+    }
+
+    /// Returns the learning rate of poses for photos of `longest_side` pixels.
+    pub(super) fn poses_for(&self, longest_side: u32) -> f64 {
+        self.poses * (POSES_SIDE / f64::from(longest_side)).min(1.)
     }
 
     /// Returns the weight of known depths, which falls to 0 in the first half: later the photos decide.

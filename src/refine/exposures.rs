@@ -204,7 +204,8 @@ fn median(values: &mut [f32]) -> f32 {
 mod tests {
     use super::*;
     use crate::data::View;
-    use crate::scene::Intrinsics;
+    use crate::refine::{InitialScene, gaussians_from_photos};
+    use crate::scene::{Intrinsics, SH_C0};
     use glam::DMat4;
     use tch::{Device, Kind};
 
@@ -244,6 +245,29 @@ mod tests {
             for (found, expected) in found.iter().zip(expected) {
                 assert!((found[c] - (expected - all)).abs() < 0.01, "{} is not {}", found[c], expected - all);
             }
+        }
+    }
+
+    /// Initial Gaussians have the average exposure, whichever photo they come from.
+    #[test]
+    fn initial_colours_have_the_average_exposure() {
+        let gains = [0.8, 1.25, 1.];
+        let views: Vec<View> = [-0.5, 0., 0.5].into_iter().zip(gains).map(|(x, g)| wall(x, [g; 3])).collect();
+        let initial = |correction| {
+            gaussians_from_photos(&views, &[], None, 900, 0, correction, |_| true).expect("depths")
+        };
+        // Brightness of the Gaussians of each photo, relative to all: a third of them come from each.
+        let brightness = |scene: &InitialScene| {
+            let colours = &scene.gaussians.sh * SH_C0 + 0.5;
+            let of = |photo: i64| colours.narrow(1, 300 * photo, 300).mean(Kind::Double).double_value(&[]);
+            [0, 1, 2].map(|photo| of(photo) / colours.mean(Kind::Double).double_value(&[]))
+        };
+        let (corrected, uncorrected) = (initial(ExposureCorrection::On), initial(ExposureCorrection::Off));
+        assert!(uncorrected.log_exposures.is_none() && brightness(&uncorrected)[1] > 1.15);
+        for (photo, found) in brightness(&corrected).into_iter().enumerate() {
+            assert!((found - 1.).abs() < 0.04, "photo {photo}: {found}");
+            let exposure = corrected.log_exposures.as_ref().unwrap()[photo][0].exp();
+            assert!((exposure / gains[photo] - 1.).abs() < 0.02, "photo {photo}: {exposure}");
         }
     }
 

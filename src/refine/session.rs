@@ -2,6 +2,7 @@
 //! few pixels during the optimization. All of it shares one budget and uses a local frame of the capture (spec 2.5).
 
 use super::begin::{InitialScene, gaussians_from_photos};
+use super::config::RefineConfig;
 use super::corrections::{Correction, Corrections};
 use super::depth_map::DepthMap;
 use super::exposures::{ExposureCorrection, LogGains};
@@ -619,7 +620,10 @@ impl<'a> RefineSession<'a> {
     fn corrections(&self, state: Option<&RefineState>, depth: f64) -> Result<Corrections> {
         let RefineOptions { correct_poses, config, device, .. } = self.options;
         let (count, exposures) = (self.photos.len(), self.log_exposures.as_deref());
-        let mut corrections = Corrections::new(count, *correct_poses, exposures, depth, config, *device);
+        let sides = self.photos.iter().map(|photo| photo.camera.width.max(photo.camera.height));
+        let poses = config.poses_for(sides.max().unwrap_or(0));
+        let config = RefineConfig { poses, ..config.clone() };
+        let mut corrections = Corrections::new(count, *correct_poses, exposures, depth, &config, *device);
         if let Some(state) = state {
             corrections.load_state(state)?;
         }
