@@ -55,7 +55,7 @@ test:
 .PHONY: quick
 quick: check-format check-lints
 	env -u LIBTORCH $(CARGO) test --locked --lib $(CRATES)
-	$(CARGO) test --release --locked --lib
+	$(CARGO) test --release --locked --lib -p globalsplat -p globalsplat-csrc
 
 # WITHOUT names checks to leave out, such as one that has just been run.
 CHECKS := $(filter-out $(WITHOUT),check-crates check-format check-lints check-library check-docs check-tests)
