@@ -68,10 +68,12 @@ impl DepthMap {
     }
 }
 
-fn numbers(t: &Tensor) -> Vec<f32> {
+/// Returns the values of a float32 tensor.
+pub(super) fn numbers(t: &Tensor) -> Vec<f32> {
     Vec::try_from(t.contiguous().view([-1])).expect("numbers")
 }
 
-fn truths(t: &Tensor) -> Vec<bool> {
+/// Returns the values of a Boolean tensor.
+pub(super) fn truths(t: &Tensor) -> Vec<bool> {
     Vec::try_from(t.contiguous().view([-1])).expect("truths")
 }

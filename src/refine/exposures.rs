@@ -1,6 +1,6 @@
 //! Exposures of photos relative to each other, measured where photos show the same surface, as panoramas are balanced (Brown and Lowe 2007).
 
-use super::depth_map::DepthMap;
+use super::depth_map::{DepthMap, numbers, truths};
 use super::small_photo::SmallPhoto;
 use super::view_selection::{nearest_to, projection};
 use crate::scene::Camera;
@@ -140,9 +140,8 @@ fn balance(ratios: &[Vec<Option<Ratio>>], indices: &[usize]) -> Vec<LogGains> {
 
 impl<'a> ExposedPhoto<'a> {
     fn new(photo: &'a SmallPhoto) -> Self {
-        let colours = Vec::try_from(photo.image.contiguous().view([-1])).expect("numbers");
-        let truths = |t: Tensor| Vec::try_from(t.contiguous().view([-1])).expect("truths");
-        ExposedPhoto { photo, colours, counted: photo.counted().map(truths), depths: None }
+        let counted = photo.counted().as_ref().map(truths);
+        ExposedPhoto { photo, colours: numbers(&photo.image), counted, depths: None }
     }
 
     /// Returns the colour of a pixel that counts and is neither too dark nor too bright.

@@ -40,18 +40,22 @@ impl GaussianOptimizer {
         let first = raw.sh.size()[2].isqrt() - 1;
         let degrees = [first, first.max(config.sh_degree)];
         let leaves = GaussianParams::from_raw(raw, degrees[1]);
-        let optimizer = Optimizer::new(leaves.named_parameters().map(alone).into()).with_epsilon(EPSILON);
         let growth = Growth { first_count: leaves.count(), degrees, degree: first, averaged_steps: 0 };
+        GaussianOptimizer::from_params(leaves, depth, config, growth, count)
+    }
+
+    /// Creates an optimizer of `leaves` without moments and averages.
+    fn from_params(
+        leaves: GaussianParams,
+        depth: f64,
+        config: &RefineConfig,
+        growth: Growth,
+        count: i64,
+    ) -> Self {
+        let optimizer = Optimizer::new(leaves.named_parameters().map(alone).into()).with_epsilon(EPSILON);
         let last_count = leaves.count().max(count);
-        GaussianOptimizer {
-            leaves,
-            optimizer,
-            config: config.clone(),
-            depth,
-            growth,
-            last_count,
-            average: None,
-        }
+        let config = config.clone();
+        GaussianOptimizer { leaves, optimizer, config, depth, growth, last_count, average: None }
     }
 
     /// Creates the optimizer that `state` was made of, on `device`. The Gaussians grow to at least `count`.
@@ -80,18 +84,10 @@ impl GaussianOptimizer {
                 expected,
             ));
         }
-        let mut optimizer = Optimizer::new(leaves.named_parameters().map(alone).into()).with_epsilon(EPSILON);
-        optimizer.load_state(state.file(), &state.tensors_of(GAUSSIANS))?;
-        let last_count = leaves.count().max(count);
-        Ok(GaussianOptimizer {
-            leaves,
-            optimizer,
-            config: config.clone(),
-            depth,
-            growth,
-            last_count,
-            average,
-        })
+        let mut all = GaussianOptimizer::from_params(leaves, depth, config, growth, count);
+        all.optimizer.load_state(state.file(), &state.tensors_of(GAUSSIANS))?;
+        all.average = average;
+        Ok(all)
     }
 
     /// Adds the parameters, their moments and their averages to `tensors`.

@@ -1,5 +1,5 @@
 //! Refinement session from a capture to Gaussians: reads the photos, creates the initial Gaussians, optimizes them, and scores them on a
-//! few pixels during the optimization. All of it shares one budget and uses a local frame of the capture (spec 2.5).
+//! few views during the optimization. All of it shares one budget and uses a local frame of the capture (spec 2.5).
 
 use super::begin::{InitialScene, gaussians_from_photos};
 use super::config::RefineConfig;
@@ -82,8 +82,8 @@ pub enum RefineEvent<'a> {
     Scored(&'a EvalPoint),
     /// Whole views are being scored; the value is the number of views that are done.
     Scoring(usize),
-    /// Warning to print, a sentence: photos that were left out, exposures that are corrected, missing depth information, or too little time. The callback's answer to it
-    /// is ignored.
+    /// Warning to print, a sentence: photos that were left out, exposures that are corrected, missing depth information, or too little time.
+    /// The callback's answer to it is ignored.
     Warning(&'a str),
 }
 

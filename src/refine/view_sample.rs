@@ -3,11 +3,9 @@
 use super::corrections::Corrections;
 use crate::data::View;
 use crate::error::Result;
-use crate::loss::{masked_mse, masked_photometric, psnr_of_mse, ssim};
-use crate::render::render_views;
-use crate::scene::{Camera, Gaussians};
+use crate::eval::{CaptureScores, score_views};
+use crate::scene::Gaussians;
 use serde::Serialize;
-use tch::{Kind, Tensor};
 
 /// Maximum number of views in a sample.
 const MAX_VIEWS: usize = 8;
@@ -65,37 +63,23 @@ impl ViewSample {
         ViewSample { indices: self.indices.clone(), views: views.collect() }
     }
 
-    /// Scores a splat in float32; returns `None` if there are no views.
+    /// Scores a splat; returns `None` if there are no views.
     ///
     /// # Errors
     /// Fails if rendering fails.
     pub fn score(&self, gaussians: &Gaussians) -> Result<Option<SampleScores>> {
-        let cameras: Vec<Camera> = self.views.iter().map(|view| view.camera).collect();
-        let pictures = render_views(gaussians, &cameras)?;
-        let scores = pictures.iter().zip(&self.views).map(|(picture, view)| {
-            let valid = |t: &Tensor| t.to_device(picture.rgb.device()).clamp(0., 1.);
-            let (picture, photo) = (picture.rgb.clamp(0., 1.), valid(&view.image.to_float()));
-            let (mse, ssim) = match &view.mask {
-                Some(mask) => {
-                    let mask = valid(&mask.to_float());
-                    (masked_mse(&picture, &photo, &mask), masked_photometric(&picture, &photo, &mask, 0., 1.))
-                }
-                None => ((&picture - &photo).square().mean(Kind::Double), ssim(&picture, &photo)),
-            };
-            [psnr_of_mse(mse.double_value(&[])), ssim.double_value(&[])]
-        });
-        let count = self.views.len() as f64;
-        let sums = scores.reduce(|a, b| [a[0] + b[0], a[1] + b[1]]);
-        Ok(sums.map(|[psnr, ssim]| SampleScores { psnr: psnr / count, ssim: ssim / count }))
+        let scores = score_views("sample", gaussians, &self.views, None, |_| true)?;
+        Ok(scores.map(|CaptureScores { psnr, ssim, .. }| SampleScores { psnr, ssim }))
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::Intrinsics;
+    use crate::render::render_views;
+    use crate::scene::{Camera, Intrinsics};
     use glam::DMat4;
-    use tch::Device;
+    use tch::{Device, Kind, Tensor};
 
     #[test]
     fn a_sample_has_few_pixels_and_its_scores_are_those_of_the_views() {
