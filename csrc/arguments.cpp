@@ -38,13 +38,13 @@ Inputs Arguments::to_inputs(at::Device device) const {
   const auto type = means.scalar_type() == at::kDouble ? at::kDouble : at::kFloat;
   const auto there = [&](const Tensor& t) { return t.to(device, type).contiguous(); };
   return {{there(means), there(scales), there(quaternions), there(opacities), there(sh)},
-          there(w2c), there(intrinsics.detach()), width, height, eps2d};
+          there(w2c), there(intrinsics.detach()), width, height, eps2d, antialiased};
 }
 
 Arguments borrowed(const SplatArguments& of) {
   const auto tensor = [](size_t address) -> const Tensor& { return *reinterpret_cast<const Tensor*>(address); };
   return {tensor(of.means), tensor(of.scales), tensor(of.quaternions), tensor(of.opacities), tensor(of.sh),
-          tensor(of.w2c), tensor(of.intrinsics), of.width, of.height, of.eps2d};
+          tensor(of.w2c), tensor(of.intrinsics), of.width, of.height, of.eps2d, of.antialiased};
 }
 
 }  // namespace globalsplat

@@ -16,6 +16,7 @@ struct Arguments {
   const Tensor &means, &scales, &quaternions, &opacities, &sh, &w2c, &intrinsics;
   int64_t width, height;
   double eps2d;
+  bool antialiased;
 
   // Throws if shapes or values are invalid.
   void check() const;

@@ -21,6 +21,7 @@ struct Inputs {
   Tensor w2c, intrinsics;
   int64_t width, height;  // pixels
   double eps2d;           // pixels²
+  bool antialiased;       // as in SplatArguments
 
   int64_t scenes() const { return w2c.size(0); }
   int64_t cameras() const { return w2c.size(1); }  // per scene

@@ -27,10 +27,10 @@ const Backend& backend_of(const Tensor& means) {
   return means.device().type() == cuda::backend.device ? cuda::backend : cpu::backend;
 }
 
-// ---- state that autograd saves for a call: the seven input tensors and three numbers, then the op's own tensors ----
+// ---- state that autograd saves for a call: the seven input tensors and four settings, then the op's own tensors ----
 
 constexpr size_t kInputTensors = 7;
-constexpr size_t kInputs = 10;
+constexpr size_t kInputs = 11;
 
 void save(AutogradContext* ctx, const Inputs& in, const tensor_list& more = {}) {
   const Gaussians& g = in.gaussians;
@@ -40,17 +40,19 @@ void save(AutogradContext* ctx, const Inputs& in, const tensor_list& more = {}) 
   ctx->saved_data["width"] = in.width;
   ctx->saved_data["height"] = in.height;
   ctx->saved_data["eps2d"] = in.eps2d;
+  ctx->saved_data["antialiased"] = in.antialiased;
 }
 
 Inputs saved_inputs(AutogradContext* ctx, const tensor_list& t) {
   return {{t[0], t[1], t[2], t[3], t[4]}, t[5], t[6], ctx->saved_data["width"].toInt(),
-          ctx->saved_data["height"].toInt(), ctx->saved_data["eps2d"].toDouble()};
+          ctx->saved_data["height"].toInt(), ctx->saved_data["eps2d"].toDouble(),
+          ctx->saved_data["antialiased"].toBool()};
 }
 
 // Index of w2c among the input tensors.
 constexpr size_t kW2c = 5;
 
-// Returns gradients in autograd's order, undefined for intrinsics and numbers.
+// Returns gradients in autograd's order, undefined for intrinsics and settings.
 tensor_list gradients_of(const Gradients& gradients) {
   const Gaussians& g = gradients.gaussians;
   tensor_list out = {g.means, g.scales, g.quaternions, g.opacities, g.sh, gradients.w2c};
@@ -69,8 +71,8 @@ struct SavedStateHolder : torch::CustomClassHolder {
 
 struct SplatFunction : torch::autograd::Function<SplatFunction> {
   static tensor_list forward(AutogradContext* ctx, Tensor means, Tensor scales, Tensor quaternions, Tensor opacities,
-                             Tensor sh, Tensor w2c, Tensor intrinsics, int64_t width, int64_t height, double eps2d) {
-    const Inputs in{{means, scales, quaternions, opacities, sh}, w2c, intrinsics, width, height, eps2d};
+                             Tensor sh, Tensor w2c, Tensor intrinsics, int64_t width, int64_t height, double eps2d, bool antialiased) {
+    const Inputs in{{means, scales, quaternions, opacities, sh}, w2c, intrinsics, width, height, eps2d, antialiased};
     std::unique_ptr<const SavedState> saved;
     const RenderOutput outputs = backend_of(means).splat(in, saved);
     save(ctx, in, {outputs.rgb, outputs.alpha, outputs.depth});
@@ -90,8 +92,8 @@ struct SplatFunction : torch::autograd::Function<SplatFunction> {
 
 struct ProjectFunction : torch::autograd::Function<ProjectFunction> {
   static tensor_list forward(AutogradContext* ctx, Tensor means, Tensor scales, Tensor quaternions, Tensor opacities,
-                             Tensor sh, Tensor w2c, Tensor intrinsics, int64_t width, int64_t height, double eps2d) {
-    const Inputs in{{means, scales, quaternions, opacities, sh}, w2c, intrinsics, width, height, eps2d};
+                             Tensor sh, Tensor w2c, Tensor intrinsics, int64_t width, int64_t height, double eps2d, bool antialiased) {
+    const Inputs in{{means, scales, quaternions, opacities, sh}, w2c, intrinsics, width, height, eps2d, antialiased};
     const Projected projected = backend_of(means).project(in);
     save(ctx, in);
     ctx->mark_non_differentiable({projected.visible});
@@ -118,7 +120,7 @@ void run(const SplatArguments& of, rust::Slice<size_t> out) {
   const Inputs in = a.to_inputs(there == home.type() ? home : at::Device(there));
   const Gaussians& g = in.gaussians;
   const tensor_list results = Function::apply(g.means, g.scales, g.quaternions, g.opacities, g.sh, in.w2c, in.intrinsics,
-                                              in.width, in.height, in.eps2d);
+                                              in.width, in.height, in.eps2d, in.antialiased);
   for (size_t k = 0; k < out.size(); ++k) out[k] = reinterpret_cast<size_t>(new Tensor(results[k].to(home)));
 }
 

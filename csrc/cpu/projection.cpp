@@ -22,7 +22,7 @@ struct ProjectedScenes {
   explicit ProjectedScenes(const Inputs& in) : scenes(scenes_of<T>(in)), cameras(in.cameras()) {
     std::vector<raster::Splat<T>*> places;
     for (const auto& view : views_of<T>(in)) {
-      params.push_back(raster::make_projection_params(view.camera, int(in.width), int(in.height), in.eps2d));
+      params.push_back(raster::make_projection_params(view.camera, int(in.width), int(in.height), in.eps2d, in.antialiased));
       splats.emplace_back(size_t(in.count()));
       places.push_back(splats.back().data());
     }

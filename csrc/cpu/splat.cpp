@@ -43,7 +43,7 @@ std::unique_ptr<raster::Frame<T>> draw(const Inputs& in, RenderOutput& out, rast
   out.rgb = at::empty({in.scenes(), in.cameras(), 3, in.height, in.width}, options);
   out.alpha = at::empty({in.scenes(), in.cameras(), in.height, in.width}, options);
   out.depth = at::empty_like(out.alpha);
-  const raster::Settings settings{int(in.width), int(in.height), in.eps2d, get_num_threads()};
+  const raster::Settings settings{int(in.width), int(in.height), in.eps2d, in.antialiased, get_num_threads()};
   return raster::Frame<T>::draw(scenes_of<T>(in), views_of<T>(in), settings, pictures_of<T>(out), times);
 }
 

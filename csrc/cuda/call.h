@@ -65,8 +65,8 @@ inline constexpr int ceil_div(int64_t items, int of) { return int((items + of - 
 
 // Kernels, documented where they are defined: gaussians.h, tile_lists.h, losses.h, sort.h, tiles.h.
 extern "C" {
-__global__ void gs_lenses(Call, float eps2d, const float* w2c, const float* intrinsics, ProjectionParams<float>* params,
-                          uint32_t* tile_counts);
+__global__ void gs_lenses(Call, float eps2d, bool antialiased, const float* w2c, const float* intrinsics,
+                          ProjectionParams<float>* params, uint32_t* tile_counts);
 __global__ void gs_project(Call, Gaussians<float>, const ProjectionParams<float>* params, Splat<float>* splats);
 __global__ void gs_cover(Call, const Splat<float>* splats, uint32_t* group_pairs, uint32_t* of_tiles, uint32_t* first,
                          uint64_t* keys, TileEntry* pairs);

@@ -13,6 +13,7 @@ struct Arguments {
   int64_t scenes, cameras;     // B, and C cameras per scene
   int width, height;
   double eps2d;
+  bool antialiased;
 };
 
 // The Gaussians of every scene, projected into each of the scene's views.

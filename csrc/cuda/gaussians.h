@@ -40,12 +40,12 @@ extern "C" {
 
 // Computes the projection parameters, one view per thread. If `tile_counts` isn't null, sets it to 0 for every tile of every view, plus one
 // element.
-__global__ void gs_lenses(Call call, float eps2d, const float* w2c, const float* intrinsics, ProjectionParams<float>* params,
-                          uint32_t* tile_counts) {
+__global__ void gs_lenses(Call call, float eps2d, bool antialiased, const float* w2c, const float* intrinsics,
+                          ProjectionParams<float>* params, uint32_t* tile_counts) {
   const int64_t k = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
   if (k < call.views)
     params[k] = raster::make_projection_params(raster::camera_of(w2c + 16 * k, intrinsics + 9 * k), call.grid.width, call.grid.height,
-                                               double(eps2d));
+                                               double(eps2d), antialiased);
   if (tile_counts != nullptr && k <= int64_t(call.views) * call.grid.tiles()) tile_counts[k] = 0;
 }
 

@@ -27,7 +27,8 @@ Arguments arguments_of(const Inputs& in) {
   const globalsplat::Gaussians& g = in.gaussians;
   return {{data<float>(g.means), data<float>(g.scales), data<float>(g.quaternions), data<float>(g.opacities),
            data<float>(g.sh), in.count(), int(g.sh.size(2))},
-          data<float>(in.w2c), data<float>(in.intrinsics), in.scenes(), in.cameras(), int(in.width), int(in.height), in.eps2d};
+          data<float>(in.w2c), data<float>(in.intrinsics), in.scenes(), in.cameras(), int(in.width), int(in.height), in.eps2d,
+          in.antialiased};
 }
 
 template <class Number>

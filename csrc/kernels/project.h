@@ -3,8 +3,11 @@
 //     t = W μ + p                          camera space; z ≤ 0.01 is dropped
 //     (u, v) = (f_x t_x/z + c_x, f_y t_y/z + c_y)
 //     J = [[f_x/z, 0, −f_x a/z], [0, f_y/z, −f_y b/z]],   a = clamp(t_x/z), b = clamp(t_y/z)
-//     Σ2D = (J W R S)(J W R S)ᵀ + eps2d·I;    det ≤ 0 is dropped
+//     Σ2D = H Hᵀ + eps2d·I with H = J W R S;  det ≤ 0 is dropped
 //     colour = max(0, ½ + Σ_b Y_b(d) sh_b),  d = (μ − o)/‖μ − o‖,  o = −Wᵀ p.
+//
+// If `antialiased` is set, opacities are multiplied by ρ = √(det(H Hᵀ) / det Σ2D), so that eps2d widens a Gaussian without adding to its
+// integral (Mip-Splatting, Yu et al. 2024, eq. 8).
 //
 // R is the rotation of the normalized quaternion, S = diag(scales). A quaternion whose largest component is 0, subnormal or not finite has
 // no rotation: R is NaN, and the Gaussian is dropped. The clamp, 15 % of the image's width (height) beyond its borders, affects only J.
@@ -39,7 +42,9 @@ struct Projection {
   Vector<T> a, b;                   // clamped t_x/z, t_y/z
   Mask<T> is_a_unclamped, is_b_unclamped;
   Vector<T> wrs[9], jwrs[6];        // W R S and J W R S (2×3)
+  Vector<T> normal[3], normal2;     // cross product of H's rows and its square, det(H Hᵀ)
   Vector<T> cov_xx, cov_xy, cov_yy, determinant;
+  Vector<T> log2_opacity;           // of the opacity times ρ
   Vector<T> factor_a, factor_b, factor_c;  // Splat's a, b, c
 };
 
@@ -160,9 +165,11 @@ GS_INLINE void project_group(const Group<T>& g, const ProjectionParams<T>& param
   p.cov_xy = h[0] * h[3] + h[1] * h[4] + h[2] * h[5];
   p.cov_yy = h[3] * h[3] + h[4] * h[4] + h[5] * h[5] + params.eps2d;
   // det(H Hᵀ + εI) = |h₁ × h₂|² + ε (tr + ε): no cancellation for needles, unlike xx·yy − xy².
-  const V cross_x = h[1] * h[5] - h[2] * h[4], cross_y = h[2] * h[3] - h[0] * h[5], cross_z = h[0] * h[4] - h[1] * h[3];
-  p.determinant = cross_x * cross_x + cross_y * cross_y + cross_z * cross_z +
-                  params.eps2d * (p.cov_xx + p.cov_yy - params.eps2d);
+  p.normal[0] = h[1] * h[5] - h[2] * h[4];
+  p.normal[1] = h[2] * h[3] - h[0] * h[5];
+  p.normal[2] = h[0] * h[4] - h[1] * h[3];
+  p.normal2 = p.normal[0] * p.normal[0] + p.normal[1] * p.normal[1] + p.normal[2] * p.normal[2];
+  p.determinant = p.normal2 + params.eps2d * (p.cov_xx + p.cov_yy - params.eps2d);
   p.visible = both(p.visible, both(less(zero, p.determinant), less_equal(p.determinant, largest)));
 
   // Half the inverse is [[a², ab], [ab, b² + c²]]: 2a² = Σ_yy/det, and 2c² = 1/Σ_yy, because the Schur complement of an inverse is the
@@ -172,19 +179,25 @@ GS_INLINE void project_group(const Group<T>& g, const ProjectionParams<T>& param
   p.factor_b = -p.factor_a * p.cov_xy / p.cov_yy;
   p.factor_c = sqrt(scale / p.cov_yy);
   p.visible = both(p.visible, both(less(zero, p.factor_a), less(zero, p.factor_c)));
+  p.log2_opacity = g.log2_opacity;
+  if (params.antialiased) {
+    const V opacity = g.opacity * sqrt(p.normal2 / p.determinant);
+    p.visible = both(p.visible, less_equal(broadcast<T>(T(kMinAlpha)), opacity));
+    p.log2_opacity = log2_of<T>(opacity);
+  }
   const V u = c.fx * x, v = c.fy * y;
   p.visible = both(p.visible, both(less_equal(u * u, largest), less_equal(v * v, largest)));
 }
 
 // Computes the fields of Splat, in its order, for all lanes.
 template <class T>
-GS_INLINE void make_splats(const Group<T>& g, const ProjectionParams<T>& params, const Projection<T>& p, const Shading<T>& s,
+GS_INLINE void make_splats(const ProjectionParams<T>& params, const Projection<T>& p, const Shading<T>& s,
                            Vector<T> out[16]) {
   using V = Vector<T>;
   const V zero{}, a = p.factor_a, b = p.factor_b, c = p.factor_c;
   // α ≥ 1/255 ⟺ s ≤ log₂(255·opacity). The margin covers the rounding of s, whose terms may exceed s itself: at the rim of a splat by 1 +
   // |b|/c.
-  const V exact = g.log2_opacity + T(kLog2Of255), skew = magnitude(b) / c;
+  const V exact = p.log2_opacity + T(kLog2Of255), skew = magnitude(b) / c;
   constexpr T rounding = sizeof(T) == 4 ? T(1e-6) : T(1e-15);
   const V reach = exact + T(1e-3) * (T(1) + exact) + rounding * exact * (T(1) + skew);
   const V radius = sqrt(reach), bb_cc = b * b + c * c;
@@ -193,7 +206,7 @@ GS_INLINE void make_splats(const Group<T>& g, const ProjectionParams<T>& params,
                          a,
                          b,
                          c,
-                         g.log2_opacity,
+                         p.log2_opacity,
                          larger(s.colour[0], zero),
                          larger(s.colour[1], zero),
                          larger(s.colour[2], zero),
@@ -245,7 +258,7 @@ void project(const Gaussians<T>& g, int64_t begin, int64_t end, const Projection
       project_group(group, params[view], projection);
       if (any(projection.visible)) {
         shade_group(group, g.bases, params[view], projection.visible, shading);
-        make_splats(group, params[view], projection, shading, numbers);
+        make_splats(params[view], projection, shading, numbers);
       }
       store_columns(numbers, 16, group.count, &splats[view][i].u);
     }
@@ -294,7 +307,7 @@ GS_INLINE void project_group_backward(const Group<T>& g, const ProjectionParams<
   const V power = d[0], power_p = d[1], power_r = d[2], power_pp = d[3], power_pr = d[4], power_rr = d[5];
   const auto add = [&](V& to, V value) { to += select(touched, value, zero); };
 
-  // α = opacity·e^{−σ} and ν = −α ∂L/∂α, so ∂L/∂opacity = Σ e^{−σ} ∂L/∂α = −Σν / opacity.
+  // α = opacity·ρ·e^{−σ} and ν = −α ∂L/∂α, so ∂L/∂opacity = −Σν / opacity, and ∂L/∂(ln ρ) = −Σν.
   add(out.opacity, -power / g.opacity);
   for (int k = 0; k < 3; ++k) add(out.mean[k], d_r[k]);
 
@@ -304,9 +317,15 @@ GS_INLINE void project_group_backward(const Group<T>& g, const ProjectionParams<
   const V a = p.factor_a, b = p.factor_b, c = p.factor_c;
   const V d_u = two_ln2 * a * power_p;
   const V d_v = two_ln2 * (b * power_p + c * power_r);
-  const V m_xx = -two_ln2_squared * a * a * power_pp;
-  const V m_xy = -two_ln2_squared * a * (b * power_pp + c * power_pr);
-  const V m_yy = -two_ln2_squared * (b * b * power_pp + T(2) * b * c * power_pr + c * c * power_rr);
+  V m_xx = -two_ln2_squared * a * a * power_pp;
+  V m_xy = -two_ln2_squared * a * (b * power_pp + c * power_pr);
+  V m_yy = -two_ln2_squared * (b * b * power_pp + T(2) * b * c * power_pr + c * c * power_rr);
+  if (params.antialiased) {
+    // ln ρ = ½ ln det(H Hᵀ) − ½ ln det Σ2D. The second term gives ∂L/∂Σ2D another ½ Σν Σ2D⁻¹.
+    m_xx += ln2 * power * a * a;
+    m_xy += ln2 * power * a * b;
+    m_yy += ln2 * power * (b * b + c * c);
+  }
 
   // Σ2D = H Hᵀ + εI: ∂L/∂H = 2 (∂L/∂Σ2D) H;  H = J V with V = W R S.
   const Camera<T>& camera = params.camera;
@@ -316,6 +335,16 @@ GS_INLINE void project_group_backward(const Group<T>& g, const ProjectionParams<
   for (int k = 0; k < 3; ++k) {
     d_jwrs[k] = T(2) * (m_xx * p.jwrs[k] + m_xy * p.jwrs[3 + k]);
     d_jwrs[3 + k] = T(2) * (m_xy * p.jwrs[k] + m_yy * p.jwrs[3 + k]);
+  }
+  if (params.antialiased) {
+    // det(H Hᵀ) = |n|² with n = h₁ × h₂: its gradients are 2 h₂ × n and 2 n × h₁.
+    const V* n = p.normal;
+    const V d_normal = -power / p.normal2;
+    for (int k = 0; k < 3; ++k) {
+      const int i = (k + 1) % 3, j = (k + 2) % 3;
+      d_jwrs[k] += d_normal * (p.jwrs[3 + i] * n[j] - p.jwrs[3 + j] * n[i]);
+      d_jwrs[3 + k] += d_normal * (n[i] * p.jwrs[j] - n[j] * p.jwrs[i]);
+    }
   }
   for (int k = 0; k < 3; ++k) {
     d_wrs[k] = fx * d_jwrs[k];

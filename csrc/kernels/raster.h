@@ -18,7 +18,8 @@ struct View {
 
 struct Settings {
   int width, height;
-  double eps2d;  // added to the diagonal of every 2D covariance, pixels²
+  double eps2d;      // added to the diagonal of every 2D covariance, pixels²
+  bool antialiased;  // as in ProjectionParams
   int num_threads;
 };
 

@@ -69,6 +69,7 @@ struct ProjectionParams {
   Camera<T> camera;
   int width, height;
   T eps2d;                         // added to the diagonal of every 2D covariance, pixels²
+  bool antialiased;                // whether opacities are reduced by what eps2d adds to the splats' areas
   T centre[3];                     // world
   T x_low, x_high, y_low, y_high;  // clamp range of x/z and y/z for the Jacobian
 };

@@ -28,6 +28,9 @@ mod ffi {
         height: i32,
         /// Value added to the diagonal of every projected covariance, in pixels².
         eps2d: f64,
+        /// Multiplies opacities by the square root of det(Σ) / det(Σ + eps2d·I), Σ being the projected covariance, as gsplat's
+        /// mode `antialiased` does.
+        antialiased: bool,
     }
 
     /// Wall-clock seconds of the stages of a call, summed over all its views.

@@ -12,8 +12,8 @@ from . import draw
 EPS_2D = 0.05
 
 
-def settings(size):
-    return {"height": size[0], "width": size[1], "eps2d": EPS_2D}
+def settings(size, antialiased=False):
+    return {"height": size[0], "width": size[1], "eps2d": EPS_2D, "antialiased": antialiased}
 
 
 def scattered(rng, size, batch, cameras, count, bases):

@@ -20,7 +20,7 @@ async function adobe() {
     read: (file) => spz.loadSpzFromBuffer(new Uint8Array(readFileSync(file)), { to: axes }),
     write: (cloud, file, version) => {
       const options = { version: Number(version), from: axes, sh1Bits: 5, shRestBits: 4 };
-      return spz.saveSpzToBuffer({ ...cloud, antialiased: false, extensions: [] }, options);
+      return spz.saveSpzToBuffer({ ...cloud, extensions: [] }, options);
     },
   };
 }
@@ -42,7 +42,7 @@ const { read, write } = program === "adobe" ? await adobe() : inJavaScript;
 if (verb === "read") {
   const cloud = await read(from);
   const lists = LISTS.map((name) => [name, Array.from(cloud[name])]);
-  writeFileSync(to, JSON.stringify({ numPoints: cloud.numPoints, shDegree: cloud.shDegree, ...Object.fromEntries(lists) }));
+  writeFileSync(to, JSON.stringify({ numPoints: cloud.numPoints, shDegree: cloud.shDegree, antialiased: cloud.antialiased, ...Object.fromEntries(lists) }));
 } else {
   const cloud = JSON.parse(readFileSync(from));
   LISTS.forEach((name) => (cloud[name] = new Float32Array(cloud[name])));

@@ -19,11 +19,12 @@ def covariance(scales, quaternions):
     return rs @ rs.transpose(-1, -2)
 
 
-def project(means, scales, quaternions, w2c, intrinsic, width, height, eps2d=EPS_2D):
+def project(means, scales, quaternions, w2c, intrinsic, width, height, eps2d=EPS_2D, antialiased=False):
     """Projects Gaussians (means [N, 3], scales [N, 3], quaternions [N, 4]) to a camera (w2c [4, 4], intrinsic [3, 3]).
 
     Returns a dict of mean2d [N, 2], cov2d [N, 2, 2] (with eps2d), conic [N, 3] = (a, b, c) of [[a, b], [b, c]] =
-    cov2d^-1, depth [N], visible [N]. Values of a Gaussian that is not visible are finite and have no meaning.
+    cov2d^-1, depth [N], visible [N], compensation [N]. Values of a Gaussian that is not visible are finite and have no
+    meaning. compensation is the factor of opacities: 1, or sqrt(det(cov2d without eps2d) / det(cov2d)) if `antialiased`.
     """
     rotation, translation = w2c[:3, :3], w2c[:3, 3]
     fx, fy, cx, cy = intrinsic[0, 0], intrinsic[1, 1], intrinsic[0, 2], intrinsic[1, 2]
@@ -43,12 +44,19 @@ def project(means, scales, quaternions, w2c, intrinsic, width, height, eps2d=EPS
         dim=-2,
     )  # [N, 2, 3]
     jw = jacobian @ rotation
-    cov2d = jw @ covariance(scales, quaternions) @ jw.transpose(-1, -2)
-    cov2d = cov2d + eps2d * torch.eye(2, dtype=means.dtype, device=means.device)
+    unfiltered = jw @ covariance(scales, quaternions) @ jw.transpose(-1, -2)
+    cov2d = unfiltered + eps2d * torch.eye(2, dtype=means.dtype, device=means.device)
 
     det = cov2d[:, 0, 0] * cov2d[:, 1, 1] - cov2d[:, 0, 1] * cov2d[:, 1, 0]
     invertible = det > 0
     det = torch.where(invertible, det, 1.0)
+    compensation = torch.ones_like(det)
+    if antialiased:
+        # The determinant as a sum of squares: the product of the eigenvalues cancels for thin Gaussians.
+        half = jw @ (matrix_from_quaternion(quaternions) * scales[:, None, :])
+        area = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(-1)
+        has_area = area > 0
+        compensation = torch.where(has_area, torch.sqrt(torch.where(has_area, area, 1.0) / det), 0.0)
     conic = torch.stack([cov2d[:, 1, 1] / det, -cov2d[:, 0, 1] / det, cov2d[:, 0, 0] / det], dim=-1)
     return {
         "mean2d": mean2d,
@@ -56,6 +64,7 @@ def project(means, scales, quaternions, w2c, intrinsic, width, height, eps2d=EPS
         "conic": conic,
         "depth": depth,
         "visible": in_front & invertible,
+        "compensation": compensation,
     }
 
 
@@ -149,13 +158,13 @@ def composite(projected, opacities, colours, pixels):
     return rgb, accumulated, expected
 
 
-def render(means, scales, quaternions, opacities, sh, w2c, intrinsic, width, height, eps2d=EPS_2D):
+def render(means, scales, quaternions, opacities, sh, w2c, intrinsic, width, height, eps2d=EPS_2D, antialiased=False):
     """Renders one scene with one camera on a black background.
 
     Returns RGB [H, W, 3], accumulated opacity [H, W], expected depth [H, W].
     """
-    projected = project(means, scales, quaternions, w2c, intrinsic, width, height, eps2d)
+    projected = project(means, scales, quaternions, w2c, intrinsic, width, height, eps2d, antialiased)
     colours = sh_colour(means, sh, w2c)
     pixels = pixel_centres(width, height, means.dtype, means.device)
-    rgb, accumulated, depth = composite(projected, opacities, colours, pixels)
+    rgb, accumulated, depth = composite(projected, opacities * projected["compensation"], colours, pixels)
     return rgb.reshape(height, width, 3), accumulated.reshape(height, width), depth.reshape(height, width)

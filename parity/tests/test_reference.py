@@ -559,14 +559,14 @@ def test_smooth_scene_meets_its_requirements():
     assert p["mean2d"][3, 0] > 1.15 * WIDTH + 1 and p["mean2d"][4, 1] < -0.15 * HEIGHT - 1
 
 
-@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
-def test_splat_gradients(coefficients):
+@pytest.mark.parametrize("coefficients, antialiased", [(1, False), (4, False), (9, False), (16, False), (4, True)])
+def test_splat_gradients(coefficients, antialiased):
     """Gradients of all three outputs with respect to all five inputs pass gradcheck."""
     w2c, intrinsic = camera()
     inputs = [value.requires_grad_() for value in smooth_scene(w2c, coefficients)]
 
     def render(*values):
-        return splat.render(*values, w2c, intrinsic, WIDTH, HEIGHT)
+        return splat.render(*values, w2c, intrinsic, WIDTH, HEIGHT, antialiased=antialiased)
 
     assert torch.autograd.gradcheck(render, inputs, eps=1e-6, atol=1e-7, rtol=1e-5)
 
@@ -584,7 +584,7 @@ def test_splat_parts_gradients():
     assert torch.autograd.gradcheck(colour, (means, sh), eps=1e-6, atol=1e-7, rtol=1e-5)
 
 
-def scalar_render(means, scales, quaternions, opacities, sh, w2c, intrinsic, width, height, eps2d):
+def scalar_render(means, scales, quaternions, opacities, sh, w2c, intrinsic, width, height, eps2d, antialiased):
     """Renders with scalar Python arithmetic and loops, one pixel and one Gaussian at a time."""
     n = len(means)
     means, scales, quaternions = means.tolist(), scales.tolist(), quaternions.tolist()
@@ -644,20 +644,22 @@ def scalar_render(means, scales, quaternions, opacities, sh, w2c, intrinsic, wid
         det = a * c - b * b
         if det <= 0:
             continue
+        area = cov[0][0] * cov[1][1] - b * b
+        opacity = opacities[g] * (math.sqrt(max(area, 0.0) / det) if antialiased else 1.0)
         d = [means[g][t] - centre[t] for t in range(3)]
         length = math.sqrt(sum(t * t for t in d))
         values = basis(*(t / length for t in d))
         colour = [max(0.0, 0.5 + sum(values[t] * sh[g][t][ch] for t in range(len(sh[g])))) for ch in range(3)]
-        drawn.append((z, g, fx * x / z + cx, fy * y / z + cy, (c / det, -b / det, a / det), colour))
+        drawn.append((z, g, fx * x / z + cx, fy * y / z + cy, (c / det, -b / det, a / det), opacity, colour))
     drawn.sort(key=lambda item: item[:2])
 
     images = torch.zeros(height, width, 5, dtype=torch.float64)
     for i in range(height):
         for column in range(width):
             remaining, rgb, depth = 1.0, [0.0, 0.0, 0.0], 0.0
-            for z, g, u, v, (ca, cb, cc), colour in drawn:
+            for z, _, u, v, (ca, cb, cc), opacity, colour in drawn:
                 dx, dy = u - (column + 0.5), v - (i + 0.5)
-                alpha = min(0.999, opacities[g] * math.exp(-0.5 * (ca * dx * dx + 2 * cb * dx * dy + cc * dy * dy)))
+                alpha = min(0.999, opacity * math.exp(-0.5 * (ca * dx * dx + 2 * cb * dx * dy + cc * dy * dy)))
                 if alpha < 1 / 255:
                     continue
                 if remaining * (1 - alpha) <= 1e-4:
@@ -694,15 +696,16 @@ def crowded_scene(w2c, seed):
     return means, scales, quaternions, opacities, 4.0 * sh
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_splat_against_scalar_loops(seed):
+@pytest.mark.parametrize("seed, antialiased", [(0, False), (1, False), (2, False), (0, True)])
+def test_splat_against_scalar_loops(seed, antialiased):
     w2c, intrinsic = camera()
     values = crowded_scene(w2c, seed)
-    ours = splat.render(*values, w2c, intrinsic, WIDTH, HEIGHT)
-    theirs = scalar_render(*values, w2c, intrinsic, WIDTH, HEIGHT, splat.EPS_2D)
+    ours = splat.render(*values, w2c, intrinsic, WIDTH, HEIGHT, antialiased=antialiased)
+    theirs = scalar_render(*values, w2c, intrinsic, WIDTH, HEIGHT, splat.EPS_2D, antialiased)
     for name, a, b in zip(("rgb", "opacity", "depth"), ours, theirs):
         assert (a - b).abs().max().item() < 1e-10, name
-    single = splat.render(*(v.float() for v in values), w2c.float(), intrinsic.float(), WIDTH, HEIGHT)
+    values, w2c, intrinsic = [v.float() for v in values], w2c.float(), intrinsic.float()
+    single = splat.render(*values, w2c, intrinsic, WIDTH, HEIGHT, antialiased=antialiased)
     assert single[0].dtype == torch.float32
     close = (single[0].double() - theirs[0]).abs().amax(-1) < 1e-4  # a threshold may go the other way at a pixel
     assert close.double().mean() > 0.95

@@ -147,8 +147,8 @@ def read_by(program, file, folder):
     return splat_of(json.loads((folder / "numbers.json").read_text()))
 
 
-def write_by(program, splat, file, folder, *version):
-    (folder / "numbers.json").write_text(json.dumps(cloud(splat)))
+def write_by(program, splat, file, folder, *version, antialiased=False):
+    (folder / "numbers.json").write_text(json.dumps(cloud(splat) | {"antialiased": antialiased}))
     run("node", NPM / "splats.mjs", "write", program, folder / "numbers.json", file, *version)
 
 
@@ -189,6 +189,21 @@ def test_niantics_library_reads_and_writes_as_we_do(tmp_path, degree):
         ours(tmp_path / "b.spz", tmp_path / "c.ply")
         expected = STEPS["spz of version 2" if version == "2" else "their spz"]
         assert_same(splat, read_ply(tmp_path / "c.ply"), expected)
+
+
+def test_niantics_library_and_we_mark_antialiased_splats_alike(tmp_path):
+    write_ply(tmp_path / "plain.ply", made(1))
+    plain = (tmp_path / "plain.ply").read_bytes()
+    comment = b"comment SplatRenderMode: mip\n"
+    (tmp_path / "marked.ply").write_bytes(plain.replace(b"element vertex", comment + b"element vertex", 1))
+    for name, expected in [("plain", False), ("marked", True)]:
+        ours(tmp_path / f"{name}.ply", tmp_path / "a.spz")
+        read_by("adobe", tmp_path / "a.spz", tmp_path)
+        assert json.loads((tmp_path / "numbers.json").read_text())["antialiased"] == expected
+        for version in "34":
+            write_by("adobe", made(1), tmp_path / "b.spz", tmp_path, version, antialiased=expected)
+            ours(tmp_path / "b.spz", tmp_path / "c.ply")
+            assert (comment in (tmp_path / "c.ply").read_bytes()[:200]) == expected
 
 
 # In compressed PLYs, spz-js mistakes coefficients of degree 1 and 2 for others, and reads their bytes as older viewers

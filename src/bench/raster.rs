@@ -292,6 +292,7 @@ pub fn synthetic_gaussians(count: usize, views: usize, size: ImageSize) -> (Gaus
         quaternions: Tensor::from_slice(&quaternions).view([1, n, 4]),
         opacities: Tensor::from_slice(&opacities).view([1, n]),
         sh: Tensor::from_slice(&sh).view([1, n, 16, 3]),
+        antialiased: false,
     };
     (gaussians, camera_path(views, focal, width, height))
 }

@@ -80,6 +80,7 @@ fn splat(path: &Path) -> Result<Value> {
         "kind": "splat",
         "gaussians": g.count(),
         "sh_degree": splat.sh_degree,
+        "antialiased": splat.antialiased,
         "bytes": std::fs::metadata(path)?.len(),
         "x": axis(0),
         "y": axis(1),

@@ -3,7 +3,8 @@
 use glam::DVec3;
 use globalsplat::error::Result;
 use globalsplat::io::{
-    ShLimits, Splat, check_writable_origin, fit_splat, rounding_warning, write_local_splat, write_splat,
+    ShLimits, Splat, can_mark_antialiased, check_writable_origin, fit_splat, rounding_warning,
+    write_local_splat, write_splat,
 };
 use globalsplat::scene::Camera;
 use std::path::Path;
@@ -25,6 +26,10 @@ pub fn write_for(path: &Path, splat: &Splat, cameras: &[Camera], local_origin: O
 /// Writes `splat` to `path`, with coordinates relative to `local_origin` if there is one. Otherwise they are world coordinates,
 /// and their loss of precision in float32 is reported on standard error.
 pub fn write(path: &Path, splat: &Splat, local_origin: Option<DVec3>) -> Result<()> {
+    if splat.antialiased && !can_mark_antialiased(path)? {
+        let line = "the format can't say that the splat is antialiased, and viewers show it slightly wrong";
+        eprintln!("{}: {line}", path.display());
+    }
     if let Some(origin) = local_origin {
         return Ok(write_local_splat(path, &splat.with_origin(origin))?);
     }

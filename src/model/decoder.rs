@@ -174,6 +174,7 @@ impl Decoder {
             quaternions: quaternion_from_6d(&rotations_6d),
             opacities: sigmoid(&logits).clamp(0., MAX_OPACITY),
             sh: shown.sh.view([b, n, self.sh_bases, 3]),
+            antialiased: false,
         };
         let raw = RawOutputs { log_scales, rotations, sh, opacity_logits: logits };
         Decoded { gaussians, rotations_6d, raw }

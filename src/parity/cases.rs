@@ -369,6 +369,7 @@ fn gaussians_and_cameras(request: &Request) -> Result<(Gaussians, Cameras)> {
         quaternions: input("quaternions")?,
         opacities: input("opacities")?,
         sh: input("sh")?,
+        antialiased: request.number("antialiased")?,
     };
     let cameras = Cameras {
         w2c: input("w2c")?,

@@ -13,6 +13,8 @@ pub struct RefineConfig {
     /// Fractions of the optimization at which the width and height of images double, up to the full size after the last fraction. By
     /// default there are two, which depend on the full size: images of 240 pixels or more show enough for most of the steps.
     pub resolution_schedule: Option<Vec<f64>>,
+    /// `true` to optimize a splat for antialiased rendering, see [`Splat::antialiased`](globalsplat_splat_file::Splat::antialiased).
+    pub antialiased: bool,
     /// Final degree of the spherical harmonics.
     pub sh_degree: i64,
     /// Interval between increases of the degree of the spherical harmonics by one, as a fraction of the optimization.
@@ -68,6 +70,7 @@ impl Default for RefineConfig {
         RefineConfig {
             views: 1,
             resolution_schedule: None,
+            antialiased: false,
             sh_degree: 1,
             sh_every: 0.3,
             means: 2e-3,

@@ -112,13 +112,17 @@ impl GaussianOptimizer {
 
     /// Returns the Gaussians, differentiable with respect to the parameters. `progress` goes from 0 to 1.
     pub fn gaussians(&self, progress: f64) -> Gaussians {
-        self.leaves.activate(self.degree_at(progress))
+        self.activate(&self.leaves, progress)
     }
 
     /// Returns the average of the Gaussians over the last steps if there is one, else the current ones; not differentiable.
     pub(super) fn averaged_gaussians(&self) -> Gaussians {
         let params = self.average.as_ref().unwrap_or(&self.leaves);
-        tch::no_grad(|| params.activate(self.degree_at(1.))).map(Tensor::copy)
+        tch::no_grad(|| self.activate(params, 1.)).map(Tensor::copy)
+    }
+
+    fn activate(&self, params: &GaussianParams, progress: f64) -> Gaussians {
+        Gaussians { antialiased: self.config.antialiased, ..params.activate(self.degree_at(progress)) }
     }
 
     /// Returns the degree of the spherical harmonics, at least the one that an earlier step used.

@@ -41,7 +41,7 @@ use crate::device::Stopwatch;
 use crate::error::{Error, Result};
 use crate::loss::{depth_smoothness, fill_masked, masked_depth_smoothness, masked_photometric, photometric};
 use crate::render::cpu::KernelThreads;
-use crate::render::{Cameras, DEFAULT_EPS2D, RenderOutput, render, render_views};
+use crate::render::{Cameras, RenderOutput, default_eps2d, render, render_views};
 use crate::scene::{Camera, Gaussians};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -146,7 +146,8 @@ pub(crate) fn refine_timed(
             stopwatch.time("photos", || photos.draw(progress, config.views, &mut random));
         let gaussians = stopwatch.time("activation", || optimizer.gaussians(progress));
         let cameras = Cameras { w2c: corrections.w2c(&batch, &which), ..batch.cameras() };
-        let mut pictures = stopwatch.time("render", || render(&gaussians, &cameras, DEFAULT_EPS2D))?;
+        let mut pictures =
+            stopwatch.time("render", || render(&gaussians, &cameras, default_eps2d(&gaussians)))?;
         pictures.rgb = corrections.apply_exposures(pictures.rgb, &which);
         let background = background.map(|background| background.colour(&mut random));
         let loss = stopwatch.time("loss", || {
@@ -263,6 +264,7 @@ mod tests {
     use crate::bench::synthetic_gaussians;
     use crate::device::num_threads;
     use crate::eval::score_views;
+    use crate::render::DEFAULT_EPS2D;
     use crate::scene::{ImageSize, Intrinsics, RawGaussians};
     use glam::{DMat4, DVec3};
     use globalsplat_csrc::ops::{WAITING, computing, record_ops, record_outermost_ops};

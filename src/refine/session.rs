@@ -189,12 +189,15 @@ enum Start<'a> {
 pub struct RefineSession<'a> {
     capture: &'a Capture,
     options: &'a RefineOptions,
+    /// Hyperparameters of the options. `antialiased` is also set for an initial splat or state that is antialiased.
+    config: RefineConfig,
     clock: Instant,
     on_event: Box<dyn FnMut(RefineEvent) -> bool + 'a>,
     is_stopped: bool,
     frame: LocalFrame,
     photos: Vec<View>,
     held_out: Vec<View>,
+    /// Views among `scored` that are scored during the optimization.
     held_out_sample: ViewSample,
     /// Held-out views that there is time to score as a whole.
     scored: Vec<View>,
@@ -255,11 +258,12 @@ impl<'a> RefineSession<'a> {
         Ok(RefineSession {
             capture,
             options,
+            config: options.config.clone(),
             clock,
             on_event: Box::new(on_event),
             is_stopped: false,
             frame,
-            held_out_sample: ViewSample::small(&held_out),
+            held_out_sample: ViewSample::small(&[]),
             photos,
             held_out,
             scored: vec![],
@@ -322,18 +326,21 @@ impl<'a> RefineSession<'a> {
         let mut warnings = vec![];
         let start = match initial {
             Initial::Splat(splat) => {
+                self.config.antialiased |= splat.antialiased;
                 let local = Gaussians::from_splat(splat).to_local(&self.frame, splat.origin);
                 Start::Splat(splat, RawGaussians::from_gaussians(&local.to_device(self.options.device)))
             }
             Initial::State(state) => {
+                self.config.antialiased |= state.record.antialiased;
                 if state.record.has_depths {
                     let _ = self.gaussians_from_photos(None)?.ok_or_else(stopped)?;
                 }
-                let RefineOptions { config, gaussians, correct_exposures, device, .. } = self.options;
+                let RefineOptions { gaussians, correct_exposures, device, .. } = self.options;
                 if *correct_exposures == ExposureCorrection::Auto {
                     self.log_exposures = state.has_exposures().then(|| self.equal_exposures());
                 }
-                let optimizer = GaussianOptimizer::from_state(state, config, *gaussians as i64, *device)?;
+                let optimizer =
+                    GaussianOptimizer::from_state(state, &self.config, *gaussians as i64, *device)?;
                 Start::State(state, optimizer.into())
             }
             Initial::Model(loaded) => {
@@ -364,7 +371,8 @@ impl<'a> RefineSession<'a> {
             self.log_exposures = Some(self.equal_exposures());
         }
         let gaussians = match &start {
-            Start::Photos(raw) | Start::Splat(_, raw) => raw.activate(),
+            Start::Photos(raw) => Gaussians { antialiased: self.config.antialiased, ..raw.activate() },
+            Start::Splat(splat, raw) => Gaussians { antialiased: splat.antialiased, ..raw.activate() },
             Start::Model(gaussians) => gaussians.map(Tensor::shallow_clone),
             Start::State(_, optimizer) => optimizer.averaged_gaussians(),
         };
@@ -392,6 +400,7 @@ impl<'a> RefineSession<'a> {
     pub fn run(&mut self) -> Result<RefineResult> {
         let (start, initial, depth) = self.start.take().expect("a start");
         self.scored = self.affordable_views(&initial)?;
+        self.held_out_sample = ViewSample::small(&self.scored);
         let scoring = Instant::now();
         let held_out_before = self.score_whole(&initial, &self.scored_views(), None)?;
         let count = initial.count().max(self.options.gaussians as i64);
@@ -457,6 +466,11 @@ impl<'a> RefineSession<'a> {
             self.score_whole(&result.gaussians, &self.scored_views(), None)?
         };
         Ok(before.zip(after).map(<[CaptureScores; 2]>::from))
+    }
+
+    /// Returns the mean scores of the sample of [`EvalPoint`], given the scores of all views by [`RefineSession::score_held_out`].
+    pub fn sample_scores(&self, scores: &CaptureScores) -> SampleScores {
+        self.held_out_sample.select_scores(scores)
     }
 
     /// Scores the initial and the final Gaussians by LPIPS, with the networks whose weights are installed: on all held-out views, or on a
@@ -618,7 +632,7 @@ impl<'a> RefineSession<'a> {
 
     /// Returns the corrections with which the optimization begins, those of `state` if it continues from one.
     fn corrections(&self, state: Option<&RefineState>, depth: f64) -> Result<Corrections> {
-        let RefineOptions { correct_poses, config, device, .. } = self.options;
+        let (RefineOptions { correct_poses, device, .. }, config) = (self.options, &self.config);
         let (count, exposures) = (self.photos.len(), self.log_exposures.as_deref());
         let sides = self.photos.iter().map(|photo| photo.camera.width.max(photo.camera.height));
         let poses = config.poses_for(sides.max().unwrap_or(0));
@@ -632,23 +646,23 @@ impl<'a> RefineSession<'a> {
 
     /// Optimizes the Gaussians of `start`, and the corrections of the photos. `depth` is the depth of these Gaussians.
     fn optimize(&mut self, start: Start, depth: f64) -> Result<(Gaussians, Corrections, RefineState)> {
-        let RefineOptions { config, seed, device, .. } = self.options;
+        let (RefineOptions { seed, device, .. }, config) = (self.options, self.config.clone());
         let final_count = if matches!(start, Start::Splat(..)) { 0 } else { self.options.gaussians as i64 };
         let (mut optimizer, depth, earlier) = match start {
             Start::Photos(raw) | Start::Splat(_, raw) => {
-                (GaussianOptimizer::new(&raw, depth, config, final_count), depth, None)
+                (GaussianOptimizer::new(&raw, depth, &config, final_count), depth, None)
             }
             Start::Model(gaussians) => {
                 let raw = self.filled(&gaussians)?;
                 let depth = scene_depth(&raw.activate(), &self.photos)?;
-                (GaussianOptimizer::new(&raw, depth, config, final_count), depth, None)
+                (GaussianOptimizer::new(&raw, depth, &config, final_count), depth, None)
             }
             Start::State(state, optimizer) => (*optimizer, depth, Some(state)),
         };
         let mut corrections = self.corrections(earlier, depth)?;
         let (reached, earlier_total) =
             earlier.map_or_else(Default::default, |state| (state.record.reached, state.record.total));
-        let photos = Photos::new(&self.photos, &self.depth_maps, config, *device);
+        let photos = Photos::new(&self.photos, &self.depth_maps, &config, *device);
         let budget = match self.options.budget {
             Budget::Time(time) => {
                 let used = self.reserve + self.clock.elapsed() + earlier_total;
@@ -657,7 +671,7 @@ impl<'a> RefineSession<'a> {
             steps => steps,
         };
         let background = self.options.mask_background;
-        let task = Task { photos: &photos, depth, config, budget, seed: *seed, background, reached };
+        let task = Task { photos: &photos, depth, config: &config, budget, seed: *seed, background, reached };
         let mut marks = EVAL_FRACTIONS.iter().peekable();
         let (mut is_due, mut failure) = (false, None);
         let (gaussians, reached) = refine(&mut optimizer, &mut corrections, &task, |at| {
@@ -696,6 +710,7 @@ impl<'a> RefineSession<'a> {
             total: earlier_total + self.clock.elapsed(),
             depth,
             has_depths: !self.depth_maps.is_empty(),
+            antialiased: config.antialiased,
             growth: optimizer.growth(),
         };
         Ok((gaussians, corrections, RefineState::new(record, tensors)))

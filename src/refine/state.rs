@@ -41,6 +41,9 @@ pub(super) struct Record {
     pub depth: f64,
     /// `true` if the plane sweep's depths were used.
     pub has_depths: bool,
+    /// `true` if the Gaussians are optimized for antialiased rendering.
+    #[serde(default)]
+    pub antialiased: bool,
     /// How the Gaussians have grown.
     pub growth: Growth,
 }

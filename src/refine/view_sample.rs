@@ -3,7 +3,7 @@
 use super::corrections::Corrections;
 use crate::data::View;
 use crate::error::Result;
-use crate::eval::{CaptureScores, score_views};
+use crate::eval::{CaptureScores, ViewScore, score_views};
 use crate::scene::Gaussians;
 use serde::Serialize;
 
@@ -71,6 +71,15 @@ impl ViewSample {
         let scores = score_views("sample", gaussians, &self.views, None, |_| true)?;
         Ok(scores.map(|CaptureScores { psnr, ssim, .. }| SampleScores { psnr, ssim }))
     }
+
+    /// Returns the mean scores of the sample, given the `scores` of all views that it was chosen from.
+    pub fn select_scores(&self, scores: &CaptureScores) -> SampleScores {
+        let mean = |score: fn(&ViewScore) -> f64| {
+            let sum: f64 = self.indices.iter().map(|&index| score(&scores.views[index])).sum();
+            sum / self.indices.len() as f64
+        };
+        SampleScores { psnr: mean(|view| view.psnr), ssim: mean(|view| view.ssim) }
+    }
 }
 
 #[cfg(test)]
@@ -89,21 +98,30 @@ mod tests {
             quaternions: Tensor::from_slice(&[1f32, 0., 0., 0.]).view([1, 1, 4]),
             opacities: Tensor::full([1, 1], 0.7, (Kind::Float, Device::Cpu)),
             sh: Tensor::ones([1, 1, 1, 3], (Kind::Float, Device::Cpu)),
+            antialiased: false,
         };
         let views = |width: u32, height: u32, count: usize| -> Vec<View> {
             let intrinsics = Intrinsics { fx: 200., fy: 190., cx: 100., cy: 80. };
             let camera = Camera { intrinsics, c2w: DMat4::IDENTITY, width, height };
             let image = render_views(&gaussians, &[camera]).unwrap().remove(0).rgb;
-            let view = View { name: String::new(), image: (image + 0.01).into(), mask: None, camera };
-            (0..count).map(|_| view.shallow_clone()).collect()
+            let view = |index: usize| {
+                let image = (&image + 0.01 + 0.001 * index as f64).into();
+                View { name: String::new(), image, mask: None, camera }
+            };
+            (0..count).map(view).collect()
         };
-        let small = ViewSample::small(&views(210, 170, 20));
+        let all = views(210, 170, 20);
+        let small = ViewSample::small(&all);
         assert_eq!(small.indices, [0, 3, 6, 9, 12, 15, 18]);
         let large = views(1000, 600, 9);
         assert_eq!(ViewSample::small(&large).indices, [0, 5]);
         assert_eq!(ViewSample::large(&large).indices, [0, 2, 4, 6, 8]);
         let scores = small.score(&gaussians).unwrap().unwrap();
-        assert!((scores.psnr - 40.).abs() < 0.01 && scores.ssim > 0.9, "{scores:?}");
+        let of_all = score_views("", &gaussians, &all, None, |_| true).unwrap().unwrap();
+        assert!((of_all.views[0].psnr - 40.).abs() < 0.01 && of_all.views[0].ssim > 0.9, "{of_all:?}");
+        let selected = small.select_scores(&of_all);
+        assert!((scores.psnr - selected.psnr).abs() < 1e-9 && (scores.ssim - selected.ssim).abs() < 1e-9);
+        assert!((scores.psnr - of_all.psnr).abs() > 0.01, "{scores:?} {}", of_all.psnr);
         assert!(ViewSample::small(&[]).score(&gaussians).unwrap().is_none());
     }
 }

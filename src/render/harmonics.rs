@@ -218,6 +218,7 @@ mod tests {
             quaternions: Tensor::from_slice(&[1f32, 0., 0., 0.]).repeat([1, 3, 1]),
             opacities: Tensor::full([1, 3], 0.1, options),
             sh,
+            antialiased: false,
         }
     }
 

@@ -18,8 +18,17 @@ use crate::scene::{Camera, Gaussians, pose_to_rows};
 use globalsplat_csrc::render::{self as ffi, SplatArguments};
 use tch::{Device, Kind, Tensor};
 
-/// Default value added to the diagonal of every projected covariance, in pixels².
+/// Value added to the diagonal of every projected covariance of a splat that isn't antialiased, in pixels².
 pub const DEFAULT_EPS2D: f64 = 0.05;
+
+/// Value added to the diagonal of every projected covariance of an antialiased splat, in pixels², as in Mip-Splatting (Yu et al. 2024).
+/// A pixel itself has a variance of 1/12 in each direction.
+pub const ANTIALIASED_EPS2D: f64 = 0.1;
+
+/// Returns the value that is added to the diagonal of every projected covariance of `gaussians` by default, in pixels².
+pub fn default_eps2d(gaussians: &Gaussians) -> f64 {
+    if gaussians.antialiased { ANTIALIASED_EPS2D } else { DEFAULT_EPS2D }
+}
 
 /// Cameras to render from: C cameras for each of B scenes.
 #[derive(Debug)]
@@ -64,7 +73,8 @@ pub struct RenderOutput {
     pub depth: Tensor,
 }
 
-/// Renders every scene from its cameras on the device of the Gaussians, the CPU or a CUDA device, with bit-identical results.
+/// Renders every scene from its cameras on the device of the Gaussians, the CPU or a CUDA device, with bit-identical results. `eps2d` is added
+/// to the diagonal of every projected covariance; [`default_eps2d`] returns the usual value.
 /// Differentiable with respect to the Gaussians and to `w2c`, whose entries are treated as independent values. float64 tensors are rendered
 /// in float64, on the host wherever they are, and all others in float32.
 ///
@@ -123,6 +133,7 @@ fn arguments(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> SplatArgum
         width: cameras.width as i32,
         height: cameras.height as i32,
         eps2d,
+        antialiased: gaussians.antialiased,
     }
 }
 

@@ -18,6 +18,7 @@ pub fn transform(gaussians: &Gaussians, to: &Similarity) -> Gaussians {
         quaternions: rotate_quaternions(&gaussians.quaternions, DQuat::from_mat3(&to.rotation)),
         opacities: gaussians.opacities.shallow_clone(),
         sh: rotate_sh(&gaussians.sh, &to.rotation),
+        antialiased: gaussians.antialiased,
     }
 }
 

@@ -1,6 +1,6 @@
 //! Renders one splat from cameras of any sizes, one by one, for display and evaluation.
 
-use super::{Cameras, DEFAULT_EPS2D, render};
+use super::{Cameras, default_eps2d, render};
 use crate::error::Result;
 use crate::scene::{Camera, Gaussians, LocalFrame};
 use glam::DVec3;
@@ -53,7 +53,8 @@ pub fn render_views(gaussians: &Gaussians, cameras: &[Camera]) -> Result<Vec<Ren
     cameras
         .iter()
         .map(|camera| {
-            let rendered = tch::no_grad(|| render(gaussians, &Cameras::single(camera), DEFAULT_EPS2D))?;
+            let rendered =
+                tch::no_grad(|| render(gaussians, &Cameras::single(camera), default_eps2d(gaussians)))?;
             let first = |t: Tensor| t.select(0, 0).select(0, 0);
             Ok(RenderedView {
                 rgb: first(rendered.rgb),

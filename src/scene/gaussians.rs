@@ -16,6 +16,9 @@ pub struct Gaussians {
     pub opacities: Tensor,
     /// Spherical harmonics coefficients, `[B, N, (degree + 1)², 3]`.
     pub sh: Tensor,
+    /// `true` if the renderer has to reduce opacities by what its low-pass filter adds to the area of the projected Gaussians, as
+    /// [`Splat::antialiased`](globalsplat_splat_file::Splat::antialiased) says.
+    pub antialiased: bool,
 }
 
 impl Gaussians {
@@ -32,6 +35,7 @@ impl Gaussians {
             quaternions: f(&self.quaternions),
             opacities: f(&self.opacities),
             sh: f(&self.sh),
+            antialiased: self.antialiased,
         }
     }
 
@@ -59,7 +63,7 @@ pub struct RawGaussians {
 impl RawGaussians {
     /// Returns the parameters that activate to `gaussians`: opacities up to 1e-6, everything else up to rounding.
     pub fn from_gaussians(gaussians: &Gaussians) -> Self {
-        let Gaussians { means, scales, quaternions, opacities, sh } = gaussians;
+        let Gaussians { means, scales, quaternions, opacities, sh, .. } = gaussians;
         RawGaussians {
             means: means.shallow_clone(),
             log_scales: scales.clamp_min(MIN_SCALE).log(),
@@ -69,7 +73,7 @@ impl RawGaussians {
         }
     }
 
-    /// Returns the activated Gaussians. Differentiable.
+    /// Returns the activated Gaussians, whose opacities are rendered unreduced. Differentiable.
     pub fn activate(&self) -> Gaussians {
         Gaussians {
             means: self.means.shallow_clone(),
@@ -77,6 +81,7 @@ impl RawGaussians {
             quaternions: self.quaternions.shallow_clone(),
             opacities: sigmoid(&self.opacity_logits),
             sh: self.sh.shallow_clone(),
+            antialiased: false,
         }
     }
 
@@ -159,6 +164,7 @@ mod tests {
             quaternions: Tensor::from_slice(&[2f32, 0., 0., 0., 0., 0.6, 0.8, 0.]).view([1, 2, 4]),
             opacities: Tensor::from_slice(&[0f32, 0.99]).view([1, 2]),
             sh: Tensor::from_slice(&[0.5f32, -3., 0., 1., 2., 3.]).view([1, 2, 1, 3]),
+            antialiased: false,
         };
         let raw = RawGaussians::from_gaussians(&gaussians);
         assert!(raw.named_parameters().iter().all(|(_, t)| t.isfinite().all().int64_value(&[]) == 1));

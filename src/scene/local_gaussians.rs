@@ -58,6 +58,7 @@ mod tests {
             quaternions: numbers(80, 0., 30.).view([1, 20, 4]),
             opacities: numbers(20, 0., 1.).view([1, 20]),
             sh: numbers(60, 0., 9.).view([1, 20, 1, 3]),
+            antialiased: false,
         }
     }
 

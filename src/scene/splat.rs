@@ -25,13 +25,11 @@ impl Gaussians {
     /// Returns the Gaussians of `splat`, [1, N, ..], float32 on the host, with means relative to the splat's origin.
     pub fn from_splat(splat: &Splat) -> Self {
         let active = RawGaussians::from_splat(splat).activate();
-        match &splat.linear_scales {
-            Some(scales) => Gaussians {
-                scales: Tensor::from_slice(scales.as_flattened()).view_as(&active.scales),
-                ..active
-            },
-            None => active,
-        }
+        let scales = match &splat.linear_scales {
+            Some(scales) => Tensor::from_slice(scales.as_flattened()).view_as(&active.scales),
+            None => active.scales,
+        };
+        Gaussians { scales, antialiased: splat.antialiased, ..active }
     }
 
     /// Returns the splat of one scene, whose means are relative to `origin`, without gradients. Gaussians whose quaternion has length 0
@@ -55,7 +53,8 @@ impl Gaussians {
             rows(&raw.sh)?,
         )?;
         let linear_scales = Some(rows(&on_host.scales)?);
-        Ok(Splat { origin, linear_scales, ..splat }.without_missing_rotations("the splat"))
+        Ok(Splat { origin, linear_scales, antialiased: self.antialiased, ..splat }
+            .without_missing_rotations("the splat"))
     }
 }
 

@@ -158,5 +158,6 @@ fn gaussians_of(patches: &[Patch]) -> Gaussians {
         quaternions: tensor(quaternions, 4),
         opacities: tensor(vec![0.95; patches.len()], 1).squeeze_dim(-1),
         sh: tensor(flatten(|p| (p.colour - 0.5) / SH_C0), 3).unsqueeze(2),
+        antialiased: false,
     }
 }

@@ -352,6 +352,25 @@ fn a_refinement_is_continued_and_logged() {
     );
 }
 
+/// A splat that is optimized for antialiased rendering is marked, and keeps the mark when it is continued or refined.
+#[test]
+fn antialiased_splats_keep_their_mark() {
+    let (folder, room) = room();
+    let scene = arg(&room).to_string();
+    let refine = |out: &Path, options: &[&str]| {
+        run_json(&[&["refine", "--scene", &scene, "--out", arg(out), "--json"][..], options].concat());
+        read_splat(out).unwrap().antialiased
+    };
+    let [plain, marked, again] =
+        ["plain.ply", "marked.ply", "again.spz"].map(|name| folder.path().join(name));
+    let initial = ["--gaussians", "500", "--steps", "20"];
+    assert!(!refine(&plain, &initial));
+    assert!(refine(&marked, &[&initial[..], &["--antialiased", "--resume"]].concat()));
+    assert!(refine(&marked, &["--gaussians", "500", "--steps", "25", "--resume"]));
+    assert!(refine(&again, &["--splat", arg(&marked), "--steps", "5"]));
+    assert_eq!(run_json(&["inspect", arg(&again), "--json"])["antialiased"], true);
+}
+
 /// A capture scaled by a power of two gives bit-identical results up to the scale; one in any other unit, or far from the
 /// origin, is reconstructed as well.
 #[test]

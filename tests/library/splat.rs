@@ -18,6 +18,7 @@ fn gaussians(scenes: i64, count: i64, degree: i64, kind: Kind, seed: u64) -> Gau
         quaternions: random.symmetric(&[scenes, count, 4]),
         opacities: random.uniform(&[scenes, count]) * 0.9 + 0.05,
         sh: random.symmetric(&[scenes, count, (degree + 1) * (degree + 1), 3]) * 0.5,
+        antialiased: false,
     }
     .map(|t| t.to_kind(kind))
 }
@@ -85,6 +86,33 @@ fn of_any_length(g: &Gaussians) -> Gaussians {
         Tensor::from_slice(&[0f64, -66., 66., -100., 100.]).repeat([count / 5 + 1]).narrow(0, 0, count);
     let powers = exponents.exp2().view([1, count, 1]).to_kind(g.quaternions.kind());
     Gaussians { quaternions: &g.quaternions * powers, ..g.map(Tensor::shallow_clone) }
+}
+
+/// Checks that an antialiased Gaussian keeps its integral of opacity · 2π √(det Σ), however small it is, while another one grows by the
+/// filter's variance.
+#[test]
+fn antialiasing_keeps_the_integral_of_a_gaussian() {
+    let camera = straight_camera(1, 33, 33);
+    let integral = |sigma: f64, antialiased: bool| {
+        let number = |values: &[f32], shape: &[i64]| Tensor::from_slice(values).view(shape);
+        let gaussian = Gaussians {
+            means: number(&[0.; 3], &[1, 1, 3]) + Tensor::from_slice(&[0f32, 0., 1.]),
+            scales: number(&[sigma as f32 / 100.; 3], &[1, 1, 3]),
+            quaternions: number(&[1., 0., 0., 0.], &[1, 1, 4]),
+            opacities: number(&[0.8], &[1, 1]),
+            sh: number(&[0.; 3], &[1, 1, 1, 3]),
+            antialiased,
+        };
+        let rendered = render(&gaussian, &camera, 0.3).unwrap();
+        rendered.alpha.sum(Kind::Double).double_value(&[]) / (0.8 * 2. * std::f64::consts::PI)
+    };
+    for sigma in [2f64, 1., 0.5, 0.25] {
+        let (kept, grown) = (integral(sigma, true), integral(sigma, false));
+        let variance = sigma * sigma;
+        // Values of α below 1/255 are cut off.
+        assert!((kept / variance - 1.).abs() < 0.05, "σ {sigma}: {kept}");
+        assert!((grown / (variance + 0.3) - 1.).abs() < 0.05, "σ {sigma}: {grown}");
+    }
 }
 
 /// Returns the rendered images, and the gradients of [`objective`].
@@ -336,6 +364,7 @@ fn lone_gaussians(width: f64, height: f64, seed: u64) -> Gaussians {
         quaternions: tensor(&quaternions, &[n, 1, 4]),
         opacities: tensor(&opacities, &[n, 1]),
         sh: Tensor::zeros([n, 1, 1, 3], (Kind::Float, Device::Cpu)),
+        antialiased: false,
     }
 }
 

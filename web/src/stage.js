@@ -19,9 +19,11 @@ export class Stage {
     this.world.quaternion.setFromUnitVectors(new Vector3(...scene.up), new Vector3(0, 1, 0));
     this.world.updateMatrixWorld();
     this.camera = new LensCamera();
-    // Match our rasterizer: sorted by depth, with the blur that the model was trained with.
+    // Match our rasterizer: sorted by depth, with the blur that the splat was optimized with. Spark reduces opacities by what `blurAmount`
+    // adds to the area of a Gaussian, and not by what `preBlurAmount` does.
+    const [preBlurAmount, blurAmount] = scene.antialiased ? [0, scene.blur] : [scene.blur, 0];
     this.spark = new SparkRenderer({
-      renderer: this.renderer, preBlurAmount: scene.blur, blurAmount: 0, sortRadial: false, maxStdDev: 3.3, onDirty: () => this.touch(),
+      renderer: this.renderer, preBlurAmount, blurAmount, sortRadial: false, maxStdDev: 3.3, onDirty: () => this.touch(),
     });
     this.all = new Scene();
     this.all.add(this.world, this.spark);

@@ -68,7 +68,7 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     }
 
     let (rest, sh_degree) = read_rest(path, bytes, &header, words.len())?;
-    let mut splat = Splat { sh_degree, ..Splat::default() };
+    let mut splat = Splat { sh_degree, antialiased: header.antialiased, ..Splat::default() };
     let bases = splat.bases();
     for (index, &[position, rotation, scale, colour]) in words.iter().enumerate() {
         let bounds = chunks[index / CHUNK];
@@ -170,16 +170,17 @@ pub(crate) fn write(path: &Path, splat: &Splat) -> Result<()> {
         (0..3).flat_map(move |channel| rest.iter().map(move |coefficients| pack_sh(coefficients[channel])))
     });
     let rest: Vec<u8> = rest.collect();
-    let header = header(splat.len(), splat.bases());
+    let header = header(splat);
     write_atomically(path, |writer| {
         let parts = [header.as_bytes(), &bounds, &words, &rest];
         parts.iter().try_for_each(|part| writer.write_all(part)).map_err(Error::write(path))
     })
 }
 
-fn header(count: usize, bases: usize) -> String {
-    let mut lines = vec!["ply".to_string(), "format binary_little_endian 1.0".into()];
-    lines.push(format!("element chunk {}", count.div_ceil(CHUNK)));
+fn header(splat: &Splat) -> String {
+    let (count, bases) = (splat.len(), splat.bases());
+    let mut lines =
+        vec![format!("{}element chunk {}", Header::first_lines(splat.antialiased), count.div_ceil(CHUNK))];
     lines.extend(BOUNDED.iter().flat_map(bound_names).map(|name| format!("property float {name}")));
     lines.push(format!("element vertex {count}"));
     lines.extend(WORDS.iter().map(|name| format!("property uint {name}")));

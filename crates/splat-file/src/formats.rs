@@ -101,6 +101,14 @@ pub fn check_writable_splat(path: &Path) -> Result<()> {
     check_writable_file(path)
 }
 
+/// Returns `true` if the format that the extension of `path` selects can say that a splat is antialiased.
+///
+/// # Errors
+/// Returns an error for an unknown extension.
+pub fn can_mark_antialiased(path: &Path) -> Result<bool> {
+    Ok(format_of(path)?.ending != ".splat")
+}
+
 /// Returns the limits of the spherical harmonics in the format that the extension of `path` selects.
 ///
 /// # Errors

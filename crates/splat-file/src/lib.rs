@@ -15,8 +15,8 @@ mod splat;
 mod spz;
 
 pub use formats::{
-    check_writable_splat, find_splat, is_splat_name, limits_of, read_splat, read_splat_without_invalid,
-    write_local_splat, write_splat,
+    can_mark_antialiased, check_writable_splat, find_splat, is_splat_name, limits_of, read_splat,
+    read_splat_without_invalid, write_local_splat, write_splat,
 };
 pub use globalsplat_files::{Error, Result};
 pub use limits::ShLimits;

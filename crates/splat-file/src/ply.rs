@@ -39,7 +39,7 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     }
     let rest = (0..).take_while(|k| has(&format!("f_rest_{k}"))).count();
     let sh_degree = degree_of_rest(path, rest)?;
-    let mut splat = Splat { sh_degree, ..Splat::default() };
+    let mut splat = Splat { sh_degree, antialiased: header.antialiased, ..Splat::default() };
     let bases = splat.bases();
     let mut names: Vec<String> = [owned(["x", "y", "z"]), sh_names(bases), shape_names()].concat();
     let colours = COLOURS.into_iter().find(|names| names.iter().all(|name| has(name)));
@@ -141,7 +141,7 @@ pub(crate) fn write(path: &Path, splat: &Splat) -> Result<()> {
         true => number,
         false => number.clamp(min, max),
     };
-    let header = header(splat.len(), splat.bases());
+    let header = header(splat);
     write_atomically(path, |writer| {
         writer.write_all(header.as_bytes()).map_err(Error::write(path))?;
         let mut row = vec![];
@@ -161,11 +161,12 @@ pub(crate) fn write(path: &Path, splat: &Splat) -> Result<()> {
     })
 }
 
-/// Returns the header that [`write`] writes before the values of `n` Gaussians with `bases` spherical harmonics.
-fn header(n: usize, bases: usize) -> String {
+/// Returns the header that [`write`] writes before the values of the Gaussians.
+fn header(splat: &Splat) -> String {
     let means_and_normals = owned(["x", "y", "z", "nx", "ny", "nz"]);
-    let names = [means_and_normals, sh_names(bases), shape_names()].concat();
-    let mut header = format!("ply\nformat binary_little_endian 1.0\nelement vertex {n}\n");
+    let names = [means_and_normals, sh_names(splat.bases()), shape_names()].concat();
+    let mut header = Header::first_lines(splat.antialiased);
+    header.push_str(&format!("element vertex {}\n", splat.len()));
     for name in &names {
         header.push_str(&format!("property float {name}\n"));
     }
@@ -192,5 +193,5 @@ pub(crate) fn size(splat: &Splat) -> u64 {
     /// Number of values of position, normal, opacity, scale and rotation.
     const NUMBERS: usize = 14;
     let (n, bases) = (splat.len(), splat.bases());
-    header(n, bases).len() as u64 + (n * (NUMBERS + 3 * bases) * 4) as u64
+    header(splat).len() as u64 + (n * (NUMBERS + 3 * bases) * 4) as u64
 }

@@ -91,7 +91,12 @@ pub struct Header {
     pub length: usize,
     pub encoding: Encoding,
     pub elements: Vec<Element>,
+    /// `true` if a comment says that the splat is antialiased.
+    pub antialiased: bool,
 }
+
+/// Comment of an antialiased splat, after the keyword, as Brush, gsplat and nerfstudio write it.
+const ANTIALIASED: [&str; 2] = ["SplatRenderMode:", "mip"];
 
 impl Header {
     /// Returns `true` if `bytes` begin like a PLY.
@@ -103,7 +108,7 @@ impl Header {
         if !Self::begins(bytes) {
             return Err(Error::input(path, "the file", "no PLY", "a PLY of a 3D Gaussian splat"));
         }
-        let (mut length, mut encoding) = (0, None);
+        let (mut length, mut encoding, mut antialiased) = (0, None, false);
         let mut elements: Vec<Element> = vec![];
         for line in bytes.split_inclusive(|&byte| byte == b'\n') {
             length += line.len();
@@ -119,7 +124,7 @@ impl Header {
                             "how numbers are written",
                         ));
                     };
-                    return Ok(Header { length, encoding, elements });
+                    return Ok(Header { length, encoding, elements, antialiased });
                 }
                 ["format", name, ..] => encoding = Some(parse_encoding(path, name)?),
                 ["element", name, count] => {
@@ -142,10 +147,21 @@ impl Header {
                     let kind = parse_kind(path, kind, name)?;
                     element.properties.push(Property { name: name.to_string(), kind });
                 }
-                _ => {} // comments
+                // Postshot writes `antialiased 1`.
+                ["comment", comment @ ..] => {
+                    antialiased |= comment == ANTIALIASED || comment == ["antialiased", "1"];
+                }
+                _ => {}
             }
         }
         Err(Error::input(path, "the header", "without its end", "a line end_header"))
+    }
+
+    /// Returns the lines at the beginning of a written header, up to the first element.
+    pub fn first_lines(antialiased: bool) -> String {
+        let comment =
+            if antialiased { format!("comment {}\n", ANTIALIASED.join(" ")) } else { String::new() };
+        format!("ply\nformat binary_little_endian 1.0\n{comment}")
     }
 
     pub fn element(&self, name: &str) -> Option<&Element> {

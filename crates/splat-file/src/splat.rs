@@ -35,6 +35,9 @@ pub struct Splat {
     pub sh: Vec<[f32; 3]>,
     /// Degree of the spherical harmonics, 0 to 3.
     pub sh_degree: usize,
+    /// `true` if the opacities are meant for an antialiased renderer: one whose low-pass filter adds ε to the diagonal of a projected
+    /// covariance Σ and multiplies the opacity by √(det Σ / det(Σ + ε)), like Mip-Splatting's and gsplat's mode `antialiased`.
+    pub antialiased: bool,
     /// Origin of the means in world coordinates: world = origin + mean.
     pub origin: DVec3,
     /// Messages about what was left out or changed when the splat was read or created, a sentence each. Splats derived from it have none.
@@ -65,6 +68,7 @@ impl Splat {
             opacity_logits,
             sh,
             sh_degree,
+            antialiased: false,
             origin: DVec3::ZERO,
             warnings: vec![],
         };
@@ -171,6 +175,7 @@ impl Splat {
             opacity_logits: indices.iter().map(|&index| self.opacity_logits[index]).collect(),
             sh: indices.iter().flat_map(|&index| self.sh_of(index)).copied().collect(),
             sh_degree: self.sh_degree,
+            antialiased: self.antialiased,
             origin: self.origin,
             warnings: self.warnings.clone(),
         }

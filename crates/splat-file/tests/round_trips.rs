@@ -126,6 +126,40 @@ fn plys_are_exact() {
 }
 
 /// A quantizing format doesn't change values that it has already rounded.
+/// Checks that every format except for .splat, which has no place for it, says whether a splat is antialiased.
+#[test]
+fn antialiased_splats_are_marked() {
+    let folder = tempfile::tempdir().unwrap();
+    for antialiased in [false, true] {
+        let splat = Splat { antialiased, ..random_splat(20, 1, 5) };
+        for name in ["a.ply", "a.compressed.ply", "a.spz"] {
+            let copy = read_splat(&written(folder.path(), name, &splat)).unwrap();
+            assert_eq!(copy.antialiased, antialiased, "{name}");
+            assert_eq!(copy.select(&[3]).antialiased, antialiased);
+        }
+        assert!(!read_splat(&written(folder.path(), "a.splat", &splat)).unwrap().antialiased);
+    }
+    let ply =
+        std::fs::read(written(folder.path(), "a.ply", &Splat { antialiased: true, ..random_splat(1, 0, 5) }))
+            .unwrap();
+    let text = String::from_utf8_lossy(&ply);
+    assert!(
+        text.starts_with("ply\nformat binary_little_endian 1.0\ncomment SplatRenderMode: mip\n"),
+        "{text}"
+    );
+    for (comment, expected) in
+        [("antialiased 1", true), ("SplatRenderMode: default", false), ("antialiased 0", false)]
+    {
+        let path = folder.path().join("other.ply");
+        let other = text.find("comment ").unwrap();
+        let mut bytes = ply[..other].to_vec();
+        bytes.extend(format!("comment {comment}\n").bytes());
+        bytes.extend(&ply[other + "comment SplatRenderMode: mip\n".len()..]);
+        std::fs::write(&path, bytes).unwrap();
+        assert_eq!(read_splat(&path).unwrap().antialiased, expected, "{comment}");
+    }
+}
+
 #[test]
 fn second_round_trips_change_nothing() {
     let folder = tempfile::tempdir().unwrap();

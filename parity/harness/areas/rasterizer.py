@@ -26,7 +26,7 @@ RASTERIZER_FLOAT32 = Tolerance(
 DOUBT = {np.float64: 1e-9, np.float32: 5e-4}
 
 
-def splat_draws(rng, module, dtype, family, tolerance):
+def splat_draws(rng, module, dtype, family, tolerance, antialiased=False):
     """Yields draws of a family of scenes.
 
     Float64 scenes are drawn again until they have no doubtful pixels. Float32 scenes have a mask of doubtful pixels,
@@ -36,7 +36,7 @@ def splat_draws(rng, module, dtype, family, tolerance):
     if module == "rasterizer":
         differentiate += ("opacities",)
     for label, (size, make) in family.items():
-        config = scenes.settings(size)
+        config = scenes.settings(size, antialiased)
         for _ in range(MOST_TRIES):
             inputs = {name: value.astype(dtype) for name, value in make(rng, size).items()}
             doubtful = doubtful_pixels(config, inputs, DOUBT[dtype]) if module == "rasterizer" else None
@@ -79,11 +79,11 @@ def projection_thin_float32(rng):
 
 @reference_for("projection")
 def projection_reference(config, params, inputs):
-    size = config["width"], config["height"], config["eps2d"]
+    settings = config["width"], config["height"], config["eps2d"], config["antialiased"]
 
     def project(means, scales, quaternions, opacities, sh, w2c, intrinsics):
-        seen = reference.splat.project(means, scales, quaternions, w2c, intrinsics, *size)
-        visible = seen["visible"] & (opacities >= reference.splat.SMALLEST_ALPHA)
+        seen = reference.splat.project(means, scales, quaternions, w2c, intrinsics, *settings)
+        visible = seen["visible"] & (opacities * seen["compensation"] >= reference.splat.SMALLEST_ALPHA)
         colour = reference.splat.sh_colour(means, sh, w2c)
         return {
             "visible": visible.long(),
@@ -122,11 +122,24 @@ def rasterizer_thin_float32(rng):
     yield from splat_draws(rng, "rasterizer", np.float32, scenes.THIN, RASTERIZER_FLOAT32)
 
 
+@case
+def rasterizer_antialiased(rng):
+    """Opacities reduced by the determinants of the projected covariances, which needles and discs have tiny ones of."""
+    family = scenes.RANDOM | scenes.ADVERSARIAL | scenes.THIN
+    yield from splat_draws(rng, "rasterizer", np.float64, family, FLOAT64, antialiased=True)
+
+
+@case
+def rasterizer_antialiased_float32(rng):
+    family = scenes.RANDOM | scenes.ADVERSARIAL
+    yield from splat_draws(rng, "rasterizer", np.float32, family, RASTERIZER_FLOAT32, antialiased=True)
+
+
 @reference_for("rasterizer")
 def rasterizer_reference(config, params, inputs):
     def render(*scene_and_camera):
         rgb, alpha, depth = reference.splat.render(
-            *scene_and_camera, config["width"], config["height"], config["eps2d"]
+            *scene_and_camera, config["width"], config["height"], config["eps2d"], config["antialiased"]
         )
         return {"rgb": rgb.movedim(-1, 0), "alpha": alpha, "depth": depth}
 

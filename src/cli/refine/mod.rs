@@ -101,6 +101,10 @@ pub struct Refine {
         require_equals = true
     )]
     correct_exposures: WhenToCorrect,
+    /// Optimize the splat for antialiased rendering, which looks right at smaller sizes and from afar, too. The file is marked, and
+    /// viewers have to support it: others show the splat slightly worse
+    #[arg(long)]
+    antialiased: bool,
     #[command(flatten)]
     reports: Reports,
     /// Override a setting of the method, as in views=4; docs/refine.md lists them
@@ -189,8 +193,10 @@ impl Refine {
     fn options(&self, holdout: Holdout) -> Result<RefineOptions> {
         let default = RefineOptions::default();
         let time = parse_time(self.seconds)?;
+        let mut config = RefineConfig::with(&self.set, self.splat.is_some())?;
+        config.antialiased |= self.antialiased;
         Ok(RefineOptions {
-            config: RefineConfig::with(&self.set, self.splat.is_some())?,
+            config,
             budget: self.steps.map_or(time, Budget::Steps),
             seed: self.seed,
             holdout,

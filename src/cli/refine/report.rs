@@ -2,8 +2,8 @@
 
 use super::super::print_json;
 use globalsplat::eval::CaptureScores;
-use globalsplat::refine::{Correction, RefineResult, RefineSession, SampleScores};
-use serde_json::{Value, json};
+use globalsplat::refine::{Correction, EvalPoint, RefineResult, RefineSession, SampleScores};
+use serde_json::json;
 use std::path::Path;
 
 /// Prints the result that was written to `out`, as one JSON object if `is_json`. Scores are those before and after the optimization.
@@ -32,9 +32,9 @@ pub fn print_result(
         });
         if let Some([before, after]) = held_out {
             let of = |scores_of: &CaptureScores, lpips| scores(scores_of.psnr, scores_of.ssim, lpips);
-            let last = json!({ "seconds": ended, "steps": steps, "psnr": after.psnr, "ssim": after.ssim });
-            let mut curve: Vec<Value> = result.curve.iter().map(|point| json!(point)).collect();
-            curve.push(last);
+            let scores = session.sample_scores(after);
+            let last = EvalPoint { seconds: *ended, steps: *steps, scores };
+            let curve: Vec<&EvalPoint> = result.curve.iter().chain([&last]).collect();
             object["held_out"] = json!({
                 "views": after.views.len(), "before": of(before, of_held_out[0]),
                 "after": of(after, of_held_out[1]), "curve": curve,

@@ -6,7 +6,7 @@ use base64::engine::general_purpose::STANDARD;
 use glam::DVec3;
 use globalsplat::data::{Capture, load_views};
 use globalsplat::io::{encode_photo, rgb_from_tensor};
-use globalsplat::render::{DEFAULT_EPS2D, SplatRenderer, orbit_around_gaussians};
+use globalsplat::render::{SplatRenderer, default_eps2d, orbit_around_gaussians};
 use globalsplat::scene::{Camera, Gaussians, ImageSize, LocalFrame, smooth_path};
 use serde::Serialize;
 
@@ -38,6 +38,8 @@ pub struct Contents {
     frustum: f64,
     /// Value added to the diagonal of a Gaussian's projected covariance, in square pixels (spec 6.2).
     blur: f64,
+    /// `true` if opacities are reduced by what the blur adds to the area of a Gaussian.
+    antialiased: bool,
 }
 
 #[derive(Serialize)]
@@ -95,7 +97,8 @@ impl Contents {
             up: up.try_normalize().unwrap_or(DVec3::NEG_Y).into(),
             distance,
             frustum: FRUSTUM * distance,
-            blur: DEFAULT_EPS2D,
+            blur: default_eps2d(gaussians),
+            antialiased: gaussians.antialiased,
         })
     }
 }

@@ -76,6 +76,7 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
             .collect(),
         sh,
         sh_degree: description.sh_degree,
+        antialiased: description.antialiased,
         ..Splat::default()
     };
     let mut invalid = InvalidGaussians::default();
@@ -167,7 +168,7 @@ fn write(path: &Path, splat: &Splat) -> Result<()> {
             .collect(),
         harmonics,
     };
-    let description = Description::written(splat.len(), splat.sh_degree, fractional_bits);
+    let description = Description::written(splat, fractional_bits);
     container::write(path, &description, &streams)
 }
 

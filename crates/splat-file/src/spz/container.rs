@@ -2,7 +2,7 @@
 
 use super::axes::Axes;
 use super::{MAGIC, recognizes};
-use crate::{Error, Result};
+use crate::{Error, Result, Splat};
 use flate2::Compression;
 use flate2::bufread::GzDecoder;
 use flate2::write::GzEncoder;
@@ -13,6 +13,8 @@ use std::path::Path;
 /// Size of the header in bytes, up to version 3 (`GZIP_HEADER`) and since version 4 (`PLAIN_HEADER`).
 const GZIP_HEADER: usize = 16;
 const PLAIN_HEADER: usize = 32;
+/// Flag that the splat is antialiased.
+const ANTIALIASED: u8 = 1;
 /// Flag that there are extensions: after the streams up to version 3, before them since version 4.
 const HAS_EXTENSIONS: u8 = 2;
 /// Type of the extension that names the axes.
@@ -45,12 +47,21 @@ pub struct Description {
     pub sh_degree: usize,
     /// Number of fractional bits of positions.
     pub fractional_bits: u32,
+    pub antialiased: bool,
     pub axes: Axes,
 }
 
 impl Description {
-    pub fn written(count: usize, sh_degree: usize, fractional_bits: u32) -> Self {
-        Description { version: WRITTEN_VERSION, count, sh_degree, fractional_bits, axes: Axes::RUB }
+    pub fn written(splat: &Splat, fractional_bits: u32) -> Self {
+        let Splat { sh_degree, antialiased, .. } = *splat;
+        Description {
+            version: WRITTEN_VERSION,
+            count: splat.len(),
+            sh_degree,
+            fractional_bits,
+            antialiased,
+            axes: Axes::RUB,
+        }
     }
 
     /// Parses the part of the header that all versions have in common.
@@ -70,8 +81,15 @@ impl Description {
         if fractional_bits > 30 {
             return Err(Error::input(path, "the number of fractional bits", fractional_bits, "0 to 30"));
         }
-        let (sh_degree, fractional_bits) = (sh_degree.into(), fractional_bits.into());
-        Ok((Description { version, count, sh_degree, fractional_bits, axes: Axes::RUB }, flags))
+        let description = Description {
+            version,
+            count,
+            sh_degree: sh_degree.into(),
+            fractional_bits: fractional_bits.into(),
+            antialiased: flags & ANTIALIASED != 0,
+            axes: Axes::RUB,
+        };
+        Ok((description, flags))
     }
 
     /// Returns the number of bytes per Gaussian in each stream.
@@ -232,7 +250,8 @@ pub fn write(path: &Path, description: &Description, streams: &Streams) -> Resul
     let mut header = MAGIC.to_vec();
     header.extend(description.version.to_le_bytes());
     header.extend((description.count as u32).to_le_bytes());
-    header.extend([description.sh_degree as u8, description.fractional_bits as u8, 0, 0]);
+    let flags = if description.antialiased { ANTIALIASED } else { 0 };
+    header.extend([description.sh_degree as u8, description.fractional_bits as u8, flags, 0]);
     let Streams { positions, opacities, colours, scales, rotations, harmonics } = streams;
     write_atomically(path, |writer| {
         let mut encoder = GzEncoder::new(writer, Compression::best());
