@@ -9,8 +9,8 @@ variant is a name and arguments of `refine`, as in `--variant large "--size 1008
 the defaults are measured. All splats are scored by `globalsplat eval` on the same pixels: the held-out views with the
 longer side --size, or their own if it is smaller. --peer scores the splats of another program alike:
 DIR/CAPTURE.SECONDS.SEED.ply, from the other views. Prints a Markdown table of mean PSNR, SSIM and LPIPS (VGG, if
-`make weights` was run) over the seeds, with the 95 % confidence interval of PSNR. Every result is kept in OUT and not
-repeated. Run nothing else meanwhile.
+`make weights` was run) over the seeds, with the 95 % confidence interval of PSNR, and writes the curves to
+OUT/curves.svg. Every result is kept in OUT and not repeated. Run nothing else meanwhile.
 """
 
 import argparse
@@ -20,6 +20,7 @@ import statistics
 from pathlib import Path
 
 from core_runs import row, told, told_once
+from line_plots import line_plots
 from refine_runs import refined
 
 # Quantiles of Student's t distribution for 95 % confidence, by the number of samples.
@@ -74,8 +75,10 @@ def main():
         parser.error("expected --capture or --synthetic")
     row("capture", "method", "time", "steps", "Gaussians", "PSNR, dB", "SSIM", "LPIPS")
     row(*["---"] * 8)
+    plots = {}
     for folder, *holdout in captures:
         holdout, capture_name = holdout[0] if holdout else "every:8", Path(folder).name.split("#")[-1]
+        curves = plots.setdefault(capture_name, {})
         for seconds in arguments.seconds:
             results = {name: [] for name, _ in [*variants, *arguments.peer]}
             for seed in range(arguments.seeds):
@@ -96,6 +99,9 @@ def main():
                     time, psnr = f"{seconds:g} s", with_interval(of("psnr"))
                     row(capture_name, name, time, mean(of("steps"), 0), mean(of("gaussians"), 0), psnr,
                         mean(of("ssim"), 3), mean(of("lpips_vgg"), 3))
+                    curves.setdefault(name, []).append((seconds, statistics.mean(of("psnr"))))
+    if len(arguments.seconds) > 1:
+        (arguments.out / "curves.svg").write_text(line_plots(plots, sorted(arguments.seconds), is_logarithmic=True))
 
 
 if __name__ == "__main__":
