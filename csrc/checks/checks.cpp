@@ -72,7 +72,8 @@ bool same(const std::vector<Item>& a, const std::vector<Item>& b) {
 template <class T>
 class Render {
  public:
-  Render(const Scene<T>& scene, int num_threads) : settings_{scene.width, scene.height, 0.05, num_threads}, views_(scene.views) {
+  Render(const Scene<T>& scene, int num_threads)
+      : settings_{scene.width, scene.height, 0.05, scene.antialiased, num_threads}, views_(scene.views) {
     // Unwritten outputs differ from those of a render with another number of threads.
     const T unwritten = T(num_threads);
     const size_t pixels = size_t(scene.width) * size_t(scene.height);

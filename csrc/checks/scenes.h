@@ -25,6 +25,7 @@ struct Scene {
   int width, height, bases;            // bases: spherical harmonics per channel
   std::vector<Arrays<T>> gaussians;    // one item per scene of the batch
   std::vector<raster::View<T>> views;
+  bool antialiased = false;
 };
 
 class Random {
@@ -212,6 +213,9 @@ inline std::vector<Scene<double>> all_scenes(int bases) {
 
   // A tile has more pairs than a GPU sorts in shared memory.
   add_scattered("a long list", 8, 8, 1, 1, 10000);
+
+  // Every scene is antialiased with two of the four numbers of bases.
+  for (size_t i = 0; i < scenes.size(); ++i) scenes[i].antialiased = (i + size_t(bases)) % 2 == 1;
   return scenes;
 }
 
@@ -225,7 +229,7 @@ inline Scene<double> many_gaussians(int bases) {
 template <class T>
 Scene<T> as(const Scene<double>& scene) {
   const auto numbers = [](const std::vector<double>& from) { return std::vector<T>(from.begin(), from.end()); };
-  Scene<T> out{scene.name, scene.width, scene.height, scene.bases, {}, {}};
+  Scene<T> out{scene.name, scene.width, scene.height, scene.bases, {}, {}, scene.antialiased};
   for (const Arrays<double>& g : scene.gaussians)
     out.gaussians.push_back({numbers(g.means), numbers(g.scales), numbers(g.quaternions), numbers(g.opacities), numbers(g.sh)});
   for (const raster::View<double>& view : scene.views) {

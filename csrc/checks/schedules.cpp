@@ -71,7 +71,8 @@ RenderResult render_emulated(const Scene<float>& scene, uint64_t seed) {
   const cuda::Arguments arguments{{means.data(), scales.data(), quaternions.data(), opacities.data(), sh.data(),
                                    int64_t(count_of(scene)), scene.bases},
                                   w2c.data(), intrinsics.data(), scenes,
-                                  scenes == 0 ? 0 : int64_t(scene.views.size()) / scenes, scene.width, scene.height, 0.05};
+                                  scenes == 0 ? 0 : int64_t(scene.views.size()) / scenes, scene.width, scene.height, 0.05,
+                                  scene.antialiased};
   RenderResult result = nan_filled(scene);
   const cuda::emulated::Emulator device(seed);
   const cuda::Frame frame(device, arguments, {result.rgb.data(), result.alpha.data(), result.depth.data()});
@@ -107,7 +108,8 @@ RenderResult render_on_cpu(const Scene<float>& scene) {
   }
   raster::StageTimes times;
   std::vector<raster::CameraGradient<float>> cameras(views);
-  const auto frame = raster::Frame<float>::draw(gaussians, scene.views, {scene.width, scene.height, 0.05, 2}, outputs, times);
+  const raster::Settings settings{scene.width, scene.height, 0.05, scene.antialiased, 2};
+  const auto frame = raster::Frame<float>::draw(gaussians, scene.views, settings, outputs, times);
   frame->backward(gaussians, pictures, gradients, out, cameras.data(), times);
   for (size_t k = 0; k < views; ++k)
     for (int number = 0; number < 16; ++number) {

@@ -8,7 +8,7 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use globalsplat::data::{load_views, open_capture};
 use globalsplat::eval::psnr;
-use globalsplat::io::{depth_colours, read_image, read_splat, tensor_from_rgb};
+use globalsplat::io::{Splat, depth_colours, read_image, read_splat, tensor_from_rgb, write_splat};
 use globalsplat::render::render_views;
 use globalsplat::scene::{Gaussians, ImageSize};
 use serde_json::{Value, json};
@@ -136,6 +136,27 @@ fn from_depth_colours(picture: &Tensor) -> f64 {
     let pixels = picture.flatten(1, 2).transpose(0, 1).contiguous();
     let distances = Tensor::cdist(&pixels, &Tensor::from_slice2(&depth_colours()), 2., None::<i64>);
     distances.amin([1i64].as_slice(), false).mean(Kind::Double).double_value(&[])
+}
+
+/// The page shows an antialiased splat of small Gaussians as our rasterizer does.
+#[test]
+fn an_antialiased_splat_is_shown_as_one() {
+    let Some(capture) = captures().map(|mut captures| captures.swap_remove(0)) else { return };
+    if !has_viewer() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let [marked, plain, page] = ["marked.ply", "plain.ply", "page.html"].map(|name| folder.path().join(name));
+    let mut splat = read_splat(&capture.join("reference.ply")).unwrap();
+    splat.log_scales.as_flattened_mut().iter_mut().for_each(|log_scale| *log_scale -= 2.);
+    write_splat(&plain, &splat).unwrap();
+    write_splat(&marked, &Splat { antialiased: true, ..splat }).unwrap();
+    succeed(&["render", "--splat", arg(&marked), "--scene", arg(&capture), "--html", arg(&page)]);
+    let Some(mut shown) = Shown::open(&page) else { return };
+    let picture = shown.picture();
+    let [own, other] = [&marked, &plain].map(|splat| psnr(&picture, &expected(&capture, splat, 0).0));
+    println!("an antialiased splat: {own:.2} dB, as another one: {other:.2} dB");
+    assert!(own >= LEAST && own > other + 3., "{own:.2} dB, as another one {other:.2} dB");
 }
 
 #[test]
