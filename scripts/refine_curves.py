@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Plots the PSNR of held-out views over time in `globalsplat refine`, from photos alone and from the shipped weights.
+"""Plots the PSNR of held-out views over time in `globalsplat refine`, from photos alone and from the bundled weights.
 
     .venv/bin/python scripts/refine_curves.py --capture DIR HOLDOUT [VIEWS] [--capture …] [--out OUT] [--seconds 60]
 
@@ -14,7 +14,7 @@ from core_runs import row
 from line_plots import line_plots
 from refine_runs import SMALL, refined
 
-STARTS = {"nothing": "photos alone", "weights": "the shipped weights"}
+STARTS = {"nothing": "photos alone", "weights": "bundled weights"}
 SECONDS = [2, 3, 5, 10, 20, 30, 60]
 
 

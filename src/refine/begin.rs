@@ -16,8 +16,9 @@ use tch::{Device, Kind, Tensor};
 const EXTENT: f64 = 0.5;
 /// Initial logit of the opacity.
 const LOGIT: f32 = -1.;
-/// Divisor that limits the Gaussians at points: at most 1/`POINTS_SHARE` of all. Points are exact, but lie mostly at corners.
-const POINTS_SHARE: usize = 2;
+/// Divisor of the minimum number of Gaussians at depths instead of points: 1/`DEPTHS_SHARE` of all. Points are exact, but there are none on
+/// plain surfaces.
+const DEPTHS_SHARE: usize = 10;
 /// Maximum relative distance of a Gaussian from the depth that the photos agree on.
 const NEAR: f64 = 0.1;
 
@@ -131,7 +132,7 @@ fn sample_gaussians(depth_maps: &[DepthMap], points: &[Point], count: usize, see
         shares.push(shares[shares.len() - 1] + counted / all);
     }
     let spacing = (pixels / count.max(1) as f64).sqrt(); // in pixels of the downscaled images
-    let chosen = sample(&mut random, points.len(), points.len().min(count / POINTS_SHARE));
+    let chosen = sample(&mut random, points.len(), points.len().min(count - count / DEPTHS_SHARE));
     let mut balls: Vec<IsotropicGaussian> =
         chosen.iter().map(|i| at_point(points[i], depth_maps, spacing)).collect();
     let left = count - balls.len();

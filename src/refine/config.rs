@@ -15,10 +15,11 @@ pub struct RefineConfig {
     pub resolution_schedule: Option<Vec<f64>>,
     /// `true` to optimize a splat for antialiased rendering, see [`Splat::antialiased`](globalsplat_splat_file::Splat::antialiased).
     pub antialiased: bool,
-    /// Final degree of the spherical harmonics.
-    pub sh_degree: i64,
-    /// Interval between increases of the degree of the spherical harmonics by one, as a fraction of the optimization.
-    pub sh_every: f64,
+    /// Final degree of the spherical harmonics. By default it is 2 for more than 100,000 Gaussians and else 1.
+    pub sh_degree: Option<i64>,
+    /// Interval between increases of the degree of the spherical harmonics by one, as a fraction of the optimization. By default it is 0.3
+    /// up to degree 1, and 0.2 up to higher degrees.
+    pub sh_every: Option<f64>,
     /// Initial learning rate of the means, in scene depths, for up to 16,384 Gaussians. For N it is multiplied by (16,384 / N)^0.75.
     pub means: f64,
     /// Final learning rate of the means, relative to the initial one. The decay is exponential.
@@ -71,8 +72,8 @@ impl Default for RefineConfig {
             views: 1,
             resolution_schedule: None,
             antialiased: false,
-            sh_degree: 1,
-            sh_every: 0.3,
+            sh_degree: None,
+            sh_every: None,
             means: 2e-3,
             means_end: 0.02,
             log_scales: 2e-2,
@@ -120,6 +121,9 @@ const POSES_SIDE: f64 = 256.;
 
 /// Minimum longer side of photos, in pixels, that show enough detail for most of the steps.
 const DETAILED_SIDE: u32 = 240;
+
+/// Number of Gaussians above which spherical harmonics have degree 2 by default.
+const MANY_GAUSSIANS: i64 = 100_000;
 
 /// Maximum number of photo sizes besides the full size.
 const MAX_SIZES: usize = 8;
@@ -174,8 +178,8 @@ impl RefineConfig {
             (schedule.len() <= MAX_SIZES, "8 sizes or fewer"),
             (schedule.iter().all(is_inner_fraction), "numbers above 0 and below 1"),
             (schedule.is_sorted_by(|a, b| a < b), "numbers that increase"),
-            ((0..=3).contains(&self.sh_degree), "0 to 3"),
-            (0. < self.sh_every && self.sh_every.is_finite(), "a finite number above 0"),
+            (self.sh_degree.is_none_or(|degree| (0..=3).contains(&degree)), "0 to 3"),
+            (self.sh_every.is_none_or(|every| 0. < every && every.is_finite()), "a finite number above 0"),
             (rates.iter().all(|rate| (0. ..=10.).contains(rate)), "0 to 10"),
             (
                 [self.means_end, self.lr_final_factor].iter().all(|&end| 0. < end && end <= 1.),
@@ -194,7 +198,22 @@ impl RefineConfig {
 
     /// Returns the defaults for a start from a splat, which needs no small images and no opacity penalty.
     pub fn from_splat() -> Self {
-        RefineConfig { resolution_schedule: Some(vec![]), opacity: 0., ..Default::default() }
+        RefineConfig {
+            resolution_schedule: Some(vec![]),
+            sh_degree: Some(1),
+            opacity: 0.,
+            ..Default::default()
+        }
+    }
+
+    /// Returns the final degree of the spherical harmonics of `count` Gaussians.
+    pub(super) fn sh_degree_for(&self, count: i64) -> i64 {
+        self.sh_degree.unwrap_or(if count > MANY_GAUSSIANS { 2 } else { 1 })
+    }
+
+    /// Returns the interval between increases of the degree up to `degree`, as a fraction of the optimization.
+    pub(super) fn sh_every_for(&self, degree: i64) -> f64 {
+        self.sh_every.unwrap_or(if degree > 1 { 0.2 } else { 0.3 })
     }
 
     /// Returns the learning rate of poses for photos of `longest_side` pixels.
@@ -223,6 +242,18 @@ impl RefineConfig {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn many_gaussians_have_spherical_harmonics_of_degree_2() {
+        let plan = |overrides: &[String], from_splat: bool, count: i64| {
+            let config = RefineConfig::with(overrides, from_splat).unwrap();
+            let degree = config.sh_degree_for(count);
+            (degree, config.sh_every_for(degree))
+        };
+        assert_eq!([100_000, 100_001].map(|count| plan(&[], false, count)), [(1, 0.3), (2, 0.2)]);
+        assert_eq!(plan(&[], true, 1_000_000), (1, 0.3));
+        assert_eq!(plan(&["sh_degree=3".into(), "sh_every=0.1".into()], false, 10), (3, 0.1));
+    }
 
     #[test]
     fn invalid_overrides_are_refused() {

@@ -38,7 +38,8 @@ impl GaussianOptimizer {
     /// lengths.
     pub fn new(raw: &RawGaussians, depth: f64, config: &RefineConfig, count: i64) -> Self {
         let first = raw.sh.size()[2].isqrt() - 1;
-        let degrees = [first, first.max(config.sh_degree)];
+        let last_count = count.max(raw.means.size()[1]);
+        let degrees = [first, first.max(config.sh_degree_for(last_count))];
         let leaves = GaussianParams::from_raw(raw, degrees[1]);
         let growth = Growth { first_count: leaves.count(), degrees, degree: first, averaged_steps: 0 };
         GaussianOptimizer::from_params(leaves, depth, config, growth, count)
@@ -128,7 +129,7 @@ impl GaussianOptimizer {
     /// Returns the degree of the spherical harmonics, at least the one that an earlier step used.
     fn degree_at(&self, progress: f64) -> i64 {
         let [first, last] = self.growth.degrees;
-        (first + (progress / self.config.sh_every) as i64).min(last).max(self.growth.degree)
+        (first + (progress / self.config.sh_every_for(last)) as i64).min(last).max(self.growth.degree)
     }
 
     /// Returns the number of Gaussians that there should be, which grows exponentially.

@@ -43,6 +43,8 @@ impl MaskBackground {
 
 /// Number of Gaussians that one core can optimize in one second of a time budget.
 const GAUSSIANS_PER_CORE_SECOND: f64 = 400.;
+/// Time in seconds after which more time is for more steps, not for more Gaussians, which match the photos better but not other views.
+const MAX_SECONDS_OF_GROWTH: f64 = 240.;
 /// Minimum number of pixels, in all photos together, for each Gaussian.
 const PIXELS_PER_GAUSSIAN: u64 = 24;
 /// Number of Gaussians of the paper's main model, the minimum of [`RefineOptions::gaussians_for`].
@@ -119,7 +121,7 @@ impl RefineOptions {
     pub fn gaussians_for(&self, capture: &Capture) -> usize {
         let Budget::Time(time) = self.budget else { return MIN_GAUSSIANS };
         let cores = std::thread::available_parallelism().map_or(1., |cores| cores.get() as f64);
-        let by_time = GAUSSIANS_PER_CORE_SECOND * cores * time.as_secs_f64();
+        let by_time = GAUSSIANS_PER_CORE_SECOND * cores * time.as_secs_f64().min(MAX_SECONDS_OF_GROWTH);
         let (cameras, (shown, _)) = (capture.cameras(), capture.split(self.holdout));
         let pixels = |&index: &usize| {
             let ImageSize { height, width } = PhotoSize::Within(LARGEST_SIDE).of(&cameras[index]);
@@ -275,7 +277,11 @@ mod tests {
         let minute = of(time(60), &large);
         assert!((16_384..=1_000_000).contains(&minute));
         assert!(of(time(120), &large) == (2 * minute).min(1_000_000) || minute == 16_384, "{minute}");
-        assert_eq!([of(time(1), &large), of(time(100_000), &large)], [16_384, 1_000_000]);
+        assert_eq!(of(time(1), &large), 16_384);
+        // After four minutes more time is for more steps.
+        let most = of(time(240), &large);
+        assert!(most == (4 * minute).min(1_000_000) || minute == 16_384, "{minute} {most}");
+        assert_eq!(of(time(100_000), &large), most);
         // A Gaussian for 24 pixels.
         assert_eq!(of(time(100_000), &small), 256 * 256 * 9 / 24);
         assert_eq!(of(Budget::Steps(100_000), &large), 16_384);
