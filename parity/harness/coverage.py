@@ -36,6 +36,8 @@ CASES_OF = {
         "projection_thin_float32",
         "rasterizer",
         "rasterizer_adversarial",
+        "rasterizer_antialiased",
+        "rasterizer_antialiased_float32",
         "rasterizer_float32",
         "rasterizer_adversarial_float32",
         "rasterizer_thin_float32",
