@@ -5,7 +5,7 @@ use crate::device::{Stopwatch, peak_memory_bytes_on, reset_peak_memory, resident
 use crate::error::Result;
 use crate::render::cpu::{StageTimes, count_pairs, multiply_add_peak, simd_level, stage_times};
 use crate::render::cuda::{kernel_times, measure_kernels};
-use crate::render::{Cameras, DEFAULT_EPS2D, RenderOutput, render};
+use crate::render::{Cameras, RenderOutput, default_eps2d, render};
 use crate::scene::{Gaussians, ImageSize};
 use glam::{DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
@@ -130,9 +130,10 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
     // The first round warms up caches and threads.
     for round in 0..=repeats {
         let mut watch = Stopwatch::new(device);
-        watch.time("forward", || no_grad(|| render(gaussians, cameras, DEFAULT_EPS2D)))?;
+        watch.time("forward", || no_grad(|| render(gaussians, cameras, default_eps2d(gaussians))))?;
         let parameters = gaussians.map(|t| t.detach().set_requires_grad(true));
-        let output = watch.time("with gradients", || render(&parameters, cameras, DEFAULT_EPS2D))?;
+        let output =
+            watch.time("with gradients", || render(&parameters, cameras, default_eps2d(&parameters)))?;
         let objective = sum_of_images(&output);
         watch.time("with gradients", || objective.backward());
         if round > 0 {
@@ -144,7 +145,7 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
         }
     }
     let working_bytes = peak_memory_bytes_on(device).saturating_sub(memory_before);
-    let counts = count_pairs(gaussians, cameras, DEFAULT_EPS2D)?;
+    let counts = count_pairs(gaussians, cameras, default_eps2d(gaussians))?;
     let pairs = Pairs {
         tile_entries: counts.tile_entries as f64 / views as f64,
         evaluated: counts.evaluated as f64 / views as f64,
@@ -222,7 +223,7 @@ fn compare_with_cpu(gaussians: &Gaussians, cameras: &Cameras) -> Result<Vec<Tens
 /// Renders the images, and computes the gradients of the sum of all images.
 fn render_with_gradients(gaussians: &Gaussians, cameras: &Cameras) -> Result<Vec<(&'static str, Tensor)>> {
     let parameters = gaussians.map(|t| t.detach().set_requires_grad(true));
-    let output = render(&parameters, cameras, DEFAULT_EPS2D)?;
+    let output = render(&parameters, cameras, default_eps2d(&parameters))?;
     sum_of_images(&output).backward();
     let RenderOutput { rgb, alpha, depth } = output;
     Ok(vec![
