@@ -122,6 +122,12 @@ fn distance(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
 }
 
+/// Returns the first real capture; `None` if there is none, or if the viewer isn't built.
+fn capture() -> Option<PathBuf> {
+    let capture = captures()?.swap_remove(0);
+    has_viewer().then_some(capture)
+}
+
 /// Returns our own render from a capture's camera, and the photo, as large as the page.
 fn expected(capture: &Path, splat: &Path, index: usize) -> (Tensor, Tensor) {
     let size = ImageSize { width: SIDE, height: SIDE };
@@ -141,10 +147,7 @@ fn from_depth_colours(picture: &Tensor) -> f64 {
 /// The page shows an antialiased splat of small Gaussians as our rasterizer does.
 #[test]
 fn an_antialiased_splat_is_shown_as_one() {
-    let Some(capture) = captures().map(|mut captures| captures.swap_remove(0)) else { return };
-    if !has_viewer() {
-        return;
-    }
+    let Some(capture) = capture() else { return };
     let folder = tempfile::tempdir().unwrap();
     let [marked, plain, page] = ["marked.ply", "plain.ply", "page.html"].map(|name| folder.path().join(name));
     let mut splat = read_splat(&capture.join("reference.ply")).unwrap();
@@ -161,10 +164,7 @@ fn an_antialiased_splat_is_shown_as_one() {
 
 #[test]
 fn a_page_shows_the_scene_and_can_be_walked_in() {
-    let Some(capture) = captures().map(|mut captures| captures.swap_remove(0)) else { return };
-    if !has_viewer() {
-        return;
-    }
+    let Some(capture) = capture() else { return };
     let folder = tempfile::tempdir().unwrap();
     let page = folder.path().join("page.html");
     let splat = capture.join("reference.ply");
