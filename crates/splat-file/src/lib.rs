@@ -11,8 +11,10 @@ mod ply;
 mod ply_body;
 mod ply_header;
 mod rotations;
+mod sh;
 mod splat;
 mod spz;
+mod transform;
 
 pub use formats::{
     can_mark_antialiased, check_writable_splat, find_splat, is_splat_name, limits_of, read_splat,
@@ -21,4 +23,5 @@ pub use formats::{
 pub use globalsplat_files::{Error, Result};
 pub use limits::ShLimits;
 pub use origin::{check_writable_origin, origin_file, splat_files};
+pub use sh::ShRotation;
 pub use splat::{MIN_SCALE, OPACITY_MARGIN, SH_C0, Splat};

@@ -1,0 +1,127 @@
+//! Moves splats: rotation, uniform scale and translation, spherical harmonics included.
+
+use crate::sh::ShRotation;
+use crate::{Error, Result, Splat};
+use glam::{DMat3, DMat4, DQuat, DVec3};
+
+/// Maximum difference between a matrix and the nearest similarity, relative to its scale. Numbers in files have about six digits.
+const TOLERANCE: f64 = 1e-4;
+
+/// A similarity transform: x ↦ scale · rotation · x + translation.
+struct Similarity {
+    scale: f64,
+    rotation: DMat3,
+    translation: DVec3,
+}
+
+impl Similarity {
+    /// Decomposes a matrix.
+    ///
+    /// # Errors
+    /// Returns an error if the matrix isn't finite, or does more than rotate, scale uniformly and translate.
+    fn from_matrix(matrix: &DMat4) -> Result<Self> {
+        let linear = DMat3::from_mat4(*matrix);
+        let scale = linear.determinant().cbrt();
+        let is_affine = matrix.row(3).abs_diff_eq(DMat4::IDENTITY.row(3), TOLERANCE);
+        if !(matrix.is_finite() && is_affine && scale > 0. && (linear * scale.recip()).is_finite()) {
+            let found = format!("{:?}", matrix.transpose().to_cols_array());
+            return Err(Error::setting("the matrix", found, "a rotation, a scale above 0 and a translation"));
+        }
+        let rotation = linear * scale.recip();
+        if !(rotation.transpose() * rotation).abs_diff_eq(DMat3::IDENTITY, TOLERANCE) {
+            let lengths =
+                [rotation.x_axis, rotation.y_axis, rotation.z_axis].map(|axis| axis.length() * scale);
+            let found = format!("one whose axes have the lengths {lengths:.6?} or aren't perpendicular");
+            return Err(Error::setting(
+                "the matrix",
+                found,
+                "a rotation, the same scale along all axes and a translation",
+            ));
+        }
+        // Removes the rounding errors of the matrix.
+        let rotation = DMat3::from_quat(DQuat::from_mat3(&rotation).normalize());
+        Ok(Similarity { scale, rotation, translation: matrix.w_axis.truncate() })
+    }
+
+    fn apply(&self, point: DVec3) -> DVec3 {
+        self.scale * (self.rotation * point) + self.translation
+    }
+}
+
+impl Splat {
+    /// Returns the splat with every point x moved to `matrix` · x. The colours of the moved splat, seen from a camera that is moved along,
+    /// are the same. The origin is moved, too, unless it is zero.
+    ///
+    /// ```
+    /// use glam::{DMat4, DVec3};
+    /// use globalsplat_splat_file::Splat;
+    ///
+    /// let ball = Splat::new(0, vec![[1., 0., 0.]], vec![[0.; 3]], vec![[1., 0., 0., 0.]], vec![0.], vec![[0.; 3]])?;
+    /// let quarter_turn = DMat4::from_rotation_z(std::f64::consts::FRAC_PI_2);
+    /// let turned = ball.transformed(&quarter_turn)?;
+    /// assert!((turned.means[0][1] - 1.).abs() < 1e-6);
+    /// # Ok::<(), globalsplat_splat_file::Error>(())
+    /// ```
+    ///
+    /// # Errors
+    /// Returns an error if the matrix isn't finite, or does more than rotate, scale uniformly and translate.
+    pub fn transformed(&self, matrix: &DMat4) -> Result<Self> {
+        let to = Similarity::from_matrix(matrix)?;
+        let has_origin = self.origin != DVec3::ZERO;
+        let move_mean = |mean: &[f32; 3]| -> [f32; 3] {
+            let mean = DVec3::from_array(mean.map(f64::from));
+            let moved = if has_origin { to.scale * (to.rotation * mean) } else { to.apply(mean) };
+            moved.to_array().map(|coordinate| coordinate as f32)
+        };
+        let turn = DQuat::from_mat3(&to.rotation);
+        let turn_quaternion = |&[w, x, y, z]: &[f32; 4]| -> [f32; 4] {
+            let [x, y, z, w] = [x, y, z, w].map(f64::from);
+            let turned = turn * DQuat::from_xyzw(x, y, z, w);
+            [turned.w, turned.x, turned.y, turned.z].map(|part| part as f32)
+        };
+        let mut splat = Splat { warnings: vec![], ..self.clone() };
+        splat.means = self.means.iter().map(move_mean).collect();
+        if to.scale != 1. {
+            let log_scale = to.scale.ln();
+            for value in splat.log_scales.as_flattened_mut() {
+                *value = (f64::from(*value) + log_scale) as f32;
+            }
+            for value in splat.linear_scales.iter_mut().flatten().flatten() {
+                *value = (f64::from(*value) * to.scale) as f32;
+            }
+        }
+        if to.rotation != DMat3::IDENTITY {
+            splat.quaternions = self.quaternions.iter().map(turn_quaternion).collect();
+            let bases = splat.bases();
+            ShRotation::new(&to.rotation).apply(splat.sh.chunks_exact_mut(bases));
+        }
+        if has_origin {
+            splat.origin = to.apply(self.origin);
+        }
+        Ok(splat)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_similarities_are_accepted() {
+        let rotation = DQuat::from_euler(glam::EulerRot::XYZ, 0.3, -1., 2.);
+        let matrix =
+            DMat4::from_scale_rotation_translation(DVec3::splat(2.5), rotation, DVec3::new(1., 2., 3.));
+        let to = Similarity::from_matrix(&matrix).unwrap();
+        assert!((to.scale - 2.5).abs() < 1e-12 && to.translation == DVec3::new(1., 2., 3.));
+        assert!(to.rotation.abs_diff_eq(DMat3::from_quat(rotation), 1e-12));
+        for refused in [
+            DMat4::from_scale(DVec3::new(1., 1., 2.)),
+            DMat4::from_scale(DVec3::new(1., 1., -1.)),
+            DMat4::ZERO,
+            DMat4::NAN,
+            DMat4::from_cols_array(&std::array::from_fn(|k| if k % 5 == 0 || k == 3 { 1. } else { 0. })),
+        ] {
+            assert!(Similarity::from_matrix(&refused).is_err(), "{refused}");
+        }
+    }
+}
