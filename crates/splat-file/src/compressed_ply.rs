@@ -1,7 +1,7 @@
 //! PlayCanvas' compressed PLY (spec 10.12). Each Gaussian has four words of 32 bits, and a byte for each SH coefficient above degree 0.
 //! Positions, scales and colours are quantized between the bounds of a chunk of 256 Gaussians.
 
-use crate::formats::Contents;
+use crate::formats::{Contents, WriteOptions};
 use crate::invalid::InvalidGaussians;
 use crate::morton::morton_order;
 use crate::ply::degree_of_rest;
@@ -136,7 +136,7 @@ pub(crate) fn limits() -> ShLimits {
 ///
 /// # Errors
 /// Returns an error if the file can't be written.
-pub(crate) fn write(path: &Path, splat: &Splat) -> Result<()> {
+pub(crate) fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
     let order = morton_order(&splat.means);
     let (mut bounds, mut words) = (vec![], vec![]);
     for chunk in order.chunks(CHUNK) {

@@ -1,6 +1,6 @@
 //! antimatter15's `.splat` format: 32 bytes per Gaussian and nothing else (spec 10.14).
 
-use crate::formats::{Contents, is_recognized};
+use crate::formats::{Contents, WriteOptions, is_recognized};
 use crate::invalid::InvalidGaussians;
 use crate::rotations::normalized;
 use crate::splat::{log_of_scale, logit_of_opacity};
@@ -58,7 +58,7 @@ pub(crate) fn limits() -> ShLimits {
 ///
 /// # Errors
 /// Returns an error if there is no Gaussian, or the file can't be written.
-pub(crate) fn write(path: &Path, splat: &Splat) -> Result<()> {
+pub(crate) fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
     if splat.is_empty() {
         return Err(Error::failed(format!(
             "{}: a .splat holds one Gaussian at least, found 0",

@@ -9,6 +9,19 @@ use glam::DVec3;
 use globalsplat_files::check_writable_file;
 use std::path::{Path, PathBuf};
 
+/// Choices within a format.
+#[derive(Debug, Clone)]
+pub struct WriteOptions {
+    /// Version of SPZ, 2 to 4. Programs from before 2026 read versions up to 3.
+    pub spz_version: u32,
+}
+
+impl Default for WriteOptions {
+    fn default() -> Self {
+        WriteOptions { spz_version: 4 }
+    }
+}
+
 /// Contents of a file as a format's reader returns them, before its Gaussians are checked.
 pub(crate) struct Contents {
     pub splat: Splat,
@@ -18,7 +31,7 @@ pub(crate) struct Contents {
 /// Functions of a format.
 pub(crate) struct Codec {
     pub read: fn(&Path, &[u8]) -> Result<Contents>,
-    pub write: fn(&Path, &Splat) -> Result<()>,
+    pub write: fn(&Path, &Splat, &WriteOptions) -> Result<()>,
     pub limits: fn() -> ShLimits,
 }
 
@@ -196,11 +209,19 @@ pub fn write_splat(path: &Path, splat: &Splat) -> Result<()> {
 /// # Errors
 /// Returns the errors of [`write_splat`].
 pub fn write_local_splat(path: &Path, splat: &Splat) -> Result<()> {
+    write_local_splat_with(path, splat, &WriteOptions::default())
+}
+
+/// Writes a splat like [`write_local_splat`], with `options`.
+///
+/// # Errors
+/// Returns the errors of [`write_splat`], or an error if the format doesn't allow the options.
+pub fn write_local_splat_with(path: &Path, splat: &Splat, options: &WriteOptions) -> Result<()> {
     let codec = format_of(path)?.codec(path)?;
     splat.check_lengths()?;
     let (rotated, _) = drop_missing_rotations(splat);
     write_with_origin(path, splat.origin, || {
         rotated.check_finite(path)?;
-        (codec.write)(path, &rotated)
+        (codec.write)(path, &rotated, options)
     })
 }

@@ -3,7 +3,7 @@
 //! A vertex has x y z, nx ny nz (zeros), f_dc_0..2, f_rest_*, opacity (a logit), scale_0..2 (logs), rot_0..3 (w, x, y, z). f_rest is
 //! channel-major: all reds, all greens, all blues. Files are written as float32, binary, little-endian.
 
-use crate::formats::Contents;
+use crate::formats::{Contents, WriteOptions};
 use crate::invalid::InvalidGaussians;
 use crate::ply_body::columns;
 use crate::ply_header::{Header, Scalar};
@@ -135,7 +135,7 @@ pub(crate) fn limits() -> ShLimits {
 ///
 /// # Errors
 /// Returns an error if the file can't be written.
-pub(crate) fn write(path: &Path, splat: &Splat) -> Result<()> {
+pub(crate) fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
     let max_logit = ((1. - OPACITY_MARGIN) / OPACITY_MARGIN).ln() as f32;
     let finite = |number: f32, min: f32, max: f32| match number.is_finite() {
         true => number,

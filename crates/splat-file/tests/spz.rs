@@ -4,8 +4,18 @@
 mod common;
 
 use common::{assert_says, largest_error, random_splat, refused, refused_file, written};
-use globalsplat_splat_file::{Splat, read_splat, read_splat_without_invalid, write_splat};
+use globalsplat_splat_file::{
+    Splat, WriteOptions, read_splat, read_splat_without_invalid, write_local_splat_with, write_splat,
+};
 use std::io::{Read, Write};
+use std::path::{Path, PathBuf};
+
+/// Writes `splat` as an SPZ of a version and returns its path.
+fn written_version(folder: &Path, spz_version: u32, splat: &Splat) -> PathBuf {
+    let path = folder.join(format!("{spz_version}.spz"));
+    write_local_splat_with(&path, splat, &WriteOptions { spz_version }).unwrap();
+    path
+}
 
 /// An SPZ file has the values of the first Gaussian at the offsets of SPZ's documentation.
 #[test]
@@ -20,9 +30,8 @@ fn an_spz_is_as_documented() {
         vec![[0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]],
     )
     .unwrap();
-    let bytes = std::fs::read(written(folder.path(), "one.spz", &splat)).unwrap();
-    let mut unfolded = vec![];
-    flate2::bufread::GzDecoder::new(&bytes[..]).read_to_end(&mut unfolded).unwrap();
+    let bytes = std::fs::read(written_version(folder.path(), 3, &splat)).unwrap();
+    let unfolded = ungzip(&bytes);
     assert_eq!(unfolded[..4], *b"NGSP");
     assert_eq!(unfolded[4..16], [3, 0, 0, 0, 1, 0, 0, 0, 1, 21, 0, 0], "version, Gaussians, degree, bits");
     // Niantic's library gives these bytes for these values, except for positions, which it stores with 12 fractional bits, and
@@ -32,6 +41,54 @@ fn an_spz_is_as_documented() {
     assert_eq!(unfolded[36..], hex("73665a4d4033dae6f3"));
     let fixed = |at: usize| i32::from_le_bytes([0, unfolded[at], unfolded[at + 1], unfolded[at + 2]]) >> 8;
     assert_eq!([16, 19, 22].map(fixed), [1 << 21, -(2 << 21), -(3 << 21)]);
+    // Version 2 differs in its rotations, a byte for each of x, y and z.
+    let older = ungzip(&std::fs::read(written_version(folder.path(), 2, &splat)).unwrap());
+    assert_eq!(older[4], 2);
+    assert_eq!(older[5..32], unfolded[5..32]);
+    assert_eq!(older[32..35], hex("8d6558"));
+    assert_eq!(older[35..], unfolded[36..]);
+    // Version 4 has the same streams, each by itself in Zstandard, after a header of 32 bytes and a table of contents.
+    let newest = std::fs::read(written(folder.path(), "one.spz", &splat)).unwrap();
+    assert_eq!(newest[..16], [&unfolded[..4], &[4, 0, 0, 0], &unfolded[8..15], &[6]].concat());
+    assert_eq!(newest[16..32], [&[32u8][..], &[0; 15]].concat());
+    let word = |at: usize| u64::from_le_bytes(newest[at..at + 8].try_into().unwrap()) as usize;
+    let mut at = 32 + 6 * 16;
+    let mut streams = vec![];
+    for entry in (0..6).map(|stream| 32 + stream * 16) {
+        let stream = zstd::decode_all(&newest[at..at + word(entry)]).unwrap();
+        assert_eq!(stream.len(), word(entry + 8));
+        streams.extend(stream);
+        at += word(entry);
+    }
+    assert_eq!((at, &streams[..]), (newest.len(), &unfolded[16..]));
+    let flat = std::fs::read(written(folder.path(), "flat.spz", &splat.with_sh_degree(0))).unwrap();
+    assert_eq!(flat[15], 5, "no stream of coefficients");
+}
+
+/// Each version that is written gives the same Gaussians when it is read, up to version 2's rotations.
+#[test]
+fn all_versions_are_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let splat = random_splat(300, 3, 4);
+    let [two, three, four] =
+        [2, 3, 4].map(|version| read_splat(&written_version(folder.path(), version, &splat)).unwrap());
+    assert_eq!(three, four);
+    let product = |(a, b): (&[f32; 4], &[f32; 4])| a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>().abs();
+    let closeness = two.quaternions.iter().zip(&four.quaternions).map(product).fold(1f32, f32::min);
+    assert!(closeness > 0.995 && closeness < 1., "{closeness}");
+    assert_eq!(Splat { quaternions: four.quaternions.clone(), ..two }, four);
+    for spz_version in [1, 5] {
+        let path = folder.path().join("none.spz");
+        let error = write_local_splat_with(&path, &splat, &WriteOptions { spz_version }).unwrap_err();
+        assert_says(&error.to_string(), &["the version of SPZ", "expected 2 to 4"]);
+        assert!(!path.exists());
+    }
+}
+
+fn ungzip(bytes: &[u8]) -> Vec<u8> {
+    let mut inside = vec![];
+    flate2::bufread::GzDecoder::new(bytes).read_to_end(&mut inside).unwrap();
+    inside
 }
 
 fn hex(text: &str) -> Vec<u8> {
@@ -110,12 +167,19 @@ fn the_axes_of_an_spz_are_applied() {
 
 #[test]
 fn bad_spzs() {
+    let folder = tempfile::tempdir().unwrap();
+    let gzipped = std::fs::read(written_version(folder.path(), 3, &random_splat(300, 1, 9))).unwrap();
     let unfolded = |change: &dyn Fn(&mut Vec<u8>)| {
         refused("spz", |bytes| {
-            let mut inside = vec![];
-            flate2::bufread::GzDecoder::new(&bytes[..]).read_to_end(&mut inside).unwrap();
+            let mut inside = ungzip(&gzipped);
             change(&mut inside);
             *bytes = gzip(&inside);
+        })
+    };
+    let changed = |change: &dyn Fn(&mut Vec<u8>)| {
+        refused("spz", |bytes| {
+            *bytes = gzipped.clone();
+            change(bytes);
         })
     };
     assert_says(&unfolded(&|inside| inside[0] = b'n'), &["the first bytes is", "NGSP"]);
@@ -137,8 +201,8 @@ fn bad_spzs() {
         inside.extend([3, 0, 0xbe, 0xad, 9, 0, 0, 0, 6]);
     });
     assert_says(&extension, &["an extension is cut short: 1 bytes, expected 9 bytes"]);
-    assert_says(&refused("spz", |bytes| bytes.truncate(100)), &["damaged", "a whole gzip"]);
-    assert_says(&refused("spz", |bytes| *bytes.last_mut().unwrap() ^= 1), &["the end is damaged"]);
+    assert_says(&changed(&|bytes| bytes.truncate(100)), &["damaged", "a whole gzip"]);
+    assert_says(&changed(&|bytes| *bytes.last_mut().unwrap() ^= 1), &["the end is damaged"]);
     assert_says(&refused("spz", |bytes| *bytes = b"no gzip".to_vec()), &["the file is no SPZ"]);
 }
 

@@ -2,18 +2,21 @@
 
 use super::axes::Axes;
 use super::container::{self, Description, Streams};
-use crate::formats::{Codec, Contents};
+use crate::formats::{Codec, Contents, WriteOptions};
 use crate::invalid::InvalidGaussians;
 use crate::rotations::normalized;
 use crate::splat::logit_of_opacity;
 use crate::{Error, Result, ShLimits, Splat};
 use half::f16;
 use std::f64::consts::FRAC_1_SQRT_2;
+use std::ops::RangeInclusive;
 use std::path::Path;
 
 /// Functions of the format.
 pub(crate) const CODEC: Option<Codec> = Some(Codec { read, write, limits });
 
+/// Versions that are written. Version 1 has positions in float16.
+const WRITTEN_VERSIONS: RangeInclusive<u32> = 2..=4;
 /// Factor of an SH coefficient of degree 0, to which ½ is added.
 const COLOUR_SCALE: f64 = 0.15;
 /// Steps per unit of a scale's logarithm, counted from `LOG_SCALE_BEGIN`.
@@ -98,6 +101,10 @@ fn unpack_first_three(bytes: [u8; 3]) -> [f32; 4] {
     normalized([w, x, y, z].map(|part| part as f32))
 }
 
+fn pack_first_three([w, x, y, z]: [f32; 4]) -> [u8; 3] {
+    [x, y, z].map(|part| ((f64::from(part * w.signum()) + 1.) * 127.5).round() as u8)
+}
+
 /// Unpacks a rotation from all but the largest of x, y, z and w, whose index is in the upper two bits.
 fn unpack_smallest_three(bytes: [u8; 4]) -> [f32; 4] {
     let mut word = u32::from_le_bytes(bytes);
@@ -130,7 +137,11 @@ fn pack_smallest_three([w, x, y, z]: [f32; 4]) -> [u8; 4] {
 ///
 /// # Errors
 /// Returns an error if a position is too far away for 24 bits, or the file can't be written.
-fn write(path: &Path, splat: &Splat) -> Result<()> {
+fn write(path: &Path, splat: &Splat, options: &WriteOptions) -> Result<()> {
+    let version = options.spz_version;
+    if !WRITTEN_VERSIONS.contains(&version) {
+        return Err(Error::setting("the version of SPZ", version, "2 to 4"));
+    }
     let farthest = splat.means.as_flattened().iter().fold(0f32, |farthest, x| farthest.max(x.abs()));
     let fits = |bits: &u32| f64::from(farthest) * f64::from(1u32 << bits) <= MAX_FIXED;
     let Some(fractional_bits) = (0..=MAX_FRACTIONAL_BITS).rev().find(fits) else {
@@ -158,18 +169,19 @@ fn write(path: &Path, splat: &Splat) -> Result<()> {
     }
     let colours = (0..splat.len()).flat_map(|index| splat.sh_of(index)[0]);
     let scales = splat.log_scales.as_flattened().iter();
+    let rotations = || (0..splat.len()).map(|index| axes.rotation(splat.unit_quaternion(index)));
     let streams = Streams {
         positions,
         opacities: (0..splat.len()).map(|index| byte(f64::from(splat.opacity(index)) * 255.)).collect(),
         colours: colours.map(|dc| byte((f64::from(dc) * COLOUR_SCALE + 0.5) * 255.)).collect(),
         scales: scales.map(|&log| byte((f64::from(log) - LOG_SCALE_BEGIN) * LOG_SCALE_STEPS)).collect(),
-        rotations: (0..splat.len())
-            .flat_map(|index| pack_smallest_three(axes.rotation(splat.unit_quaternion(index))))
-            .collect(),
+        rotations: match version {
+            2 => rotations().flat_map(pack_first_three).collect(),
+            _ => rotations().flat_map(pack_smallest_three).collect(),
+        },
         harmonics,
     };
-    let description = Description::written(splat, fractional_bits);
-    container::write(path, &description, &streams)
+    container::write(path, &Description::written(version, splat, fractional_bits), streams)
 }
 
 /// Rounds to the nearest of 2^`bits` values, one of which is 0.
