@@ -4,7 +4,7 @@
 use crate::invalid::InvalidGaussians;
 use crate::origin::{read_origin, write_with_origin};
 use crate::rotations::drop_missing_rotations;
-use crate::{Error, Result, ShLimits, Splat, compressed_ply, dot_splat, ply, spz};
+use crate::{Error, Result, ShLimits, Splat, compressed_ply, dot_splat, ply, sog, spz};
 use glam::DVec3;
 use globalsplat_files::check_writable_file;
 use std::path::{Path, PathBuf};
@@ -37,7 +37,7 @@ pub(crate) struct Codec {
 
 /// A splat file format.
 struct Format {
-    /// Suffix of file names, in lower case.
+    /// Suffix of file names, in lower case, or a whole file name if it doesn't begin with a dot.
     ending: &'static str,
     /// Function that returns `true` if bytes are certainly in this format.
     recognizes: fn(&[u8]) -> bool,
@@ -45,8 +45,11 @@ struct Format {
     codec: Option<Codec>,
 }
 
+/// Name of the file that describes an unbundled SOG.
+const SOG_META: &str = "meta.json";
+
 /// All formats. The first one whose suffix matches, or that recognizes a file, is used.
-const FORMATS: [Format; 4] = [
+const FORMATS: [Format; 6] = [
     Format {
         ending: ".compressed.ply",
         recognizes: compressed_ply::recognizes,
@@ -61,6 +64,16 @@ const FORMATS: [Format; 4] = [
         recognizes: ply::recognizes,
         codec: Some(Codec { read: ply::read, write: ply::write, limits: ply::limits }),
     },
+    Format {
+        ending: ".sog",
+        recognizes: sog::recognizes,
+        codec: Some(Codec { read: sog::read_bundle, write: sog::write_bundle, limits: sog::limits }),
+    },
+    Format {
+        ending: SOG_META,
+        recognizes: |_| false,
+        codec: Some(Codec { read: sog::read_folder, write: sog::write_folder, limits: sog::limits }),
+    },
     Format { ending: ".spz", recognizes: spz::recognizes, codec: spz::CODEC },
     Format {
         ending: ".splat",
@@ -70,6 +83,11 @@ const FORMATS: [Format; 4] = [
 ];
 
 impl Format {
+    /// Returns `true` if a file with this name, in lower case, is in this format.
+    fn is_named(&self, name: &str) -> bool {
+        if self.ending.starts_with('.') { name.ends_with(self.ending) } else { name == self.ending }
+    }
+
     /// Returns the functions of the format, which is that of the file at `path`.
     ///
     /// # Errors
@@ -88,9 +106,9 @@ impl Format {
 /// Returns an error for an unknown extension.
 fn format_of(path: &Path) -> Result<&'static Format> {
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
-    FORMATS.iter().find(|format| name.ends_with(format.ending)).ok_or_else(|| {
+    FORMATS.iter().find(|format| format.is_named(&name)).ok_or_else(|| {
         let found = path.extension().map_or("missing".into(), |ending| format!(".{}", ending.display()));
-        Error::input(path, "the ending", found, ".ply, .compressed.ply, .spz or .splat")
+        Error::input(path, "the ending", found, ".ply, .compressed.ply, .sog, .spz or .splat")
     })
 }
 
@@ -101,8 +119,9 @@ pub fn is_splat_name(path: &Path) -> bool {
 
 /// Returns the path of the splat `name` in `folder`, in any format, or if there is none, the path of the missing PLY.
 pub fn find_splat(folder: &Path, name: &str) -> PathBuf {
-    let candidates = FORMATS.map(|format| folder.join(format!("{name}{}", format.ending)));
-    candidates.into_iter().find(|path| path.is_file()).unwrap_or_else(|| folder.join(format!("{name}.ply")))
+    let endings = FORMATS.iter().map(|format| format.ending).filter(|ending| ending.starts_with('.'));
+    let mut candidates = endings.map(|ending| folder.join(format!("{name}{ending}")));
+    candidates.find(|path| path.is_file()).unwrap_or_else(|| folder.join(format!("{name}.ply")))
 }
 
 /// Checks that a splat could be written at `path`. Call it before the work starts.

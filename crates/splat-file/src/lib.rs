@@ -12,6 +12,7 @@ mod ply_body;
 mod ply_header;
 mod rotations;
 mod sh;
+mod sog;
 mod splat;
 mod spz;
 mod transform;

@@ -5,7 +5,7 @@ use globalsplat_splat_file::{Splat, limits_of, read_splat, write_splat};
 use std::path::{Path, PathBuf};
 
 /// Extensions of all formats.
-pub const ENDINGS: [&str; 4] = ["ply", "compressed.ply", "spz", "splat"];
+pub const ENDINGS: [&str; 5] = ["ply", "compressed.ply", "sog", "spz", "splat"];
 
 /// Returns the extensions of the formats that this build writes.
 pub fn endings() -> impl Iterator<Item = &'static str> {

@@ -1,0 +1,168 @@
+//! Files of a SOG: in a ZIP archive or in a folder, and their images.
+
+use crate::{Error, Result};
+use globalsplat_files::{PartialFile, parent_of, write_atomically};
+use image_webp::{ColorType, EncoderParams, WebPDecoder, WebPEncoder};
+use std::io::{Cursor, Read, Write};
+use std::path::Path;
+use zip::write::FileOptions;
+use zip::{CompressionMethod, ZipArchive, ZipWriter};
+
+/// Maximum ratio of decompressed to compressed size of the archive, with `MAX_SMALL` bytes allowed in addition.
+const MAX_RATIO: u64 = 64;
+const MAX_SMALL: u64 = 1 << 20;
+
+/// Image of four bytes per pixel, row by row.
+pub struct Image {
+    pub width: usize,
+    pub pixels: Vec<[u8; 4]>,
+}
+
+/// Reader of a SOG's files.
+pub struct Reader<'a> {
+    path: &'a Path,
+    /// Archive and maximum size of a file in it, or `None` for files in a folder.
+    archive: Option<(ZipArchive<Cursor<&'a [u8]>>, u64)>,
+}
+
+impl<'a> Reader<'a> {
+    /// Opens the archive at `path`, whose contents are `bytes`.
+    ///
+    /// # Errors
+    /// Returns an error if `bytes` aren't a ZIP archive.
+    pub fn open_zip(path: &'a Path, bytes: &'a [u8]) -> Result<Self> {
+        let archive = ZipArchive::new(Cursor::new(bytes))
+            .map_err(|why| Error::input(path, "the file", format!("damaged: {why}"), "a ZIP archive"))?;
+        Ok(Reader { path, archive: Some((archive, MAX_SMALL + MAX_RATIO * bytes.len() as u64)) })
+    }
+
+    /// Opens the folder of the `meta.json` at `path`.
+    pub fn open_folder(path: &'a Path) -> Self {
+        Reader { path, archive: None }
+    }
+
+    /// Returns the contents of the file `name`.
+    ///
+    /// # Errors
+    /// Returns an error if there is no such file, it is damaged, or it is outside of the folder.
+    pub fn file(&mut self, name: &str) -> Result<Vec<u8>> {
+        let Some((archive, max)) = &mut self.archive else {
+            if name.is_empty() || name.contains(['/', '\\']) || name == ".." {
+                return Err(Error::input(
+                    self.path,
+                    "a file name",
+                    format!("{name:?}"),
+                    "a name without a folder",
+                ));
+            }
+            let file = parent_of(self.path).join(name);
+            return std::fs::read(&file).map_err(Error::read(&file));
+        };
+        let refuse = |found: String| Error::input(self.path, name, found, "a file in the archive");
+        let file = archive.by_name(name).map_err(|why| refuse(why.to_string()))?;
+        let mut contents = vec![];
+        file.take(*max + 1).read_to_end(&mut contents).map_err(|why| refuse(format!("damaged: {why}")))?;
+        match contents.len() as u64 > *max {
+            true => Err(refuse(format!("more than {max} bytes"))),
+            false => Ok(contents),
+        }
+    }
+
+    /// Returns the image `name` if `is_allowed` returns `true` for its number of pixels, which is known before memory is allocated.
+    ///
+    /// # Errors
+    /// Returns an error if the file is absent, damaged, or too large.
+    pub fn image(&mut self, name: &str, is_allowed: impl FnOnce(usize) -> bool) -> Result<Image> {
+        let file = self.file(name)?;
+        let damaged = |why: image_webp::DecodingError| {
+            Error::input(self.path, name, format!("damaged: {why}"), "a WebP image")
+        };
+        let mut decoder = WebPDecoder::new(Cursor::new(&file)).map_err(damaged)?;
+        let (width, height) = decoder.dimensions();
+        let count = width as usize * height as usize;
+        if !is_allowed(count) {
+            let found = format!("of {width}×{height} pixels");
+            return Err(Error::input(self.path, name, found, "about as many pixels as Gaussians"));
+        }
+        let bytes_per_pixel = if decoder.has_alpha() { 4 } else { 3 };
+        let mut bytes = vec![0; count * bytes_per_pixel];
+        decoder.read_image(&mut bytes).map_err(damaged)?;
+        let pixels = match bytes_per_pixel {
+            4 => bytes.as_chunks().0.to_vec(),
+            _ => bytes.as_chunks().0.iter().map(|&[red, green, blue]| [red, green, blue, 255]).collect(),
+        };
+        Ok(Image { width: width as usize, pixels })
+    }
+}
+
+/// Returns the images as lossless WebP files.
+///
+/// # Errors
+/// Returns an error that names `path` if an image is larger than WebP allows: 16,384 pixels in a dimension.
+pub fn encode_all(path: &Path, images: Vec<(&'static str, Image)>) -> Result<Vec<(&'static str, Vec<u8>)>> {
+    let encode = |(name, image): (&'static str, Image)| {
+        let file = encode_webp(&image)
+            .map_err(|why| Error::failed(format!("{}: {name} can't be encoded: {why}", path.display())))?;
+        Ok((name, file))
+    };
+    std::thread::scope(|scope| {
+        let threads: Vec<_> = images.into_iter().map(|image| scope.spawn(move || encode(image))).collect();
+        threads.into_iter().map(|thread| thread.join().expect("the encoder doesn't panic")).collect()
+    })
+}
+
+/// Encodes an image with and without prediction of pixels from their neighbours, and returns the smaller file.
+fn encode_webp(image: &Image) -> std::result::Result<Vec<u8>, image_webp::EncodingError> {
+    let is_opaque = image.pixels.iter().all(|pixel| pixel[3] == 255);
+    let (bytes, color) = match is_opaque {
+        true => (
+            image.pixels.iter().flat_map(|&[red, green, blue, _]| [red, green, blue]).collect(),
+            ColorType::Rgb8,
+        ),
+        false => (image.pixels.as_flattened().to_vec(), ColorType::Rgba8),
+    };
+    let height = image.pixels.len() / image.width;
+    let mut smallest: Option<Vec<u8>> = None;
+    for use_predictor_transform in [false, true] {
+        let mut file = vec![];
+        let mut encoder = WebPEncoder::new(&mut file);
+        let mut params = EncoderParams::default();
+        params.use_predictor_transform = use_predictor_transform;
+        encoder.set_params(params);
+        encoder.encode(&bytes, image.width as u32, height as u32, color)?;
+        smallest = smallest.filter(|smallest| smallest.len() <= file.len()).or(Some(file));
+    }
+    Ok(smallest.expect("two files"))
+}
+
+/// Writes `meta.json` and the images to a ZIP archive, atomically.
+///
+/// # Errors
+/// Returns an error if the file can't be written.
+pub fn write_zip(path: &Path, meta: &[u8], images: &[(&'static str, Vec<u8>)]) -> Result<()> {
+    // WebP can't be compressed further.
+    let options = FileOptions::default().compression_method(CompressionMethod::Stored);
+    let mut archive = ZipWriter::new(Cursor::new(vec![]));
+    let files = images.iter().map(|(name, file)| (*name, &file[..])).chain([("meta.json", meta)]);
+    for (name, file) in files {
+        archive.start_file(name, options).expect("a short name");
+        archive.write_all(file).expect("memory");
+    }
+    let archive = archive.finish().expect("memory").into_inner();
+    write_atomically(path, |writer| writer.write_all(&archive).map_err(Error::write(path)))
+}
+
+/// Writes `meta.json` to `path` and the images beside it. No file is replaced before all of them are written.
+///
+/// # Errors
+/// Returns an error if a file can't be written.
+pub fn write_files(path: &Path, meta: &[u8], images: &[(&'static str, Vec<u8>)]) -> Result<()> {
+    let beside = images.iter().map(|(name, file)| (parent_of(path).join(name), &file[..]));
+    let mut partials = vec![];
+    for (path, contents) in beside.chain([(path.to_owned(), meta)]) {
+        let mut partial = PartialFile::create(&path)?;
+        partial.file.write_all(contents).map_err(Error::write(&path))?;
+        partials.push(partial);
+    }
+    partials.into_iter().try_for_each(PartialFile::persist)
+}

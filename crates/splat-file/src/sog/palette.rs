@@ -1,0 +1,252 @@
+//! Vector quantization by k-means, without random numbers: the result depends on neither the number of threads nor a seed.
+
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// Number of values in a codebook, whose indices are bytes.
+const CODEBOOK: usize = 256;
+/// Number of iterations over a codebook's values, and over vectors.
+const VALUE_ITERATIONS: usize = 20;
+const VECTOR_ITERATIONS: usize = 8;
+/// Maximum number of vectors from which the first of the two levels of centroids is computed.
+const SAMPLE: usize = 1 << 15;
+/// Number of centroids whose distances are computed together.
+const LANES: usize = 8;
+
+/// Numbers that stand for all values of a property, ascending.
+pub struct Codebook {
+    pub values: Vec<f32>,
+}
+
+impl Codebook {
+    /// Computes the values that are close to all of `values` in the sense of least squares.
+    pub fn build(values: impl Iterator<Item = f32>) -> Self {
+        let mut sorted: Vec<f32> = values.collect();
+        sorted.sort_unstable_by(f32::total_cmp);
+        let mut distinct = sorted.clone();
+        distinct.dedup();
+        if distinct.len() <= CODEBOOK {
+            distinct.resize(CODEBOOK, distinct.last().copied().unwrap_or(0.));
+            return Codebook { values: distinct };
+        }
+        let mut sums = vec![0.];
+        sums.extend(sorted.iter().scan(0., |sum, &value| {
+            *sum += f64::from(value);
+            Some(*sum)
+        }));
+        // Begins with one half of the values at equal steps of rank, the other half at equal steps of value.
+        let step = |k: usize| (2 * k + 1) as f64 / CODEBOOK as f64;
+        let (low, high) = (f64::from(sorted[0]), f64::from(sorted[sorted.len() - 1]));
+        let by_rank = (0..CODEBOOK / 2).map(|k| sorted[(step(k) * sorted.len() as f64) as usize]);
+        let by_value = (0..CODEBOOK / 2).map(|k| (low + step(k) * (high - low)) as f32);
+        let mut book = Codebook { values: by_rank.chain(by_value).collect() };
+        for _ in 0..VALUE_ITERATIONS {
+            book.values.sort_unstable_by(f32::total_cmp);
+            let ends = book.values.windows(2).map(|pair| {
+                let middle = (pair[0] + pair[1]) / 2.;
+                sorted.partition_point(|&value| value <= middle)
+            });
+            let ends: Vec<usize> = ends.chain([sorted.len()]).collect();
+            let mut begin = 0;
+            for (value, end) in book.values.iter_mut().zip(ends) {
+                if end > begin {
+                    *value = ((sums[end] - sums[begin]) / (end - begin) as f64) as f32;
+                }
+                begin = begin.max(end);
+            }
+        }
+        book.values.sort_unstable_by(f32::total_cmp);
+        book
+    }
+
+    /// Returns the index of the nearest value.
+    pub fn index(&self, value: f32) -> u8 {
+        let above = self.values.partition_point(|&other| other < value).min(CODEBOOK - 1);
+        let below = above.saturating_sub(1);
+        let nearest = if value - self.values[below] <= self.values[above] - value { below } else { above };
+        nearest as u8
+    }
+}
+
+/// Vectors that stand for all vectors of a set, and the index of each vector's representative.
+pub struct Palette {
+    /// Centroids, one after the other.
+    pub centroids: Vec<f32>,
+    pub labels: Vec<u32>,
+}
+
+impl Palette {
+    /// Divides `vectors` of `dim` numbers into at most `size` clusters, in two levels: √`size` clusters of all vectors, each of which is
+    /// divided into a share of the centroids in proportion to its number of vectors.
+    pub fn build(vectors: &[f32], dim: usize, size: usize) -> Self {
+        let count = vectors.len() / dim;
+        if count <= size {
+            return Palette { centroids: vectors.to_vec(), labels: (0..count as u32).collect() };
+        }
+        let coarse = (size as f64).sqrt() as usize;
+        let sample: Vec<f32> =
+            vectors.chunks_exact(dim).step_by(count.div_ceil(SAMPLE)).flatten().copied().collect();
+        let coarse_of = assign(vectors, dim, &means_of_clusters(&sample, dim, coarse));
+        let mut members = vec![vec![]; coarse];
+        coarse_of.iter().enumerate().for_each(|(index, &cluster)| members[cluster as usize].push(index));
+        members.retain(|members| !members.is_empty());
+        let parts = in_parallel(members.len(), |cluster| {
+            let members = &members[cluster];
+            let own: Vec<f32> =
+                members.iter().flat_map(|&index| &vectors[index * dim..][..dim]).copied().collect();
+            let share = (members.len() * (size - coarse) / count + 1).min(members.len());
+            let centroids = means_of_clusters(&own, dim, share);
+            let labels = assign_serially(&own, dim, &Lanes::new(&centroids, dim));
+            (centroids, labels)
+        });
+        let mut palette = Palette { centroids: vec![], labels: vec![0; count] };
+        for (members, (centroids, labels)) in members.iter().zip(parts) {
+            let first = (palette.centroids.len() / dim) as u32;
+            members.iter().zip(labels).for_each(|(&index, label)| palette.labels[index] = first + label);
+            palette.centroids.extend(centroids);
+        }
+        palette
+    }
+}
+
+/// Divides `vectors` into `count` clusters (Lloyd's algorithm) and returns their means. The algorithm begins with vectors at equal distances
+/// in the list.
+fn means_of_clusters(vectors: &[f32], dim: usize, count: usize) -> Vec<f32> {
+    let total = vectors.len() / dim;
+    let mut centroids: Vec<f32> =
+        (0..count).flat_map(|k| &vectors[k * total / count * dim..][..dim]).copied().collect();
+    for _ in 0..VECTOR_ITERATIONS {
+        let labels = assign_serially(vectors, dim, &Lanes::new(&centroids, dim));
+        let mut sums = vec![0f64; count * dim];
+        let mut sizes = vec![0usize; count];
+        for (vector, &label) in vectors.chunks_exact(dim).zip(&labels) {
+            sizes[label as usize] += 1;
+            let sum = &mut sums[label as usize * dim..][..dim];
+            sum.iter_mut().zip(vector).for_each(|(sum, value)| *sum += f64::from(*value));
+        }
+        for (k, &size) in sizes.iter().enumerate().filter(|(_, size)| **size > 0) {
+            for (value, sum) in centroids[k * dim..][..dim].iter_mut().zip(&sums[k * dim..]) {
+                *value = (sum / size as f64) as f32;
+            }
+        }
+    }
+    centroids
+}
+
+/// Centroids in groups of `LANES`, number by number, and half of their squared lengths.
+struct Lanes {
+    values: Vec<[f32; LANES]>,
+    halves: Vec<[f32; LANES]>,
+    count: usize,
+}
+
+impl Lanes {
+    fn new(centroids: &[f32], dim: usize) -> Self {
+        let count = centroids.len() / dim;
+        let (mut values, mut halves) = (vec![], vec![]);
+        for group in centroids.chunks(LANES * dim) {
+            let lane = |lane: usize| group.get(lane * dim..(lane + 1) * dim);
+            values.extend(
+                (0..dim).map(|d| std::array::from_fn(|k| lane(k).map_or(0., |centroid| centroid[d]))),
+            );
+            halves.push(std::array::from_fn(|k| {
+                lane(k)
+                    .map_or(f32::INFINITY, |centroid| centroid.iter().map(|value| value * value / 2.).sum())
+            }));
+        }
+        Lanes { values, halves, count }
+    }
+}
+
+/// Returns the index of the centroid next to each vector.
+fn assign_serially(vectors: &[f32], dim: usize, lanes: &Lanes) -> Vec<u32> {
+    let nearest = |vector: &[f32]| {
+        // |x − c|² / 2 without the term that all centroids have in common.
+        let (mut nearest, mut least) = (0, f32::INFINITY);
+        for (group, (values, halves)) in lanes.values.chunks_exact(dim).zip(&lanes.halves).enumerate() {
+            let mut distances = *halves;
+            for (value, centroids) in vector.iter().zip(values) {
+                distances.iter_mut().zip(centroids).for_each(|(distance, c)| *distance -= value * c);
+            }
+            for (lane, &distance) in distances.iter().enumerate() {
+                if distance < least {
+                    (nearest, least) = (group * LANES + lane, distance);
+                }
+            }
+        }
+        nearest.min(lanes.count - 1) as u32
+    };
+    vectors.chunks_exact(dim).map(nearest).collect()
+}
+
+/// Calls [`assign_serially`] on all cores.
+fn assign(vectors: &[f32], dim: usize, centroids: &[f32]) -> Vec<u32> {
+    const PART: usize = 1 << 12;
+    let lanes = Lanes::new(centroids, dim);
+    let parts: Vec<&[f32]> = vectors.chunks(PART * dim).collect();
+    in_parallel(parts.len(), |part| assign_serially(parts[part], dim, &lanes)).concat()
+}
+
+/// Returns the results of `task` for 0 to `count`, computed on all cores.
+fn in_parallel<T: Send>(count: usize, task: impl Fn(usize) -> T + Sync) -> Vec<T> {
+    let next = AtomicUsize::new(0);
+    let threads = std::thread::available_parallelism().map_or(1, usize::from).min(count);
+    let work = || {
+        let mut results = vec![];
+        loop {
+            let index = next.fetch_add(1, Ordering::Relaxed);
+            if index >= count {
+                return results;
+            }
+            results.push((index, task(index)));
+        }
+    };
+    let mut results = std::thread::scope(|scope| {
+        let threads: Vec<_> = (0..threads).map(|_| scope.spawn(work)).collect();
+        threads
+            .into_iter()
+            .flat_map(|thread| thread.join().expect("the task doesn't panic"))
+            .collect::<Vec<_>>()
+    });
+    results.sort_by_key(|(index, _)| *index);
+    results.into_iter().map(|(_, result)| result).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn few_values_are_kept_and_many_are_near() {
+        let few = Codebook::build([3., -1., 3., 0.5].into_iter());
+        assert!([3., -1., 0.5].iter().all(|&value| few.values[usize::from(few.index(value))] == value));
+        // Values of a normal distribution, by sums, with a few far away.
+        let value =
+            |k: usize| if k % 1000 == 7 { 40. } else { (0..6).map(|j| (k * (j + 3)) as f32 % 1.7).sum() };
+        let many: Vec<f32> = (0..20_000).map(value).collect();
+        let book = Codebook::build(many.iter().copied());
+        let error = |&value: &f32| {
+            (f64::from(value) - f64::from(book.values[usize::from(book.index(value))])).powi(2)
+        };
+        let root_mean_square = (many.iter().map(error).sum::<f64>() / many.len() as f64).sqrt();
+        assert!(root_mean_square < 0.02, "{root_mean_square}");
+        assert_eq!(Codebook::build([].into_iter()).values, [0.; 256]);
+    }
+
+    #[test]
+    fn vectors_of_clusters_are_near_their_centroids() {
+        // 5,000 vectors around 40 places.
+        let place = |k: usize, d: usize| ((k % 40 * 7 + d * 13) % 40) as f32;
+        let vectors: Vec<f32> =
+            (0..5000).flat_map(|k| (0..9).map(move |d| place(k, d) + (k * (d + 3)) as f32 % 0.1)).collect();
+        let palette = Palette::build(&vectors, 9, 200);
+        assert!(palette.centroids.len() / 9 <= 200);
+        let error = vectors.chunks_exact(9).zip(&palette.labels).map(|(vector, &label)| {
+            let centroid = &palette.centroids[label as usize * 9..];
+            vector.iter().zip(centroid).map(|(a, b)| (a - b).powi(2)).sum::<f32>()
+        });
+        let error = (error.sum::<f32>() / vectors.len() as f32).sqrt();
+        assert!(error < 0.2, "{error}");
+        let small = Palette::build(&vectors[..90], 9, 200);
+        assert_eq!((small.centroids, small.labels), (vectors[..90].to_vec(), (0..10).collect()));
+    }
+}
