@@ -33,6 +33,8 @@ pub(crate) struct Codec {
     pub read: fn(&Path, &[u8]) -> Result<Contents>,
     pub write: fn(&Path, &Splat, &WriteOptions) -> Result<()>,
     pub limits: fn() -> ShLimits,
+    /// Function that rounds SH coefficients above degree 0 as the format does, if that depends on all Gaussians.
+    pub round_sh: Option<fn(&Splat) -> Splat>,
 }
 
 /// A splat file format.
@@ -57,28 +59,44 @@ const FORMATS: [Format; 6] = [
             read: compressed_ply::read,
             write: compressed_ply::write,
             limits: compressed_ply::limits,
+            round_sh: None,
         }),
     },
     Format {
         ending: ".ply",
         recognizes: ply::recognizes,
-        codec: Some(Codec { read: ply::read, write: ply::write, limits: ply::limits }),
+        codec: Some(Codec { read: ply::read, write: ply::write, limits: ply::limits, round_sh: None }),
     },
     Format {
         ending: ".sog",
         recognizes: sog::recognizes,
-        codec: Some(Codec { read: sog::read_bundle, write: sog::write_bundle, limits: sog::limits }),
+        codec: Some(Codec {
+            read: sog::read_bundle,
+            write: sog::write_bundle,
+            limits: sog::limits,
+            round_sh: Some(sog::round_sh),
+        }),
     },
     Format {
         ending: SOG_META,
         recognizes: |_| false,
-        codec: Some(Codec { read: sog::read_folder, write: sog::write_folder, limits: sog::limits }),
+        codec: Some(Codec {
+            read: sog::read_folder,
+            write: sog::write_folder,
+            limits: sog::limits,
+            round_sh: Some(sog::round_sh),
+        }),
     },
     Format { ending: ".spz", recognizes: spz::recognizes, codec: spz::CODEC },
     Format {
         ending: ".splat",
         recognizes: |_| false,
-        codec: Some(Codec { read: dot_splat::read, write: dot_splat::write, limits: dot_splat::limits }),
+        codec: Some(Codec {
+            read: dot_splat::read,
+            write: dot_splat::write,
+            limits: dot_splat::limits,
+            round_sh: None,
+        }),
     },
 ];
 
@@ -147,6 +165,16 @@ pub fn can_mark_antialiased(path: &Path) -> Result<bool> {
 /// Returns an error for an unknown extension, or a format that this build can't write.
 pub fn limits_of(path: &Path) -> Result<ShLimits> {
     Ok((format_of(path)?.codec(path)?.limits)())
+}
+
+/// Returns the splat with the SH coefficients above degree 0 that a file at `path` would hold, if its format rounds them to values that
+/// depend on all Gaussians, as a SOG does. Writing the returned splat doesn't change them. Other formats return `None`.
+///
+/// # Errors
+/// Returns an error for an unknown extension, a format that this build can't write, or if a list of the splat has the wrong length.
+pub fn round_sh(path: &Path, splat: &Splat) -> Result<Option<Splat>> {
+    splat.check_lengths()?;
+    Ok(format_of(path)?.codec(path)?.round_sh.map(|round_sh| round_sh(splat)))
 }
 
 /// Reads a splat in the format that is recognized by its contents, or else in the format of its extension. Gaussians whose quaternion has

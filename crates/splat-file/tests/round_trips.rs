@@ -5,7 +5,7 @@ mod common;
 use common::{assert_says, endings, largest_error, random_splat, written};
 use glam::DVec3;
 use globalsplat_splat_file::{
-    SH_C0, Splat, find_splat, is_splat_name, limits_of, origin_file, read_splat, write_local_splat,
+    SH_C0, Splat, find_splat, is_splat_name, limits_of, origin_file, read_splat, round_sh, write_local_splat,
     write_splat,
 };
 use std::path::Path;
@@ -160,6 +160,32 @@ fn antialiased_splats_are_marked() {
         std::fs::write(&path, bytes).unwrap();
         assert_eq!(read_splat(&path).unwrap().antialiased, expected, "{comment}");
     }
+}
+
+/// A SOG of many Gaussians has fewer sets of coefficients than Gaussians. They are near the original ones, are known before the file is
+/// written, and are written again as they are.
+#[test]
+fn coefficients_of_a_sog_are_known_beforehand() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut splat = random_splat(1200, 2, 3);
+    // Coefficients of 50 kinds, with differences within each kind.
+    for index in 0..splat.len() {
+        for basis in 1..9 {
+            splat.sh[index * 9 + basis] = [0, 1, 2].map(|channel| {
+                ((index % 50 * (basis + channel)) as f32 / 7.).sin() + (index as f32).sin() / 50.
+            });
+        }
+    }
+    let path = folder.path().join("a.sog");
+    let rounded = round_sh(&path, &splat).unwrap().unwrap();
+    let error = largest_error(rounded.sh.as_flattened(), splat.sh.as_flattened());
+    assert!(error > 0.001 && error < 0.06, "{error}");
+    assert_eq!(Splat { sh: splat.sh.clone(), ..rounded.clone() }, splat);
+    for (name, expected) in [("a.sog", &splat), ("b.sog", &rounded), ("meta.json", &rounded)] {
+        let copy = matched(expected, &read_splat(&written(folder.path(), name, expected)).unwrap());
+        assert_eq!(bases(&copy, 1, 9), bases(&rounded, 1, 9), "{name}");
+    }
+    assert!(round_sh(&folder.path().join("a.ply"), &splat).unwrap().is_none());
 }
 
 /// A quantizing format doesn't change values that it has already rounded. Formats whose steps depend on the bounds of the values, which the

@@ -244,6 +244,38 @@ pub(crate) fn write_folder(path: &Path, splat: &Splat, _: &WriteOptions) -> Resu
     write_files(path, &meta, &encode_all(path, images)?)
 }
 
+/// Returns the centroids of the coefficients above degree 0, with the values that they are rounded to, and labels in the order of `order`.
+fn build_palette(splat: &Splat, order: &[usize]) -> (Palette, Codebook) {
+    let vectors: Vec<f32> =
+        order.iter().flat_map(|&index| splat.sh_of(index)[1..].as_flattened()).copied().collect();
+    let size = (splat.len() / GAUSSIANS_PER_CENTROID).clamp(MIN_CENTROIDS, MAX_CENTROIDS);
+    let palette = Palette::build(&vectors, 3 * (splat.bases() - 1), size);
+    let codebook = Codebook::build(palette.centroids.iter().copied());
+    (palette, codebook)
+}
+
+/// Returns the splat with the coefficients above degree 0 that a SOG stores for it. They are written without further rounding.
+pub(crate) fn round_sh(splat: &Splat) -> Splat {
+    let mut rounded = splat.clone();
+    let coefficients = splat.bases() - 1;
+    if coefficients > 0 {
+        let order = morton_order(&splat.means);
+        let (palette, codebook) = build_palette(splat, &order);
+        let centroids: Vec<[f32; 3]> = palette
+            .centroids
+            .as_chunks()
+            .0
+            .iter()
+            .map(|colour: &[f32; 3]| colour.map(|value| codebook.values[usize::from(codebook.index(value))]))
+            .collect();
+        for (&index, label) in order.iter().zip(palette.labels) {
+            rounded.sh[index * splat.bases() + 1..][..coefficients]
+                .copy_from_slice(&centroids[label as usize * coefficients..][..coefficients]);
+        }
+    }
+    rounded
+}
+
 /// Returns the contents of `meta.json`, and the images by name. The Gaussians are in Morton order, for which images compress well.
 fn encode(splat: &Splat) -> (Vec<u8>, Vec<(&'static str, Image)>) {
     let order = morton_order(&splat.means);
@@ -297,11 +329,7 @@ fn encode(splat: &Splat) -> (Vec<u8>, Vec<(&'static str, Image)>) {
     ];
     let coefficients = splat.bases() - 1;
     let sh_rest = (coefficients > 0 && !splat.is_empty()).then(|| {
-        let vectors: Vec<f32> =
-            order.iter().flat_map(|&index| splat.sh_of(index)[1..].as_flattened()).copied().collect();
-        let size = (splat.len() / GAUSSIANS_PER_CENTROID).clamp(MIN_CENTROIDS, MAX_CENTROIDS);
-        let palette = Palette::build(&vectors, 3 * coefficients, size);
-        let codebook = Codebook::build(palette.centroids.iter().copied());
+        let (palette, codebook) = build_palette(splat, &order);
         let mut centroids: Vec<[u8; 4]> = palette
             .centroids
             .as_chunks()

@@ -1,5 +1,6 @@
 //! Vector quantization by k-means, without random numbers: the result depends on neither the number of threads nor a seed.
 
+use std::collections::HashMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// Number of values in a codebook, whose indices are bytes.
@@ -76,12 +77,12 @@ pub struct Palette {
 
 impl Palette {
     /// Divides `vectors` of `dim` numbers into at most `size` clusters, in two levels: √`size` clusters of all vectors, each of which is
-    /// divided into a share of the centroids in proportion to its number of vectors.
+    /// divided into a share of the centroids in proportion to its number of vectors. Vectors of which at most `size` differ are kept.
     pub fn build(vectors: &[f32], dim: usize, size: usize) -> Self {
-        let count = vectors.len() / dim;
-        if count <= size {
-            return Palette { centroids: vectors.to_vec(), labels: (0..count as u32).collect() };
+        if let Some(palette) = Self::of_distinct(vectors, dim, size) {
+            return palette;
         }
+        let count = vectors.len() / dim;
         let coarse = (size as f64).sqrt() as usize;
         let sample: Vec<f32> =
             vectors.chunks_exact(dim).step_by(count.div_ceil(SAMPLE)).flatten().copied().collect();
@@ -105,6 +106,25 @@ impl Palette {
             palette.centroids.extend(centroids);
         }
         palette
+    }
+
+    /// Returns the palette of all distinct vectors, or `None` if they are more than `size`.
+    fn of_distinct(vectors: &[f32], dim: usize, size: usize) -> Option<Self> {
+        let mut palette = Palette { centroids: vec![], labels: vec![] };
+        let mut indices = HashMap::new();
+        for vector in vectors.chunks_exact(dim) {
+            let bits: Vec<u32> = vector.iter().map(|value| value.to_bits()).collect();
+            let next = indices.len() as u32;
+            let index = *indices.entry(bits).or_insert(next);
+            palette.labels.push(index);
+            if index == next {
+                palette.centroids.extend(vector);
+            }
+            if indices.len() > size {
+                return None;
+            }
+        }
+        Some(palette)
     }
 }
 
@@ -246,7 +266,12 @@ mod tests {
         });
         let error = (error.sum::<f32>() / vectors.len() as f32).sqrt();
         assert!(error < 0.2, "{error}");
-        let small = Palette::build(&vectors[..90], 9, 200);
-        assert_eq!((small.centroids, small.labels), (vectors[..90].to_vec(), (0..10).collect()));
+        // Ten vectors, each of them three times.
+        let few = vectors[..90].repeat(3);
+        let small = Palette::build(&few, 9, 20);
+        assert_eq!(
+            (small.centroids, small.labels),
+            (vectors[..90].to_vec(), (0..10).collect::<Vec<_>>().repeat(3))
+        );
     }
 }

@@ -13,7 +13,7 @@ use std::ops::RangeInclusive;
 use std::path::Path;
 
 /// Functions of the format.
-pub(crate) const CODEC: Option<Codec> = Some(Codec { read, write, limits });
+pub(crate) const CODEC: Option<Codec> = Some(Codec { read, write, limits, round_sh: None });
 
 /// Versions that are written. Version 1 has positions in float16.
 const WRITTEN_VERSIONS: RangeInclusive<u32> = 2..=4;
