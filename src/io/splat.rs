@@ -1,38 +1,53 @@
 //! Splats fitted to the format of a file, and the precision of their positions in it.
 
 use crate::error::Result;
-use crate::render::fit_harmonics;
+use crate::render::{compensate_mean_colour, fit_harmonics, shrink_harmonics};
 use crate::scene::{Camera, Gaussians, RawGaussians, splat_frame};
 use glam::DVec3;
-use globalsplat_splat_file::{ShLimits, Splat, limits_of};
+use globalsplat_splat_file::{ShLimits, Splat, has_sh_palette, limits_of, round_sh};
 use std::path::Path;
 use tch::Tensor;
 
 /// Maximum ratio of the spacing of float32 positions to the scene's typical distance whose effect on rendered images is invisible.
 const MAX_SPACING_RATIO: f64 = 1e-4;
 
-/// Returns `splat` with spherical harmonics within `limits` and those of the format of `path`, which look the same from `cameras`.
+/// Returns `splat` with spherical harmonics within `limits` and those of the format of `path`, which look the same from `cameras`. For a
+/// format with a palette of coefficients they are made small first, rounded as the file's will be, and the mean colours are corrected.
 ///
 /// # Errors
 /// Returns an error for an unknown extension.
 pub fn fit_splat(path: &Path, splat: &Splat, limits: &ShLimits, cameras: &[Camera]) -> Result<Splat> {
     let limits = limits.intersect(&limits_of(path)?);
+    let has_palette = !cameras.is_empty() && has_sh_palette(path)?;
     let gaussians = Gaussians::from_splat(splat);
     let frame = gaussians.local_frame(splat.origin);
+    let cameras = frame.cameras_to_local(cameras);
     let local = gaussians.to_local(&frame, splat.origin);
-    let fitted = fit_harmonics(&local, &frame.cameras_to_local(cameras), &limits);
+    let smallest = if has_palette { shrink_harmonics(&local, &cameras) } else { local };
+    let fitted = fit_harmonics(&smallest, &cameras, &limits);
     // Logits of opacities that stay are kept to the bit.
     let logits = RawGaussians::from_gaussians(&fitted).opacity_logits;
     let kept = Tensor::from_slice(&splat.opacity_logits).view_as(&logits);
     let logits = logits.where_self(&fitted.opacities.not_equal_tensor(&gaussians.opacities), &kept);
-    let sh = Vec::<f32>::try_from(fitted.sh.flatten(0, -1))?.as_chunks().0.to_vec();
-    Ok(Splat {
-        opacity_logits: Vec::try_from(logits.flatten(0, -1))?,
-        sh,
-        sh_degree: fitted.sh.size()[2].isqrt() as usize - 1,
-        warnings: vec![],
-        ..splat.clone()
-    })
+    let with_sh = |fitted: &Gaussians| -> Result<Splat> {
+        Ok(Splat {
+            opacity_logits: Vec::try_from(logits.flatten(0, -1))?,
+            sh: Vec::<f32>::try_from(fitted.sh.flatten(0, -1))?.as_chunks().0.to_vec(),
+            sh_degree: fitted.sh.size()[2].isqrt() as usize - 1,
+            warnings: vec![],
+            ..splat.clone()
+        })
+    };
+    let within_limits = with_sh(&fitted)?;
+    if !has_palette {
+        return Ok(within_limits);
+    }
+    let rounded = Gaussians {
+        sh: Gaussians::from_splat(&round_sh(path, &within_limits)?).sh,
+        ..fitted.map(Tensor::shallow_clone)
+    };
+    let compensated = compensate_mean_colour(&fitted, &rounded, &cameras);
+    with_sh(&fit_harmonics(&compensated, &[], &limits))
 }
 
 /// Returns a message about the rounding of positions to float32 when `splat` is written in world coordinates, if it is visible in rendered

@@ -3,6 +3,9 @@
 //! File formats that store a coefficient in one byte can't hold values beyond a bound. Clamping the values changes colours in every
 //! direction. But cameras see a Gaussian from few directions, and other coefficients within the bound show the same colours in those
 //! directions.
+//!
+//! A format that stores a palette of coefficients holds small coefficients best. What a palette changes in the mean colour that the cameras
+//! see is compensated by the coefficient of degree 0.
 
 use crate::scene::{Camera, Gaussians, SH_C0};
 use glam::{DMat4, DVec3};
@@ -32,29 +35,18 @@ const NEAR: f64 = 0.01;
 /// (spec 2.5). Coefficients within the limits stay. Others are clamped, or, if any of `cameras` sees the Gaussian, fitted so that the
 /// cameras see its colours as closely as possible. The opacity of a Gaussian that would be too dark is raised.
 pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &ShLimits) -> Gaussians {
-    let numbers = |tensor: &Tensor| Vec::<f32>::try_from(tensor.flatten(0, -1)).expect("float32 on the host");
-    let (means, scales) = (numbers(&gaussians.means), numbers(&gaussians.scales));
-    let (opacities, sh) = (numbers(&gaussians.opacities), numbers(&gaussians.sh));
-    let bases = gaussians.sh.size()[2] as usize;
-    let cameras: Vec<_> = cameras.iter().map(|&camera| (camera, camera.c2w.inverse())).collect();
-    let fitted: Vec<_> = (0..opacities.len())
+    let colours = Colours::new(gaussians, cameras);
+    let fitted: Vec<_> = (0..colours.opacities.len())
         .into_par_iter()
         .map(|index| {
-            let mut coefficients = [[0.; 3]; BASES];
-            for (basis, colour) in sh[3 * bases * index..][..3 * bases].chunks_exact(3).enumerate() {
-                coefficients[basis] = [0, 1, 2].map(|channel| f64::from(colour[channel]));
+            let (coefficients, opacity) = (colours.coefficients(index), f64::from(colours.opacities[index]));
+            match clamp(&coefficients, limits) == coefficients {
+                true => (coefficients, opacity),
+                false => Fit::new(coefficients, colours.seen(index), limits).best(opacity),
             }
-            if clamp(&coefficients, limits) == coefficients {
-                return (coefficients, f64::from(opacities[index]));
-            }
-            let mean = DVec3::from_array([0, 1, 2].map(|axis| f64::from(means[3 * index + axis])));
-            let radius =
-                scales[3 * index..][..3].iter().fold(0., |largest: f64, &s| largest.max(f64::from(s)));
-            Fit::new(mean, VISIBLE_SIGMAS * radius, coefficients, &cameras, limits)
-                .best(f64::from(opacities[index]))
         })
         .collect();
-    let kept = bases.min((limits.degree + 1).pow(2));
+    let kept = colours.bases.min((limits.degree + 1).pow(2));
     let sh: Vec<f32> = fitted
         .iter()
         .flat_map(|(coefficients, _)| coefficients[..kept].as_flattened().iter().map(|&c| c as f32))
@@ -67,7 +59,102 @@ pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &ShLimit
     }
 }
 
+/// Returns the Gaussians with the smallest coefficients that show the same colours to `cameras`, for formats that hold small coefficients
+/// best. `gaussians` are as in [`fit_harmonics`]. Gaussians that no camera sees stay.
+pub fn shrink_harmonics(gaussians: &Gaussians, cameras: &[Camera]) -> Gaussians {
+    let colours = Colours::new(gaussians, cameras);
+    let limits = ShLimits::up_to(gaussians.sh.size()[2].isqrt() as usize - 1);
+    let shrunk = (0..colours.opacities.len()).into_par_iter().flat_map_iter(|index| {
+        let (coefficients, seen) = (colours.coefficients(index), colours.seen(index));
+        let shrunk = match seen.is_empty() {
+            true => coefficients,
+            false => Fit::new(coefficients, seen, &limits).solve_smallest(),
+        };
+        shrunk.into_iter().take(colours.bases).flatten().map(|coefficient| coefficient as f32)
+    });
+    with_sh(gaussians, &shrunk.collect::<Vec<_>>())
+}
+
+/// Returns `rounded`, whose coefficients above degree 0 differ from those of `gaussians`, with coefficients of degree 0 for which `cameras`
+/// see the same mean colour as of `gaussians`.
+pub fn compensate_mean_colour(gaussians: &Gaussians, rounded: &Gaussians, cameras: &[Camera]) -> Gaussians {
+    let (before, after) = (Colours::new(gaussians, cameras), Colours::new(rounded, &[]));
+    let compensated = (0..before.opacities.len()).into_par_iter().flat_map_iter(|index| {
+        let (original, mut rounded) = (before.coefficients(index), after.coefficients(index));
+        let seen = before.seen(index);
+        for channel in 0..3 {
+            let difference = |basis: &[f64; BASES]| -> f64 {
+                (0..BASES).map(|k| basis[k] * (original[k][channel] - rounded[k][channel])).sum()
+            };
+            let mean: f64 = seen.iter().map(|(basis, weight)| weight * difference(basis)).sum();
+            rounded[0][channel] += mean / SH_C0;
+        }
+        rounded.into_iter().take(after.bases).flatten().map(|coefficient| coefficient as f32)
+    });
+    with_sh(rounded, &compensated.collect::<Vec<_>>())
+}
+
+/// Returns the Gaussians with other coefficients.
+fn with_sh(gaussians: &Gaussians, sh: &[f32]) -> Gaussians {
+    Gaussians { sh: Tensor::from_slice(sh).view_as(&gaussians.sh), ..gaussians.map(Tensor::shallow_clone) }
+}
+
 type Coefficients = [[f64; 3]; BASES];
+
+/// Values of the basis functions towards each camera that sees a Gaussian, and the camera's weight; weights add up to 1.
+type Seen = Vec<([f64; BASES], f64)>;
+
+/// Numbers of Gaussians, and the cameras that see them.
+struct Colours {
+    means: Vec<f32>,
+    scales: Vec<f32>,
+    opacities: Vec<f32>,
+    sh: Vec<f32>,
+    bases: usize,
+    /// Cameras, and the inverses of their poses.
+    cameras: Vec<(Camera, DMat4)>,
+}
+
+impl Colours {
+    fn new(gaussians: &Gaussians, cameras: &[Camera]) -> Self {
+        let numbers =
+            |tensor: &Tensor| Vec::<f32>::try_from(tensor.flatten(0, -1)).expect("float32 on the host");
+        Colours {
+            means: numbers(&gaussians.means),
+            scales: numbers(&gaussians.scales),
+            opacities: numbers(&gaussians.opacities),
+            sh: numbers(&gaussians.sh),
+            bases: gaussians.sh.size()[2] as usize,
+            cameras: cameras.iter().map(|&camera| (camera, camera.c2w.inverse())).collect(),
+        }
+    }
+
+    /// Returns the coefficients of Gaussian `index`; those of higher degrees are 0.
+    fn coefficients(&self, index: usize) -> Coefficients {
+        let mut coefficients = [[0.; 3]; BASES];
+        let own = &self.sh[3 * self.bases * index..][..3 * self.bases];
+        for (coefficient, colour) in coefficients.iter_mut().zip(own.as_chunks().0) {
+            *coefficient = colour.map(f64::from);
+        }
+        coefficients
+    }
+
+    fn seen(&self, index: usize) -> Seen {
+        let mean = DVec3::from_array([0, 1, 2].map(|axis| f64::from(self.means[3 * index + axis])));
+        let largest = self.scales[3 * index..][..3].iter().fold(0f32, |largest, &scale| largest.max(scale));
+        let radius = VISIBLE_SIGMAS * f64::from(largest);
+        let mut seen: Seen = self
+            .cameras
+            .iter()
+            .filter_map(|(camera, w2c)| {
+                Some((basis_towards(camera, mean), weight(camera, w2c, mean, radius)?))
+            })
+            .collect();
+        let total: f64 = seen.iter().map(|(_, weight)| weight).sum();
+        seen.iter_mut().for_each(|(_, weight)| *weight /= total);
+        seen
+    }
+}
 
 /// Clamps coefficients to `limits`.
 fn clamp(coefficients: &Coefficients, limits: &ShLimits) -> Coefficients {
@@ -80,29 +167,14 @@ fn clamp(coefficients: &Coefficients, limits: &ShLimits) -> Coefficients {
 /// Least-squares problem for the coefficients of one Gaussian.
 struct Fit<'a> {
     original: Coefficients,
-    /// Values of the basis functions towards each camera that sees the Gaussian, and the camera's weight; weights add up to 1.
-    seen: Vec<([f64; BASES], f64)>,
+    seen: Seen,
     /// Quadratic cost of a change of the coefficients: Σ weight·Y·Yᵀ over cameras, plus a small multiple of the identity.
     cost: [[f64; BASES]; BASES],
     limits: &'a ShLimits,
 }
 
 impl<'a> Fit<'a> {
-    fn new(
-        mean: DVec3,
-        radius: f64,
-        original: Coefficients,
-        cameras: &[(Camera, DMat4)],
-        limits: &'a ShLimits,
-    ) -> Self {
-        let mut seen: Vec<_> = cameras
-            .iter()
-            .filter_map(|(camera, w2c)| {
-                Some((basis_towards(camera, mean), weight(camera, w2c, mean, radius)?))
-            })
-            .collect();
-        let total: f64 = seen.iter().map(|(_, weight)| weight).sum();
-        seen.iter_mut().for_each(|(_, weight)| *weight /= total);
+    fn new(original: Coefficients, seen: Seen, limits: &'a ShLimits) -> Self {
         let mut cost = [[0.; BASES]; BASES];
         for (row, costs) in cost.iter_mut().enumerate() {
             costs[row] = OTHER_DIRECTIONS_WEIGHT;
@@ -129,6 +201,29 @@ impl<'a> Fit<'a> {
         self.original.iter_mut().flatten().for_each(|coefficient| *coefficient *= factor);
         self.original[0].iter_mut().for_each(|constant| *constant += (factor - 1.) * 0.5 / SH_C0);
         (self.solve(), raised)
+    }
+
+    /// Returns the coefficients that minimize the squared error of the seen colours, plus a small multiple of their own squares.
+    ///
+    /// With the cost A = Σ weight·Y·Yᵀ + ε, they are c = A⁻¹ (A − ε) c₀. A is positive definite, so Gauss–Jordan elimination needs no pivots.
+    fn solve_smallest(&self) -> Coefficients {
+        let mut rows = self.cost;
+        let mut solution: Coefficients = std::array::from_fn(|row| {
+            [0, 1, 2].map(|channel| {
+                let product = |k: usize| self.cost[row][k] * self.original[k][channel];
+                let sum: f64 = (0..BASES).map(product).sum();
+                sum - OTHER_DIRECTIONS_WEIGHT * self.original[row][channel]
+            })
+        });
+        for pivot in 0..BASES {
+            let (line, right) = (rows[pivot], solution[pivot]);
+            for row in (0..BASES).filter(|&row| row != pivot) {
+                let factor = rows[row][pivot] / line[pivot];
+                (pivot..BASES).for_each(|k| rows[row][k] -= factor * line[k]);
+                (0..3).for_each(|channel| solution[row][channel] -= factor * right[channel]);
+            }
+        }
+        std::array::from_fn(|row| solution[row].map(|value| value / rows[row][row]))
     }
 
     fn solve(&self) -> Coefficients {
@@ -242,6 +337,24 @@ mod tests {
         assert!(fit < 0.003 && clamp > 0.02, "{fit} fitted, {clamp} clamped");
         assert!(fitted.sh.narrow(1, 1, 1).equal(&clamped.sh.narrow(1, 1, 1)), "seen by nobody");
         assert!(fitted.sh.narrow(1, 2, 1).equal(&original.sh.narrow(1, 2, 1)), "within the limits");
+    }
+
+    /// The smallest coefficients look the same from the cameras, and rounded ones have the same mean colour.
+    #[test]
+    fn coefficients_shrink_and_rounding_is_compensated() {
+        let (original, cameras) = (gaussians(3.), cameras(5));
+        let shrunk = shrink_harmonics(&original, &cameras);
+        let largest = |g: &Gaussians, index: i64| g.sh.narrow(1, index, 1).abs().max().double_value(&[]);
+        assert!(largest(&shrunk, 0) < 2. && largest(&shrunk, 1) == 3., "{}", largest(&shrunk, 0));
+        let difference = loss(&original, &shrunk, &cameras);
+        assert!(difference > 0. && difference < 0.003, "{difference}");
+        let mut rounded = shrunk.map(Tensor::shallow_clone);
+        rounded.sh = &shrunk.sh + 0.2;
+        rounded.sh.narrow(2, 0, 1).copy_(&shrunk.sh.narrow(2, 0, 1));
+        let compensated = compensate_mean_colour(&original, &rounded, &cameras);
+        let (before, after) = (loss(&original, &rounded, &cameras), loss(&original, &compensated, &cameras));
+        assert!(after < 0.15 * before, "{before} rounded, {after} compensated");
+        assert!(compensated.sh.narrow(2, 1, 15).equal(&rounded.sh.narrow(2, 1, 15)));
     }
 
     #[test]

@@ -8,7 +8,7 @@ mod transform;
 mod views;
 
 use crate::ffi::take_outputs;
-pub use harmonics::fit_harmonics;
+pub use harmonics::{compensate_mean_colour, fit_harmonics, shrink_harmonics};
 pub use orbit::orbit_around_gaussians;
 pub use transform::transform;
 pub use views::{RenderedView, SplatRenderer, render_views};

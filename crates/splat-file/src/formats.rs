@@ -33,7 +33,7 @@ pub(crate) struct Codec {
     pub read: fn(&Path, &[u8]) -> Result<Contents>,
     pub write: fn(&Path, &Splat, &WriteOptions) -> Result<()>,
     pub limits: fn() -> ShLimits,
-    /// Function that rounds SH coefficients above degree 0 as the format does, if that depends on all Gaussians.
+    /// Function that rounds SH coefficients above degree 0 as the format does, if it has a palette of them.
     pub round_sh: Option<fn(&Splat) -> Splat>,
 }
 
@@ -167,14 +167,22 @@ pub fn limits_of(path: &Path) -> Result<ShLimits> {
     Ok((format_of(path)?.codec(path)?.limits)())
 }
 
-/// Returns the splat with the SH coefficients above degree 0 that a file at `path` would hold, if its format rounds them to values that
-/// depend on all Gaussians, as a SOG does. Writing the returned splat doesn't change them. Other formats return `None`.
+/// Returns `true` if the format that the extension of `path` selects holds SH coefficients above degree 0 as a palette, as a SOG does.
 ///
 /// # Errors
-/// Returns an error for an unknown extension, a format that this build can't write, or if a list of the splat has the wrong length.
-pub fn round_sh(path: &Path, splat: &Splat) -> Result<Option<Splat>> {
+/// Returns an error for an unknown extension, or a format that this build can't write.
+pub fn has_sh_palette(path: &Path) -> Result<bool> {
+    Ok(format_of(path)?.codec(path)?.round_sh.is_some())
+}
+
+/// Returns the splat with the SH coefficients above degree 0 that a file at `path` would hold, if its format has a palette of them, which
+/// depends on all Gaussians. Writing the returned splat doesn't change them. Other formats don't change the splat.
+///
+/// # Errors
+/// Returns the errors of [`has_sh_palette`], or an error if a list of the splat has the wrong length.
+pub fn round_sh(path: &Path, splat: &Splat) -> Result<Splat> {
     splat.check_lengths()?;
-    Ok(format_of(path)?.codec(path)?.round_sh.map(|round_sh| round_sh(splat)))
+    Ok(format_of(path)?.codec(path)?.round_sh.map_or_else(|| splat.clone(), |round_sh| round_sh(splat)))
 }
 
 /// Reads a splat in the format that is recognized by its contents, or else in the format of its extension. Gaussians whose quaternion has

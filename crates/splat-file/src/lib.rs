@@ -18,8 +18,9 @@ mod spz;
 mod transform;
 
 pub use formats::{
-    WriteOptions, can_mark_antialiased, check_writable_splat, find_splat, is_splat_name, limits_of,
-    read_splat, read_splat_without_invalid, round_sh, write_local_splat, write_local_splat_with, write_splat,
+    WriteOptions, can_mark_antialiased, check_writable_splat, find_splat, has_sh_palette, is_splat_name,
+    limits_of, read_splat, read_splat_without_invalid, round_sh, write_local_splat, write_local_splat_with,
+    write_splat,
 };
 pub use globalsplat_files::{Error, Result};
 pub use limits::ShLimits;

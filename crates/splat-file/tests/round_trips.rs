@@ -5,8 +5,8 @@ mod common;
 use common::{assert_says, endings, largest_error, random_splat, written};
 use glam::DVec3;
 use globalsplat_splat_file::{
-    SH_C0, Splat, find_splat, is_splat_name, limits_of, origin_file, read_splat, round_sh, write_local_splat,
-    write_splat,
+    SH_C0, Splat, find_splat, has_sh_palette, is_splat_name, limits_of, origin_file, read_splat, round_sh,
+    write_local_splat, write_splat,
 };
 use std::path::Path;
 
@@ -177,7 +177,7 @@ fn coefficients_of_a_sog_are_known_beforehand() {
         }
     }
     let path = folder.path().join("a.sog");
-    let rounded = round_sh(&path, &splat).unwrap().unwrap();
+    let rounded = round_sh(&path, &splat).unwrap();
     let error = largest_error(rounded.sh.as_flattened(), splat.sh.as_flattened());
     assert!(error > 0.001 && error < 0.06, "{error}");
     assert_eq!(Splat { sh: splat.sh.clone(), ..rounded.clone() }, splat);
@@ -185,7 +185,9 @@ fn coefficients_of_a_sog_are_known_beforehand() {
         let copy = matched(expected, &read_splat(&written(folder.path(), name, expected)).unwrap());
         assert_eq!(bases(&copy, 1, 9), bases(&rounded, 1, 9), "{name}");
     }
-    assert!(round_sh(&folder.path().join("a.ply"), &splat).unwrap().is_none());
+    let ply = folder.path().join("a.ply");
+    assert_eq!(round_sh(&ply, &splat).unwrap(), splat);
+    assert_eq!((has_sh_palette(&path).unwrap(), has_sh_palette(&ply).unwrap()), (true, false));
 }
 
 /// A quantizing format doesn't change values that it has already rounded. Formats whose steps depend on the bounds of the values, which the
