@@ -1,5 +1,6 @@
 #![doc = include_str!("../README.md")]
 
+mod axes;
 mod compressed_ply;
 mod dot_splat;
 mod formats;

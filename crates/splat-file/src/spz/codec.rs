@@ -1,7 +1,7 @@
 //! Values of an SPZ's streams.
 
-use super::axes::Axes;
 use super::container::{self, Description, Streams};
+use crate::axes::Axes;
 use crate::formats::{Codec, Contents};
 use crate::invalid::InvalidGaussians;
 use crate::rotations::normalized;

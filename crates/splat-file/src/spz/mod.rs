@@ -2,8 +2,6 @@
 //! is written: it is the oldest whose rotations are precise enough, and programs that read version 4 read it too.
 
 #[cfg(feature = "spz")]
-mod axes;
-#[cfg(feature = "spz")]
 mod codec;
 #[cfg(feature = "spz")]
 mod container;
