@@ -4,7 +4,7 @@
 use crate::invalid::InvalidGaussians;
 use crate::origin::{read_origin, write_with_origin};
 use crate::rotations::drop_missing_rotations;
-use crate::{Error, Result, ShLimits, Splat, compressed_ply, dot_splat, ply, spz};
+use crate::{Error, Result, ShLimits, Splat, compressed_ply, dot_splat, ksplat, ply, spz};
 use glam::DVec3;
 use globalsplat_files::check_writable_file;
 use std::path::{Path, PathBuf};
@@ -18,6 +18,12 @@ pub(crate) struct Contents {
 /// Functions of a format.
 pub(crate) struct Codec {
     pub read: fn(&Path, &[u8]) -> Result<Contents>,
+    /// Functions that write the format, or `None` if it is only read.
+    pub writer: Option<Writer>,
+}
+
+/// Functions that write a format.
+pub(crate) struct Writer {
     pub write: fn(&Path, &Splat) -> Result<()>,
     pub limits: fn() -> ShLimits,
 }
@@ -28,33 +34,30 @@ struct Format {
     ending: &'static str,
     /// Function that returns `true` if bytes are certainly in this format.
     recognizes: fn(&[u8]) -> bool,
+    /// `true` if a file can say that the splat is antialiased.
+    marks_antialiased: bool,
     /// Functions of the format, or `None` if this build lacks the feature that it needs.
     codec: Option<Codec>,
 }
 
 /// All formats. The first one whose suffix matches, or that recognizes a file, is used.
-const FORMATS: [Format; 4] = [
+const FORMATS: [Format; 5] = [
     Format {
         ending: ".compressed.ply",
         recognizes: compressed_ply::recognizes,
-        codec: Some(Codec {
-            read: compressed_ply::read,
-            write: compressed_ply::write,
-            limits: compressed_ply::limits,
-        }),
+        marks_antialiased: true,
+        codec: compressed_ply::CODEC,
     },
-    Format {
-        ending: ".ply",
-        recognizes: ply::recognizes,
-        codec: Some(Codec { read: ply::read, write: ply::write, limits: ply::limits }),
-    },
-    Format { ending: ".spz", recognizes: spz::recognizes, codec: spz::CODEC },
-    Format {
-        ending: ".splat",
-        recognizes: |_| false,
-        codec: Some(Codec { read: dot_splat::read, write: dot_splat::write, limits: dot_splat::limits }),
-    },
+    Format { ending: ".ply", recognizes: ply::recognizes, marks_antialiased: true, codec: ply::CODEC },
+    Format { ending: ".spz", recognizes: spz::recognizes, marks_antialiased: true, codec: spz::CODEC },
+    Format { ending: ".splat", recognizes: |_| false, marks_antialiased: false, codec: dot_splat::CODEC },
+    Format { ending: ".ksplat", recognizes: |_| false, marks_antialiased: false, codec: ksplat::CODEC },
 ];
+
+/// Extensions of all formats, for messages.
+const ENDINGS: &str = ".ply, .compressed.ply, .spz, .splat or .ksplat";
+/// Extensions of the formats that are written, for messages.
+const WRITTEN_ENDINGS: &str = ".ply, .compressed.ply, .spz or .splat";
 
 impl Format {
     /// Returns the functions of the format, which is that of the file at `path`.
@@ -67,6 +70,16 @@ impl Format {
             Error::input(path, "the format", self.ending, expected)
         })
     }
+
+    /// Returns the functions that write the format, which is that of the file at `path`.
+    ///
+    /// # Errors
+    /// Returns an error if this build lacks the feature that the format needs, or if the format is only read.
+    fn writer(&self, path: &Path) -> Result<&Writer> {
+        self.codec(path)?.writer.as_ref().ok_or_else(|| {
+            Error::input(path, "the format", format!("{}, which is only read", self.ending), WRITTEN_ENDINGS)
+        })
+    }
 }
 
 /// Returns the format that belongs to the extension of `path`.
@@ -77,7 +90,7 @@ fn format_of(path: &Path) -> Result<&'static Format> {
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
     FORMATS.iter().find(|format| name.ends_with(format.ending)).ok_or_else(|| {
         let found = path.extension().map_or("missing".into(), |ending| format!(".{}", ending.display()));
-        Error::input(path, "the ending", found, ".ply, .compressed.ply, .spz or .splat")
+        Error::input(path, "the ending", found, ENDINGS)
     })
 }
 
@@ -97,7 +110,7 @@ pub fn find_splat(folder: &Path, name: &str) -> PathBuf {
 /// # Errors
 /// Returns an error for an unknown extension or a format that this build can't write, or a request error that names the path.
 pub fn check_writable_splat(path: &Path) -> Result<()> {
-    format_of(path)?.codec(path)?;
+    format_of(path)?.writer(path)?;
     check_writable_file(path)
 }
 
@@ -106,7 +119,7 @@ pub fn check_writable_splat(path: &Path) -> Result<()> {
 /// # Errors
 /// Returns an error for an unknown extension.
 pub fn can_mark_antialiased(path: &Path) -> Result<bool> {
-    Ok(format_of(path)?.ending != ".splat")
+    Ok(format_of(path)?.marks_antialiased)
 }
 
 /// Returns the limits of the spherical harmonics in the format that the extension of `path` selects.
@@ -114,7 +127,7 @@ pub fn can_mark_antialiased(path: &Path) -> Result<bool> {
 /// # Errors
 /// Returns an error for an unknown extension, or a format that this build can't write.
 pub fn limits_of(path: &Path) -> Result<ShLimits> {
-    Ok((format_of(path)?.codec(path)?.limits)())
+    Ok((format_of(path)?.writer(path)?.limits)())
 }
 
 /// Reads a splat in the format that is recognized by its contents, or else in the format of its extension. Gaussians whose quaternion has
@@ -196,11 +209,11 @@ pub fn write_splat(path: &Path, splat: &Splat) -> Result<()> {
 /// # Errors
 /// Returns the errors of [`write_splat`].
 pub fn write_local_splat(path: &Path, splat: &Splat) -> Result<()> {
-    let codec = format_of(path)?.codec(path)?;
+    let writer = format_of(path)?.writer(path)?;
     splat.check_lengths()?;
     let (rotated, _) = drop_missing_rotations(splat);
     write_with_origin(path, splat.origin, || {
         rotated.check_finite(path)?;
-        (codec.write)(path, &rotated)
+        (writer.write)(path, &rotated)
     })
 }

@@ -5,6 +5,7 @@ mod compressed_ply;
 mod dot_splat;
 mod formats;
 mod invalid;
+mod ksplat;
 mod limits;
 mod morton;
 mod origin;

@@ -2,7 +2,7 @@
 
 use super::container::{self, Description, Streams};
 use crate::axes::Axes;
-use crate::formats::{Codec, Contents};
+use crate::formats::{Codec, Contents, Writer};
 use crate::invalid::InvalidGaussians;
 use crate::rotations::normalized;
 use crate::splat::logit_of_opacity;
@@ -12,7 +12,7 @@ use std::f64::consts::FRAC_1_SQRT_2;
 use std::path::Path;
 
 /// Functions of the format.
-pub(crate) const CODEC: Option<Codec> = Some(Codec { read, write, limits });
+pub(crate) const CODEC: Option<Codec> = Some(Codec { read, writer: Some(Writer { write, limits }) });
 
 /// Factor of an SH coefficient of degree 0, to which ½ is added.
 const COLOUR_SCALE: f64 = 0.15;
