@@ -2,9 +2,9 @@
 //! file that is read is recognized by its contents, where that is possible.
 
 use crate::invalid::InvalidGaussians;
-use crate::origin::{read_origin, write_with_origin};
+use crate::origin::{origin_file, read_origin, write_with_origin};
 use crate::rotations::drop_missing_rotations;
-use crate::{Error, Result, ShLimits, Splat, compressed_ply, dot_splat, ksplat, ply, spz};
+use crate::{Error, Result, ShLimits, Splat, compressed_ply, dot_splat, gltf, ksplat, ply, spz};
 use glam::DVec3;
 use globalsplat_files::check_writable_file;
 use std::path::{Path, PathBuf};
@@ -41,7 +41,7 @@ struct Format {
 }
 
 /// All formats. The first one whose suffix matches, or that recognizes a file, is used.
-const FORMATS: [Format; 5] = [
+const FORMATS: [Format; 7] = [
     Format {
         ending: ".compressed.ply",
         recognizes: compressed_ply::recognizes,
@@ -51,15 +51,32 @@ const FORMATS: [Format; 5] = [
     Format { ending: ".ply", recognizes: ply::recognizes, marks_antialiased: true, codec: ply::CODEC },
     Format { ending: ".spz", recognizes: spz::recognizes, marks_antialiased: true, codec: spz::CODEC },
     Format { ending: ".splat", recognizes: |_| false, marks_antialiased: false, codec: dot_splat::CODEC },
+    Format {
+        ending: ".glb",
+        recognizes: gltf::recognizes_glb,
+        marks_antialiased: false,
+        codec: gltf::GLB_CODEC,
+    },
+    Format {
+        ending: ".gltf",
+        recognizes: gltf::recognizes_json,
+        marks_antialiased: false,
+        codec: gltf::GLTF_CODEC,
+    },
     Format { ending: ".ksplat", recognizes: |_| false, marks_antialiased: false, codec: ksplat::CODEC },
 ];
 
 /// Extensions of all formats, for messages.
-const ENDINGS: &str = ".ply, .compressed.ply, .spz, .splat or .ksplat";
+const ENDINGS: &str = ".ply, .compressed.ply, .spz, .splat, .glb, .gltf or .ksplat";
 /// Extensions of the formats that are written, for messages.
-const WRITTEN_ENDINGS: &str = ".ply, .compressed.ply, .spz or .splat";
+const WRITTEN_ENDINGS: &str = ".ply, .compressed.ply, .spz, .splat, .glb or .gltf";
 
 impl Format {
+    /// Returns the path of the second file that the splat at `path` is written to, if there is one.
+    fn buffer_file(&self, path: &Path) -> Option<PathBuf> {
+        (self.ending == ".gltf").then(|| gltf::buffer_file(path))
+    }
+
     /// Returns the functions of the format, which is that of the file at `path`.
     ///
     /// # Errors
@@ -99,6 +116,12 @@ pub fn is_splat_name(path: &Path) -> bool {
     format_of(path).is_ok()
 }
 
+/// Returns the files that a splat at `path` may consist of: the splat itself, its origin file, and the buffer of a `.gltf`.
+pub fn splat_files(path: &Path) -> Vec<PathBuf> {
+    let buffer = format_of(path).ok().and_then(|format| format.buffer_file(path));
+    [path.to_owned(), origin_file(path)].into_iter().chain(buffer).collect()
+}
+
 /// Returns the path of the splat `name` in `folder`, in any format, or if there is none, the path of the missing PLY.
 pub fn find_splat(folder: &Path, name: &str) -> PathBuf {
     let candidates = FORMATS.map(|format| folder.join(format!("{name}{}", format.ending)));
@@ -110,7 +133,11 @@ pub fn find_splat(folder: &Path, name: &str) -> PathBuf {
 /// # Errors
 /// Returns an error for an unknown extension or a format that this build can't write, or a request error that names the path.
 pub fn check_writable_splat(path: &Path) -> Result<()> {
-    format_of(path)?.writer(path)?;
+    let format = format_of(path)?;
+    format.writer(path)?;
+    if let Some(file) = format.buffer_file(path) {
+        check_writable_file(&file)?;
+    }
     check_writable_file(path)
 }
 

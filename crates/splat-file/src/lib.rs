@@ -4,6 +4,7 @@ mod axes;
 mod compressed_ply;
 mod dot_splat;
 mod formats;
+mod gltf;
 mod invalid;
 mod ksplat;
 mod limits;
@@ -20,10 +21,10 @@ mod transform;
 
 pub use formats::{
     can_mark_antialiased, check_writable_splat, find_splat, is_splat_name, limits_of, read_splat,
-    read_splat_without_invalid, write_local_splat, write_splat,
+    read_splat_without_invalid, splat_files, write_local_splat, write_splat,
 };
 pub use globalsplat_files::{Error, Result};
 pub use limits::ShLimits;
-pub use origin::{check_writable_origin, origin_file, splat_files};
+pub use origin::{check_writable_origin, origin_file};
 pub use sh::ShRotation;
 pub use splat::{MIN_SCALE, OPACITY_MARGIN, SH_C0, Splat};
