@@ -117,7 +117,7 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         return Err(Error::input(path, "the number of sections", sections, expected));
     };
     let headers = headers.as_chunks::<SECTION_HEADER>().0;
-    let sh_degree = headers.iter().map(|header| sh_degree(header)).max().unwrap_or(0);
+    let sh_degree = headers.iter().map(sh_degree).max().unwrap_or(0);
     if sh_degree > 3 {
         return Err(Error::input(path, "the SH degree", sh_degree, "0 to 3"));
     }
