@@ -143,8 +143,12 @@ fn the_numbers_of_a_glb_are_turned() {
     let mut glb = Glb::written(&splat);
     let turned: Vec<f32> = splat.means.iter().flat_map(|&[x, y, z]| [-x, -y, z]).collect();
     assert_eq!(glb.floats("POSITION"), turned);
-    let low = turned.iter().skip(1).step_by(3).fold(f32::INFINITY, |low, &y| low.min(y));
-    assert_eq!(glb.accessor("POSITION")["min"][1].as_f64(), Some(low.into()));
+    for axis in 0..3 {
+        let numbers = || turned.iter().skip(axis).step_by(3).copied();
+        let (low, high) = (numbers().reduce(f32::min).unwrap(), numbers().reduce(f32::max).unwrap());
+        assert_eq!(glb.accessor("POSITION")["min"][axis].as_f64(), Some(low.into()));
+        assert_eq!(glb.accessor("POSITION")["max"][axis].as_f64(), Some(high.into()));
+    }
     // (0, 0, 0, 1) · (w, x, y, z), as x, y, z, w.
     assert_eq!(glb.floats(ROTATION)[..4], [0.7, 0.1, 0.5, -0.5]);
     let linear: Vec<f32> = (0..3).flat_map(|index| splat.scale(index)).collect();
@@ -241,6 +245,8 @@ fn nodes_move_gaussians() {
         json["scene"] = json!(0);
     });
     assert_says(&cycle, &["node 2 is reached twice, expected a tree"]);
+    let twice = glb.refused(|json| json["scenes"] = json!([{"nodes": [2, 1]}]));
+    assert_says(&twice, &["node 1 is reached twice"]);
     assert_says(&glb.refused(|json| json["scene"] = json!(1)), &["scene 1 is missing"]);
 }
 
@@ -443,6 +449,11 @@ fn buffers_are_files_or_data() {
     std::fs::create_dir(folder.path().join("sub")).unwrap();
     std::fs::write(folder.path().join("sub/b:c.bin"), &bin).unwrap();
     assert_same("a folder", &splat, &read_with("sub/b%3Ac.bin").unwrap());
+    assert_same(
+        "a name with a colon",
+        &splat,
+        &read_splat(&written(folder.path(), "b:c.gltf", &splat)).unwrap(),
+    );
     let mut refused =
         |uri: &str, parts: &[&str]| assert_says(&read_with(uri).unwrap_err().to_string(), parts);
     for uri in
@@ -586,13 +597,16 @@ fn bad_glbs() {
     }
     assert_says(
         &glb.refused(|json| json["asset"]["version"] = json!("1.0")),
-        &["the version is 1.0, expected 2.0"],
+        &["the version is \"1.0\", expected 2.0"],
     );
     let required = glb.refused(|json| json["extensionsRequired"] = json!(["KHR_draco_mesh_compression"]));
     assert_says(
         &required,
-        &["a required extension is KHR_draco_mesh_compression, expected KHR_gaussian_splatting,"],
+        &["a required extension is \"KHR_draco_mesh_compression\", expected KHR_gaussian_splatting,"],
     );
+    // A long text with line breaks is still one short sentence.
+    let long = glb.refused(|json| json["extensionsRequired"] = json!(["a\n".repeat(1000)]));
+    assert!(long.len() < 500, "{long}");
     assert_says(&glb.refused(|json| json["nodes"][0]["mesh"] = json!(3)), &["mesh 3 is missing", "below 1"]);
     let primitive =
         |change: &dyn Fn(&mut Value)| glb.refused(|json| change(&mut json["meshes"][0]["primitives"][0]));

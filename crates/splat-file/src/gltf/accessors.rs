@@ -1,6 +1,6 @@
 //! Numbers of accessors.
 
-use super::container::Document;
+use super::container::{Document, quoted};
 use super::json::Accessor;
 use crate::{Error, Result};
 
@@ -115,7 +115,7 @@ impl Document<'_> {
         };
         let shape = if N == 1 { "SCALAR".to_string() } else { format!("VEC{N}") };
         if accessor.shape != shape {
-            return Err(error("the type", format!("{:.20?}", accessor.shape), &shape));
+            return Err(error("the type", quoted(&accessor.shape), &shape));
         }
         let scalar = Scalar::from_code(accessor.component_type)
             .filter(|&scalar| components.allow(scalar, accessor.normalized));

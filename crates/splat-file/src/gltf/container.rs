@@ -8,7 +8,7 @@ use std::borrow::Cow;
 use std::cell::OnceCell;
 use std::fs;
 use std::io::Read;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 /// Version of glTF, and of the container `.glb`.
 const VERSION: &str = "2.0";
@@ -45,11 +45,11 @@ impl<'a> Document<'a> {
             .map_err(|why| Error::input(path, "the JSON", format!("invalid: {why}"), "glTF 2.0"))?;
         let version = &gltf.asset.version;
         if !version.starts_with("2.") {
-            return Err(Error::input(path, "the version", version, VERSION));
+            return Err(Error::input(path, "the version", quoted(version), VERSION));
         }
         if let Some(unknown) = gltf.extensions_required.iter().find(|name| !KNOWN.contains(&name.as_str())) {
             let expected = format!("{} or none", KNOWN.join(", "));
-            return Err(Error::input(path, "a required extension", unknown, expected));
+            return Err(Error::input(path, "a required extension", quoted(unknown), expected));
         }
         let buffers = gltf.buffers.iter().map(|_| OnceCell::new()).collect();
         Ok(Document { path, gltf, length: bytes.len(), bin, buffers })
@@ -143,18 +143,26 @@ impl<'a> Document<'a> {
 
     /// Returns the path of the file that a URI refers to.
     fn relative_path(&self, field: &str, uri: &str) -> Result<PathBuf> {
+        // A colon after the first slash, or in percent-encoding, is part of a name.
+        let is_url = uri.split_once(':').is_some_and(|(scheme, _)| !scheme.contains('/'));
         let name = decode_percent(uri).filter(|name| {
-            let is_url = name.split_once(':').is_some_and(|(scheme, _)| !scheme.contains(['/', '\\']));
-            !(name.is_empty() || is_url || name.starts_with(['/', '\\']) || name.contains('\0'))
+            let is_absolute = name.starts_with(['/', '\\'])
+                || Path::new(name).components().any(|part| matches!(part, Component::Prefix(_)));
+            !(name.is_empty() || is_url || is_absolute || name.contains('\0'))
         });
         match name {
             Some(name) => Ok(parent_of(self.path).join(name)),
             None => {
                 let expected = "a data URI, or a path relative to the file's folder";
-                Err(Error::input(self.path, format!("the uri of {field}"), format!("{uri:.200?}"), expected))
+                Err(Error::input(self.path, format!("the uri of {field}"), quoted(uri), expected))
             }
         }
     }
+}
+
+/// Returns the beginning of a text from a file, in quotes and on one line.
+pub fn quoted(text: &str) -> String {
+    format!("{:?}", text.chars().take(60).collect::<String>())
 }
 
 /// Returns the JSON and the binary chunk of a `.glb`.

@@ -1,7 +1,7 @@
 //! Gaussians of a glTF file.
 
 use super::accessors::Components;
-use super::container::Document;
+use super::container::{Document, quoted};
 use super::json::{Primitive, Splatting};
 use super::scene::MeshNode;
 use super::{COLOUR_SPACE, EXTENSION, KERNEL, POINTS, SPZ_EXTENSION, sh_attribute, turn_rotation_back};
@@ -234,7 +234,7 @@ impl PrimitiveReader<'_> {
     /// Returns a warning if a property of the extension has an unknown value.
     fn unknown(&self, property: &str, found: Option<&str>, known: &str) -> Option<String> {
         let found = found.filter(|&found| found != known)?;
-        Some(format!("{}: {property} {found:.60?} is read as {known}", self.document.path.display()))
+        Some(format!("{}: {property} {} is read as {known}", self.document.path.display(), quoted(found)))
     }
 }
 
