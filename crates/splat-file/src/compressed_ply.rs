@@ -1,7 +1,7 @@
 //! PlayCanvas' compressed PLY (spec 10.12). Each Gaussian has four words of 32 bits, and a byte for each SH coefficient above degree 0.
 //! Positions, scales and colours are quantized between the bounds of a chunk of 256 Gaussians.
 
-use crate::formats::{Contents, WriteOptions};
+use crate::formats::{Codec, Contents, WriteOptions, Writer};
 use crate::invalid::InvalidGaussians;
 use crate::morton::morton_order;
 use crate::ply::degree_of_rest;
@@ -13,6 +13,9 @@ use crate::{Error, Result, SH_C0, ShLimits, Splat};
 use globalsplat_files::write_atomically;
 use std::f64::consts::SQRT_2;
 use std::path::Path;
+
+/// Functions of the format.
+pub(crate) const CODEC: Option<Codec> = Some(Codec { read, writer: Some(Writer::new(write, limits)) });
 
 /// Number of Gaussians in a chunk, which share their bounds.
 const CHUNK: usize = 256;
@@ -41,7 +44,7 @@ pub(crate) fn recognizes(bytes: &[u8]) -> bool {
 ///
 /// # Errors
 /// Returns an error if an element or property is missing or has another type, or if the file is truncated.
-pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
+fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let header = Header::parse(path, bytes)?;
     let owned = |names: &[&str]| names.iter().map(|name| name.to_string()).collect::<Vec<_>>();
     expect_type(path, &header, "vertex", &owned(&WORDS), Scalar::U32)?;
@@ -128,7 +131,7 @@ fn bound_names(names: &[&str; 3]) -> Vec<String> {
 }
 
 /// Returns the range of SH coefficients that the format can store. Degree 0 is unlimited, because each chunk has its own bounds of colours.
-pub(crate) fn limits() -> ShLimits {
+fn limits() -> ShLimits {
     ShLimits { rest: -SH_RANGE / 2. ..=SH_RANGE / 2., ..ShLimits::up_to(3) }
 }
 
@@ -136,7 +139,7 @@ pub(crate) fn limits() -> ShLimits {
 ///
 /// # Errors
 /// Returns an error if the file can't be written.
-pub(crate) fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
+fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
     let order = morton_order(&splat.means);
     let (mut bounds, mut words) = (vec![], vec![]);
     for chunk in order.chunks(CHUNK) {

@@ -1,12 +1,15 @@
 //! antimatter15's `.splat` format: 32 bytes per Gaussian and nothing else (spec 10.14).
 
-use crate::formats::{Contents, WriteOptions, is_recognized};
+use crate::formats::{Codec, Contents, WriteOptions, Writer, is_recognized};
 use crate::invalid::InvalidGaussians;
 use crate::rotations::normalized;
 use crate::splat::{log_of_scale, logit_of_opacity};
 use crate::{Error, Result, SH_C0, ShLimits, Splat};
 use globalsplat_files::write_atomically;
 use std::path::Path;
+
+/// Functions of the format.
+pub(crate) const CODEC: Option<Codec> = Some(Codec { read, writer: Some(Writer::new(write, limits)) });
 
 /// Number of bytes of a Gaussian: position and scale, float32 each, then colour, opacity and rotation, a byte each.
 const BYTES: usize = 32;
@@ -15,7 +18,7 @@ const BYTES: usize = 32;
 ///
 /// # Errors
 /// Returns an error if the file doesn't consist of whole Gaussians.
-pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
+fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let (gaussians, rest) = bytes.as_chunks::<BYTES>();
     if gaussians.is_empty() || !rest.is_empty() {
         let found = format!("{} bytes", bytes.len());
@@ -50,7 +53,7 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
 }
 
 /// Returns the limits of coefficients: colours that a screen shows, independent of the view direction.
-pub(crate) fn limits() -> ShLimits {
+fn limits() -> ShLimits {
     ShLimits { degree: 0, dc: -0.5 / SH_C0..=0.5 / SH_C0, rest: 0. ..=0. }
 }
 
@@ -58,7 +61,7 @@ pub(crate) fn limits() -> ShLimits {
 ///
 /// # Errors
 /// Returns an error if there is no Gaussian, or the file can't be written.
-pub(crate) fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
+fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
     if splat.is_empty() {
         return Err(Error::failed(format!(
             "{}: a .splat holds one Gaussian at least, found 0",

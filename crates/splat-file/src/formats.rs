@@ -2,9 +2,9 @@
 //! file that is read is recognized by its contents, where that is possible.
 
 use crate::invalid::InvalidGaussians;
-use crate::origin::{read_origin, write_with_origin};
+use crate::origin::{origin_file, read_origin, write_with_origin};
 use crate::rotations::drop_missing_rotations;
-use crate::{Error, Result, ShLimits, Splat, compressed_ply, dot_splat, ply, sog, spz};
+use crate::{Error, Result, ShLimits, Splat, compressed_ply, dot_splat, gltf, ksplat, ply, sog, spz};
 use glam::DVec3;
 use globalsplat_files::check_writable_file;
 use std::path::{Path, PathBuf};
@@ -31,10 +31,26 @@ pub(crate) struct Contents {
 /// Functions of a format.
 pub(crate) struct Codec {
     pub read: fn(&Path, &[u8]) -> Result<Contents>,
+    /// Functions that write the format, or `None` if it is only read.
+    pub writer: Option<Writer>,
+}
+
+/// Functions that write a format.
+pub(crate) struct Writer {
     pub write: fn(&Path, &Splat, &WriteOptions) -> Result<()>,
     pub limits: fn() -> ShLimits,
     /// Function that rounds SH coefficients above degree 0 as the format does, if it has a palette of them.
     pub round_sh: Option<fn(&Splat) -> Splat>,
+}
+
+impl Writer {
+    /// Creates the functions of a format without a palette.
+    pub const fn new(
+        write: fn(&Path, &Splat, &WriteOptions) -> Result<()>,
+        limits: fn() -> ShLimits,
+    ) -> Self {
+        Writer { write, limits, round_sh: None }
+    }
 }
 
 /// A splat file format.
@@ -43,6 +59,8 @@ struct Format {
     ending: &'static str,
     /// Function that returns `true` if bytes are certainly in this format.
     recognizes: fn(&[u8]) -> bool,
+    /// `true` if a file can say that the splat is antialiased.
+    marks_antialiased: bool,
     /// Functions of the format, or `None` if this build lacks the feature that it needs.
     codec: Option<Codec>,
 }
@@ -51,59 +69,46 @@ struct Format {
 const SOG_META: &str = "meta.json";
 
 /// All formats. The first one whose suffix matches, or that recognizes a file, is used.
-const FORMATS: [Format; 6] = [
+const FORMATS: [Format; 9] = [
     Format {
         ending: ".compressed.ply",
         recognizes: compressed_ply::recognizes,
-        codec: Some(Codec {
-            read: compressed_ply::read,
-            write: compressed_ply::write,
-            limits: compressed_ply::limits,
-            round_sh: None,
-        }),
+        marks_antialiased: true,
+        codec: compressed_ply::CODEC,
     },
+    Format { ending: ".ply", recognizes: ply::recognizes, marks_antialiased: true, codec: ply::CODEC },
+    Format { ending: ".sog", recognizes: sog::recognizes, marks_antialiased: true, codec: sog::CODEC },
+    Format { ending: SOG_META, recognizes: |_| false, marks_antialiased: true, codec: sog::FOLDER_CODEC },
+    Format { ending: ".spz", recognizes: spz::recognizes, marks_antialiased: true, codec: spz::CODEC },
+    Format { ending: ".splat", recognizes: |_| false, marks_antialiased: false, codec: dot_splat::CODEC },
     Format {
-        ending: ".ply",
-        recognizes: ply::recognizes,
-        codec: Some(Codec { read: ply::read, write: ply::write, limits: ply::limits, round_sh: None }),
+        ending: ".glb",
+        recognizes: gltf::recognizes_glb,
+        marks_antialiased: false,
+        codec: gltf::GLB_CODEC,
     },
-    Format {
-        ending: ".sog",
-        recognizes: sog::recognizes,
-        codec: Some(Codec {
-            read: sog::read_bundle,
-            write: sog::write_bundle,
-            limits: sog::limits,
-            round_sh: Some(sog::round_sh),
-        }),
-    },
-    Format {
-        ending: SOG_META,
-        recognizes: |_| false,
-        codec: Some(Codec {
-            read: sog::read_folder,
-            write: sog::write_folder,
-            limits: sog::limits,
-            round_sh: Some(sog::round_sh),
-        }),
-    },
-    Format { ending: ".spz", recognizes: spz::recognizes, codec: spz::CODEC },
-    Format {
-        ending: ".splat",
-        recognizes: |_| false,
-        codec: Some(Codec {
-            read: dot_splat::read,
-            write: dot_splat::write,
-            limits: dot_splat::limits,
-            round_sh: None,
-        }),
-    },
+    Format { ending: ".gltf", recognizes: |_| false, marks_antialiased: false, codec: gltf::GLTF_CODEC },
+    Format { ending: ".ksplat", recognizes: |_| false, marks_antialiased: false, codec: ksplat::CODEC },
 ];
+
+/// Extensions of all formats, for messages.
+const ENDINGS: &str = ".ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf or .ksplat";
+/// Extensions of the formats that are written, for messages.
+const WRITTEN_ENDINGS: &str = ".ply, .compressed.ply, .sog, .spz, .splat, .glb or .gltf";
 
 impl Format {
     /// Returns `true` if a file with this name, in lower case, is in this format.
     fn is_named(&self, name: &str) -> bool {
         if self.ending.starts_with('.') { name.ends_with(self.ending) } else { name == self.ending }
+    }
+
+    /// Returns the paths of the other files that the splat at `path` is written to.
+    fn other_files(&self, path: &Path) -> Vec<PathBuf> {
+        match self.ending {
+            ".gltf" => vec![gltf::buffer_file(path)],
+            SOG_META => sog::IMAGES.map(|name| path.with_file_name(name)).to_vec(),
+            _ => vec![],
+        }
     }
 
     /// Returns the functions of the format, which is that of the file at `path`.
@@ -116,6 +121,16 @@ impl Format {
             Error::input(path, "the format", self.ending, expected)
         })
     }
+
+    /// Returns the functions that write the format, which is that of the file at `path`.
+    ///
+    /// # Errors
+    /// Returns an error if this build lacks the feature that the format needs, or if the format is only read.
+    fn writer(&self, path: &Path) -> Result<&Writer> {
+        self.codec(path)?.writer.as_ref().ok_or_else(|| {
+            Error::input(path, "the format", format!("{}, which is only read", self.ending), WRITTEN_ENDINGS)
+        })
+    }
 }
 
 /// Returns the format that belongs to the extension of `path`.
@@ -126,13 +141,20 @@ fn format_of(path: &Path) -> Result<&'static Format> {
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
     FORMATS.iter().find(|format| format.is_named(&name)).ok_or_else(|| {
         let found = path.extension().map_or("missing".into(), |ending| format!(".{}", ending.display()));
-        Error::input(path, "the ending", found, ".ply, .compressed.ply, .sog, .spz or .splat")
+        Error::input(path, "the ending", found, ENDINGS)
     })
 }
 
 /// Returns `true` if `path` has the extension of a splat format.
 pub fn is_splat_name(path: &Path) -> bool {
     format_of(path).is_ok()
+}
+
+/// Returns the files that a splat at `path` may consist of: the splat itself, its origin file, and the buffer of a `.gltf` or the
+/// images of a SOG's `meta.json`.
+pub fn splat_files(path: &Path) -> Vec<PathBuf> {
+    let others = format_of(path).ok().map_or(vec![], |format| format.other_files(path));
+    [path.to_owned(), origin_file(path)].into_iter().chain(others).collect()
 }
 
 /// Returns the path of the splat `name` in `folder`, in any format, or if there is none, the path of the missing PLY.
@@ -147,7 +169,9 @@ pub fn find_splat(folder: &Path, name: &str) -> PathBuf {
 /// # Errors
 /// Returns an error for an unknown extension or a format that this build can't write, or a request error that names the path.
 pub fn check_writable_splat(path: &Path) -> Result<()> {
-    format_of(path)?.codec(path)?;
+    let format = format_of(path)?;
+    format.writer(path)?;
+    format.other_files(path).iter().try_for_each(|file| check_writable_file(file))?;
     check_writable_file(path)
 }
 
@@ -156,7 +180,7 @@ pub fn check_writable_splat(path: &Path) -> Result<()> {
 /// # Errors
 /// Returns an error for an unknown extension.
 pub fn can_mark_antialiased(path: &Path) -> Result<bool> {
-    Ok(format_of(path)?.ending != ".splat")
+    Ok(format_of(path)?.marks_antialiased)
 }
 
 /// Returns the limits of the spherical harmonics in the format that the extension of `path` selects.
@@ -164,7 +188,7 @@ pub fn can_mark_antialiased(path: &Path) -> Result<bool> {
 /// # Errors
 /// Returns an error for an unknown extension, or a format that this build can't write.
 pub fn limits_of(path: &Path) -> Result<ShLimits> {
-    Ok((format_of(path)?.codec(path)?.limits)())
+    Ok((format_of(path)?.writer(path)?.limits)())
 }
 
 /// Returns `true` if the format that the extension of `path` selects holds SH coefficients above degree 0 as a palette, as a SOG does.
@@ -172,7 +196,7 @@ pub fn limits_of(path: &Path) -> Result<ShLimits> {
 /// # Errors
 /// Returns an error for an unknown extension, or a format that this build can't write.
 pub fn has_sh_palette(path: &Path) -> Result<bool> {
-    Ok(format_of(path)?.codec(path)?.round_sh.is_some())
+    Ok(format_of(path)?.writer(path)?.round_sh.is_some())
 }
 
 /// Returns the splat with the SH coefficients above degree 0 that a file at `path` would hold, if its format has a palette of them, which
@@ -182,7 +206,7 @@ pub fn has_sh_palette(path: &Path) -> Result<bool> {
 /// Returns the errors of [`has_sh_palette`], or an error if a list of the splat has the wrong length.
 pub fn round_sh(path: &Path, splat: &Splat) -> Result<Splat> {
     splat.check_lengths()?;
-    Ok(format_of(path)?.codec(path)?.round_sh.map_or_else(|| splat.clone(), |round_sh| round_sh(splat)))
+    Ok(format_of(path)?.writer(path)?.round_sh.map_or_else(|| splat.clone(), |round_sh| round_sh(splat)))
 }
 
 /// Reads a splat in the format that is recognized by its contents, or else in the format of its extension. Gaussians whose quaternion has
@@ -272,11 +296,11 @@ pub fn write_local_splat(path: &Path, splat: &Splat) -> Result<()> {
 /// # Errors
 /// Returns the errors of [`write_splat`], or an error if the format doesn't allow the options.
 pub fn write_local_splat_with(path: &Path, splat: &Splat, options: &WriteOptions) -> Result<()> {
-    let codec = format_of(path)?.codec(path)?;
+    let writer = format_of(path)?.writer(path)?;
     splat.check_lengths()?;
     let (rotated, _) = drop_missing_rotations(splat);
     write_with_origin(path, splat.origin, || {
         rotated.check_finite(path)?;
-        (codec.write)(path, &rotated, options)
+        (writer.write)(path, &rotated, options)
     })
 }

@@ -24,11 +24,6 @@ pub fn origin_file(path: &Path) -> PathBuf {
     name.into()
 }
 
-/// Returns the files that a splat at `path` may consist of: the splat itself, and its origin file.
-pub fn splat_files(path: &Path) -> [PathBuf; 2] {
-    [path.to_owned(), origin_file(path)]
-}
-
 /// Checks that the origin file of a splat at `path`, whose name is longer, could be written. Call it before the work starts.
 ///
 /// # Errors

@@ -3,13 +3,16 @@
 //! A vertex has x y z, nx ny nz (zeros), f_dc_0..2, f_rest_*, opacity (a logit), scale_0..2 (logs), rot_0..3 (w, x, y, z). f_rest is
 //! channel-major: all reds, all greens, all blues. Files are written as float32, binary, little-endian.
 
-use crate::formats::{Contents, WriteOptions};
+use crate::formats::{Codec, Contents, WriteOptions, Writer};
 use crate::invalid::InvalidGaussians;
 use crate::ply_body::columns;
 use crate::ply_header::{Header, Scalar};
 use crate::{Error, MIN_SCALE, OPACITY_MARGIN, Result, SH_C0, ShLimits, Splat};
 use globalsplat_files::write_atomically;
 use std::path::Path;
+
+/// Functions of the format.
+pub(crate) const CODEC: Option<Codec> = Some(Codec { read, writer: Some(Writer::new(write, limits)) });
 
 /// Maximum logarithm of a scale: larger scales exceed float32.
 const MAX_LOG_SCALE: f32 = 88.;
@@ -29,7 +32,7 @@ pub(crate) fn recognizes(bytes: &[u8]) -> bool {
 ///
 /// # Errors
 /// Returns an error if a property is missing, or if the file is a point cloud or truncated.
-pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
+fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let header = Header::parse(path, bytes)?;
     let vertex = header.element("vertex");
     let has = |name: &str| vertex.is_some_and(|vertex| vertex.has(name));
@@ -126,7 +129,7 @@ fn find_invalid(names: &[String], values: &[f32]) -> InvalidGaussians {
 }
 
 /// Returns the limits of coefficients: a PLY can hold any number.
-pub(crate) fn limits() -> ShLimits {
+fn limits() -> ShLimits {
     ShLimits::up_to(3)
 }
 
@@ -135,7 +138,7 @@ pub(crate) fn limits() -> ShLimits {
 ///
 /// # Errors
 /// Returns an error if the file can't be written.
-pub(crate) fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
+fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
     let max_logit = ((1. - OPACITY_MARGIN) / OPACITY_MARGIN).ln() as f32;
     let finite = |number: f32, min: f32, max: f32| match number.is_finite() {
         true => number,

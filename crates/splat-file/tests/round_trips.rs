@@ -5,8 +5,8 @@ mod common;
 use common::{assert_says, endings, largest_error, random_splat, written};
 use glam::DVec3;
 use globalsplat_splat_file::{
-    SH_C0, Splat, find_splat, has_sh_palette, is_splat_name, limits_of, origin_file, read_splat, round_sh,
-    write_local_splat, write_splat,
+    SH_C0, Splat, can_mark_antialiased, find_splat, has_sh_palette, is_splat_name, limits_of, origin_file,
+    read_splat, round_sh, write_local_splat, write_splat,
 };
 use std::path::Path;
 
@@ -91,6 +91,8 @@ fn max_errors(ending: &str) -> [f64; 7] {
             0.5 / 128. + 1e-6,
             0.5 / 64. + 1e-6,
         ],
+        // Scales and opacities are linear, colours unlimited, all in float32.
+        "glb" | "gltf" => [0., 1e-6, 1e-6, 1e-7, 0., 0., 0.],
         _ => [0., 1e-6, 0.012, 0.51 / 255., 0.51 / 255. / SH_C0, 0., 0.],
     }
 }
@@ -128,18 +130,20 @@ fn plys_are_exact() {
     assert_eq!(splat.ply_bytes(), std::fs::metadata(&first).unwrap().len());
 }
 
-/// Checks that every format except for .splat, which has no place for it, says whether a splat is antialiased.
+/// Formats that have a place for it say whether a splat is antialiased.
 #[test]
 fn antialiased_splats_are_marked() {
     let folder = tempfile::tempdir().unwrap();
     for antialiased in [false, true] {
         let splat = Splat { antialiased, ..random_splat(20, 1, 5) };
-        for ending in endings().filter(|ending| *ending != "splat") {
-            let copy = read_splat(&written(folder.path(), &format!("a.{ending}"), &splat)).unwrap();
-            assert_eq!(copy.antialiased, antialiased, "{ending}");
-            assert_eq!(copy.select(&[3]).antialiased, antialiased);
+        for ending in endings() {
+            let path = written(folder.path(), &format!("a.{ending}"), &splat);
+            let copy = read_splat(&path).unwrap();
+            let has_place = !["splat", "glb", "gltf"].contains(&ending);
+            assert_eq!(can_mark_antialiased(&path).unwrap(), has_place, "{ending}");
+            assert_eq!(copy.antialiased, antialiased && has_place, "{ending}");
+            assert_eq!(copy.select(&[3]).antialiased, copy.antialiased);
         }
-        assert!(!read_splat(&written(folder.path(), "a.splat", &splat)).unwrap().antialiased);
     }
     let ply =
         std::fs::read(written(folder.path(), "a.ply", &Splat { antialiased: true, ..random_splat(1, 0, 5) }))
@@ -199,7 +203,11 @@ fn second_round_trips_change_nothing() {
         let mut path = written(folder.path(), &format!("0.{ending}"), &random_splat(600, 3, 6));
         for trip in 1..4 {
             let next = written(folder.path(), &format!("{trip}.{ending}"), &read_splat(&path).unwrap());
-            let [a, b] = [&path, &next].map(|path| std::fs::read(path).unwrap());
+            // The JSON of a .gltf names its buffer, which has the numbers.
+            let [a, b] = [&path, &next].map(|path| match ending {
+                "gltf" => std::fs::read(path.with_extension("bin")).unwrap(),
+                _ => std::fs::read(path).unwrap(),
+            });
             // The first trip normalizes rotations that a .splat has rounded to bytes.
             assert!(a == b || (trip == 1 && ending == "splat"), "{ending}, trip {trip}");
             path = next;
@@ -260,7 +268,7 @@ fn quaternions_of_any_length_are_kept() {
 fn files_are_recognized() {
     let folder = tempfile::tempdir().unwrap();
     let splat = random_splat(300, 2, 2);
-    for ending in endings().filter(|ending| *ending != "splat") {
+    for ending in endings().filter(|ending| !["splat", "gltf"].contains(ending)) {
         let path = written(folder.path(), &format!("a.{ending}"), &splat);
         for other in endings() {
             let renamed = folder.path().join(format!("renamed.{other}"));
@@ -275,7 +283,10 @@ fn files_are_recognized() {
     for (name, message) in [("a.obj", "the ending is .obj"), ("a", "the ending is missing")] {
         let error = write_splat(&folder.path().join(name), &splat).unwrap_err();
         assert!(error.is_invalid_request());
-        assert_says(&error.to_string(), &[message, "expected .ply, .compressed.ply, .sog, .spz or .splat"]);
+        assert_says(
+            &error.to_string(),
+            &[message, "expected .ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf or .ksplat"],
+        );
     }
 }
 

@@ -2,7 +2,7 @@
 
 use super::container::{Image, Reader, encode_all, write_files, write_zip};
 use super::palette::{Codebook, Palette};
-use crate::formats::{Contents, WriteOptions};
+use crate::formats::{Codec, Contents, WriteOptions, Writer};
 use crate::invalid::InvalidGaussians;
 use crate::morton::morton_order;
 use crate::rotations::normalized;
@@ -11,6 +11,27 @@ use crate::{Error, Result, ShLimits, Splat};
 use serde::{Deserialize, Serialize};
 use std::f64::consts::SQRT_2;
 use std::path::Path;
+
+/// Functions of the bundled and of the unbundled format.
+pub(crate) const CODEC: Option<Codec> = Some(Codec {
+    read: read_bundle,
+    writer: Some(Writer { write: write_bundle, limits, round_sh: Some(round_sh) }),
+});
+pub(crate) const FOLDER_CODEC: Option<Codec> = Some(Codec {
+    read: read_folder,
+    writer: Some(Writer { write: write_folder, limits, round_sh: Some(round_sh) }),
+});
+
+/// Names of the images that are written; those of coefficients are absent from a splat of degree 0.
+pub(crate) const IMAGES: [&str; 7] = [
+    "means_l.webp",
+    "means_u.webp",
+    "scales.webp",
+    "quats.webp",
+    "sh0.webp",
+    "shN_centroids.webp",
+    "shN_labels.webp",
+];
 
 /// Version that is read and written.
 const VERSION: u64 = 2;
@@ -84,7 +105,7 @@ struct Rest {
 ///
 /// # Errors
 /// Returns an error for another version, or if the archive or an image is damaged or doesn't fit the others.
-pub(crate) fn read_bundle(path: &Path, bytes: &[u8]) -> Result<Contents> {
+fn read_bundle(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let mut reader = Reader::open_zip(path, bytes)?;
     let meta = reader.file("meta.json")?;
     read(path, reader, &meta)
@@ -94,7 +115,7 @@ pub(crate) fn read_bundle(path: &Path, bytes: &[u8]) -> Result<Contents> {
 ///
 /// # Errors
 /// Returns the errors of [`read_bundle`], or an error if an image can't be read.
-pub(crate) fn read_folder(path: &Path, bytes: &[u8]) -> Result<Contents> {
+fn read_folder(path: &Path, bytes: &[u8]) -> Result<Contents> {
     read(path, Reader::open_folder(path), bytes)
 }
 
@@ -222,7 +243,7 @@ fn pack_rotation(quaternion: [f32; 4]) -> [u8; 4] {
 }
 
 /// Returns the limits of SH coefficients: the codebooks fit any range.
-pub(crate) fn limits() -> ShLimits {
+fn limits() -> ShLimits {
     ShLimits::up_to(3)
 }
 
@@ -230,7 +251,7 @@ pub(crate) fn limits() -> ShLimits {
 ///
 /// # Errors
 /// Returns an error if the file can't be written.
-pub(crate) fn write_bundle(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
+fn write_bundle(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
     let (meta, images) = encode(splat);
     write_zip(path, &meta, &encode_all(path, images)?)
 }
@@ -239,7 +260,7 @@ pub(crate) fn write_bundle(path: &Path, splat: &Splat, _: &WriteOptions) -> Resu
 ///
 /// # Errors
 /// Returns an error if a file can't be written.
-pub(crate) fn write_folder(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
+fn write_folder(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
     let (meta, images) = encode(splat);
     write_files(path, &meta, &encode_all(path, images)?)
 }
@@ -255,7 +276,7 @@ fn build_palette(splat: &Splat, order: &[usize]) -> (Palette, Codebook) {
 }
 
 /// Returns the splat with the coefficients above degree 0 that a SOG stores for it. They are written without further rounding.
-pub(crate) fn round_sh(splat: &Splat) -> Splat {
+fn round_sh(splat: &Splat) -> Splat {
     let mut rounded = splat.clone();
     let coefficients = splat.bases() - 1;
     if coefficients > 0 {

@@ -5,7 +5,7 @@ mod codec;
 mod container;
 mod palette;
 
-pub(crate) use codec::{limits, read_bundle, read_folder, round_sh, write_bundle, write_folder};
+pub(crate) use codec::{CODEC, FOLDER_CODEC, IMAGES};
 
 /// Returns `true` if `bytes` are a ZIP archive, which no other format is.
 pub(crate) fn recognizes(bytes: &[u8]) -> bool {

@@ -1,8 +1,8 @@
 //! Values of an SPZ's streams.
 
-use super::axes::Axes;
 use super::container::{self, Description, Streams};
-use crate::formats::{Codec, Contents, WriteOptions};
+use crate::axes::Axes;
+use crate::formats::{Codec, Contents, WriteOptions, Writer};
 use crate::invalid::InvalidGaussians;
 use crate::rotations::normalized;
 use crate::splat::logit_of_opacity;
@@ -13,7 +13,7 @@ use std::ops::RangeInclusive;
 use std::path::Path;
 
 /// Functions of the format.
-pub(crate) const CODEC: Option<Codec> = Some(Codec { read, write, limits, round_sh: None });
+pub(crate) const CODEC: Option<Codec> = Some(Codec { read, writer: Some(Writer::new(write, limits)) });
 
 /// Versions that are written. Version 1 has positions in float16.
 const WRITTEN_VERSIONS: RangeInclusive<u32> = 2..=4;

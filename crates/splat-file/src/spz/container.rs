@@ -1,7 +1,7 @@
 //! Container of SPZ: a header and six streams, together in gzip up to version 3, each in Zstandard since version 4.
 
-use super::axes::Axes;
 use super::{MAGIC, recognizes};
+use crate::axes::Axes;
 use crate::{Error, Result, Splat};
 use flate2::Compression;
 use flate2::bufread::GzDecoder;
@@ -229,7 +229,9 @@ fn axes_of(path: &Path, mut extensions: &[u8]) -> Result<Axes> {
             return Err(Error::input(path, "an extension", found, format!("{length} bytes")));
         };
         if let (COORDINATE_SYSTEM, Some(number)) = (kind, contents.first_chunk()) {
-            axes = Axes::from_code(path, u32::from_le_bytes(*number))?;
+            let number = u32::from_le_bytes(*number);
+            axes = Axes::from_code(number)
+                .ok_or_else(|| Error::input(path, "the coordinate system", number, "1 to 8 (LDB to RUF)"))?;
         }
         extensions = after;
     }

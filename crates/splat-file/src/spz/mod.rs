@@ -2,8 +2,6 @@
 //! 2 to 4 are written. Rotations of version 2 have seven bits and are off by up to half a degree, those of later versions by a tenth.
 
 #[cfg(feature = "spz")]
-mod axes;
-#[cfg(feature = "spz")]
 mod codec;
 #[cfg(feature = "spz")]
 mod container;

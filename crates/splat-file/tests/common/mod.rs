@@ -4,8 +4,8 @@
 use globalsplat_splat_file::{Splat, limits_of, read_splat, write_splat};
 use std::path::{Path, PathBuf};
 
-/// Extensions of all formats.
-pub const ENDINGS: [&str; 5] = ["ply", "compressed.ply", "sog", "spz", "splat"];
+/// Extensions of all formats that are written.
+pub const ENDINGS: [&str; 7] = ["ply", "compressed.ply", "sog", "spz", "splat", "glb", "gltf"];
 
 /// Returns the extensions of the formats that this build writes.
 pub fn endings() -> impl Iterator<Item = &'static str> {

@@ -1,7 +1,6 @@
-//! Directions of coordinate axes. Formats of splats have x to the right, y down, z forward; SPZ usually has y up, z back.
+//! Directions of coordinate axes. Formats of splats have x to the right, y down, z forward; SPZ and glTF have y up.
 
-use crate::{Error, Result};
-use std::path::Path;
+use crate::Splat;
 
 /// Axes whose reversal changes the sign of a spherical harmonic, in the order of spec 6.3 from degree 1: y, z, x; xy, yz, …
 const ODD: [[bool; 3]; 15] = {
@@ -16,25 +15,29 @@ const ODD: [[bool; 3]; 15] = {
     [Y, Z, X, XY, YZ, NONE, XZ, NONE, Y, XYZ, Y, Z, X, Z, X]
 };
 
-/// Signs that convert x, y and z between SPZ's axes and those to the right, down and forward, in both directions.
+/// Signs that convert x, y and z between other axes and those to the right, down and forward, in both directions.
 #[derive(Debug, Clone, Copy)]
-pub struct Axes([f32; 3]);
+pub(crate) struct Axes([f32; 3]);
 
 impl Axes {
     /// Right, up, back: the default of SPZ.
     pub const RUB: Axes = Axes([1., -1., -1.]);
 
+    /// Left, up, forward: the axes of splats in glTF, half a turn about z away.
+    pub const LUF: Axes = Axes([-1., -1., 1.]);
+
     /// Returns the axes with this number in the extension SPZ_ADOBE_coordinate_system: 1 to 8 are LDB, RDB, LUB, RUB, LDF, RDF, LUF and
-    /// RUF, 0 is unspecified.
-    pub fn from_code(path: &Path, number: u32) -> Result<Self> {
+    /// RUF, 0 is unspecified. Returns `None` for other numbers.
+    #[cfg(feature = "spz")]
+    pub fn from_code(number: u32) -> Option<Self> {
         let sign = |positive: bool| if positive { 1. } else { -1. };
         match number {
-            0 => Ok(Axes::RUB),
+            0 => Some(Axes::RUB),
             1..=8 => {
                 let bits = number - 1;
-                Ok(Axes([sign(bits & 1 != 0), sign(bits & 2 == 0), sign(bits & 4 != 0)]))
+                Some(Axes([sign(bits & 1 != 0), sign(bits & 2 == 0), sign(bits & 4 != 0)]))
             }
-            _ => Err(Error::input(path, "the coordinate system", number, "1 to 8 (LDB to RUF)")),
+            _ => None,
         }
     }
 
@@ -51,5 +54,21 @@ impl Axes {
     /// Returns the factors of the spherical harmonics of degree 1 and more.
     pub fn harmonics(self) -> [f32; 15] {
         ODD.map(|odd| odd.iter().zip(self.0).map(|(&odd, sign)| if odd { sign } else { 1. }).product())
+    }
+    /// Converts the Gaussians of `splat` exactly: numbers change their signs only.
+    pub fn convert(self, splat: &mut Splat) {
+        self.convert_without_rotations(splat);
+        splat.quaternions.iter_mut().for_each(|quaternion| *quaternion = self.rotation(*quaternion));
+    }
+
+    /// Converts the Gaussians of `splat` like [`Axes::convert`], except for their rotations.
+    pub fn convert_without_rotations(self, splat: &mut Splat) {
+        let (bases, signs) = (splat.bases(), self.harmonics());
+        splat.means.iter_mut().for_each(|mean| *mean = self.position(*mean));
+        for of_one in splat.sh.chunks_exact_mut(bases) {
+            for (colour, sign) in of_one[1..].iter_mut().zip(signs) {
+                *colour = colour.map(|channel| sign * channel);
+            }
+        }
     }
 }

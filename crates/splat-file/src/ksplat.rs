@@ -1,0 +1,246 @@
+//! mkkellogg's `.ksplat` format, versions 0.1 and later, which is only read. A header of 4,096 bytes and one of 1,024 bytes per section
+//! are followed by the sections. From compression level 1, positions are relative to the centres of buckets of Gaussians.
+
+use crate::formats::{Codec, Contents};
+use crate::invalid::InvalidGaussians;
+use crate::splat::{log_of_scale, logit_of_opacity};
+use crate::{Error, Result, SH_C0, Splat};
+use std::path::Path;
+
+/// Functions of the format.
+pub(crate) const CODEC: Option<Codec> = Some(Codec { read, writer: None });
+
+/// Size in bytes of the header, and of the header of each section.
+const HEADER: usize = 4096;
+const SECTION_HEADER: usize = 1024;
+/// Size in bytes of a bucket: its centre, three float32.
+const BUCKET: usize = 12;
+/// Position within a bucket that is its centre, if a section doesn't say otherwise.
+const DEFAULT_RANGE: u32 = 32767;
+/// Magnitude of the minimum and maximum of SH coefficients of level 2, if the file doesn't say otherwise.
+const DEFAULT_SH_RANGE: f32 = 1.5;
+
+/// Returns the number at `at` in little-endian bytes, which must be long enough.
+fn u16_at(bytes: &[u8], at: usize) -> u16 {
+    u16::from_le_bytes([bytes[at], bytes[at + 1]])
+}
+
+fn u32_at(bytes: &[u8], at: usize) -> u32 {
+    u32::from_le_bytes([0, 1, 2, 3].map(|byte| bytes[at + byte]))
+}
+
+fn f32_at(bytes: &[u8], at: usize) -> f32 {
+    f32::from_bits(u32_at(bytes, at))
+}
+
+/// Converts a number of 16 bits (IEEE 754 binary16), exactly.
+fn f32_from_half(bits: u16) -> f32 {
+    let mantissa = f32::from(bits & 0x3ff);
+    let size = match (bits >> 10) & 0x1f {
+        0 => mantissa * (-24f32).exp2(),
+        31 if mantissa == 0. => f32::INFINITY,
+        31 => f32::NAN,
+        exponent => (1024. + mantissa) * (f32::from(exponent) - 25.).exp2(),
+    };
+    if bits >> 15 == 0 { size } else { -size }
+}
+
+/// How the numbers of a file are stored.
+struct Encoding {
+    /// Compression level: 0 for float32, 1 for 16 bits, 2 for 16 bits with bytes for spherical harmonics.
+    level: u16,
+    /// Minimum and maximum of the spherical harmonics of level 2.
+    sh_range: [f32; 2],
+}
+
+impl Encoding {
+    /// Returns the number of bytes of a position, a scale or a quaternion's component.
+    fn number_bytes(&self) -> usize {
+        if self.level == 0 { 4 } else { 2 }
+    }
+
+    /// Returns the number of bytes of an SH coefficient.
+    fn sh_bytes(&self) -> usize {
+        [4, 2, 1][usize::from(self.level)]
+    }
+
+    /// Returns the number of bytes of a Gaussian: position, scale, quaternion, then colour and opacity, then spherical harmonics.
+    fn gaussian_bytes(&self, bases: usize) -> usize {
+        10 * self.number_bytes() + 4 + 3 * (bases - 1) * self.sh_bytes()
+    }
+
+    /// Returns number `index` of a Gaussian: 3 to 5 are the scales, 6 to 9 the quaternion. At level 0, the first three are the position.
+    fn number(&self, gaussian: &[u8], index: usize) -> f32 {
+        match self.level {
+            0 => f32_at(gaussian, 4 * index),
+            _ => f32_from_half(u16_at(gaussian, 2 * index)),
+        }
+    }
+
+    /// Returns number `index` of the spherical harmonics in `bytes`.
+    fn sh(&self, bytes: &[u8], index: usize) -> f32 {
+        let [min, max] = self.sh_range.map(f64::from);
+        match self.level {
+            0 => f32_at(bytes, 4 * index),
+            1 => f32_from_half(u16_at(bytes, 2 * index)),
+            _ => (min + f64::from(bytes[index]) / 255. * (max - min)) as f32,
+        }
+    }
+}
+
+/// Reads a `.ksplat`.
+///
+/// # Errors
+/// Returns an error for another version or compression level, or if the file is cut short or its numbers contradict each other.
+fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
+    if bytes.len() < HEADER {
+        let found = format!("{} bytes", bytes.len());
+        return Err(Error::input(path, "the header", found, format!("{HEADER} bytes")));
+    }
+    let (major, minor) = (bytes[0], bytes[1]);
+    if major != 0 || minor < 1 {
+        return Err(Error::input(path, "the version", format!("{major}.{minor}"), "0.1 or later below 1"));
+    }
+    let level = u16_at(bytes, 20);
+    if level > 2 {
+        return Err(Error::input(path, "the compression level", level, "0 to 2"));
+    }
+    let or_default = |bound: f32, default: f32| if bound == 0. { default } else { bound };
+    let sh_range =
+        [or_default(f32_at(bytes, 36), -DEFAULT_SH_RANGE), or_default(f32_at(bytes, 40), DEFAULT_SH_RANGE)];
+    let encoding = Encoding { level, sh_range };
+    let (sections, count) = (u32_at(bytes, 4) as usize, u32_at(bytes, 16));
+    let Some((headers, mut rest)) =
+        sections.checked_mul(SECTION_HEADER).and_then(|length| bytes[HEADER..].split_at_checked(length))
+    else {
+        let expected = format!("{} at most in a file of {} bytes", bytes.len() / SECTION_HEADER, bytes.len());
+        return Err(Error::input(path, "the number of sections", sections, expected));
+    };
+    let headers = headers.as_chunks::<SECTION_HEADER>().0;
+    let sh_degree = headers.iter().map(sh_degree).max().unwrap_or(0);
+    if sh_degree > 3 {
+        return Err(Error::input(path, "the SH degree", sh_degree, "0 to 3"));
+    }
+    let mut splat = Splat { sh_degree, linear_scales: Some(vec![]), ..Splat::default() };
+    for (index, header) in headers.iter().enumerate() {
+        let section = Section { path, index, header, encoding: &encoding };
+        rest = section.read(rest, &mut splat)?;
+    }
+    if splat.is_empty() || splat.len() != count as usize {
+        let found = format!("{count}, with {} in the sections", splat.len());
+        return Err(Error::input(
+            path,
+            "the number of Gaussians",
+            found,
+            "1 or more, as many in the sections",
+        ));
+    }
+    let mut invalid = InvalidGaussians::default();
+    invalid.add_all(&splat);
+    Ok(Contents { splat, invalid })
+}
+
+/// Returns the degree of the spherical harmonics of a section, which is 0 if it has no Gaussians.
+fn sh_degree(header: &[u8; SECTION_HEADER]) -> usize {
+    if u32_at(header, 4) == 0 { 0 } else { u16_at(header, 40).into() }
+}
+
+/// Section of a file: Gaussians with the same layout.
+struct Section<'a> {
+    path: &'a Path,
+    index: usize,
+    header: &'a [u8; SECTION_HEADER],
+    encoding: &'a Encoding,
+}
+
+impl Section<'_> {
+    fn error(&self, field: &str, found: impl std::fmt::Display, expected: impl Into<String>) -> Error {
+        Error::input(self.path, format!("{field} of section {}", self.index), found, expected)
+    }
+
+    /// Appends the Gaussians of the section, with which `bytes` begin, to `splat`, whose SH degree is at least that of the section. Returns
+    /// the bytes after the section.
+    fn read<'b>(&self, bytes: &'b [u8], splat: &mut Splat) -> Result<&'b [u8]> {
+        let number = |at: usize| u32_at(self.header, at) as usize;
+        let (count, max_count, bucket_count) = (number(0), number(4), number(12));
+        let (full_buckets, partial_buckets) = (number(32), number(36));
+        let bases = (sh_degree(self.header) + 1).pow(2);
+        let stride = self.encoding.gaussian_bytes(bases);
+        let lengths =
+            [(partial_buckets, 4), (bucket_count, u16_at(self.header, 20).into()), (max_count, stride)];
+        let mut rest = bytes;
+        let mut parts = [&[][..]; 3];
+        for (part, (count, size)) in parts.iter_mut().zip(lengths) {
+            let length = count as u128 * size as u128;
+            let split = usize::try_from(length).ok().and_then(|length| rest.split_at_checked(length));
+            let Some(split) = split else {
+                let all: u128 = lengths.iter().map(|&(count, size)| count as u128 * size as u128).sum();
+                let found = format!("cut short: {} bytes", bytes.len());
+                return Err(self.error("the body", found, format!("{all} bytes")));
+            };
+            (*part, rest) = split;
+        }
+        let [partial_lengths, buckets, gaussians] = parts;
+        if count > max_count {
+            return Err(self.error("the number of Gaussians", count, format!("{max_count} at most")));
+        }
+        let gaussians = gaussians.chunks_exact(stride).take(count);
+        if self.encoding.level == 0 {
+            for gaussian in gaussians {
+                splat.means.push([0, 1, 2].map(|axis| f32_at(gaussian, 4 * axis)));
+                self.push_others(gaussian, bases, splat);
+            }
+            return Ok(rest);
+        }
+        if usize::from(u16_at(self.header, 20)) != BUCKET {
+            let found = u16_at(self.header, 20);
+            return Err(self.error("the size of a bucket", found, format!("{BUCKET} bytes")));
+        }
+        let (buckets, _) = buckets.as_chunks::<BUCKET>();
+        if full_buckets.saturating_add(partial_buckets) > buckets.len() {
+            let found = format!("{}", buckets.len());
+            let expected = format!("{full_buckets} full and {partial_buckets} partially filled ones");
+            return Err(self.error("the number of buckets", found, expected));
+        }
+        let range = match u32_at(self.header, 24) {
+            0 => DEFAULT_RANGE,
+            range => range,
+        };
+        let half_block = f64::from(f32_at(self.header, 16)) / 2.;
+        let full = std::iter::repeat_n(number(8), full_buckets);
+        let partial = partial_lengths.as_chunks().0.iter().map(|&length| u32::from_le_bytes(length) as usize);
+        let mut centres =
+            full.chain(partial).zip(buckets).flat_map(|(length, bucket)| std::iter::repeat_n(bucket, length));
+        for (place, gaussian) in gaussians.enumerate() {
+            let Some(bucket) = centres.next() else {
+                let expected = format!("{count}, as many as in the section");
+                return Err(self.error("the number of Gaussians in the buckets", place, expected));
+            };
+            splat.means.push([0, 1, 2].map(|axis| {
+                let step = f64::from(u16_at(gaussian, 2 * axis)) - f64::from(range);
+                (step * half_block / f64::from(range) + f64::from(f32_at(bucket, 4 * axis))) as f32
+            }));
+            self.push_others(gaussian, bases, splat);
+        }
+        Ok(rest)
+    }
+
+    /// Appends the values of a Gaussian to `splat`, except for its position.
+    fn push_others(&self, gaussian: &[u8], bases: usize, splat: &mut Splat) {
+        let scale = [3, 4, 5].map(|index| self.encoding.number(gaussian, index));
+        splat.log_scales.push(scale.map(log_of_scale));
+        splat.linear_scales.get_or_insert_default().push(scale);
+        splat.quaternions.push([6, 7, 8, 9].map(|index| self.encoding.number(gaussian, index)));
+        let (colour, harmonics) = gaussian[10 * self.encoding.number_bytes()..].split_at(4);
+        splat.sh.push([0, 1, 2].map(|channel| ((f64::from(colour[channel]) / 255. - 0.5) / SH_C0) as f32));
+        splat.opacity_logits.push(logit_of_opacity(f64::from(colour[3]) / 255.));
+        // Degree by degree, and within a degree channel by channel.
+        for degree in 1..bases.isqrt() {
+            let (begin, count) = (3 * (degree * degree - 1), 2 * degree + 1);
+            splat.sh.extend((0..count).map(|basis| {
+                [0, 1, 2].map(|channel| self.encoding.sh(harmonics, begin + channel * count + basis))
+            }));
+        }
+        splat.sh.resize(splat.means.len() * splat.bases(), [0.; 3]);
+    }
+}

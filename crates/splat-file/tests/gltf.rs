@@ -1,0 +1,743 @@
+//! glTF: its bytes, files as of other programs, and invalid files.
+
+mod common;
+
+use common::{Random, assert_says, largest_error, random_splat, refused_file, written};
+use glam::{DMat3, DMat4, DQuat, DVec3};
+use globalsplat_splat_file::{
+    Error, SH_C0, Splat, check_writable_splat, read_splat, read_splat_without_invalid, splat_files,
+    write_splat,
+};
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+
+/// Contents of a `.glb`.
+#[derive(Clone)]
+struct Glb {
+    json: Value,
+    bin: Vec<u8>,
+}
+
+impl Glb {
+    fn written(splat: &Splat) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let bytes = std::fs::read(written(folder.path(), "a.glb", splat)).unwrap();
+        let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
+        assert_eq!((&bytes[..4], word(4), word(8)), (&b"glTF"[..], 2, bytes.len()));
+        let (length, kind) = (word(12), &bytes[16..20]);
+        assert_eq!((length % 4, kind), (0, &b"JSON"[..]));
+        let (json, bin) = bytes[20..].split_at(length);
+        assert_eq!((word(20 + length), &bin[4..8]), (bin.len() - 8, &b"BIN\0"[..]));
+        assert_eq!(bin.len() % 4, 0);
+        Glb { json: serde_json::from_slice(json).unwrap(), bin: bin[8..].to_vec() }
+    }
+
+    fn bytes(&self) -> Vec<u8> {
+        let mut json = self.json.to_string().into_bytes();
+        json.resize(json.len().next_multiple_of(4), b' ');
+        let mut bin = self.bin.clone();
+        bin.resize(bin.len().next_multiple_of(4), 0);
+        let length = 12 + 8 + json.len() + 8 + bin.len();
+        let word = |number: usize| (number as u32).to_le_bytes();
+        let header = [*b"glTF", word(2), word(length), word(json.len()), *b"JSON"];
+        let body = [word(bin.len()), *b"BIN\0"];
+        [header.as_flattened(), &json, body.as_flattened(), &bin].concat()
+    }
+
+    fn write(&self, folder: &Path) -> PathBuf {
+        let path = folder.join("a.glb");
+        std::fs::write(&path, self.bytes()).unwrap();
+        path
+    }
+
+    fn read(&self) -> Splat {
+        let folder = tempfile::tempdir().unwrap();
+        read_splat(&self.write(folder.path())).unwrap()
+    }
+
+    /// Returns the message with which the file is refused after a change of its JSON.
+    fn refused(&self, change: impl FnOnce(&mut Value)) -> String {
+        let mut changed = self.clone();
+        change(&mut changed.json);
+        let folder = tempfile::tempdir().unwrap();
+        refused_file(&changed.write(folder.path()))
+    }
+
+    fn primitive(&mut self) -> &mut Value {
+        &mut self.json["meshes"][0]["primitives"][0]
+    }
+
+    fn accessor(&mut self, attribute: &str) -> &mut Value {
+        let index = self.primitive()["attributes"][attribute].as_u64().expect("an attribute");
+        &mut self.json["accessors"][index as usize]
+    }
+
+    /// Returns the floats of an attribute.
+    fn floats(&mut self, attribute: &str) -> Vec<f32> {
+        let view = self.accessor(attribute)["bufferView"].as_u64().unwrap() as usize;
+        let view = &self.json["bufferViews"][view];
+        let [offset, length] = ["byteOffset", "byteLength"].map(|name| view[name].as_u64().unwrap() as usize);
+        let bytes = &self.bin[offset..][..length];
+        bytes.as_chunks().0.iter().map(|&four| f32::from_le_bytes(four)).collect()
+    }
+
+    /// Replaces the numbers of an attribute by `bytes` in a buffer view of their own.
+    fn set(&mut self, attribute: &str, bytes: &[u8], accessor: Value) {
+        self.bin.resize(self.bin.len().next_multiple_of(4), 0);
+        let view = json!({"buffer": 0, "byteOffset": self.bin.len(), "byteLength": bytes.len()});
+        self.bin.extend(bytes);
+        self.json["buffers"][0]["byteLength"] = json!(self.bin.len());
+        let index = self.json["bufferViews"].as_array().unwrap().len();
+        self.json["bufferViews"].as_array_mut().unwrap().push(view);
+        let mut accessor = accessor;
+        accessor["bufferView"] = json!(index);
+        let own = self.json["accessors"].as_array_mut().unwrap();
+        own.push(accessor);
+        let index = own.len() - 1;
+        self.primitive()["attributes"][attribute] = json!(index);
+    }
+}
+
+const ROTATION: &str = "KHR_gaussian_splatting:ROTATION";
+const SCALE: &str = "KHR_gaussian_splatting:SCALE";
+const OPACITY: &str = "KHR_gaussian_splatting:OPACITY";
+const DC: &str = "KHR_gaussian_splatting:SH_DEGREE_0_COEF_0";
+
+/// Half a turn about z, from the axes of other formats to those of glTF and back.
+fn half_turn() -> DMat4 {
+    DMat4::from_scale(DVec3::new(-1., -1., 1.))
+}
+
+/// Checks that two splats have the same Gaussians but for rounding.
+fn assert_same(what: &str, a: &Splat, b: &Splat) {
+    assert_eq!((a.len(), a.sh_degree), (b.len(), b.sh_degree), "{what}");
+    // Covariances of Gaussians whose largest scale is 1: half turns about own axes change quaternions, not Gaussians.
+    let shapes = |splat: &Splat| -> Vec<f32> {
+        let shape = |index: usize| {
+            let [w, x, y, z] = splat.quaternions[index].map(f64::from);
+            let scale = DVec3::from_array(splat.scale(index).map(f64::from));
+            let axes = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize())
+                * DMat3::from_diagonal(scale / scale.max_element());
+            (axes * axes.transpose()).to_cols_array()
+        };
+        (0..splat.len()).flat_map(shape).map(|number| number as f32).collect()
+    };
+    let opacities = |splat: &Splat| (0..splat.len()).map(|index| splat.opacity(index)).collect::<Vec<_>>();
+    let errors = [
+        ("means", largest_error(a.means.as_flattened(), b.means.as_flattened())),
+        ("scales", largest_error(a.log_scales.as_flattened(), b.log_scales.as_flattened())),
+        ("shapes", largest_error(&shapes(a), &shapes(b))),
+        ("opacities", largest_error(&opacities(a), &opacities(b))),
+        ("spherical harmonics", largest_error(a.sh.as_flattened(), b.sh.as_flattened())),
+    ];
+    for (name, error) in errors {
+        assert!(error < 1e-5, "{what}: {name} are off by {error}");
+    }
+}
+
+/// A .glb has linear scales and opacities, and y up: half a turn about z, by changes of signs.
+#[test]
+fn the_numbers_of_a_glb_are_turned() {
+    let mut splat = random_splat(3, 3, 1);
+    splat.quaternions = vec![[0.5, 0.1, -0.7, 0.5]; 3];
+    let mut glb = Glb::written(&splat);
+    let turned: Vec<f32> = splat.means.iter().flat_map(|&[x, y, z]| [-x, -y, z]).collect();
+    assert_eq!(glb.floats("POSITION"), turned);
+    for axis in 0..3 {
+        let numbers = || turned.iter().skip(axis).step_by(3).copied();
+        let (low, high) = (numbers().reduce(f32::min).unwrap(), numbers().reduce(f32::max).unwrap());
+        assert_eq!(glb.accessor("POSITION")["min"][axis].as_f64(), Some(low.into()));
+        assert_eq!(glb.accessor("POSITION")["max"][axis].as_f64(), Some(high.into()));
+    }
+    // (0, 0, 0, 1) · (w, x, y, z), as x, y, z, w.
+    assert_eq!(glb.floats(ROTATION)[..4], [0.7, 0.1, 0.5, -0.5]);
+    let linear: Vec<f32> = (0..3).flat_map(|index| splat.scale(index)).collect();
+    assert_eq!(glb.floats(SCALE), linear);
+    assert_eq!(glb.floats(OPACITY), [0, 1, 2].map(|index| splat.opacity(index)));
+    // Functions that are odd in exactly one of x and y change their signs.
+    let odd = [false, true, false, true, false, true, false, true, false];
+    let odd = odd.into_iter().chain([true, false, true, false, true, false, true]);
+    for (basis, is_odd) in odd.enumerate() {
+        let degree = basis.isqrt();
+        let name = format!("KHR_gaussian_splatting:SH_DEGREE_{degree}_COEF_{}", basis - degree * degree);
+        let own = splat.sh_of(1)[basis].map(|channel| if is_odd { -channel } else { channel });
+        assert_eq!(glb.floats(&name)[3..6], own, "{name}");
+    }
+    let colour = glb.accessor("COLOR_0").clone();
+    assert_eq!((&colour["componentType"], &colour["normalized"]), (&json!(5121), &json!(true)));
+    let offset = glb.json["bufferViews"][1]["byteOffset"].as_u64().unwrap() as usize;
+    let expected = |channel: usize| {
+        let value = (f64::from(splat.sh_of(0)[0][channel]) * SH_C0 + 0.5) * 255.;
+        value.round().clamp(0., 255.) as u8
+    };
+    let alpha = (splat.opacity(0) * 255.).round() as u8;
+    assert_eq!(glb.bin[offset..][..4], [expected(0), expected(1), expected(2), alpha]);
+    assert_eq!(glb.json["extensionsUsed"], json!(["KHR_gaussian_splatting"]));
+    let properties = json!({
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "sortingMethod": "cameraDistance",
+        "projection": "perspective",
+    });
+    assert_eq!(glb.primitive()["extensions"]["KHR_gaussian_splatting"], properties);
+    assert_eq!(glb.primitive()["mode"], 0);
+    assert_same("round trip", &splat, &glb.read());
+}
+
+/// Positions, scales, spherical harmonics and quaternions of length 1 are kept to the bit, and opacities of 0 and 1 are exact.
+#[test]
+fn glbs_are_exact() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut splat = random_splat(300, 3, 5);
+    splat.quaternions = vec![[0.5, -0.5, 0.5, 0.5]; 300];
+    splat.opacity_logits[..2].copy_from_slice(&[f32::INFINITY, f32::NEG_INFINITY]);
+    splat.log_scales[0] = [f32::NEG_INFINITY; 3];
+    let copy = read_splat(&written(folder.path(), "a.glb", &splat)).unwrap();
+    assert_eq!((&copy.means, &copy.sh, &copy.quaternions), (&splat.means, &splat.sh, &splat.quaternions));
+    assert_eq!(copy.opacity_logits[..2], splat.opacity_logits[..2]);
+    assert_eq!(copy.log_scales[0], splat.log_scales[0]);
+    let scales: Vec<[f32; 3]> = (0..300).map(|index| splat.scale(index)).collect();
+    assert_eq!(copy.linear_scales, Some(scales));
+}
+
+/// The transforms of a node and all its parents are applied, as matrices or in parts.
+#[test]
+fn nodes_move_gaussians() {
+    let splat = random_splat(40, 3, 2);
+    let mut glb = Glb::written(&splat);
+    let turn = DQuat::from_euler(glam::EulerRot::XYZ, 0.3, -1., 2.);
+    let parts = DMat4::from_scale_rotation_translation(DVec3::splat(0.5), turn, DVec3::new(1., -2., 3.));
+    let matrix = DMat4::from_scale_rotation_translation(DVec3::splat(3.), turn, DVec3::new(4., 0., -1.));
+    glb.json["nodes"] = json!([
+        {"mesh": 0, "translation": [1., -2., 3.], "rotation": turn.to_array(), "scale": [0.5, 0.5, 0.5]},
+        {"children": [0], "name": "no transform"},
+        {"matrix": matrix.to_cols_array(), "children": [1]},
+    ]);
+    glb.json["scenes"][0]["nodes"] = json!([2]);
+    let world = half_turn() * matrix * parts * half_turn();
+    let expected = splat.transformed(&world).unwrap();
+    let read = glb.read();
+    assert_same("nodes", &expected, &read);
+    assert!(read.linear_scales.is_some());
+    // Without a scene all roots are read.
+    glb.json.as_object_mut().unwrap().remove("scene");
+    assert_same("the first scene", &expected, &glb.read());
+    glb.json.as_object_mut().unwrap().remove("scenes");
+    assert_same("no scene", &expected, &glb.read());
+    glb.json["nodes"][0]["scale"] = json!([1., 1., 2.]);
+    let message = glb.refused(|_| ());
+    assert_says(
+        &message,
+        &["the transform of node 0, with those of its parents, is one whose axes", "same scale"],
+    );
+    assert_says(
+        &glb.refused(|json| json["nodes"][0]["rotation"] = json!([0, 0, 0, 0])),
+        &["the transform of node 0"],
+    );
+    assert_says(&glb.refused(|json| json["nodes"][0]["children"] = json!([2])), &["the scene is without"]);
+    assert_says(
+        &glb.refused(|json| json["nodes"][2]["children"] = json!([7])),
+        &["node 7 is missing", "below 3"],
+    );
+    let cycle = glb.refused(|json| {
+        json["nodes"][0]["children"] = json!([2]);
+        json["scenes"] = json!([{"nodes": [2]}]);
+        json["scene"] = json!(0);
+    });
+    assert_says(&cycle, &["node 2 is reached twice, expected a tree"]);
+    let twice = glb.refused(|json| json["scenes"] = json!([{"nodes": [2, 1]}]));
+    assert_says(&twice, &["node 1 is reached twice"]);
+    assert_says(&glb.refused(|json| json["scene"] = json!(1)), &["scene 1 is missing"]);
+}
+
+/// Primitives of all nodes are joined, with spherical harmonics of the highest degree, and other primitives are counted.
+#[test]
+fn primitives_are_joined() {
+    let splat = random_splat(20, 2, 3);
+    let mut glb = Glb::written(&splat);
+    let mut flat = glb.primitive().clone();
+    let attributes = flat["attributes"].as_object_mut().unwrap();
+    attributes.retain(|name, _| !name.contains("DEGREE_1") && !name.contains("DEGREE_2"));
+    let triangles = json!({"attributes": {"POSITION": 0}});
+    glb.json["meshes"] = json!([
+        {"primitives": [glb.primitive().clone(), triangles]},
+        {"primitives": [flat, triangles]},
+        {"primitives": [triangles]},
+    ]);
+    glb.json["nodes"] = json!([{"mesh": 0}, {"mesh": 1, "translation": [0, 0, 1]}, {"mesh": 2}]);
+    glb.json["scenes"][0]["nodes"] = json!([0, 1, 2]);
+    let folder = tempfile::tempdir().unwrap();
+    let path = glb.write(folder.path());
+    let read = read_splat(&path).unwrap();
+    assert_eq!((read.len(), read.sh_degree), (40, 2));
+    let first: Vec<usize> = (0..20).collect();
+    let second: Vec<usize> = (20..40).collect();
+    let moved = splat.transformed(&DMat4::from_translation(DVec3::Z)).unwrap();
+    assert_same("the first", &splat, &Splat { warnings: vec![], ..read.select(&first) });
+    assert_same("the second", &moved.with_sh_degree(0).with_sh_degree(2), &read.select(&second));
+    let message = "3 of 5 mesh primitives are left out, which aren't Gaussian splats";
+    assert_eq!(read.warnings, [format!("{}: {message}", path.display())]);
+    let none = glb.refused(|json| json["scenes"][0]["nodes"] = json!([2]));
+    assert_says(&none, &["the scene is without Gaussian splats, but with 1 other mesh primitives"]);
+}
+
+/// Quantized attributes, strides and offsets are read.
+#[test]
+fn quantized_and_interleaved_attributes_are_read() {
+    let splat = random_splat(4, 0, 6);
+    let mut glb = Glb::written(&splat);
+    let count = 4;
+    // Positions and scales share a buffer view with a stride.
+    let (mut bytes, mut positions, mut scales) = (vec![], vec![], vec![]);
+    for row in 0..4i16 {
+        let position = [row - 2, 3 * row, -row];
+        let scale = [row as u8 + 1, 2, 255 - row as u8];
+        bytes.extend([9, 9]);
+        bytes.extend(position.iter().flat_map(|number| number.to_le_bytes()));
+        bytes.extend(scale);
+        bytes.push(9);
+        positions.push([-f32::from(position[0]), -f32::from(position[1]), f32::from(position[2])]);
+        scales.push(scale.map(f32::from));
+    }
+    bytes.truncate(bytes.len() - 1);
+    glb.set(
+        "POSITION",
+        &bytes,
+        json!({"componentType": 5122, "count": count, "type": "VEC3", "byteOffset": 2}),
+    );
+    let view = glb.accessor("POSITION")["bufferView"].as_u64().unwrap() as usize;
+    glb.json["bufferViews"][view]["byteStride"] = json!(12);
+    let position = glb.accessor("POSITION").clone();
+    let scale = glb.accessor(SCALE);
+    *scale = json!({"componentType": 5121, "count": count, "type": "VEC3", "byteOffset": 8});
+    scale["bufferView"] = position["bufferView"].clone();
+    let rotations: Vec<u8> = [[0i8, 0, 0, 127], [127, 0, 0, 0], [-128, 0, 0, 0], [64, -64, 64, 64]]
+        .as_flattened()
+        .iter()
+        .flat_map(|number| number.to_le_bytes())
+        .collect();
+    glb.set(
+        ROTATION,
+        &rotations,
+        json!({"componentType": 5120, "normalized": true, "count": count, "type": "VEC4"}),
+    );
+    let opacities = [0u16, 65535, 13107, 32768].map(u16::to_le_bytes);
+    glb.set(
+        OPACITY,
+        opacities.as_flattened(),
+        json!({"componentType": 5123, "normalized": true, "count": count, "type": "SCALAR"}),
+    );
+    glb.json["extensionsRequired"] = json!(["KHR_mesh_quantization"]);
+    let read = glb.read();
+    assert_eq!(read.means, positions);
+    assert_eq!(read.linear_scales.as_ref().unwrap(), &scales);
+    // (w, x, y, z), after half a turn back about z.
+    let half = 64. / 127.;
+    let expected = [[0., 0., 0., -1.], [0., 0., -1., 0.], [0., 0., 1., 0.], [half, -half, -half, -half]];
+    assert_eq!(read.quaternions, expected);
+    assert_eq!(read.opacity_logits[..2], [f32::NEG_INFINITY, f32::INFINITY]);
+    assert!((read.opacity(2) - 0.2).abs() < 1e-7);
+    let short = glb.refused(|json| json["bufferViews"][view]["byteLength"] = json!(bytes.len() - 1));
+    assert_says(
+        &short,
+        &["the extent of accessor", SCALE, "4 elements, which end at byte 47", "the 46 bytes"],
+    );
+    let stride = glb.refused(|json| json["bufferViews"][view]["byteStride"] = json!(4));
+    assert_says(&stride, &["the stride of accessor", "(POSITION) is 4, expected 6 bytes or more"]);
+}
+
+/// Colours and opacities come from COLOR_0 if the attributes of the extension are absent, as in files of its drafts.
+#[test]
+fn colours_are_a_fallback() {
+    let splat = random_splat(50, 0, 4);
+    let mut glb = Glb::written(&splat);
+    glb.primitive()["attributes"].as_object_mut().unwrap().remove(DC);
+    let read = glb.read();
+    assert!(largest_error(read.sh.as_flattened(), splat.sh.as_flattened()) < 0.51 / 255. / SH_C0);
+    assert_eq!(read.opacity(7), splat.opacity(7));
+    glb.primitive()["attributes"].as_object_mut().unwrap().remove(OPACITY);
+    assert!((glb.read().opacity(7) - splat.opacity(7)).abs() < 0.51 / 255.);
+    let three = [[0u8, 51, 255]; 50];
+    let mut three_channels = glb.clone();
+    three_channels.set(
+        "COLOR_0",
+        three.as_flattened(),
+        json!({"componentType": 5121, "normalized": true, "count": 50, "type": "VEC3"}),
+    );
+    assert_says(
+        &three_channels.refused(|_| ()),
+        &["the type of accessor", "(COLOR_0) is \"VEC3\", expected VEC4"],
+    );
+    let opacity = json!({"componentType": 5121, "normalized": true, "count": 50, "type": "SCALAR"});
+    three_channels.set(OPACITY, &[255; 50], opacity);
+    let dc = [0., 0.2, 1.].map(|colour| ((colour - 0.5) / SH_C0) as f32);
+    assert_eq!(three_channels.read().sh[9], dc);
+    glb.primitive()["attributes"].as_object_mut().unwrap().remove("COLOR_0");
+    let message = format!("the attribute {DC} of primitive 0 of mesh 0 is missing");
+    assert_says(&glb.refused(|_| ()), &[&message]);
+}
+
+/// Values of properties that this crate doesn't know are reported once.
+#[test]
+fn unknown_properties_are_reported() {
+    let mut glb = Glb::written(&random_splat(2, 0, 4));
+    let splatting = &mut glb.primitive()["extensions"]["KHR_gaussian_splatting"];
+    splatting["colorSpace"] = json!("lin_rec709_display");
+    splatting["kernel"] = json!("customShape");
+    glb.json["nodes"] = json!([{"mesh": 0}, {"mesh": 0}]);
+    glb.json["scenes"][0]["nodes"] = json!([0, 1]);
+    let folder = tempfile::tempdir().unwrap();
+    let path = glb.write(folder.path());
+    let path_name = path.display();
+    let expected = [
+        format!("{path_name}: kernel \"customShape\" is read as ellipse"),
+        format!("{path_name}: colorSpace \"lin_rec709_display\" is read as srgb_rec709_display"),
+    ];
+    assert_eq!(read_splat(&path).unwrap().warnings, expected);
+}
+
+/// Writes `bytes` in base64.
+fn base64(bytes: &[u8]) -> String {
+    const DIGITS: &[u8] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let mut text = String::new();
+    for three in bytes.chunks(3) {
+        let word =
+            three.iter().fold(0u32, |word, &byte| word << 8 | u32::from(byte)) << (8 * (3 - three.len()));
+        for place in 0..4 {
+            let digit = DIGITS[(word >> (18 - 6 * place) & 63) as usize];
+            text.push(if place <= three.len() { digit.into() } else { '=' });
+        }
+    }
+    text
+}
+
+/// A buffer is a file beside the .gltf, whose name is percent-encoded, or a data URI.
+#[test]
+fn buffers_are_files_or_data() {
+    let folder = tempfile::tempdir().unwrap();
+    let splat = random_splat(30, 1, 8);
+    let path = written(folder.path(), "my room, große.gltf", &splat);
+    let buffer = folder.path().join("my room, große.bin");
+    let mut json: Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    assert_eq!(json["buffers"][0]["uri"], "my%20room%2C%20gro%C3%9Fe.bin");
+    let bin = std::fs::read(&buffer).unwrap();
+    let glb = Glb::written(&splat);
+    assert_eq!((&json["accessors"], &bin), (&glb.json["accessors"], &glb.bin));
+    assert_same("a file", &splat, &read_splat(&path).unwrap());
+    assert_eq!(splat_files(&path)[2], buffer);
+    assert_eq!(splat_files(&path.with_extension("glb")).len(), 2);
+
+    std::fs::remove_file(&buffer).unwrap();
+    let error = read_splat(&path).unwrap_err();
+    assert!(matches!(error, Error::Read { .. }) && error.is_invalid_request(), "{error}");
+    assert_says(&error.to_string(), &["große.bin can't be read"]);
+    std::fs::write(&buffer, &bin[1..]).unwrap();
+    assert_says(&refused_file(&path), &["große.bin: buffer 0 is cut short: ", "bytes, expected "]);
+    std::fs::remove_file(&buffer).unwrap();
+    std::fs::create_dir(&buffer).unwrap();
+    assert_says(&refused_file(&path), &["große.bin: the buffer is no regular file"]);
+
+    let mut read_with = |uri: &str| {
+        json["buffers"][0]["uri"] = json!(uri);
+        std::fs::write(&path, json.to_string()).unwrap();
+        read_splat(&path)
+    };
+    for kind in ["application/octet-stream", "application/gltf-buffer", ""] {
+        let read = read_with(&format!("data:{kind};base64,{}", base64(&bin))).unwrap();
+        assert_same("a data URI", &splat, &read);
+    }
+    std::fs::create_dir(folder.path().join("sub")).unwrap();
+    std::fs::write(folder.path().join("sub/b:c.bin"), &bin).unwrap();
+    assert_same("a folder", &splat, &read_with("sub/b%3Ac.bin").unwrap());
+    assert_same(
+        "a name with a colon",
+        &splat,
+        &read_splat(&written(folder.path(), "b:c.gltf", &splat)).unwrap(),
+    );
+    let mut refused =
+        |uri: &str, parts: &[&str]| assert_says(&read_with(uri).unwrap_err().to_string(), parts);
+    for uri in
+        ["/etc/hostname", "%2Fetc/hostname", "https://a.org/b.bin", "file:///b.bin", "\\\\host\\b", "", "%ff"]
+    {
+        refused(uri, &["the uri of buffer 0 is", "expected a data URI, or a path relative to"]);
+    }
+    for uri in ["data:application/octet-stream,abc", "data:;base64,a~~~", "data:"] {
+        refused(uri, &["buffer 0 is another or a damaged data URI"]);
+    }
+    refused(&format!("data:;base64,{}", base64(&bin[4..])), &["buffer 0 is cut short"]);
+}
+
+/// Both files of a .gltf are checked before the work, and neither changes if the other can't be written.
+#[test]
+fn a_gltf_is_written_with_its_buffer_or_not_at_all() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = written(folder.path(), "a.gltf", &random_splat(3, 0, 1));
+    let before = std::fs::read(&path).unwrap();
+    std::fs::remove_file(folder.path().join("a.bin")).unwrap();
+    std::fs::create_dir(folder.path().join("a.bin")).unwrap();
+    assert_says(&check_writable_splat(&path).unwrap_err().to_string(), &["a.bin"]);
+    assert_says(&write_splat(&path, &random_splat(5, 0, 1)).unwrap_err().to_string(), &["a.bin"]);
+    assert_eq!(std::fs::read(&path).unwrap(), before);
+    let other = folder.path().join("b.gltf");
+    std::fs::create_dir(&other).unwrap();
+    assert_says(&write_splat(&other, &random_splat(5, 0, 1)).unwrap_err().to_string(), &["b.gltf"]);
+    assert!(!folder.path().join("b.bin").exists());
+    for name in ["c.glb", "c.gltf"] {
+        let error = write_splat(&folder.path().join(name), &Splat::default()).unwrap_err();
+        assert_says(&error.to_string(), &["glTF holds one Gaussian at least, found 0"]);
+    }
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 3);
+}
+
+/// The numbers of an SPZ in a glTF file are in glTF's axes.
+#[cfg(feature = "spz")]
+#[test]
+fn spzs_inside_are_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let splat = Splat { antialiased: true, ..random_splat(60, 3, 9) };
+    let spz = written(folder.path(), "a.spz", &splat);
+    let bytes = std::fs::read(&spz).unwrap();
+    let read = read_splat(&spz).unwrap();
+    let glb = |translation: [f64; 3]| Glb {
+        json: json!({
+            "asset": {"version": "2.0"},
+            "extensionsUsed": ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"],
+            "extensionsRequired": ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"],
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0, "translation": translation}],
+            "meshes": [{"primitives": [{
+                "attributes": {"POSITION": 0},
+                "mode": 0,
+                "extensions": {"KHR_gaussian_splatting": {"extensions": {
+                    "KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0},
+                }}},
+            }]}],
+            "accessors": [{"componentType": 5126, "count": 60, "type": "VEC3"}],
+            "bufferViews": [{"buffer": 0, "byteLength": bytes.len()}],
+            "buffers": [{"byteLength": bytes.len()}],
+        }),
+        bin: bytes.clone(),
+    };
+    let inside = glb([0.; 3]).read();
+    // The SPZ has (x, −y, −z), which is read as (−x, y, −z): half a turn about y.
+    let means: Vec<[f32; 3]> = read.means.iter().map(|&[x, y, z]| [-x, y, -z]).collect();
+    assert_eq!(inside.means, means);
+    let turned = read.transformed(&DMat4::from_rotation_y(std::f64::consts::PI)).unwrap();
+    assert_same("an SPZ", &turned, &inside);
+    assert!(inside.antialiased && inside.warnings.is_empty() && inside.linear_scales.is_none());
+    let moved = glb([1., 2., 3.]).read();
+    assert!((moved.means[5][0] - (inside.means[5][0] - 1.)).abs() < 1e-6);
+    assert!((moved.means[5][2] - (inside.means[5][2] + 3.)).abs() < 1e-6);
+
+    // Together with a primitive of attributes, linear scales are those of the logarithms.
+    let mut both = Glb::written(&random_splat(2, 0, 1));
+    let other = glb([0.; 3]);
+    let offset = both.bin.len();
+    both.bin.extend(&bytes);
+    both.json["buffers"][0]["byteLength"] = json!(both.bin.len());
+    let views = both.json["bufferViews"].as_array_mut().unwrap();
+    views.push(json!({"buffer": 0, "byteOffset": offset, "byteLength": bytes.len()}));
+    let view = views.len() - 1;
+    let mut primitive = other.json["meshes"][0]["primitives"][0].clone();
+    primitive["extensions"]["KHR_gaussian_splatting"]["extensions"]["KHR_gaussian_splatting_compression_spz_2"]
+        ["bufferView"] = json!(view);
+    both.json["meshes"][0]["primitives"].as_array_mut().unwrap().push(primitive);
+    let read = both.read();
+    assert_eq!((read.len(), read.sh_degree, read.antialiased), (62, 3, false));
+    assert_eq!(read.scale(2), inside.scale(0));
+
+    let damaged = glb([0.; 3]).refused(|json| json["bufferViews"][0]["byteLength"] = json!(bytes.len() - 1));
+    assert_says(&damaged, &["a.glb: stream 5 is cut short"]);
+    assert_says(
+        &glb([0.; 3]).refused(|json| json["bufferViews"][0]["byteOffset"] = json!(1)),
+        &["buffer view 0 is", "bytes at 1, expected a part of buffer 0"],
+    );
+}
+
+/// A build without SPZ says so.
+#[cfg(not(feature = "spz"))]
+#[test]
+fn spzs_inside_need_the_feature() {
+    let mut glb = Glb::written(&random_splat(2, 0, 1));
+    glb.primitive()["extensions"]["KHR_gaussian_splatting"]["extensions"] =
+        json!({"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}});
+    let message = "the compression is KHR_gaussian_splatting_compression_spz_2, expected none, or a build";
+    assert_says(&glb.refused(|_| ()), &[message]);
+}
+
+#[test]
+fn bad_glbs() {
+    let folder = tempfile::tempdir().unwrap();
+    let glb = Glb::written(&random_splat(30, 1, 9));
+    let whole = glb.bytes();
+    let path = folder.path().join("a.glb");
+    let changed = |change: &dyn Fn(&mut Vec<u8>)| {
+        let mut bytes = whole.clone();
+        change(&mut bytes);
+        std::fs::write(&path, bytes).unwrap();
+        refused_file(&path)
+    };
+    assert_says(&changed(&|bytes| bytes[4] = 1), &["the version of the .glb is 1, expected 2"]);
+    assert_says(&changed(&|bytes| bytes.truncate(11)), &["the header is 11 bytes, expected 12"]);
+    assert_says(&changed(&|bytes| bytes[11] = 255), &["the length in the header is", "the size of the file"]);
+    assert_says(&changed(&|bytes| bytes[8..12].fill(0)), &["the length in the header is 0, expected 12 to"]);
+    assert_says(
+        &changed(&|bytes| bytes[8..12].copy_from_slice(&[12, 0, 0, 0])),
+        &["the JSON chunk is missing"],
+    );
+    assert_says(&changed(&|bytes| bytes[16] = b'X'), &["the first chunk is of type \"XSON\""]);
+    assert_says(&changed(&|bytes| bytes[15] = 255), &["a chunk is cut short"]);
+    assert_says(&changed(&|bytes| bytes[20] = b'['), &["the JSON is invalid: ", "expected glTF 2.0"]);
+    for length in 0..whole.len() {
+        if length < 40 || length % 53 == 0 {
+            std::fs::write(&path, &whole[..length]).unwrap();
+            refused_file(&path);
+        }
+    }
+    assert_says(
+        &glb.refused(|json| json["asset"]["version"] = json!("1.0")),
+        &["the version is \"1.0\", expected 2.0"],
+    );
+    let required = glb.refused(|json| json["extensionsRequired"] = json!(["KHR_draco_mesh_compression"]));
+    assert_says(
+        &required,
+        &["a required extension is \"KHR_draco_mesh_compression\", expected KHR_gaussian_splatting,"],
+    );
+    // A long text with line breaks is still one short sentence.
+    let long = glb.refused(|json| json["extensionsRequired"] = json!(["a\n".repeat(1000)]));
+    assert!(long.len() < 500, "{long}");
+    assert_says(&glb.refused(|json| json["nodes"][0]["mesh"] = json!(3)), &["mesh 3 is missing", "below 1"]);
+    let primitive =
+        |change: &dyn Fn(&mut Value)| glb.refused(|json| change(&mut json["meshes"][0]["primitives"][0]));
+    assert_says(
+        &primitive(&|primitive| primitive["mode"] = json!(4)),
+        &["the mode of primitive 0 of mesh 0 is 4, expected 0 (POINTS)"],
+    );
+    assert_says(
+        &primitive(&|primitive| primitive["attributes"]["POSITION"] = json!(99)),
+        &["the accessor of POSITION, 99 is missing"],
+    );
+    for missing in ["POSITION", ROTATION, SCALE, "KHR_gaussian_splatting:SH_DEGREE_1_COEF_1"] {
+        let error = primitive(&|primitive| {
+            primitive["attributes"].as_object_mut().unwrap().remove(missing);
+        });
+        assert_says(&error, &[&format!("the attribute {missing} of primitive 0 of mesh 0 is missing")]);
+    }
+    let accessor = |attribute: &str, key: &str, value: Value| {
+        let mut changed = glb.clone();
+        changed.accessor(attribute)[key] = value;
+        changed.refused(|_| ())
+    };
+    assert_says(&accessor(SCALE, "type", json!("VEC4")), &[SCALE, "is \"VEC4\", expected VEC3"]);
+    assert_says(
+        &accessor(ROTATION, "componentType", json!(5121)),
+        &["is 5121, expected float (5126), or normalized"],
+    );
+    assert_says(
+        &accessor(SCALE, "componentType", json!(5125)),
+        &["the component type", "is 5125, expected float"],
+    );
+    assert_says(&accessor(OPACITY, "componentType", json!(5122)), &["unsigned byte (5121)"]);
+    assert_says(&accessor(SCALE, "count", json!(29)), &["is 29, expected 30, as many as positions"]);
+    assert_says(
+        &accessor("POSITION", "count", json!(4_000_000_000u32)),
+        &["the extent of accessor 0 (POSITION) is 4000000000 elements, which end at byte 48000000000"],
+    );
+    assert_says(&accessor("POSITION", "count", json!(usize::MAX)), &["the extent of accessor 0"]);
+    assert_says(&accessor("POSITION", "count", json!(0)), &["is 0 elements", "expected 1 or more"]);
+    assert_says(&accessor("POSITION", "byteOffset", json!(usize::MAX)), &["the extent of accessor 0"]);
+    assert_says(&accessor(SCALE, "sparse", json!({"count": 1})), &["the storage of accessor", "is sparse"]);
+    assert_says(&accessor(SCALE, "bufferView", json!(null)), &["the buffer view of accessor", "is missing"]);
+    assert_says(&accessor(SCALE, "bufferView", json!(99)), &["buffer view 99 is missing"]);
+    assert_says(&accessor(SCALE, "count", json!("many")), &["the JSON is invalid"]);
+    assert_says(&accessor(SCALE, "count", json!(-1)), &["the JSON is invalid"]);
+    let view = |key: &str, value: Value| glb.refused(|json| json["bufferViews"][0][key] = value);
+    assert_says(
+        &view("byteLength", json!(usize::MAX)),
+        &["buffer view 0 is 18446744073709551615 bytes at 0"],
+    );
+    assert_says(&view("byteOffset", json!(usize::MAX)), &["buffer view 0 is"]);
+    assert_says(&view("buffer", json!(1)), &["buffer 1 is missing, expected an index below 1"]);
+    let buffer = glb.refused(|json| json["buffers"][0]["byteLength"] = json!(1_000_000_000_000u64));
+    assert_says(&buffer, &["buffer 0 is cut short", "expected 1000000000000 bytes"]);
+    let uri = glb.refused(|json| {
+        json["buffers"] = json!([{"byteLength": 1}, {"byteLength": 8}]);
+        json["bufferViews"][0]["buffer"] = json!(1);
+    });
+    assert_says(&uri, &["buffer 1 is without a uri"]);
+}
+
+/// Meshes that many nodes share can't fill the memory.
+#[test]
+fn shared_meshes_are_limited() {
+    let mut glb = Glb::written(&random_splat(20_000, 0, 1));
+    let nodes = vec![json!({"mesh": 0}); 400];
+    let all: Vec<usize> = (0..nodes.len()).collect();
+    glb.json["nodes"] = json!(nodes);
+    glb.json["scenes"][0]["nodes"] = json!(all);
+    assert_says(
+        &glb.refused(|_| ()),
+        &["the number of Gaussians is more than fit", "256 times the files' bytes"],
+    );
+    glb.json["scenes"][0]["nodes"] = json!([0, 1, 2]);
+    assert_eq!(glb.read().len(), 60_000);
+    // A chain of nodes as long as the file allows needs no recursion.
+    let chain: Vec<Value> = (0..100_000).map(|index| json!({"children": [index + 1]})).collect();
+    glb.json["nodes"] = [chain, vec![json!({"mesh": 0})]].concat().into();
+    glb.json["scenes"][0]["nodes"] = json!([0]);
+    assert_eq!(glb.read().len(), 20_000);
+}
+
+/// Gaussians with invalid values are refused, or left out and counted.
+#[test]
+fn invalid_values_are_refused_or_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    for (attribute, value, field, expected) in [
+        ("POSITION", f32::NAN, "the position of Gaussian 1 is NaN", "finite numbers"),
+        (SCALE, -0.5, "the scale of Gaussian 1 is -0.5", "0 or more"),
+        (SCALE, f32::INFINITY, "the scale of Gaussian 1 is inf", "finite numbers"),
+        (ROTATION, f32::NAN, "the rotation of Gaussian 1 is", "finite numbers"),
+        (OPACITY, f32::NAN, "the opacity of Gaussian 1 is NaN", "0 to 1"),
+        (OPACITY, 1.5, "the opacity of Gaussian 1 is 1.5", "0 to 1"),
+        (OPACITY, -0.1, "the opacity of Gaussian 1 is -0.1", "0 to 1"),
+        (DC, f32::INFINITY, "the colour of Gaussian 1 is inf", "finite numbers"),
+    ] {
+        let mut glb = Glb::written(&random_splat(3, 0, 1));
+        let view = glb.accessor(attribute)["bufferView"].as_u64().unwrap() as usize;
+        let view = &glb.json["bufferViews"][view];
+        let [offset, length] = ["byteOffset", "byteLength"].map(|name| view[name].as_u64().unwrap() as usize);
+        glb.bin[offset + length / 3..][..4].copy_from_slice(&value.to_le_bytes());
+        let path = glb.write(folder.path());
+        assert_says(&refused_file(&path), &[field, expected, "`globalsplat convert` leaves out"]);
+        let repaired = read_splat_without_invalid(&path).unwrap();
+        assert_eq!((repaired.len(), repaired.warnings.len()), (2, 1));
+        for name in ["b.glb", "b.ply"] {
+            assert_eq!(read_splat(&written(folder.path(), name, &repaired)).unwrap().len(), 2);
+        }
+    }
+}
+
+/// No change of bytes makes the reader panic or allocate what the file can't hold.
+#[test]
+fn random_changes_are_read_or_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.glb");
+    let whole = Glb::written(&random_splat(2, 1, 9)).bytes();
+    let mut random = Random::new(8);
+    for _ in 0..3000 {
+        let mut bytes = whole.clone();
+        for _ in 0..2 {
+            let at = (random.uniform() * bytes.len() as f32) as usize;
+            // Digits keep the JSON valid more often.
+            let is_digit = bytes[at].is_ascii_digit();
+            let new = random.uniform() * if is_digit { 10. } else { 256. };
+            bytes[at] = if is_digit { b'0' + new as u8 } else { new as u8 };
+        }
+        std::fs::write(&path, bytes).unwrap();
+        if let Err(error) = read_splat(&path) {
+            assert_eq!(error.to_string().lines().count(), 1, "{error}");
+            assert!(error.is_invalid_request());
+        }
+    }
+}
