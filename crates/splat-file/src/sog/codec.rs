@@ -134,7 +134,8 @@ fn read(path: &Path, mut reader: Reader, meta: &[u8]) -> Result<Contents> {
         Err(why) => return refuse("meta.json", why.to_string(), "the entries of a SOG of version 2"),
     };
     let mut image = |name: &str| -> Result<Image> {
-        let image = reader.image(name, |pixels| pixels / MAX_PIXELS.0 <= meta.count + MAX_PIXELS.1)?;
+        let image =
+            reader.image(name, |pixels| pixels / MAX_PIXELS.0 <= meta.count.saturating_add(MAX_PIXELS.1))?;
         if image.pixels.len() < meta.count {
             let expected = format!("{} or more, one for each Gaussian", meta.count);
             return Err(Error::input(
