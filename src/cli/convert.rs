@@ -1,38 +1,42 @@
+use super::edits::Edits;
 use super::{open_capture, print_json, splat_out, warn};
 use anyhow::Result;
 use clap::Args;
 use glam::DVec3;
 use globalsplat::eval::psnr_between;
 use globalsplat::io::{
-    InputFiles, ShLimits, Splat, check_writable_splat, fit_splat, read_splat, read_splat_without_invalid,
+    InputFiles, ShLimits, Splat, WriteOptions, check_writable_splat, edit_splat, fit_splat, move_cameras,
+    read_splat, read_splat_without_invalid, splat_files,
 };
-use globalsplat::render::orbit_around_gaussians;
-use globalsplat::scene::{Camera, Gaussians, ImageSize, LocalFrame, splat_frame};
+use globalsplat::render::orbit_around_splat;
+use globalsplat::scene::{Camera, LocalFrame, splat_frame};
 use serde_json::{Value, json};
+use std::cmp::Ordering;
 use std::path::{Path, PathBuf};
 
-/// Number and size of views on an orbit around a splat, if no capture is given.
-const VIEWS: usize = 8;
-const SIZE: ImageSize = ImageSize { width: 512, height: 512 };
-
-/// Write a splat in another format, or with spherical harmonics of another degree, and report the loss.
+/// Write a splat in another format, edit it, and report the loss.
 ///
-/// Formats are 3DGS' PLY (.ply), PlayCanvas' compressed PLY (.compressed.ply), Niantic's SPZ (.spz) and antimatter15's .splat,
-/// which has no spherical harmonics. The written file is read again and rendered beside the original: the loss is the PSNR
-/// between both, over eight views around the splat or over the capture's cameras.
+/// Formats are 3DGS' PLY (.ply), PlayCanvas' compressed PLY (.compressed.ply) and SOG (.sog, or meta.json for a folder),
+/// Niantic's SPZ (.spz), glTF with KHR_gaussian_splatting (.glb, .gltf) and antimatter15's .splat, which has no spherical
+/// harmonics; mkkellogg's .ksplat is only read. The written file is read again and rendered beside the original: the loss is the
+/// PSNR between both, over eight views around the splat or over the capture's cameras.
 ///
-/// SPZ stores coefficients within ±1, and a .splat stores only one coefficient per colour channel; viewers for browsers keep no
-/// more of a PLY's coefficients, either (--for-viewers). With a capture, the remaining coefficients are fitted to look the same
-/// from its cameras; otherwise values out of range are clamped, which may cost much quality.
+/// SPZ stores coefficients within ±1, a SOG a few sets of coefficients for all Gaussians, and a .splat only one coefficient per
+/// colour channel; viewers for browsers keep no more of a PLY's coefficients, either (--for-viewers). With a capture, the
+/// coefficients are fitted to look the same from its cameras; otherwise values out of range are clamped, which may cost much
+/// quality.
+///
+/// Edits are applied one after the other, and the capture's cameras move along. The loss is measured in the moved world.
 ///
 /// Gaussians that can't be rendered are removed and counted: those with values that aren't finite, which other commands refuse,
 /// and those whose rotation has length 0.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat convert room.ply room.spz\n  \
     globalsplat convert room.ply small.spz --sh-degree 1 --scene captures/room\n  \
-    globalsplat convert room.ply shared.ply --for-viewers --scene captures/room")]
+    globalsplat convert room.ply shared.ply --for-viewers --scene captures/room\n  \
+    globalsplat convert room.ply table.sog --up z --crop-sphere 0,0,0,2 --filter-floaters --scale 10")]
 pub struct Convert {
-    /// Input splat: .ply, .compressed.ply, .spz or .splat
+    /// Input splat: .ply, .compressed.ply, .sog, meta.json, .spz, .splat, .glb, .gltf or .ksplat
     #[arg(value_name = "FROM")]
     from: PathBuf,
     /// Output file, whose extension selects the format
@@ -52,6 +56,14 @@ pub struct Convert {
     /// origin, as in UTM coordinates, float32 and the formats' own number types lose detail
     #[arg(long)]
     local_origin: bool,
+    /// Version of SPZ, for programs that don't read the newest
+    #[arg(long, value_name = "N", default_value = "4", value_parser = clap::value_parser!(u32).range(2..=4))]
+    spz_version: u32,
+    /// Remove Gaussians with values that aren't finite; `convert` always does, and scripts for splat-transform may say so
+    #[arg(long)]
+    filter_nan: bool,
+    #[command(flatten)]
+    edits: Edits,
     /// Print the result as one JSON object
     #[arg(long)]
     json: bool,
@@ -64,11 +76,17 @@ impl Convert {
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
         let mut inputs = InputFiles::default();
         capture.iter().for_each(|capture| capture.add_input_files(&mut inputs));
-        inputs.check_file(&self.to)?;
-        let original = read_splat_without_invalid(&self.from)?;
-        warn(&original.warnings);
+        self.edits.add_input_files(&mut inputs)?;
+        splat_files(&self.to).iter().try_for_each(|file| inputs.check_file(file))?;
+        let source = read_splat_without_invalid(&self.from)?;
+        warn(&source.warnings);
         // The input is described before the output replaces it, in case they are the same file.
-        let from = description(&self.from, &original)?;
+        let from = description(&self.from, &source)?;
+        let (options, edits): (Vec<_>, Vec<_>) = self.edits.read(warn)?.into_iter().unzip();
+        let cameras = capture.as_ref().map_or(vec![], |capture| capture.cameras());
+        let edited = edit_splat(&source, &edits, &cameras)?;
+        let cameras = move_cameras(&cameras, &edited.from_original);
+        let original = edited.splat;
         let degree = self.sh_degree.map_or(original.sh_degree, |degree| degree as usize);
         let limits = match self.for_viewers {
             true => ShLimits::for_viewers(degree),
@@ -76,40 +94,54 @@ impl Convert {
         };
         let fit = |cameras: &[Camera]| fit_splat(&self.to, &original, &limits, cameras);
         let fitted = match &capture {
-            Some(capture) => Some(fit(&capture.cameras())?),
+            Some(_) => Some(fit(&cameras)?),
             // The writer clamps by itself.
             None if !self.for_viewers => None,
             None => Some(fit(&[])?),
         };
         let written = fitted.as_ref().unwrap_or(&original).with_sh_degree(degree);
         let origin = self.local_origin.then(|| match &capture {
-            Some(capture) => LocalFrame::from_cameras(&capture.cameras()).origin,
+            Some(_) => LocalFrame::from_cameras(&cameras).origin,
             // A splat that already has an origin keeps it.
             None if original.origin != DVec3::ZERO => original.origin,
             None => splat_frame(&original).origin,
         });
-        splat_out::write(&self.to, &written, origin)?;
+        splat_out::write_with(&self.to, &written, origin, &WriteOptions { spz_version: self.spz_version })?;
         let copy = read_splat(&self.to)?;
         let to = description(&self.to, &copy)?;
 
-        let cameras = match &capture {
-            Some(capture) => capture.cameras(),
-            None => orbit_around_gaussians(&Gaussians::from_splat(&original), original.origin, SIZE, VIEWS),
-        };
+        let moved = source.transformed(&edited.from_original)?;
+        let cameras = if capture.is_some() { cameras } else { orbit_around_splat(&moved) };
         if capture.is_none() {
             self.tell_cut(&original, &fit(&[])?);
         }
-        let psnr = psnr_between(&original, &copy, &cameras)?;
+        let psnr = psnr_between(&moved, &copy, &cameras)?;
         let views = cameras.len();
         if self.json {
-            let report = json!({ "from": from, "to": to, "views": views, "psnr": psnr, "same_pixels": psnr.is_none() });
+            let edits: Vec<_> = options
+                .iter()
+                .zip(&edited.counts)
+                .map(|(option, count)| json!({ "edit": option, "gaussians": count }))
+                .collect();
+            let report = json!({ "from": from, "edits": edits, "to": to, "views": views, "psnr": psnr, "same_pixels": psnr.is_none() });
             print_json(&report);
         } else {
+            println!("{}", line(&from));
+            let mut before = source.len();
+            for (option, &count) in options.iter().zip(&edited.counts) {
+                let change = match count.cmp(&before) {
+                    Ordering::Less => format!("{} removed, {count} left", before - count),
+                    Ordering::Equal => format!("{count} Gaussians"),
+                    Ordering::Greater => format!("{} added, {count} Gaussians", count - before),
+                };
+                println!("{option}: {change}");
+                before = count;
+            }
             let loss = match psnr {
                 Some(psnr) => format!("{psnr:.2} dB between renders of both"),
                 None => "the same pixels".into(),
             };
-            println!("{}\n{}\n{views} views: {loss}", line(&from), line(&to));
+            println!("{}\n{views} views: {loss}", line(&to));
         }
         Ok(())
     }
@@ -134,11 +166,14 @@ impl Convert {
 }
 
 fn description(path: &Path, splat: &Splat) -> Result<Value> {
+    // The images of a SOG's meta.json, or the buffer of a .gltf, are a part of the splat.
+    let files = splat_files(path).into_iter().filter(|file| file.is_file());
+    let bytes: u64 = files.map(|file| Ok(std::fs::metadata(file)?.len())).sum::<std::io::Result<u64>>()?;
     Ok(json!({
         "splat": path.to_string_lossy(),
         "gaussians": splat.len(),
         "sh_degree": splat.sh_degree,
-        "bytes": std::fs::metadata(path)?.len(),
+        "bytes": bytes,
     }))
 }
 

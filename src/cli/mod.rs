@@ -13,6 +13,7 @@ mod capture;
 mod convert;
 mod device;
 mod doctor;
+mod edits;
 mod eval;
 mod export;
 mod import;

@@ -3,8 +3,8 @@
 use glam::DVec3;
 use globalsplat::error::Result;
 use globalsplat::io::{
-    ShLimits, Splat, can_mark_antialiased, check_writable_origin, fit_splat, rounding_warning,
-    write_local_splat, write_splat,
+    ShLimits, Splat, WriteOptions, can_mark_antialiased, check_writable_origin, fit_splat, rounding_warning,
+    write_local_splat_with,
 };
 use globalsplat::scene::Camera;
 use std::path::Path;
@@ -26,15 +26,25 @@ pub fn write_for(path: &Path, splat: &Splat, cameras: &[Camera], local_origin: O
 /// Writes `splat` to `path`, with coordinates relative to `local_origin` if there is one. Otherwise they are world coordinates,
 /// and their loss of precision in float32 is reported on standard error.
 pub fn write(path: &Path, splat: &Splat, local_origin: Option<DVec3>) -> Result<()> {
+    write_with(path, splat, local_origin, &WriteOptions::default())
+}
+
+/// Writes a splat like [`write`], with `options`.
+pub fn write_with(
+    path: &Path,
+    splat: &Splat,
+    local_origin: Option<DVec3>,
+    options: &WriteOptions,
+) -> Result<()> {
     if splat.antialiased && !can_mark_antialiased(path)? {
         let line = "the format can't say that the splat is antialiased, and viewers show it slightly wrong";
         eprintln!("{}: {line}", path.display());
     }
     if let Some(origin) = local_origin {
-        return Ok(write_local_splat(path, &splat.with_origin(origin))?);
+        return Ok(write_local_splat_with(path, &splat.with_origin(origin), options)?);
     }
     if let Some(loss) = rounding_warning(splat) {
         eprintln!("{}: {loss}; --local-origin keeps them exact", path.display());
     }
-    Ok(write_splat(path, splat)?)
+    Ok(write_local_splat_with(path, &splat.with_origin(DVec3::ZERO), options)?)
 }

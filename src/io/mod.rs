@@ -3,10 +3,12 @@
 
 mod depth_colours;
 mod dtype;
+mod edit;
 mod event_file;
 mod event_reader;
 mod images;
 mod mosaic;
+mod neighbours;
 mod npy;
 mod pretrained;
 mod shards;
@@ -25,12 +27,13 @@ pub use globalsplat_files::{
     InputFiles, check_regular, check_writable_dir, check_writable_file, checksum, parent_of, write_atomically,
 };
 pub use globalsplat_splat_file::{
-    ShLimits, Splat, can_mark_antialiased, check_writable_origin, check_writable_splat, find_splat,
-    is_splat_name, limits_of, origin_file, read_splat, read_splat_without_invalid, splat_files,
-    write_local_splat, write_splat,
+    ShLimits, Splat, WriteOptions, can_mark_antialiased, check_writable_origin, check_writable_splat,
+    find_splat, is_splat_name, limits_of, origin_file, read_splat, read_splat_without_invalid, splat_files,
+    write_local_splat, write_local_splat_with, write_splat,
 };
 
 pub use depth_colours::{DepthScale, colourize_depth, depth_colours};
+pub use edit::{EditedSplat, SplatEdit, edit_splat, move_cameras};
 pub use globalsplat_capture::{decode_photo, encode_photo, read_image};
 pub use images::{
     check_writable_png, is_png_name, rgb_from_tensor, tensor_from_rgb, tile_horizontally, tile_vertically,

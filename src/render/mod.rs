@@ -1,5 +1,6 @@
 //! Safe, typed bindings to the differentiable splat op (spec 6).
 
+mod contribution;
 pub mod cpu;
 pub mod cuda;
 mod harmonics;
@@ -8,8 +9,9 @@ mod transform;
 mod views;
 
 use crate::ffi::take_outputs;
+pub use contribution::contributions;
 pub use harmonics::{compensate_mean_colour, fit_harmonics, shrink_harmonics};
-pub use orbit::orbit_around_gaussians;
+pub use orbit::{orbit_around_gaussians, orbit_around_splat};
 pub use transform::transform;
 pub use views::{RenderedView, SplatRenderer, render_views};
 

@@ -2,7 +2,17 @@
 
 use crate::scene::{Camera, Gaussians, ImageSize, Intrinsics, orbit_around_point};
 use glam::{DMat4, DVec3};
+use globalsplat_splat_file::Splat;
 use tch::Kind;
+
+/// Number and size of the views of [`orbit_around_splat`].
+const VIEWS: usize = 8;
+const SIZE: ImageSize = ImageSize { width: 512, height: 512 };
+
+/// Returns eight cameras of 512×512 pixels on an orbit around a splat, in world coordinates.
+pub fn orbit_around_splat(splat: &Splat) -> Vec<Camera> {
+    orbit_around_gaussians(&Gaussians::from_splat(splat), splat.origin, SIZE, VIEWS)
+}
 
 /// Returns `frames` cameras on an orbit around the opacity-weighted centre of the Gaussians of one scene, whose means are relative to
 /// `origin`. The cameras are in world coordinates, and far enough away to see most of the splat.

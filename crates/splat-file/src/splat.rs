@@ -181,6 +181,21 @@ impl Splat {
         }
     }
 
+    /// Returns the Gaussians of both splats, with the origin of the first one and the higher SH degree.
+    pub fn merged(&self, other: &Self) -> Self {
+        let degree = self.sh_degree.max(other.sh_degree);
+        let other = other.with_origin(self.origin).with_sh_degree(degree);
+        let mut merged = self.with_sh_degree(degree);
+        merged.linear_scales =
+            self.linear_scales.clone().zip(other.linear_scales).map(|(a, b)| [a, b].concat());
+        merged.means.extend(other.means);
+        merged.log_scales.extend(other.log_scales);
+        merged.quaternions.extend(other.quaternions);
+        merged.opacity_logits.extend(other.opacity_logits);
+        merged.sh.extend(other.sh);
+        merged
+    }
+
     /// Returns the size in bytes of the splat as a 3DGS PLY, the format that every program reads.
     pub fn ply_bytes(&self) -> u64 {
         ply::size(self)

@@ -1,0 +1,279 @@
+//! Options that edit a splat, in the order in which they are given.
+
+use super::open_capture;
+use clap::{Arg, ArgAction, ArgMatches, Args, Command, FromArgMatches};
+use glam::{DMat4, DQuat, DVec3};
+use globalsplat::io::{InputFiles, Splat, SplatEdit, read_splat_without_invalid, splat_files};
+use std::f64::consts::{FRAC_PI_2, PI};
+use std::path::PathBuf;
+
+/// Edit as it is given, before files are read.
+#[derive(Debug, Clone)]
+enum EditArgument {
+    Edit(SplatEdit),
+    SeenBy(PathBuf),
+    Merge(PathBuf),
+}
+
+type Parser = fn(&str) -> Result<EditArgument, String>;
+
+/// Name, name of the value, help and parser of an option.
+type EditOption = (&'static str, &'static str, &'static str, Parser);
+
+/// All options.
+const OPTIONS: [EditOption; 13] = [
+    ("scale", "FACTOR", "Scale about the world's origin", |text| {
+        transform(DMat4::from_scale(DVec3::splat(positive(text)?)))
+    }),
+    (
+        "rotate",
+        "X,Y,Z",
+        "Rotate about the world's x axis, then its y axis, then its z axis, in degrees",
+        |text| {
+            let [x, y, z] = numbers(text)?.map(f64::to_radians);
+            transform(DMat4::from_rotation_z(z) * DMat4::from_rotation_y(y) * DMat4::from_rotation_x(x))
+        },
+    ),
+    ("translate", "X,Y,Z", "Move by a vector", |text| {
+        transform(DMat4::from_translation(DVec3::from(numbers(text)?)))
+    }),
+    (
+        "matrix",
+        "NUMBERS",
+        "Multiply by a matrix of 4×4 numbers, row by row, which rotates, scales uniformly and translates",
+        |text| transform(DMat4::from_cols_array(&numbers(text)?).transpose()),
+    ),
+    (
+        "up",
+        "AXIS",
+        "Rotate a splat whose axis x, y, z, -x, -y or -z points up, so that -y does, as 3DGS and most viewers have it",
+        parse_up,
+    ),
+    (
+        "crop-box",
+        "X,Y,Z,X,Y,Z",
+        "Keep the Gaussians whose centres are in the box between two corners",
+        |text| {
+            let [a, b, c, d, e, f] = numbers(text)?;
+            let (first, second) = (DVec3::new(a, b, c), DVec3::new(d, e, f));
+            edit(SplatEdit::CropBox(first.min(second), first.max(second)))
+        },
+    ),
+    ("crop-sphere", "X,Y,Z,RADIUS", "Keep the Gaussians whose centres are in a sphere", |text| {
+        let [x, y, z, radius] = numbers(text)?;
+        edit(SplatEdit::CropSphere(DVec3::new(x, y, z), radius))
+    }),
+    ("min-opacity", "OPACITY", "Remove Gaussians of a lower opacity, 0 to 1", |text| {
+        edit(SplatEdit::MinOpacity(positive(text)?))
+    }),
+    (
+        "max-scale",
+        "LENGTH",
+        "Remove Gaussians with a larger standard deviation along any of their axes",
+        |text| edit(SplatEdit::MaxScale(positive(text)?)),
+    ),
+    (
+        "filter-floaters",
+        "FACTOR",
+        "Remove isolated Gaussians: those whose eighth neighbour is FACTOR times as far as is usual, 10 by default, and beyond \
+         their own size",
+        |text| edit(SplatEdit::FilterFloaters(positive(text)?)),
+    ),
+    (
+        "seen-by",
+        "SCENE",
+        "Remove Gaussians that no camera of this capture sees: those that contribute less than a tenth of a pixel to all views \
+         together",
+        |text| Ok(EditArgument::SeenBy(text.into())),
+    ),
+    (
+        "decimate",
+        "N",
+        "Keep N Gaussians: those that contribute most to the views of --scene, or to eight views around the splat",
+        |text| match text.parse() {
+            Ok(0) | Err(_) => Err("expected a number of Gaussians, 1 or more".into()),
+            Ok(count) => edit(SplatEdit::Decimate(count)),
+        },
+    ),
+    ("merge", "FILE", "Add the Gaussians of another splat", |text| Ok(EditArgument::Merge(text.into()))),
+];
+
+fn edit(edit: SplatEdit) -> Result<EditArgument, String> {
+    Ok(EditArgument::Edit(edit))
+}
+
+fn transform(matrix: DMat4) -> Result<EditArgument, String> {
+    edit(SplatEdit::Transform(matrix))
+}
+
+/// Parses `N` finite numbers that are separated by commas.
+fn numbers<const N: usize>(text: &str) -> Result<[f64; N], String> {
+    let numbers: Option<Vec<f64>> = text
+        .split(',')
+        .map(|part| part.trim().parse().ok().filter(|number: &f64| number.is_finite()))
+        .collect();
+    let expected = || match N {
+        1 => "expected a number".into(),
+        _ => format!("expected {N} numbers with commas between them"),
+    };
+    numbers.and_then(|numbers| numbers.try_into().ok()).ok_or_else(expected)
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    match numbers(text) {
+        Ok([number]) if number > 0. => Ok(number),
+        _ => Err("expected a number above 0".into()),
+    }
+}
+
+fn parse_up(text: &str) -> Result<EditArgument, String> {
+    let rotation = match text {
+        "x" => DQuat::from_rotation_z(-FRAC_PI_2),
+        "-x" => DQuat::from_rotation_z(FRAC_PI_2),
+        "y" => DQuat::from_rotation_x(PI),
+        "-y" => DQuat::IDENTITY,
+        "z" => DQuat::from_rotation_x(FRAC_PI_2),
+        "-z" => DQuat::from_rotation_x(-FRAC_PI_2),
+        _ => return Err("expected x, y, z, -x, -y or -z".into()),
+    };
+    transform(DMat4::from_quat(rotation))
+}
+
+/// Edits in the order in which they are given, each with its option as it is given.
+#[derive(Debug)]
+pub struct Edits(Vec<(String, EditArgument)>);
+
+impl Edits {
+    /// Adds the files that the edits read.
+    pub fn add_input_files(&self, inputs: &mut InputFiles) -> globalsplat::Result<()> {
+        for (_, argument) in &self.0 {
+            match argument {
+                EditArgument::Edit(_) => {}
+                EditArgument::SeenBy(path) => open_capture(path)?.add_input_files(inputs),
+                EditArgument::Merge(path) => splat_files(path).iter().for_each(|file| inputs.add(file)),
+            }
+        }
+        Ok(())
+    }
+
+    /// Reads the files of the edits, and returns each edit with its option. `warn` receives the warnings of the splats that are read.
+    pub fn read(&self, warn: impl Fn(&[String])) -> globalsplat::Result<Vec<(&str, SplatEdit)>> {
+        let read = |argument: &EditArgument| -> globalsplat::Result<SplatEdit> {
+            Ok(match argument {
+                EditArgument::Edit(edit) => edit.clone(),
+                EditArgument::SeenBy(path) => SplatEdit::SeenBy(open_capture(path)?.cameras()),
+                EditArgument::Merge(path) => {
+                    let splat: Splat = read_splat_without_invalid(path)?;
+                    warn(&splat.warnings);
+                    SplatEdit::Merge(Box::new(splat))
+                }
+            })
+        };
+        self.0.iter().map(|(option, argument)| Ok((&option[..], read(argument)?))).collect()
+    }
+}
+
+impl Args for Edits {
+    fn augment_args(command: Command) -> Command {
+        let argument = |(name, value, help, parser): EditOption| {
+            let argument = Arg::new(name)
+                .long(name)
+                .value_name(value)
+                .help(help)
+                .help_heading("Edits, applied in the order in which they are given")
+                .action(ArgAction::Append)
+                .allow_hyphen_values(true)
+                .value_parser(move |text: &str| parser(text).map(|argument| (text.to_owned(), argument)));
+            match name {
+                "filter-floaters" => {
+                    argument.num_args(0..=1).require_equals(true).default_missing_value("10")
+                }
+                _ => argument,
+            }
+        };
+        command.args(OPTIONS.map(argument))
+    }
+
+    fn augment_args_for_update(command: Command) -> Command {
+        Self::augment_args(command)
+    }
+}
+
+impl FromArgMatches for Edits {
+    fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
+        let mut edits = vec![];
+        for (name, ..) in OPTIONS {
+            let values = matches.get_many::<(String, EditArgument)>(name).into_iter().flatten();
+            let places = matches.indices_of(name).into_iter().flatten();
+            edits.extend(
+                places
+                    .zip(values)
+                    .map(|(place, (text, argument))| (place, (format!("--{name} {text}"), argument.clone()))),
+            );
+        }
+        edits.sort_by_key(|(place, _)| *place);
+        Ok(Edits(edits.into_iter().map(|(_, edit)| edit).collect()))
+    }
+
+    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
+        *self = Self::from_arg_matches(matches)?;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Program {
+        #[command(flatten)]
+        edits: Edits,
+    }
+
+    #[test]
+    fn edits_are_in_the_order_of_the_options() {
+        let arguments = "x --translate -1,2,3 --scale 2 --filter-floaters --translate 4,5,6 --up -z --crop-sphere 0,0,0,1";
+        let program = Program::try_parse_from(arguments.split(' ')).unwrap();
+        let edits = program.edits.read(|_| ()).unwrap();
+        let options: Vec<_> = edits.iter().map(|(option, _)| *option).collect();
+        let expected = [
+            "--translate -1,2,3",
+            "--scale 2",
+            "--filter-floaters 10",
+            "--translate 4,5,6",
+            "--up -z",
+            "--crop-sphere 0,0,0,1",
+        ];
+        assert_eq!(options, expected);
+        let SplatEdit::Transform(matrix) = &edits[4].1 else { panic!("{edits:?}") };
+        assert!(matrix.transform_vector3(DVec3::NEG_Z).abs_diff_eq(DVec3::NEG_Y, 1e-12));
+        for up in ["x", "y", "-x", "-y", "z"] {
+            let Ok(EditArgument::Edit(SplatEdit::Transform(matrix))) = parse_up(up) else { panic!("{up}") };
+            let sign = if up.starts_with('-') { -1. } else { 1. };
+            let axis = match up.trim_start_matches('-') {
+                "x" => DVec3::X,
+                "y" => DVec3::Y,
+                _ => DVec3::Z,
+            };
+            assert!(matrix.transform_vector3(sign * axis).abs_diff_eq(DVec3::NEG_Y, 1e-12), "{up}");
+        }
+    }
+
+    #[test]
+    fn bad_values_are_refused() {
+        for (arguments, message) in [
+            ("--scale 0", "expected a number above 0"),
+            ("--scale nan", "expected a number above 0"),
+            ("--translate 1,2", "expected 3 numbers with commas"),
+            ("--crop-box 1,2,3,4,5,x", "expected 6 numbers"),
+            ("--decimate 0", "1 or more"),
+            ("--up w", "expected x, y, z, -x, -y or -z"),
+        ] {
+            let error =
+                Program::try_parse_from(std::iter::once("x").chain(arguments.split(' '))).err().unwrap();
+            assert!(error.to_string().contains(message), "{arguments}: {error}");
+        }
+    }
+}

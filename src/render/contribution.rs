@@ -1,0 +1,58 @@
+//! How much each Gaussian contributes to images.
+
+use super::{Cameras, default_eps2d, render};
+use crate::error::Result;
+use crate::scene::{Camera, Gaussians, SH_C0};
+use tch::Tensor;
+
+/// Returns the contribution of each Gaussian to the images of `cameras`, in pixels: the sum over all pixels of its weight α·T, its opacity
+/// there times the transmittance in front of it. `gaussians` are of one scene, in the cameras' local frame (spec 2.5).
+///
+/// The weight of a Gaussian in a pixel is the derivative of the pixel's colour with respect to the Gaussian's colour.
+///
+/// # Errors
+/// Fails like [`render`].
+pub fn contributions(gaussians: &Gaussians, cameras: &[Camera]) -> Result<Vec<f32>> {
+    let count = gaussians.count();
+    let colours = Tensor::zeros([1, count, 1, 3], (gaussians.means.kind(), gaussians.means.device()));
+    let colours = colours.set_requires_grad(true);
+    let grey = Gaussians { sh: colours.shallow_clone(), ..gaussians.map(Tensor::detach) };
+    for camera in cameras {
+        let image = render(&grey, &Cameras::single(camera), default_eps2d(gaussians))?;
+        image.rgb.select(2, 0).sum(None).backward();
+    }
+    let grad = colours.grad();
+    if !grad.defined() {
+        return Ok(vec![0.; count as usize]);
+    }
+    Ok(Vec::try_from((grad.select(3, 0) / SH_C0).flatten(0, -1))?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Intrinsics;
+    use glam::DMat4;
+    use tch::{Device, Kind};
+
+    /// The contributions add up to the accumulated opacity, and a Gaussian behind an opaque one contributes little.
+    #[test]
+    fn contributions_add_up_to_alpha() {
+        let options = (Kind::Float, Device::Cpu);
+        let gaussians = Gaussians {
+            means: Tensor::from_slice(&[0f32, 0., 2., 0., 0., 4., 0., 0., -2.]).view([1, 3, 3]),
+            scales: Tensor::from_slice(&[0.3f32, 0.3, 0.3]).view([1, 3, 1]).repeat([1, 1, 3]),
+            quaternions: Tensor::from_slice(&[1f32, 0., 0., 0.]).repeat([1, 3, 1]),
+            opacities: Tensor::from_slice(&[0.99f32, 0.9, 0.9]).view([1, 3]),
+            sh: Tensor::full([1, 3, 4, 3], -9., options), // black
+            antialiased: false,
+        };
+        let intrinsics = Intrinsics { fx: 30., fy: 30., cx: 16., cy: 16. };
+        let camera = Camera { intrinsics, c2w: DMat4::IDENTITY, width: 32, height: 32 };
+        let found = contributions(&gaussians, &[camera, camera]).unwrap();
+        let image = render(&gaussians, &Cameras::single(&camera), default_eps2d(&gaussians)).unwrap();
+        let alpha = 2. * image.alpha.sum(Kind::Double).double_value(&[]);
+        assert!((f64::from(found.iter().sum::<f32>()) - alpha).abs() < 1e-3 * alpha, "{found:?}, {alpha}");
+        assert!(found[0] > 5. * found[1] && found[1] > 0. && found[2] == 0., "{found:?}");
+    }
+}
