@@ -166,14 +166,11 @@ impl Convert {
 }
 
 fn description(path: &Path, splat: &Splat) -> Result<Value> {
-    // The images of a SOG's meta.json, or the buffer of a .gltf, are a part of the splat.
-    let files = splat_files(path).into_iter().filter(|file| file.is_file());
-    let bytes: u64 = files.map(|file| Ok(std::fs::metadata(file)?.len())).sum::<std::io::Result<u64>>()?;
     Ok(json!({
         "splat": path.to_string_lossy(),
         "gaussians": splat.len(),
         "sh_degree": splat.sh_degree,
-        "bytes": bytes,
+        "bytes": splat_out::total_bytes(path)?,
     }))
 }
 

@@ -82,7 +82,7 @@ const OPTIONS: [EditOption; 13] = [
     (
         "seen-by",
         "SCENE",
-        "Remove Gaussians that no camera of this capture sees: those that contribute less than a tenth of a pixel to all views \
+        "Remove Gaussians that no camera of this capture sees: those that contribute less than a thousandth of a pixel to all views \
          together",
         |text| Ok(EditArgument::SeenBy(text.into())),
     ),

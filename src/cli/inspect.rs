@@ -1,24 +1,34 @@
-use super::{open_capture, print_json, warn};
+use super::{open_capture, print_json, splat_out, warn};
 use anyhow::Result;
 use clap::Args;
 use glam::DVec3;
 use globalsplat::data::{Chunk, Dataset, INDEX_FILE, Split};
 use globalsplat::error::Error;
-use globalsplat::io::{WeightsFile, is_splat_name, is_weights_name, read_splat};
+use globalsplat::io::{
+    InputFiles, Splat, WeightsFile, check_writable_png, is_splat_name, is_weights_name,
+    read_splat_without_invalid, splat_files, write_png,
+};
 use globalsplat::reconstruct::{CONFIG_KEY, ModelFile, STAGE_KEY};
+use globalsplat::render::{SplatRenderer, orbit_around_splat};
 use globalsplat::scene::Gaussians;
 use serde_json::{Value, json};
+use std::f64::consts::PI;
 use std::path::{Path, PathBuf};
 use tch::{Kind, Tensor};
 
 /// Print the contents of a splat, a weights file, a capture, a chunk, or a folder of chunks.
 #[derive(Args)]
-#[command(after_help = "Example:\n  globalsplat inspect room.ply")]
+#[command(
+    after_help = "Examples:\n  globalsplat inspect room.ply\n  globalsplat inspect room.sog --preview room.png"
+)]
 pub struct Inspect {
-    /// Splat (.ply, .compressed.ply, .spz, .splat), weights (.safetensors, .ckpt), a .torch, a capture, or a folder with an
+    /// Splat (.ply, .compressed.ply, .sog, meta.json, .spz, .splat, .glb, .gltf, .ksplat), weights (.safetensors, .ckpt), a .torch, a capture, or a folder with an
     /// index.json
     #[arg(value_name = "FILE|DIR")]
     path: PathBuf,
+    /// Also render a splat to this PNG, 512×512 pixels, from in front of it
+    #[arg(long, value_name = "FILE")]
+    preview: Option<PathBuf>,
     /// Print the contents as one JSON object
     #[arg(long)]
     json: bool,
@@ -26,10 +36,21 @@ pub struct Inspect {
 
 impl Inspect {
     pub fn run(self) -> Result<()> {
+        if let Some(preview) = &self.preview {
+            if !is_splat_name(&self.path) {
+                let why =
+                    format!("--preview: {} isn't a splat, the only kind that it shows", self.path.display());
+                return Err(Error::request(why).into());
+            }
+            check_writable_png(preview)?;
+            let mut inputs = InputFiles::default();
+            splat_files(&self.path).iter().for_each(|file| inputs.add(file));
+            inputs.check_file(preview)?;
+        }
         let is_scene_of_chunk = !self.path.exists() && self.path.to_string_lossy().contains(".torch#");
         let object = match self.path.extension().and_then(|e| e.to_str()) {
             _ if is_scene_of_chunk => capture(&self.path)?,
-            _ if is_splat_name(&self.path) => splat(&self.path)?,
+            _ if is_splat_name(&self.path) => splat(&self.path, self.preview.as_deref())?,
             _ if is_weights_name(&self.path) => weights(&self.path)?,
             _ if !self.path.exists() => {
                 return Err(Error::request(format!("{}: no such file or folder", self.path.display())).into());
@@ -40,7 +61,7 @@ impl Inspect {
             _ if self.path.is_dir() => capture(&self.path)?,
             _ => {
                 std::fs::metadata(&self.path).map_err(Error::read(&self.path))?;
-                let expected = "a splat (.ply, .compressed.ply, .spz or .splat), a .safetensors, a .ckpt, a .torch or a capture";
+                let expected = "a splat such as a .ply, .sog, .spz or .glb, a .safetensors, a .ckpt, a .torch or a capture";
                 return Err(Error::input(&self.path, "the path", "of an unknown type", expected).into());
             }
         };
@@ -70,24 +91,53 @@ fn range(t: &Tensor) -> Value {
     json!([t.min().double_value(&[]), t.median().double_value(&[]), t.max().double_value(&[])])
 }
 
-fn splat(path: &Path) -> Result<Value> {
-    let splat = read_splat(path)?;
+/// Returns quantiles of the positive `values`, by name.
+fn quantiles(values: impl Iterator<Item = f32>) -> Value {
+    let mut sorted: Vec<f32> = values.collect();
+    sorted.sort_unstable_by(f32::total_cmp);
+    let at = |percent: usize| sorted.get((sorted.len().saturating_sub(1)) * percent / 100).copied();
+    json!({ "p1": at(1), "p5": at(5), "p25": at(25), "p50": at(50), "p75": at(75), "p95": at(95), "p99": at(99) })
+}
+
+/// Returns the mean square over all directions of the colours' part of each SH degree, a mean over Gaussians and channels.
+fn sh_energy(splat: &Splat) -> Vec<f64> {
+    let mut energies = vec![0.; splat.sh_degree + 1];
+    for index in 0..splat.len() {
+        for (basis, colour) in splat.sh_of(index).iter().enumerate() {
+            energies[basis.isqrt()] += colour.iter().map(|&channel| f64::from(channel).powi(2)).sum::<f64>();
+        }
+    }
+    // The integral of a squared spherical harmonic over the sphere, whose area is 4π, is 1.
+    let numbers = (3 * splat.len().max(1)) as f64 * 4. * PI;
+    energies.into_iter().map(|energy| energy / numbers).collect()
+}
+
+fn splat(path: &Path, preview: Option<&Path>) -> Result<Value> {
+    let splat = read_splat_without_invalid(path)?;
     warn(&splat.warnings);
     let g = Gaussians::from_splat(&splat);
     let axis = |i: usize| range(&(g.means.select(-1, i as i64).to_kind(Kind::Double) + splat.origin[i]));
     let origin = (splat.origin != DVec3::ZERO).then(|| splat.origin.to_array());
+    if let Some(preview) = preview {
+        let camera = orbit_around_splat(&splat)[0];
+        write_png(preview, &SplatRenderer::from_splat(&splat).render(&[camera])?[0].rgb)?;
+    }
     Ok(json!({
         "kind": "splat",
         "gaussians": g.count(),
+        "left_out": Some(&splat.warnings).filter(|warnings| !warnings.is_empty()),
         "sh_degree": splat.sh_degree,
         "antialiased": splat.antialiased,
-        "bytes": std::fs::metadata(path)?.len(),
+        "bytes": splat_out::total_bytes(path)?,
         "x": axis(0),
         "y": axis(1),
         "z": axis(2),
         "local_origin": origin,
         "scales": range(&g.scales),
+        "scale_quantiles": quantiles((0..splat.len()).flat_map(|index| splat.scale(index))),
         "opacities": range(&g.opacities),
+        "opacity_quantiles": quantiles((0..splat.len()).map(|index| splat.opacity(index))),
+        "sh_energy": sh_energy(&splat),
     }))
 }
 

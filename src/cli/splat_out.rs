@@ -1,10 +1,10 @@
 //! Output of a splat, with coordinates relative to the world's origin or to a local one.
 
 use glam::DVec3;
-use globalsplat::error::Result;
+use globalsplat::error::{Error, Result};
 use globalsplat::io::{
     ShLimits, Splat, WriteOptions, can_mark_antialiased, check_writable_origin, fit_splat, rounding_warning,
-    write_local_splat_with,
+    splat_files, write_local_splat_with,
 };
 use globalsplat::scene::Camera;
 use std::path::Path;
@@ -15,6 +15,12 @@ use std::path::Path;
 /// A request error that names the file.
 pub fn check_origin(path: &Path, is_local: bool) -> Result<()> {
     if is_local { Ok(check_writable_origin(path)?) } else { Ok(()) }
+}
+
+/// Returns the size of the splat at `path` with all its files, such as the images of a SOG's `meta.json`.
+pub fn total_bytes(path: &Path) -> Result<u64> {
+    let files = splat_files(path).into_iter().filter(|file| file.is_file());
+    files.map(|file| Ok(std::fs::metadata(&file).map_err(Error::read(&file))?.len())).sum()
 }
 
 /// Calls [`write`] with spherical harmonics fitted to the range of the format, so that the splat looks the same from `cameras`.

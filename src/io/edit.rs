@@ -8,7 +8,7 @@ use glam::{DMat3, DMat4, DVec3};
 use globalsplat_splat_file::Splat;
 
 /// Contribution to all images, in pixels, below which cameras don't see a Gaussian.
-const MIN_CONTRIBUTION: f32 = 0.1;
+const MIN_CONTRIBUTION: f32 = 1e-3;
 /// Number of neighbours within whose distance a Gaussian isn't isolated.
 const NEIGHBOURS: usize = 8;
 /// Number of standard deviations that a Gaussian extends to, for its neighbours.
@@ -30,7 +30,7 @@ pub enum SplatEdit {
     /// Removes isolated Gaussians: those whose eighth neighbour is beyond their own size, and farther than the median of this distance
     /// times a factor.
     FilterFloaters(f64),
-    /// Removes Gaussians that contribute less than a tenth of a pixel to all images of cameras together. The cameras are in the world of the
+    /// Removes Gaussians that contribute less than a thousandth of a pixel to all images of cameras together. The cameras are in the world of the
     /// splat before all edits.
     SeenBy(Vec<Camera>),
     /// Keeps this number of Gaussians: those that contribute most to images.

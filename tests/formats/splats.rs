@@ -86,16 +86,16 @@ fn unknown_file_endings_are_refused() {
     let splat = written(folder.path(), "a.ply", &random_splat(2, 0, 1));
     for (name, message) in [("a.obj", "the ending is .obj"), ("a", "the ending is missing")] {
         let to = folder.path().join(name);
-        let all = [message, "expected .ply, .compressed.ply, .spz or .splat"];
+        let all = [message, "expected .ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf or .ksplat"];
         assert_says(&refuse(&["convert", arg(&splat), arg(&to)]), &all);
         std::fs::copy(&splat, &to).unwrap();
         assert_says(&refuse(&["convert", arg(&to), arg(&splat)]), &all);
         std::fs::remove_file(&to).unwrap();
     }
     let (_kept, room) = room();
-    let out = folder.path().join("made.sog");
+    let out = folder.path().join("made.obj");
     let refine = ["refine", "--scene", arg(&room), "--steps", "1", "--out", arg(&out)];
-    assert_says(&refuse(&refine), &["the ending is .sog"]);
+    assert_says(&refuse(&refine), &["the ending is .obj"]);
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing was written");
 }
 
@@ -131,6 +131,104 @@ fn convert_reports_the_loss() {
     assert_eq!(higher.status.code(), Some(2));
 }
 
+/// Edits are applied in their order and counted, and the loss is measured by cameras that move along.
+#[test]
+fn convert_edits_in_the_given_order() {
+    let (folder, room) = room();
+    let original = room.join("truth.ply");
+    let to = folder.path().join("edited.ply");
+    let convert = |options: &[&str]| -> Value {
+        serde_json::from_str(&succeed(&[&["convert", arg(&original), arg(&to), "--json"], options].concat()))
+            .unwrap()
+    };
+    let counts = |report: &Value| -> Vec<u64> {
+        report["edits"].as_array().unwrap().iter().map(|edit| edit["gaussians"].as_u64().unwrap()).collect()
+    };
+    let splat = read_splat(&original).unwrap();
+    let all = splat.len() as u64;
+    let moved =
+        convert(&["--rotate", "20,-40,100", "--scale", "3", "--translate", "-4,5,-6", "--scene", arg(&room)]);
+    assert_eq!(counts(&moved), [all; 3]);
+    // Rounded positions change the order of Gaussians at the same depth.
+    assert!(moved["psnr"].as_f64().unwrap() > 35., "{moved}");
+    let back = [
+        "--translate",
+        "4,-5,6",
+        "--scale",
+        "0.333333333333333",
+        "--rotate",
+        "0,0,-100",
+        "--rotate",
+        "0,40,0",
+    ];
+    let again = folder.path().join("again.ply");
+    succeed(&[&["convert", arg(&to), arg(&again)][..], &back, &["--rotate", "-20,0,0"]].concat());
+    let again = read_splat(&again).unwrap();
+    let farthest = splat_files::largest_error(again.means.as_flattened(), splat.means.as_flattened());
+    assert!(farthest < 1e-5, "{farthest}");
+    // A box before and after the splat is moved into it.
+    let crop = ["--crop-box", "100,-9,-9,109,9,9"];
+    let translate = ["--translate", "104,0,0"];
+    assert!(counts(&convert(&[translate, crop].concat()))[1] > all / 2);
+    assert_says(
+        &refuse(&[&["convert", arg(&original), arg(&to)], &crop[..], &translate].concat()),
+        &["remove all Gaussians"],
+    );
+    // The Gaussians that are seen most matter most.
+    let half = (all / 2).to_string();
+    let [decimated, cut] = [
+        &["--decimate", &half, "--scene", arg(&room)][..],
+        &["--crop-box", "-99,-99,-99,0,99,99", "--scene", arg(&room)],
+    ]
+    .map(|options| convert(options));
+    assert_eq!(counts(&decimated), [all / 2]);
+    assert!(decimated["psnr"].as_f64() > cut["psnr"].as_f64(), "{decimated} {cut}");
+    // A Gaussian behind all cameras isn't seen, one far from all others is isolated, wherever the splat has been moved.
+    let stray = {
+        let mut stray = splat.select(&[0]);
+        stray.means[0] = [0., 0., -500.];
+        written(folder.path(), "stray.ply", &stray)
+    };
+    let seen =
+        convert(&["--merge", arg(&stray), "--scale", "2", "--seen-by", arg(&room), "--scene", arg(&room)]);
+    assert_eq!(counts(&seen)[..2], [all + 1, all + 1]);
+    assert!(counts(&seen)[2] <= all && seen["psnr"].as_f64().unwrap() > 35., "{seen}");
+    assert!(read_splat(&to).unwrap().means.iter().all(|mean| mean[2] > -100.), "the stray one is gone");
+    assert_eq!(counts(&convert(&["--merge", arg(&stray), "--filter-floaters=30"])), [all + 1, all]);
+    let random = written(folder.path(), "random.ply", &random_splat(200, 1, 2));
+    let filters = ["--min-opacity", "0.5", "--max-scale", "0.3", "--merge", arg(&stray)];
+    let report = succeed(&[&["convert", arg(&random), arg(&to)][..], &filters].concat());
+    assert_says(&report, &["--min-opacity 0.5: ", " removed, ", "--max-scale 0.3: ", ": 1 added, "]);
+    let kept = read_splat(&to).unwrap();
+    let passes =
+        |index: usize| kept.opacity(index) >= 0.5 && kept.scale(index).iter().all(|&scale| scale <= 0.3);
+    assert!((0..kept.len() - 1).all(passes) && kept.len() > 10 && kept.len() < 100, "{report}");
+    let error = refuse(&["convert", arg(&original), arg(&to), "--matrix", "1,0,0,0,0,1,0,0,0,0,2,0,0,0,0,1"]);
+    assert_says(&error, &["the matrix", "the same scale along all axes"]);
+}
+
+/// A splat that is moved with its spherical harmonics looks the same to cameras that are moved along.
+#[test]
+fn moved_splats_look_the_same() {
+    let splat = random_splat(300, 3, 11);
+    let rotation = glam::DQuat::from_euler(glam::EulerRot::XYZ, 0.5, -1.1, 2.3);
+    let matrix = glam::DMat4::from_scale_rotation_translation(
+        glam::DVec3::splat(0.4),
+        rotation,
+        glam::DVec3::new(3., -1., 2.),
+    );
+    let moved = splat.transformed(&matrix).unwrap();
+    let along = globalsplat::io::move_cameras(&[camera()], &matrix)[0];
+    let seen = |splat: &Splat, camera: Camera| {
+        globalsplat::render::SplatRenderer::from_splat(splat).render(&[camera]).unwrap().remove(0).rgb
+    };
+    let psnr = globalsplat::eval::psnr(&seen(&splat, camera()), &seen(&moved, along));
+    assert!(psnr > 70., "{psnr} dB");
+    let without_colours = Splat { sh: splat.sh.clone(), ..moved };
+    let psnr = globalsplat::eval::psnr(&seen(&splat, camera()), &seen(&without_colours, along));
+    assert!(psnr < 40., "colours matter: {psnr} dB");
+}
+
 /// Coefficients beyond SPZ's range are clamped without a capture; with a capture the others are fitted to its cameras.
 #[test]
 fn convert_preserves_the_views_of_a_capture() {
@@ -146,6 +244,7 @@ fn convert_preserves_the_views_of_a_capture() {
     for (ending, gain, always) in [
         ("spz", 6., &[][..]),
         ("splat", 0.5, &[]),
+        ("sog", 6., &[]),
         ("ply", 6., &["--for-viewers"]),
         ("spz", 6., &["--for-viewers"]),
     ] {
@@ -238,11 +337,14 @@ fn convert_repairs_invalid_gaussians() {
         let render = ["render", "--splat", arg(path), "--orbit", "--out", arg(&picture)];
         let refine = ["refine", "--splat", arg(path), "--scene", arg(&room), "--out", arg(&out)];
         let eval = ["eval", "--splat", arg(path), "--scene", arg(&room)];
-        let commands = [&["inspect", arg(path)][..], &render, &refine, &eval];
-        for arguments in &commands[..if index == 0 { 4 } else { 1 }] {
+        for arguments in [&render[..], &refine, &eval].into_iter().take(if index == 0 { 3 } else { 1 }) {
             assert_says(&refuse(arguments), &[field, "`globalsplat convert` leaves out"]);
         }
-        for ending in &ENDINGS[if index == 0 { 0..4 } else { index % 4..index % 4 + 1 }] {
+        let (warnings, report) = said(&["inspect", arg(path)]);
+        assert_says(&warnings, &["1 of 3 Gaussians are left out", property]);
+        assert_says(&report, &["gaussians            2"]);
+        let one = index % ENDINGS.len();
+        for ending in &ENDINGS[if index == 0 { 0..ENDINGS.len() } else { one..one + 1 }] {
             let to = folder.path().join(format!("repaired.{ending}"));
             let (warnings, _) = said(&["convert", arg(path), arg(&to)]);
             let expected = format!(
@@ -277,8 +379,14 @@ fn surfels_are_flat() {
     let mut thinnest = splat.clone();
     thinnest.log_scales.iter_mut().for_each(|log_scale| log_scale[2] = f32::NEG_INFINITY);
     assert!(psnr_of_pictures(&splat, &thinnest, camera()) > 90.);
-    for (ending, flat) in [("ply", 1.1e-30), ("compressed.ply", 2.1e-9), ("spz", 4.6e-5), ("splat", 1.1e-30)]
-    {
+    for (ending, flat) in [
+        ("ply", 1.1e-30),
+        ("compressed.ply", 2.1e-9),
+        ("sog", 2.1e-9),
+        ("spz", 4.6e-5),
+        ("splat", 1.1e-30),
+        ("glb", 1.1e-30),
+    ] {
         let to = folder.path().join(format!("a.{ending}"));
         let (warnings, _) = said(&["convert", arg(&surfels), arg(&to)]);
         assert_eq!(warnings.lines().count(), 1, "{warnings}");

@@ -159,14 +159,15 @@ fn an_image_size_that_the_patch_does_not_divide() {
     assert!(!run.exists(), "nothing was begun");
 }
 
-/// Changes the bytes of the room's splat by `change`, inspects the result, and returns the error message.
+/// Changes the bytes of the room's splat by `change`, renders the result, and returns the error message.
 fn broken_splat(change: impl FnOnce(&mut Vec<u8>)) -> String {
     let (folder, room) = room();
     let file = folder.path().join("broken.ply");
     let mut bytes = std::fs::read(room.join("truth.ply")).unwrap();
     change(&mut bytes);
     std::fs::write(&file, bytes).unwrap();
-    let error = refuse(&["inspect", arg(&file)]);
+    let out = folder.path().join("views");
+    let error = refuse(&["render", "--splat", arg(&file), "--scene", arg(&room), "--out", arg(&out)]);
     assert_says(&error, &["broken.ply"]);
     error
 }

@@ -1,7 +1,7 @@
 //! Every command, run as a user runs it.
 
 use crate::common::program::{
-    arg, command, fail, globalsplat, room, rooms, succeed, tiny_config, tiny_weights,
+    arg, command, fail, globalsplat, refuse, room, rooms, succeed, tiny_config, tiny_weights,
 };
 use crate::common::{has_lpips, skip};
 use serde_json::{Value, json};
@@ -379,11 +379,50 @@ fn inspect_describes_splats_captures_and_weights() {
     let weights = tiny_weights(folder.path(), &room);
     let splat = json(&["inspect", arg(&room.join("truth.ply")), "--json"]);
     assert_eq!((splat["kind"].as_str(), splat["sh_degree"].as_i64()), (Some("splat"), Some(0)));
+    for part in ["scale_quantiles", "opacity_quantiles"] {
+        let at = |name: &str| splat[part][name].as_f64().unwrap();
+        assert!(at("p1") <= at("p50") && at("p50") <= at("p99") && at("p99") > 0., "{splat}");
+    }
+    // A colour of degree 0 is the same in all directions.
+    assert_eq!(splat["sh_energy"].as_array().unwrap().len(), 1);
+    let preview = folder.path().join("preview.png");
+    succeed(&["inspect", arg(&room.join("truth.ply")), "--preview", arg(&preview)]);
+    let image = image::open(&preview).unwrap().into_rgb8();
+    assert_eq!(image.dimensions(), (512, 512));
+    assert!(image.pixels().filter(|pixel| pixel.0 != [0; 3]).count() > 10_000, "something is seen");
+    let error = refuse(&["inspect", arg(&room), "--preview", arg(&preview)]);
+    assert!(error.contains("isn't a splat"), "{error}");
     let capture = json(&["inspect", arg(&room), "--json"]);
     assert_eq!((capture["kind"].as_str(), capture["views"].as_i64()), (Some("capture"), Some(9)));
     let weights = json(&["inspect", arg(&weights), "--json"]);
     assert_eq!(weights["kind"], "weights");
     assert!(weights["configuration"].as_str().unwrap().contains("latents = 16"));
+}
+
+/// Weights of any file are exported: rounded, in shards, for torch, and back.
+#[test]
+fn any_weights_are_exported() {
+    let (folder, room) = room();
+    let weights = tiny_weights(folder.path(), &room);
+    let at = |name: &str| folder.path().join(name);
+    std::fs::create_dir(at("shards")).unwrap();
+    let export = |from: &Path, to: &Path, more: &[&str]| {
+        json(&[&["export", "--weights", arg(from), "--out", arg(to), "--json"], more].concat())
+    };
+    let rounded = export(&weights, &at("bf16.safetensors"), &["--dtype", "bf16"]);
+    assert!(rounded["bytes"].as_u64().unwrap() < std::fs::metadata(&weights).unwrap().len() * 2 / 3);
+    let sharded = export(&weights, &at("shards/model.safetensors"), &["--max-shard-size", "20KB"]);
+    export(Path::new(sharded["weights"].as_str().unwrap()), &at("joined.safetensors"), &[]);
+    export(&weights, &at("model.ckpt"), &["--format", "torch"]);
+    export(&at("model.ckpt"), &at("back.safetensors"), &[]);
+    export(&weights, &at("again.safetensors"), &[]);
+    let again = std::fs::read(at("again.safetensors")).unwrap();
+    for name in ["joined.safetensors", "back.safetensors"] {
+        assert_eq!(std::fs::read(at(name)).unwrap(), again, "{name}");
+    }
+    let error = refuse(&["export", "--weights", arg(&weights), "--out", arg(&weights)]);
+    assert!(error.contains("tiny.safetensors"), "{error}");
+    fail(&["export", "--weights", arg(&weights), "--best", "--out", arg(&at("none.safetensors"))], 2);
 }
 
 #[test]
