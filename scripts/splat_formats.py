@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Measures size and quality of each splat format: bytes, PSNR between renders, and PSNR against photos.
+"""Measures each splat format: bytes, PSNR between renders, PSNR against photos, and seconds to write and to read.
 
     .venv/bin/python scripts/splat_formats.py CAPTURE… [--splat reference.ply] [--out OUT]
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 from core_runs import row, told
 
-ENDINGS = ["ply", "compressed.ply", "spz", "splat"]
+ENDINGS = ["ply", "glb", "compressed.ply", "spz", "sog", "splat"]
 
 
 def photos_psnr(splat, capture):
@@ -26,17 +26,20 @@ def main():
     parser.add_argument("--out", type=Path, default=Path("runs/splat_formats"))
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    row("splat", "format", "bytes", "dB between renders", "PSNR of the photos", "without `--scene`")
-    row("---", "---", *["---:"] * 4)
+    row("splat", "format", "bytes", "dB between renders", "PSNR of the photos", "without `--scene`", "write, s", "read, s")
+    row("---", "---", *["---:"] * 6)
     for capture in arguments.captures:
         original = capture / arguments.splat
-        row(capture.name, "published", f"{original.stat().st_size:,}", "", f"{photos_psnr(original, capture):.2f}", "")
+        row(capture.name, "published", f"{original.stat().st_size:,}", "", f"{photos_psnr(original, capture):.2f}", "", "", "")
         for ending in ENDINGS:
             fitted, plain = (arguments.out / f"{capture.name}.{name}.{ending}" for name in ("fitted", "plain"))
             loss = told("convert", original, fitted, "--scene", capture)
             told("convert", original, plain)
             scores = [f"{photos_psnr(splat, capture):.2f}" for splat in (fitted, plain)]
-            row(capture.name, f"`.{ending}`", f"{loss['to']['bytes']:,}", f"{loss['psnr']:.1f}", *scores)
+            # Pixels that are all the same have no PSNR.
+            between = f"{loss['psnr']:.1f}" if loss["psnr"] else "same"
+            seconds = [f"{loss['to'][key]:.2f}" for key in ("write_seconds", "read_seconds")]
+            row(capture.name, f"`.{ending}`", f"{loss['to']['bytes']:,}", between, *scores, *seconds)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ use globalsplat::scene::{Camera, LocalFrame, splat_frame};
 use serde_json::{Value, json};
 use std::cmp::Ordering;
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 /// Write a splat in another format, edit it, and report the loss.
 ///
@@ -106,9 +107,13 @@ impl Convert {
             None if original.origin != DVec3::ZERO => original.origin,
             None => splat_frame(&original).origin,
         });
+        let begin = Instant::now();
         splat_out::write_with(&self.to, &written, origin, &WriteOptions { spz_version: self.spz_version })?;
+        let written_at = Instant::now();
         let copy = read_splat(&self.to)?;
-        let to = description(&self.to, &copy)?;
+        let mut to = description(&self.to, &copy)?;
+        to["read_seconds"] = written_at.elapsed().as_secs_f64().into();
+        to["write_seconds"] = written_at.duration_since(begin).as_secs_f64().into();
 
         let moved = source.transformed(&edited.from_original)?;
         let cameras = if capture.is_some() { cameras } else { orbit_around_splat(&moved) };

@@ -59,7 +59,7 @@ pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &ShLimit
     }
 }
 
-/// Returns the Gaussians with the smallest coefficients that show the same colours to `cameras`, for formats that hold small coefficients
+/// Returns the Gaussians with the smallest coefficients above degree 0 that show the same colours to `cameras`, for formats that hold small coefficients
 /// best. `gaussians` are as in [`fit_harmonics`]. Gaussians that no camera sees stay.
 pub fn shrink_harmonics(gaussians: &Gaussians, cameras: &[Camera]) -> Gaussians {
     let colours = Colours::new(gaussians, cameras);
@@ -203,11 +203,15 @@ impl<'a> Fit<'a> {
         (self.solve(), raised)
     }
 
-    /// Returns the coefficients that minimize the squared error of the seen colours, plus a small multiple of their own squares.
+    /// Returns the coefficients that minimize the squared error of the seen colours, plus a small multiple ε of the squares of all
+    /// coefficients above degree 0.
     ///
-    /// With the cost A = Σ weight·Y·Yᵀ + ε, they are c = A⁻¹ (A − ε) c₀. A is positive definite, so Gauss–Jordan elimination needs no pivots.
+    /// With A = Σ weight·Y·Yᵀ, they are c = (A + ε·diag(0, 1, 1, …))⁻¹ A c₀. The matrix is positive definite, so Gauss–Jordan elimination
+    /// needs no pivots.
     fn solve_smallest(&self) -> Coefficients {
+        let bases = (self.limits.degree + 1).pow(2);
         let mut rows = self.cost;
+        rows[0][0] -= OTHER_DIRECTIONS_WEIGHT;
         let mut solution: Coefficients = std::array::from_fn(|row| {
             [0, 1, 2].map(|channel| {
                 let product = |k: usize| self.cost[row][k] * self.original[k][channel];
@@ -215,15 +219,17 @@ impl<'a> Fit<'a> {
                 sum - OTHER_DIRECTIONS_WEIGHT * self.original[row][channel]
             })
         });
-        for pivot in 0..BASES {
+        for pivot in 0..bases {
             let (line, right) = (rows[pivot], solution[pivot]);
-            for row in (0..BASES).filter(|&row| row != pivot) {
+            for row in (0..bases).filter(|&row| row != pivot) {
                 let factor = rows[row][pivot] / line[pivot];
-                (pivot..BASES).for_each(|k| rows[row][k] -= factor * line[k]);
+                (pivot..bases).for_each(|k| rows[row][k] -= factor * line[k]);
                 (0..3).for_each(|channel| solution[row][channel] -= factor * right[channel]);
             }
         }
-        std::array::from_fn(|row| solution[row].map(|value| value / rows[row][row]))
+        std::array::from_fn(|row| {
+            if row < bases { solution[row].map(|value| value / rows[row][row]) } else { [0.; 3] }
+        })
     }
 
     fn solve(&self) -> Coefficients {
@@ -345,7 +351,17 @@ mod tests {
         let (original, cameras) = (gaussians(3.), cameras(5));
         let shrunk = shrink_harmonics(&original, &cameras);
         let largest = |g: &Gaussians, index: i64| g.sh.narrow(1, index, 1).abs().max().double_value(&[]);
-        assert!(largest(&shrunk, 0) < 2. && largest(&shrunk, 1) == 3., "{}", largest(&shrunk, 0));
+        assert!(largest(&shrunk, 0) < 2.5 && largest(&shrunk, 1) == 3., "{}", largest(&shrunk, 0));
+        // Colours that don't depend on the direction stay as they are.
+        let mut constant = original.map(Tensor::shallow_clone);
+        constant.sh = original.sh.copy();
+        let _ = constant.sh.narrow(2, 1, 15).fill_(0.);
+        let _ = constant.sh.narrow(2, 0, 1).fill_(1.5);
+        let difference = (shrink_harmonics(&constant, &cameras).sh - &constant.sh).abs().max();
+        assert!(difference.double_value(&[]) < 1e-5, "{difference}");
+        let flat = Gaussians { sh: original.sh.narrow(2, 0, 4).copy(), ..original.map(Tensor::shallow_clone) };
+        let difference = loss(&flat, &shrink_harmonics(&flat, &cameras), &cameras);
+        assert!(difference < 0.003, "degree 1: {difference}");
         let difference = loss(&original, &shrunk, &cameras);
         assert!(difference > 0. && difference < 0.003, "{difference}");
         let mut rounded = shrunk.map(Tensor::shallow_clone);
