@@ -3,8 +3,10 @@
 Values must be equal up to each format's quantization. The programs are pinned in parity/npm, and installed by `npm ci`.
 """
 
+import gzip
 import json
 import shutil
+import struct
 import subprocess
 from pathlib import Path
 
@@ -26,6 +28,20 @@ STEPS = {
     "their spz": (0.51 / 4096, 0.51 / 16, 0.003, 0.51 / 255, 0.51 / 255 / 0.15, 8.51 / 128),
     "spz of version 2": (0.51 / 4096, 0.51 / 16, 0.12, 0.51 / 255, 0.51 / 255 / 0.15, 8.51 / 128),
     "splat": (1e-6, 1e-5, 0.02, 0.51 / 255, 0.51 / 255 / C0, 0),
+    # Positions have 16 bits of ±ln(4.6), with steps in proportion to |x| + 1. Scales, colours and coefficients have 256
+    # values at unequal steps: a whole one of equal steps. Rotations have 8 bits of ±1/√2 for three components, whose
+    # errors add up in the fourth one.
+    "sog": (1.02 / 65535 * 4.6 * np.log(4.6), 1.8 / 255, 3 * 0.51 * 2**0.5 / 255, 0.51 / 255, 1.8 / 255, 1.8 / 255),
+    "glb": (1e-6, 1e-5, 1e-5, 1e-5, 1e-6, 1e-6),
+    # Babylon.js keeps bytes of all but positions and scales.
+    "glb in babylon": (1e-6, 1e-5, 1.02 / 127.5, 0.51 / 255, 0.51 / 255 / C0, 0.51 / 128),
+    # 16 bits of a bucket's size for positions, half precision, and bytes for colours and opacities. Level 2 has bytes for
+    # coefficients, too.
+    "ksplat of level 0": (1e-6, 1e-5, 1e-6, 0.51 / 255, 0.51 / 255 / C0, 1e-6),
+    "ksplat of level 1": (1.02 / 32767, 2**-11, 2**-11, 0.51 / 255, 0.51 / 255 / C0, 2**-12),
+    "ksplat of level 2": (1.02 / 32767, 2**-11, 2**-11, 0.51 / 255, 0.51 / 255 / C0, 1.53 / 255),
+    # Two programs read the same file.
+    "same file": (1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6),
 }
 
 
@@ -108,8 +124,9 @@ def ours(source, target, *options):
 
 
 def transformed(source, target, *options):
-    """Converts a splat with PlayCanvas' splat-transform."""
-    run("node", NPM / "node_modules/@playcanvas/splat-transform/bin/cli.mjs", "-q", "-w", source, target, *options)
+    """Converts a splat with PlayCanvas' splat-transform, which otherwise needs a GPU to write a SOG."""
+    command = ["node", NPM / "node_modules/@playcanvas/splat-transform/bin/cli.mjs", "-q", "-w", "-g", "cpu"]
+    run(*command, source, target, *options)
 
 
 def cloud(splat):
@@ -152,23 +169,32 @@ def write_by(program, splat, file, folder, *version, antialiased=False):
     run("node", NPM / "splats.mjs", "write", program, folder / "numbers.json", file, *version)
 
 
+def named(folder, ending):
+    """Returns the path of a file with this ending, or the file with this name in its own folder."""
+    if not ending.endswith(".json"):
+        return folder / f"b.{ending}"
+    (folder / "b").mkdir()
+    return folder / "b" / ending
+
+
 def without_sh(splat):
     return {name: values for name, values in splat.items() if not name.startswith("f_rest_")}
 
 
 @pytest.mark.parametrize("degree", range(4))
-@pytest.mark.parametrize("ending", ["ply", "compressed.ply", "spz", "splat"])
+@pytest.mark.parametrize("ending", ["ply", "compressed.ply", "spz", "splat", "sog", "meta.json"])
 def test_splat_transform_reads_ours(tmp_path, ending, degree):
     splat = made(degree)
     write_ply(tmp_path / "a.ply", splat)
-    ours(tmp_path / "a.ply", tmp_path / f"b.{ending}")
-    transformed(tmp_path / f"b.{ending}", tmp_path / "c.ply")
+    file = named(tmp_path, ending)
+    ours(tmp_path / "a.ply", file)
+    transformed(file, tmp_path / "c.ply")
     expected = without_sh(splat) if ending == "splat" else splat
-    assert_same(expected, read_ply(tmp_path / "c.ply"), STEPS[ending])
+    assert_same(expected, read_ply(tmp_path / "c.ply"), STEPS["sog" if ending == "meta.json" else ending])
 
 
 @pytest.mark.parametrize("degree", range(4))
-@pytest.mark.parametrize("ending, options", [("ply", []), ("compressed.ply", []), ("spz", ["3"]), ("spz", ["4"])])
+@pytest.mark.parametrize("ending, options", [("ply", []), ("compressed.ply", []), ("spz", ["3"]), ("spz", ["4"]), ("glb", [])])
 def test_we_read_splat_transforms(tmp_path, ending, options, degree):
     splat = made(degree)
     write_ply(tmp_path / "a.ply", splat)
@@ -178,17 +204,43 @@ def test_we_read_splat_transforms(tmp_path, ending, options, degree):
     assert_same(splat, read_ply(tmp_path / "c.ply"), STEPS["their spz" if ending == "spz" else ending])
 
 
+# splat-transform's palette of coefficients is coarse for so few Gaussians, so both programs read its file.
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("ending", ["sog", "meta.json"])
+def test_we_read_splat_transforms_sogs_as_it_does(tmp_path, ending, degree):
+    splat = made(degree)
+    write_ply(tmp_path / "a.ply", splat)
+    file = named(tmp_path, ending)
+    transformed(tmp_path / "a.ply", file)
+    ours(file, tmp_path / "c.ply")
+    transformed(file, tmp_path / "d.ply")
+    read = read_ply(tmp_path / "c.ply")
+    assert_same(read_ply(tmp_path / "d.ply"), read, STEPS["same file"])
+    steps = [2 * step for step in STEPS["sog"]]  # splat-transform cuts numbers off instead of rounding them
+    assert_same(without_sh(splat), without_sh(read), steps)
+
+
+def spz_version(file):
+    contents = file.read_bytes()
+    header = contents if contents.startswith(b"NGSP") else gzip.decompress(contents)
+    return int.from_bytes(header[4:8], "little")
+
+
 @pytest.mark.parametrize("degree", range(4))
 def test_niantics_library_reads_and_writes_as_we_do(tmp_path, degree):
     splat = made(degree)
     write_ply(tmp_path / "a.ply", splat)
     ours(tmp_path / "a.ply", tmp_path / "a.spz")
-    assert_same(splat, read_by("adobe", tmp_path / "a.spz", tmp_path), STEPS["spz"])
+    assert spz_version(tmp_path / "a.spz") == 4
     for version in "234":
+        of_two = STEPS["spz of version 2"]
+        steps = (*STEPS["spz"][:2], of_two[2] if version == "2" else STEPS["spz"][2], *STEPS["spz"][3:])
+        ours(tmp_path / "a.ply", tmp_path / "a.spz", "--spz-version", version)
+        assert spz_version(tmp_path / "a.spz") == int(version)
+        assert_same(splat, read_by("adobe", tmp_path / "a.spz", tmp_path), steps)
         write_by("adobe", splat, tmp_path / "b.spz", tmp_path, version)
         ours(tmp_path / "b.spz", tmp_path / "c.ply")
-        expected = STEPS["spz of version 2" if version == "2" else "their spz"]
-        assert_same(splat, read_ply(tmp_path / "c.ply"), expected)
+        assert_same(splat, read_ply(tmp_path / "c.ply"), of_two if version == "2" else STEPS["their spz"])
 
 
 def test_niantics_library_and_we_mark_antialiased_splats_alike(tmp_path):
@@ -204,6 +256,68 @@ def test_niantics_library_and_we_mark_antialiased_splats_alike(tmp_path):
             write_by("adobe", made(1), tmp_path / "b.spz", tmp_path, version, antialiased=expected)
             ours(tmp_path / "b.spz", tmp_path / "c.ply")
             assert (comment in (tmp_path / "c.ply").read_bytes()[:200]) == expected
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_babylon_reads_our_gltf_as_it_reads_splat_transforms(tmp_path, degree):
+    splat = made(degree)
+    # splat-transform doesn't normalize rotations, of which Babylon.js keeps bytes.
+    length = np.linalg.norm(columns(splat, *(f"rot_{k}" for k in range(4))), axis=1).astype("<f4")
+    splat |= {f"rot_{k}": splat[f"rot_{k}"] / length for k in range(4)}
+    write_ply(tmp_path / "a.ply", splat)
+    for convert, name in [(transformed, "theirs.glb"), (ours, "ours.glb"), (ours, "ours.gltf")]:
+        convert(tmp_path / "a.ply", tmp_path / name)
+        assert_same(splat, read_by("babylon", tmp_path / name, tmp_path), STEPS["glb in babylon"])
+
+
+def ksplat(splat, level):
+    """Returns the bytes of a .ksplat, in buckets of 16 Gaussians and partially filled ones, whose size is 4."""
+    size, capacity, middle = 4, 16, 32767
+    places = columns(splat, *"xyz")
+    octants = [np.flatnonzero((places > 0) @ [1, 2, 4] == octant) for octant in range(8)]
+    buckets = [octant[k : k + capacity] for octant in octants for k in range(0, len(octant), capacity)]
+    buckets.sort(key=len, reverse=True)
+    partial = [len(bucket) for bucket in buckets if len(bucket) < capacity]
+    order = np.concatenate(buckets)
+    centres = np.array([np.sign(places[bucket[0]]) * 1.75 for bucket in buckets])
+    steps = places[order] - np.repeat(centres, [len(bucket) for bucket in buckets], axis=0)
+    steps = np.round(steps / (size / 2) * middle) + middle
+    turns = columns(splat, *(f"rot_{k}" for k in range(4)))
+    numbers = np.hstack([np.exp(columns(splat, *(f"scale_{k}" for k in range(3)))), turns])[order]
+    colours = columns(splat, *(f"f_dc_{k}" for k in range(3))) * C0 + 0.5
+    opacities = 1 / (1 + np.exp(-columns(splat, "opacity")))
+    channels = rest(splat)[order].reshape(COUNT, 3, -1)
+    degree = [0, 3, 8, 15].index(channels.shape[2])
+    sh = np.hstack([channels[:, :, d * d - 1 : d * (d + 2)].reshape(COUNT, -1) for d in range(degree + 1)])
+    if level == 2:
+        sh = np.round((sh + 1.5) / 3 * 255)
+    rows = [
+        places[order].astype("<f4") if level == 0 else steps.astype("<u2"),
+        numbers.astype("<f2" if level else "<f4"),
+        np.round(np.hstack([colours, opacities])[order] * 255).astype("u1"),
+        sh.astype(["<f4", "<f2", "u1"][level]),
+    ]
+    rows = np.hstack([np.ascontiguousarray(part).view("u1") for part in rows if part.size])
+    header, section = bytearray(4096), bytearray(1024)
+    struct.pack_into("<BBxxIIIIH", header, 0, 0, 1, 1, 1, COUNT, COUNT, level)
+    has_buckets = level > 0
+    full = (len(buckets) - len(partial)) * has_buckets
+    numbers = (COUNT, COUNT, capacity, len(buckets) * has_buckets, size, 12, middle * has_buckets)
+    struct.pack_into("<IIIIfHxxI4xIIH", section, 0, *numbers, full, len(partial) * has_buckets, degree)
+    tables = np.array(partial, "<u4").tobytes() + centres.astype("<f4").tobytes()
+    return bytes(header) + bytes(section) + tables * has_buckets + rows.tobytes()
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("level", range(3))
+def test_we_read_ksplats_as_splat_transform_does(tmp_path, level, degree):
+    splat = made(degree)
+    (tmp_path / "a.ksplat").write_bytes(ksplat(splat, level))
+    ours(tmp_path / "a.ksplat", tmp_path / "b.ply")
+    transformed(tmp_path / "a.ksplat", tmp_path / "c.ply")
+    read = read_ply(tmp_path / "b.ply")
+    assert_same(splat, read, STEPS[f"ksplat of level {level}"])
+    assert_same(read_ply(tmp_path / "c.ply"), read, STEPS["same file"])
 
 
 # In compressed PLYs, spz-js mistakes coefficients of degree 1 and 2 for others, and reads their bytes as older viewers

@@ -99,30 +99,41 @@ fn public_viewers_show_our_splats_as_we_do() {
     let of = |name: &str| folder.path().join(name);
     let published = capture.join("reference.ply");
     // The embedded model's reconstruction, unchanged; and the published splat, whose colours are far beyond the range of a
-    // byte, converted by `convert --for-viewers`.
+    // byte, converted by `convert --for-viewers`. Spark reads SPZ up to version 3, and no glTF.
     succeed(&["reconstruct", "--scene", arg(&capture), "--out", arg(&of("made.ply"))]);
-    succeed(&["reconstruct", "--scene", arg(&capture), "--out", arg(&of("made.spz"))]);
-    for ending in ["ply", "spz"] {
-        let to = of(&format!("published.{ending}"));
-        succeed(&["convert", arg(&published), arg(&to), "--for-viewers", "--scene", arg(&capture)]);
+    for name in ["made.spz", "made.sog", "made.glb"] {
+        let (from, to) = (of("made.ply"), of(name));
+        succeed(&["convert", arg(&from), arg(&to), "--scene", arg(&capture), "--spz-version", "3"]);
     }
+    for name in ["published.ply", "published.spz", "published-4.spz", "published.sog", "published.glb"] {
+        let (to, version) = (of(name), if name.ends_with("-4.spz") { "4" } else { "3" });
+        let (scene, version) = (["--scene", arg(&capture)], ["--spz-version", version]);
+        let command = ["convert", arg(&published), arg(&to), "--for-viewers"];
+        succeed(&[&command[..], &scene, &version].concat());
+    }
+    let (both, babylon) = (&["spark", "babylon"][..], &["babylon"][..]);
     let screenshots = Screenshots::create();
     let camera = first_camera(&capture);
     let files = [
-        ("made", of("made.ply"), of("made.ply"), LEAST),
-        ("made", of("made.ply"), of("made.spz"), LEAST),
-        ("published", published.clone(), of("published.ply"), LEAST),
-        ("published", published.clone(), of("published.spz"), LEAST),
+        ("made", of("made.ply"), of("made.ply"), LEAST, both),
+        ("made", of("made.ply"), of("made.spz"), LEAST, both),
+        ("made", of("made.ply"), of("made.sog"), LEAST, both),
+        ("made", of("made.ply"), of("made.glb"), LEAST, babylon),
+        ("published", published.clone(), of("published.ply"), LEAST, both),
+        ("published", published.clone(), of("published.spz"), LEAST, both),
+        ("published, version 4", published.clone(), of("published-4.spz"), LEAST, babylon),
+        ("published", published.clone(), of("published.sog"), LEAST, both),
+        ("published", published.clone(), of("published.glb"), LEAST, babylon),
         // The viewers clamp its colours, each in its own way, so its PSNR is only printed.
-        ("as it is", published.clone(), published, 0.),
+        ("as it is", published.clone(), published, 0., both),
     ];
-    for (name, original, file, least) in files {
+    for (name, original, file, least, readers) in files {
         let splat = read_splat(&original).unwrap();
         let own =
             render_views(&Gaussians::from_splat(&splat), &[camera]).unwrap().remove(0).rgb.clamp(0., 1.);
         screenshots.save(&format!("{name}-own"), &own);
         let ending = file.extension().unwrap().to_str().unwrap();
-        for (viewer, page) in &viewers {
+        for (viewer, page) in viewers.iter().filter(|(viewer, _)| readers.contains(viewer)) {
             let what = format!("{name}, .{ending}, in {viewer}");
             let (report, picture) = show(&mut browser, page, &file, &camera);
             screenshots.save(&format!("{name}-{ending}-{viewer}"), &picture);

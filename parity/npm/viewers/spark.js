@@ -13,7 +13,7 @@ window.show = async (bytes, ending, { c2w, angle, aspect, width, height }) => {
   renderer.setSize(width, height, false);
   const scene = new Scene();
   scene.add(new SparkRenderer({ renderer }));
-  const splat = new SplatMesh({ fileBytes: bytes, fileType: ending });
+  const splat = new SplatMesh({ fileBytes: bytes, fileName: `scene.${ending}` });
   await splat.initialized;
   // Spark uses the file's axes: in an SPZ file, y points up.
   if (ending === "spz") splat.rotation.x = Math.PI;
