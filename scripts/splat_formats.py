@@ -34,11 +34,11 @@ def main():
         for ending in ENDINGS:
             fitted, plain = (arguments.out / f"{capture.name}.{name}.{ending}" for name in ("fitted", "plain"))
             loss = told("convert", original, fitted, "--scene", capture)
-            told("convert", original, plain)
+            unfitted = told("convert", original, plain)
             scores = [f"{photos_psnr(splat, capture):.2f}" for splat in (fitted, plain)]
             # Pixels that are all the same have no PSNR.
             between = f"{loss['psnr']:.1f}" if loss["psnr"] else "same"
-            seconds = [f"{loss['to'][key]:.2f}" for key in ("write_seconds", "read_seconds")]
+            seconds = [f"{unfitted['to'][key]:.2f}" for key in ("write_seconds", "read_seconds")]
             row(capture.name, f"`.{ending}`", f"{loss['to']['bytes']:,}", between, *scores, *seconds)
 
 

@@ -57,9 +57,9 @@ pub struct Convert {
     /// origin, as in UTM coordinates, float32 and the formats' own number types lose detail
     #[arg(long)]
     local_origin: bool,
-    /// Version of SPZ, for programs that don't read the newest
-    #[arg(long, value_name = "N", default_value = "4", value_parser = clap::value_parser!(u32).range(2..=4))]
-    spz_version: u32,
+    /// Version of SPZ, 2 to 4; by default 4, or with --for-viewers 3, because some viewers don't read 4
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..=4))]
+    spz_version: Option<u32>,
     /// Remove Gaussians with values that aren't finite; `convert` always does, and scripts for splat-transform may say so
     #[arg(long)]
     filter_nan: bool,
@@ -108,7 +108,8 @@ impl Convert {
             None => splat_frame(&original).origin,
         });
         let begin = Instant::now();
-        splat_out::write_with(&self.to, &written, origin, &WriteOptions { spz_version: self.spz_version })?;
+        let spz_version = self.spz_version.unwrap_or(if self.for_viewers { 3 } else { 4 });
+        splat_out::write_with(&self.to, &written, origin, &WriteOptions { spz_version })?;
         let written_at = Instant::now();
         let copy = read_splat(&self.to)?;
         let mut to = description(&self.to, &copy)?;

@@ -359,7 +359,8 @@ mod tests {
         let _ = constant.sh.narrow(2, 0, 1).fill_(1.5);
         let difference = (shrink_harmonics(&constant, &cameras).sh - &constant.sh).abs().max();
         assert!(difference.double_value(&[]) < 1e-5, "{difference}");
-        let flat = Gaussians { sh: original.sh.narrow(2, 0, 4).copy(), ..original.map(Tensor::shallow_clone) };
+        let flat =
+            Gaussians { sh: original.sh.narrow(2, 0, 4).copy(), ..original.map(Tensor::shallow_clone) };
         let difference = loss(&flat, &shrink_harmonics(&flat, &cameras), &cameras);
         assert!(difference < 0.003, "degree 1: {difference}");
         let difference = loss(&original, &shrunk, &cameras);

@@ -7,7 +7,10 @@ use base64::engine::general_purpose::STANDARD;
 use glam::DVec3;
 use globalsplat::data::Capture;
 use globalsplat::error::Error;
-use globalsplat::io::{self, ShLimits, Splat, check_writable_file, fit_splat, write_atomically, write_splat};
+use globalsplat::io::{
+    self, ShLimits, Splat, WriteOptions, check_writable_file, fit_splat, write_atomically,
+    write_local_splat_with,
+};
 use globalsplat::scene::{Camera, Gaussians};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use std::path::Path;
@@ -72,7 +75,9 @@ pub fn write_page(
 fn spz(splat: &Splat, cameras: &[Camera]) -> Result<Vec<u8>> {
     let folder = tempfile::tempdir()?;
     let file = folder.path().join("scene.spz");
-    write_splat(&file, &fit_splat(&file, splat, &ShLimits::for_viewers(splat.sh_degree), cameras)?)?;
+    let fitted = fit_splat(&file, splat, &ShLimits::for_viewers(splat.sh_degree), cameras)?;
+    // Spark doesn't read newer versions.
+    write_local_splat_with(&file, &fitted, &WriteOptions { spz_version: 3 })?;
     Ok(std::fs::read(file)?)
 }
 
