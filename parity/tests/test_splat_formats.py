@@ -332,3 +332,30 @@ def test_another_reader_of_plys_reads_and_writes_as_we_do(tmp_path, ending, degr
     write_by("spz-js", splat, tmp_path / f"c.{ending}", tmp_path)
     ours(tmp_path / f"c.{ending}", tmp_path / "d.ply")
     assert_same(splat, read_ply(tmp_path / "d.ply"), steps)
+
+
+# splat-transform turns a splat by 180° about z before it applies an edit, which reverses x and y.
+@pytest.mark.parametrize(
+    "edit, their_edit",
+    [
+        (["--rotate", "-10,-20,-35"], ["-r", "10,20,-35"]),
+        (["--translate", "-1,-2,3", "--scale", "2.5"], ["-t", "1,2,3", "-s", "2.5"]),
+        (["--crop-box", "-2,-1,-3,1,3,2.5"], ["-B", "-1,-3,-3,2,1,2.5"]),
+        (["--crop-sphere", "1,-1,0.5,3"], ["-S", "-1,1,0.5,3"]),
+        (["--min-opacity", "0.5"], ["-V", "opacity,gte,0.5"]),
+        (["--sh-degree", "1"], ["-H", "1"]),
+    ],
+)
+def test_edits_are_those_of_splat_transform(tmp_path, edit, their_edit):
+    splat = made(3)
+    write_ply(tmp_path / "a.ply", splat)
+    ours(tmp_path / "a.ply", tmp_path / "b.ply", *edit)
+    transformed(tmp_path / "a.ply", tmp_path / "c.ply", *their_edit)
+    found, expected = read_ply(tmp_path / "b.ply"), read_ply(tmp_path / "c.ply")
+    assert len(found["x"]) == len(expected["x"]) > 0
+    assert "crop" not in edit[0] or len(found["x"]) < COUNT
+    turns = [columns(one, *(f"rot_{k}" for k in range(4))) for one in (found, expected)]
+    turns = [turn / np.linalg.norm(turn, axis=1, keepdims=True) for turn in turns]
+    np.testing.assert_allclose(np.abs((turns[0] * turns[1]).sum(1)), 1, atol=1e-6)
+    for name in set(expected) - {f"rot_{k}" for k in range(4)} - {"nx", "ny", "nz"}:
+        np.testing.assert_allclose(found[name], expected[name], rtol=0, atol=1e-5, err_msg=name)

@@ -3,10 +3,11 @@ use super::{open_capture, print_json, splat_out, warn};
 use anyhow::Result;
 use clap::Args;
 use glam::DVec3;
+use globalsplat::data::write_transforms_json;
 use globalsplat::eval::psnr_between;
 use globalsplat::io::{
-    InputFiles, ShLimits, Splat, WriteOptions, check_writable_splat, edit_splat, fit_splat, move_cameras,
-    read_splat, read_splat_without_invalid, splat_files,
+    InputFiles, ShLimits, Splat, WriteOptions, check_writable_file, check_writable_splat, edit_splat,
+    fit_splat, move_cameras, read_splat, read_splat_without_invalid, splat_files,
 };
 use globalsplat::render::orbit_around_splat;
 use globalsplat::scene::{Camera, LocalFrame, splat_frame};
@@ -53,6 +54,10 @@ pub struct Convert {
     /// Minimize the loss for the cameras of this capture, and report the loss over them
     #[arg(long, value_name = "PATH")]
     scene: Option<PathBuf>,
+    /// Also write the cameras of --scene, moved along with the splat, as a nerfstudio transforms.json of undistorted cameras, for
+    /// example for `render --path`
+    #[arg(long, value_name = "FILE", requires = "scene")]
+    cameras_out: Option<PathBuf>,
     /// Write coordinates relative to the centre of the scene, which is stored in a file beside the splat: far from the world's
     /// origin, as in UTM coordinates, float32 and the formats' own number types lose detail
     #[arg(long)]
@@ -78,7 +83,9 @@ impl Convert {
         let mut inputs = InputFiles::default();
         capture.iter().for_each(|capture| capture.add_input_files(&mut inputs));
         self.edits.add_input_files(&mut inputs)?;
-        splat_files(&self.to).iter().try_for_each(|file| inputs.check_file(file))?;
+        let mut outputs = splat_files(&self.to).into_iter().chain(self.cameras_out.clone());
+        outputs.try_for_each(|file| inputs.check_file(&file))?;
+        self.cameras_out.as_deref().map(check_writable_file).transpose()?;
         let source = read_splat_without_invalid(&self.from)?;
         warn(&source.warnings);
         // The input is described before the output replaces it, in case they are the same file.
@@ -116,6 +123,9 @@ impl Convert {
         to["read_seconds"] = written_at.elapsed().as_secs_f64().into();
         to["write_seconds"] = written_at.duration_since(begin).as_secs_f64().into();
 
+        if let (Some(file), Some(capture)) = (&self.cameras_out, &capture) {
+            write_transforms_json(file, &capture.render_names(), &cameras)?;
+        }
         let moved = source.transformed(&edited.from_original)?;
         let cameras = if capture.is_some() { cameras } else { orbit_around_splat(&moved) };
         if capture.is_none() {

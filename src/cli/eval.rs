@@ -43,7 +43,7 @@ pub struct Eval {
     /// Weights: a file that `export` or `import` wrote, or a checkpoint (.ckpt)
     #[arg(long, value_name = "FILE", group = "subject")]
     weights: Option<PathBuf>,
-    /// Splat in the capture's world coordinates: .ply, .compressed.ply, .spz or .splat; with --data a folder of splats
+    /// Splat in the capture's world coordinates, in any format that `convert` reads; with --data a folder of splats
     #[arg(long, value_name = "FILE|DIR", group = "subject")]
     splat: Option<PathBuf>,
     /// Folder of images named like the photos; with --data a folder of such folders

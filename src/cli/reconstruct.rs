@@ -35,7 +35,7 @@ pub struct Reconstruct {
     /// masks and transparency of the capture itself
     #[arg(long, value_name = "DIR")]
     masks: Option<PathBuf>,
-    /// Output splat: .ply, .compressed.ply, .spz or .splat
+    /// Output splat: .ply, .compressed.ply, .sog, meta.json, .spz, .splat, .glb or .gltf
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
     /// Maximum number of photos, spread along the camera path; by default the number that the weights were configured for, 24

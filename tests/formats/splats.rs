@@ -14,6 +14,7 @@ use splat_files::{
     write_changed_ply, write_surfels, written,
 };
 use std::io::Write;
+use std::path::Path;
 
 /// Gaussians keep the bits of a splat's parameters, and give them back unless they are infinite.
 #[test]
@@ -151,6 +152,26 @@ fn convert_edits_in_the_given_order() {
     assert_eq!(counts(&moved), [all; 3]);
     // Rounded positions change the order of Gaussians at the same depth.
     assert!(moved["psnr"].as_f64().unwrap() > 35., "{moved}");
+    // The moved cameras see of the moved splat what the capture's cameras see of the original.
+    let cameras = folder.path().join("moved.json");
+    convert(&[
+        "--rotate",
+        "20,-40,100",
+        "--scale",
+        "3",
+        "--scene",
+        arg(&room),
+        "--cameras-out",
+        arg(&cameras),
+    ]);
+    let views = |splat: &Path, path: &Path| {
+        let out = folder.path().join("views.png");
+        succeed(&["render", "--splat", arg(splat), "--path", arg(path), "--out", arg(&out)]);
+        globalsplat::io::tensor_from_rgb(&image::open(&out).unwrap().into_rgb8())
+    };
+    let psnr = globalsplat::eval::psnr(&views(&original, &room.join("cameras.json")), &views(&to, &cameras));
+    assert!(psnr > 33., "{psnr} dB");
+    convert(&["--rotate", "20,-40,100", "--scale", "3", "--translate", "-4,5,-6"]);
     let back = [
         "--translate",
         "4,-5,6",

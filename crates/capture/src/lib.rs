@@ -14,7 +14,7 @@ pub use formats::{CHUNK_EXTENSION, CHUNK_INDEX_FILE, Chunk, camera_numbers};
 pub use formats::{
     CameraPath, CaptureFolders, FoundCaptures, MASKS_FOLDER, PhotoList, Point, capture_folders,
     find_captures, find_masks, find_masks_in, folder_name, is_capture, list_photos, open_capture,
-    read_camera_path, read_points, write_cameras_json,
+    read_camera_path, read_points, write_cameras_json, write_transforms_json,
 };
 pub use geometry::{
     Camera, ImageSize, Intrinsics, LocalFrame, Normalization, Placement, Similarity, check_pose, normalize,

@@ -32,7 +32,7 @@ const MAX_GAUSSIANS: usize = 10_000_000;
     globalsplat refine --scene captures/room --holdout every:8 --sheet views.png --out room.ply\n  \
     globalsplat refine --scene captures/room --gaussians 100000 --seconds 240 --out room.ply")]
 pub struct Refine {
-    /// Initial splat, in the capture's world coordinates: .ply, .compressed.ply, .spz or .splat
+    /// Initial splat, in the capture's world coordinates, in any format that `convert` reads
     #[arg(long, value_name = "FILE", conflicts_with = "gaussians")]
     splat: Option<PathBuf>,
     /// Initialization without --splat: from the photos alone, or from a model's reconstruction
@@ -53,7 +53,7 @@ pub struct Refine {
     /// Background of masked pixels instead of ignoring them, so that the splat stays empty there
     #[arg(long, value_enum, value_name = "COLOUR")]
     mask_background: Option<Background>,
-    /// Output splat: .ply, .compressed.ply, .spz or .splat
+    /// Output splat: .ply, .compressed.ply, .sog, meta.json, .spz, .splat, .glb or .gltf
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
     /// Write the state of the optimization beside the splat, as in room.state.safetensors, and continue from it if it is there:

@@ -40,7 +40,7 @@ const ALPHA: &str = "_alpha";
     globalsplat render --splat room.ply --scene captures/room --html room.html"
 )]
 pub struct Render {
-    /// Splat: .ply, .compressed.ply, .spz or .splat
+    /// Splat: .ply, .compressed.ply, .sog, meta.json, .spz, .splat, .glb, .gltf or .ksplat
     #[arg(long, value_name = "FILE", group = "source")]
     splat: Option<PathBuf>,
     /// Weights to reconstruct the capture with, as `reconstruct` does: a file that `export` or `import` wrote, or a checkpoint

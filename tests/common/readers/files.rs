@@ -123,6 +123,22 @@ pub fn compressed_ply(bytes: &[u8]) {
     read_and_repair(&file("compressed_ply", "splat.compressed.ply", bytes));
 }
 
+pub fn glb(bytes: &[u8]) {
+    read_and_repair(&file("glb", "splat.glb", bytes));
+}
+
+pub fn gltf(bytes: &[u8]) {
+    read_and_repair(&file("gltf", "splat.gltf", bytes));
+}
+
+pub fn ksplat(bytes: &[u8]) {
+    read_and_repair(&file("ksplat", "splat.ksplat", bytes));
+}
+
+pub fn sog(bytes: &[u8]) {
+    read_and_repair(&file("sog", "splat.sog", bytes));
+}
+
 /// Reads a splat of one Gaussian with the origin file `bytes`; a splat that can be read must survive a round trip with its
 /// origin.
 pub fn splat_origin(bytes: &[u8]) {

@@ -20,7 +20,7 @@ use std::sync::OnceLock;
 pub type Reader = fn(&[u8]);
 
 /// Readers, by the names of fuzz targets and of the folders of their seeds.
-pub const READERS: [(&str, Reader); 30] = [
+pub const READERS: [(&str, Reader); 34] = [
     ("antimatter", files::antimatter),
     ("camera_path", files::camera_path),
     ("cameras_json", files::cameras_json),
@@ -35,6 +35,9 @@ pub const READERS: [(&str, Reader); 30] = [
     ("dataset_index", files::dataset_index),
     ("evaluation", files::evaluation),
     ("evaluation_index", files::evaluation_index),
+    ("glb", files::glb),
+    ("gltf", files::gltf),
+    ("ksplat", files::ksplat),
     ("made_cameras", made_captures::cameras),
     ("made_chunk", made_chunks::chunk),
     ("made_colmap", made_captures::colmap),
@@ -46,6 +49,7 @@ pub const READERS: [(&str, Reader); 30] = [
     ("photo", files::photo),
     ("ply", files::ply),
     ("shard_index", files::shard_index),
+    ("sog", files::sog),
     ("splat_origin", files::splat_origin),
     ("spz", files::spz),
     ("transforms_json", files::transforms_json),

@@ -18,6 +18,7 @@ pub use chunk::{CHUNK_EXTENSION, CHUNK_INDEX_FILE, Chunk, camera_numbers};
 pub use colmap::{Point, read_points};
 pub use photo_folder::{PhotoList, list_photos};
 pub use photos::{find_masks, find_masks_in};
+pub use transforms_json::write_transforms_json;
 
 use crate::capture::{Capture, Purpose};
 use globalsplat_files::{Error, Result};

@@ -8,12 +8,12 @@ use super::natural::natural_order;
 use super::photos::{find_photos, portable};
 use super::{CaptureOpener, file_in, folder_name};
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
-use crate::geometry::{Camera, ImageSize, Intrinsics, nearest_rigid_of_scaled};
+use crate::geometry::{Camera, ImageSize, Intrinsics, nearest_rigid_of_scaled, pose_to_rows};
 use crate::lens::{COLMAP_MODELS, Distortion, Lens, LensModel, equirectangular_intrinsics};
 use crate::pixels::read_image_size;
 use glam::{DMat4, DVec4};
-use globalsplat_files::{Error, Result, parent_of, read_text};
-use serde_json::Value;
+use globalsplat_files::{Error, Result, parent_of, read_text, write_json};
+use serde_json::{Value, json};
 use std::collections::HashSet;
 use std::f64::consts::PI;
 use std::path::{Path, PathBuf};
@@ -31,6 +31,9 @@ const TEST_LISTS: [&str; 2] = ["test_filenames", "val_filenames"];
 
 /// Names of the perspective lenses whose coefficients have keys of their own.
 const PERSPECTIVE_MODELS: [&str; 5] = ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL"];
+
+/// Signs of the axes of OpenGL cameras in those of OpenCV.
+const OPENGL_AXES: DVec4 = DVec4::new(1., -1., -1., 1.);
 
 /// Name of the lens model whose k4 to k6 form a denominator.
 const FULL_OPENCV: &str = "FULL_OPENCV";
@@ -225,11 +228,33 @@ pub(super) fn describe_value(value: Option<&Value>) -> String {
     }
 }
 
+/// Writes cameras without distortion as a `transforms.json` at `file`, each with its own size and focal lengths. `names` are the photos'
+/// paths, relative to the file's folder.
+///
+/// # Errors
+/// Fails if the file can't be written.
+///
+/// # Panics
+/// Panics if the numbers of names and cameras differ.
+pub fn write_transforms_json(file: &Path, names: &[String], cameras: &[Camera]) -> Result<()> {
+    assert_eq!(names.len(), cameras.len(), "each camera needs one name");
+    let frame = |(name, camera): (&String, &Camera)| {
+        let Intrinsics { fx, fy, cx, cy } = camera.intrinsics;
+        let rows = pose_to_rows(&(camera.c2w * DMat4::from_diagonal(OPENGL_AXES)));
+        json!({
+            "file_path": name, "w": camera.width, "h": camera.height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy,
+            "transform_matrix": rows.chunks(4).collect::<Vec<_>>(),
+        })
+    };
+    let frames: Vec<_> = names.iter().zip(cameras).map(frame).collect();
+    write_json(file, &json!({ "camera_model": "PINHOLE", "frames": frames }))
+}
+
 /// Returns the pose of 16 numbers, row by row, converted to OpenCV axes. OpenGL's y axis points up and its z axis backward, so
 /// those two columns change sign.
 pub(super) fn from_opengl(entries: &[f64; 16]) -> DMat4 {
     let opengl = DMat4::from_cols_array(entries).transpose();
-    opengl * DMat4::from_diagonal(DVec4::new(1., -1., -1., 1.))
+    opengl * DMat4::from_diagonal(OPENGL_AXES)
 }
 
 /// Fields of a frame, each either its own or the one shared by all frames.

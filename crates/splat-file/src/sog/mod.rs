@@ -1,4 +1,4 @@
-//! PlayCanvas' SOG, version 2: the properties of all Gaussians as lossless WebP images and a `meta.json`, together in a ZIP archive (`.sog`)
+//! PlayCanvas' SOG, version 2 (spec 10.19): the properties of all Gaussians as lossless WebP images and a `meta.json`, together in a ZIP archive (`.sog`)
 //! or as files in a folder (`meta.json`). The pixel at x, y of each image belongs to Gaussian x + width · y. The axes are a PLY's.
 
 mod codec;
