@@ -201,7 +201,7 @@ fn convert_edits_in_the_given_order() {
         &["--decimate", &half, "--scene", arg(&room)][..],
         &["--crop-box", "-99,-99,-99,0,99,99", "--scene", arg(&room)],
     ]
-    .map(|options| convert(options));
+    .map(&convert);
     assert_eq!(counts(&decimated), [all / 2]);
     assert!(decimated["psnr"].as_f64() > cut["psnr"].as_f64(), "{decimated} {cut}");
     // A Gaussian behind all cameras isn't seen, one far from all others is isolated, wherever the splat has been moved.
