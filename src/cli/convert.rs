@@ -2,12 +2,13 @@ use super::edits::Edits;
 use super::{open_capture, print_json, splat_out, warn};
 use anyhow::Result;
 use clap::Args;
-use glam::DVec3;
+use glam::{DMat4, DVec3};
+use globalsplat::Error;
 use globalsplat::data::write_transforms_json;
 use globalsplat::eval::psnr_between;
 use globalsplat::io::{
-    InputFiles, ShLimits, Splat, WriteOptions, check_writable_file, check_writable_splat, edit_splat,
-    fit_splat, move_cameras, read_splat, read_splat_without_invalid, splat_files,
+    InputFiles, ShLimits, Splat, SplatEdit, WriteOptions, check_writable_file, check_writable_splat,
+    edit_splat, fit_splat, move_cameras, read_splat, read_splat_without_invalid, splat_files,
 };
 use globalsplat::render::orbit_around_splat;
 use globalsplat::scene::{Camera, LocalFrame, splat_frame};
@@ -15,6 +16,9 @@ use serde_json::{Value, json};
 use std::cmp::Ordering;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
+
+/// Change of a coefficient that counts as cut off: more than a quantization step.
+const MIN_CUT: f32 = 0.01;
 
 /// Write a splat in another format, edit it, and report the loss.
 ///
@@ -28,7 +32,8 @@ use std::time::Instant;
 /// coefficients are fitted to look the same from its cameras; otherwise values out of range are clamped, which may cost much
 /// quality.
 ///
-/// Edits are applied one after the other, and the capture's cameras move along. The loss is measured in the moved world.
+/// Edits are applied one after the other, and the capture's cameras move along. The loss then includes what the edits change;
+/// a second figure is that of the format alone.
 ///
 /// Gaussians that can't be rendered are removed and counted: those with values that aren't finite, which other commands refuse,
 /// and those whose rotation has length 0.
@@ -83,16 +88,41 @@ impl Convert {
         let mut inputs = InputFiles::default();
         capture.iter().for_each(|capture| capture.add_input_files(&mut inputs));
         self.edits.add_input_files(&mut inputs)?;
-        let mut outputs = splat_files(&self.to).into_iter().chain(self.cameras_out.clone());
-        outputs.try_for_each(|file| inputs.check_file(&file))?;
-        self.cameras_out.as_deref().map(check_writable_file).transpose()?;
+        splat_files(&self.to).iter().try_for_each(|file| inputs.check_file(file))?;
+        if let Some(file) = &self.cameras_out {
+            [&self.from, &self.to]
+                .iter()
+                .flat_map(|path| splat_files(path))
+                .for_each(|file| inputs.add(&file));
+            if file == &self.to {
+                let why =
+                    format!("{}: the cameras would replace the splat, expected another name", file.display());
+                return Err(Error::request(why).into());
+            }
+            inputs.check_file(file)?;
+            check_writable_file(file)?;
+        }
         let source = read_splat_without_invalid(&self.from)?;
         warn(&source.warnings);
         // The input is described before the output replaces it, in case they are the same file.
-        let from = description(&self.from, &source)?;
+        let mut from = description(&self.from, &source)?;
+        from["warnings"] = source.warnings.clone().into();
         let (options, edits): (Vec<_>, Vec<_>) = self.edits.read(warn)?.into_iter().unzip();
         let cameras = capture.as_ref().map_or(vec![], |capture| capture.cameras());
+        for (option, edit) in options.iter().zip(&edits) {
+            if matches!(edit, SplatEdit::Merge(other) if other.antialiased != source.antialiased) {
+                let kind = if source.antialiased { "are" } else { "aren't" };
+                eprintln!(
+                    "{option}: only one of the splats is antialiased; all Gaussians {kind} rendered so, as those of {}",
+                    self.from.display()
+                );
+            }
+        }
         let edited = edit_splat(&source, &edits, &cameras)?;
+        let moved = match edited.from_original == DMat4::IDENTITY {
+            true => source.clone(),
+            false => edit_splat(&source, &[SplatEdit::Transform(edited.from_original)], &[])?.splat,
+        };
         let cameras = move_cameras(&cameras, &edited.from_original);
         let original = edited.splat;
         let degree = self.sh_degree.map_or(original.sh_degree, |degree| degree as usize);
@@ -126,12 +156,14 @@ impl Convert {
         if let (Some(file), Some(capture)) = (&self.cameras_out, &capture) {
             write_transforms_json(file, &capture.render_names(), &cameras)?;
         }
-        let moved = source.transformed(&edited.from_original)?;
         let cameras = if capture.is_some() { cameras } else { orbit_around_splat(&moved) };
         if capture.is_none() {
             self.tell_cut(&original, &fit(&[])?);
         }
         let psnr = psnr_between(&moved, &copy, &cameras)?;
+        // What the file's format costs, without what the edits change.
+        let file_psnr =
+            (!edits.is_empty()).then(|| psnr_between(&original, &copy, &cameras)).transpose()?.flatten();
         let views = cameras.len();
         if self.json {
             let edits: Vec<_> = options
@@ -139,7 +171,7 @@ impl Convert {
                 .zip(&edited.counts)
                 .map(|(option, count)| json!({ "edit": option, "gaussians": count }))
                 .collect();
-            let report = json!({ "from": from, "edits": edits, "to": to, "views": views, "psnr": psnr, "same_pixels": psnr.is_none() });
+            let report = json!({ "from": from, "edits": edits, "to": to, "views": views, "psnr": psnr, "file_psnr": file_psnr, "same_pixels": psnr.is_none() });
             print_json(&report);
         } else {
             println!("{}", line(&from));
@@ -157,7 +189,9 @@ impl Convert {
                 Some(psnr) => format!("{psnr:.2} dB between renders of both"),
                 None => "the same pixels".into(),
             };
-            println!("{}\n{views} views: {loss}", line(&to));
+            let of_file =
+                file_psnr.map(|psnr| format!("; {psnr:.2} dB between the edited splat and the file"));
+            println!("{}\n{views} views: {loss}{}", line(&to), of_file.unwrap_or_default());
         }
         Ok(())
     }
@@ -168,12 +202,16 @@ impl Convert {
             let pairs = original.sh_of(index).iter().zip(held.sh_of(index));
             pairs.flat_map(|(original, held)| original.iter().zip(held))
         };
-        let cut = (0..held.len()).flat_map(coefficients).filter(|(original, held)| original != held).count();
+        let cut = (0..held.len())
+            .flat_map(coefficients)
+            .filter(|(original, held)| (**original - **held).abs() > MIN_CUT)
+            .count();
         let share = 100. * cut as f64 / (3 * held.sh.len()) as f64;
-        if share > 0. {
+        if cut > 0 {
+            let share = if share < 0.05 { "less than 0.1".into() } else { format!("{share:.1}") };
             let who = if self.for_viewers { "viewers hold" } else { "the format holds" };
             eprintln!(
-                "{}: {share:.1} % of the colours' coefficients are beyond what {who} and cut off; --scene, with the cameras that \
+                "{}: {share} % of the colours' coefficients are beyond what {who} and cut off; --scene, with the cameras that \
                  matter, loses less",
                 self.to.display()
             );

@@ -52,19 +52,21 @@ const OPTIONS: [EditOption; 13] = [
     (
         "crop-box",
         "X,Y,Z,X,Y,Z",
-        "Keep the Gaussians whose centres are in the box between two corners",
-        |text| {
-            let [a, b, c, d, e, f] = numbers(text)?;
-            let (first, second) = (DVec3::new(a, b, c), DVec3::new(d, e, f));
-            edit(SplatEdit::CropBox(first.min(second), first.max(second)))
+        "Keep the Gaussians whose centres are in the box between two corners; - stands for no bound",
+        parse_box,
+    ),
+    (
+        "crop-sphere",
+        "X,Y,Z,RADIUS",
+        "Keep the Gaussians whose centres are in a sphere",
+        |text| match numbers(text)? {
+            [x, y, z, radius] if radius > 0. => edit(SplatEdit::CropSphere(DVec3::new(x, y, z), radius)),
+            _ => Err("expected a radius above 0".into()),
         },
     ),
-    ("crop-sphere", "X,Y,Z,RADIUS", "Keep the Gaussians whose centres are in a sphere", |text| {
-        let [x, y, z, radius] = numbers(text)?;
-        edit(SplatEdit::CropSphere(DVec3::new(x, y, z), radius))
-    }),
-    ("min-opacity", "OPACITY", "Remove Gaussians of a lower opacity, 0 to 1", |text| {
-        edit(SplatEdit::MinOpacity(positive(text)?))
+    ("min-opacity", "OPACITY", "Remove Gaussians of a lower opacity, 0 to 1", |text| match numbers(text)? {
+        [opacity] if (0. ..=1.).contains(&opacity) => edit(SplatEdit::MinOpacity(opacity)),
+        _ => Err("expected a number from 0 to 1".into()),
     }),
     (
         "max-scale",
@@ -126,8 +128,25 @@ fn positive(text: &str) -> Result<f64, String> {
     }
 }
 
+/// Parses a box, where - stands for no bound, as for splat-transform.
+fn parse_box(text: &str) -> Result<EditArgument, String> {
+    let bounds: Vec<&str> = text.split(',').map(str::trim).collect();
+    let corner = |bounds: &[&str], unbounded: f64| -> Result<DVec3, String> {
+        let bound = |text: &&str| if *text == "-" { Ok([unbounded]) } else { numbers(text) };
+        let bounds = bounds.iter().map(|text| Ok(bound(text)?[0])).collect::<Result<Vec<f64>, String>>()?;
+        Ok(DVec3::from_slice(&bounds))
+    };
+    match bounds.split_at_checked(3) {
+        Some((first, second)) if second.len() == 3 => {
+            let (low, high) = (corner(first, f64::NEG_INFINITY)?, corner(second, f64::INFINITY)?);
+            edit(SplatEdit::CropBox(low.min(high), low.max(high)))
+        }
+        _ => Err("expected 6 numbers with commas between them, or - where there is no bound".into()),
+    }
+}
+
 fn parse_up(text: &str) -> Result<EditArgument, String> {
-    let rotation = match text {
+    let rotation = match &text.to_lowercase()[..] {
         "x" => DQuat::from_rotation_z(-FRAC_PI_2),
         "-x" => DQuat::from_rotation_z(FRAC_PI_2),
         "y" => DQuat::from_rotation_x(PI),
@@ -182,7 +201,8 @@ impl Args for Edits {
                 .help(help)
                 .help_heading("Edits, applied in the order in which they are given")
                 .action(ArgAction::Append)
-                .allow_hyphen_values(true)
+                // Paths that begin with a hyphen are rare, and a forgotten value isn't the next option.
+                .allow_hyphen_values(!["merge", "seen-by"].contains(&name))
                 .value_parser(move |text: &str| parser(text).map(|argument| (text.to_owned(), argument)));
             match name {
                 "filter-floaters" => {
@@ -208,7 +228,7 @@ impl FromArgMatches for Edits {
             edits.extend(
                 places
                     .zip(values)
-                    .map(|(place, (text, argument))| (place, (format!("--{name} {text}"), argument.clone()))),
+                    .map(|(place, (text, argument))| (place, (format!("--{name}={text}"), argument.clone()))),
             );
         }
         edits.sort_by_key(|(place, _)| *place);
@@ -239,16 +259,21 @@ mod tests {
         let edits = program.edits.read(|_| ()).unwrap();
         let options: Vec<_> = edits.iter().map(|(option, _)| *option).collect();
         let expected = [
-            "--translate -1,2,3",
-            "--scale 2",
-            "--filter-floaters 10",
-            "--translate 4,5,6",
-            "--up -z",
-            "--crop-sphere 0,0,0,1",
+            "--translate=-1,2,3",
+            "--scale=2",
+            "--filter-floaters=10",
+            "--translate=4,5,6",
+            "--up=-z",
+            "--crop-sphere=0,0,0,1",
         ];
         assert_eq!(options, expected);
         let SplatEdit::Transform(matrix) = &edits[4].1 else { panic!("{edits:?}") };
         assert!(matrix.transform_vector3(DVec3::NEG_Z).abs_diff_eq(DVec3::NEG_Y, 1e-12));
+        let Ok(EditArgument::Edit(SplatEdit::CropBox(low, high))) = parse_box("-,1,-,2,-,3") else {
+            panic!()
+        };
+        assert_eq!((low.y, high.x, high.z), (1., 2., 3.));
+        assert!(low.x == f64::NEG_INFINITY && low.z == f64::NEG_INFINITY && high.y == f64::INFINITY);
         for up in ["x", "y", "-x", "-y", "z"] {
             let Ok(EditArgument::Edit(SplatEdit::Transform(matrix))) = parse_up(up) else { panic!("{up}") };
             let sign = if up.starts_with('-') { -1. } else { 1. };
@@ -268,6 +293,9 @@ mod tests {
             ("--scale nan", "expected a number above 0"),
             ("--translate 1,2", "expected 3 numbers with commas"),
             ("--crop-box 1,2,3,4,5,x", "expected 6 numbers"),
+            ("--crop-box 1,2,3", "expected 6 numbers"),
+            ("--crop-sphere 0,0,0,-1", "a radius above 0"),
+            ("--min-opacity 1.5", "from 0 to 1"),
             ("--decimate 0", "1 or more"),
             ("--up w", "expected x, y, z, -x, -y or -z"),
         ] {

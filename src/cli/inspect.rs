@@ -94,9 +94,12 @@ fn range(t: &Tensor) -> Value {
 /// Returns quantiles of the positive `values`, by name.
 fn quantiles(values: impl Iterator<Item = f32>) -> Value {
     let mut sorted: Vec<f32> = values.collect();
+    if sorted.is_empty() {
+        return Value::Null;
+    }
     sorted.sort_unstable_by(f32::total_cmp);
     let at = |percent: usize| sorted.get((sorted.len().saturating_sub(1)) * percent / 100).copied();
-    json!({ "p1": at(1), "p5": at(5), "p25": at(25), "p50": at(50), "p75": at(75), "p95": at(95), "p99": at(99) })
+    json!({ "p01": at(1), "p05": at(5), "p25": at(25), "p50": at(50), "p75": at(75), "p95": at(95), "p99": at(99) })
 }
 
 /// Returns the mean square over all directions of the colours' part of each SH degree, a mean over Gaussians and channels.
@@ -125,7 +128,7 @@ fn splat(path: &Path, preview: Option<&Path>) -> Result<Value> {
     Ok(json!({
         "kind": "splat",
         "gaussians": g.count(),
-        "left_out": Some(&splat.warnings).filter(|warnings| !warnings.is_empty()),
+        "warnings": Some(&splat.warnings).filter(|warnings| !warnings.is_empty()),
         "sh_degree": splat.sh_degree,
         "antialiased": splat.antialiased,
         "bytes": splat_out::total_bytes(path)?,

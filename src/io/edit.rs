@@ -57,10 +57,13 @@ pub struct EditedSplat {
 /// Fails if a matrix does more than rotate, scale uniformly and translate, if no Gaussian is left, or like [`crate::render::render`].
 pub fn edit_splat(original: &Splat, edits: &[SplatEdit], cameras: &[Camera]) -> Result<EditedSplat> {
     let mut edited = EditedSplat { splat: original.clone(), from_original: DMat4::IDENTITY, counts: vec![] };
-    for edit in edits {
+    for (index, edit) in edits.iter().enumerate() {
+        let before = edited.splat.len();
         edited.apply(edit, cameras)?;
-        if edited.splat.is_empty() && !original.is_empty() {
-            return Err(Error::request("the edits remove all Gaussians, expected at least one that is left"));
+        if edited.splat.is_empty() && before > 0 {
+            let which = format!("edit {} of {}", index + 1, edits.len());
+            let why = format!("{which} removes all {before} Gaussians, expected at least one that is left");
+            return Err(Error::request(why));
         }
         edited.counts.push(edited.splat.len());
     }
@@ -84,6 +87,10 @@ impl EditedSplat {
     fn apply(&mut self, edit: &SplatEdit, cameras: &[Camera]) -> Result<()> {
         match edit {
             SplatEdit::Transform(matrix) => {
+                // With an origin in float64, several moves, or one far away, don't round the positions.
+                if self.splat.origin == DVec3::ZERO {
+                    self.splat = self.splat.with_origin(splat_frame(&self.splat).origin);
+                }
                 self.splat = self.splat.transformed(matrix)?;
                 self.from_original = *matrix * self.from_original;
             }

@@ -57,7 +57,7 @@ fn search(
     let (near, far) = if offset < 0. { (lower, upper) } else { (upper, lower) };
     let next = (axis + 1) % 3;
     search(points, near, next, (index, point), nearest);
-    if nearest.last().is_some_and(|last| offset * offset <= *last) {
+    if nearest.last().is_some_and(|last| offset * offset < *last) {
         search(points, far, next, (index, point), nearest);
     }
 }

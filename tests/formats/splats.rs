@@ -87,7 +87,10 @@ fn unknown_file_endings_are_refused() {
     let splat = written(folder.path(), "a.ply", &random_splat(2, 0, 1));
     for (name, message) in [("a.obj", "the ending is .obj"), ("a", "the ending is missing")] {
         let to = folder.path().join(name);
-        let all = [message, "expected .ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf or .ksplat"];
+        let all = [
+            message,
+            "expected .ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf, .ksplat or meta.json",
+        ];
         assert_says(&refuse(&["convert", arg(&splat), arg(&to)]), &all);
         std::fs::copy(&splat, &to).unwrap();
         assert_says(&refuse(&["convert", arg(&to), arg(&splat)]), &all);
@@ -172,6 +175,15 @@ fn convert_edits_in_the_given_order() {
     let psnr = globalsplat::eval::psnr(&views(&original, &room.join("cameras.json")), &views(&to, &cameras));
     assert!(psnr > 33., "{psnr} dB");
     convert(&["--rotate", "20,-40,100", "--scale", "3", "--translate", "-4,5,-6"]);
+    let over = |file: &Path| {
+        ["convert", arg(&original), arg(&to), "--scene", arg(&room), "--cameras-out", arg(file)]
+            .map(String::from)
+    };
+    for file in [&original, &to] {
+        let arguments = over(file);
+        let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+        assert_says(&refuse(&arguments), &["expected another name"]);
+    }
     let back = [
         "--translate",
         "4,-5,6",
@@ -187,13 +199,26 @@ fn convert_edits_in_the_given_order() {
     let again = read_splat(&again).unwrap();
     let farthest = splat_files::largest_error(again.means.as_flattened(), splat.means.as_flattened());
     assert!(farthest < 1e-5, "{farthest}");
+    // Far away, a local origin keeps the detail, and edits there and back change nothing.
+    let far = folder.path().join("far.ply");
+    let there = ["--translate", "50000000,0,0"];
+    succeed(&[&["convert", arg(&original), arg(&far), "--local-origin"], &there[..]].concat());
+    let far_splat = read_splat(&far).unwrap();
+    let distance = (far_splat.origin.x + f64::from(far_splat.means[7][0])) - f64::from(splat.means[7][0]);
+    assert!((distance - 5e7).abs() < 1e-4, "{distance}");
+    let (warnings, _) = said(&[&["convert", arg(&original), arg(&to)], &there[..]].concat());
+    assert_says(&warnings, &["positions are rounded"]);
+    convert(&["--translate", "50000000,0,0", "--translate", "-50000000,0,0"]);
+    let back_again = read_splat(&to).unwrap();
+    let farthest = splat_files::largest_error(back_again.means.as_flattened(), splat.means.as_flattened());
+    assert!(farthest < 1e-5, "{farthest}");
     // A box before and after the splat is moved into it.
     let crop = ["--crop-box", "100,-9,-9,109,9,9"];
     let translate = ["--translate", "104,0,0"];
     assert!(counts(&convert(&[translate, crop].concat()))[1] > all / 2);
     assert_says(
         &refuse(&[&["convert", arg(&original), arg(&to)], &crop[..], &translate].concat()),
-        &["remove all Gaussians"],
+        &["edit 1 of 2 removes all "],
     );
     // The Gaussians that are seen most matter most.
     let half = (all / 2).to_string();
@@ -219,7 +244,7 @@ fn convert_edits_in_the_given_order() {
     let random = written(folder.path(), "random.ply", &random_splat(200, 1, 2));
     let filters = ["--min-opacity", "0.5", "--max-scale", "0.3", "--merge", arg(&stray)];
     let report = succeed(&[&["convert", arg(&random), arg(&to)][..], &filters].concat());
-    assert_says(&report, &["--min-opacity 0.5: ", " removed, ", "--max-scale 0.3: ", ": 1 added, "]);
+    assert_says(&report, &["--min-opacity=0.5: ", " removed, ", "--max-scale=0.3: ", ": 1 added, "]);
     let kept = read_splat(&to).unwrap();
     let passes =
         |index: usize| kept.opacity(index) >= 0.5 && kept.scale(index).iter().all(|&scale| scale <= 0.3);

@@ -381,7 +381,7 @@ fn inspect_describes_splats_captures_and_weights() {
     assert_eq!((splat["kind"].as_str(), splat["sh_degree"].as_i64()), (Some("splat"), Some(0)));
     for part in ["scale_quantiles", "opacity_quantiles"] {
         let at = |name: &str| splat[part][name].as_f64().unwrap();
-        assert!(at("p1") <= at("p50") && at("p50") <= at("p99") && at("p99") > 0., "{splat}");
+        assert!(at("p01") <= at("p50") && at("p50") <= at("p99") && at("p99") > 0., "{splat}");
     }
     // A colour of degree 0 is the same in all directions.
     assert_eq!(splat["sh_energy"].as_array().unwrap().len(), 1);

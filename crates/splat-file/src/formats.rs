@@ -92,9 +92,9 @@ const FORMATS: [Format; 9] = [
 ];
 
 /// Extensions of all formats, for messages.
-const ENDINGS: &str = ".ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf or .ksplat";
+const ENDINGS: &str = ".ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf, .ksplat or meta.json";
 /// Extensions of the formats that are written, for messages.
-const WRITTEN_ENDINGS: &str = ".ply, .compressed.ply, .sog, .spz, .splat, .glb or .gltf";
+const WRITTEN_ENDINGS: &str = ".ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf or meta.json";
 
 impl Format {
     /// Returns `true` if a file with this name, in lower case, is in this format.
@@ -167,11 +167,18 @@ pub fn find_splat(folder: &Path, name: &str) -> PathBuf {
 /// Checks that a splat could be written at `path`. Call it before the work starts.
 ///
 /// # Errors
-/// Returns an error for an unknown extension or a format that this build can't write, or a request error that names the path.
+/// Returns an error for an unknown extension or a format that this build can't write, a request error that names the path, or an error if a
+/// new splat would replace a file that belongs to something else, such as the buffer of a `.gltf`.
 pub fn check_writable_splat(path: &Path) -> Result<()> {
     let format = format_of(path)?;
     format.writer(path)?;
-    format.other_files(path).iter().try_for_each(|file| check_writable_file(file))?;
+    for file in format.other_files(path) {
+        check_writable_file(&file)?;
+        if file.exists() && !path.exists() {
+            let found = format!("{}, which would be replaced", file.display());
+            return Err(Error::input(path, "a file beside it", found, "another name for the output"));
+        }
+    }
     check_writable_file(path)
 }
 

@@ -113,7 +113,8 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let Some((headers, mut rest)) =
         sections.checked_mul(SECTION_HEADER).and_then(|length| bytes[HEADER..].split_at_checked(length))
     else {
-        let expected = format!("{} at most in a file of {} bytes", bytes.len() / SECTION_HEADER, bytes.len());
+        let expected =
+            format!("{} at most in a file of {} bytes", (bytes.len() - HEADER) / SECTION_HEADER, bytes.len());
         return Err(Error::input(path, "the number of sections", sections, expected));
     };
     let headers = headers.as_chunks::<SECTION_HEADER>().0;

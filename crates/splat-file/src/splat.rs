@@ -181,8 +181,12 @@ impl Splat {
         }
     }
 
-    /// Returns the Gaussians of both splats, with the origin of the first one and the higher SH degree.
+    /// Returns the Gaussians of both splats, with the origin of the first one that has one, the antialiased mark of the first one, and the
+    /// higher SH degree.
     pub fn merged(&self, other: &Self) -> Self {
+        if self.origin == DVec3::ZERO && other.origin != DVec3::ZERO {
+            return self.with_origin(other.origin).merged(other);
+        }
         let degree = self.sh_degree.max(other.sh_degree);
         let other = other.with_origin(self.origin).with_sh_degree(degree);
         let mut merged = self.with_sh_degree(degree);

@@ -23,9 +23,18 @@ impl Similarity {
         let linear = DMat3::from_mat4(*matrix);
         let scale = linear.determinant().cbrt();
         let is_affine = matrix.row(3).abs_diff_eq(DMat4::IDENTITY.row(3), TOLERANCE);
-        if !(matrix.is_finite() && is_affine && scale > 0. && (linear * scale.recip()).is_finite()) {
+        if !(matrix.is_finite() && is_affine) {
             let found = format!("{:?}", matrix.transpose().to_cols_array());
-            return Err(Error::setting("the matrix", found, "a rotation, a scale above 0 and a translation"));
+            return Err(Error::setting(
+                "the matrix",
+                found,
+                "finite numbers, and 0, 0, 0, 1 as the last row",
+            ));
+        }
+        if !(scale > 0. && scale.is_finite() && (linear * scale.recip()).is_finite()) {
+            let found = format!("one of the determinant {}", linear.determinant());
+            let expected = "a rotation and a scale above 0, which have a finite determinant above 0";
+            return Err(Error::setting("the matrix", found, expected));
         }
         let rotation = linear * scale.recip();
         if !(rotation.transpose() * rotation).abs_diff_eq(DMat3::IDENTITY, TOLERANCE) {

@@ -5,8 +5,8 @@ mod common;
 use common::{assert_says, endings, largest_error, random_splat, written};
 use glam::DVec3;
 use globalsplat_splat_file::{
-    SH_C0, Splat, can_mark_antialiased, find_splat, has_sh_palette, is_splat_name, limits_of, origin_file,
-    read_splat, round_sh, write_local_splat, write_splat,
+    SH_C0, Splat, can_mark_antialiased, check_writable_splat, find_splat, has_sh_palette, is_splat_name,
+    limits_of, origin_file, read_splat, round_sh, write_local_splat, write_splat,
 };
 use std::path::Path;
 
@@ -263,6 +263,19 @@ fn quaternions_of_any_length_are_kept() {
     }
 }
 
+/// A new splat of several files doesn't replace a file that was there before.
+#[test]
+fn files_beside_a_new_splat_are_kept() {
+    let folder = tempfile::tempdir().unwrap();
+    let (splat, path) = (random_splat(3, 0, 1), folder.path().join("a.gltf"));
+    check_writable_splat(&path).unwrap();
+    std::fs::write(folder.path().join("a.bin"), "mine").unwrap();
+    let error = check_writable_splat(&path).unwrap_err().to_string();
+    assert_says(&error, &["a.gltf: a file beside it is ", "a.bin, which would be replaced"]);
+    write_splat(&path, &splat).unwrap();
+    check_writable_splat(&path).unwrap();
+}
+
 /// The contents of a file determine its format, not its name, for formats that can be recognized.
 #[test]
 fn files_are_recognized() {
@@ -285,7 +298,10 @@ fn files_are_recognized() {
         assert!(error.is_invalid_request());
         assert_says(
             &error.to_string(),
-            &[message, "expected .ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf or .ksplat"],
+            &[
+                message,
+                "expected .ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf, .ksplat or meta.json",
+            ],
         );
     }
 }

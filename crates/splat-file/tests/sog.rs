@@ -124,6 +124,8 @@ fn refused_meta(change: impl FnOnce(&mut Value)) -> String {
 
 #[test]
 fn bad_metas() {
+    let overflow = refused_meta(|meta| meta["shN"]["count"] = json!(u64::MAX / 3 + 1));
+    assert_says(&overflow, &["shN.count is 6148914691236517206, expected 1 to 65536"]);
     assert_says(
         &refused_meta(|meta| meta["version"] = json!(1)),
         &["the version in meta.json is 1, expected 2"],
@@ -177,6 +179,29 @@ fn bad_images_and_archives() {
     assert_eq!(read_splat_without_invalid(&path).unwrap().len(), 2);
     write_pixels(&file, 1000, &vec![[9; 4]; 1_000_000]);
     assert_says(&refused_file(&path), &["quats.webp is of 1000×1000 pixels, expected about as many"]);
+    // As many pixels as the Gaussians that the file claims, from a few bytes.
+    let small = tempfile::tempdir().unwrap();
+    let (_, bomb) = three(small.path());
+    for name in ["means_l.webp", "means_u.webp", "scales.webp", "quats.webp", "sh0.webp", "shN_labels.webp"] {
+        write_pixels(&small.path().join(name), 700, &vec![[9, 9, 9, 255]; 700 * 700]);
+    }
+    let mut meta: Value = serde_json::from_slice(&fs::read(&bomb).unwrap()).unwrap();
+    meta["count"] = json!(700 * 700);
+    fs::write(&bomb, serde_json::to_vec(&meta).unwrap()).unwrap();
+    assert_says(&refused_file(&bomb), &["means_l.webp is of 700×700 pixels", "256 times the bytes"]);
+    // Other properties may be the same for all Gaussians.
+    let mut random = common::Random::new(1);
+    let noise: Vec<[u8; 4]> = (0..700 * 700)
+        .map(|_| [0; 4].map(|_: u8| (random.uniform() * 256.) as u8))
+        .map(|[red, green, blue, _]| [red, green, blue, 255])
+        .collect();
+    write_pixels(&small.path().join("means_l.webp"), 700, &noise);
+    write_pixels(&small.path().join("quats.webp"), 700, &vec![[128, 128, 128, 252]; 700 * 700]);
+    write_pixels(&small.path().join("shN_labels.webp"), 700, &vec![[0, 0, 0, 255]; 700 * 700]);
+    meta["scales"]["codebook"] = json!(vec![-3.; 256]);
+    meta["sh0"]["codebook"] = json!(vec![0.5; 256]);
+    fs::write(&bomb, serde_json::to_vec(&meta).unwrap()).unwrap();
+    assert_eq!(read_splat(&bomb).unwrap().len(), 700 * 700);
     fs::write(&file, b"RIFF").unwrap();
     assert_says(&refused_file(&path), &["quats.webp is damaged"]);
     fs::remove_file(&file).unwrap();

@@ -228,8 +228,7 @@ pub(super) fn describe_value(value: Option<&Value>) -> String {
     }
 }
 
-/// Writes cameras without distortion as a `transforms.json` at `file`, each with its own size and focal lengths. `names` are the photos'
-/// paths, relative to the file's folder.
+/// Writes cameras without distortion as a `transforms.json` at `file`, each with its own size and focal lengths. `names` name the frames.
 ///
 /// # Errors
 /// Fails if the file can't be written.

@@ -50,6 +50,10 @@ const MAX_LOG_SCALE: f32 = 20.;
 /// Number of image pixels that are allowed in addition to one per Gaussian, as a factor and as a constant.
 const MAX_PIXELS: (usize, usize) = (4, 1 << 16);
 
+/// Maximum number of bytes of the pixels of positions for each byte of their file, with `MAX_SMALL` bytes allowed in addition.
+const MAX_RATIO: usize = 256;
+const MAX_SMALL: usize = 1 << 20;
+
 /// Contents of `meta.json`.
 #[derive(Serialize, Deserialize)]
 struct Meta {
@@ -123,7 +127,7 @@ fn read(path: &Path, mut reader: Reader, meta: &[u8]) -> Result<Contents> {
     let refuse = |field: &str, found: String, expected: &str| Err(Error::input(path, field, found, expected));
     let value: serde_json::Value = match serde_json::from_slice(meta) {
         Ok(value) => value,
-        Err(why) => return refuse("meta.json", why.to_string(), "the JSON of a SOG"),
+        Err(why) => return refuse("meta.json", format!("no JSON ({why})"), "the JSON of a SOG"),
     };
     let version = value.get("version").map_or("missing".into(), ToString::to_string);
     if version != VERSION.to_string() {
@@ -131,11 +135,17 @@ fn read(path: &Path, mut reader: Reader, meta: &[u8]) -> Result<Contents> {
     }
     let meta: Meta = match serde_json::from_value(value) {
         Ok(meta) => meta,
-        Err(why) => return refuse("meta.json", why.to_string(), "the entries of a SOG of version 2"),
+        Err(why) => {
+            return refuse("meta.json", format!("incomplete ({why})"), "the entries of a SOG of version 2");
+        }
     };
+    let [lower_name, upper_name] = &meta.means.files;
     let mut image = |name: &str| -> Result<Image> {
-        let image =
-            reader.image(name, |pixels| pixels / MAX_PIXELS.0 <= meta.count.saturating_add(MAX_PIXELS.1))?;
+        let image = reader.image(name, |pixels, bytes| {
+            // The lower bytes of positions hardly compress, and all other images have as many pixels.
+            let is_small = name != lower_name || 4 * pixels <= MAX_SMALL + MAX_RATIO * bytes;
+            is_small && pixels / MAX_PIXELS.0 <= meta.count.saturating_add(MAX_PIXELS.1)
+        })?;
         if image.pixels.len() < meta.count {
             let expected = format!("{} or more, one for each Gaussian", meta.count);
             return Err(Error::input(
@@ -147,7 +157,7 @@ fn read(path: &Path, mut reader: Reader, meta: &[u8]) -> Result<Contents> {
         }
         Ok(image)
     };
-    let [lower, upper] = [image(&meta.means.files[0])?, image(&meta.means.files[1])?];
+    let [lower, upper] = [image(lower_name)?, image(upper_name)?];
     let [scales, rotations, colours] =
         [image(&meta.scales.files[0])?, image(&meta.quats.files[0])?, image(&meta.sh0.files[0])?];
     let labels = meta.sh_rest.as_ref().map(|rest| image(&rest.files[1])).transpose()?;
@@ -190,10 +200,13 @@ fn read(path: &Path, mut reader: Reader, meta: &[u8]) -> Result<Contents> {
         if !(1..=3).contains(&rest.bands) {
             return refuse("shN.bands", rest.bands.to_string(), "1 to 3");
         }
+        if !(1..=MAX_CENTROIDS).contains(&rest.count) {
+            return refuse("shN.count", rest.count.to_string(), "1 to 65536");
+        }
         let coefficients = (rest.bands + 1).pow(2) - 1;
         let name = &rest.files[0];
         let centroids =
-            reader.image(name, |pixels| pixels <= (MAX_CENTROIDS + CENTROIDS_PER_ROW) * coefficients)?;
+            reader.image(name, |pixels, _| pixels <= (MAX_CENTROIDS + CENTROIDS_PER_ROW) * coefficients)?;
         if centroids.width != CENTROIDS_PER_ROW * coefficients {
             let expected = format!("{} for degree {}", CENTROIDS_PER_ROW * coefficients, rest.bands);
             return refuse(&format!("the width of {name}"), centroids.width.to_string(), &expected);

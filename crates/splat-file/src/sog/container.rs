@@ -1,7 +1,8 @@
 //! Files of a SOG: in a ZIP archive or in a folder, and their images.
 
+use super::IMAGES;
 use crate::{Error, Result};
-use globalsplat_files::{PartialFile, parent_of, write_atomically};
+use globalsplat_files::{PartialFile, check_regular, parent_of, write_atomically};
 use image_webp::{ColorType, EncoderParams, WebPDecoder, WebPEncoder};
 use std::io::{Cursor, Read, Write};
 use std::path::Path;
@@ -56,10 +57,11 @@ impl<'a> Reader<'a> {
                 ));
             }
             let file = parent_of(self.path).join(name);
+            check_regular(&file)?;
             return std::fs::read(&file).map_err(Error::read(&file));
         };
         let refuse = |found: String| Error::input(self.path, name, found, "a file in the archive");
-        let file = archive.by_name(name).map_err(|why| refuse(why.to_string()))?;
+        let file = archive.by_name(name).map_err(|why| refuse(format!("missing or damaged ({why})")))?;
         let mut contents = vec![];
         file.take(*max + 1).read_to_end(&mut contents).map_err(|why| refuse(format!("damaged: {why}")))?;
         match contents.len() as u64 > *max {
@@ -68,11 +70,12 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// Returns the image `name` if `is_allowed` returns `true` for its number of pixels, which is known before memory is allocated.
+    /// Returns the image `name` if `is_allowed` returns `true` for its numbers of pixels and of bytes in the file, which are known before
+    /// memory is allocated.
     ///
     /// # Errors
     /// Returns an error if the file is absent, damaged, or too large.
-    pub fn image(&mut self, name: &str, is_allowed: impl FnOnce(usize) -> bool) -> Result<Image> {
+    pub fn image(&mut self, name: &str, is_allowed: impl FnOnce(usize, usize) -> bool) -> Result<Image> {
         let file = self.file(name)?;
         let damaged = |why: image_webp::DecodingError| {
             Error::input(self.path, name, format!("damaged: {why}"), "a WebP image")
@@ -80,9 +83,14 @@ impl<'a> Reader<'a> {
         let mut decoder = WebPDecoder::new(Cursor::new(&file)).map_err(damaged)?;
         let (width, height) = decoder.dimensions();
         let count = width as usize * height as usize;
-        if !is_allowed(count) {
+        if !is_allowed(count, file.len()) {
             let found = format!("of {width}×{height} pixels");
-            return Err(Error::input(self.path, name, found, "about as many pixels as Gaussians"));
+            return Err(Error::input(
+                self.path,
+                name,
+                found,
+                "about as many pixels as Gaussians, and at most 256 times the bytes of the file",
+            ));
         }
         let bytes_per_pixel = if decoder.has_alpha() { 4 } else { 3 };
         let mut bytes = vec![0; count * bytes_per_pixel];
@@ -164,5 +172,13 @@ pub fn write_files(path: &Path, meta: &[u8], images: &[(&'static str, Vec<u8>)])
         partial.file.write_all(contents).map_err(Error::write(&path))?;
         partials.push(partial);
     }
-    partials.into_iter().try_for_each(PartialFile::persist)
+    partials.into_iter().try_for_each(PartialFile::persist)?;
+    // Images of an older splat of a higher SH degree.
+    let is_old = |name: &&&str| images.iter().all(|(written, _)| written != *name);
+    for old in
+        IMAGES.iter().filter(is_old).map(|name| path.with_file_name(name)).filter(|file| file.is_file())
+    {
+        std::fs::remove_file(&old).map_err(Error::write(&old))?;
+    }
+    Ok(())
 }

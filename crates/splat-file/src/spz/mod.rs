@@ -1,5 +1,5 @@
 //! Niantic's SPZ (spec 10.13): a byte for most values, grouped by kind over all Gaussians, compressed. Versions 1 to 4 are read, versions
-//! 2 to 4 are written. Rotations of version 2 have seven bits and are off by up to half a degree, those of later versions by a tenth.
+//! 2 to 4 are written. Rotations of version 2 have 8 bits per component, those of later versions 10.
 
 #[cfg(feature = "spz")]
 mod codec;
