@@ -292,7 +292,7 @@ mod tests {
             ("--scale 0", "expected a number above 0"),
             ("--scale nan", "expected a number above 0"),
             ("--translate 1,2", "expected 3 numbers with commas"),
-            ("--crop-box 1,2,3,4,5,x", "expected 6 numbers"),
+            ("--crop-box 1,2,3,4,5,x", "expected a number"),
             ("--crop-box 1,2,3", "expected 6 numbers"),
             ("--crop-sphere 0,0,0,-1", "a radius above 0"),
             ("--min-opacity 1.5", "from 0 to 1"),
