@@ -7,11 +7,10 @@ use crate::morton::morton_order;
 use crate::ply::degree_of_rest;
 use crate::ply_body::columns;
 use crate::ply_header::{Header, Kind, Scalar};
-use crate::rotations::normalized;
+use crate::rotations::{from_smallest_three, smallest_three};
 use crate::splat::logit_of_opacity;
 use crate::{Error, Result, SH_C0, ShLimits, Splat};
 use globalsplat_files::write_atomically;
-use std::f64::consts::SQRT_2;
 use std::path::Path;
 
 /// Functions of the format.
@@ -240,27 +239,15 @@ fn unpack<const N: usize>(mut word: u32, bits: [u32; N]) -> [f64; N] {
     fractions
 }
 
-/// Packs a unit quaternion by the "smallest three" method: the index of the component with the largest magnitude in two bits, then the
-/// other three components. If the largest component is negative, the negative of the quaternion is packed, which is the same rotation.
+/// Packs a unit quaternion: the index of the component with the largest magnitude in two bits, then the other three components.
 fn pack_rotation(quaternion: [f32; 4]) -> u32 {
-    let larger = |a: &usize, b: &usize| quaternion[*a].abs().total_cmp(&quaternion[*b].abs());
-    let largest = (0..4).rev().max_by(larger).expect("four components");
-    let sign = f64::from(quaternion[largest].signum());
-    let mut others = (0..4).filter(|&index| index != largest);
-    let fractions = ROTATION_BITS.map(|_| {
-        let index = others.next().expect("three others");
-        sign * f64::from(quaternion[index]) / SQRT_2 + 0.5
-    });
+    let (largest, fractions) = smallest_three(quaternion);
     (largest as u32) << 30 | pack(fractions, ROTATION_BITS)
 }
 
 /// Unpacks the unit quaternion that [`pack_rotation`] packed.
 fn unpack_rotation(word: u32) -> [f32; 4] {
-    let others = unpack(word, ROTATION_BITS).map(|fraction| (fraction - 0.5) * SQRT_2);
-    let rest = 1. - others.iter().map(|other| other * other).sum::<f64>();
-    let mut quaternion = others.to_vec();
-    quaternion.insert((word >> 30) as usize, rest.max(0.).sqrt());
-    normalized(std::array::from_fn(|index| quaternion[index] as f32))
+    from_smallest_three((word >> 30) as usize, unpack(word, ROTATION_BITS))
 }
 
 /// Quantizes an SH coefficient to a byte. Values out of range are clamped.

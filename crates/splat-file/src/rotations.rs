@@ -2,6 +2,7 @@
 
 use crate::Splat;
 use std::borrow::Cow;
+use std::f64::consts::SQRT_2;
 
 /// Maximum binary exponent: quaternions whose largest component is within 2^±10 keep their length.
 const MAX_EXPONENT: f64 = 10.;
@@ -45,4 +46,27 @@ pub(crate) fn normalized(quaternion: [f32; 4]) -> [f32; 4] {
         true => quaternion.map(|part| (f64::from(part) / length) as f32),
         false => quaternion,
     }
+}
+
+/// Returns the index of the component with the largest magnitude of a unit quaternion, and the other three components mapped from
+/// [−√½, √½] to [0, 1]. If the largest one is negative, those of the negative quaternion, which is the same rotation.
+pub(crate) fn smallest_three(quaternion: [f32; 4]) -> (usize, [f64; 3]) {
+    let larger = |a: &usize, b: &usize| quaternion[*a].abs().total_cmp(&quaternion[*b].abs());
+    let largest = (0..4).rev().max_by(larger).expect("four components");
+    let sign = f64::from(quaternion[largest].signum());
+    let mut others = (0..4).filter(|&index| index != largest);
+    let fractions = [(); 3].map(|()| {
+        let index = others.next().expect("three others");
+        sign * f64::from(quaternion[index]) / SQRT_2 + 0.5
+    });
+    (largest, fractions)
+}
+
+/// Returns the unit quaternion of which [`smallest_three`] returned the index and the fractions.
+pub(crate) fn from_smallest_three(largest: usize, fractions: [f64; 3]) -> [f32; 4] {
+    let others = fractions.map(|fraction| (fraction - 0.5) * SQRT_2);
+    let rest = 1. - others.iter().map(|other| other * other).sum::<f64>();
+    let mut quaternion = others.to_vec();
+    quaternion.insert(largest, rest.max(0.).sqrt());
+    normalized(std::array::from_fn(|index| quaternion[index] as f32))
 }

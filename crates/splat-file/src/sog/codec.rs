@@ -5,11 +5,10 @@ use super::palette::{Codebook, Palette};
 use crate::formats::{Codec, Contents, WriteOptions, Writer};
 use crate::invalid::InvalidGaussians;
 use crate::morton::morton_order;
-use crate::rotations::normalized;
+use crate::rotations::{from_smallest_three, smallest_three};
 use crate::splat::logit_of_opacity;
 use crate::{Error, Result, ShLimits, Splat};
 use serde::{Deserialize, Serialize};
-use std::f64::consts::SQRT_2;
 use std::path::Path;
 
 /// Functions of the bundled and of the unbundled format.
@@ -190,7 +189,8 @@ fn read(path: &Path, mut reader: Reader, meta: &[u8]) -> Result<Contents> {
             splat.sh.push([0.; 3]);
             continue;
         };
-        splat.quaternions.push(unpack_rotation([a, b, c], largest.into()));
+        let fractions = [a, b, c].map(|byte| f64::from(byte) / 255.);
+        splat.quaternions.push(from_smallest_three(largest.into(), fractions));
         let [red, green, blue, opacity] = colours.pixels[index];
         let colour = |index: u8| look_up(&meta.sh0.codebook, &meta.sh0.files[0], index);
         splat.sh.push([colour(red)?, colour(green)?, colour(blue)?]);
@@ -234,25 +234,10 @@ fn read(path: &Path, mut reader: Reader, meta: &[u8]) -> Result<Contents> {
     Ok(Contents { splat, invalid })
 }
 
-/// Unpacks a rotation (w, x, y, z) from all components but the largest one.
-fn unpack_rotation(others: [u8; 3], largest: usize) -> [f32; 4] {
-    let others = others.map(|byte| (f64::from(byte) / 255. - 0.5) * SQRT_2);
-    let rest = 1. - others.iter().map(|other| other * other).sum::<f64>();
-    let mut quaternion = others.to_vec();
-    quaternion.insert(largest, rest.max(0.).sqrt());
-    normalized(std::array::from_fn(|index| quaternion[index] as f32))
-}
-
-/// Packs a rotation of length 1. If its largest component is negative, the negative of the quaternion is packed, which is the same rotation.
+/// Packs a unit quaternion (w, x, y, z): all components but the largest one, and the index of that one.
 fn pack_rotation(quaternion: [f32; 4]) -> [u8; 4] {
-    let larger = |a: &usize, b: &usize| quaternion[*a].abs().total_cmp(&quaternion[*b].abs());
-    let largest = (0..4).rev().max_by(larger).expect("four components");
-    let sign = f64::from(quaternion[largest].signum());
-    let mut others = (0..4).filter(|&index| index != largest);
-    let [a, b, c] = [(); 3].map(|()| {
-        let part = sign * f64::from(quaternion[others.next().expect("three others")]);
-        ((part / SQRT_2 + 0.5) * 255.).round() as u8
-    });
+    let (largest, fractions) = smallest_three(quaternion);
+    let [a, b, c] = fractions.map(|fraction| (fraction * 255.).round() as u8);
     [a, b, c, FIRST_MODE + largest as u8]
 }
 
