@@ -55,6 +55,7 @@ impl Axes {
     pub fn harmonics(self) -> [f32; 15] {
         ODD.map(|odd| odd.iter().zip(self.0).map(|(&odd, sign)| if odd { sign } else { 1. }).product())
     }
+
     /// Converts the Gaussians of `splat` exactly: numbers change their signs only.
     pub fn convert(self, splat: &mut Splat) {
         self.convert_without_rotations(splat);

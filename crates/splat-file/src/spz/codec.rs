@@ -52,7 +52,6 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let threes = |bytes: &[u8], number: &dyn Fn(u8) -> f64| -> Vec<[f32; 3]> {
         bytes.as_chunks().0.iter().map(|of_one: &[u8; 3]| of_one.map(|byte| number(byte) as f32)).collect()
     };
-    let signs = axes.harmonics();
     let colours = threes(&streams.colours, &|byte| (f64::from(byte) / 255. - 0.5) / COLOUR_SCALE);
     let harmonics = threes(&streams.harmonics, &|byte| (f64::from(byte) - 128.) / 128.);
     let bases = (description.sh_degree + 1).pow(2);
@@ -60,7 +59,7 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     for (index, colour) in colours.into_iter().enumerate() {
         sh.push(colour);
         let of_one = &harmonics[index * (bases - 1)..][..bases - 1];
-        sh.extend(of_one.iter().zip(signs).map(|(colour, sign)| colour.map(|channel| sign * channel)));
+        sh.extend(of_one);
     }
     let rotations = match version {
         1 | 2 => {
@@ -68,10 +67,10 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         }
         _ => streams.rotations.as_chunks().0.iter().map(|&bytes| unpack_smallest_three(bytes)).collect(),
     };
-    let splat = Splat {
-        means: coordinates.as_chunks().0.iter().map(|&mean| axes.position(mean)).collect(),
+    let mut splat = Splat {
+        means: coordinates.as_chunks().0.to_vec(),
         log_scales: threes(&streams.scales, &|byte| f64::from(byte) / LOG_SCALE_STEPS + LOG_SCALE_BEGIN),
-        quaternions: rotations.into_iter().map(|rotation| axes.rotation(rotation)).collect(),
+        quaternions: rotations,
         opacity_logits: streams
             .opacities
             .iter()
@@ -82,6 +81,7 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         antialiased: description.antialiased,
         ..Splat::default()
     };
+    axes.convert(&mut splat);
     let mut invalid = InvalidGaussians::default();
     invalid.add_all(&splat);
     Ok(Contents { splat, invalid })
