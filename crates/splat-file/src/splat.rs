@@ -187,17 +187,38 @@ impl Splat {
         if self.origin == DVec3::ZERO && other.origin != DVec3::ZERO {
             return self.with_origin(other.origin).merged(other);
         }
-        let degree = self.sh_degree.max(other.sh_degree);
-        let other = other.with_origin(self.origin).with_sh_degree(degree);
-        let mut merged = self.with_sh_degree(degree);
-        merged.linear_scales =
-            self.linear_scales.clone().zip(other.linear_scales).map(|(a, b)| [a, b].concat());
-        merged.means.extend(other.means);
-        merged.log_scales.extend(other.log_scales);
-        merged.quaternions.extend(other.quaternions);
-        merged.opacity_logits.extend(other.opacity_logits);
-        merged.sh.extend(other.sh);
-        merged
+        let has_linear_scales = self.linear_scales.is_some() && other.linear_scales.is_some();
+        let joined = Splat::concat(&[self, &other.with_origin(self.origin)]);
+        Splat {
+            linear_scales: joined.linear_scales.filter(|_| has_linear_scales),
+            antialiased: self.antialiased,
+            origin: self.origin,
+            ..joined
+        }
+    }
+
+    /// Returns the Gaussians of all `parts`, with spherical harmonics of the highest degree, and linear scales if a part has them. Their means
+    /// stay as they are.
+    pub(crate) fn concat(parts: &[&Splat]) -> Self {
+        let sh_degree = parts.iter().map(|part| part.sh_degree).max().unwrap_or(0);
+        let is_linear = parts.iter().any(|part| part.linear_scales.is_some());
+        let mut all = Splat { sh_degree, linear_scales: is_linear.then(Vec::new), ..Splat::default() };
+        let bases = all.bases();
+        for part in parts {
+            all.means.extend(&part.means);
+            all.log_scales.extend(&part.log_scales);
+            all.quaternions.extend(&part.quaternions);
+            all.opacity_logits.extend(&part.opacity_logits);
+            if let Some(scales) = &mut all.linear_scales {
+                scales.extend((0..part.len()).map(|index| part.scale(index)));
+            }
+            for index in 0..part.len() {
+                let end = all.sh.len() + bases;
+                all.sh.extend(part.sh_of(index));
+                all.sh.resize(end, [0.; 3]);
+            }
+        }
+        all
     }
 
     /// Returns the size in bytes of the splat as a 3DGS PLY, the format that every program reads.

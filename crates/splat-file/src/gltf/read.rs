@@ -60,7 +60,8 @@ pub fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
             path.display()
         )));
     }
-    let mut splat = concat(&parts);
+    let mut splat = Splat::concat(&parts.iter().collect::<Vec<_>>());
+    splat.antialiased = parts.iter().all(|part| part.antialiased);
     Axes::LUF.convert_without_rotations(&mut splat);
     splat.quaternions.iter_mut().for_each(|quaternion| *quaternion = turn_rotation_back(*quaternion));
     splat.warnings = warnings;
@@ -250,32 +251,4 @@ fn moved(path: &Path, splat: Splat, place: &MeshNode) -> Result<Splat> {
         }
         other => other,
     })
-}
-
-/// Returns the Gaussians of all `parts`, with spherical harmonics of the highest degree.
-fn concat(parts: &[Splat]) -> Splat {
-    let sh_degree = parts.iter().map(|part| part.sh_degree).max().unwrap_or(0);
-    let is_linear = parts.iter().any(|part| part.linear_scales.is_some());
-    let mut all = Splat {
-        sh_degree,
-        antialiased: parts.iter().all(|part| part.antialiased),
-        linear_scales: is_linear.then(Vec::new),
-        ..Splat::default()
-    };
-    let bases = all.bases();
-    for part in parts {
-        all.means.extend(&part.means);
-        all.log_scales.extend(&part.log_scales);
-        all.quaternions.extend(&part.quaternions);
-        all.opacity_logits.extend(&part.opacity_logits);
-        if let Some(scales) = &mut all.linear_scales {
-            scales.extend((0..part.len()).map(|index| part.scale(index)));
-        }
-        for index in 0..part.len() {
-            let end = all.sh.len() + bases;
-            all.sh.extend(part.sh_of(index));
-            all.sh.resize(end, [0.; 3]);
-        }
-    }
-    all
 }
