@@ -87,7 +87,7 @@ impl Convert {
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
         let mut inputs = InputFiles::default();
         capture.iter().for_each(|capture| capture.add_input_files(&mut inputs));
-        self.edits.add_input_files(&mut inputs)?;
+        let (options, edits): (Vec<_>, Vec<_>) = self.edits.read(&mut inputs, warn)?.into_iter().unzip();
         splat_files(&self.to).iter().try_for_each(|file| inputs.check_file(file))?;
         if let Some(file) = &self.cameras_out {
             [&self.from, &self.to]
@@ -107,7 +107,6 @@ impl Convert {
         // The input is described before the output replaces it, in case they are the same file.
         let mut from = description(&self.from, &source)?;
         from["warnings"] = source.warnings.clone().into();
-        let (options, edits): (Vec<_>, Vec<_>) = self.edits.read(warn)?.into_iter().unzip();
         let cameras = capture.as_ref().map_or(vec![], |capture| capture.cameras());
         for (option, edit) in options.iter().zip(&edits) {
             if matches!(edit, SplatEdit::Merge(other) if other.antialiased != source.antialiased) {
@@ -119,8 +118,9 @@ impl Convert {
             }
         }
         let edited = edit_splat(&source, &edits, &cameras)?;
+        let count = source.len();
         let moved = match edited.from_original == DMat4::IDENTITY {
-            true => source.clone(),
+            true => source,
             false => edit_splat(&source, &[SplatEdit::Transform(edited.from_original)], &[])?.splat,
         };
         let cameras = move_cameras(&cameras, &edited.from_original);
@@ -175,7 +175,7 @@ impl Convert {
             print_json(&report);
         } else {
             println!("{}", line(&from));
-            let mut before = source.len();
+            let mut before = count;
             for (option, &count) in options.iter().zip(&edited.counts) {
                 let change = match count.cmp(&before) {
                     Ordering::Less => format!("{} removed, {count} left", before - count),

@@ -3,7 +3,7 @@
 use super::open_capture;
 use clap::{Arg, ArgAction, ArgMatches, Args, Command, FromArgMatches};
 use glam::{DMat4, DQuat, DVec3};
-use globalsplat::io::{InputFiles, Splat, SplatEdit, read_splat_without_invalid, splat_files};
+use globalsplat::io::{InputFiles, SplatEdit, read_splat_without_invalid, splat_files};
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::path::PathBuf;
 
@@ -163,26 +163,24 @@ fn parse_up(text: &str) -> Result<EditArgument, String> {
 pub struct Edits(Vec<(String, EditArgument)>);
 
 impl Edits {
-    /// Adds the files that the edits read.
-    pub fn add_input_files(&self, inputs: &mut InputFiles) -> globalsplat::Result<()> {
-        for (_, argument) in &self.0 {
-            match argument {
-                EditArgument::Edit(_) => {}
-                EditArgument::SeenBy(path) => open_capture(path)?.add_input_files(inputs),
-                EditArgument::Merge(path) => splat_files(path).iter().for_each(|file| inputs.add(file)),
-            }
-        }
-        Ok(())
-    }
-
-    /// Reads the files of the edits, and returns each edit with its option. `warn` receives the warnings of the splats that are read.
-    pub fn read(&self, warn: impl Fn(&[String])) -> globalsplat::Result<Vec<(&str, SplatEdit)>> {
-        let read = |argument: &EditArgument| -> globalsplat::Result<SplatEdit> {
+    /// Reads the files of the edits, and returns each edit with its option. The files are added to `inputs`; `warn` receives the warnings of the
+    /// splats that are read.
+    pub fn read(
+        &self,
+        inputs: &mut InputFiles,
+        warn: impl Fn(&[String]),
+    ) -> globalsplat::Result<Vec<(&str, SplatEdit)>> {
+        let mut read = |argument: &EditArgument| -> globalsplat::Result<SplatEdit> {
             Ok(match argument {
                 EditArgument::Edit(edit) => edit.clone(),
-                EditArgument::SeenBy(path) => SplatEdit::SeenBy(open_capture(path)?.cameras()),
+                EditArgument::SeenBy(path) => {
+                    let capture = open_capture(path)?;
+                    capture.add_input_files(inputs);
+                    SplatEdit::SeenBy(capture.cameras())
+                }
                 EditArgument::Merge(path) => {
-                    let splat: Splat = read_splat_without_invalid(path)?;
+                    splat_files(path).iter().for_each(|file| inputs.add(file));
+                    let splat = read_splat_without_invalid(path)?;
                     warn(&splat.warnings);
                     SplatEdit::Merge(Box::new(splat))
                 }
@@ -256,7 +254,7 @@ mod tests {
     fn edits_are_in_the_order_of_the_options() {
         let arguments = "x --translate -1,2,3 --scale 2 --filter-floaters --translate 4,5,6 --up -z --crop-sphere 0,0,0,1";
         let program = Program::try_parse_from(arguments.split(' ')).unwrap();
-        let edits = program.edits.read(|_| ()).unwrap();
+        let edits = program.edits.read(&mut InputFiles::default(), |_| ()).unwrap();
         let options: Vec<_> = edits.iter().map(|(option, _)| *option).collect();
         let expected = [
             "--translate=-1,2,3",
