@@ -60,16 +60,8 @@ NOTICE = re.compile(
 )
 # Names of temporary files and folders.
 TEMPORARY = re.compile(r"(^|/)\.[^/]+\.globalsplat-(partial(-\d+)?|old)(/|$)")
-VOLATILE = {
-    "seconds",
-    "seconds_of",
-    "seconds_from_start",
-    "begin_seconds",
-    "peak_memory_bytes",
-    "samples_per_second",
-    "forward_seconds",
-    "load_seconds",
-}
+# JSON fields that differ from run to run: times, rates and memory.
+VOLATILE = re.compile(r"(^|_)seconds?(_|$)|peak_memory")
 
 
 def plain(text):
@@ -81,7 +73,7 @@ def plain(text):
 def steady(value):
     """Returns a JSON value without the fields that differ from run to run."""
     if isinstance(value, dict):
-        return {key: steady(of) for key, of in value.items() if key not in VOLATILE}
+        return {key: steady(of) for key, of in value.items() if not VOLATILE.search(key)}
     return [steady(of) for of in value] if isinstance(value, list) else value
 
 
