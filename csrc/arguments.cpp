@@ -31,20 +31,22 @@ void Arguments::check() const {
   TORCH_CHECK(width > 0 && height > 0 && width <= kMaxSide && height <= kMaxSide, "the picture is ", width, "×",
               height, ", expected sides from 1 to ", kMaxSide);
   TORCH_CHECK(count < kMaxCount, "there are ", count, " Gaussians, expected fewer than ", kMaxCount);
-  TORCH_CHECK(eps2d >= 0, "eps2d is ", eps2d, ", expected 0 or more");
+  TORCH_CHECK(projection.eps2d >= 0, "eps2d is ", projection.eps2d, ", expected 0 or more");
+  TORCH_CHECK(projection.near_plane >= 0, "near_plane is ", projection.near_plane, ", expected 0 or more");
+  TORCH_CHECK(!projection.direct_colours || bases == 1, "colours have shape ", sh.sizes(), ", expected [B, N, 1, 3]");
 }
 
 Inputs Arguments::to_inputs(at::Device device) const {
   const auto type = means.scalar_type() == at::kDouble ? at::kDouble : at::kFloat;
   const auto there = [&](const Tensor& t) { return t.to(device, type).contiguous(); };
   return {{there(means), there(scales), there(quaternions), there(opacities), there(sh)},
-          there(w2c), there(intrinsics.detach()), width, height, eps2d, antialiased};
+          there(w2c), there(intrinsics.detach()), width, height, projection};
 }
 
 Arguments borrowed(const SplatArguments& of) {
   const auto tensor = [](size_t address) -> const Tensor& { return *reinterpret_cast<const Tensor*>(address); };
   return {tensor(of.means), tensor(of.scales), tensor(of.quaternions), tensor(of.opacities), tensor(of.sh),
-          tensor(of.w2c), tensor(of.intrinsics), of.width, of.height, of.eps2d, of.antialiased};
+          tensor(of.w2c), tensor(of.intrinsics), of.width, of.height, {of.eps2d, of.antialiased}};
 }
 
 }  // namespace globalsplat

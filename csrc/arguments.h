@@ -15,8 +15,7 @@ struct SplatArguments;  // shared with Rust, see src/render.rs
 struct Arguments {
   const Tensor &means, &scales, &quaternions, &opacities, &sh, &w2c, &intrinsics;
   int64_t width, height;
-  double eps2d;
-  bool antialiased;
+  raster::ProjectionSettings projection;
 
   // Throws if shapes or values are invalid.
   void check() const;

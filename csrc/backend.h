@@ -6,6 +6,8 @@
 
 #include <memory>
 
+#include "kernels/types.h"
+
 namespace globalsplat {
 
 using at::Tensor;
@@ -20,18 +22,23 @@ struct Inputs {
   Gaussians gaussians;
   Tensor w2c, intrinsics;
   int64_t width, height;  // pixels
-  double eps2d;           // pixels²
-  bool antialiased;       // as in SplatArguments
+  raster::ProjectionSettings projection;
 
   int64_t scenes() const { return w2c.size(0); }
   int64_t cameras() const { return w2c.size(1); }  // per scene
   int64_t count() const { return gaussians.means.size(1); }  // Gaussians per scene
 };
 
-// Results of a backward pass.
+// Gradients that a backward pass computes besides those of the Gaussians.
+struct GradientRequest {
+  bool w2c = false, means2d = false;
+};
+
+// Results of a backward pass. What isn't requested is undefined.
 struct Gradients {
   Gaussians gaussians;
-  Tensor w2c;  // [B, C, 4, 4] with last rows 0; undefined if not requested
+  Tensor w2c;      // [B, C, 4, 4] with last rows 0
+  Tensor means2d;  // [B, C, N, 2], of the projected means in pixels
 };
 
 // Outputs of splat(), or their gradients: [B, C, 3, H, W], [B, C, H, W], [B, C, H, W].
@@ -50,13 +57,17 @@ struct SavedState {
 };
 
 // Functions of a backend. New tensors have the device and the type of the inputs. Incoming gradients are contiguous. Backward functions
-// return gradients of all five Gaussian tensors, and of w2c if `of_cameras` is set.
+// return gradients of all five Gaussian tensors, and those that are requested. Only splat_backward() computes `means2d`.
 struct Backend {
   at::DeviceType device;
   RenderOutput (*splat)(const Inputs&, std::unique_ptr<const SavedState>& saved);
-  Gradients (*splat_backward)(const Inputs&, const RenderOutput& outputs, const RenderOutput& gradients, const SavedState&, bool of_cameras);
+  Gradients (*splat_backward)(const Inputs&, const RenderOutput& outputs, const RenderOutput& gradients, const SavedState&, GradientRequest);
   Projected (*project)(const Inputs&);
-  Gradients (*project_backward)(const Inputs&, const Projected& gradients, bool of_cameras);
+  Gradients (*project_backward)(const Inputs&, const Projected& gradients, GradientRequest);
 };
+
+// Returns the backend for tensors of this device and type. The CPU backend also serves devices without a backend of their own, and float64,
+// which exists to verify gradients.
+const Backend& backend_of(const Tensor& means);
 
 }  // namespace globalsplat

@@ -14,39 +14,45 @@
 #include "kernels/sh.h"
 
 namespace globalsplat {
-namespace {
 
-using torch::autograd::AutogradContext;
-using torch::autograd::tensor_list;
-
-// Returns the backend for tensors of this device and type. The CPU backend also serves devices without a backend of their own, and float64,
-// which exists to verify gradients.
 const Backend& backend_of(const Tensor& means) {
   if (means.scalar_type() == at::kDouble) return cpu::backend;
   if (const Backend* emulated = cuda::emulated_backend()) return *emulated;
   return means.device().type() == cuda::backend.device ? cuda::backend : cpu::backend;
 }
 
-// ---- state that autograd saves for a call: the seven input tensors and four settings, then the op's own tensors ----
+namespace {
+
+using torch::autograd::AutogradContext;
+using torch::autograd::tensor_list;
+
+// ---- state that autograd saves for a call: the seven input tensors, then the op's own tensors, and what isn't a tensor ----
 
 constexpr size_t kInputTensors = 7;
-constexpr size_t kInputs = 11;
+constexpr size_t kInputs = 10;
 
-void save(AutogradContext* ctx, const Inputs& in, const tensor_list& more = {}) {
+struct SavedCall : torch::CustomClassHolder {
+  SavedCall(const Inputs& in, std::unique_ptr<const SavedState> s)
+      : width(in.width), height(in.height), projection(in.projection), state(std::move(s)) {}
+  int64_t width, height;
+  raster::ProjectionSettings projection;
+  std::unique_ptr<const SavedState> state;
+};
+
+void save(AutogradContext* ctx, const Inputs& in, std::unique_ptr<const SavedState> state, const tensor_list& more = {}) {
   const Gaussians& g = in.gaussians;
   tensor_list tensors = {g.means, g.scales, g.quaternions, g.opacities, g.sh, in.w2c, in.intrinsics};
   tensors.insert(tensors.end(), more.begin(), more.end());
   ctx->save_for_backward(std::move(tensors));
-  ctx->saved_data["width"] = in.width;
-  ctx->saved_data["height"] = in.height;
-  ctx->saved_data["eps2d"] = in.eps2d;
-  ctx->saved_data["antialiased"] = in.antialiased;
+  ctx->saved_data["call"] = c10::IValue::make_capsule(c10::make_intrusive<SavedCall>(in, std::move(state)));
 }
 
-Inputs saved_inputs(AutogradContext* ctx, const tensor_list& t) {
-  return {{t[0], t[1], t[2], t[3], t[4]}, t[5], t[6], ctx->saved_data["width"].toInt(),
-          ctx->saved_data["height"].toInt(), ctx->saved_data["eps2d"].toDouble(),
-          ctx->saved_data["antialiased"].toBool()};
+c10::intrusive_ptr<SavedCall> saved_call(AutogradContext* ctx) {
+  return c10::static_intrusive_pointer_cast<SavedCall>(ctx->saved_data["call"].toCapsule());
+}
+
+Inputs saved_inputs(const SavedCall& call, const tensor_list& t) {
+  return {{t[0], t[1], t[2], t[3], t[4]}, t[5], t[6], call.width, call.height, call.projection};
 }
 
 // Index of w2c among the input tensors.
@@ -62,40 +68,34 @@ tensor_list gradients_of(const Gradients& gradients) {
 
 Tensor contiguous(const Tensor& t) { return t.defined() ? t.contiguous() : t; }
 
-struct SavedStateHolder : torch::CustomClassHolder {
-  explicit SavedStateHolder(std::unique_ptr<const SavedState> k) : saved(std::move(k)) {}
-  std::unique_ptr<const SavedState> saved;
-};
-
 // ---- the two ops ----
 
 struct SplatFunction : torch::autograd::Function<SplatFunction> {
-  static tensor_list forward(AutogradContext* ctx, Tensor means, Tensor scales, Tensor quaternions, Tensor opacities,
-                             Tensor sh, Tensor w2c, Tensor intrinsics, int64_t width, int64_t height, double eps2d, bool antialiased) {
-    const Inputs in{{means, scales, quaternions, opacities, sh}, w2c, intrinsics, width, height, eps2d, antialiased};
-    std::unique_ptr<const SavedState> saved;
-    const RenderOutput outputs = backend_of(means).splat(in, saved);
-    save(ctx, in, {outputs.rgb, outputs.alpha, outputs.depth});
-    ctx->saved_data["saved_state"] = c10::IValue::make_capsule(c10::make_intrusive<SavedStateHolder>(std::move(saved)));
+  static tensor_list forward(AutogradContext* ctx, Tensor means, Tensor scales, Tensor quaternions, Tensor opacities, Tensor sh,
+                             Tensor w2c, Tensor intrinsics, int64_t width, int64_t height, raster::ProjectionSettings projection) {
+    const Inputs in{{means, scales, quaternions, opacities, sh}, w2c, intrinsics, width, height, projection};
+    std::unique_ptr<const SavedState> state;
+    const RenderOutput outputs = backend_of(means).splat(in, state);
+    save(ctx, in, std::move(state), {outputs.rgb, outputs.alpha, outputs.depth});
     return {outputs.rgb, outputs.alpha, outputs.depth};
   }
 
   static tensor_list backward(AutogradContext* ctx, tensor_list g) {
     const tensor_list t = ctx->get_saved_variables();
-    const auto holder = c10::static_intrusive_pointer_cast<SavedStateHolder>(ctx->saved_data["saved_state"].toCapsule());
+    const auto call = saved_call(ctx);
     return gradients_of(backend_of(t[0])
-                            .splat_backward(saved_inputs(ctx, t), {t[kInputTensors], t[kInputTensors + 1], t[kInputTensors + 2]},
-                                            {contiguous(g[0]), contiguous(g[1]), contiguous(g[2])}, *holder->saved,
-                                            ctx->needs_input_grad(kW2c)));
+                            .splat_backward(saved_inputs(*call, t), {t[kInputTensors], t[kInputTensors + 1], t[kInputTensors + 2]},
+                                            {contiguous(g[0]), contiguous(g[1]), contiguous(g[2])}, *call->state,
+                                            {ctx->needs_input_grad(kW2c)}));
   }
 };
 
 struct ProjectFunction : torch::autograd::Function<ProjectFunction> {
-  static tensor_list forward(AutogradContext* ctx, Tensor means, Tensor scales, Tensor quaternions, Tensor opacities,
-                             Tensor sh, Tensor w2c, Tensor intrinsics, int64_t width, int64_t height, double eps2d, bool antialiased) {
-    const Inputs in{{means, scales, quaternions, opacities, sh}, w2c, intrinsics, width, height, eps2d, antialiased};
+  static tensor_list forward(AutogradContext* ctx, Tensor means, Tensor scales, Tensor quaternions, Tensor opacities, Tensor sh,
+                             Tensor w2c, Tensor intrinsics, int64_t width, int64_t height, raster::ProjectionSettings projection) {
+    const Inputs in{{means, scales, quaternions, opacities, sh}, w2c, intrinsics, width, height, projection};
     const Projected projected = backend_of(means).project(in);
-    save(ctx, in);
+    save(ctx, in, nullptr);
     ctx->mark_non_differentiable({projected.visible});
     return {projected.visible, projected.mean2d, projected.conic, projected.depth, projected.colour};
   }
@@ -103,9 +103,9 @@ struct ProjectFunction : torch::autograd::Function<ProjectFunction> {
   static tensor_list backward(AutogradContext* ctx, tensor_list g) {
     const tensor_list t = ctx->get_saved_variables();
     return gradients_of(backend_of(t[0])
-                            .project_backward(saved_inputs(ctx, t), {{}, contiguous(g[1]), contiguous(g[2]), contiguous(g[3]),
-                                                                     contiguous(g[4])},
-                                              ctx->needs_input_grad(kW2c)));
+                            .project_backward(saved_inputs(*saved_call(ctx), t), {{}, contiguous(g[1]), contiguous(g[2]), contiguous(g[3]),
+                                                                                  contiguous(g[4])},
+                                              {ctx->needs_input_grad(kW2c)}));
   }
 };
 
@@ -120,7 +120,7 @@ void run(const SplatArguments& of, rust::Slice<size_t> out) {
   const Inputs in = a.to_inputs(there == home.type() ? home : at::Device(there));
   const Gaussians& g = in.gaussians;
   const tensor_list results = Function::apply(g.means, g.scales, g.quaternions, g.opacities, g.sh, in.w2c, in.intrinsics,
-                                              in.width, in.height, in.eps2d, in.antialiased);
+                                              in.width, in.height, in.projection);
   for (size_t k = 0; k < out.size(); ++k) out[k] = reinterpret_cast<size_t>(new Tensor(results[k].to(home)));
 }
 

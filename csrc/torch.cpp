@@ -9,6 +9,7 @@
 #include "depth_search.cpp"
 #include "device.cpp"
 #include "image_losses.cpp"
+#include "library.cpp"
 #include "linear.cpp"
 #include "nccl.cpp"
 #include "ops.cpp"

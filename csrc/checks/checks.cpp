@@ -73,7 +73,7 @@ template <class T>
 class Render {
  public:
   Render(const Scene<T>& scene, int num_threads)
-      : settings_{scene.width, scene.height, 0.05, scene.antialiased, num_threads}, views_(scene.views) {
+      : settings_{scene.width, scene.height, scene.projection, num_threads}, views_(scene.views) {
     // Unwritten outputs differ from those of a render with another number of threads.
     const T unwritten = T(num_threads);
     const size_t pixels = size_t(scene.width) * size_t(scene.height);
@@ -82,6 +82,7 @@ class Render {
                          int64_t(g.opacities.size()), scene.bases});
       gradients_.push_back(g);
       for (auto* array : arrays(gradients_.back())) std::fill(array->begin(), array->end(), unwritten);
+      means2d_.emplace_back(2 * g.opacities.size() * views_.size() / scene.gaussians.size(), unwritten);
     }
     Random random(9);
     for (size_t k = 0; k < views_.size(); ++k) {
@@ -100,8 +101,10 @@ class Render {
 
   void backward() {
     std::vector<raster::GaussianGradients<T>> out;
-    for (Arrays<T>& g : gradients_)
-      out.push_back({g.means.data(), g.scales.data(), g.quaternions.data(), g.opacities.data(), g.sh.data()});
+    for (size_t b = 0; b < gradients_.size(); ++b) {
+      Arrays<T>& g = gradients_[b];
+      out.push_back({g.means.data(), g.scales.data(), g.quaternions.data(), g.opacities.data(), g.sh.data(), means2d_[b].data()});
+    }
     raster::StageTimes times;
     cameras_.assign(views_.size(), {});
     frame_->backward(scenes_, places<const T>(pictures_), places<const T>(output_gradients_), out, cameras_.data(), times);
@@ -118,6 +121,7 @@ class Render {
     for (size_t b = 0; b < gradients_.size(); ++b) {
       const auto ours = arrays(gradients_[b]), theirs = arrays(other.gradients_[b]);
       for (size_t k = 0; k < ours.size(); ++k) expect(same(*ours[k], *theirs[k]), "gradients differ from one thread's");
+      expect(same(means2d_[b], other.means2d_[b]), "gradients of projected means differ from one thread's");
     }
     expect(same(cameras_, other.cameras_), "cameras' gradients differ from one thread's");
   }
@@ -144,6 +148,7 @@ class Render {
   std::vector<Planes> pictures_, output_gradients_;  // output_gradients_: gradients of the loss
   std::vector<raster::CameraGradient<T>> cameras_;
   std::vector<Arrays<T>> gradients_;
+  std::vector<std::vector<T>> means2d_;  // gradients of projected means, one item per scene
   std::unique_ptr<raster::Frame<T>> frame_;
 };
 

@@ -25,7 +25,7 @@ struct Scene {
   int width, height, bases;            // bases: spherical harmonics per channel
   std::vector<Arrays<T>> gaussians;    // one item per scene of the batch
   std::vector<raster::View<T>> views;
-  bool antialiased = false;
+  raster::ProjectionSettings projection{0.05};
 };
 
 class Random {
@@ -215,7 +215,9 @@ inline std::vector<Scene<double>> all_scenes(int bases) {
   add_scattered("a long list", 8, 8, 1, 1, 10000);
 
   // Every scene is antialiased with two of the four numbers of bases.
-  for (size_t i = 0; i < scenes.size(); ++i) scenes[i].antialiased = (i + size_t(bases)) % 2 == 1;
+  for (size_t i = 0; i < scenes.size(); ++i) scenes[i].projection.antialiased = (i + size_t(bases)) % 2 == 1;
+  // A third of those with a single basis function have colours instead.
+  for (size_t i = 0; bases == 1 && i < scenes.size(); i += 3) scenes[i].projection.direct_colours = true;
   return scenes;
 }
 
@@ -229,7 +231,7 @@ inline Scene<double> many_gaussians(int bases) {
 template <class T>
 Scene<T> as(const Scene<double>& scene) {
   const auto numbers = [](const std::vector<double>& from) { return std::vector<T>(from.begin(), from.end()); };
-  Scene<T> out{scene.name, scene.width, scene.height, scene.bases, {}, {}, scene.antialiased};
+  Scene<T> out{scene.name, scene.width, scene.height, scene.bases, {}, {}, scene.projection};
   for (const Arrays<double>& g : scene.gaussians)
     out.gaussians.push_back({numbers(g.means), numbers(g.scales), numbers(g.quaternions), numbers(g.opacities), numbers(g.sh)});
   for (const raster::View<double>& view : scene.views) {

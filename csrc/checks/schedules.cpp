@@ -17,8 +17,10 @@ using Numbers = std::vector<float>;
 
 // Outputs and gradients of a render, for all scenes and views consecutively.
 struct RenderResult {
-  Numbers rgb, alpha, depth, means, scales, quaternions, opacities, sh, w2c;
-  std::vector<Numbers*> all() { return {&rgb, &alpha, &depth, &means, &scales, &quaternions, &opacities, &sh, &w2c}; }
+  Numbers rgb, alpha, depth, means, scales, quaternions, opacities, sh, w2c, means2d;
+  std::vector<Numbers*> all() {
+    return {&rgb, &alpha, &depth, &means, &scales, &quaternions, &opacities, &sh, &w2c, &means2d};
+  }
   static constexpr size_t kImages = 3;  // number of images, the first items of all()
 };
 
@@ -40,7 +42,8 @@ RenderResult nan_filled(const Scene<float>& scene) {
   const size_t count = count_of(scene) * scene.gaussians.size();
   const auto nans = [](size_t numbers) { return Numbers(numbers, std::nanf("")); };
   return {nans(3 * pixels), nans(pixels), nans(pixels), nans(3 * count), nans(3 * count), nans(4 * count),
-          nans(count), nans(size_t(scene.bases) * 3 * count), nans(16 * scene.views.size())};
+          nans(count), nans(size_t(scene.bases) * 3 * count), nans(16 * scene.views.size()),
+          nans(2 * count_of(scene) * scene.views.size())};
 }
 
 // Renders with the GPU kernels in the emulator, forward and backward. `seed` determines the order of blocks and threads.
@@ -71,14 +74,15 @@ RenderResult render_emulated(const Scene<float>& scene, uint64_t seed) {
   const cuda::Arguments arguments{{means.data(), scales.data(), quaternions.data(), opacities.data(), sh.data(),
                                    int64_t(count_of(scene)), scene.bases},
                                   w2c.data(), intrinsics.data(), scenes,
-                                  scenes == 0 ? 0 : int64_t(scene.views.size()) / scenes, scene.width, scene.height, 0.05,
-                                  scene.antialiased};
+                                  scenes == 0 ? 0 : int64_t(scene.views.size()) / scenes, scene.width, scene.height,
+                                  scene.projection};
   RenderResult result = nan_filled(scene);
   const cuda::emulated::Emulator device(seed);
   const cuda::Frame frame(device, arguments, {result.rgb.data(), result.alpha.data(), result.depth.data()});
   frame.backward(device, arguments, {result.rgb.data(), result.alpha.data(), result.depth.data()},
                  {g_rgb.data(), g_alpha.data(), g_depth.data()},
-                 {result.means.data(), result.scales.data(), result.quaternions.data(), result.opacities.data(), result.sh.data()},
+                 {result.means.data(), result.scales.data(), result.quaternions.data(), result.opacities.data(), result.sh.data(),
+                  result.means2d.data()},
                  result.w2c.data());
   return result;
 }
@@ -97,7 +101,8 @@ RenderResult render_on_cpu(const Scene<float>& scene) {
     gaussians.push_back({g.means.data(), g.scales.data(), g.quaternions.data(), g.opacities.data(), g.sh.data(), int64_t(count),
                          scene.bases});
     out.push_back({result.means.data() + 3 * count * b, result.scales.data() + 3 * count * b, result.quaternions.data() + 4 * count * b,
-                   result.opacities.data() + count * b, result.sh.data() + size_t(scene.bases) * 3 * count * b});
+                   result.opacities.data() + count * b, result.sh.data() + size_t(scene.bases) * 3 * count * b,
+                   result.means2d.data() + 2 * count * views / scene.gaussians.size() * b});
   }
   std::vector<raster::RenderOutput<float>> outputs;
   std::vector<raster::RenderOutput<const float>> pictures, gradients;
@@ -108,7 +113,7 @@ RenderResult render_on_cpu(const Scene<float>& scene) {
   }
   raster::StageTimes times;
   std::vector<raster::CameraGradient<float>> cameras(views);
-  const raster::Settings settings{scene.width, scene.height, 0.05, scene.antialiased, 2};
+  const raster::Settings settings{scene.width, scene.height, scene.projection, 2};
   const auto frame = raster::Frame<float>::draw(gaussians, scene.views, settings, outputs, times);
   frame->backward(gaussians, pictures, gradients, out, cameras.data(), times);
   for (size_t k = 0; k < views; ++k)

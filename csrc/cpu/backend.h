@@ -9,10 +9,10 @@ extern const Backend backend;
 
 // splat.cpp
 RenderOutput splat(const Inputs& in, std::unique_ptr<const SavedState>& saved);
-Gradients splat_backward(const Inputs& in, const RenderOutput& outputs, const RenderOutput& gradients, const SavedState& saved, bool of_cameras);
+Gradients splat_backward(const Inputs& in, const RenderOutput& outputs, const RenderOutput& gradients, const SavedState& saved, GradientRequest request);
 
 // projection.cpp
 Projected project(const Inputs& in);
-Gradients project_backward(const Inputs& in, const Projected& gradients, bool of_cameras);
+Gradients project_backward(const Inputs& in, const Projected& gradients, GradientRequest request);
 
 }  // namespace globalsplat::cpu

@@ -33,13 +33,15 @@ std::vector<raster::Gaussians<T>> scenes_of(const Inputs& in) {
 
 // Returns the gradients of Gaussians, one item per scene.
 template <class T>
-std::vector<raster::GaussianGradients<T>> gradients_of(const Gaussians& g) {
+std::vector<raster::GaussianGradients<T>> gradients_of(const Gradients& of) {
   std::vector<raster::GaussianGradients<T>> scenes;
+  const Gaussians& g = of.gaussians;
   const int64_t count = g.means.size(1), bases = g.sh.size(2);
   for (int64_t b = 0; b < g.means.size(0); ++b)
     scenes.push_back({g.means.data_ptr<T>() + b * count * 3, g.scales.data_ptr<T>() + b * count * 3,
                       g.quaternions.data_ptr<T>() + b * count * 4, g.opacities.data_ptr<T>() + b * count,
-                      g.sh.data_ptr<T>() + b * count * bases * 3});
+                      g.sh.data_ptr<T>() + b * count * bases * 3,
+                      of.means2d.defined() ? of.means2d.data_ptr<T>() + b * of.means2d[0].numel() : nullptr});
   return scenes;
 }
 

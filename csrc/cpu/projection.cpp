@@ -22,7 +22,7 @@ struct ProjectedScenes {
   explicit ProjectedScenes(const Inputs& in) : scenes(scenes_of<T>(in)), cameras(in.cameras()) {
     std::vector<raster::Splat<T>*> places;
     for (const auto& view : views_of<T>(in)) {
-      params.push_back(raster::make_projection_params(view.camera, int(in.width), int(in.height), in.eps2d, in.antialiased));
+      params.push_back(raster::make_projection_params(view.camera, int(in.width), int(in.height), in.projection));
       splats.emplace_back(size_t(in.count()));
       places.push_back(splats.back().data());
     }
@@ -67,7 +67,7 @@ Projected project_as(const Inputs& in) {
 }
 
 template <class T>
-Gradients project_backward_as(const Inputs& in, const Projected& gradients, bool of_cameras) {
+Gradients project_backward_as(const Inputs& in, const Projected& gradients, GradientRequest request) {
   const ProjectedScenes<T> projected(in);
   // One record per visible Gaussian: the sums over pixels that project_backward() converts to exactly these gradients.
   const size_t views = projected.splats.size(), count = size_t(in.count());
@@ -97,16 +97,16 @@ Gradients project_backward_as(const Inputs& in, const Projected& gradients, bool
     for (size_t i = 0; i < count; ++i) first[view][i + 1] += first[view][i];
     of_views.push_back({records[view].data(), first[view].data()});
   }
-  Gradients out{empty_like(in.gaussians), {}};
-  const auto places = gradients_of<T>(out.gaussians);
-  std::vector<raster::CameraGradient<T>> cameras(of_cameras ? views : 0);
+  Gradients out{empty_like(in.gaussians), {}, {}};
+  const auto places = gradients_of<T>(out);
+  std::vector<raster::CameraGradient<T>> cameras(request.w2c ? views : 0);
   for (size_t b = 0; b < projected.scenes.size(); ++b) {
     const int64_t view = int64_t(b) * projected.cameras;
     raster::kernels().of<T>().project_backward(projected.scenes[b], 0, int64_t(count), projected.params.data() + view,
                                                projected.cameras, of_views.data() + view, places[b],
-                                               of_cameras ? cameras.data() + view : nullptr);
+                                               request.w2c ? cameras.data() + view : nullptr);
   }
-  if (of_cameras) out.w2c = w2c_gradient(in, cameras);
+  if (request.w2c) out.w2c = w2c_gradient(in, cameras);
   return out;
 }
 
@@ -116,8 +116,8 @@ Projected project(const Inputs& in) {
   return dispatch_by_type(in, [&](auto number) { return project_as<decltype(number)>(in); });
 }
 
-Gradients project_backward(const Inputs& in, const Projected& gradients, bool of_cameras) {
-  return dispatch_by_type(in, [&](auto number) { return project_backward_as<decltype(number)>(in, gradients, of_cameras); });
+Gradients project_backward(const Inputs& in, const Projected& gradients, GradientRequest request) {
+  return dispatch_by_type(in, [&](auto number) { return project_backward_as<decltype(number)>(in, gradients, request); });
 }
 
 }  // namespace globalsplat::cpu

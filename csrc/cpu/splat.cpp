@@ -43,7 +43,7 @@ std::unique_ptr<raster::Frame<T>> draw(const Inputs& in, RenderOutput& out, rast
   out.rgb = at::empty({in.scenes(), in.cameras(), 3, in.height, in.width}, options);
   out.alpha = at::empty({in.scenes(), in.cameras(), in.height, in.width}, options);
   out.depth = at::empty_like(out.alpha);
-  const raster::Settings settings{int(in.width), int(in.height), in.eps2d, in.antialiased, get_num_threads()};
+  const raster::Settings settings{int(in.width), int(in.height), in.projection, get_num_threads()};
   return raster::Frame<T>::draw(scenes_of<T>(in), views_of<T>(in), settings, pictures_of<T>(out), times);
 }
 
@@ -59,15 +59,16 @@ RenderOutput splat(const Inputs& in, std::unique_ptr<const SavedState>& saved) {
 }
 
 Gradients splat_backward(const Inputs& in, const RenderOutput& outputs, const RenderOutput& gradients, const SavedState& saved,
-                         bool of_cameras) {
+                         GradientRequest request) {
   return dispatch_by_type(in, [&](auto number) {
     using T = decltype(number);
-    Gradients out{empty_like(in.gaussians), {}};
-    std::vector<raster::CameraGradient<T>> cameras(of_cameras ? size_t(in.scenes() * in.cameras()) : 0);
+    Gradients out{empty_like(in.gaussians), {}, {}};
+    if (request.means2d) out.means2d = at::empty({in.scenes(), in.cameras(), in.count(), 2}, in.gaussians.means.options());
+    std::vector<raster::CameraGradient<T>> cameras(request.w2c ? size_t(in.scenes() * in.cameras()) : 0);
     static_cast<const SavedFrame<T>&>(saved).frame->backward(
-        scenes_of<T>(in), pictures_of<const T>(outputs), pictures_of<const T>(gradients), gradients_of<T>(out.gaussians),
-        of_cameras ? cameras.data() : nullptr, last_times);
-    if (of_cameras) out.w2c = w2c_gradient(in, cameras);
+        scenes_of<T>(in), pictures_of<const T>(outputs), pictures_of<const T>(gradients), gradients_of<T>(out),
+        request.w2c ? cameras.data() : nullptr, last_times);
+    if (request.w2c) out.w2c = w2c_gradient(in, cameras);
     return out;
   });
 }

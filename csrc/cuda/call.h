@@ -16,6 +16,7 @@ using raster::GaussianGradients;
 using raster::Gaussians;
 using raster::Grid;
 using raster::ProjectionParams;
+using raster::ProjectionSettings;
 using raster::RenderOutput;
 using raster::Splat;
 using raster::SplatGradient;
@@ -65,7 +66,7 @@ inline constexpr int ceil_div(int64_t items, int of) { return int((items + of - 
 
 // Kernels, documented where they are defined: gaussians.h, tile_lists.h, losses.h, sort.h, tiles.h.
 extern "C" {
-__global__ void gs_lenses(Call, float eps2d, bool antialiased, const float* w2c, const float* intrinsics,
+__global__ void gs_lenses(Call, ProjectionSettings, const float* w2c, const float* intrinsics,
                           ProjectionParams<float>* params, uint32_t* tile_counts);
 __global__ void gs_project(Call, Gaussians<float>, const ProjectionParams<float>* params, Splat<float>* splats);
 __global__ void gs_cover(Call, const Splat<float>* splats, uint32_t* group_pairs, uint32_t* of_tiles, uint32_t* first,

@@ -42,7 +42,7 @@ ProjectedScenes::ProjectedScenes(const Device& device, const Arguments& of, bool
       splats(allocate_array<Splat<float>>(device, int64_t(call.views) * call.count)),
       tile_counts(counts_tiles ? allocate_array<uint32_t>(device, places_of_tiles(call)) : Memory()) {
   const int64_t num_threads = counts_tiles ? std::max<int64_t>(call.views, places_of_tiles(call)) : call.views;
-  GS_LAUNCH(device, gs_lenses, for_each(num_threads, kWarp), kWarp, call, float(of.eps2d), of.antialiased, of.w2c,
+  GS_LAUNCH(device, gs_lenses, for_each(num_threads, kWarp), kWarp, call, of.projection, of.w2c,
             of.intrinsics, as<ProjectionParams<float>>(params), as<uint32_t>(tile_counts));
   GS_LAUNCH(device, gs_project, for_each(call.count, kGaussianThreads, call.views), kGaussianThreads, call, of.gaussians,
             as<ProjectionParams<float>>(params), as<Splat<float>>(splats));

@@ -12,8 +12,7 @@ struct Arguments {
   const float* intrinsics;     // [B, C, 3, 3]
   int64_t scenes, cameras;     // B, and C cameras per scene
   int width, height;
-  double eps2d;
-  bool antialiased;
+  ProjectionSettings projection;
 };
 
 // The Gaussians of every scene, projected into each of the scene's views.

@@ -22,7 +22,7 @@ inline Gaussians<float> scene_of(const Gaussians<float>& all, int64_t scene) {
 inline GaussianGradients<float> scene_of(const GaussianGradients<float>& all, const Gaussians<float>& of, int64_t scene) {
   const int64_t first = scene * of.count;
   return {all.means + 3 * first, all.scales + 3 * first, all.quaternions + 4 * first, all.opacities + first,
-          all.sh + 3 * of.bases * first};
+          all.sh + 3 * of.bases * first, nullptr};
 }
 
 // Calls body(g) with a number of spherical harmonics that is a compile-time constant, so that loops over them keep values in registers.
@@ -40,12 +40,12 @@ extern "C" {
 
 // Computes the projection parameters, one view per thread. If `tile_counts` isn't null, sets it to 0 for every tile of every view, plus one
 // element.
-__global__ void gs_lenses(Call call, float eps2d, bool antialiased, const float* w2c, const float* intrinsics,
+__global__ void gs_lenses(Call call, ProjectionSettings projection, const float* w2c, const float* intrinsics,
                           ProjectionParams<float>* params, uint32_t* tile_counts) {
   const int64_t k = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
   if (k < call.views)
     params[k] = raster::make_projection_params(raster::camera_of(w2c + 16 * k, intrinsics + 9 * k), call.grid.width, call.grid.height,
-                                               double(eps2d), antialiased);
+                                               projection);
   if (tile_counts != nullptr && k <= int64_t(call.views) * call.grid.tiles()) tile_counts[k] = 0;
 }
 
@@ -108,7 +108,7 @@ __global__ void __launch_bounds__(kGaussianThreads, 4)
     for (int64_t k = member; k < call.cameras; k += sharing) {
       const int64_t place = (view + k) * call.count + i;
       const uint32_t from = is_there ? first[place] : 0, to = is_there ? first[place + 1] : 0;
-      float d[raster::kSplatGradientNumbers] = {}, of_camera[raster::kCameraNumbers] = {};
+      float d[raster::kSplatGradientNumbers] = {}, d_mean2d[2] = {}, of_camera[raster::kCameraNumbers] = {};
       for (uint32_t record = from; record < to; ++record) {
         const auto* const numbers = reinterpret_cast<const FloatPair*>(records + record);
         for (int n = 0; n < raster::kSplatGradientNumbers; ++n) d[n] += numbers[n / 2].numbers[n % 2];
@@ -121,17 +121,21 @@ __global__ void __launch_bounds__(kGaussianThreads, 4)
         const ProjectionParams<float>& of_view = params[view + k];
         float d_r[3];
         const Splat<float>& splat = splats[place];
+        const auto is_unclamped = [&](float colour) { return of_view.direct_colours || colour > 0; };
         for (int n = 0; n < 3; ++n) group.mean[n] = scene.means[3 * i + n];
         raster::lane::compute_directions(group, scene.bases, of_view, true, shading);
         raster::lane::shade_group_backward<float>(
-            scene.bases, shading, {splat.red > 0, splat.green > 0, splat.blue > 0}, d,
+            scene.bases, shading, {is_unclamped(splat.red), is_unclamped(splat.green), is_unclamped(splat.blue)}, d,
             [&](int n) { return coefficients[lane()][n]; },
             [&](int n, float x, float y) { sums_of_sh[n] = raster::lane::add_product(x, y, ever ? sums_of_sh[n] : 0); }, d_r);
         raster::lane::load_shapes(scene, i, i + 1, group);
         raster::lane::project_group(group, of_view, projection);
-        raster::lane::project_group_backward(group, of_view, projection, true, d, d_r, sum, camera_gradients != nullptr, of_camera);
+        raster::lane::project_group_backward(group, of_view, projection, true, d, d_r, sum, d_mean2d, camera_gradients != nullptr,
+                                             of_camera);
         ever = true;
       }
+      if (out.means2d != nullptr && is_there)
+        for (int n = 0; n < 2; ++n) out.means2d[2 * place + n] = d_mean2d[n];
       if (camera_gradients != nullptr) {
         const WarpReduction<raster::kCameraNumbers, kWarp> fold;
         const float number = fold(of_camera);

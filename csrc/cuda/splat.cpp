@@ -27,8 +27,8 @@ Arguments arguments_of(const Inputs& in) {
   const globalsplat::Gaussians& g = in.gaussians;
   return {{data<float>(g.means), data<float>(g.scales), data<float>(g.quaternions), data<float>(g.opacities),
            data<float>(g.sh), in.count(), int(g.sh.size(2))},
-          data<float>(in.w2c), data<float>(in.intrinsics), in.scenes(), in.cameras(), int(in.width), int(in.height), in.eps2d,
-          in.antialiased};
+          data<float>(in.w2c), data<float>(in.intrinsics), in.scenes(), in.cameras(), int(in.width), int(in.height),
+          in.projection};
 }
 
 template <class Number>
@@ -37,16 +37,18 @@ RenderOutput<Number> places_of(const globalsplat::RenderOutput& p) {
 }
 
 // Returns uninitialized gradients.
-Gradients empty_gradients(const Inputs& in, bool of_cameras) {
+Gradients empty_gradients(const Inputs& in, GradientRequest request) {
   const auto empty = [](const Tensor& t) { return at::empty_like(t); };
   const globalsplat::Gaussians& g = in.gaussians;
   return {{empty(g.means), empty(g.scales), empty(g.quaternions), empty(g.opacities), empty(g.sh)},
-          of_cameras ? empty(in.w2c) : Tensor()};
+          request.w2c ? empty(in.w2c) : Tensor(),
+          request.means2d ? at::empty({in.scenes(), in.cameras(), in.count(), 2}, g.means.options()) : Tensor()};
 }
 
-GaussianGradients<float> places_of(const globalsplat::Gaussians& g) {
+GaussianGradients<float> places_of(const Gradients& of) {
+  const globalsplat::Gaussians& g = of.gaussians;
   return {data<float>(g.means), data<float>(g.scales), data<float>(g.quaternions), data<float>(g.opacities),
-          data<float>(g.sh)};
+          data<float>(g.sh), of.means2d.defined() ? data<float>(of.means2d) : nullptr};
 }
 
 float* place_of_cameras(const Gradients& g) { return g.w2c.defined() ? data<float>(g.w2c) : nullptr; }
@@ -67,11 +69,11 @@ globalsplat::RenderOutput splat(const Inputs& in, std::unique_ptr<const SavedSta
 }
 
 Gradients splat_backward(const Inputs& in, const globalsplat::RenderOutput& outputs, const globalsplat::RenderOutput& gradients,
-                         const SavedState& saved, bool of_cameras) {
+                         const SavedState& saved, GradientRequest request) {
   const auto device = kernel_device(in.gaussians.means);
-  const Gradients out = empty_gradients(in, of_cameras);
+  const Gradients out = empty_gradients(in, request);
   static_cast<const SavedFrame&>(saved).frame.backward(*device, arguments_of(in), places_of<const float>(outputs),
-                                                     places_of<const float>(gradients), places_of(out.gaussians),
+                                                     places_of<const float>(gradients), places_of(out),
                                                      place_of_cameras(out));
   return out;
 }
@@ -97,7 +99,7 @@ Projected project(const Inputs& in) {
 
 // Creates one record per visible Gaussian, with the sums over pixels that are converted to exactly these gradients: ∂L/∂(u, v) = 2 ln
 // 2·UᵀM, and W = 2UNUᵀ for N = ∂L/∂(Σ2D⁻¹), where the single value xy stands for two entries.
-Gradients project_backward(const Inputs& in, const Projected& gradients, bool of_cameras) {
+Gradients project_backward(const Inputs& in, const Projected& gradients, GradientRequest request) {
   const auto device = kernel_device(in.gaussians.means);
   const ProjectedScenes projected(*device, arguments_of(in));
   const std::vector<Tensor> s = numbers_of(projected, in);
@@ -112,9 +114,9 @@ Gradients project_backward(const Inputs& in, const Projected& gradients, bool of
   const Tensor visible = (s[kZ] > 0).flatten();
   const Tensor records = all.flatten(0, 2).index_select(0, visible.nonzero().squeeze(1)).contiguous();
   const Tensor first = at::cat({at::zeros({1}, visible.options().dtype(at::kInt)), visible.cumsum(0, at::kInt)});
-  const Gradients out = empty_gradients(in, of_cameras);
+  const Gradients out = empty_gradients(in, request);
   projected.backward(*device, arguments_of(in), reinterpret_cast<const SplatGradient<float>*>(data<float>(records)),
-                reinterpret_cast<const uint32_t*>(data<int32_t>(first)), places_of(out.gaussians), place_of_cameras(out));
+                reinterpret_cast<const uint32_t*>(data<int32_t>(first)), places_of(out), place_of_cameras(out));
   return out;
 }
 

@@ -1,10 +1,10 @@
 // Projection of Gaussians into cameras, forward and backward, a vector of Gaussians at a time (spec 6.2).
 //
-//     t = W μ + p                          camera space; z ≤ 0.01 is dropped
+//     t = W μ + p                          camera space; z ≤ near_plane and z ≥ far_plane are dropped
 //     (u, v) = (f_x t_x/z + c_x, f_y t_y/z + c_y)
 //     J = [[f_x/z, 0, −f_x a/z], [0, f_y/z, −f_y b/z]],   a = clamp(t_x/z), b = clamp(t_y/z)
 //     Σ2D = H Hᵀ + eps2d·I with H = J W R S;  det ≤ 0 is dropped
-//     colour = max(0, ½ + Σ_b Y_b(d) sh_b),  d = (μ − o)/‖μ − o‖,  o = −Wᵀ p.
+//     colour = max(0, ½ + Σ_b Y_b(d) sh_b),  d = (μ − o)/‖μ − o‖,  o = −Wᵀ p;  with `direct_colours` colour = sh_0.
 //
 // If `antialiased` is set, opacities are multiplied by ρ = √(det(H Hᵀ) / det Σ2D), so that eps2d widens a Gaussian without adding to its
 // integral (Mip-Splatting, Yu et al. 2024, eq. 8).
@@ -140,7 +140,8 @@ GS_INLINE void project_group(const Group<T>& g, const ProjectionParams<T>& param
   for (int r = 0; r < 3; ++r)
     p.t[r] = c.rotation[3 * r] * g.mean[0] + c.rotation[3 * r + 1] * g.mean[1] + c.rotation[3 * r + 2] * g.mean[2] +
              c.translation[r];
-  p.visible = both(less(broadcast<T>(T(kNearPlane)), p.t[2]), less_equal(broadcast<T>(T(kMinAlpha)), g.opacity));
+  p.visible = both(less(broadcast<T>(params.near_plane), p.t[2]), less_equal(broadcast<T>(T(kMinAlpha)), g.opacity));
+  p.visible = both(p.visible, less(p.t[2], broadcast<T>(params.far_plane)));
   if (!any(p.visible)) return;
 
   p.inverse_z = T(1) / p.t[2];
@@ -195,6 +196,7 @@ GS_INLINE void make_splats(const ProjectionParams<T>& params, const Projection<T
                            Vector<T> out[16]) {
   using V = Vector<T>;
   const V zero{}, a = p.factor_a, b = p.factor_b, c = p.factor_c;
+  const auto clamped = [&](V colour) { return params.direct_colours ? colour : larger(colour, zero); };
   // α ≥ 1/255 ⟺ s ≤ log₂(255·opacity). The margin covers the rounding of s, whose terms may exceed s itself: at the rim of a splat by 1 +
   // |b|/c.
   const V exact = p.log2_opacity + T(kLog2Of255), skew = magnitude(b) / c;
@@ -207,9 +209,9 @@ GS_INLINE void make_splats(const ProjectionParams<T>& params, const Projection<T
                          b,
                          c,
                          p.log2_opacity,
-                         larger(s.colour[0], zero),
-                         larger(s.colour[1], zero),
-                         larger(s.colour[2], zero),
+                         clamped(s.colour[0]),
+                         clamped(s.colour[1]),
+                         clamped(s.colour[2]),
                          select(p.visible, p.t[2], zero),
                          reach,
                          radius * sqrt(bb_cc) / (a * c) * T(1 + 1e-5) + T(1e-3),
@@ -232,13 +234,14 @@ GS_INLINE void compute_directions(const Group<T>& g, int bases, const Projection
   s.inverse_distance = select(visible, T(1) / sqrt(distance2), V{});
   for (int k = 0; k < 3; ++k) s.direction[k] *= s.inverse_distance;
   sh_basis<T>(bases, s.direction, s.basis);
+  if (params.direct_colours) s.basis[0] = broadcast<T>(T(1));
 }
 
 template <class T>
 GS_INLINE void shade_group(const Group<T>& g, int bases, const ProjectionParams<T>& params, Mask<T> visible, Shading<T>& s) {
   compute_directions(g, bases, params, visible, s);
   for (int channel = 0; channel < 3; ++channel) {
-    s.colour[channel] = broadcast<T>(T(0.5));
+    s.colour[channel] = broadcast<T>(T(params.direct_colours ? 0 : 0.5));
     for (int k = 0; k < bases; ++k) s.colour[channel] = fma(s.basis[k], g.sh[3 * k + channel], s.colour[channel]);
   }
 }
@@ -296,12 +299,13 @@ GS_INLINE void shade_group_backward(int bases, const Shading<T>& s, const Mask<T
 }
 
 // Adds the gradients that one camera's pixel sums `d` give to the Gaussians, except for spherical harmonics, in lanes in which `touched` is
-// true; in other lanes `d` and `d_r` are 0. If `of_cameras` is set, `of_camera` receives the gradient of the camera from each lane, in
-// CameraGradient's order.
+// true; in other lanes `d` and `d_r` are 0. `d_mean2d` receives the gradient of the projected means. If `of_cameras` is set, `of_camera`
+// receives the gradient of the camera from each lane, in CameraGradient's order.
 template <class T>
 GS_INLINE void project_group_backward(const Group<T>& g, const ProjectionParams<T>& params, const Projection<T>& p, Mask<T> touched,
                                       const Vector<T> d[kSplatGradientNumbers], const Vector<T> d_r[3],
-                                      GroupGradient<T>& out, bool of_cameras, Vector<T> of_camera[kCameraNumbers]) {
+                                      GroupGradient<T>& out, Vector<T> d_mean2d[2], bool of_cameras,
+                                      Vector<T> of_camera[kCameraNumbers]) {
   using V = Vector<T>;
   const V zero{};
   const V power = d[0], power_p = d[1], power_r = d[2], power_pp = d[3], power_pr = d[4], power_rr = d[5];
@@ -317,6 +321,8 @@ GS_INLINE void project_group_backward(const Group<T>& g, const ProjectionParams<
   const V a = p.factor_a, b = p.factor_b, c = p.factor_c;
   const V d_u = two_ln2 * a * power_p;
   const V d_v = two_ln2 * (b * power_p + c * power_r);
+  d_mean2d[0] = select(touched, d_u, zero);
+  d_mean2d[1] = select(touched, d_v, zero);
   V m_xx = -two_ln2_squared * a * a * power_pp;
   V m_xy = -two_ln2_squared * a * (b * power_pp + c * power_pr);
   V m_yy = -two_ln2_squared * (b * b * power_pp + T(2) * b * c * power_pr + c * c * power_rr);
@@ -434,7 +440,7 @@ GS_INLINE void project_backward_group(const Gaussians<T>& g, int64_t i, int64_t 
   GroupGradient<T> sum;
   Mask<T> ever{};
   for (int64_t view = 0; view < views; ++view) {
-    V d[kSplatGradientNumbers], of_camera[kCameraNumbers] = {};
+    V d[kSplatGradientNumbers], d_mean2d[2] = {}, of_camera[kCameraNumbers] = {};
     const Mask<T> touched = sum_records(records_of(view), i, group.count, d);
     if (any(touched)) {
       ever = Mask<T>(ever | touched);
@@ -443,14 +449,16 @@ GS_INLINE void project_backward_group(const Gaussians<T>& g, int64_t i, int64_t 
       project_group(group, params[view], projection);
       if (any(projection.visible)) {  // all Gaussians with records are visible
         shade_group(group, g.bases, params[view], touched, shading);
-        const Mask<T> is_lit[3] = {less(V{}, shading.colour[0]), less(V{}, shading.colour[1]), less(V{}, shading.colour[2])};
+        const auto is_unclamped = [&](V colour) { return params[view].direct_colours ? touched : less(V{}, colour); };
+        const Mask<T> is_lit[3] = {is_unclamped(shading.colour[0]), is_unclamped(shading.colour[1]), is_unclamped(shading.colour[2])};
         V d_r[3];
         shade_group_backward<T>(
             g.bases, shading, is_lit, d, [&](int n) { return group.sh[n]; },
             [&](int n, V x, V y) { sum.sh[n] = add_product(x, y, sum.sh[n]); }, d_r);
-        project_group_backward(group, params[view], projection, touched, d, d_r, sum, of_cameras, of_camera);
+        project_group_backward(group, params[view], projection, touched, d, d_r, sum, d_mean2d, of_cameras, of_camera);
       }
     }
+    if (out.means2d != nullptr) store_columns(d_mean2d, 2, group.count, out.means2d + 2 * (view * g.count + i));
     if (of_cameras) add_camera_gradient(view, of_camera);
   }
   V d_scale[3], d_quaternion[4];

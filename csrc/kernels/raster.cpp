@@ -61,8 +61,7 @@ Frame<T>::Frame(const std::vector<View<T>>& views, const std::vector<Gaussians<T
       views_(views.size()),
       first_view_(scenes.size() + 1, 0) {
   for (const View<T>& view : views) {
-    projection_params_.push_back(make_projection_params(view.camera, settings.width, settings.height, settings.eps2d,
-                                                        settings.antialiased));
+    projection_params_.push_back(make_projection_params(view.camera, settings.width, settings.height, settings.projection));
     ++first_view_[size_t(view.scene) + 1];
   }
   for (size_t scene = 0; scene < scenes.size(); ++scene) first_view_[scene + 1] += first_view_[scene];

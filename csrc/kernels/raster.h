@@ -18,8 +18,7 @@ struct View {
 
 struct Settings {
   int width, height;
-  double eps2d;      // added to the diagonal of every 2D covariance, pixels²
-  bool antialiased;  // as in ProjectionParams
+  ProjectionSettings projection;
   int num_threads;
 };
 

@@ -6,8 +6,7 @@
 
 namespace globalsplat::raster {
 
-// Constants of the image formation model (the same for all renders, so they are not parameters).
-inline constexpr double kNearPlane = 0.01;          // Gaussians whose camera-space z is not above it are dropped
+// Constants of the image formation model. ProjectionSettings has those that callers may change.
 inline constexpr double kMinAlpha = 1.0 / 255.0;    // smaller values of α contribute nothing
 inline constexpr double kMaxAlpha = 0.999;          // maximum of α; no gradient passes the cap
 inline constexpr double kMinTransmittance = 1e-4;   // a Gaussian that would reduce T to this or less ends the pixel
@@ -46,6 +45,7 @@ struct GaussianGradients {
   T* quaternions;
   T* opacities;
   T* sh;
+  T* means2d;  // [cameras of the scene, N, 2], of the projected means; null if not requested
 };
 
 // Gradient with respect to a camera's pose: of the nine entries of `rotation`, treated as independent, then of `translation`.
@@ -53,6 +53,15 @@ inline constexpr int kCameraNumbers = 12;
 template <class T>
 struct CameraGradient {
   T numbers[kCameraNumbers];
+};
+
+// Settings of the projection that all cameras of a call share.
+struct ProjectionSettings {
+  double eps2d = 0;           // added to the diagonal of every 2D covariance, pixels²
+  bool antialiased = false;   // whether opacities are reduced by what eps2d adds to the splats' areas
+  bool direct_colours = false;  // whether `sh` holds colours [N, 1, 3] that are used as they are, instead of harmonics
+  double near_plane = 0.01;   // Gaussians whose camera-space z is not between near_plane and far_plane are dropped
+  double far_plane = 1e10;
 };
 
 // Pinhole camera: x_camera = rotation · x_world + translation, then pixels by the intrinsics.
@@ -68,8 +77,8 @@ template <class T>
 struct ProjectionParams {
   Camera<T> camera;
   int width, height;
-  T eps2d;                         // added to the diagonal of every 2D covariance, pixels²
-  bool antialiased;                // whether opacities are reduced by what eps2d adds to the splats' areas
+  T eps2d, near_plane, far_plane;  // as in ProjectionSettings
+  bool antialiased, direct_colours;
   T centre[3];                     // world
   T x_low, x_high, y_low, y_high;  // clamp range of x/z and y/z for the Jacobian
 };

@@ -1,0 +1,116 @@
+// The ops as PyTorch's dispatcher knows them, torch.ops.globalsplat: what the Python package calls. Their autograd formulas, and the shapes
+// of their results for fake tensors, are registered in Python (python/globalsplat/_ops.py).
+#include <ATen/ops/empty.h>
+#include <torch/library.h>
+
+#include "arguments.h"
+#include "backend.h"
+
+namespace globalsplat {
+namespace {
+
+using torch::jit::Stack;
+
+// Owner of a forward pass's state, and of the memory of the tensor [1] of int64 that stands for it.
+struct StateOwner {
+  int64_t value;
+  std::unique_ptr<const SavedState> state;
+};
+
+void delete_state(void* owner) { delete static_cast<StateOwner*>(owner); }
+
+Tensor to_tensor(std::unique_ptr<const SavedState> state) {
+  auto* const owner = new StateOwner{0, std::move(state)};
+  c10::DataPtr memory(&owner->value, owner, delete_state, at::kCPU);
+  return at::empty({0}, at::kLong).set_(c10::Storage(c10::Storage::use_byte_size_t(), sizeof(owner->value), std::move(memory)), 0, {1}, {1});
+}
+
+// Returns the state for which a tensor stands, or null if the tensor is a copy, as when saved tensors were moved to another device.
+const SavedState* state_of(const Tensor& tensor) {
+  const c10::DataPtr& memory = tensor.storage().data_ptr();
+  return memory.get_deleter() == delete_state ? static_cast<const StateOwner*>(memory.get_context())->state.get() : nullptr;
+}
+
+// Arguments of every op. Shapes: means [B, N, 3], quats [B, N, 4], scales [B, N, 3], opacities [B, N], colors [B, N, K, 3], viewmats
+// [B, C, 4, 4], Ks [B, C, 3, 3].
+#define GS_ARGUMENTS                                                                                                                  \
+  "Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor colors, Tensor viewmats, Tensor Ks, int width, int height, " \
+  "float eps2d, float near_plane, float far_plane, bool antialiased, bool direct_colors"
+constexpr size_t kArguments = 14;
+
+// Checks the arguments and returns them on the device of their backend.
+Inputs inputs_of(c10::ArrayRef<c10::IValue> of) {
+  const Tensor& means = of[0].toTensor();
+  const raster::ProjectionSettings projection{of[9].toDouble(), of[12].toBool(), of[13].toBool(), of[10].toDouble(), of[11].toDouble()};
+  const Arguments arguments{means,
+                            of[2].toTensor(),
+                            of[1].toTensor(),
+                            of[3].toTensor(),
+                            of[4].toTensor(),
+                            of[5].toTensor(),
+                            of[6].toTensor(),
+                            of[7].toInt(),
+                            of[8].toInt(),
+                            projection};
+  arguments.check();
+  const at::DeviceType device = backend_of(means).device;
+  return arguments.to_inputs(device == means.device().type() ? means.device() : at::Device(device));
+}
+
+// Replaces an op's arguments by its results.
+template <class... Results>
+void finish(Stack* stack, size_t arguments, const Results&... results) {
+  torch::jit::drop(*stack, arguments);
+  torch::jit::push(*stack, results...);
+}
+
+void splat_op(const c10::OperatorHandle&, Stack* stack) {
+  const Inputs in = inputs_of(torch::jit::last(*stack, kArguments));
+  std::unique_ptr<const SavedState> state;
+  const RenderOutput out = backend_of(in.gaussians.means).splat(in, state);
+  finish(stack, kArguments, out.rgb, out.alpha, out.depth, to_tensor(std::move(state)));
+}
+
+void splat_backward_op(const c10::OperatorHandle&, Stack* stack) {
+  constexpr size_t kAll = kArguments + 7;
+  const auto all = torch::jit::last(*stack, kAll);
+  const Inputs in = inputs_of(all.slice(0, kArguments));
+  const auto tensor = [&](size_t index) { return all[kArguments + index].toTensor().contiguous(); };
+  RenderOutput outputs{tensor(0), tensor(1), tensor(2)};
+  const Backend& backend = backend_of(in.gaussians.means);
+  const SavedState* state = state_of(all[kArguments + 3].toTensor());
+  std::unique_ptr<const SavedState> repeated;
+  if (state == nullptr) {
+    outputs = backend.splat(in, repeated);
+    state = repeated.get();
+  }
+  const Gradients d = backend.splat_backward(in, outputs, {tensor(4), tensor(5), tensor(6)}, *state, {true, true});
+  const Gaussians& g = d.gaussians;
+  finish(stack, kAll, g.means, g.quaternions, g.scales, g.opacities, g.sh, d.w2c, d.means2d);
+}
+
+void project_op(const c10::OperatorHandle&, Stack* stack) {
+  const Inputs in = inputs_of(torch::jit::last(*stack, kArguments));
+  const Projected out = backend_of(in.gaussians.means).project(in);
+  finish(stack, kArguments, out.visible, out.mean2d, out.conic, out.depth);
+}
+
+// Shapes of results: rgb [B, C, 3, H, W], alpha and depth [B, C, H, W]; visible and depths [B, C, N], means2d [B, C, N, 2], conics
+// [B, C, N, 3]. The gradients have the order of the arguments that they belong to, then those of means2d.
+TORCH_LIBRARY(globalsplat, library) {
+  library.def("splat(" GS_ARGUMENTS ") -> (Tensor rgb, Tensor alpha, Tensor depth, Tensor state)");
+  library.def("splat_backward(" GS_ARGUMENTS ", Tensor rgb, Tensor alpha, Tensor depth, Tensor state, Tensor d_rgb, Tensor d_alpha, "
+              "Tensor d_depth) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
+  library.def("project(" GS_ARGUMENTS ") -> (Tensor visible, Tensor means2d, Tensor conics, Tensor depths)");
+}
+
+void implement(torch::Library& library) {
+  library.impl("splat", torch::CppFunction::makeFromBoxedFunction<&splat_op>());
+  library.impl("splat_backward", torch::CppFunction::makeFromBoxedFunction<&splat_backward_op>());
+  library.impl("project", torch::CppFunction::makeFromBoxedFunction<&project_op>());
+}
+TORCH_LIBRARY_IMPL(globalsplat, CPU, library) { implement(library); }
+TORCH_LIBRARY_IMPL(globalsplat, CUDA, library) { implement(library); }
+
+}  // namespace
+}  // namespace globalsplat
