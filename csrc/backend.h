@@ -46,9 +46,10 @@ struct RenderOutput {
   Tensor rgb, alpha, depth;
 };
 
-// Outputs of project(), or their gradients, except that `visible` has none; shapes as in splat.h.
+// Outputs of project(), or their gradients, except that `visible` and `opacity` have none; shapes as in splat.h. `opacity`, [B, C, N], is
+// that of the splat, which antialiasing reduces.
 struct Projected {
-  Tensor visible, mean2d, conic, depth, colour;
+  Tensor visible, mean2d, conic, depth, colour, opacity;
 };
 
 // State other than tensors that a backend's splat() passes to its splat_backward().

@@ -65,14 +65,14 @@ void finish(Stack* stack, size_t arguments, const Results&... results) {
 }
 
 void splat_op(const c10::OperatorHandle&, Stack* stack) {
-  const Inputs in = inputs_of(torch::jit::last(*stack, kArguments));
+  const Inputs in = inputs_of(torch::jit::last(*stack, kArguments + 1).slice(0, kArguments));
   std::unique_ptr<const SavedState> state;
   const RenderOutput out = backend_of(in.gaussians.means).splat(in, state);
-  finish(stack, kArguments, out.rgb, out.alpha, out.depth, to_tensor(std::move(state)));
+  finish(stack, kArguments + 1, out.rgb, out.alpha, out.depth, to_tensor(std::move(state)));
 }
 
 void splat_backward_op(const c10::OperatorHandle&, Stack* stack) {
-  constexpr size_t kAll = kArguments + 7;
+  constexpr size_t kAll = kArguments + 9;
   const auto all = torch::jit::last(*stack, kAll);
   const Inputs in = inputs_of(all.slice(0, kArguments));
   const auto tensor = [&](size_t index) { return all[kArguments + index].toTensor().contiguous(); };
@@ -84,24 +84,27 @@ void splat_backward_op(const c10::OperatorHandle&, Stack* stack) {
     outputs = backend.splat(in, repeated);
     state = repeated.get();
   }
-  const Gradients d = backend.splat_backward(in, outputs, {tensor(4), tensor(5), tensor(6)}, *state, {true, true});
+  const GradientRequest request{all[kArguments + 7].toBool(), all[kArguments + 8].toBool()};
+  const Gradients d = backend.splat_backward(in, outputs, {tensor(4), tensor(5), tensor(6)}, *state, request);
   const Gaussians& g = d.gaussians;
-  finish(stack, kAll, g.means, g.quaternions, g.scales, g.opacities, g.sh, d.w2c, d.means2d);
+  const auto defined = [&](const Tensor& t) { return t.defined() ? t : at::empty({0}, g.means.options()); };
+  finish(stack, kAll, g.means, g.quaternions, g.scales, g.opacities, g.sh, defined(d.w2c), defined(d.means2d));
 }
 
 void project_op(const c10::OperatorHandle&, Stack* stack) {
   const Inputs in = inputs_of(torch::jit::last(*stack, kArguments));
   const Projected out = backend_of(in.gaussians.means).project(in);
-  finish(stack, kArguments, out.visible, out.mean2d, out.conic, out.depth);
+  finish(stack, kArguments, out.mean2d, out.conic, out.depth, out.opacity, out.visible);
 }
 
-// Shapes of results: rgb [B, C, 3, H, W], alpha and depth [B, C, H, W]; visible and depths [B, C, N], means2d [B, C, N, 2], conics
-// [B, C, N, 3]. The gradients have the order of the arguments that they belong to, then those of means2d.
+// Shapes of results: rgb [B, C, 3, H, W], alpha and depth [B, C, H, W]; visible, depths and opacities [B, C, N], means2d [B, C, N, 2], conics
+// [B, C, N, 3]. The argument means2d of splat is not read: it is there to receive the gradient of the projected means. The gradients have
+// the order of the arguments that they belong to. Those that aren't requested have no elements.
 TORCH_LIBRARY(globalsplat, library) {
-  library.def("splat(" GS_ARGUMENTS ") -> (Tensor rgb, Tensor alpha, Tensor depth, Tensor state)");
+  library.def("splat(" GS_ARGUMENTS ", Tensor? means2d) -> (Tensor rgb, Tensor alpha, Tensor depth, Tensor state)");
   library.def("splat_backward(" GS_ARGUMENTS ", Tensor rgb, Tensor alpha, Tensor depth, Tensor state, Tensor d_rgb, Tensor d_alpha, "
-              "Tensor d_depth) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
-  library.def("project(" GS_ARGUMENTS ") -> (Tensor visible, Tensor means2d, Tensor conics, Tensor depths)");
+              "Tensor d_depth, bool has_viewmats_grad, bool has_means2d_grad) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
+  library.def("project(" GS_ARGUMENTS ") -> (Tensor means2d, Tensor conics, Tensor depths, Tensor opacities, Tensor visible)");
 }
 
 void implement(torch::Library& library) {

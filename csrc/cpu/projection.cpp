@@ -1,6 +1,7 @@
 #include <ATen/ops/zeros.h>
 
 #include <algorithm>
+#include <cmath>
 #include <vector>
 
 #include "../kernels/kernels.h"
@@ -50,7 +51,7 @@ Projected project_as(const Inputs& in) {
     return at::zeros(tail, options);
   };
   const auto options = in.gaussians.means.options();
-  const Projected out{zeros({}, at::kLong), zeros({2}, options), zeros({3}, options), zeros({}, options), zeros({3}, options)};
+  const Projected out{zeros({}, at::kLong), zeros({2}, options), zeros({3}, options), zeros({}, options), zeros({3}, options), zeros({}, options)};
   const auto put = [](const Tensor& to, int64_t at, std::initializer_list<T> values) {
     std::copy(values.begin(), values.end(), to.data_ptr<T>() + int64_t(values.size()) * at);
   };
@@ -62,6 +63,7 @@ Projected project_as(const Inputs& in) {
     put(out.conic, at, {two_ln2 * s.a * s.a, two_ln2 * s.a * s.b, two_ln2 * (s.b * s.b + s.c * s.c)});
     put(out.depth, at, {s.z});
     put(out.colour, at, {s.red, s.green, s.blue});
+    put(out.opacity, at, {std::exp2(s.log2_opacity)});
   });
   return out;
 }

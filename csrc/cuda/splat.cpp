@@ -82,7 +82,7 @@ Gradients splat_backward(const Inputs& in, const globalsplat::RenderOutput& outp
 std::vector<Tensor> numbers_of(const ProjectedScenes& projected, const Inputs& in) {
   return tensor_of(projected.splats.get(), {in.scenes(), in.cameras(), in.count(), 16}, in.gaussians.means.options()).unbind(-1);
 }
-constexpr size_t kU = 0, kV = 1, kA = 2, kB = 3, kC = 4, kRed = 6, kZ = 9;  // indices of fields
+constexpr size_t kU = 0, kV = 1, kA = 2, kB = 3, kC = 4, kLog2Opacity = 5, kRed = 6, kZ = 9;  // indices of fields
 constexpr double kTwoLn2 = 2 / raster::kLog2E;
 
 // Σ2D⁻¹ = 2 ln 2·UᵀU with U = [[a, b], [0, c]].
@@ -94,7 +94,7 @@ Projected project(const Inputs& in) {
   const auto shown = [&](const Tensor& t) { return at::where(t.dim() > visible.dim() ? visible.unsqueeze(-1) : visible, t, 0); };
   return {visible.to(at::kLong), shown(at::stack({s[kU], s[kV]}, -1)),
           shown(kTwoLn2 * at::stack({a * a, a * b, b * b + c * c}, -1)), shown(s[kZ]),
-          shown(at::stack({s[kRed], s[kRed + 1], s[kRed + 2]}, -1))};
+          shown(at::stack({s[kRed], s[kRed + 1], s[kRed + 2]}, -1)), shown(s[kLog2Opacity].exp2())};
 }
 
 // Creates one record per visible Gaussian, with the sums over pixels that are converted to exactly these gradients: ∂L/∂(u, v) = 2 ln

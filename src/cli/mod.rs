@@ -22,7 +22,6 @@ mod memory;
 mod model;
 mod option_names;
 #[cfg(target_os = "linux")]
-mod oversubscription;
 mod pack;
 mod parity;
 mod progress;
@@ -138,8 +137,7 @@ pub fn main() -> ExitCode {
     memory::install_failure_handlers();
     // This must precede the start of other threads.
     globalsplat::model::flush_denormals();
-    #[cfg(target_os = "linux")]
-    let _guard = oversubscription::start_guard();
+    let _guard = globalsplat::device::OversubscriptionGuard::start();
     // Errors of libtorch that the library's own checks don't catch arrive as panics: the user still gets one sentence, and with
     // RUST_BACKTRACE=1 a backtrace.
     panic::set_hook(Box::new(|panic| {

@@ -19,9 +19,20 @@ const INTERVAL: Duration = Duration::from_millis(200);
 const START_THRESHOLD: f64 = 0.25;
 const STOP_THRESHOLD: f64 = 0.1;
 
-/// Starts the guard, which runs until the returned value is dropped. If the CPU time of other processes can't be measured,
-/// threads wait as usual.
-pub fn start_guard() -> Option<Background> {
+/// Guard against oversubscription, which runs until it is dropped: while other processes take cores, libtorch's threads don't spin while
+/// they wait for each other, which would slow down work on small tensors several times. The number of threads doesn't change.
+#[derive(Debug)]
+pub struct OversubscriptionGuard(#[expect(dead_code, reason = "is only dropped")] Option<Background>);
+
+impl OversubscriptionGuard {
+    /// Starts the guard. If the CPU time of other processes can't be measured, as on other systems than Linux, threads wait as usual.
+    pub fn start() -> Self {
+        OversubscriptionGuard(start_thread())
+    }
+}
+
+/// Starts the guard's thread.
+fn start_thread() -> Option<Background> {
     // Without the guard's thread, the program runs as if no other process used the cores.
     Background::start("oversub", |until: Receiver<()>| {
         let mut idle_teams = Vec::new();
@@ -55,7 +66,8 @@ fn start_idle_team() -> Option<Background> {
 
 /// Background thread that ends and is joined when this is dropped: a detached thread may still be inside libtorch when the
 /// process unloads libtorch.
-pub struct Background {
+#[derive(Debug)]
+struct Background {
     tell: Option<Sender<()>>,
     thread: Option<JoinHandle<()>>,
 }
@@ -89,6 +101,12 @@ struct Times {
 }
 
 impl Times {
+    #[cfg(not(target_os = "linux"))]
+    fn now() -> Option<Times> {
+        None
+    }
+
+    #[cfg(target_os = "linux")]
     fn now() -> Option<Times> {
         // SAFETY: both are plain data for which zero is a valid value, and the calls fill them.
         let (set, usage, tick) = unsafe {
@@ -175,7 +193,7 @@ mod tests {
 
     #[test]
     fn guard_thread_ends_when_dropped() {
-        let guard = start_guard();
+        let guard = OversubscriptionGuard::start();
         assert!(becomes("oversub", 1), "{}", called("oversub"));
         drop(guard);
         assert!(becomes("oversub", 0), "{}", called("oversub"));

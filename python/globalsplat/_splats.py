@@ -1,0 +1,170 @@
+"""Splat files as dictionaries."""
+
+import os
+import warnings
+from collections.abc import Mapping
+from typing import Any, Literal, TypedDict, cast, overload
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from . import _native
+
+#: Value of `eps2d` for which splats are made, in pixels², and for antialiased ones.
+EPS2D, ANTIALIASED_EPS2D = 0.05, 0.1
+
+Array = Any
+"""A NumPy array or a tensor."""
+
+
+class Splat(TypedDict):
+    """Gaussians, as arguments of :func:`rasterization` of the same names."""
+
+    means: Array
+    quats: Array
+    scales: Array
+    opacities: Array
+    colors: Array
+    sh_degree: int
+    eps2d: float
+    rasterize_mode: Literal["classic", "antialiased"]
+
+
+class Parameters(TypedDict):
+    """Gaussians before activation, as 3DGS and gsplat optimize and store them.
+
+    :attr:`scales` are logarithms and :attr:`opacities` logits. :attr:`sh0` has the first spherical harmonic, :math:`(N, 1, 3)`, and
+    :attr:`shN` the others, :math:`(N, K - 1, 3)`.
+    """
+
+    means: Array
+    quats: Array
+    scales: Array
+    opacities: Array
+    sh0: Array
+    shN: Array
+
+
+@overload
+def load_splat(path: str | os.PathLike[str], activated: Literal[True] = True) -> Splat: ...
+@overload
+def load_splat(path: str | os.PathLike[str], activated: Literal[False]) -> Parameters: ...
+def load_splat(path: str | os.PathLike[str], activated: bool = True) -> Splat | Parameters:
+    """Reads a splat file of any format that the program reads, such as .ply, .compressed.ply, .sog, .spz, .splat, .ksplat or .glb.
+
+    Args:
+        path (str or PathLike): the file.
+        activated (bool): returns arguments of :func:`rasterization` if ``True``, and the parameters that the file holds, bit for bit,
+            if ``False``.
+
+    Returns:
+        A dictionary of NumPy arrays in float32. Warnings of the reader are given as :class:`UserWarning`.
+
+    Raises:
+        ValueError: if the file isn't a valid splat.
+        OSError: if it can't be read.
+
+    Examples::
+
+        >>> splat = globalsplat.load_splat("room.ply")
+        >>> tensors = {name: torch.as_tensor(value) if hasattr(value, "shape") else value for name, value in splat.items()}
+        >>> image, alpha, meta = globalsplat.rasterization(**tensors, viewmats=viewmats, Ks=Ks, width=640, height=480)
+    """
+    raw, lines = _native.read_splat(path)
+    warn(lines)
+    if not activated:
+        parameters = {key: raw[name] for key, name in (("means", "means"), ("quats", "quats"))}
+        sh = raw["sh"]
+        return cast(
+            Parameters,
+            {**parameters, "scales": raw["log_scales"], "opacities": raw["opacity_logits"], "sh0": sh[:, :1], "shN": sh[:, 1:]},
+        )
+    return to_splat(raw)
+
+
+def save_splat(path: str | os.PathLike[str], splat: Mapping[str, Any], activated: bool = True) -> None:
+    """Writes a splat file in the format that the extension names. The file is replaced in one step.
+
+    Args:
+        path (str or PathLike): the file.
+        splat (dict): arrays or tensors of N Gaussians with the keys of :class:`Splat`, of which ``sh_degree``, ``eps2d`` and
+            ``rasterize_mode`` may be absent, or those of :class:`Parameters` if :attr:`activated` is ``False``.
+        activated (bool): as in :func:`load_splat`.
+
+    Raises:
+        ValueError: if shapes don't fit, a value isn't finite, or the extension is unknown.
+        OSError: if the file can't be written.
+
+    Examples::
+
+        >>> globalsplat.save_splat("room.spz", splat)
+        >>> globalsplat.save_splat("trained.ply", params, activated=False)  # an nn.ParameterDict as in gsplat's trainer
+    """
+    _native.write_splat(path, from_splat(splat, activated))
+
+
+def to_splat(raw: Mapping[str, Any]) -> Splat:
+    """Converts what the native module returns to arguments of rasterization()."""
+    antialiased = raw["antialiased"]
+    sh = raw["sh"]
+    return {
+        "means": raw["means"],
+        "quats": raw["quats"],
+        "scales": np.exp(raw["log_scales"].astype(np.float64)).astype(np.float32),
+        "opacities": (1.0 / (1.0 + np.exp(-raw["opacity_logits"].astype(np.float64)))).astype(np.float32),
+        "colors": sh,
+        "sh_degree": round(sh.shape[1] ** 0.5) - 1,
+        "eps2d": ANTIALIASED_EPS2D if antialiased else EPS2D,
+        "rasterize_mode": "antialiased" if antialiased else "classic",
+    }
+
+
+def from_splat(splat: Mapping[str, Any], activated: bool = True) -> dict[str, Any]:
+    """Converts a splat to what the native module takes."""
+    names = ["means", "quats", "scales", "opacities", *(["colors"] if activated else ["sh0", "shN"])]
+    missing = [name for name in names if name not in splat]
+    if missing:
+        raise ValueError(f"the splat has no {', '.join(missing)}, expected {', '.join(names)}")
+    values = {name: _to_array(name, splat[name]) for name in names}
+    means, scales, opacities = values["means"], values["scales"], values["opacities"]
+    if means.ndim != 2:
+        raise ValueError(f"means has shape {list(means.shape)}, expected [N, 3]")
+    opacities = opacities.reshape(len(means))
+    if activated:
+        sh = values["colors"]
+        with np.errstate(divide="ignore"):
+            scales = np.log(scales)
+            opacities = np.log(opacities) - np.log1p(-opacities)
+    else:
+        sh = np.concatenate([values["sh0"], values["shN"]], 1)
+    if sh.ndim != 3:
+        raise ValueError(f"colors has shape {list(sh.shape)}, expected spherical harmonics [N, K, 3]")
+
+    def contiguous(array: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
+        return np.ascontiguousarray(array, np.float32)
+
+    return {
+        "means": contiguous(means),
+        "quats": contiguous(values["quats"]),
+        "log_scales": contiguous(scales),
+        "opacity_logits": contiguous(opacities),
+        "sh": contiguous(sh),
+        "antialiased": splat.get("rasterize_mode") == "antialiased" if activated else False,
+    }
+
+
+def _to_array(name: str, value: Array) -> npt.NDArray[np.float64]:
+    """Returns a finite float64 array of an array or tensor."""
+    if isinstance(value, torch.Tensor):
+        value = value.detach().cpu().double().numpy()
+    array = np.asarray(value, np.float64)
+    if np.isnan(array).any():
+        raise ValueError(f"{name} has values that aren't numbers")
+    return array
+
+
+def warn(lines: list[str]) -> None:
+    """Gives the warnings of the native module to the caller of this package's function."""
+    for line in lines:
+        warnings.warn(line, stacklevel=3)

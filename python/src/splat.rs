@@ -1,0 +1,96 @@
+//! Splat files as dictionaries of arrays.
+
+use crate::error::to_python;
+use crate::work::run;
+use globalsplat::io::{ShLimits, Splat, check_writable_splat, fit_splat};
+use numpy::{PyArray, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use std::path::PathBuf;
+
+/// Reads a splat file of any format. Returns the parameters that 3DGS optimizes, and the warnings of the reader.
+#[pyfunction]
+pub fn read_splat(py: Python<'_>, path: PathBuf) -> PyResult<(Bound<'_, PyDict>, Vec<String>)> {
+    let splat = run(py, || Ok(globalsplat::io::read_splat(&path)?))?;
+    let warnings = splat.warnings.clone();
+    Ok((to_dict(py, splat)?, warnings))
+}
+
+/// Writes a splat file in the format that the file's extension names.
+#[pyfunction]
+pub fn write_splat(py: Python<'_>, path: PathBuf, splat: Parameters) -> PyResult<()> {
+    let splat = splat.into_splat()?;
+    run(py, || {
+        check_writable_splat(&path)?;
+        let fitted = fit_splat(&path, &splat, &ShLimits::up_to(splat.sh_degree), &[])?;
+        Ok(globalsplat::io::write_splat(&path, &fitted)?)
+    })
+}
+
+/// Returns the parameters of `splat`, with means in world coordinates.
+pub fn to_dict(py: Python<'_>, splat: Splat) -> PyResult<Bound<'_, PyDict>> {
+    let (count, bases) = (splat.len(), splat.bases());
+    let origin = splat.origin;
+    let world = |mean: [f32; 3]| (origin + glam::Vec3::from(mean).as_dvec3()).as_vec3().to_array();
+    let means: Vec<[f32; 3]> = splat.means.iter().copied().map(world).collect();
+    let array = |values: Vec<f32>, shape: &[usize]| PyArray::from_vec(py, values).reshape(shape.to_vec());
+    let dict = PyDict::new(py);
+    dict.set_item("means", array(means.into_flattened(), &[count, 3])?)?;
+    dict.set_item("quats", array(splat.quaternions.into_flattened(), &[count, 4])?)?;
+    dict.set_item("log_scales", array(splat.log_scales.into_flattened(), &[count, 3])?)?;
+    dict.set_item("opacity_logits", array(splat.opacity_logits, &[count])?)?;
+    dict.set_item("sh", array(splat.sh.into_flattened(), &[count, bases, 3])?)?;
+    dict.set_item("antialiased", splat.antialiased)?;
+    Ok(dict)
+}
+
+/// Parameters of Gaussians, as [`to_dict`] returns them.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+pub struct Parameters<'py> {
+    means: PyReadonlyArray2<'py, f32>,
+    quats: PyReadonlyArray2<'py, f32>,
+    log_scales: PyReadonlyArray2<'py, f32>,
+    opacity_logits: PyReadonlyArray1<'py, f32>,
+    sh: PyReadonlyArray3<'py, f32>,
+    antialiased: bool,
+}
+
+impl Parameters<'_> {
+    /// Returns a splat with the origin of its coordinates at zero.
+    pub fn into_splat(self) -> PyResult<Splat> {
+        let bases = self.sh.as_array().shape()[1];
+        let degree = bases.isqrt().wrapping_sub(1);
+        if degree > 3 || (degree + 1).pow(2) != bases {
+            return Err(PyValueError::new_err(format!(
+                "colors has {bases} spherical harmonics per Gaussian, expected 1, 4, 9 or 16"
+            )));
+        }
+        let splat = Splat::new(
+            degree,
+            rows("means", self.means.as_slice())?,
+            rows("scales", self.log_scales.as_slice())?,
+            rows("quats", self.quats.as_slice())?,
+            rows::<1>("opacities", self.opacity_logits.as_slice())?.into_flattened(),
+            rows("colors", self.sh.as_slice())?,
+        )
+        .map_err(to_python)?;
+        Ok(Splat { antialiased: self.antialiased, ..splat })
+    }
+}
+
+/// Returns the numbers of a contiguous array in rows of N.
+fn rows<const N: usize>(
+    name: &str,
+    values: Result<&[f32], impl std::fmt::Display>,
+) -> PyResult<Vec<[f32; N]>> {
+    let values = values.map_err(|why| PyValueError::new_err(format!("{name}: {why}")))?;
+    match values.as_chunks() {
+        (rows, []) => Ok(rows.to_vec()),
+        _ => Err(PyValueError::new_err(format!(
+            "{name} has {} numbers, expected a multiple of {N}",
+            values.len()
+        ))),
+    }
+}
