@@ -27,8 +27,8 @@ weights() {
 # Makes .venv, unless it is there, and checks the version of the Python that it needs.
 make_venv() {
     local python="${PYTHON:-python3}"
-    if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null; then
-        missing "no Python 3.10 or newer found; install one or name it with PYTHON=... (it brings libtorch and runs the parity checks)"
+    if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then
+        missing "no Python 3.11 or newer found; install one or name it with PYTHON=... (it brings libtorch and runs the parity checks)"
     fi
     [ -x .venv/bin/python ] || "$python" -m venv .venv \
         || missing "$python can't make a virtual environment; install its venv module (Debian: apt install python3-venv)"
