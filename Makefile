@@ -102,9 +102,9 @@ parity-pytest:
 	$(CARGO) build --release --locked --example make_rooms
 	.venv/bin/python -m pytest -q parity
 parity-self-test:
-	.venv/bin/python parity/run.py --self-test $(SELF_TEST)
+	.venv/bin/python -m parity --self-test $(SELF_TEST)
 parity-kernels:
-	.venv/bin/python parity/run.py --only '[pr][ra]*_float32,photometric,ssim,depth_smoothness' --cuda-on-cpu 1 --self-test $(SELF_TEST)
+	.venv/bin/python -m parity --only '[pr][ra]*_float32,photometric,ssim,depth_smoothness' --cuda-on-cpu 1 --self-test $(SELF_TEST)
 
 # The whole self-test instead of a quarter.
 .PHONY: parity-full

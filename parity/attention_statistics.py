@@ -14,16 +14,17 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
-import reference.stream
 import torch
-from harness import draw
-from harness.names import reference_config
 from PIL import Image
-from reference.encoder import encode
-from reference.layers import layer_norm, linear
-from reference.normalize import normalize_scene
-from reference.tokens import view_tokens
 from safetensors import safe_open
+
+from parity import reference
+from parity.harness import draw
+from parity.harness.names import reference_config
+from parity.reference.encoder import encode
+from parity.reference.layers import layer_norm, linear
+from parity.reference.normalize import normalize_scene
+from parity.reference.tokens import view_tokens
 
 
 def read_model(path):

@@ -17,18 +17,13 @@ import time
 from pathlib import Path
 
 import numpy as np
-import reference.decoder
-import reference.encoder
-import reference.layers
-import reference.model
-import reference.rays
-import reference.stream
-import reference.tokens
 import torch
-from harness import draw
-from harness.names import reference_config
 from torch.nn import functional
 from torch.utils.flop_counter import FlopCounterMode
+
+from parity import reference
+from parity.harness import draw
+from parity.harness.names import reference_config
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SIZE = 256

@@ -18,11 +18,11 @@ import time
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from harness.areas import CASES
-from harness.document import format_document
-from harness.exchange import ProgramError, program
-from harness.runner import run_cases
-from harness.table import as_json, self_test_report, table
+from parity.harness.areas import CASES
+from parity.harness.document import format_document
+from parity.harness.exchange import ProgramError, program
+from parity.harness.runner import run_cases
+from parity.harness.table import as_json, self_test_report, table
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 WRONG_REQUEST = 2

@@ -2,10 +2,11 @@
 
 import numpy as np
 import torch
-from reference.loss.lpips import COMPARED, NETWORKS
-from reference.loss.vgg19 import BLOCKS
-from reference.normalize import invert_rigid
-from reference.rotation import matrix_from_quaternion
+
+from ..reference.loss.lpips import COMPARED, NETWORKS
+from ..reference.loss.vgg19 import BLOCKS
+from ..reference.normalize import invert_rigid
+from ..reference.rotation import matrix_from_quaternion
 
 AUXILIARIES = 4
 MAIN_16K = {

@@ -10,9 +10,9 @@ import torch
 from .areas import CASES
 from .close_calls import resolve_close_calls
 from .compare import compare
-from .perturb import find_undetected
 from .evaluate import Evaluation
 from .exchange import Request, exchange
+from .perturb import find_undetected
 from .registry import Draw
 from .tolerance import Tolerance
 

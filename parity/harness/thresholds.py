@@ -6,7 +6,8 @@ without being equal. Rounding may then decide, and neither the pixel nor its gra
 """
 
 import torch
-from reference import splat
+
+from ..reference import splat
 
 MOST_TRIES = 100  # maximum number of attempts to draw inputs without doubtful pixels or close calls
 

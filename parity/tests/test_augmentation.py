@@ -1,17 +1,12 @@
 """Tests of the reference's resizing against Pillow, and of simple properties of its colour jitter."""
 
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-REPOSITORY = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(REPOSITORY / "parity"))
-
-from reference import jitter, resample  # noqa: E402
+from parity.reference import jitter, resample
 
 
 def saturated(rng, height, width):

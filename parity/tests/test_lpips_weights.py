@@ -4,18 +4,12 @@ import array
 import io
 import json
 import pickle
-import sys
 import tarfile
-from pathlib import Path
 
+import lpips_weights
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
-
-REPOSITORY = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(REPOSITORY / "scripts"))
-
-import lpips_weights  # noqa: E402
 
 
 class MakesAFile:

@@ -7,19 +7,16 @@ Golden tensors are read from $GLOBALSPLAT_GOLDEN, or else from ../shared/golden 
 import json
 import math
 import os
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import load_file
 
+from parity.reference import decoder, encoder, model, normalize, rays, rotation, schedule, splat, tokens
+from parity.reference.loss import consistency, decoder_regularization, frustum, lpips, mse, subsets
+
 REPOSITORY = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(REPOSITORY / "parity"))
-
-from reference import decoder, encoder, model, normalize, rays, rotation, schedule, splat, tokens  # noqa: E402
-from reference.loss import consistency, decoder_regularization, frustum, lpips, mse, subsets  # noqa: E402
-
 torch.set_num_threads(1)
 
 GOLDEN = Path(os.environ.get("GLOBALSPLAT_GOLDEN", REPOSITORY.parent / "shared" / "golden"))

@@ -3,11 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-import reference.encoder
-import reference.layers
-import reference.stream
 import torch
 
+from ... import reference
 from .. import draw
 from ..draw import integer, normal
 from ..names import reference_config, with_prefix

@@ -1,14 +1,8 @@
 """Cases of the terms of the training objective that need no trained network."""
 
 import numpy as np
-import reference.loss.consistency
-import reference.loss.decoder_regularization
-import reference.loss.depth_smoothness
-import reference.loss.frustum
-import reference.loss.mask
-import reference.loss.mse
-import reference.loss.ssim
 
+from ... import reference
 from .. import draw
 from ..draw import integer, normal, uniform
 from ..registry import Draw, by, case, reference_for

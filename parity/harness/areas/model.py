@@ -1,7 +1,6 @@
 """Cases of the complete model, from images to Gaussians."""
 
-import reference.model
-
+from ... import reference
 from .. import draw
 from ..draw import integer, uniform
 from ..names import reference_config

@@ -1,9 +1,8 @@
 """Cases of the losses that compare the features of trained networks."""
 
 import numpy as np
-import reference.loss.lpips
-import reference.loss.vgg19
 
+from ... import reference
 from .. import draw
 from ..close_calls import ON_CPU, ON_GPU, calls_within, closest, decisions_of_lpips, decisions_of_vgg19
 from ..draw import uniform

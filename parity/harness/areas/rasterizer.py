@@ -1,9 +1,9 @@
 """Cases of projection and rasterizer, in float64 and float32."""
 
 import numpy as np
-import reference.splat
 import torch
 
+from ... import reference
 from .. import scenes
 from ..registry import Draw, case, reference_for
 from ..thresholds import MOST_TRIES, doubtful_pixels

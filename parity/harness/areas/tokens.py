@@ -1,8 +1,6 @@
 """Cases of the tokenizer, from images and cameras to the tokens that the encoder reads."""
 
-import reference.rays
-import reference.tokens
-
+from ... import reference
 from .. import draw
 from ..draw import integer, normal
 from ..names import reference_config, with_prefix

@@ -3,10 +3,9 @@
 from itertools import product
 
 import numpy as np
-import reference.loss.subsets
-import reference.schedule
 import torch
 
+from ... import reference
 from ..draw import normal
 from ..registry import Draw, case, reference_for
 from ..tolerance import FLOAT64
