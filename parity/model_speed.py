@@ -70,7 +70,9 @@ class Torch:
     def __init__(self, views):
         rng = np.random.default_rng(0)
         self.config = reference_config(draw.MAIN_16K)
-        inputs = {"images": draw.uniform(rng, 0.0, 1.0, 1, views, 3, SIZE, SIZE)} | draw.views(rng, 1, views, SIZE, SIZE)
+        inputs = {"images": draw.uniform(rng, 0.0, 1.0, 1, views, 3, SIZE, SIZE)} | draw.views(
+            rng, 1, views, SIZE, SIZE
+        )
         self.inputs = [torch.from_numpy(inputs[name]) for name in ("images", "c2w", "intrinsics")]
         params = {name: torch.from_numpy(value) for name, value in draw.parameters(rng, draw.MAIN_16K).items()}
         self.params = params | {"gaussian_decoder.patch_center_bias": torch.tensor([[[0.0, 0.0, 1.5]]])}
@@ -123,7 +125,9 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--views", metavar="N", type=int, default=24, help="number of photos (default: 24)")
     parser.add_argument("--rounds", metavar="N", type=int, default=3, help="alternating measurements (default: 3)")
-    parser.add_argument("--precision", choices=["f32", "bf16"], nargs="+", default=["f32", "bf16"], help="(default: both)")
+    parser.add_argument(
+        "--precision", choices=["f32", "bf16"], nargs="+", default=["f32", "bf16"], help="(default: both)"
+    )
     parser.add_argument("--gflop", action="store_true", help="only print the PyTorch model's FLOP count")
     parser.add_argument("--binary", metavar="PATH", default=str(REPOSITORY / "target" / "release" / "globalsplat"))
     options = parser.parse_args()

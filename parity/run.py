@@ -6,6 +6,8 @@
     python parity/run.py --self-test 2/5         checks this for every fifth case, beginning with the third
     python parity/run.py --only '*float32,ssim' --cuda-on-cpu 1    runs the CUDA kernels, emulated on the CPU
     python parity/run.py --self-test --markdown docs/parity.md     also writes a report
+
+Exits with 1 if a comparison fails, and with 2 if the request is wrong.
 """
 
 import argparse

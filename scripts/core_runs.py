@@ -53,7 +53,10 @@ def files_of(path):
     if path.is_dir():
         return sorted(file for file in path.rglob("*") if file.is_file())
     if index.is_file() and (path == index or not path.exists()):
-        return [index, *sorted({index.with_name(name) for name in json.loads(index.read_text())["weight_map"].values()})]
+        return [
+            index,
+            *sorted({index.with_name(name) for name in json.loads(index.read_text())["weight_map"].values()}),
+        ]
     return [path] if path.is_file() else []
 
 

@@ -57,7 +57,9 @@ def main():
             if points is not None:
                 count += 1
                 params = [float(value) for value in camera.params]
-                cameras.append({"model": model, "size": [camera.height, camera.width], "params": params, "points": points})
+                cameras.append(
+                    {"model": model, "size": [camera.height, camera.width], "params": params, "points": points}
+                )
     lines = ",\n".join(json.dumps(camera) for camera in cameras)
     FOLDER.mkdir(exist_ok=True)
     (FOLDER / "lens_models.json").write_text(f'{{"pycolmap": "{pycolmap.__version__}", "cameras": [\n{lines}\n]}}\n')

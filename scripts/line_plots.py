@@ -33,7 +33,8 @@ def line_plots(captures, ticks, is_logarithmic=False):
     labels = dict.fromkeys(label for curves in captures.values() for label in curves)
     colours = dict(zip(labels, COLOURS))
     plots = [
-        plot(name, curves, colours, ticks, is_logarithmic, i * WIDTH) for i, (name, curves) in enumerate(captures.items())
+        plot(name, curves, colours, ticks, is_logarithmic, i * WIDTH)
+        for i, (name, curves) in enumerate(captures.items())
     ]
     legend = "".join(
         f'<path d="M{LEFT + 150 * i} {HEIGHT + 4}h22" style="stroke: {colour}; stroke-width: 2"/>'

@@ -97,8 +97,16 @@ def main():
                 if found:
                     of = lambda key: [result.get(key) for result in found]
                     time, psnr = f"{seconds:g} s", with_interval(of("psnr"))
-                    row(capture_name, name, time, mean(of("steps"), 0), mean(of("gaussians"), 0), psnr,
-                        mean(of("ssim"), 3), mean(of("lpips_vgg"), 3))
+                    row(
+                        capture_name,
+                        name,
+                        time,
+                        mean(of("steps"), 0),
+                        mean(of("gaussians"), 0),
+                        psnr,
+                        mean(of("ssim"), 3),
+                        mean(of("lpips_vgg"), 3),
+                    )
                     curves.setdefault(name, []).append((seconds, statistics.mean(of("psnr"))))
     if len(arguments.seconds) > 1:
         (arguments.out / "curves.svg").write_text(line_plots(plots, sorted(arguments.seconds), is_logarithmic=True))

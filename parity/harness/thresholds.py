@@ -33,7 +33,9 @@ def doubtful_pixels(config, inputs, margin):
                 config["antialiased"],
             )
             opacities = opacities * projected["compensation"]
-            doubtful[b, c] = doubtful_in_view(projected, opacities, splat.pixel_centres(width, height, torch.float64), margin)
+            doubtful[b, c] = doubtful_in_view(
+                projected, opacities, splat.pixel_centres(width, height, torch.float64), margin
+            )
     return doubtful.reshape(batch, cameras, height, width).numpy()
 
 

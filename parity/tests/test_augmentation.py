@@ -1,6 +1,5 @@
 """Tests of the reference's resizing against Pillow, and of simple properties of its colour jitter."""
 
-
 import numpy as np
 import pytest
 import torch

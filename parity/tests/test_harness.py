@@ -170,7 +170,10 @@ def test_the_reference_in_float32_passes_every_case():
 
 def test_a_case_is_drawn_the_same_alone_and_with_others():
     alone = next(prepare_cases(["mixer"], 3)).request
-    for other, same in [(list(prepare_cases(["heads", "mixer"], 3))[4], True), (next(prepare_cases(["mixer"], 4)), False)]:
+    for other, same in [
+        (list(prepare_cases(["heads", "mixer"], 3))[4], True),
+        (next(prepare_cases(["mixer"], 4)), False),
+    ]:
         equal = [
             np.array_equal(value, getattr(other.request, group).get(name))
             for group in ("params", "inputs", "cotangents")
@@ -227,6 +230,7 @@ def test_close_calls_of_lpips():
     """A value of 0 before a ReLU and equal maxima of a pooling window are close calls."""
     params = draw.lpips_parameters(np.random.default_rng(0), "lpips_alex")
     pictures = draw.uniform(np.random.default_rng(1), 0.0, 1.0, 1, 3, 31, 31)
+
     def closest_of(params, pictures):
         return closest(decisions_of_lpips("lpips_alex", params, [pictures]))
 

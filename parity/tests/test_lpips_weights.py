@@ -60,9 +60,7 @@ def checkpoint(rng, network, count):
     def kernel(*shape):
         return rng.standard_normal(shape).astype(np.float32)
 
-    layers = {
-        f"Conv_{i}": {"kernel": kernel(3, 2, 2 + i, 3 + i), "bias": kernel(3 + i)} for i in range(count)
-    }
+    layers = {f"Conv_{i}": {"kernel": kernel(3, 2, 2 + i, 3 + i), "bias": kernel(3 + i)} for i in range(count)}
     linear = {f"NetLinLayer_{i}": {"Conv_0": {"kernel": kernel(1, 1, 4 + i, 1)}} for i in range(5)}
     return {network: layers, **linear}
 

@@ -414,9 +414,7 @@ def test_rotations():
     """The round trip 6D -> matrix -> quaternion -> matrix is exact for all four branches of the quaternion."""
     generator = torch.Generator().manual_seed(1)
     six = torch.randn(500, 6, generator=generator, dtype=torch.float64)
-    half_turns = torch.tensor(
-        [[1, 0, 0, 0, -1, 0], [-1, 0, 0, 0, 1, 0], [-1, 0, 0, 0, -1, 0]], dtype=torch.float64
-    )
+    half_turns = torch.tensor([[1, 0, 0, 0, -1, 0], [-1, 0, 0, 0, 1, 0], [-1, 0, 0, 0, -1, 0]], dtype=torch.float64)
     matrix = rotation.matrix_from_6d(torch.cat([six, half_turns]))
     assert torch.allclose(matrix @ matrix.transpose(-1, -2), torch.eye(3, dtype=torch.float64).expand_as(matrix))
     assert torch.allclose(torch.linalg.det(matrix), torch.ones(len(matrix), dtype=torch.float64))
@@ -459,10 +457,7 @@ def test_adamw_and_clipping_against_torch():
     assert [schedule.is_decayed(name, p) for name, p in start.items()] == [True, False, False]
     theirs = {name: torch.nn.Parameter(p.clone()) for name, p in start.items()}
     optimizer = torch.optim.AdamW(
-        [
-            {"params": [p], "weight_decay": 0.1 if schedule.is_decayed(name, p) else 0.0}
-            for name, p in theirs.items()
-        ],
+        [{"params": [p], "weight_decay": 0.1 if schedule.is_decayed(name, p) else 0.0} for name, p in theirs.items()],
         lr=1e-2,
     )
     ours = {name: (p, torch.zeros_like(p), torch.zeros_like(p)) for name, p in start.items()}
@@ -722,9 +717,7 @@ def flat(opacities, depths, dtype=torch.float64):
 def blend(opacities, depths, pixel=(0.5, 0.5)):
     projected, opacities = flat(opacities, depths)
     colours = torch.eye(len(opacities), dtype=torch.float64)  # the "colour" of a Gaussian is its own weight
-    rgb, accumulated, depth = splat.composite(
-        projected, opacities, colours, torch.tensor([pixel], dtype=torch.float64)
-    )
+    rgb, accumulated, depth = splat.composite(projected, opacities, colours, torch.tensor([pixel], dtype=torch.float64))
     return rgb[0], accumulated[0], depth[0], opacities
 
 

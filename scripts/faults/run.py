@@ -167,7 +167,11 @@ class Tree:
             grows = isinstance(value, tuple) and isinstance(end, tuple) and end[: len(value)] == value
             if files not in known and not grows:
                 wrong.append(f"{unit} is neither old nor new")
-        moved = {plain("/" + name)[1:]: value for name, value in self.temporary.items() if ".globalsplat-old/" in name and value}
+        moved = {
+            plain("/" + name)[1:]: value
+            for name, value in self.temporary.items()
+            if ".globalsplat-old/" in name and value
+        }
         for unit, files in of[0].items():
             lies_beside = crashed and all(moved.get(name) == value for name, value in files.items())
             if unit in of[-1] and unit not in units and not lies_beside and unit != completed_by:
@@ -246,7 +250,9 @@ class Operation:
         def chosen(of):
             return range(1, of + 1) if not most or of <= most else [1 + i * (of - 1) // (most - 1) for i in range(most)]
 
-        return [(group, n, *fault) for group, faults in FAULTS.items() for n in chosen(count[group]) for fault in faults]
+        return [
+            (group, n, *fault) for group, faults in FAULTS.items() for n in chosen(count[group]) for fault in faults
+        ]
 
     def again(self):
         """Runs the same command again without faults and returns the errors. Results are cached by initial state."""
@@ -494,7 +500,9 @@ def told_of(op, fault, done, wrong):
     """Describes a failure, with the options that reproduce it."""
     how = " ".join(map(str, fault))
     said = done.said.strip().replace("\n", "\n    ") or "nothing said"
-    return f"\n--only \"{op.name}\" --fault {how}, {done.hit[0]}\n  exit code {done.code}: {said}\n  " + "\n  ".join(wrong)
+    return f'\n--only "{op.name}" --fault {how}, {done.hit[0]}\n  exit code {done.code}: {said}\n  ' + "\n  ".join(
+        wrong
+    )
 
 
 def inject(operations, most, short, one):
@@ -545,7 +553,9 @@ def spoil(operations):
         tree = Tree(op.bench.out)
         assert not tree.differs(op.new) and not tree.mixes(op.trees, op.unit_of), op.name
         units = tree.units(op.unit_of)
-        for path in [path for path in op.bench.out.rglob("*") if path.is_file() and path.name not in (".lock", "stdout")]:
+        for path in [
+            path for path in op.bench.out.rglob("*") if path.is_file() and path.name not in (".lock", "stdout")
+        ]:
             right = path.read_bytes()
             middle = len(right) // 2
             flipped = right[:middle] + bytes([right[middle] ^ 1]) + right[middle + 1 :]

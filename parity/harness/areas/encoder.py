@@ -168,7 +168,11 @@ def stream_round_reference(config, params, inputs):
     mask = torch.ones(slots.shape[1], 1, dtype=slots.dtype)
     mask[-REGISTERS:] = 0.0
     heads, blocks = config["heads"], config["self_attention_blocks"]
-    return {"slots": reference.stream.stream_round(with_prefix("round", params), "round", slots, memory, heads, blocks, mask)}
+    return {
+        "slots": reference.stream.stream_round(
+            with_prefix("round", params), "round", slots, memory, heads, blocks, mask
+        )
+    }
 
 
 @case

@@ -193,7 +193,9 @@ def depth_smoothness(rng):
 
 @reference_for("depth_smoothness")
 def depth_smoothness_reference(config, params, inputs):
-    return {"loss": config["factor"] * reference.loss.depth_smoothness.depth_smoothness(inputs["depth"], inputs["photo"])}
+    return {
+        "loss": config["factor"] * reference.loss.depth_smoothness.depth_smoothness(inputs["depth"], inputs["photo"])
+    }
 
 
 def masks(rng, *shape):

@@ -110,7 +110,9 @@ def perceptual(rng):
         both = [pictures for half in np.split(rendered, 2) for pictures in (half, truth)]
         return decisions_of_lpips("lpips_alex", of_alex, [pictures.reshape(-1, 3, 31, 31) for pictures in both])
 
-    (rendered, truth), close_calls = draw_without_close_calls(rng, decisions_of_alex, (2, 1, 3, 31, 31), (1, 1, 3, 31, 31))
+    (rendered, truth), close_calls = draw_without_close_calls(
+        rng, decisions_of_alex, (2, 1, 3, 31, 31), (1, 1, 3, 31, 31)
+    )
     inputs = {"rendered": rendered, "truth": truth, **of_alex}
     yield Draw("lpips_alex", inputs, {"kind": "lpips_alex"}, differentiate=("rendered",), close_calls=close_calls)
 

@@ -52,15 +52,11 @@ if sys.argv[1] == "feature_extractor":
     )
 elif sys.argv[1] == "matches_importer":
     pairing = pycolmap.ImportedPairingOptions(match_list_path=options["match_list_path"])
-    pycolmap.match_image_pairs(
-        database, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu
-    )
+    pycolmap.match_image_pairs(database, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu)
 elif sys.argv[1] == "spatial_matcher":
     pycolmap.match_spatial(database, matching_options=matching, device=pycolmap.Device.cpu)
 elif sys.argv[1] == "mapper":
-    pycolmap.incremental_mapping(
-        database, options["image_path"], options["output_path"], options=pipeline
-    )
+    pycolmap.incremental_mapping(database, options["image_path"], options["output_path"], options=pipeline)
 elif sys.argv[1] == "bundle_adjuster":
     # A robust loss, for which COLMAP's own program has no option. Its scale, in terms of the median error, suits errors that are mostly
     # normally distributed.
