@@ -51,14 +51,14 @@ gpu-bundle: build
 test:
 	@scripts/count_skips.sh $(MAKE) --no-print-directory --keep-going checks
 
-# The checks for the edit loop: formatting, lints, and the unit tests of the crates without libtorch and of the library.
+# The checks for the edit loop: formatting, lints, types of the Python, and the unit tests of the crates without libtorch and of the library.
 .PHONY: quick
-quick: check-format check-lints
+quick: check-format check-lints check-python
 	env -u LIBTORCH $(CARGO) test --locked --lib $(CRATES)
 	$(CARGO) test --release --locked --lib -p globalsplat -p globalsplat-csrc
 
 # WITHOUT names checks to leave out, such as one that has just been run.
-CHECKS := $(filter-out $(WITHOUT),check-crates check-format check-lints check-library check-docs check-tests)
+CHECKS := $(filter-out $(WITHOUT),check-crates check-format check-lints check-python check-library check-docs check-tests)
 .PHONY: checks $(CHECKS)
 checks: $(CHECKS) parity
 $(filter-out check-crates,$(CHECKS)): venv
@@ -80,6 +80,11 @@ check-format:
 	$(CARGO) fmt --all --check
 check-lints:
 	$(CARGO) clippy --release --locked --all-targets -- -D warnings
+# Checks format, lints and types of all Python, with the settings of pyproject.toml.
+check-python:
+	.venv/bin/python -m ruff format --check .
+	.venv/bin/python -m ruff check .
+	.venv/bin/python -m mypy
 # Checks the library without the dependencies that only the program needs.
 check-library:
 	$(CARGO) check --release --locked --lib --no-default-features

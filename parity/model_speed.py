@@ -78,7 +78,8 @@ class Torch:
         self.params = params | {"gaussian_decoder.patch_center_bias": torch.tensor([[[0.0, 0.0, 1.5]]])}
 
     def run(self):
-        return reference.model.forward(self.config, self.params, *self.inputs, stage=3, mix=1.0)
+        images, c2w, intrinsics = self.inputs
+        return reference.model.forward(self.config, self.params, images, c2w, intrinsics, stage=3, mix=1.0)
 
     def seconds(self, precision):
         with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
@@ -109,7 +110,7 @@ def compare(options):
             ours.append(report["milliseconds"]["median"] * 1e-3)
             theirs.append(torch_model.seconds(precision))
             print(f"{precision}: program {ours[-1]:.2f} s, PyTorch {theirs[-1]:.2f} s", file=sys.stderr)
-        ratios = [a / b for a, b in zip(ours, theirs)]
+        ratios = [a / b for a, b in zip(ours, theirs, strict=True)]
         results[precision] = {
             "program_seconds": statistics.median(ours),
             "torch_seconds": statistics.median(theirs),

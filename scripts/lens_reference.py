@@ -104,7 +104,7 @@ def write_rig(folder):
         frame = pycolmap.Frame(frame_id=number + 1, rig_id=1)
         frame.rig_from_world = pose([0.3 * number, -0.2, 0.1 * number, 0.8], [number, 0.5 * number, 1 - number])
         images = [2 * number + 1, 2 * number + 2]
-        for sensor, image in zip(sensors, images):
+        for sensor, image in zip(sensors, images, strict=True):
             frame.add_data_id(pycolmap.data_t(sensor, image))
         model.add_frame(frame)
         for camera, image in enumerate(images, 1):

@@ -8,6 +8,7 @@ A row is a part of the benchmark, with the median, the minimum and the upper qua
 
 import json
 import sys
+from pathlib import Path
 
 SPREAD = ("median", "least", "upper_quartile")
 
@@ -46,5 +47,4 @@ def show(figures):
 
 
 if __name__ == "__main__":
-    with open(sys.argv[1], encoding="utf-8") as file:
-        show(json.load(file))
+    show(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")))

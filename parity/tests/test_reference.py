@@ -200,7 +200,7 @@ def test_lpips(network):
             if network == "lpips_alex" or j == len(row) - 1:
                 linear, total = params[f"lin{compared}.weight"].flatten(), 0.0
                 a, b = (picture.flatten(1).T / (picture.flatten(1).T.norm(dim=1)[:, None] + 1e-10) for picture in x)
-                for ours, theirs in zip(a, b):
+                for ours, theirs in zip(a, b, strict=True):
                     total += (linear * (ours - theirs) ** 2).sum().item()
                 expected += total / len(a)
                 compared += 1
@@ -337,7 +337,7 @@ def test_impossible_intrinsics_are_an_error(at, value):
         intrinsic[0, 2], intrinsic[1, 2] = x, y
         rays.check_intrinsics(intrinsic, 8, 8)
     intrinsic[at] = value
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="intrinsics: "):
         rays.check_intrinsics(intrinsic, 8, 8)
 
 
@@ -565,14 +565,17 @@ def test_splat_gradients(coefficients, antialiased):
 
 def test_splat_parts_gradients():
     w2c, intrinsic = camera()
-    means, scales, quaternions, opacities, sh = (value.requires_grad_() for value in smooth_scene(w2c))
+    means, scales, quaternions, _, sh = (value.requires_grad_() for value in smooth_scene(w2c))
 
     def project(*values):
         p = splat.project(*values, w2c, intrinsic, WIDTH, HEIGHT)
         return p["mean2d"], p["cov2d"], p["conic"], p["depth"]
 
     assert torch.autograd.gradcheck(project, (means, scales, quaternions), eps=1e-6, atol=1e-7, rtol=1e-5)
-    colour = lambda m, c: splat.sh_colour(m, c, w2c)  # noqa: E731
+
+    def colour(means, sh):
+        return splat.sh_colour(means, sh, w2c)
+
     assert torch.autograd.gradcheck(colour, (means, sh), eps=1e-6, atol=1e-7, rtol=1e-5)
 
 
@@ -588,7 +591,7 @@ def scalar_render(means, scales, quaternions, opacities, sh, w2c, intrinsic, wid
         return [[sum(a[i][t] * b[t][j] for t in range(len(b))) for j in range(len(b[0]))] for i in range(len(a))]
 
     def transpose(a):
-        return [list(column) for column in zip(*a)]
+        return [list(column) for column in zip(*a, strict=True)]
 
     def hamilton(p, q):
         return (
@@ -694,7 +697,7 @@ def test_splat_against_scalar_loops(seed, antialiased):
     values = crowded_scene(w2c, seed)
     ours = splat.render(*values, w2c, intrinsic, WIDTH, HEIGHT, antialiased=antialiased)
     theirs = scalar_render(*values, w2c, intrinsic, WIDTH, HEIGHT, splat.EPS_2D, antialiased)
-    for name, a, b in zip(("rgb", "opacity", "depth"), ours, theirs):
+    for name, a, b in zip(("rgb", "opacity", "depth"), ours, theirs, strict=True):
         assert (a - b).abs().max().item() < 1e-10, name
     values, w2c, intrinsic = [v.float() for v in values], w2c.float(), intrinsic.float()
     single = splat.render(*values, w2c, intrinsic, WIDTH, HEIGHT, antialiased=antialiased)

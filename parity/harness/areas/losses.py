@@ -95,7 +95,7 @@ def consistency(rng):
         ((1, 2, 3, 5), 1.0, (1.0, 1.0)),
     ]:
 
-        def alpha():
+        def alpha(shape=shape, empty=empty):
             return uniform(rng, 0.02, 1.0, *shape) * np.where(rng.random(shape) < empty, 0.005, 1.0).astype(np.float32)
 
         inputs = {

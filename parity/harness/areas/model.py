@@ -18,7 +18,7 @@ def model(rng):
         (1, 0.0, {"camera_code": False}),
     ]:
         config = draw.model_config(rng, **fixed)
-        image, inputs = draw.pictures(rng, config, integer(rng, 1, 2), integer(rng, 1, 3))
+        _, inputs = draw.pictures(rng, config, integer(rng, 1, 2), integer(rng, 1, 3))
         suffix = "" if config["camera_code"] else ", no camera code"
         label = f"{by(*inputs['images'].shape)}, stage {stage}, λ {mix}, {config['streams']}{suffix}"
         params = draw.parameters(rng, config)

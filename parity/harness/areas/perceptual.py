@@ -26,7 +26,7 @@ def draw_without_close_calls(rng, decisions, *shapes):
     for _ in range(MOST_TRIES):
         pictures = [uniform(rng, 0.0, 1.0, *shape) for shape in shapes]
         if closest(decisions(*pictures)) > ON_CPU:
-            return pictures, lambda: calls_within(ON_GPU, decisions(*pictures))
+            return pictures, lambda pictures=pictures: calls_within(ON_GPU, decisions(*pictures))
     raise RuntimeError(f"every one of {MOST_TRIES} sets of pictures has a close call")
 
 

@@ -66,7 +66,7 @@ def stages_reference(config, params, inputs):
             return config["final_stage"], 1.0
         return reference.schedule.stage(step, config["final_stage"], config["boundaries"], config["transition"])
 
-    index, mix = zip(*(at(step) for step in inputs["steps"].tolist()))
+    index, mix = zip(*(at(step) for step in inputs["steps"].tolist()), strict=True)
     return {"index": torch.tensor(index), "mix": torch.tensor(mix, dtype=torch.float64)}
 
 

@@ -4,8 +4,9 @@ import json
 import os
 import sys
 import threading
+from pathlib import Path
 
-sys.path = [path for path in sys.path if path]
+sys.path = [path for path in sys.path if path]  # noqa: TID251
 import pycolmap  # noqa: E402
 
 
@@ -39,8 +40,7 @@ for name in list(options):
 
 database = options["database_path"]
 if sys.argv[1] == "feature_extractor":
-    with open(options["image_list_path"], encoding="utf-8") as file:
-        names = file.read().splitlines()
+    names = Path(options["image_list_path"]).read_text(encoding="utf-8").splitlines()
     pycolmap.extract_features(
         database,
         options["image_path"],
