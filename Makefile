@@ -69,12 +69,15 @@ check-crates:
 	env -u LIBTORCH $(CARGO) test --locked $(CRATES)
 	env -u LIBTORCH $(CARGO) test --locked -p globalsplat-splat-file --no-default-features
 	env -u LIBTORCH $(CARGO) check --locked -p globalsplat-capture --no-default-features
-# Packages these crates as for crates.io, and builds each package by itself. Needs cargo 1.90 for packages that depend on each other.
+# Packages these crates as for crates.io, builds each package by itself, and checks that it has a README and the licenses. Needs cargo
+# 1.90 for packages that depend on each other.
 .PHONY: check-packages
 check-packages:
 	@# Packages of an earlier run have the same version, so cargo would take what it unpacked and compiled of them.
 	@rm -rf target/package target/debug/.fingerprint/globalsplat-* $(or $(CARGO_HOME),~/.cargo)/registry/src/-*/globalsplat-*
 	env -u LIBTORCH $(CARGO) package --locked --allow-dirty $(CRATES)
+	@for package in target/package/*.crate; do for file in README.md LICENSE-MIT LICENSE-APACHE; do \
+	    tar -tzf $$package | grep "/$$file$$" >/dev/null || { echo "$$package has no $$file" >&2; exit 1; }; done; done
 
 check-format:
 	$(CARGO) fmt --all --check
