@@ -51,14 +51,14 @@ gpu-bundle: build
 test:
 	@scripts/count_skips.sh $(MAKE) --no-print-directory --keep-going checks
 
-# The checks for the edit loop: formatting, lints, and the unit tests of the crates without libtorch and of the library.
+# The checks for the edit loop: formatting, lints, types of the Python, and the unit tests of the crates without libtorch and of the library.
 .PHONY: quick
-quick: check-format check-lints
+quick: check-format check-lints check-python
 	env -u LIBTORCH $(CARGO) test --locked --lib $(CRATES)
 	$(CARGO) test --release --locked --lib -p globalsplat -p globalsplat-csrc
 
 # WITHOUT names checks to leave out, such as one that has just been run.
-CHECKS := $(filter-out $(WITHOUT),check-crates check-format check-lints check-library check-docs check-tests)
+CHECKS := $(filter-out $(WITHOUT),check-crates check-format check-lints check-python check-library check-docs check-tests)
 .PHONY: checks $(CHECKS)
 checks: $(CHECKS) parity
 $(filter-out check-crates,$(CHECKS)): venv
@@ -69,17 +69,25 @@ check-crates:
 	env -u LIBTORCH $(CARGO) test --locked $(CRATES)
 	env -u LIBTORCH $(CARGO) test --locked -p globalsplat-splat-file --no-default-features
 	env -u LIBTORCH $(CARGO) check --locked -p globalsplat-capture --no-default-features
-# Packages these crates as for crates.io, and builds each package by itself. Needs cargo 1.90 for packages that depend on each other.
+# Packages these crates as for crates.io, builds each package by itself, and checks that it has a README and the licenses. Needs cargo
+# 1.90 for packages that depend on each other.
 .PHONY: check-packages
 check-packages:
 	@# Packages of an earlier run have the same version, so cargo would take what it unpacked and compiled of them.
 	@rm -rf target/package target/debug/.fingerprint/globalsplat-* $(or $(CARGO_HOME),~/.cargo)/registry/src/-*/globalsplat-*
 	env -u LIBTORCH $(CARGO) package --locked --allow-dirty $(CRATES)
+	@for package in target/package/*.crate; do for file in README.md LICENSE-MIT LICENSE-APACHE; do \
+	    tar -tzf $$package | grep "/$$file$$" >/dev/null || { echo "$$package has no $$file" >&2; exit 1; }; done; done
 
 check-format:
 	$(CARGO) fmt --all --check
 check-lints:
 	$(CARGO) clippy --release --locked --all-targets -- -D warnings
+# Checks format, lints and types of all Python, with the settings of pyproject.toml.
+check-python:
+	.venv/bin/python -m ruff format --check .
+	.venv/bin/python -m ruff check .
+	.venv/bin/python -m mypy
 # Checks the library without the dependencies that only the program needs.
 check-library:
 	$(CARGO) check --release --locked --lib --no-default-features
@@ -102,9 +110,9 @@ parity-pytest:
 	$(CARGO) build --release --locked --example make_rooms
 	.venv/bin/python -m pytest -q parity
 parity-self-test:
-	.venv/bin/python parity/run.py --self-test $(SELF_TEST)
+	.venv/bin/python -m parity --self-test $(SELF_TEST)
 parity-kernels:
-	.venv/bin/python parity/run.py --only '[pr][ra]*_float32,photometric,ssim,depth_smoothness' --cuda-on-cpu 1 --self-test $(SELF_TEST)
+	.venv/bin/python -m parity --only '[pr][ra]*_float32,photometric,ssim,depth_smoothness' --cuda-on-cpu 1 --self-test $(SELF_TEST)
 
 # The whole self-test instead of a quarter.
 .PHONY: parity-full

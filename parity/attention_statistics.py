@@ -14,23 +14,24 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
-import reference.stream
 import torch
-from harness import draw
-from harness.names import reference_config
 from PIL import Image
-from reference.encoder import encode
-from reference.layers import layer_norm, linear
-from reference.normalize import normalize_scene
-from reference.tokens import view_tokens
 from safetensors import safe_open
+
+from parity import reference
+from parity.harness import draw
+from parity.harness.names import reference_config
+from parity.reference.encoder import encode
+from parity.reference.layers import layer_norm, linear
+from parity.reference.normalize import normalize_scene
+from parity.reference.tokens import view_tokens
 
 
 def read_model(path):
     """Returns the weights in float32, and the configuration of the training run from their metadata."""
     with safe_open(path, "pt") as file:
         config = tomllib.loads(file.metadata()["globalsplat.config"])
-        return {name: file.get_tensor(name).float() for name in file.keys()}, config
+        return {name: file.get_tensor(name).float() for name in file.keys()}, config  # noqa: SIM118
 
 
 def read_capture(folder, height, width):
@@ -41,7 +42,7 @@ def read_capture(folder, height, width):
     described = json.loads((folder / "cameras.json").read_text())
     views = described["views"]
     photos = [Image.open(folder / view["image"]).convert("RGB").resize((width, height)) for view in views]
-    images = torch.tensor(np.stack(photos)).permute(0, 3, 1, 2) / 255.0
+    images = torch.tensor(np.stack([np.asarray(photo) for photo in photos])).permute(0, 3, 1, 2) / 255.0
     c2w, _, _ = normalize_scene(torch.tensor([view["c2w"] for view in views]))
     intrinsics = torch.tensor([view["intrinsic"] for view in views])
     rows, columns = described["image_shape"]

@@ -85,7 +85,7 @@ def sample(scene):
         crop_side = side / zoom
         left, top = cx - side / 2 + shift_x * (side - crop_side), cy - side / 2 + shift_y * (side - crop_side)
         box = (left, top, left + crop_side, top + crop_side)
-        image = image.resize((SIZE, SIZE), Image.LANCZOS, box=box)
+        image = image.resize((SIZE, SIZE), Image.Resampling.LANCZOS, box=box)
         for adjust in jitter:
             image = adjust(image)
         tensors[frame] = torch.from_numpy(np.array(image)).permute(2, 0, 1).contiguous().float().div(255)
@@ -107,6 +107,7 @@ class Chunks(IterableDataset):
 
     def __iter__(self):
         worker = get_worker_info()
+        assert worker is not None, "the loader has workers"
         paths = self.paths[worker.id :: worker.num_workers]
         random.seed(worker.id)
         # A worker without chunks has no samples.
@@ -151,7 +152,7 @@ def compare(options, root):
         completed = subprocess.run(command, stdout=subprocess.PIPE, check=True)
         theirs.append(json.loads(completed.stdout)["views_per_second"])
         print(f"program {ours[-1]:.0f} views/s, Python {theirs[-1]:.0f} views/s", file=sys.stderr)
-    ratios = [a / b for a, b in zip(ours, theirs)]
+    ratios = [a / b for a, b in zip(ours, theirs, strict=True)]
     return {
         "program_views_per_second": statistics.median(ours),
         "python_views_per_second": statistics.median(theirs),

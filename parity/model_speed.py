@@ -17,18 +17,13 @@ import time
 from pathlib import Path
 
 import numpy as np
-import reference.decoder
-import reference.encoder
-import reference.layers
-import reference.model
-import reference.rays
-import reference.stream
-import reference.tokens
 import torch
-from harness import draw
-from harness.names import reference_config
 from torch.nn import functional
 from torch.utils.flop_counter import FlopCounterMode
+
+from parity import reference
+from parity.harness import draw
+from parity.harness.names import reference_config
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SIZE = 256
@@ -75,13 +70,16 @@ class Torch:
     def __init__(self, views):
         rng = np.random.default_rng(0)
         self.config = reference_config(draw.MAIN_16K)
-        inputs = {"images": draw.uniform(rng, 0.0, 1.0, 1, views, 3, SIZE, SIZE)} | draw.views(rng, 1, views, SIZE, SIZE)
+        inputs = {"images": draw.uniform(rng, 0.0, 1.0, 1, views, 3, SIZE, SIZE)} | draw.views(
+            rng, 1, views, SIZE, SIZE
+        )
         self.inputs = [torch.from_numpy(inputs[name]) for name in ("images", "c2w", "intrinsics")]
         params = {name: torch.from_numpy(value) for name, value in draw.parameters(rng, draw.MAIN_16K).items()}
         self.params = params | {"gaussian_decoder.patch_center_bias": torch.tensor([[[0.0, 0.0, 1.5]]])}
 
     def run(self):
-        return reference.model.forward(self.config, self.params, *self.inputs, stage=3, mix=1.0)
+        images, c2w, intrinsics = self.inputs
+        return reference.model.forward(self.config, self.params, images, c2w, intrinsics, stage=3, mix=1.0)
 
     def seconds(self, precision):
         with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
@@ -112,7 +110,7 @@ def compare(options):
             ours.append(report["milliseconds"]["median"] * 1e-3)
             theirs.append(torch_model.seconds(precision))
             print(f"{precision}: program {ours[-1]:.2f} s, PyTorch {theirs[-1]:.2f} s", file=sys.stderr)
-        ratios = [a / b for a, b in zip(ours, theirs)]
+        ratios = [a / b for a, b in zip(ours, theirs, strict=True)]
         results[precision] = {
             "program_seconds": statistics.median(ours),
             "torch_seconds": statistics.median(theirs),
@@ -128,7 +126,9 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--views", metavar="N", type=int, default=24, help="number of photos (default: 24)")
     parser.add_argument("--rounds", metavar="N", type=int, default=3, help="alternating measurements (default: 3)")
-    parser.add_argument("--precision", choices=["f32", "bf16"], nargs="+", default=["f32", "bf16"], help="(default: both)")
+    parser.add_argument(
+        "--precision", choices=["f32", "bf16"], nargs="+", default=["f32", "bf16"], help="(default: both)"
+    )
     parser.add_argument("--gflop", action="store_true", help="only print the PyTorch model's FLOP count")
     parser.add_argument("--binary", metavar="PATH", default=str(REPOSITORY / "target" / "release" / "globalsplat"))
     options = parser.parse_args()

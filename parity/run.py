@@ -6,6 +6,8 @@
     python parity/run.py --self-test 2/5         checks this for every fifth case, beginning with the third
     python parity/run.py --only '*float32,ssim' --cuda-on-cpu 1    runs the CUDA kernels, emulated on the CPU
     python parity/run.py --self-test --markdown docs/parity.md     also writes a report
+
+Exits with 1 if a comparison fails, and with 2 if the request is wrong.
 """
 
 import argparse
@@ -18,11 +20,11 @@ import time
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from harness.areas import CASES
-from harness.document import format_document
-from harness.exchange import ProgramError, program
-from harness.runner import run_cases
-from harness.table import as_json, self_test_report, table
+from parity.harness.areas import CASES
+from parity.harness.document import format_document
+from parity.harness.exchange import ProgramError, program
+from parity.harness.runner import run_cases
+from parity.harness.table import as_json, self_test_report, table
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 WRONG_REQUEST = 2

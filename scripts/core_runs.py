@@ -18,6 +18,7 @@ def environment(**more):
 def core_seconds(command, **variables):
     """Runs a command and returns its standard output and its CPU time in seconds."""
     process = subprocess.Popen(command, env=environment(**variables), stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
     told = process.stdout.read()
     _, status, usage = os.wait4(process.pid, 0)
     if status != 0:
@@ -53,13 +54,18 @@ def files_of(path):
     if path.is_dir():
         return sorted(file for file in path.rglob("*") if file.is_file())
     if index.is_file() and (path == index or not path.exists()):
-        return [index, *sorted({index.with_name(name) for name in json.loads(index.read_text())["weight_map"].values()})]
+        return [
+            index,
+            *sorted({index.with_name(name) for name in json.loads(index.read_text())["weight_map"].values()}),
+        ]
     return [path] if path.is_file() else []
 
 
 def identity(command):
     """Returns a command's arguments, and a checksum of the files that they refer to, except the argument of --out."""
-    inputs = [Path(str(argument)) for before, argument in zip(("", *command), command) if before != "--out"]
+    inputs = [
+        Path(str(argument)) for before, argument in zip(("", *command), command, strict=False) if before != "--out"
+    ]
     checksum = 0
     for file in (file for path in inputs for file in files_of(path)):
         with file.open("rb") as opened:

@@ -46,7 +46,12 @@ def main():
             side = phase * arguments.trained
             scores = [f"{one['psnr']:.2f} / {one['ssim']:.3f}" for one in told]
             seconds = min(one["forward_seconds"] for one in told)
-            row(SETTINGS[name] + (f", {side}" if phase > 1 else ""), str(told[0]["input"]["views"]), *scores, f"{seconds:.2f}")
+            row(
+                SETTINGS[name] + (f", {side}" if phase > 1 else ""),
+                str(told[0]["input"]["views"]),
+                *scores,
+                f"{seconds:.2f}",
+            )
         nearest = [one["baselines"]["nearest_photo"] for one in told]
         row("the nearest photo", "", *(f"{one['psnr']:.2f} / {one['ssim']:.3f}" for one in nearest), "")
 

@@ -57,7 +57,9 @@ def main():
             if points is not None:
                 count += 1
                 params = [float(value) for value in camera.params]
-                cameras.append({"model": model, "size": [camera.height, camera.width], "params": params, "points": points})
+                cameras.append(
+                    {"model": model, "size": [camera.height, camera.width], "params": params, "points": points}
+                )
     lines = ",\n".join(json.dumps(camera) for camera in cameras)
     FOLDER.mkdir(exist_ok=True)
     (FOLDER / "lens_models.json").write_text(f'{{"pycolmap": "{pycolmap.__version__}", "cameras": [\n{lines}\n]}}\n')
@@ -102,7 +104,7 @@ def write_rig(folder):
         frame = pycolmap.Frame(frame_id=number + 1, rig_id=1)
         frame.rig_from_world = pose([0.3 * number, -0.2, 0.1 * number, 0.8], [number, 0.5 * number, 1 - number])
         images = [2 * number + 1, 2 * number + 2]
-        for sensor, image in zip(sensors, images):
+        for sensor, image in zip(sensors, images, strict=True):
             frame.add_data_id(pycolmap.data_t(sensor, image))
         model.add_frame(frame)
         for camera, image in enumerate(images, 1):

@@ -1,6 +1,7 @@
 """Line plots of PSNR over time as SVG, one plot per capture, for scripts that measure `globalsplat refine`."""
 
 import math
+from itertools import cycle
 
 WIDTH, HEIGHT, LEFT, TOP = 250, 190, 34, 26  # size and margins of one plot, in pixels
 COLOURS = ["#2f6fd0", "#d07a2f", "#3a9a5b", "#a04fb8", "#8c6d1f"]
@@ -14,8 +15,13 @@ def plot(name, curves, colours, ticks, is_logarithmic, left):
     low, high = math.floor(min(values)), math.floor(max(values)) + 1
     scale = math.log if is_logarithmic else float
     begin, end = scale(ticks[0]), scale(ticks[-1])
-    x = lambda second: left + LEFT + (scale(max(second, ticks[0])) - begin) / (end - begin) * (WIDTH - LEFT - 18)
-    y = lambda psnr: TOP + (high - psnr) / (high - low) * (HEIGHT - TOP - 34)
+
+    def x(second):
+        return left + LEFT + (scale(max(second, ticks[0])) - begin) / (end - begin) * (WIDTH - LEFT - 18)
+
+    def y(psnr):
+        return TOP + (high - psnr) / (high - low) * (HEIGHT - TOP - 34)
+
     parts = [f'<text x="{left + LEFT}" y="16" class="name">{name}</text>']
     for psnr in range(low, high + 1, max(1, (high - low) // 4)):
         parts.append(f'<path class="grid" d="M{x(ticks[0]):.1f} {y(psnr):.1f}H{x(ticks[-1]):.1f}"/>')
@@ -31,9 +37,10 @@ def plot(name, curves, colours, ticks, is_logarithmic, left):
 def line_plots(captures, ticks, is_logarithmic=False):
     """Returns plots side by side as an SVG. `captures` has for each name its curves, see `plot`; `ticks` are seconds."""
     labels = dict.fromkeys(label for curves in captures.values() for label in curves)
-    colours = dict(zip(labels, COLOURS))
+    colours = dict(zip(labels, cycle(COLOURS), strict=False))
     plots = [
-        plot(name, curves, colours, ticks, is_logarithmic, i * WIDTH) for i, (name, curves) in enumerate(captures.items())
+        plot(name, curves, colours, ticks, is_logarithmic, i * WIDTH)
+        for i, (name, curves) in enumerate(captures.items())
     ]
     legend = "".join(
         f'<path d="M{LEFT + 150 * i} {HEIGHT + 4}h22" style="stroke: {colour}; stroke-width: 2"/>'

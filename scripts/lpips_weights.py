@@ -213,13 +213,14 @@ def write_whole(path, data):
     """Writes a file atomically: all of it or nothing."""
     path.parent.mkdir(exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    temporary = Path(name)
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(data)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
+        temporary.chmod(0o644)
+        temporary.replace(path)
     except BaseException:
-        os.unlink(name)
+        temporary.unlink()
         raise
 
 
@@ -230,7 +231,10 @@ def make(folder):
         return []
     with tarfile.open(fileobj=io.BytesIO(fetch_archive())) as archive:
         for name, (member, network, convolutions) in missing.items():
-            tree = read_arrays(archive.extractfile(member).read(), member)
+            file = archive.extractfile(member)
+            if file is None:
+                raise Broken(f"{member} is no file in the archive")
+            tree = read_arrays(file.read(), member)
             write_whole(folder / name, safetensors(tensors_of(tree, network, convolutions)))
     return [folder / name for name in missing]
 

@@ -42,6 +42,11 @@ def scores(out, splat, folder, holdout, size):
     return told_once(file, "eval", "--splat", splat, "--scene", folder, "--holdout", holdout, "--size", size)
 
 
+def values_of(name, results):
+    """Returns the value called `name` of each result, or None where there is none."""
+    return [result.get(name) for result in results]
+
+
 def mean(values, digits):
     """Formats the mean of `values`, which may lack some."""
     known = [value for value in values if value is not None]
@@ -95,11 +100,18 @@ def main():
                         results[name].append(scores(kept, splat, folder, holdout, arguments.size))
             for name, found in results.items():
                 if found:
-                    of = lambda key: [result.get(key) for result in found]
-                    time, psnr = f"{seconds:g} s", with_interval(of("psnr"))
-                    row(capture_name, name, time, mean(of("steps"), 0), mean(of("gaussians"), 0), psnr,
-                        mean(of("ssim"), 3), mean(of("lpips_vgg"), 3))
-                    curves.setdefault(name, []).append((seconds, statistics.mean(of("psnr"))))
+                    time, psnr = f"{seconds:g} s", with_interval(values_of("psnr", found))
+                    row(
+                        capture_name,
+                        name,
+                        time,
+                        mean(values_of("steps", found), 0),
+                        mean(values_of("gaussians", found), 0),
+                        psnr,
+                        mean(values_of("ssim", found), 3),
+                        mean(values_of("lpips_vgg", found), 3),
+                    )
+                    curves.setdefault(name, []).append((seconds, statistics.mean(values_of("psnr", found))))
     if len(arguments.seconds) > 1:
         (arguments.out / "curves.svg").write_text(line_plots(plots, sorted(arguments.seconds), is_logarithmic=True))
 

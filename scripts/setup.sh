@@ -27,8 +27,8 @@ weights() {
 # Makes .venv, unless it is there, and checks the version of the Python that it needs.
 make_venv() {
     local python="${PYTHON:-python3}"
-    if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null; then
-        missing "no Python 3.10 or newer found; install one or name it with PYTHON=... (it brings libtorch and runs the parity checks)"
+    if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then
+        missing "no Python 3.11 or newer found; install one or name it with PYTHON=... (it brings libtorch and runs the parity checks)"
     fi
     [ -x .venv/bin/python ] || "$python" -m venv .venv \
         || missing "$python can't make a virtual environment; install its venv module (Debian: apt install python3-venv)"
@@ -88,6 +88,11 @@ if ! cmp -s requirements.txt .venv/requirements.txt; then
         .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-compile -r requirements.txt \
         || missing "requirements.txt can't be installed; see pip's message above"
     cp requirements.txt .venv/requirements.txt
+fi
+# Scripts of parity/ import it as an installed package. -I: only from there, not from this folder.
+if [ "$(.venv/bin/python -I -c 'import parity; print(parity.__path__[0])' 2>/dev/null)" != "$PWD/parity" ]; then
+    .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e parity \
+        || missing "parity/ can't be installed in .venv; see pip's message above"
 fi
 # Cargo looks for libtorch at this path (.cargo/config.toml), which does not depend on the Python version.
 ln -sfn "$(.venv/bin/python -c 'import importlib.util, os; print(os.path.dirname(importlib.util.find_spec("torch").origin))')" .venv/libtorch

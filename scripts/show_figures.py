@@ -2,10 +2,13 @@
 
     globalsplat bench model --json >model.json
     python scripts/show_figures.py model.json
+
+A row is a part of the benchmark, with the median, the minimum and the upper quartile of its time.
 """
 
 import json
 import sys
+from pathlib import Path
 
 SPREAD = ("median", "least", "upper_quartile")
 
@@ -15,8 +18,14 @@ def is_spread(value):
 
 
 def show(figures):
-    plain = {name: value for name, value in figures.items() if value is not None and not isinstance(value, (dict, list))}
-    print(", ".join(f"{name} {value:.5g}" if isinstance(value, float) else f"{name} {value}" for name, value in plain.items()))
+    plain = {
+        name: value for name, value in figures.items() if value is not None and not isinstance(value, (dict, list))
+    }
+    print(
+        ", ".join(
+            f"{name} {value:.5g}" if isinstance(value, float) else f"{name} {value}" for name, value in plain.items()
+        )
+    )
     spreads = {name: value for name, value in figures.items() if is_spread(value)}
     rows = [(name, value, {}) for name, value in spreads.items()]
     means = []
@@ -38,5 +47,4 @@ def show(figures):
 
 
 if __name__ == "__main__":
-    with open(sys.argv[1], encoding="utf-8") as file:
-        show(json.load(file))
+    show(json.loads(Path(sys.argv[1]).read_text(encoding="utf-8")))

@@ -26,11 +26,29 @@ def main():
     parser.add_argument("--out", type=Path, default=Path("runs/splat_formats"))
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    row("splat", "format", "bytes", "dB between renders", "PSNR of the photos", "without `--scene`", "write, s", "read, s")
+    row(
+        "splat",
+        "format",
+        "bytes",
+        "dB between renders",
+        "PSNR of the photos",
+        "without `--scene`",
+        "write, s",
+        "read, s",
+    )
     row("---", "---", *["---:"] * 6)
     for capture in arguments.captures:
         original = capture / arguments.splat
-        row(capture.name, "published", f"{original.stat().st_size:,}", "", f"{photos_psnr(original, capture):.2f}", "", "", "")
+        row(
+            capture.name,
+            "published",
+            f"{original.stat().st_size:,}",
+            "",
+            f"{photos_psnr(original, capture):.2f}",
+            "",
+            "",
+            "",
+        )
         for ending in ENDINGS:
             fitted, plain = (arguments.out / f"{capture.name}.{name}.{ending}" for name in ("fitted", "plain"))
             loss = told("convert", original, fitted, "--scene", capture)

@@ -63,7 +63,9 @@ VARIANTS = {
 
 def value_of(name, settings, otherwise):
     """Returns the number that the settings, each `NAME=VALUE`, assign to `name`, or `otherwise`."""
-    return next((float(setting.removeprefix(f"{name}=")) for setting in settings if setting.startswith(f"{name}=")), otherwise)
+    return next(
+        (float(setting.removeprefix(f"{name}=")) for setting in settings if setting.startswith(f"{name}=")), otherwise
+    )
 
 
 def steps_in(seconds, config, settings, batch):
@@ -96,7 +98,7 @@ def run(out, name, seconds, scenes, config, worlds, test, captures):
     settings += [
         f"train.steps={steps}",
         "train.validate_every=0",
-        f"data.validation=[\"{test}\"]",
+        f'data.validation=["{test}"]',
         "data.threads=1",
         f"curriculum.boundaries={[int(longer * share * steps) for share in STAGES]}",
         f"curriculum.transition={int(longer * TRANSITION * steps)}",
@@ -104,10 +106,24 @@ def run(out, name, seconds, scenes, config, worlds, test, captures):
     told = train(folder / "run", config, settings, GLOBALSPLAT_WORLDS=str(worlds))
     weights = folder / "model.safetensors"
     if not weights.is_file():
-        subprocess.run([PROGRAM, "export", "--run", folder / "run", "--out", weights], check=True, stdout=subprocess.DEVNULL)
+        subprocess.run(
+            [PROGRAM, "export", "--run", folder / "run", "--out", weights], check=True, stdout=subprocess.DEVNULL
+        )
     scores = []
     for capture in captures:
-        command = [PROGRAM, "eval", "--weights", weights, "--scene", capture, "--views", "8", "--holdout", "every:3+1", "--json"]
+        command = [
+            PROGRAM,
+            "eval",
+            "--weights",
+            weights,
+            "--scene",
+            capture,
+            "--views",
+            "8",
+            "--holdout",
+            "every:3+1",
+            "--json",
+        ]
         text = subprocess.run(command, env=environment(), capture_output=True, text=True, check=True).stdout
         scores.append(json.loads(text)["psnr"])
     held_out = told["held_out"]
@@ -129,7 +145,14 @@ def main():
     out = arguments.out.absolute() / budget
     config = REPOSITORY / "configs/tiny.toml"
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        several = (arguments.seconds, arguments.scenes, config, arguments.worlds.absolute(), arguments.test.absolute(), arguments.captures)
+        several = (
+            arguments.seconds,
+            arguments.scenes,
+            config,
+            arguments.worlds.absolute(),
+            arguments.test.absolute(),
+            arguments.captures,
+        )
         results = {name: pool.submit(run, out, name, *several) for name in arguments.only}
         row("variant", "10⁶ parameters", "scenes shown", "seconds of a core", "PSNR, made-up", "SSIM", "PSNR, photos")
         row(*["---"] * 7)

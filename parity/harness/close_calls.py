@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from reference.loss import lpips, vgg19
 from torch.overrides import TorchFunctionMode
 
+from ..reference.loss import lpips, vgg19
 from .compare import norm
 
 # Margins relative to a layer's standard deviation: twice the effect of rounding on a CPU, and the possible effect of

@@ -85,7 +85,7 @@ def compare_tensor(name, ours, expected, tolerance, scale, doubtful=None):
     elif length == 0.0:
         finding.measure, finding.error = "absolute", finding.largest
     else:
-        finding.error = finding.relative
+        finding.error = norm(difference) / length
     return finding
 
 

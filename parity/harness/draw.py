@@ -2,10 +2,11 @@
 
 import numpy as np
 import torch
-from reference.loss.lpips import COMPARED, NETWORKS
-from reference.loss.vgg19 import BLOCKS
-from reference.normalize import invert_rigid
-from reference.rotation import matrix_from_quaternion
+
+from ..reference.loss.lpips import COMPARED, NETWORKS
+from ..reference.loss.vgg19 import BLOCKS
+from ..reference.normalize import invert_rigid
+from ..reference.rotation import matrix_from_quaternion
 
 AUXILIARIES = 4
 MAIN_16K = {
@@ -64,7 +65,7 @@ def shapes(config):
     """Returns the shapes of all trainable parameters of a model by name."""
     d, token = config["width"], config["ray_width"] + config["rgb_width"]
     k, bases, pixels = config["candidates"], (config["sh_degree"] + 1) ** 2, config["patch_size"] ** 2
-    found = {}
+    found: dict[str, tuple[int, ...]] = {}
 
     def linear(name, outputs, inputs, bias=True):
         found[f"{name}.weight"] = (outputs, inputs)

@@ -40,14 +40,14 @@ class Evaluation:
 
     def gradient_arrays(self, cotangents):
         """Returns the gradients of the sum of cotangent times output, as arrays named grad.param.X and grad.in.X."""
-        total = 0.0
+        total = torch.tensor(0.0)
         for name, cotangent in cotangents.items():
             output = self.outputs[name]
             total = total + (torch.tensor(cotangent).to(output.dtype).reshape(output.shape) * output).sum()
         gradients = torch.autograd.grad(total, list(self.leaves.values()), allow_unused=True)
         return {
             name: (torch.zeros_like(leaf) if gradient is None else gradient).detach().numpy()
-            for (name, leaf), gradient in zip(self.leaves.items(), gradients)
+            for (name, leaf), gradient in zip(self.leaves.items(), gradients, strict=True)
         }
 
 

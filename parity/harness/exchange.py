@@ -99,7 +99,7 @@ def exchange(requests, answerer, on_progress=lambda done: None):
         requests_folder.mkdir()
         answers_folder.mkdir()
         names = [f"{number:04}_{request.module}.npz" for number, request in enumerate(requests)]
-        for name, request in zip(names, requests):
+        for name, request in zip(names, requests, strict=True):
             write_request(requests_folder / name, request)
         answerer(requests_folder, answers_folder, on_progress)
         for name in names:

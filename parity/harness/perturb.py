@@ -4,7 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from .compare import gradient_scale, compare_tensor, norm
+from .compare import compare_tensor, gradient_scale, norm
 
 # Factor by which a tensor is multiplied.
 FACTOR = 1.001

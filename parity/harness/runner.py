@@ -10,9 +10,9 @@ import torch
 from .areas import CASES
 from .close_calls import resolve_close_calls
 from .compare import compare
-from .perturb import find_undetected
 from .evaluate import Evaluation
 from .exchange import Request, exchange
+from .perturb import find_undetected
 from .registry import Draw
 from .tolerance import Tolerance
 
@@ -109,7 +109,7 @@ def run_cases(names, seed, answerer, self_test=(), on_progress=lambda text: None
         on_progress(f"program, {done} of {len(prepared)} draws: {at.case}, {at.drawn.label}")
 
     answers = exchange([question.request for question in prepared], answerer, on_answers)
-    for done, (question, answer) in enumerate(zip(prepared, answers), start=1):
+    for done, (question, answer) in enumerate(zip(prepared, answers, strict=True), start=1):
         drawn = question.drawn
         on_progress(f"comparison, {done} of {len(prepared)} draws: {question.case}, {drawn.label}")
         tolerance = (on_gpu and drawn.on_gpu) or drawn.tolerance

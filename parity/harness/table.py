@@ -44,10 +44,7 @@ def is_output(finding):
 def worst(pairs, note):
     result, finding = max(pairs, key=lambda pair: pair[1].share)
     relative = "" if finding.relative is None else f"{finding.relative:.1e}"
-    if finding.measure == "exact":
-        tolerance = "exact"
-    else:
-        tolerance = f"{finding.tolerance:.0e} {finding.measure}"
+    tolerance = "exact" if finding.measure == "exact" else f"{finding.tolerance:.0e} {finding.measure}"
     verdict = "ok" if all(other.passed for _, other in pairs) else "FAIL"
     tensor = finding.tensor.split(".", 1)[-1]
     return result.label, tensor, f"{finding.largest:.1e}", relative, tolerance, verdict + note
@@ -57,7 +54,9 @@ def layout(rows):
     widths = [max(len(row[k]) for row in rows) for k in range(len(HEADER))]
     lines = []
     for row in rows:
-        cells = [cell.rjust(w) if k in RIGHT else cell.ljust(w) for k, (cell, w) in enumerate(zip(row, widths))]
+        cells = [
+            cell.rjust(w) if k in RIGHT else cell.ljust(w) for k, (cell, w) in enumerate(zip(row, widths, strict=True))
+        ]
         lines.append("  ".join(cells).rstrip())
     return [lines[0], "─" * max(map(len, lines)), *lines[1:]]
 

@@ -6,7 +6,8 @@ without being equal. Rounding may then decide, and neither the pixel nor its gra
 """
 
 import torch
-from reference import splat
+
+from ..reference import splat
 
 MOST_TRIES = 100  # maximum number of attempts to draw inputs without doubtful pixels or close calls
 
@@ -32,7 +33,9 @@ def doubtful_pixels(config, inputs, margin):
                 config["antialiased"],
             )
             opacities = opacities * projected["compensation"]
-            doubtful[b, c] = doubtful_in_view(projected, opacities, splat.pixel_centres(width, height, torch.float64), margin)
+            doubtful[b, c] = doubtful_in_view(
+                projected, opacities, splat.pixel_centres(width, height, torch.float64), margin
+            )
     return doubtful.reshape(batch, cameras, height, width).numpy()
 
 

@@ -63,7 +63,9 @@ def search(grey, weight, others, other_weights, to_pixels, step, planes):
     """Returns each pixel's best inverse depth, the correlation there, and a mask of the pixels where rounding may decide, [H, W] each."""
     inverse_depths = step * torch.arange(planes, dtype=grey.dtype)
     compared = [
-        correlations(grey, weight, other, None if other_weights is None else other_weights[k], to_pixels[k], inverse_depths)
+        correlations(
+            grey, weight, other, None if other_weights is None else other_weights[k], to_pixels[k], inverse_depths
+        )
         for k, other in enumerate(others)
     ]
     stacked, close = (torch.stack(parts) for parts in zip(*compared, strict=True))

@@ -1,17 +1,11 @@
 """Tests of the reference's resizing against Pillow, and of simple properties of its colour jitter."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-REPOSITORY = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(REPOSITORY / "parity"))
-
-from reference import jitter, resample  # noqa: E402
+from parity.reference import jitter, resample
 
 
 def saturated(rng, height, width):
@@ -21,7 +15,7 @@ def saturated(rng, height, width):
 
 def smooth(rng, height, width):
     coarse = Image.fromarray(rng.integers(0, 256, (4, 5, 3), dtype=np.uint8))
-    return np.asarray(coarse.resize((width, height), Image.BICUBIC))
+    return np.asarray(coarse.resize((width, height), Image.Resampling.BICUBIC))
 
 
 @pytest.mark.parametrize("draw", [saturated, smooth])
@@ -38,7 +32,9 @@ def smooth(rng, height, width):
 def test_resampling_is_pillow_s(draw, shape, region, size):
     image = draw(np.random.default_rng(0), *shape)
     left, top, width, height = region
-    theirs = Image.fromarray(image).resize(size[::-1], Image.LANCZOS, box=(left, top, left + width, top + height))
+    theirs = Image.fromarray(image).resize(
+        size[::-1], Image.Resampling.LANCZOS, box=(left, top, left + width, top + height)
+    )
     ours = resample.resample(torch.tensor(image), region, *size)
     difference = np.abs(ours.movedim(0, -1).numpy() - np.asarray(theirs, dtype=np.float64))
     # Pillow's weights have 22 bits, so a value about halfway between two levels may be rounded to the other one.

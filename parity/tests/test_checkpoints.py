@@ -144,9 +144,7 @@ def lightning(weights, prefix="model."):
 @pytest.mark.parametrize("protocol", [2, 3, 4, 5])
 def test_checkpoints_of_lightning_are_read(weights, tmp_path, legacy, protocol):
     file = tmp_path / "last.ckpt"
-    torch.save(
-        lightning(weights), file, pickle_protocol=protocol, _use_new_zipfile_serialization=not legacy
-    )
+    torch.save(lightning(weights), file, pickle_protocol=protocol, _use_new_zipfile_serialization=not legacy)
     read, told = imported(file, tmp_path / "model.safetensors")
     assert same(read, weights)
     # Frozen networks, and another tensor that isn't part of the model.
@@ -244,7 +242,9 @@ def test_torch_loads_what_export_writes(model, weights, tmp_path, dtype):
         checkpoint = torch.load(file, weights_only=True, mmap=mmap)
         state = checkpoint["state_dict"]
         assert isinstance(state, collections.OrderedDict)
-        assert same({n.removeprefix("model."): t for n, t in state.items()}, {n: t.to(kind) for n, t in weights.items()})
+        assert same(
+            {n.removeprefix("model."): t for n, t in state.items()}, {n: t.to(kind) for n, t in weights.items()}
+        )
         assert all(name.startswith("model.") for name in state)
     assert (checkpoint["epoch"], checkpoint["global_step"]) == (0, 0)
     # A module with the same parameters loads them with strict=True.

@@ -3,6 +3,7 @@
 import json
 import os
 import subprocess
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -65,8 +66,8 @@ def test_what_python_saves_is_read_the_same(packed, tmp_path):
     # Layouts that occur in datasets: slices of larger tensors, shared tensors, more scenes than one batch of the
     # pickler.
     video = torch.cat(scene["images"])
-    offsets = np.cumsum([0] + [len(image) for image in scene["images"]])
-    sliced = dict(scene, key="sliced", images=[video[a:b] for a, b in zip(offsets, offsets[1:])])
+    offsets = np.cumsum([0, *(len(image) for image in scene["images"])])
+    sliced = dict(scene, key="sliced", images=[video[a:b] for a, b in pairwise(offsets)])
     shared = dict(scene, key="shared", url="https://example.org/é")
     many = [dict(scene, key=f"scene_{i}") for i in range(1100)]
     torch.save([scene, sliced, shared, *many], tmp_path / "python.torch")
@@ -92,7 +93,7 @@ class RunsSomething:
 
 def test_a_chunk_that_runs_something_is_refused_and_runs_nothing(packed, tmp_path):
     made, file = tmp_path / "made", tmp_path / "evil.torch"
-    torch.save(torch.load(packed / "000000.torch") + [RunsSomething(made)], file)
+    torch.save([*torch.load(packed / "000000.torch"), RunsSomething(made)], file)
     done = run("inspect", file)
     assert done.returncode == 2 and "data.pkl is a pickle that asks for posix.mkdir" in done.stderr
     assert not made.exists()

@@ -11,24 +11,21 @@ import numpy as np
 import pytest
 import torch
 
+from parity import run
+from parity.harness import coverage, draw, exchange, scenes
+from parity.harness.areas import CASES
+from parity.harness.close_calls import closest, decisions_of_lpips
+from parity.harness.compare import compare, compare_tensor
+from parity.harness.document import format_document
+from parity.harness.evaluate import Evaluation, answer_files
+from parity.harness.perturb import find_undetected
+from parity.harness.runner import generator, prepare_cases, run_cases
+from parity.harness.table import as_json, table
+from parity.harness.thresholds import doubtful_pixels
+from parity.harness.tolerance import FLOAT32, FLOAT64, Tolerance
+from parity.reference.loss.lpips import convolutions
+
 REPOSITORY = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(REPOSITORY / "parity"))
-
-import run  # noqa: E402
-from harness import coverage, draw, exchange, scenes  # noqa: E402
-from harness.areas import CASES  # noqa: E402
-from harness.close_calls import closest, decisions_of_lpips  # noqa: E402
-from harness.compare import compare, compare_tensor  # noqa: E402
-from harness.perturb import find_undetected  # noqa: E402
-from harness.document import format_document  # noqa: E402
-from harness.evaluate import Evaluation, answer_files  # noqa: E402
-from harness.runner import generator, run_cases, prepare_cases  # noqa: E402
-from harness.table import as_json, table  # noqa: E402
-from harness.thresholds import doubtful_pixels  # noqa: E402
-from harness.tolerance import FLOAT32, FLOAT64, Tolerance  # noqa: E402
-
-from reference.loss.lpips import convolutions  # noqa: E402
-
 torch.set_num_threads(1)
 
 # Cases that are too slow for a test, or for which the reference in float32 is too inaccurate: its determinant suffers
@@ -173,7 +170,10 @@ def test_the_reference_in_float32_passes_every_case():
 
 def test_a_case_is_drawn_the_same_alone_and_with_others():
     alone = next(prepare_cases(["mixer"], 3)).request
-    for other, same in [(list(prepare_cases(["heads", "mixer"], 3))[4], True), (next(prepare_cases(["mixer"], 4)), False)]:
+    for other, same in [
+        (list(prepare_cases(["heads", "mixer"], 3))[4], True),
+        (next(prepare_cases(["mixer"], 4)), False),
+    ]:
         equal = [
             np.array_equal(value, getattr(other.request, group).get(name))
             for group in ("params", "inputs", "cotangents")
@@ -230,6 +230,7 @@ def test_close_calls_of_lpips():
     """A value of 0 before a ReLU and equal maxima of a pooling window are close calls."""
     params = draw.lpips_parameters(np.random.default_rng(0), "lpips_alex")
     pictures = draw.uniform(np.random.default_rng(1), 0.0, 1.0, 1, 3, 31, 31)
+
     def closest_of(params, pictures):
         return closest(decisions_of_lpips("lpips_alex", params, [pictures]))
 
@@ -277,10 +278,9 @@ def test_every_module_has_a_case():
 STAND_IN = """#!{python}
 import sys
 from pathlib import Path
-sys.path.insert(0, {parity!r})
 import numpy as np
-from harness.evaluate import answer_files
-from harness.exchange import write_answer
+from parity.harness.evaluate import answer_files
+from parity.harness.exchange import write_answer
 options = dict(zip(sys.argv[2::2], sys.argv[3::2]))
 requests, answers = Path(options["--requests"]), Path(options["--responses"])
 answer_files(requests, answers)
@@ -288,9 +288,15 @@ answer_files(requests, answers)
 """
 
 
+@pytest.fixture(autouse=True)
+def parity_is_importable(monkeypatch):
+    """Lets programs that tests start import this checkout's parity."""
+    monkeypatch.setenv("PYTHONPATH", str(REPOSITORY))
+
+
 def stand_in(tmp_path, then):
     path = tmp_path / "program"
-    path.write_text(STAND_IN.format(python=sys.executable, parity=str(REPOSITORY / "parity"), then=then))
+    path.write_text(STAND_IN.format(python=sys.executable, then=then))
     path.chmod(path.stat().st_mode | stat.S_IXUSR)
     return path
 

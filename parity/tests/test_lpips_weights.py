@@ -4,18 +4,12 @@ import array
 import io
 import json
 import pickle
-import sys
 import tarfile
-from pathlib import Path
 
+import lpips_weights
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
-
-REPOSITORY = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(REPOSITORY / "scripts"))
-
-import lpips_weights  # noqa: E402
 
 
 class MakesAFile:
@@ -31,7 +25,7 @@ class MakesAFile:
 def test_a_pickle_that_runs_something_is_refused_and_runs_nothing(tmp_path, protocol, wrapped):
     path = tmp_path / "made"
     data = pickle.dumps(wrapped(MakesAFile(path)), protocol=protocol)
-    with pytest.raises(lpips_weights.Broken, match="vgg16.ckpt is no pickle of arrays: it asks for "):
+    with pytest.raises(lpips_weights.Broken, match=r"vgg16\.ckpt is no pickle of arrays: it asks for "):
         lpips_weights.read_arrays(data, "vgg16.ckpt")
     assert not path.exists()
     pickle.loads(data)  # confirms that the pickle does create the file
@@ -56,7 +50,7 @@ def test_other_arrays_are_refused(value):
 def test_broken_bytes_are_refused():
     whole = pickle.dumps({"kernel": np.ones((2, 3), np.float32)}, protocol=3)
     for data in (b"", b"no pickle", whole[: len(whole) // 2]):
-        with pytest.raises(lpips_weights.Broken, match="a.ckpt"):
+        with pytest.raises(lpips_weights.Broken, match=r"a\.ckpt"):
             lpips_weights.read_arrays(data, "a.ckpt")
 
 
@@ -66,9 +60,7 @@ def checkpoint(rng, network, count):
     def kernel(*shape):
         return rng.standard_normal(shape).astype(np.float32)
 
-    layers = {
-        f"Conv_{i}": {"kernel": kernel(3, 2, 2 + i, 3 + i), "bias": kernel(3 + i)} for i in range(count)
-    }
+    layers = {f"Conv_{i}": {"kernel": kernel(3, 2, 2 + i, 3 + i), "bias": kernel(3 + i)} for i in range(count)}
     linear = {f"NetLinLayer_{i}": {"Conv_0": {"kernel": kernel(1, 1, 4 + i, 1)}} for i in range(5)}
     return {network: layers, **linear}
 
@@ -95,7 +87,7 @@ def test_kernels_are_turned_and_files_are_made_once(tmp_path, monkeypatch):
         for i in range(5):
             theirs = trees[name][f"NetLinLayer_{i}"]["Conv_0"]["kernel"]
             np.testing.assert_array_equal(made[f"lin{i}.weight"], theirs.transpose(3, 2, 0, 1))
-        with open(tmp_path / name, "rb") as file:
+        with (tmp_path / name).open("rb") as file:
             header = file.read(int.from_bytes(file.read(8), "little"))
         assert len(header) % 8 == 0 and json.loads(header)
     assert lpips_weights.make(tmp_path) == []

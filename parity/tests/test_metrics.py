@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +10,9 @@ import torch
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
+from parity.reference.loss.ssim import ssim
+
 REPOSITORY = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(REPOSITORY / "parity"))
-
-from reference.loss.ssim import ssim  # noqa: E402
-
 PROGRAM = REPOSITORY / "target/release/globalsplat"
 SIZES = [(11, 11), (48, 37), (64, 96)]
 

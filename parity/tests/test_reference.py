@@ -7,19 +7,16 @@ Golden tensors are read from $GLOBALSPLAT_GOLDEN, or else from ../shared/golden 
 import json
 import math
 import os
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import load_file
 
+from parity.reference import decoder, encoder, model, normalize, rays, rotation, schedule, splat, tokens
+from parity.reference.loss import consistency, decoder_regularization, frustum, lpips, mse, subsets
+
 REPOSITORY = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(REPOSITORY / "parity"))
-
-from reference import decoder, encoder, model, normalize, rays, rotation, schedule, splat, tokens  # noqa: E402
-from reference.loss import consistency, decoder_regularization, frustum, lpips, mse, subsets  # noqa: E402
-
 torch.set_num_threads(1)
 
 GOLDEN = Path(os.environ.get("GLOBALSPLAT_GOLDEN", REPOSITORY.parent / "shared" / "golden"))
@@ -203,7 +200,7 @@ def test_lpips(network):
             if network == "lpips_alex" or j == len(row) - 1:
                 linear, total = params[f"lin{compared}.weight"].flatten(), 0.0
                 a, b = (picture.flatten(1).T / (picture.flatten(1).T.norm(dim=1)[:, None] + 1e-10) for picture in x)
-                for ours, theirs in zip(a, b):
+                for ours, theirs in zip(a, b, strict=True):
                     total += (linear * (ours - theirs) ** 2).sum().item()
                 expected += total / len(a)
                 compared += 1
@@ -340,7 +337,7 @@ def test_impossible_intrinsics_are_an_error(at, value):
         intrinsic[0, 2], intrinsic[1, 2] = x, y
         rays.check_intrinsics(intrinsic, 8, 8)
     intrinsic[at] = value
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="intrinsics: "):
         rays.check_intrinsics(intrinsic, 8, 8)
 
 
@@ -417,9 +414,7 @@ def test_rotations():
     """The round trip 6D -> matrix -> quaternion -> matrix is exact for all four branches of the quaternion."""
     generator = torch.Generator().manual_seed(1)
     six = torch.randn(500, 6, generator=generator, dtype=torch.float64)
-    half_turns = torch.tensor(
-        [[1, 0, 0, 0, -1, 0], [-1, 0, 0, 0, 1, 0], [-1, 0, 0, 0, -1, 0]], dtype=torch.float64
-    )
+    half_turns = torch.tensor([[1, 0, 0, 0, -1, 0], [-1, 0, 0, 0, 1, 0], [-1, 0, 0, 0, -1, 0]], dtype=torch.float64)
     matrix = rotation.matrix_from_6d(torch.cat([six, half_turns]))
     assert torch.allclose(matrix @ matrix.transpose(-1, -2), torch.eye(3, dtype=torch.float64).expand_as(matrix))
     assert torch.allclose(torch.linalg.det(matrix), torch.ones(len(matrix), dtype=torch.float64))
@@ -462,10 +457,7 @@ def test_adamw_and_clipping_against_torch():
     assert [schedule.is_decayed(name, p) for name, p in start.items()] == [True, False, False]
     theirs = {name: torch.nn.Parameter(p.clone()) for name, p in start.items()}
     optimizer = torch.optim.AdamW(
-        [
-            {"params": [p], "weight_decay": 0.1 if schedule.is_decayed(name, p) else 0.0}
-            for name, p in theirs.items()
-        ],
+        [{"params": [p], "weight_decay": 0.1 if schedule.is_decayed(name, p) else 0.0} for name, p in theirs.items()],
         lr=1e-2,
     )
     ours = {name: (p, torch.zeros_like(p), torch.zeros_like(p)) for name, p in start.items()}
@@ -573,14 +565,17 @@ def test_splat_gradients(coefficients, antialiased):
 
 def test_splat_parts_gradients():
     w2c, intrinsic = camera()
-    means, scales, quaternions, opacities, sh = (value.requires_grad_() for value in smooth_scene(w2c))
+    means, scales, quaternions, _, sh = (value.requires_grad_() for value in smooth_scene(w2c))
 
     def project(*values):
         p = splat.project(*values, w2c, intrinsic, WIDTH, HEIGHT)
         return p["mean2d"], p["cov2d"], p["conic"], p["depth"]
 
     assert torch.autograd.gradcheck(project, (means, scales, quaternions), eps=1e-6, atol=1e-7, rtol=1e-5)
-    colour = lambda m, c: splat.sh_colour(m, c, w2c)  # noqa: E731
+
+    def colour(means, sh):
+        return splat.sh_colour(means, sh, w2c)
+
     assert torch.autograd.gradcheck(colour, (means, sh), eps=1e-6, atol=1e-7, rtol=1e-5)
 
 
@@ -596,7 +591,7 @@ def scalar_render(means, scales, quaternions, opacities, sh, w2c, intrinsic, wid
         return [[sum(a[i][t] * b[t][j] for t in range(len(b))) for j in range(len(b[0]))] for i in range(len(a))]
 
     def transpose(a):
-        return [list(column) for column in zip(*a)]
+        return [list(column) for column in zip(*a, strict=True)]
 
     def hamilton(p, q):
         return (
@@ -702,7 +697,7 @@ def test_splat_against_scalar_loops(seed, antialiased):
     values = crowded_scene(w2c, seed)
     ours = splat.render(*values, w2c, intrinsic, WIDTH, HEIGHT, antialiased=antialiased)
     theirs = scalar_render(*values, w2c, intrinsic, WIDTH, HEIGHT, splat.EPS_2D, antialiased)
-    for name, a, b in zip(("rgb", "opacity", "depth"), ours, theirs):
+    for name, a, b in zip(("rgb", "opacity", "depth"), ours, theirs, strict=True):
         assert (a - b).abs().max().item() < 1e-10, name
     values, w2c, intrinsic = [v.float() for v in values], w2c.float(), intrinsic.float()
     single = splat.render(*values, w2c, intrinsic, WIDTH, HEIGHT, antialiased=antialiased)
@@ -725,9 +720,7 @@ def flat(opacities, depths, dtype=torch.float64):
 def blend(opacities, depths, pixel=(0.5, 0.5)):
     projected, opacities = flat(opacities, depths)
     colours = torch.eye(len(opacities), dtype=torch.float64)  # the "colour" of a Gaussian is its own weight
-    rgb, accumulated, depth = splat.composite(
-        projected, opacities, colours, torch.tensor([pixel], dtype=torch.float64)
-    )
+    rgb, accumulated, depth = splat.composite(projected, opacities, colours, torch.tensor([pixel], dtype=torch.float64))
     return rgb[0], accumulated[0], depth[0], opacities
 
 

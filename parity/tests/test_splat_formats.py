@@ -194,7 +194,9 @@ def test_splat_transform_reads_ours(tmp_path, ending, degree):
 
 
 @pytest.mark.parametrize("degree", range(4))
-@pytest.mark.parametrize("ending, options", [("ply", []), ("compressed.ply", []), ("spz", ["3"]), ("spz", ["4"]), ("glb", [])])
+@pytest.mark.parametrize(
+    "ending, options", [("ply", []), ("compressed.ply", []), ("spz", ["3"]), ("spz", ["4"]), ("glb", [])]
+)
 def test_we_read_splat_transforms(tmp_path, ending, options, degree):
     splat = made(degree)
     write_ply(tmp_path / "a.ply", splat)
@@ -322,7 +324,9 @@ def test_we_read_ksplats_as_splat_transform_does(tmp_path, level, degree):
 
 # In compressed PLYs, spz-js mistakes coefficients of degree 1 and 2 for others, and reads their bytes as older viewers
 # did.
-@pytest.mark.parametrize("ending, degree", [*(("ply", degree) for degree in range(4)), ("compressed.ply", 0), ("compressed.ply", 3)])
+@pytest.mark.parametrize(
+    "ending, degree", [*(("ply", degree) for degree in range(4)), ("compressed.ply", 0), ("compressed.ply", 3)]
+)
 def test_another_reader_of_plys_reads_and_writes_as_we_do(tmp_path, ending, degree):
     splat = made(degree)
     steps = STEPS[ending] if ending == "ply" else (*STEPS[ending][:5], 0.62 / 32)

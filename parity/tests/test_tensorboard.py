@@ -4,6 +4,7 @@ import io
 import json
 import shutil
 import subprocess
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -70,7 +71,7 @@ def test_every_start_has_a_file_of_its_own(trained):
         found = list(EventFileLoader(str(trained / "tensorboard" / name)).Load())
         assert found[0].file_version == "brain.Event:2"
         starts += [event.step for event in found if event.HasField("session_log")]
-        assert all(a.wall_time <= b.wall_time for a, b in zip(found, found[1:]))
+        assert all(a.wall_time <= b.wall_time for a, b in pairwise(found))
     assert starts == [0, 8]
 
 
@@ -110,9 +111,7 @@ def test_pictures_are_strips_of_five(trained):
         assert (picture.width, picture.height) == (5 * SIZE + 4 * GAP, SIZE)
         decoded = np.asarray(Image.open(io.BytesIO(picture.encoded_image_string)))
         assert decoded.shape == (SIZE, 5 * SIZE + 4 * GAP, 3)
-        photo, truth, render, depth, alpha = (
-            decoded[:, i * (SIZE + GAP) : i * (SIZE + GAP) + SIZE] for i in range(5)
-        )
+        photo, truth, render, depth, alpha = (decoded[:, i * (SIZE + GAP) : i * (SIZE + GAP) + SIZE] for i in range(5))
         assert photo.std() > 5 and truth.std() > 5 and not np.array_equal(photo, truth)
         assert (alpha == alpha[..., :1]).all(), "grey"
         seen.append([render.any(), depth.any(), alpha.any()])

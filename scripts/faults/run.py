@@ -25,6 +25,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 
 from tensorboard.compat.proto.event_pb2 import Event
@@ -37,12 +38,12 @@ REPOSITORY = HERE.parents[1]
 # disk) leaves the same state as a crash.
 REFUSED = [("ENOSPC", 0), ("ENOSPC", 1), ("EIO", 0), ("EIO", 1), ("EINTR", 0)]
 FAULTS = {
-    "write": REFUSED + [("short", 0), ("short", 1), ("torn", 0), ("torn", 1), ("torn-EIO", 0)],
+    "write": [*REFUSED, ("short", 0), ("short", 1), ("torn", 0), ("torn", 1), ("torn-EIO", 0)],
     "truncate": REFUSED,
     "fsync": REFUSED,
     "open": REFUSED,
     "mkdir": REFUSED,
-    "rename": REFUSED + [("ENOSPC", 2)],
+    "rename": [*REFUSED, ("ENOSPC", 2)],
     "link": REFUSED,
     "remove": [("EIO", 0), ("EIO", 1)],
     "any": [("EIO", 1)],
@@ -106,7 +107,8 @@ class Tree:
     """The files below a folder by name: a hash, or the records of a log that grows. Temporary files are kept apart."""
 
     def __init__(self, folder):
-        self.files, self.temporary, self.broken = {}, {}, []
+        self.files: dict[str, str | tuple[str, ...]] = {}
+        self.temporary, self.broken = {}, []
         logged = []
         for path in sorted(folder.rglob("*")):
             name = path.relative_to(folder).as_posix()
@@ -167,7 +169,11 @@ class Tree:
             grows = isinstance(value, tuple) and isinstance(end, tuple) and end[: len(value)] == value
             if files not in known and not grows:
                 wrong.append(f"{unit} is neither old nor new")
-        moved = {plain("/" + name)[1:]: value for name, value in self.temporary.items() if ".globalsplat-old/" in name and value}
+        moved = {
+            plain("/" + name)[1:]: value
+            for name, value in self.temporary.items()
+            if ".globalsplat-old/" in name and value
+        }
         for unit, files in of[0].items():
             lies_beside = crashed and all(moved.get(name) == value for name, value in files.items())
             if unit in of[-1] and unit not in units and not lies_beside and unit != completed_by:
@@ -246,7 +252,9 @@ class Operation:
         def chosen(of):
             return range(1, of + 1) if not most or of <= most else [1 + i * (of - 1) // (most - 1) for i in range(most)]
 
-        return [(group, n, *fault) for group, faults in FAULTS.items() for n in chosen(count[group]) for fault in faults]
+        return [
+            (group, n, *fault) for group, faults in FAULTS.items() for n in chosen(count[group]) for fault in faults
+        ]
 
     def again(self):
         """Runs the same command again without faults and returns the errors. Results are cached by initial state."""
@@ -302,19 +310,19 @@ class Bench:
         ours = {"LD_PRELOAD": self.library, "FAULT_ROOT": self.out, "FAULT_LOG": self.log}
         environment = {**self.environment, **{key: str(value) for key, value in ours.items()}}
         if fault:
-            environment.update(zip(["FAULT_CALL", "FAULT_N", "FAULT_KIND", "FAULT_STICKY"], map(str, fault)))
+            environment.update(
+                zip(["FAULT_CALL", "FAULT_N", "FAULT_KIND", "FAULT_STICKY"], map(str, fault), strict=True)
+            )
         told, said = self.folder / "told", self.folder / "said"
-        with open(into or told, "wb") as out, open(said, "wb") as err:
+        with (into or told).open("wb") as out, said.open("wb") as err:
             process = subprocess.Popen([self.program, *arguments], stdout=out, stderr=err, env=environment)
             begun, code = time.monotonic(), None
             while code is None and time.monotonic() - begun < TIMEOUT:
                 if stop_when_waiting and b"training paused" in said.read_bytes():
                     process.send_signal(signal.SIGTERM)
                     stop_when_waiting = False
-                try:
+                with suppress(subprocess.TimeoutExpired):
                     code = process.wait(0.02 if stop_when_waiting else TIMEOUT)
-                except subprocess.TimeoutExpired:
-                    pass
             if code is None:
                 process.kill()
                 process.wait()
@@ -336,7 +344,7 @@ def operations(bench, only):
     tests/common/program.rs."""
     inputs, out = bench.inputs, bench.out
     source = (REPOSITORY / "tests/common/program.rs").read_text()
-    config = re.search(r'TINY_CONFIG: &str = r#"(.*?)"#', source, re.DOTALL)[1]
+    config = source.split('TINY_CONFIG: &str = r#"')[1].split('"#')[0]
     rooms, room = inputs / "rooms", inputs / "rooms/room_000"
     make_rooms(rooms, 2, 9, 40)
     tiny, weights = inputs / "tiny.toml", inputs / "tiny.safetensors"
@@ -477,7 +485,7 @@ def check(op, fault):
             wrong.append(f"it doesn't name {plain(done.hit[0])}")
         if done.told:
             wrong.append("it tells a result, and fails")
-        if kind == "short" or kind == "EINTR" and group in INTERRUPTIBLE:
+        if kind == "short" or (kind == "EINTR" and group in INTERRUPTIBLE):
             wrong.append("it doesn't go on")
         # The program waits for space on a full disk, but not when it checks that the folder is writable and not locked.
         looks = re.search(r"/out(/\.globalsplat-probe\.globalsplat-partial|/\.lock)?$", done.hit[0])
@@ -494,7 +502,9 @@ def told_of(op, fault, done, wrong):
     """Describes a failure, with the options that reproduce it."""
     how = " ".join(map(str, fault))
     said = done.said.strip().replace("\n", "\n    ") or "nothing said"
-    return f"\n--only \"{op.name}\" --fault {how}, {done.hit[0]}\n  exit code {done.code}: {said}\n  " + "\n  ".join(wrong)
+    return f'\n--only "{op.name}" --fault {how}, {done.hit[0]}\n  exit code {done.code}: {said}\n  ' + "\n  ".join(
+        wrong
+    )
 
 
 def inject(operations, most, short, one):
@@ -545,7 +555,9 @@ def spoil(operations):
         tree = Tree(op.bench.out)
         assert not tree.differs(op.new) and not tree.mixes(op.trees, op.unit_of), op.name
         units = tree.units(op.unit_of)
-        for path in [path for path in op.bench.out.rglob("*") if path.is_file() and path.name not in (".lock", "stdout")]:
+        for path in [
+            path for path in op.bench.out.rglob("*") if path.is_file() and path.name not in (".lock", "stdout")
+        ]:
             right = path.read_bytes()
             middle = len(right) // 2
             flipped = right[:middle] + bytes([right[middle] ^ 1]) + right[middle + 1 :]

@@ -10,6 +10,7 @@ mod bench_model;
 mod bench_refine;
 mod bench_train;
 mod capture;
+mod completions;
 mod convert;
 mod device;
 mod doctor;
@@ -18,6 +19,7 @@ mod eval;
 mod export;
 mod import;
 mod inspect;
+mod man;
 mod memory;
 mod model;
 mod option_names;
@@ -38,7 +40,7 @@ mod view;
 mod watch;
 mod weights_out;
 
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory, Parser, Subcommand};
 use globalsplat::Error;
 use globalsplat::data::{Capture, Holdout, PhotoSize};
 use globalsplat::error::panic_message;
@@ -83,6 +85,8 @@ enum Command {
     Inspect(inspect::Inspect),
     Bench(bench::Bench),
     Doctor(doctor::Doctor),
+    Completions(completions::Completions),
+    Man(man::Man),
     #[command(hide = true)]
     Parity(parity::Parity),
 }
@@ -107,6 +111,8 @@ impl Command {
             Command::Inspect(command) => command.run(),
             Command::Bench(command) => command.run(),
             Command::Doctor(command) => command.run(),
+            Command::Completions(command) => command.run(),
+            Command::Man(command) => command.run(),
             Command::Parity(command) => command.run(),
         }
     }
@@ -188,6 +194,11 @@ fn tell(message: &str, is_secondary: bool) {
     } else {
         eprintln!("globalsplat: {message}");
     }
+}
+
+/// Returns the command line, to describe it in other forms than help.
+fn command_line() -> clap::Command {
+    Cli::command()
 }
 
 /// Parses an image size as `--size` takes it.
@@ -297,7 +308,6 @@ fn report_downscaling(path: &Path, by: i64) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use clap::CommandFactory;
 
     #[test]
     fn every_command_has_examples_and_json() {
@@ -314,6 +324,10 @@ mod tests {
                 false => vec![command],
             };
             for leaf in leaves {
+                // A script, which a shell reads.
+                if leaf.get_name() == "completions" {
+                    continue;
+                }
                 let has_json = leaf.get_arguments().any(|argument| argument.get_id() == "json");
                 assert!(has_json, "{name} {} has no --json", leaf.get_name());
             }

@@ -37,7 +37,8 @@ fn check_or_write(page: &str, expected: &str) {
     assert!(read(page) == expected, "{page} differs from what the code gives; {advice}");
 }
 
-fn help(command: &[String]) -> String {
+/// Returns the help of a command, such as `["bench", "raster"]`.
+pub fn help(command: &[String]) -> String {
     let output = Command::new(env!("CARGO_BIN_EXE_globalsplat"))
         .args(command)
         .arg("--help")
@@ -51,7 +52,7 @@ fn help(command: &[String]) -> String {
 }
 
 /// Returns the names in the list of commands of a help text, without `help`.
-fn subcommands(help: &str) -> Vec<String> {
+pub fn subcommands(help: &str) -> Vec<String> {
     let list = help.split("Commands:\n").nth(1).unwrap_or("").split("\n\n").next().unwrap_or("");
     let names = list.lines().filter(|line| line.starts_with("  ") && !line.starts_with("   "));
     names

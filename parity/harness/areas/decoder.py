@@ -3,10 +3,9 @@
 from itertools import product
 
 import numpy as np
-import reference.decoder
-import reference.rotation
 import torch
 
+from ... import reference
 from .. import draw
 from ..draw import integer, normal, uniform
 from ..names import reference_config, with_prefix

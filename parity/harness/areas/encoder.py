@@ -3,11 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-import reference.encoder
-import reference.layers
-import reference.stream
 import torch
 
+from ... import reference
 from .. import draw
 from ..draw import integer, normal
 from ..names import reference_config, with_prefix
@@ -170,7 +168,11 @@ def stream_round_reference(config, params, inputs):
     mask = torch.ones(slots.shape[1], 1, dtype=slots.dtype)
     mask[-REGISTERS:] = 0.0
     heads, blocks = config["heads"], config["self_attention_blocks"]
-    return {"slots": reference.stream.stream_round(with_prefix("round", params), "round", slots, memory, heads, blocks, mask)}
+    return {
+        "slots": reference.stream.stream_round(
+            with_prefix("round", params), "round", slots, memory, heads, blocks, mask
+        )
+    }
 
 
 @case

@@ -1,7 +1,6 @@
 """Cases of the conversion of a smaller model's weights to a larger one's."""
 
-import reference.growth
-
+from ... import reference
 from ..draw import normal
 from ..registry import Draw, case, reference_for
 

@@ -1,14 +1,8 @@
 """Cases of the terms of the training objective that need no trained network."""
 
 import numpy as np
-import reference.loss.consistency
-import reference.loss.decoder_regularization
-import reference.loss.depth_smoothness
-import reference.loss.frustum
-import reference.loss.mask
-import reference.loss.mse
-import reference.loss.ssim
 
+from ... import reference
 from .. import draw
 from ..draw import integer, normal, uniform
 from ..registry import Draw, by, case, reference_for
@@ -101,7 +95,7 @@ def consistency(rng):
         ((1, 2, 3, 5), 1.0, (1.0, 1.0)),
     ]:
 
-        def alpha():
+        def alpha(shape=shape, empty=empty):
             return uniform(rng, 0.02, 1.0, *shape) * np.where(rng.random(shape) < empty, 0.005, 1.0).astype(np.float32)
 
         inputs = {
@@ -199,7 +193,9 @@ def depth_smoothness(rng):
 
 @reference_for("depth_smoothness")
 def depth_smoothness_reference(config, params, inputs):
-    return {"loss": config["factor"] * reference.loss.depth_smoothness.depth_smoothness(inputs["depth"], inputs["photo"])}
+    return {
+        "loss": config["factor"] * reference.loss.depth_smoothness.depth_smoothness(inputs["depth"], inputs["photo"])
+    }
 
 
 def masks(rng, *shape):

@@ -1,7 +1,6 @@
 """Cases of the complete model, from images to Gaussians."""
 
-import reference.model
-
+from ... import reference
 from .. import draw
 from ..draw import integer, uniform
 from ..names import reference_config
@@ -19,7 +18,7 @@ def model(rng):
         (1, 0.0, {"camera_code": False}),
     ]:
         config = draw.model_config(rng, **fixed)
-        image, inputs = draw.pictures(rng, config, integer(rng, 1, 2), integer(rng, 1, 3))
+        _, inputs = draw.pictures(rng, config, integer(rng, 1, 2), integer(rng, 1, 3))
         suffix = "" if config["camera_code"] else ", no camera code"
         label = f"{by(*inputs['images'].shape)}, stage {stage}, λ {mix}, {config['streams']}{suffix}"
         params = draw.parameters(rng, config)

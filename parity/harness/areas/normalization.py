@@ -1,7 +1,6 @@
 """Cases of scene normalization from the cameras."""
 
-import reference.normalize
-
+from ... import reference
 from .. import draw
 from ..draw import integer
 from ..registry import Draw, case, reference_for

@@ -1,9 +1,8 @@
 """Cases of the losses that compare the features of trained networks."""
 
 import numpy as np
-import reference.loss.lpips
-import reference.loss.vgg19
 
+from ... import reference
 from .. import draw
 from ..close_calls import ON_CPU, ON_GPU, calls_within, closest, decisions_of_lpips, decisions_of_vgg19
 from ..draw import uniform
@@ -27,7 +26,7 @@ def draw_without_close_calls(rng, decisions, *shapes):
     for _ in range(MOST_TRIES):
         pictures = [uniform(rng, 0.0, 1.0, *shape) for shape in shapes]
         if closest(decisions(*pictures)) > ON_CPU:
-            return pictures, lambda: calls_within(ON_GPU, decisions(*pictures))
+            return pictures, lambda pictures=pictures: calls_within(ON_GPU, decisions(*pictures))
     raise RuntimeError(f"every one of {MOST_TRIES} sets of pictures has a close call")
 
 
@@ -111,7 +110,9 @@ def perceptual(rng):
         both = [pictures for half in np.split(rendered, 2) for pictures in (half, truth)]
         return decisions_of_lpips("lpips_alex", of_alex, [pictures.reshape(-1, 3, 31, 31) for pictures in both])
 
-    (rendered, truth), close_calls = draw_without_close_calls(rng, decisions_of_alex, (2, 1, 3, 31, 31), (1, 1, 3, 31, 31))
+    (rendered, truth), close_calls = draw_without_close_calls(
+        rng, decisions_of_alex, (2, 1, 3, 31, 31), (1, 1, 3, 31, 31)
+    )
     inputs = {"rendered": rendered, "truth": truth, **of_alex}
     yield Draw("lpips_alex", inputs, {"kind": "lpips_alex"}, differentiate=("rendered",), close_calls=close_calls)
 

@@ -1,11 +1,9 @@
 """Cases of the preprocessing and augmentation of photos."""
 
 import numpy as np
-import reference.depth_search
-import reference.jitter
-import reference.resample
 import torch
 
+from ... import reference
 from ..draw import uniform
 from ..registry import Draw, by, case, reference_for
 from ..tolerance import Tolerance

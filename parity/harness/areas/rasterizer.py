@@ -1,9 +1,9 @@
 """Cases of projection and rasterizer, in float64 and float32."""
 
 import numpy as np
-import reference.splat
 import torch
 
+from ... import reference
 from .. import scenes
 from ..registry import Draw, case, reference_for
 from ..thresholds import MOST_TRIES, doubtful_pixels
@@ -54,7 +54,7 @@ def map_cameras(inputs, function):
     rows = []
     for b in range(inputs["w2c"].shape[0]):
         scene = [inputs[name][b] for name in ("means", "scales", "quaternions", "opacities", "sh")]
-        cameras = zip(inputs["w2c"][b], inputs["intrinsics"][b])
+        cameras = zip(inputs["w2c"][b], inputs["intrinsics"][b], strict=True)
         rows.append([function(*scene, w2c, intrinsics) for w2c, intrinsics in cameras])
     return {key: torch.stack([torch.stack([seen[key] for seen in row]) for row in rows]) for key in rows[0][0]}
 

@@ -1,8 +1,6 @@
 """Cases of the tokenizer, from images and cameras to the tokens that the encoder reads."""
 
-import reference.rays
-import reference.tokens
-
+from ... import reference
 from .. import draw
 from ..draw import integer, normal
 from ..names import reference_config, with_prefix
@@ -27,7 +25,7 @@ def rgb_tokens(rng):
     """The RGB half of the tokens, which does not depend on the cameras."""
     for _ in range(3):
         config = draw.model_config(rng)
-        image, inputs = draw.pictures(rng, config, integer(rng, 1, 3), integer(rng, 1, 4))
+        _, inputs = draw.pictures(rng, config, integer(rng, 1, 3), integer(rng, 1, 4))
         images = {"images": inputs["images"]}
         params = {"rgb_patch_embeds.1.weight": draw.parameters(rng, config)["rgb_patch_embeds.1.weight"]}
         label = f"{by(*images['images'].shape)}, patch {config['patch_size']}"
@@ -94,7 +92,7 @@ def tokens(rng):
     """Both halves of the tokens, with and without the camera code."""
     for code in (True, True, False):
         config = draw.model_config(rng, camera_code=code)
-        image, inputs = draw.pictures(rng, config, integer(rng, 1, 3), integer(rng, 1, 4))
+        _, inputs = draw.pictures(rng, config, integer(rng, 1, 3), integer(rng, 1, 4))
         params = draw.parameters(rng, config)
         tokenizer = ("rgb_patch_embeds", "ray_patch_embeds", "view_pe")
         params = {name: value for name, value in params.items() if name.startswith(tokenizer)}

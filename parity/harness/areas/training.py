@@ -3,10 +3,9 @@
 from itertools import product
 
 import numpy as np
-import reference.loss.subsets
-import reference.schedule
 import torch
 
+from ... import reference
 from ..draw import normal
 from ..registry import Draw, case, reference_for
 from ..tolerance import FLOAT64
@@ -67,7 +66,7 @@ def stages_reference(config, params, inputs):
             return config["final_stage"], 1.0
         return reference.schedule.stage(step, config["final_stage"], config["boundaries"], config["transition"])
 
-    index, mix = zip(*(at(step) for step in inputs["steps"].tolist()))
+    index, mix = zip(*(at(step) for step in inputs["steps"].tolist()), strict=True)
     return {"index": torch.tensor(index), "mix": torch.tensor(mix, dtype=torch.float64)}
 
 

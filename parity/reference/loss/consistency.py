@@ -10,9 +10,7 @@ def symmetric_l1(x, y):
     return 0.5 * (x - y.detach()).abs() + 0.5 * (y - x.detach()).abs()
 
 
-def consistency(
-    opacity_a, opacity_b, depth_a, depth_b, opacity_weight=OPACITY_WEIGHT, depth_weight=DEPTH_WEIGHT
-):
+def consistency(opacity_a, opacity_b, depth_a, depth_b, opacity_weight=OPACITY_WEIGHT, depth_weight=DEPTH_WEIGHT):
     """Returns 1e-3 L1(A_a, A_b) + 1e-2 L1(D_a, D_b) of four tensors of one shape [...]."""
     opacity = symmetric_l1(opacity_a, opacity_b).mean()
     supported = ((opacity_a > SUPPORT) & (opacity_b > SUPPORT)).to(depth_a.dtype)

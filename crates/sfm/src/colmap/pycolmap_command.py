@@ -4,8 +4,9 @@ import json
 import os
 import sys
 import threading
+from pathlib import Path
 
-sys.path = [path for path in sys.path if path]
+sys.path = [path for path in sys.path if path]  # noqa: TID251
 import pycolmap  # noqa: E402
 
 
@@ -39,8 +40,7 @@ for name in list(options):
 
 database = options["database_path"]
 if sys.argv[1] == "feature_extractor":
-    with open(options["image_list_path"], encoding="utf-8") as file:
-        names = file.read().splitlines()
+    names = Path(options["image_list_path"]).read_text(encoding="utf-8").splitlines()
     pycolmap.extract_features(
         database,
         options["image_path"],
@@ -52,15 +52,11 @@ if sys.argv[1] == "feature_extractor":
     )
 elif sys.argv[1] == "matches_importer":
     pairing = pycolmap.ImportedPairingOptions(match_list_path=options["match_list_path"])
-    pycolmap.match_image_pairs(
-        database, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu
-    )
+    pycolmap.match_image_pairs(database, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu)
 elif sys.argv[1] == "spatial_matcher":
     pycolmap.match_spatial(database, matching_options=matching, device=pycolmap.Device.cpu)
 elif sys.argv[1] == "mapper":
-    pycolmap.incremental_mapping(
-        database, options["image_path"], options["output_path"], options=pipeline
-    )
+    pycolmap.incremental_mapping(database, options["image_path"], options["output_path"], options=pipeline)
 elif sys.argv[1] == "bundle_adjuster":
     # A robust loss, for which COLMAP's own program has no option. Its scale, in terms of the median error, suits errors that are mostly
     # normally distributed.
