@@ -167,7 +167,9 @@ def rasterization(
     if sh_degree is not None:
         bases = (sh_degree + 1) ** 2
         if bases > colors.shape[-2]:
-            raise ValueError(f"colors has {colors.shape[-2]} spherical harmonics, expected {bases} or more for degree {sh_degree}")
+            raise ValueError(
+                f"colors has {colors.shape[-2]} spherical harmonics, expected {bases} or more for degree {sh_degree}"
+            )
         passes = [colors[..., :bases, :]]
     elif has_colors:
         padded = torch.nn.functional.pad(colors, (0, -channels % CHANNELS))
@@ -180,7 +182,10 @@ def rasterization(
     # Gradients reach the tensor in `meta`, so the op gets what is made from it.
     out = (*batch, cameras)
     shape, means2d = means2d.shape, means2d.reshape(*out, count, 2)
-    renders = [torch.ops.globalsplat.splat(*gaussians, of_pass, viewmats, Ks, *settings, means2d.reshape(shape)) for of_pass in passes]
+    renders = [
+        torch.ops.globalsplat.splat(*gaussians, of_pass, viewmats, Ks, *settings, means2d.reshape(shape))
+        for of_pass in passes
+    ]
     alpha, depth = renders[0][1][..., None], renders[0][2][..., None]
     images = []
     if has_colors:
@@ -202,7 +207,9 @@ def rasterization(
     return image.reshape(*out, *image.shape[2:]), alpha.reshape(*out, *alpha.shape[2:]), meta
 
 
-def _describe(means2d: Tensor, conics: Tensor, depths: Tensor, opacities: Tensor, visible: Tensor, width: int, height: int) -> dict[str, Tensor]:
+def _describe(
+    means2d: Tensor, conics: Tensor, depths: Tensor, opacities: Tensor, visible: Tensor, width: int, height: int
+) -> dict[str, Tensor]:
     """Returns the entries of `meta` for the projected Gaussians, whose tensors have the shape of means2d."""
     xx, xy, yy = conics.unbind(-1)
     variances = torch.stack([yy, xx], -1) / (xx * yy - xy * xy)[..., None]

@@ -143,7 +143,9 @@ def _to_capture(capture: Capture | Path | Tensor, viewmats: Tensor | None = None
         if images.is_floating_point():
             images = (images.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
         if images.dtype != torch.uint8 or images.dim() != 4:
-            raise ValueError(f"images are {images.dtype} of shape {list(images.shape)}, expected uint8 or floats [V, H, W, 3]")
+            raise ValueError(
+                f"images are {images.dtype} of shape {list(images.shape)}, expected uint8 or floats [V, H, W, 3]"
+            )
         cameras = [np.ascontiguousarray(matrices.detach().cpu().double().numpy()) for matrices in (viewmats, Ks)]
         return _native.capture_from_images(np.ascontiguousarray(images.numpy()), *cameras)
     if viewmats is not None or Ks is not None:
@@ -160,4 +162,7 @@ def _cuda_index(device: str | torch.device) -> int | None:
 
 def _to_tensors(raw: Mapping[str, Any], device: str | torch.device) -> Splat:
     items = to_splat(raw).items()
-    return cast(Splat, {name: torch.from_numpy(value).to(device) if isinstance(value, np.ndarray) else value for name, value in items})
+    return cast(
+        Splat,
+        {name: torch.from_numpy(value).to(device) if isinstance(value, np.ndarray) else value for name, value in items},
+    )

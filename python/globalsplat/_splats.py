@@ -78,7 +78,13 @@ def load_splat(path: str | os.PathLike[str], activated: bool = True) -> Splat | 
         sh = raw["sh"]
         return cast(
             Parameters,
-            {**parameters, "scales": raw["log_scales"], "opacities": raw["opacity_logits"], "sh0": sh[:, :1], "shN": sh[:, 1:]},
+            {
+                **parameters,
+                "scales": raw["log_scales"],
+                "opacities": raw["opacity_logits"],
+                "sh0": sh[:, :1],
+                "shN": sh[:, 1:],
+            },
         )
     return to_splat(raw)
 

@@ -16,7 +16,9 @@ def torch_folder() -> Path:
     """
     spec = importlib.util.find_spec("torch")
     if spec is None or spec.origin is None:
-        raise ImportError(f"globalsplat needs PyTorch {REQUIRED}, which isn't installed: pip install 'torch=={REQUIRED}.*'")
+        raise ImportError(
+            f"globalsplat needs PyTorch {REQUIRED}, which isn't installed: pip install 'torch=={REQUIRED}.*'"
+        )
     version = importlib.metadata.version("torch")
     if version.split(".")[:2] != REQUIRED.split("."):
         raise ImportError(

@@ -37,7 +37,7 @@ nerfacc.accumulate_along_rays = accumulate_along_rays
 nerfacc.render_weight_from_alpha = render_weight_from_alpha
 sys.modules["nerfacc"] = nerfacc
 
-from gsplat.cuda._torch_impl import (  # noqa: E402: needs the replacement of nerfacc
+from gsplat.cuda._torch_impl import (  # noqa: E402 (needs the replacement of nerfacc)
     _fully_fused_projection,
     _quat_scale_to_covar_preci,
     _spherical_harmonics,
@@ -81,7 +81,9 @@ def rasterization(
     else:
         directions = means - torch.inverse(viewmats)[:, None, :3, 3]
         bases = (sh_degree + 1) ** 2
-        colors = torch.clamp_min(_spherical_harmonics(sh_degree, directions, colors[:, :bases].expand(cameras, -1, -1, -1)) + 0.5, 0.0)
+        colors = torch.clamp_min(
+            _spherical_harmonics(sh_degree, directions, colors[:, :bases].expand(cameras, -1, -1, -1)) + 0.5, 0.0
+        )
     if render_mode in ("D", "ED"):
         colors, backgrounds = depths[..., None], None
     elif render_mode != "RGB":
@@ -97,7 +99,11 @@ def rasterization(
         renders = renders + (1.0 - alphas) * backgrounds[:, None, None]
     if render_mode.endswith("ED"):
         renders = torch.cat([renders[..., :-1], renders[..., -1:] / alphas.clamp(min=1e-10)], -1)
-    return renders, alphas, {"radii": radii, "means2d": means2d, "depths": depths, "conics": conics, "opacities": opacities}
+    return (
+        renders,
+        alphas,
+        {"radii": radii, "means2d": means2d, "depths": depths, "conics": conics, "opacities": opacities},
+    )
 
 
 @torch.no_grad()

@@ -54,15 +54,26 @@ def leaves(tensors):
 def compare(inputs, Ks, dtype, **options):
     """Compares images, alphas, meta and the gradients of all `inputs`. Pixels that rounding may decide are left out."""
     exact = [tensor.double() for tensor in inputs]
-    near = [gsplat_reference.rasterization(*exact, Ks.double(), WIDTH, HEIGHT, threshold_factor=factor, **doubles(options)) for factor in (1 - 1e-4, 1 + 1e-4)]
+    near = [
+        gsplat_reference.rasterization(*exact, Ks.double(), WIDTH, HEIGHT, threshold_factor=factor, **doubles(options))
+        for factor in (1 - 1e-4, 1 + 1e-4)
+    ]
     is_certain = ((near[0][0] - near[1][0]).abs().amax(-1) < 1e-7) & ((near[0][1] - near[1][1]).abs()[..., 0] < 1e-7)
     assert is_certain.float().mean() > 0.9
     results = []
     for render, kind in ((gsplat_reference.rasterization, torch.float64), (globalsplat.rasterization, dtype)):
         ours = leaves(tensor.to(kind) for tensor in inputs)
-        image, alpha, meta = render(*ours, Ks.to(kind), WIDTH, HEIGHT, **{name: to(kind, value) for name, value in options.items()})
-        weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * is_certain[..., None]
-        alphas = torch.randn(alpha.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64) * is_certain[..., None]
+        image, alpha, meta = render(
+            *ours, Ks.to(kind), WIDTH, HEIGHT, **{name: to(kind, value) for name, value in options.items()}
+        )
+        weights = (
+            torch.randn(image.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+            * is_certain[..., None]
+        )
+        alphas = (
+            torch.randn(alpha.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+            * is_certain[..., None]
+        )
         loss = (image * weights).sum() + (alpha * alphas).sum()
         tapped = [meta["means2d"]] if meta["means2d"].requires_grad else []
         gradients = torch.autograd.grad(loss, [*ours, *tapped])
@@ -132,9 +143,18 @@ def test_it_equals_gsplat_for_features_depths_and_backgrounds(channels, render_m
     # Features are not limited to positive numbers.
     colors = torch.randn(len(scene[0]), channels, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     backgrounds = torch.randn(2, channels, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    options = {"render_mode": render_mode, "backgrounds": backgrounds, "near_plane": 3.4, "far_plane": 4.9, "eps2d": 0.1}
+    options = {
+        "render_mode": render_mode,
+        "backgrounds": backgrounds,
+        "near_plane": 3.4,
+        "far_plane": 4.9,
+        "eps2d": 0.1,
+    }
     if render_mode in ("D", "ED"):
-        ours, theirs = (render(*scene, colors, viewmats, Ks, WIDTH, HEIGHT, **options)[0] for render in (globalsplat.rasterization, gsplat_reference.rasterization))
+        ours, theirs = (
+            render(*scene, colors, viewmats, Ks, WIDTH, HEIGHT, **options)[0]
+            for render in (globalsplat.rasterization, gsplat_reference.rasterization)
+        )
         assert_close("depth", ours, theirs)
     else:
         compare([*scene, colors, viewmats], Ks, torch.float64, **options)
@@ -142,13 +162,15 @@ def test_it_equals_gsplat_for_features_depths_and_backgrounds(channels, render_m
 
 def test_batches_and_colours_of_each_camera_equal_separate_calls():
     viewmats, Ks = cameras(2, torch.float32)
-    scenes = [[tensor for tensor in gaussians("random", torch.float32)] for _ in range(6)]
+    scenes = [list(gaussians("random", torch.float32)) for _ in range(6)]
     for index, scene in enumerate(scenes):
         scene[0] = scene[0] + 0.1 * index
     stacked = [torch.stack(tensors).unflatten(0, (2, 3)) for tensors in zip(*scenes, strict=True)]
     colors = torch.rand(2, 3, 2, 60, 4)
     batch = leaves([*stacked, colors, viewmats.expand(2, 3, -1, -1, -1)])
-    image, alpha, meta = globalsplat.rasterization(*batch, Ks.expand(2, 3, -1, -1, -1), WIDTH, HEIGHT, render_mode="RGB+D")
+    image, alpha, meta = globalsplat.rasterization(
+        *batch, Ks.expand(2, 3, -1, -1, -1), WIDTH, HEIGHT, render_mode="RGB+D"
+    )
     assert image.shape == (2, 3, 2, HEIGHT, WIDTH, 5) and alpha.shape == (2, 3, 2, HEIGHT, WIDTH, 1)
     assert meta["means2d"].shape == (2, 3, 2, 60, 2) and meta["radii"].shape == (2, 3, 2, 60, 2)
     image.square().sum().backward()
@@ -156,7 +178,13 @@ def test_batches_and_colours_of_each_camera_equal_separate_calls():
         parts = [leaves(tensor[row, column] for tensor in batch) for _ in range(2)]
         for camera, part in enumerate(parts):
             one, _, _ = globalsplat.rasterization(
-                *part[:4], part[4][camera], part[5][camera : camera + 1], Ks[camera : camera + 1], WIDTH, HEIGHT, render_mode="RGB+D"
+                *part[:4],
+                part[4][camera],
+                part[5][camera : camera + 1],
+                Ks[camera : camera + 1],
+                WIDTH,
+                HEIGHT,
+                render_mode="RGB+D",
             )
             torch.testing.assert_close(one[0], image[row, column, camera], rtol=0, atol=0)
             one.square().sum().backward()
@@ -202,7 +230,9 @@ def test_compiled_functions_give_the_same_bits():
     scene = leaves([*gaussians("random", torch.float32), torch.rand(60, 3)])
 
     def loss(means, quats, scales, opacities, colors):
-        image, alpha, _ = globalsplat.rasterization(means, quats, scales.exp() - 1, opacities, colors, viewmats, Ks, WIDTH, HEIGHT)
+        image, alpha, _ = globalsplat.rasterization(
+            means, quats, scales.exp() - 1, opacities, colors, viewmats, Ks, WIDTH, HEIGHT
+        )
         return image.square().mean() + alpha.mean()
 
     compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
@@ -252,7 +282,9 @@ def test_half_precision_renders_in_float32():
 def test_no_gaussians_render_the_background():
     viewmats, Ks = cameras(1, torch.float32)
     empty = [torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3)]
-    image, alpha, _ = globalsplat.rasterization(*empty, viewmats, Ks, WIDTH, HEIGHT, backgrounds=torch.tensor([[0.1, 0.2, 0.3]]))
+    image, alpha, _ = globalsplat.rasterization(
+        *empty, viewmats, Ks, WIDTH, HEIGHT, backgrounds=torch.tensor([[0.1, 0.2, 0.3]])
+    )
     assert (image == torch.tensor([0.1, 0.2, 0.3])).all() and (alpha == 0).all()
 
 
@@ -272,7 +304,9 @@ def test_no_gaussians_render_the_background():
 def test_arguments_that_are_not_implemented_are_refused(options):
     viewmats, Ks = cameras(1, torch.float32)
     with pytest.raises(NotImplementedError, match=next(iter(options))):
-        globalsplat.rasterization(*gaussians("random", torch.float32), torch.rand(60, 3), viewmats, Ks, WIDTH, HEIGHT, **options)
+        globalsplat.rasterization(
+            *gaussians("random", torch.float32), torch.rand(60, 3), viewmats, Ks, WIDTH, HEIGHT, **options
+        )
 
 
 def test_wrong_shapes_are_named():
@@ -284,6 +318,10 @@ def test_wrong_shapes_are_named():
     with pytest.raises(ValueError, match=r"Ks has shape \[3, 3\], expected \[1, 3, 3\]"):
         globalsplat.rasterization(means, quats, scales, opacities, colors, viewmats, Ks[0], WIDTH, HEIGHT)
     with pytest.raises(ValueError, match="render_mode"):
-        globalsplat.rasterization(means, quats, scales, opacities, colors, viewmats, Ks, WIDTH, HEIGHT, render_mode="rgb")
+        globalsplat.rasterization(
+            means, quats, scales, opacities, colors, viewmats, Ks, WIDTH, HEIGHT, render_mode="rgb"
+        )
     with pytest.raises(NotImplementedError, match="degree 3"):
-        globalsplat.rasterization(means, quats, scales, opacities, torch.rand(60, 25, 3), viewmats, Ks, WIDTH, HEIGHT, sh_degree=4)
+        globalsplat.rasterization(
+            means, quats, scales, opacities, torch.rand(60, 25, 3), viewmats, Ks, WIDTH, HEIGHT, sh_degree=4
+        )
