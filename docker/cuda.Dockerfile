@@ -14,7 +14,7 @@ RUN make setup && scripts/dist.sh cuda && mv target/dist/globalsplat-*/ /opt/glo
 
 FROM debian:bookworm-slim
 ENV NVIDIA_VISIBLE_DEVICES=all NVIDIA_DRIVER_CAPABILITIES=compute,utility
-RUN apt-get update && apt-get install -y --no-install-recommends ffmpeg libheif-examples libstdc++6 && rm -rf /var/lib/apt/lists/* \
+RUN apt-get update && apt-get install -y --no-install-recommends ffmpeg libheif-examples libstdc++6 zlib1g && rm -rf /var/lib/apt/lists/* \
     && useradd --create-home globalsplat && mkdir /work && chown globalsplat /work
 COPY --from=build /opt/globalsplat /usr/local
 USER globalsplat

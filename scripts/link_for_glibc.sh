@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Links a program or a shared library for every system with glibc 2.28 and the libstdc++ of GCC 8, although this system's are newer.
-#   cargo rustc --release --bin globalsplat -- -C linker=scripts/link_for_glibc.sh    links like cc, whose arguments it takes
-#   scripts/link_for_glibc.sh --check FILE…                              fails if a file needs a newer symbol
+#   cargo rustc --release --bin globalsplat -- -C linker="$PWD/scripts/link_for_glibc.sh"    takes the arguments of cc
+#   scripts/link_for_glibc.sh --check FILE…    fails if a file needs a newer symbol
 # The linker sees copies of this system's libraries without code, which only have the symbols up to these versions. It takes newer symbols of
 # libstdc++ from libstdc++.a, and those of glibc from glibc_compat.c. libstdc++ as a whole stays shared: libtorch exchanges its
 # objects with us. Needs GNU binutils and GCC. The copies are made once, in target/stubs. CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_LINKER=PATH
@@ -63,7 +63,7 @@ if [ ! -e "$stubs/done" ] || [ "$here/link_for_glibc.sh" -nt "$stubs/done" ]; th
         make_stub "$("$cc" -print-file-name="$library")" "$made/$library"
     done
     ln -s libm.so.6 "$made/libm.so"
-    echo "INPUT($stubs/libc.so.6 $("$cc" -print-file-name=libc_nonshared.a) AS_NEEDED($("$cc" -print-file-name=ld-linux-x86-64.so.2)))" >"$made/libc.so"
+    echo "INPUT($stubs/libc.so.6 $("$cc" -print-file-name=libc_nonshared.a) AS_NEEDED($(grep -oE '/[^ ]*/ld-linux[^ ]*' "$("$cc" -print-file-name=libc.so)")))" >"$made/libc.so"
     echo "INPUT($stubs/libstdc++.so.6 $("$cc" -print-file-name=libstdc++.a))" >"$made/libstdc++.so"
     touch "$made/done"
     mv -T "$made" "$stubs" 2>/dev/null || rm -r "$made"
