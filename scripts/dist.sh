@@ -26,7 +26,15 @@ out="$target/dist/$name"
 rm -rf "$out"
 mkdir -p "$out/bin" "$out/lib" "$out/share/globalsplat" "$out/share/doc/globalsplat"
 
-scripts/heartbeat.sh "linking" "${CARGO:-cargo}" rustc --release --locked --bin globalsplat -- -C linker="$root/scripts/link_for_glibc.sh"
+# Links the program again, by a `cc` that comes first in the PATH. With a linker in its configuration, cargo would build everything again, and
+# `cargo rustc` would build many crates again with fewer features.
+build=("${CARGO:-cargo}" build --release --locked)
+scripts/heartbeat.sh building "${build[@]}"
+mkdir -p "$target/linker"
+printf '#!/bin/sh\nCC="%s" exec "%s" "$@"\n' "$(command -v cc)" "$root/scripts/link_for_glibc.sh" >"$target/linker/cc"
+chmod +x "$target/linker/cc"
+find "$target/release/deps" -samefile "$target/release/globalsplat" -delete
+PATH="$(realpath "$target")/linker:$PATH" scripts/heartbeat.sh linking "${build[@]}"
 # Names of functions stay, for backtraces.
 strip --strip-debug -o "$out/bin/globalsplat" "$target/release/globalsplat"
 
