@@ -47,6 +47,11 @@ gpu-bundle: build
 	@tar -tzf $(BUNDLE).tar.gz >$(BUNDLE).txt
 	@echo "$(BUNDLE).tar.gz: $$(du -h $(BUNDLE).tar.gz | cut -f1), $$(wc -l <$(BUNDLE).txt) files, listed in $(BUNDLE).txt"
 
+# Packs the program with all that it needs to run on another Linux without a GPU, into target/dist. See docs/start.md.
+.PHONY: dist
+dist: setup
+	@scripts/dist.sh
+
 # Runs every check, even after one has failed; the last line reports how many tests were skipped and which requirement each lacked.
 test:
 	@scripts/count_skips.sh $(MAKE) --no-print-directory --keep-going checks
@@ -58,7 +63,7 @@ quick: check-format check-lints check-python
 	$(CARGO) test --release --locked --lib -p globalsplat -p globalsplat-csrc
 
 # WITHOUT names checks to leave out, such as one that has just been run.
-CHECKS := $(filter-out $(WITHOUT),check-crates check-format check-lints check-python check-library check-docs check-tests)
+CHECKS := $(filter-out $(WITHOUT),check-crates check-format check-licenses check-lints check-python check-library check-docs check-tests)
 .PHONY: checks $(CHECKS)
 checks: $(CHECKS) parity
 $(filter-out check-crates,$(CHECKS)): venv
@@ -81,6 +86,9 @@ check-packages:
 
 check-format:
 	$(CARGO) fmt --all --check
+# Fails on a crate or a bundled npm package with a license that isn't allowed.
+check-licenses:
+	python3 scripts/licenses.py
 check-lints:
 	$(CARGO) clippy --release --locked --all-targets -- -D warnings
 # Checks format, lints and types of all Python, with the settings of pyproject.toml.

@@ -1,0 +1,142 @@
+"""Lists the licenses of everything that is distributed with the program, and fails on one that isn't allowed.
+
+    python scripts/licenses.py                    checks, and prints the number of packages by license
+    python scripts/licenses.py --out FILE         also writes all license texts
+    python scripts/licenses.py --out FILE --cuda  the same, with NVIDIA's libraries for GPUs
+
+The packages are the crates that the program links, the npm packages that web/ bundles, and the wheels that libtorch's libraries come from.
+Needs only Python, cargo, and for --out the packages themselves.
+"""
+
+import argparse
+import json
+import os
+import re
+import subprocess
+import sys
+from collections import Counter
+from importlib.metadata import Distribution, distributions
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+# Licenses that ask for no more than their own text beside the program.
+ALLOWED = set("0BSD Apache-2.0 BSD-2-Clause BSD-3-Clause BSL-1.0 CC0-1.0 IJG ISC MIT Unicode-3.0 Unlicense Zlib".split())
+# Bundlers of web/, which are not in the bundle.
+BUILD_TOOLS = {"esbuild"}
+# NVIDIA's licenses let libraries be redistributed as parts of a program.
+CPU_WHEELS = ["torch", "nvidia-cuda-cupti", "nvidia-cuda-runtime"]
+LIBGOMP = (
+    "GPL-3.0-or-later WITH GCC-exception-3.1",
+    "libgomp.so.1, which comes with libtorch, and the parts of libstdc++ in the program are GCC's runtime libraries: GPL version 3 or later with\n"
+    "the GCC Runtime Library Exception 3.1, by which programs under any license may contain and be distributed with them. Source:\n"
+    "https://gcc.gnu.org. License: https://www.gnu.org/licenses/gpl-3.0.txt and https://www.gnu.org/licenses/gcc-exception-3.1.txt\n",
+)
+TEXT = re.compile(r"(un)?licen[sc]e|copying|notice|copyright", re.IGNORECASE)
+
+
+def is_allowed(expression: str) -> bool:
+    """Returns whether an SPDX expression can be met with allowed licenses alone."""
+    expression = re.sub(r" WITH \S+?(?=[\s)]|$)", "", expression.replace("/", " OR "))
+    words = re.findall(r"[()]|[^\s()]+", expression)
+    python = [w if w in "()" else w.lower() if w in ("AND", "OR") else str(w in ALLOWED) for w in words]
+    return bool(words) and bool(eval(" ".join(python), {}))  # Only True, False, and, or and parentheses.
+
+
+def texts(folder: Path, depth: int = 1) -> list[str]:
+    """Returns the license texts in a folder of a package, and in `depth` levels of folders below it."""
+    found = []
+    for path in sorted(folder.iterdir()):
+        if path.is_file() and TEXT.match(path.name):
+            found.append(path.read_text(errors="replace").strip() + "\n")
+        elif path.is_dir() and depth > 0:
+            found += texts(path, depth - 1)
+    return found
+
+
+def crates() -> list[tuple[str, str, list[str]]]:
+    """Returns the name, license expression and texts of every crate that the program links."""
+    command = [os.environ.get("CARGO", "cargo"), "metadata", "--locked", "--format-version", "1"]
+    command += ["--filter-platform", f"{os.uname().machine}-unknown-linux-gnu"]
+    metadata = json.loads(subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, check=True).stdout)
+    packages = {package["id"]: package for package in metadata["packages"]}
+    nodes = {node["id"]: node for node in metadata["resolve"]["nodes"]}
+    reached: set[str] = set()
+    waiting = [name for name in metadata["workspace_members"] if packages[name]["name"] == "globalsplat"]
+    while waiting:
+        name = waiting.pop()
+        if name not in reached:
+            reached.add(name)
+            waiting += [d["pkg"] for d in nodes[name]["deps"] if any(kind["kind"] is None for kind in d["dep_kinds"])]
+    linked = [packages[name] for name in reached if packages[name]["source"]]
+    found = []
+    for package in sorted(linked, key=lambda p: p["name"]):
+        written = texts(Path(package["manifest_path"]).parent)
+        if not written:
+            # Its package has no text, but its authors chose one that is the same for everyone, or asks for their names.
+            written = [f"By {', '.join(package['authors']) or package['repository']}. The text is that of {package['license']}.\n"]
+        found.append((f"{package['name']} {package['version']}", package["license"] or "", written))
+    return found
+
+
+def npm_packages(with_texts: bool) -> list[tuple[str, str, list[str]]]:
+    """Returns the same of every npm package that web/ bundles."""
+    lock = json.loads((ROOT / "web/package-lock.json").read_text())["packages"]
+    reached: set[str] = set()
+    waiting = [name for name in lock[""]["dependencies"] if name not in BUILD_TOOLS]
+    while waiting:
+        name = waiting.pop()
+        if name not in reached:
+            reached.add(name)
+            waiting += lock[f"node_modules/{name}"].get("dependencies", {})
+    found = []
+    for name in sorted(reached):
+        package = lock[f"node_modules/{name}"]
+        found.append((f"{name} {package['version']}", package.get("license", ""), texts(ROOT / "web/node_modules" / name, 0) if with_texts else []))
+    return found
+
+
+def wheels(cuda: bool) -> list[tuple[str, str, list[str]]]:
+    """Returns the same of the wheels that libtorch and the libraries that it loads come from."""
+    libtorch = Path(os.environ.get("LIBTORCH") or ROOT / ".venv/libtorch").resolve()
+    found = []
+    for wheel in distributions(path=[str(libtorch.parent)]):
+        name = wheel.metadata["Name"].lower()
+        if name in CPU_WHEELS or cuda and name.startswith("nvidia-"):
+            license = wheel.metadata["License-Expression"] or wheel.metadata["License"] or ""
+            found.append((f"{name} {wheel.version}", license, wheel_texts(wheel)))
+    return sorted(found)
+
+
+def wheel_texts(wheel: Distribution) -> list[str]:
+    """Returns the license texts that a wheel lists."""
+    files = [file for file in wheel.files or [] if TEXT.match(file.name) and file.suffix in ("", ".txt")]
+    return [Path(str(wheel.locate_file(file))).read_text(errors="replace").strip() + "\n" for file in files]
+
+
+def main() -> None:
+    """Checks the licenses, and writes their texts if a file is named."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--out", type=Path, help="the file to write all license texts to")
+    parser.add_argument("--cuda", action="store_true", help="include NVIDIA's libraries for GPUs")
+    options = parser.parse_args()
+    ours = crates() + npm_packages(options.out is not None)
+    refused = [f"{name} has the license {license!r}" for name, license, _ in ours if not is_allowed(license)]
+    if options.out:
+        ours += wheels(options.cuda) + [("libgomp, libstdc++", LIBGOMP[0], [LIBGOMP[1]])]
+        refused += [f"{name} comes without a license text" for name, _, written in ours if not written]
+    if refused:
+        sys.exit("\n".join(f"licenses: {line}, see scripts/licenses.py" for line in refused))
+    if options.out:
+        users: dict[str, list[str]] = {}
+        for name, license, written in ours:
+            for text in written:
+                users.setdefault(text, []).append(f"{name} ({license})")
+        with options.out.open("w", encoding="utf-8") as file:
+            for text, names in users.items():
+                file.write(f"{'=' * 100}\n{', '.join(dict.fromkeys(names))}\n{'=' * 100}\n\n{text}\n")
+    counts = Counter(license for _, license, _ in ours)
+    print(f"licenses: {len(ours)} packages: " + ", ".join(f"{n} {license}" for license, n in counts.most_common()))
+
+
+if __name__ == "__main__":
+    main()
