@@ -52,6 +52,13 @@ gpu-bundle: build
 dist: setup
 	@scripts/dist.sh
 
+# Builds the wheel of the Python package, python/, into target/wheels; check-wheel tests it in a fresh virtual environment.
+.PHONY: wheel check-wheel
+wheel: venv
+	@scripts/wheel.sh
+check-wheel: wheel
+	scripts/check_wheel.sh
+
 # Runs every check, even after one has failed; the last line reports how many tests were skipped and which requirement each lacked.
 test:
 	@scripts/count_skips.sh $(MAKE) --no-print-directory --keep-going checks
@@ -90,7 +97,7 @@ check-format:
 check-licenses:
 	python3 scripts/licenses.py
 check-lints:
-	$(CARGO) clippy --release --locked --all-targets -- -D warnings
+	$(CARGO) clippy --release --locked --workspace --all-targets -- -D warnings
 # Checks format, lints and types of all Python, with the settings of pyproject.toml.
 check-python:
 	.venv/bin/python -m ruff format --check .

@@ -20,16 +20,19 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 # Licenses that ask for no more than their own text beside the program.
-ALLOWED = set("0BSD Apache-2.0 BSD-2-Clause BSD-3-Clause BSL-1.0 CC0-1.0 IJG ISC MIT Unicode-3.0 Unlicense Zlib".split())
+ALLOWED = {
+    *("0BSD", "Apache-2.0", "BSD-2-Clause", "BSD-3-Clause", "BSL-1.0", "CC0-1.0", "IJG", "ISC", "MIT", "Unicode-3.0"),
+    *("Unlicense", "Zlib"),
+}
 # Bundlers of web/, which are not in the bundle.
 BUILD_TOOLS = {"esbuild"}
 # NVIDIA's licenses let libraries be redistributed as parts of a program.
 CPU_WHEELS = ["torch", "nvidia-cuda-cupti", "nvidia-cuda-runtime"]
 LIBGOMP = (
     "GPL-3.0-or-later WITH GCC-exception-3.1",
-    "libgomp.so.1, which comes with libtorch, and the parts of libstdc++ in the program are GCC's runtime libraries: GPL version 3 or later with\n"
-    "the GCC Runtime Library Exception 3.1, by which programs under any license may contain and be distributed with them. Source:\n"
-    "https://gcc.gnu.org. License: https://www.gnu.org/licenses/gpl-3.0.txt and https://www.gnu.org/licenses/gcc-exception-3.1.txt\n",
+    "libgomp.so.1, which comes with libtorch, and the parts of libstdc++ in the program are GCC's runtime libraries:\n"
+    "GPL version 3 or later with the GCC Runtime Library Exception 3.1, by which programs under any license may contain\n"
+    "and be distributed with them. Source: https://gcc.gnu.org. License: https://www.gnu.org/licenses/gpl-3.0.txt and https://www.gnu.org/licenses/gcc-exception-3.1.txt\n",
 )
 TEXT = re.compile(r"(un)?licen[sc]e|copying|notice|copyright", re.IGNORECASE)
 
@@ -73,7 +76,9 @@ def crates() -> list[tuple[str, str, list[str]]]:
         written = texts(Path(package["manifest_path"]).parent)
         if not written:
             # Its package has no text, but its authors chose one that is the same for everyone, or asks for their names.
-            written = [f"By {', '.join(package['authors']) or package['repository']}. The text is that of {package['license']}.\n"]
+            written = [
+                f"By {', '.join(package['authors']) or package['repository']}. The text is that of {package['license']}.\n"
+            ]
         found.append((f"{package['name']} {package['version']}", package["license"] or "", written))
     return found
 
@@ -91,7 +96,13 @@ def npm_packages(with_texts: bool) -> list[tuple[str, str, list[str]]]:
     found = []
     for name in sorted(reached):
         package = lock[f"node_modules/{name}"]
-        found.append((f"{name} {package['version']}", package.get("license", ""), texts(ROOT / "web/node_modules" / name, 0) if with_texts else []))
+        found.append(
+            (
+                f"{name} {package['version']}",
+                package.get("license", ""),
+                texts(ROOT / "web/node_modules" / name, 0) if with_texts else [],
+            )
+        )
     return found
 
 
@@ -101,7 +112,7 @@ def wheels(cuda: bool) -> list[tuple[str, str, list[str]]]:
     found = []
     for wheel in distributions(path=[str(libtorch.parent)]):
         name = wheel.metadata["Name"].lower()
-        if name in CPU_WHEELS or cuda and name.startswith("nvidia-"):
+        if name in CPU_WHEELS or (cuda and name.startswith("nvidia-")):
             license = wheel.metadata["License-Expression"] or wheel.metadata["License"] or ""
             found.append((f"{name} {wheel.version}", license, wheel_texts(wheel)))
     return sorted(found)
@@ -122,7 +133,7 @@ def main() -> None:
     ours = crates() + npm_packages(options.out is not None)
     refused = [f"{name} has the license {license!r}" for name, license, _ in ours if not is_allowed(license)]
     if options.out:
-        ours += wheels(options.cuda) + [("libgomp, libstdc++", LIBGOMP[0], [LIBGOMP[1]])]
+        ours += [*wheels(options.cuda), ("libgomp, libstdc++", LIBGOMP[0], [LIBGOMP[1]])]
         refused += [f"{name} comes without a license text" for name, _, written in ours if not written]
     if refused:
         sys.exit("\n".join(f"licenses: {line}, see scripts/licenses.py" for line in refused))

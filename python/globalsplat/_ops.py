@@ -15,7 +15,6 @@ def _result_dtype(means: Tensor) -> torch.dtype:
     return torch.float64 if means.dtype == torch.float64 else torch.float32
 
 
-@torch.library.register_fake("globalsplat::splat")
 def _splat_fake(
     means: Tensor,
     quats: Tensor,
@@ -39,7 +38,6 @@ def _splat_fake(
     )
 
 
-@torch.library.register_fake("globalsplat::splat_backward")
 def _splat_backward_fake(*inputs: Any) -> tuple[Tensor, ...]:
     tensors, (has_viewmats_grad, has_means2d_grad) = inputs[:TENSORS], inputs[-2:]
     means, viewmats = tensors[0], tensors[5]
@@ -51,7 +49,6 @@ def _splat_backward_fake(*inputs: Any) -> tuple[Tensor, ...]:
     return (*gradients, means.new_empty(shape, dtype=dtype))
 
 
-@torch.library.register_fake("globalsplat::project")
 def _project_fake(means: Tensor, *inputs: Any) -> tuple[Tensor, ...]:
     shape = (*inputs[4].shape[:2], means.shape[1])
     dtype = _result_dtype(means)
@@ -89,6 +86,9 @@ def _no_gradients(ctx: Any, *_: Any) -> tuple[None, ...]:
     return (None,) * (TENSORS + SETTINGS)
 
 
+torch.library.register_fake("globalsplat::splat", _splat_fake)
+torch.library.register_fake("globalsplat::splat_backward", _splat_backward_fake)
+torch.library.register_fake("globalsplat::project", _project_fake)
 torch.library.register_autograd("globalsplat::splat", _splat_backward, setup_context=_save_for_backward)
 # The projected means receive gradients, which are read from them. splat() gives the same gradients to the Gaussians itself.
 torch.library.register_autograd("globalsplat::project", _no_gradients)

@@ -178,7 +178,8 @@ def rasterization(
         passes = [colors.new_zeros(*colors.shape[:-1], 1, CHANNELS)]
 
     settings = (width, height, eps2d, near_plane, far_plane, rasterize_mode == "antialiased", sh_degree is None)
-    means2d, *projected = torch.ops.globalsplat.project(*gaussians, passes[0], viewmats, Ks, *settings)
+    means2d, *others = torch.ops.globalsplat.project(*gaussians, passes[0], viewmats, Ks, *settings)
+    conics, depths, projected_opacities, visible = (tensor.detach() for tensor in others)
     # Gradients reach the tensor in `meta`, so the op gets what is made from it.
     out = (*batch, cameras)
     shape, means2d = means2d.shape, means2d.reshape(*out, count, 2)
@@ -196,7 +197,7 @@ def rasterization(
     if has_depth:
         images.append(depth if render_mode.endswith("ED") else depth * alpha)
     meta = {
-        **_describe(means2d, *(tensor.detach() for tensor in projected), width, height),
+        **_describe(means2d, conics, depths, projected_opacities, visible, width, height),
         "width": width,
         "height": height,
         "tile_size": tile_size,

@@ -89,7 +89,13 @@ def load_splat(path: str | os.PathLike[str], activated: bool = True) -> Splat | 
     return to_splat(raw)
 
 
-def save_splat(path: str | os.PathLike[str], splat: Mapping[str, Any], activated: bool = True) -> None:
+def save_splat(
+    path: str | os.PathLike[str],
+    splat: Mapping[str, Any],
+    activated: bool = True,
+    *,
+    capture: _native.Capture | None = None,
+) -> None:
     """Writes a splat file in the format that the extension names. The file is replaced in one step.
 
     Args:
@@ -97,6 +103,8 @@ def save_splat(path: str | os.PathLike[str], splat: Mapping[str, Any], activated
         splat (dict): arrays or tensors of N Gaussians with the keys of :class:`Splat`, of which ``sh_degree``, ``eps2d`` and
             ``rasterize_mode`` may be absent, or those of :class:`Parameters` if :attr:`activated` is ``False``.
         activated (bool): as in :func:`load_splat`.
+        capture (Capture, optional): the photos' cameras. A format with fewer spherical harmonics than the splat, such as .splat, gets
+            the colours that these cameras see.
 
     Raises:
         ValueError: if shapes don't fit, a value isn't finite, or the extension is unknown.
@@ -107,7 +115,7 @@ def save_splat(path: str | os.PathLike[str], splat: Mapping[str, Any], activated
         >>> globalsplat.save_splat("room.spz", splat)
         >>> globalsplat.save_splat("trained.ply", params, activated=False)  # an nn.ParameterDict as in gsplat's trainer
     """
-    _native.write_splat(path, from_splat(splat, activated))
+    _native.write_splat(path, from_splat(splat, activated), capture)
 
 
 def to_splat(raw: Mapping[str, Any]) -> Splat:

@@ -14,6 +14,9 @@ use pyo3::prelude::*;
 use std::path::PathBuf;
 use std::sync::Arc;
 
+/// Positions and colours of points.
+type Points<'py> = (Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<f32>>);
+
 /// Photos with known cameras. Photos are read when they are needed.
 #[pyclass(frozen, module = "globalsplat")]
 pub struct Capture(pub globalsplat::data::Capture);
@@ -113,10 +116,7 @@ impl Capture {
     }
 
     /// Points of a COLMAP reconstruction and their colours in [0, 1], two arrays [P, 3]; empty if the capture has none.
-    fn points<'py>(
-        &self,
-        py: Python<'py>,
-    ) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<f32>>)> {
+    fn points<'py>(&self, py: Python<'py>) -> PyResult<Points<'py>> {
         let points = run(py, || Ok(read_points(&self.0)?))?;
         let positions: Vec<f64> = points.iter().flat_map(|point| point.position.to_array()).collect();
         let colours: Vec<f32> = points.iter().flat_map(|point| point.colour).collect();

@@ -1,5 +1,6 @@
 //! Splat files as dictionaries of arrays.
 
+use crate::capture::Capture;
 use crate::error::to_python;
 use crate::work::run;
 use globalsplat::io::{ShLimits, Splat, check_writable_splat, fit_splat};
@@ -17,13 +18,20 @@ pub fn read_splat(py: Python<'_>, path: PathBuf) -> PyResult<(Bound<'_, PyDict>,
     Ok((to_dict(py, splat)?, warnings))
 }
 
-/// Writes a splat file in the format that the file's extension names.
+/// Writes a splat file in the format that the file's extension names. What the format doesn't hold of the colours is made up for, as seen
+/// from the cameras of `capture`.
 #[pyfunction]
-pub fn write_splat(py: Python<'_>, path: PathBuf, splat: Parameters) -> PyResult<()> {
+pub fn write_splat(
+    py: Python<'_>,
+    path: PathBuf,
+    splat: Parameters,
+    capture: Option<&Capture>,
+) -> PyResult<()> {
     let splat = splat.into_splat()?;
+    let cameras = capture.map_or(vec![], |capture| capture.0.cameras());
     run(py, || {
         check_writable_splat(&path)?;
-        let fitted = fit_splat(&path, &splat, &ShLimits::up_to(splat.sh_degree), &[])?;
+        let fitted = fit_splat(&path, &splat, &ShLimits::up_to(splat.sh_degree), &cameras)?;
         Ok(globalsplat::io::write_splat(&path, &fitted)?)
     })
 }
