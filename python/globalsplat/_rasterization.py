@@ -197,6 +197,8 @@ def rasterization(
     if has_depth:
         images.append(depth if render_mode.endswith("ED") else depth * alpha)
     meta = {
+        # gsplat's indices of packed results.
+        **dict.fromkeys(("batch_ids", "camera_ids", "gaussian_ids")),
         **_describe(means2d, conics, depths, projected_opacities, visible, width, height),
         "width": width,
         "height": height,

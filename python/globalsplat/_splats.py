@@ -91,7 +91,7 @@ def load_splat(path: str | os.PathLike[str], activated: bool = True) -> Splat | 
 
 def save_splat(
     path: str | os.PathLike[str],
-    splat: Mapping[str, Any],
+    splat: Mapping[str, Any] | torch.nn.ParameterDict,
     activated: bool = True,
     *,
     capture: _native.Capture | None = None,
@@ -100,8 +100,9 @@ def save_splat(
 
     Args:
         path (str or PathLike): the file.
-        splat (dict): arrays or tensors of N Gaussians with the keys of :class:`Splat`, of which ``sh_degree``, ``eps2d`` and
-            ``rasterize_mode`` may be absent, or those of :class:`Parameters` if :attr:`activated` is ``False``.
+        splat (dict or nn.ParameterDict): arrays or tensors of N Gaussians with the keys of :class:`Splat`, of which
+            ``sh_degree``, ``eps2d`` and ``rasterize_mode`` may be absent, or those of :class:`Parameters` if
+            :attr:`activated` is ``False``.
         activated (bool): as in :func:`load_splat`.
         capture (Capture, optional): the photos' cameras. A format with fewer spherical harmonics than the splat, such as .splat, gets
             the colours that these cameras see.
@@ -134,7 +135,7 @@ def to_splat(raw: Mapping[str, Any]) -> Splat:
     }
 
 
-def from_splat(splat: Mapping[str, Any], activated: bool = True) -> dict[str, Any]:
+def from_splat(splat: Mapping[str, Any] | torch.nn.ParameterDict, activated: bool = True) -> dict[str, Any]:
     """Converts a splat to what the native module takes."""
     names = ["means", "quats", "scales", "opacities", *(["colors"] if activated else ["sh0", "shN"])]
     missing = [name for name in names if name not in splat]
