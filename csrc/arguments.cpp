@@ -28,7 +28,7 @@ void Arguments::check() const {
   expect_shape("intrinsics", intrinsics, {scenes, cameras, 3, 3});
   TORCH_CHECK(bases == 1 || bases == 4 || bases == 9 || bases == 16, "sh has ", bases,
               " basis functions, expected 1, 4, 9 or 16");
-  TORCH_CHECK(width > 0 && height > 0 && width <= kMaxSide && height <= kMaxSide, "the picture is ", width, "×",
+  TORCH_CHECK(width > 0 && height > 0 && width <= kMaxSide && height <= kMaxSide, "the image is ", width, "×",
               height, ", expected sides from 1 to ", kMaxSide);
   TORCH_CHECK(count < kMaxCount, "there are ", count, " Gaussians, expected fewer than ", kMaxCount);
   TORCH_CHECK(projection.eps2d >= 0, "eps2d is ", projection.eps2d, ", expected 0 or more");

@@ -11,7 +11,7 @@ namespace {
 
 using torch::jit::Stack;
 
-// Owner of a forward pass's state, and of the memory of the tensor [1] of int64 that stands for it.
+// Holds a forward pass's state, and the memory of the int64 tensor [1] that represents it.
 struct StateOwner {
   int64_t value;
   std::unique_ptr<const SavedState> state;
@@ -25,7 +25,7 @@ Tensor to_tensor(std::unique_ptr<const SavedState> state) {
   return at::empty({0}, at::kLong).set_(c10::Storage(c10::Storage::use_byte_size_t(), sizeof(owner->value), std::move(memory)), 0, {1}, {1});
 }
 
-// Returns the state for which a tensor stands, or null if the tensor is a copy, as when saved tensors were moved to another device.
+// Returns the state that a tensor represents, or null if the tensor is a copy, as when saved tensors were moved to another device.
 const SavedState* state_of(const Tensor& tensor) {
   const c10::DataPtr& memory = tensor.storage().data_ptr();
   return memory.get_deleter() == delete_state ? static_cast<const StateOwner*>(memory.get_context())->state.get() : nullptr;
@@ -57,25 +57,28 @@ Inputs inputs_of(c10::ArrayRef<c10::IValue> of) {
   return arguments.to_inputs(device == means.device().type() ? means.device() : at::Device(device));
 }
 
-// Replaces an op's arguments by its results.
+// Replaces an op's arguments by its results, on the device of the means, the first argument.
 template <class... Results>
 void finish(Stack* stack, size_t arguments, const Results&... results) {
+  const at::Device device = torch::jit::peek(*stack, 0, arguments).toTensor().device();
   torch::jit::drop(*stack, arguments);
-  torch::jit::push(*stack, results...);
+  torch::jit::push(*stack, results.to(device)...);
 }
 
 void splat_op(const c10::OperatorHandle&, Stack* stack) {
   const Inputs in = inputs_of(torch::jit::last(*stack, kArguments + 1).slice(0, kArguments));
   std::unique_ptr<const SavedState> state;
   const RenderOutput out = backend_of(in.gaussians.means).splat(in, state);
-  finish(stack, kArguments + 1, out.rgb, out.alpha, out.depth, to_tensor(std::move(state)));
+  finish(stack, kArguments + 1, out.rgb, out.alpha, out.depth);
+  torch::jit::push(*stack, to_tensor(std::move(state)));
 }
 
 void splat_backward_op(const c10::OperatorHandle&, Stack* stack) {
   constexpr size_t kAll = kArguments + 9;
   const auto all = torch::jit::last(*stack, kAll);
   const Inputs in = inputs_of(all.slice(0, kArguments));
-  const auto tensor = [&](size_t index) { return all[kArguments + index].toTensor().contiguous(); };
+  const at::TensorOptions options = in.gaussians.means.options();
+  const auto tensor = [&](size_t index) { return all[kArguments + index].toTensor().to(options).contiguous(); };
   RenderOutput outputs{tensor(0), tensor(1), tensor(2)};
   const Backend& backend = backend_of(in.gaussians.means);
   const SavedState* state = state_of(all[kArguments + 3].toTensor());
@@ -87,24 +90,24 @@ void splat_backward_op(const c10::OperatorHandle&, Stack* stack) {
   const GradientRequest request{all[kArguments + 7].toBool(), all[kArguments + 8].toBool()};
   const Gradients d = backend.splat_backward(in, outputs, {tensor(4), tensor(5), tensor(6)}, *state, request);
   const Gaussians& g = d.gaussians;
-  const auto defined = [&](const Tensor& t) { return t.defined() ? t : at::empty({0}, g.means.options()); };
+  const auto defined = [&](const Tensor& t) { return t.defined() ? t : at::empty({0}, options); };
   finish(stack, kAll, g.means, g.quaternions, g.scales, g.opacities, g.sh, defined(d.w2c), defined(d.means2d));
 }
 
 void project_op(const c10::OperatorHandle&, Stack* stack) {
   const Inputs in = inputs_of(torch::jit::last(*stack, kArguments));
   const Projected out = backend_of(in.gaussians.means).project(in);
-  finish(stack, kArguments, out.mean2d, out.conic, out.depth, out.opacity, out.visible);
+  finish(stack, kArguments, out.mean2d, out.conic, out.depth, out.opacity, out.variance, out.visible);
 }
 
-// Shapes of results: rgb [B, C, 3, H, W], alpha and depth [B, C, H, W]; visible, depths and opacities [B, C, N], means2d [B, C, N, 2], conics
+// Shapes of results: rgb [B, C, 3, H, W], alpha and depth [B, C, H, W]; visible, depths and opacities [B, C, N], means2d and variances [B, C, N, 2], conics
 // [B, C, N, 3]. The argument means2d of splat is not read: it is there to receive the gradient of the projected means. The gradients have
 // the order of the arguments that they belong to. Those that aren't requested have no elements.
 TORCH_LIBRARY(globalsplat, library) {
   library.def("splat(" GS_ARGUMENTS ", Tensor? means2d) -> (Tensor rgb, Tensor alpha, Tensor depth, Tensor state)");
   library.def("splat_backward(" GS_ARGUMENTS ", Tensor rgb, Tensor alpha, Tensor depth, Tensor state, Tensor d_rgb, Tensor d_alpha, "
               "Tensor d_depth, bool has_viewmats_grad, bool has_means2d_grad) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
-  library.def("project(" GS_ARGUMENTS ") -> (Tensor means2d, Tensor conics, Tensor depths, Tensor opacities, Tensor visible)");
+  library.def("project(" GS_ARGUMENTS ") -> (Tensor means2d, Tensor conics, Tensor depths, Tensor opacities, Tensor variances, Tensor visible)");
 }
 
 void implement(torch::Library& library) {

@@ -104,7 +104,7 @@ struct ProjectFunction : torch::autograd::Function<ProjectFunction> {
     const tensor_list t = ctx->get_saved_variables();
     return gradients_of(backend_of(t[0])
                             .project_backward(saved_inputs(*saved_call(ctx), t), {{}, contiguous(g[1]), contiguous(g[2]), contiguous(g[3]),
-                                                                                  contiguous(g[4]), {}},
+                                                                                  contiguous(g[4]), {}, {}},
                                               {ctx->needs_input_grad(kW2c)}));
   }
 };

@@ -51,7 +51,7 @@ Projected project_as(const Inputs& in) {
     return at::zeros(tail, options);
   };
   const auto options = in.gaussians.means.options();
-  const Projected out{zeros({}, at::kLong), zeros({2}, options), zeros({3}, options), zeros({}, options), zeros({3}, options), zeros({}, options)};
+  const Projected out{zeros({}, at::kLong), zeros({2}, options), zeros({3}, options), zeros({}, options), zeros({3}, options), zeros({}, options), zeros({2}, options)};
   const auto put = [](const Tensor& to, int64_t at, std::initializer_list<T> values) {
     std::copy(values.begin(), values.end(), to.data_ptr<T>() + int64_t(values.size()) * at);
   };
@@ -64,6 +64,9 @@ Projected project_as(const Inputs& in) {
     put(out.depth, at, {s.z});
     put(out.colour, at, {s.red, s.green, s.blue});
     put(out.opacity, at, {std::exp2(s.log2_opacity)});
+    // From the factor, since the inverse of a needle's conic loses all digits.
+    const T slope = s.b / s.c;
+    put(out.variance, at, {(1 + slope * slope) / (two_ln2 * s.a * s.a), 1 / (two_ln2 * s.c * s.c)});
   });
   return out;
 }

@@ -94,7 +94,8 @@ Projected project(const Inputs& in) {
   const auto shown = [&](const Tensor& t) { return at::where(t.dim() > visible.dim() ? visible.unsqueeze(-1) : visible, t, 0); };
   return {visible.to(at::kLong), shown(at::stack({s[kU], s[kV]}, -1)),
           shown(kTwoLn2 * at::stack({a * a, a * b, b * b + c * c}, -1)), shown(s[kZ]),
-          shown(at::stack({s[kRed], s[kRed + 1], s[kRed + 2]}, -1)), shown(s[kLog2Opacity].exp2())};
+          shown(at::stack({s[kRed], s[kRed + 1], s[kRed + 2]}, -1)), shown(s[kLog2Opacity].exp2()),
+          shown(at::stack({(1 + (b / c).square()) / (kTwoLn2 * a * a), 1 / (kTwoLn2 * c * c)}, -1))};
 }
 
 // Creates one record per visible Gaussian, with the sums over pixels that are converted to exactly these gradients: ∂L/∂(u, v) = 2 ln

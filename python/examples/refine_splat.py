@@ -1,4 +1,4 @@
-"""Reconstructs a splat from photos, and goes on with PyTorch alone: python refine_splat.py CAPTURE splat.ply"""
+"""Reconstructs a splat from photos, and goes on with PyTorch alone: python refine_splat.py CAPTURE splat.ply [STEPS]"""
 
 # %% A capture, and the network's splat of it.
 import sys
@@ -49,7 +49,7 @@ def render(index):
     return image[0]
 
 
-for step in range(300):
+for step in range(int(sys.argv[3]) if len(sys.argv) > 3 else 300):
     index = step % len(photos)
     loss = (render(index) - photos[index]).abs().mean()
     optimizer.zero_grad()

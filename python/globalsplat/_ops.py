@@ -1,6 +1,6 @@
 """The splat op for PyTorch: gradients and fake tensors of torch.ops.globalsplat, which the native module defines."""
 
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 from torch import Tensor
@@ -57,6 +57,7 @@ def _project_fake(means: Tensor, *inputs: Any) -> tuple[Tensor, ...]:
         means.new_empty((*shape, 3), dtype=dtype),
         means.new_empty(shape, dtype=dtype),
         means.new_empty(shape, dtype=dtype),
+        means.new_empty((*shape, 2), dtype=dtype),
         means.new_empty(shape, dtype=torch.int64),
     )
 
@@ -82,6 +83,10 @@ def _splat_backward(ctx: Any, d_rgb: Tensor, d_alpha: Tensor, d_depth: Tensor, _
     )
 
 
+def _no_second_gradients(*_: Any) -> NoReturn:
+    raise RuntimeError("rasterization can't be differentiated twice")
+
+
 def _no_gradients(ctx: Any, *_: Any) -> tuple[None, ...]:
     return (None,) * (TENSORS + SETTINGS)
 
@@ -90,5 +95,6 @@ torch.library.register_fake("globalsplat::splat", _splat_fake)
 torch.library.register_fake("globalsplat::splat_backward", _splat_backward_fake)
 torch.library.register_fake("globalsplat::project", _project_fake)
 torch.library.register_autograd("globalsplat::splat", _splat_backward, setup_context=_save_for_backward)
+torch.library.register_autograd("globalsplat::splat_backward", _no_second_gradients)
 # The projected means receive gradients, which are read from them. splat() gives the same gradients to the Gaussians itself.
 torch.library.register_autograd("globalsplat::project", _no_gradients)

@@ -12,8 +12,10 @@ RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 
 #: Channels that one call of the op renders.
 CHANNELS = 3
-#: Standard deviations within which a Gaussian of opacity 1 has an alpha of 1/255.
+#: Maximum number of standard deviations of gsplat's radii.
 RADIUS = 3.33
+#: Maximum radius in pixels.
+MAX_RADIUS = 2.0**30
 
 
 def rasterization(
@@ -90,11 +92,11 @@ def rasterization(
 
         - **render_colors** (Tensor): :math:`(*, C, H, W, X)`; X is D, 1 for depths, or D + 1 for both.
         - **render_alphas** (Tensor): accumulated opacities. :math:`(*, C, H, W, 1)`
-        - **meta** (dict): the projected Gaussians, as gsplat returns them with ``packed=False``: ``means2d`` :math:`(*, C, N, 2)`,
-          ``radii`` :math:`(*, C, N, 2)`, zero for those that aren't visible, ``depths`` :math:`(*, C, N)`, ``conics``
-          :math:`(*, C, N, 3)` and ``opacities`` :math:`(*, C, N)`; and ``width``, ``height``, ``tile_size``, ``n_batches`` and
-          ``n_cameras``. ``means2d`` receives the gradient that densification reads; the gradient of a loss that is computed from
-          ``means2d`` itself doesn't reach the Gaussians.
+        - **meta** (dict): the projected Gaussians, as gsplat returns them with ``packed=False``, which its strategies have to be told:
+          ``means2d`` :math:`(*, C, N, 2)`, ``radii`` :math:`(*, C, N, 2)`, zero for those that aren't visible, ``depths``
+          :math:`(*, C, N)`, ``conics`` :math:`(*, C, N, 3)` and ``opacities`` :math:`(*, C, N)`; and the sizes of the image, the tiles
+          and the batch. Lists of tiles are absent. ``means2d`` receives the gradient of the images, which densification reads. No
+          gradient of a loss on the values of ``meta`` reaches the Gaussians.
 
     Raises:
         NotImplementedError: for arguments of gsplat that aren't implemented.
@@ -129,11 +131,15 @@ def rasterization(
     )
     if sh_degree is not None and sh_degree > 3:
         raise NotImplementedError(f"sh_degree is {sh_degree}, and spherical harmonics are implemented up to degree 3")
+    _expect("sh_degree", sh_degree, sh_degree is None or sh_degree >= 0, "0 to 3, or None")
+    _expect("width", width, width >= 1, "1 or more")
+    _expect("height", height, height >= 1, "1 or more")
+    _expect("eps2d", eps2d, eps2d >= 0.0, "0 or more")
+    _expect("near_plane", near_plane, near_plane >= 0.0, "0 or more")
+    _expect("far_plane", far_plane, far_plane > near_plane, "more than near_plane")
     has_colors, has_depth = render_mode in ("RGB", "RGB+D", "RGB+ED"), render_mode != "RGB"
-    if not has_colors and render_mode not in ("D", "ED"):
-        raise ValueError(f"render_mode is {render_mode!r}, expected RGB, D, ED, RGB+D or RGB+ED")
-    if rasterize_mode not in ("classic", "antialiased"):
-        raise ValueError(f"rasterize_mode is {rasterize_mode!r}, expected classic or antialiased")
+    _expect("render_mode", render_mode, has_colors or render_mode in ("D", "ED"), "RGB, D, ED, RGB+D or RGB+ED")
+    _expect("rasterize_mode", rasterize_mode, rasterize_mode in ("classic", "antialiased"), "classic or antialiased")
 
     batch, count, cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
     tail = 1 if sh_degree is None else 2
@@ -147,6 +153,16 @@ def rasterization(
     _check("Ks", Ks, (*batch, cameras, 3, 3))
     per_gaussian = (channels,) if sh_degree is None else (colors.shape[-2], 3)
     _check("colors", colors, (*batch, *((cameras,) if has_camera_colors else ()), count, *per_gaussian))
+    _expect("the number of channels of colors", channels, channels >= 1, "1 or more")
+    for name, tensor in {
+        "quats": quats,
+        "scales": scales,
+        "opacities": opacities,
+        "colors": colors,
+        "viewmats": viewmats,
+        "Ks": Ks,
+    }.items():
+        _expect(f"the device of {name}", tensor.device, tensor.device == means.device, f"{means.device}, that of means")
     if backgrounds is not None:
         _check("backgrounds", backgrounds, (*batch, cameras, channels))
 
@@ -179,7 +195,7 @@ def rasterization(
 
     settings = (width, height, eps2d, near_plane, far_plane, rasterize_mode == "antialiased", sh_degree is None)
     means2d, *others = torch.ops.globalsplat.project(*gaussians, passes[0], viewmats, Ks, *settings)
-    conics, depths, projected_opacities, visible = (tensor.detach() for tensor in others)
+    conics, depths, projected_opacities, variances, visible = (tensor.detach() for tensor in others)
     # Gradients reach the tensor in `meta`, so the op gets what is made from it.
     out = (*batch, cameras)
     shape, means2d = means2d.shape, means2d.reshape(*out, count, 2)
@@ -199,10 +215,12 @@ def rasterization(
     meta = {
         # gsplat's indices of packed results.
         **dict.fromkeys(("batch_ids", "camera_ids", "gaussian_ids")),
-        **_describe(means2d, conics, depths, projected_opacities, visible, width, height),
+        **_describe(means2d, conics, depths, projected_opacities, variances, visible, width, height),
         "width": width,
         "height": height,
         "tile_size": tile_size,
+        "tile_width": math.ceil(width / tile_size),
+        "tile_height": math.ceil(height / tile_size),
         "n_batches": scenes,
         "n_cameras": cameras,
     }
@@ -211,12 +229,19 @@ def rasterization(
 
 
 def _describe(
-    means2d: Tensor, conics: Tensor, depths: Tensor, opacities: Tensor, visible: Tensor, width: int, height: int
+    means2d: Tensor,
+    conics: Tensor,
+    depths: Tensor,
+    opacities: Tensor,
+    variances: Tensor,
+    visible: Tensor,
+    width: int,
+    height: int,
 ) -> dict[str, Tensor]:
     """Returns the entries of `meta` for the projected Gaussians, whose tensors have the shape of means2d."""
-    xx, xy, yy = conics.unbind(-1)
-    variances = torch.stack([yy, xx], -1) / (xx * yy - xy * xy)[..., None]
-    radii = torch.ceil(RADIUS * variances.sqrt())
+    # Standard deviations within which alpha is 1/255 or more.
+    extents = (2.0 * torch.log(255.0 * opacities)).clamp(min=0.0).sqrt().clamp(max=RADIUS)
+    radii = torch.ceil(extents[..., None] * variances.sqrt()).clamp(max=MAX_RADIUS)
     size = torch.tensor([width, height], dtype=radii.dtype, device=radii.device)
     centres = means2d.detach().reshape(radii.shape)
     is_visible = (visible > 0) & ((centres + radii > 0) & (centres - radii < size)).all(-1)
@@ -235,6 +260,11 @@ def _refuse(**arguments: bool) -> None:
     names = [name for name, is_used in arguments.items() if is_used]
     if names:
         raise NotImplementedError(f"{', '.join(names)}: implemented only with the default value")
+
+
+def _expect(name: str, value: object, is_valid: bool, expected: str) -> None:
+    if not is_valid:
+        raise ValueError(f"{name} is {value}, expected {expected}")
 
 
 def _check(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:

@@ -1,5 +1,6 @@
 """Captures, and splats from them."""
 
+import json
 import os
 from collections.abc import Callable, Mapping
 from typing import Any, cast
@@ -117,6 +118,15 @@ def refine(
         >>> splat = globalsplat.refine("captures/room", seconds=30)
         >>> globalsplat.save_splat("room.ply", splat)
     """
+    for name, value, least in (
+        ("steps", steps, 1),
+        ("gaussians", gaussians, 1),
+        ("views", views, 1),
+        ("size", size, 1),
+        ("seed", seed, 0),
+    ):
+        if value is not None and value < least:
+            raise ValueError(f"{name} is {value}, expected {least} or more")
     options = {
         "seconds": seconds,
         "steps": steps,
@@ -126,7 +136,7 @@ def refine(
         "seed": seed,
         "antialiased": antialiased,
         "correct_poses": correct_poses,
-        "settings": [f"{name}={value}" for name, value in (settings or {}).items()],
+        "settings": [f"{name}={json.dumps(value)}" for name, value in (settings or {}).items()],
         "cuda": _cuda_index(device),
     }
     initial = None if splat is None else from_splat(splat)
@@ -146,6 +156,11 @@ def _to_capture(capture: Capture | Path | Tensor, viewmats: Tensor | None = None
             raise ValueError(
                 f"images are {images.dtype} of shape {list(images.shape)}, expected uint8 or floats [V, H, W, 3]"
             )
+        for name, matrices, side in (("viewmats", viewmats, 4), ("Ks", Ks, 3)):
+            if list(matrices.shape) != [len(images), side, side]:
+                raise ValueError(f"{name} has shape {list(matrices.shape)}, expected {[len(images), side, side]}")
+        if Ks[:, 0, 1].any():
+            raise ValueError("Ks have a skew, expected 0 in row 0, column 1")
         cameras = [np.ascontiguousarray(matrices.detach().cpu().double().numpy()) for matrices in (viewmats, Ks)]
         return _native.capture_from_images(np.ascontiguousarray(images.numpy()), *cameras)
     if viewmats is not None or Ks is not None:
@@ -157,7 +172,13 @@ def _cuda_index(device: str | torch.device) -> int | None:
     device = torch.device(device)
     if device.type not in ("cpu", "cuda"):
         raise ValueError(f"device is {device}, expected cpu or cuda")
-    return (device.index or 0) if device.type == "cuda" else None
+    if device.type == "cpu":
+        return None
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    index = device.index if device.index is not None else 0
+    if index >= count:
+        raise ValueError(f"device is {device}, and PyTorch finds {count} CUDA devices")
+    return index
 
 
 def _to_tensors(raw: Mapping[str, Any], device: str | torch.device) -> Splat:

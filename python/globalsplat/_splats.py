@@ -3,7 +3,7 @@
 import os
 import warnings
 from collections.abc import Mapping
-from typing import Any, Literal, TypedDict, cast, overload
+from typing import Any, Literal, TypedDict, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -44,6 +44,7 @@ class Parameters(TypedDict):
     opacities: Array
     sh0: Array
     shN: Array
+    rasterize_mode: Literal["classic", "antialiased"]
 
 
 @overload
@@ -74,18 +75,16 @@ def load_splat(path: str | os.PathLike[str], activated: bool = True) -> Splat | 
     raw, lines = _native.read_splat(path)
     warn(lines)
     if not activated:
-        parameters = {key: raw[name] for key, name in (("means", "means"), ("quats", "quats"))}
         sh = raw["sh"]
-        return cast(
-            Parameters,
-            {
-                **parameters,
-                "scales": raw["log_scales"],
-                "opacities": raw["opacity_logits"],
-                "sh0": sh[:, :1],
-                "shN": sh[:, 1:],
-            },
-        )
+        return {
+            "means": raw["means"],
+            "quats": raw["quats"],
+            "scales": raw["log_scales"],
+            "opacities": raw["opacity_logits"],
+            "sh0": sh[:, :1],
+            "shN": sh[:, 1:],
+            "rasterize_mode": _mode(raw),
+        }
     return to_splat(raw)
 
 
@@ -102,7 +101,7 @@ def save_splat(
         path (str or PathLike): the file.
         splat (dict or nn.ParameterDict): arrays or tensors of N Gaussians with the keys of :class:`Splat`, of which
             ``sh_degree``, ``eps2d`` and ``rasterize_mode`` may be absent, or those of :class:`Parameters` if
-            :attr:`activated` is ``False``.
+            :attr:`activated` is ``False``. Spherical harmonics :math:`(N, K, 3)` are needed, not colours.
         activated (bool): as in :func:`load_splat`.
         capture (Capture, optional): the photos' cameras. A format with fewer spherical harmonics than the splat, such as .splat, gets
             the colours that these cameras see.
@@ -121,7 +120,6 @@ def save_splat(
 
 def to_splat(raw: Mapping[str, Any]) -> Splat:
     """Converts what the native module returns to arguments of rasterization()."""
-    antialiased = raw["antialiased"]
     sh = raw["sh"]
     return {
         "means": raw["means"],
@@ -130,9 +128,13 @@ def to_splat(raw: Mapping[str, Any]) -> Splat:
         "opacities": (1.0 / (1.0 + np.exp(-raw["opacity_logits"].astype(np.float64)))).astype(np.float32),
         "colors": sh,
         "sh_degree": round(sh.shape[1] ** 0.5) - 1,
-        "eps2d": ANTIALIASED_EPS2D if antialiased else EPS2D,
-        "rasterize_mode": "antialiased" if antialiased else "classic",
+        "eps2d": ANTIALIASED_EPS2D if raw["antialiased"] else EPS2D,
+        "rasterize_mode": _mode(raw),
     }
+
+
+def _mode(raw: Mapping[str, Any]) -> Literal["classic", "antialiased"]:
+    return "antialiased" if raw["antialiased"] else "classic"
 
 
 def from_splat(splat: Mapping[str, Any] | torch.nn.ParameterDict, activated: bool = True) -> dict[str, Any]:
@@ -143,18 +145,30 @@ def from_splat(splat: Mapping[str, Any] | torch.nn.ParameterDict, activated: boo
         raise ValueError(f"the splat has no {', '.join(missing)}, expected {', '.join(names)}")
     values = {name: _to_array(name, splat[name]) for name in names}
     means, scales, opacities = values["means"], values["scales"], values["opacities"]
-    if means.ndim != 2:
-        raise ValueError(f"means has shape {list(means.shape)}, expected [N, 3]")
-    opacities = opacities.reshape(len(means))
+    count = len(means) if means.ndim else 0
+    if opacities.shape == (count, 1):  # as in gsplat's files
+        opacities = values["opacities"] = opacities[:, 0]
+    shapes = {"means": [count, 3], "quats": [count, 4], "scales": [count, 3], "opacities": [count]}
+    for name, shape in shapes.items():
+        if list(values[name].shape) != shape:
+            raise ValueError(f"{name} has shape {list(values[name].shape)}, expected {shape}")
+    mode = splat.get("rasterize_mode", "classic")
+    if mode not in ("classic", "antialiased"):
+        raise ValueError(f"rasterize_mode is {mode!r}, expected classic or antialiased")
     if activated:
+        for name, is_valid in (("scales", scales >= 0.0), ("opacities", (opacities >= 0.0) & (opacities <= 1.0))):
+            if not is_valid.all():
+                raise ValueError(
+                    f"{name} has {values[name][~is_valid][0]:g}, expected {'0 or more' if name == 'scales' else '0 to 1'}"
+                )
         sh = values["colors"]
         with np.errstate(divide="ignore"):
             scales = np.log(scales)
             opacities = np.log(opacities) - np.log1p(-opacities)
     else:
         sh = np.concatenate([values["sh0"], values["shN"]], 1)
-    if sh.ndim != 3:
-        raise ValueError(f"colors has shape {list(sh.shape)}, expected spherical harmonics [N, K, 3]")
+    if sh.ndim != 3 or (len(sh), sh.shape[2]) != (count, 3):
+        raise ValueError(f"colors has shape {list(sh.shape)}, expected spherical harmonics [{count}, K, 3]")
 
     def contiguous(array: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
         return np.ascontiguousarray(array, np.float32)
@@ -165,17 +179,17 @@ def from_splat(splat: Mapping[str, Any] | torch.nn.ParameterDict, activated: boo
         "log_scales": contiguous(scales),
         "opacity_logits": contiguous(opacities),
         "sh": contiguous(sh),
-        "antialiased": splat.get("rasterize_mode") == "antialiased" if activated else False,
+        "antialiased": mode == "antialiased",
     }
 
 
 def _to_array(name: str, value: Array) -> npt.NDArray[np.float64]:
-    """Returns a finite float64 array of an array or tensor."""
+    """Returns a float64 array of an array or tensor. Only logarithms and logits may be infinite."""
     if isinstance(value, torch.Tensor):
         value = value.detach().cpu().double().numpy()
     array = np.asarray(value, np.float64)
-    if np.isnan(array).any():
-        raise ValueError(f"{name} has values that aren't numbers")
+    if np.isnan(array).any() or (name not in ("scales", "opacities") and np.isinf(array).any()):
+        raise ValueError(f"{name} has values that aren't finite")
     return array
 
 

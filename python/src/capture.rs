@@ -35,7 +35,7 @@ pub fn open_capture(py: Python<'_>, path: PathBuf, masks: Option<PathBuf>) -> Py
     Ok(Capture(opened?))
 }
 
-/// Creates a capture from images in memory: `images` [V, H, W, 3], `viewmats` [V, 4, 4] and `intrinsics` [V, 3, 3] in pixels.
+/// Creates a capture from images in memory: `images` [V, H, W, 3], `viewmats` [V, 4, 4] and `intrinsics` [V, 3, 3] in pixels, without skew.
 #[pyfunction]
 pub fn capture_from_images(
     images: PyReadonlyArray4<'_, u8>,
@@ -69,8 +69,8 @@ pub fn capture_from_images(
     };
     let cameras: Vec<Camera> = (0..count).map(camera).collect();
     let source = Arc::new(Images((0..count).map(image).collect()));
-    let made = globalsplat::data::Capture::from_source("images".into(), "images".into(), &cameras, source);
-    Ok(Capture(made.map_err(to_python)?))
+    let capture = globalsplat::data::Capture::from_source("images".into(), "images".into(), &cameras, source);
+    Ok(Capture(capture.map_err(to_python)?))
 }
 
 #[pymethods]
@@ -125,10 +125,12 @@ impl Capture {
     }
 
     /// Reads a photo, without its lens distortion, at the size of its camera: [H, W, 3].
-    fn image<'py>(&self, py: Python<'py>, index: usize) -> PyResult<Bound<'py, PyArray3<u8>>> {
-        if index >= self.0.len() {
-            return Err(PyIndexError::new_err(format!("photo {index} of {}", self.0.len())));
+    fn image<'py>(&self, py: Python<'py>, index: isize) -> PyResult<Bound<'py, PyArray3<u8>>> {
+        let count = self.0.len() as isize;
+        if !(-count..count).contains(&index) {
+            return Err(PyIndexError::new_err(format!("photo {index} of {count}")));
         }
+        let index = index.rem_euclid(count) as usize;
         let photo = run(py, || Ok(self.0.photo(index)?))?;
         let (width, height) = photo.dimensions();
         PyArray::from_vec(py, photo.into_raw()).reshape([height as usize, width as usize, 3])

@@ -4,7 +4,7 @@ use crate::capture::Capture;
 use crate::error::to_python;
 use crate::models::device;
 use crate::splat::{Parameters, to_dict};
-use crate::work::run;
+use crate::work::run_guarded;
 use globalsplat::data::PhotoSize;
 use globalsplat::refine::{Budget, Initial, RefineConfig, RefineEvent, RefineOptions, RefineSession};
 use pyo3::exceptions::PyValueError;
@@ -72,12 +72,12 @@ pub fn refine<'py>(
     let count = initial.as_ref().map(|splat| splat.len().max(1));
     let options = options.into_refine_options(capture, count).map_err(to_python)?;
     let (mut warnings, mut raised) = (vec![], None);
-    let refined = run(py, || {
+    let refined = run_guarded(py, || {
         let on_event = |event: RefineEvent| {
             if let RefineEvent::Warning(line) = event {
                 warnings.push(line.to_string());
             }
-            let told = Python::attach(|py| {
+            let reported = Python::attach(|py| {
                 py.check_signals()?;
                 match (&progress, event) {
                     (Some(progress), RefineEvent::Optimizing { steps, psnr }) => {
@@ -86,7 +86,7 @@ pub fn refine<'py>(
                     _ => Ok(()),
                 }
             });
-            raised = raised.take().or(told.err());
+            raised = raised.take().or(reported.err());
             raised.is_none()
         };
         let mut session = RefineSession::load(&capture.0, &options, on_event)?;

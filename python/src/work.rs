@@ -8,11 +8,19 @@ use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
+/// Runs the network or an optimization like [`run`], and meanwhile keeps libtorch's threads from spinning while other processes need the
+/// cores.
+pub fn run_guarded<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T> + Send) -> PyResult<T> {
+    run(py, || {
+        let _guard = OversubscriptionGuard::start();
+        work()
+    })
+}
+
 /// Runs `work` while other Python threads run. Errors of libtorch that the library doesn't expect arrive as panics, and become exceptions
 /// as well.
 pub fn run<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T> + Send) -> PyResult<T> {
     let done = py.detach(|| {
-        let _guard = OversubscriptionGuard::start();
         catch_unwind(AssertUnwindSafe(work)).map_err(|panic| panic_message(panic.as_ref()).to_string())
     });
     match done {

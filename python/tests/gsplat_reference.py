@@ -99,6 +99,14 @@ def rasterization(
         renders = renders + (1.0 - alphas) * backgrounds[:, None, None]
     if render_mode.endswith("ED"):
         renders = torch.cat([renders[..., :-1], renders[..., -1:] / alphas.clamp(min=1e-10)], -1)
+    # The CUDA kernel also gets the opacities, and draws narrower boxes with them.
+    extents = (2.0 * torch.log(255.0 * opacities)).clamp(min=0.0).sqrt().clamp(max=3.33)
+    variances = conics[..., [2, 0]] / (conics[..., 0] * conics[..., 2] - conics[..., 1] ** 2)[..., None]
+    narrow = torch.ceil(extents[..., None] * variances.sqrt())
+    size = torch.tensor([width, height])
+    is_inside = ((means2d + narrow > 0) & (means2d - narrow < size)).all(-1)
+    is_visible = is_inside & (radii > 0).all(-1) & (opacities >= MIN_ALPHA)
+    radii = torch.where(is_visible[..., None], narrow, 0.0).int()
     return (
         renders,
         alphas,

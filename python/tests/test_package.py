@@ -139,6 +139,7 @@ def test_splats_are_written_and_read_in_every_format(splat, capture, tmp_path, e
     parameters = globalsplat.load_splat(path, activated=False)
     globalsplat.save_splat(tmp_path / "again.ply", parameters, activated=False)
     again = globalsplat.load_splat(tmp_path / "again.ply", activated=False)
+    assert again["rasterize_mode"] == parameters.pop("rasterize_mode")
     for name, value in parameters.items():
         is_finite = np.isfinite(value)  # logits of opacities of 0 and 1 are not, and a PLY has finite ones
         np.testing.assert_array_equal(again[name][is_finite], value[is_finite])
@@ -151,12 +152,19 @@ def test_splats_that_do_not_fit_are_refused(splat, tmp_path):
         globalsplat.save_splat(tmp_path / "room.foo", splat)
     with pytest.raises(ValueError, match="the splat has no quats"):
         globalsplat.save_splat(tmp_path / "room.ply", {"means": splat["means"]})
-    with pytest.raises(ValueError, match="means has values that aren't numbers"):
+    with pytest.raises(ValueError, match="means has values that aren't finite"):
         globalsplat.save_splat(tmp_path / "room.ply", {**splat, "means": splat["means"] * float("nan")})
     with pytest.raises(ValueError, match="5 spherical harmonics"):
         globalsplat.save_splat(tmp_path / "room.ply", {**splat, "colors": torch.zeros(16384, 5, 3)})
-    with pytest.raises(ValueError, match="scales"):
-        globalsplat.save_splat(tmp_path / "room.ply", {**splat, "scales": splat["scales"][:5]})
+    for name, value, expected in (
+        ("scales", splat["scales"][:5], r"scales has shape \[5, 3\], expected \[16384, 3\]"),
+        ("quats", splat["quats"].T, r"quats has shape \[4, 16384\], expected \[16384, 4\]"),
+        ("scales", -splat["scales"], r"scales has -.*, expected 0 or more"),
+        ("opacities", splat["opacities"] + 1.0, r"opacities has .*, expected 0 to 1"),
+        ("rasterize_mode", "smooth", r"rasterize_mode is 'smooth', expected classic or antialiased"),
+    ):
+        with pytest.raises(ValueError, match=expected):
+            globalsplat.save_splat(tmp_path / "room.ply", {**splat, name: value})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -169,6 +177,13 @@ def test_refinement_improves_a_splat(splat, capture):
     assert psnr(*render(refined, capture)) > psnr(*render(splat, capture)) + 1.0
     with pytest.raises(ZeroDivisionError):
         globalsplat.refine(capture, splat, steps=30, views=4, size=128, progress=lambda *_: 1 / 0)
+    antialiased = globalsplat.refine(capture, steps=2, gaussians=200, views=3, size=64, settings={"antialiased": True})
+    assert antialiased["rasterize_mode"] == "antialiased"
+    with pytest.raises(ValueError, match="steps is 0, expected 1 or more"):
+        globalsplat.refine(capture, steps=0)
+    if not torch.cuda.is_available():
+        with pytest.raises(ValueError, match="device is cuda, and PyTorch finds 0 CUDA devices"):
+            globalsplat.refine(capture, steps=1, device="cuda")
     with pytest.raises(ValueError, match="unknown field `nothing`"):
         globalsplat.refine(capture, splat, settings={"nothing": 1})
 

@@ -81,7 +81,11 @@ def compare(inputs, Ks, dtype, **options):
     (image, alpha, meta, gradients), ours = results
     assert_close("image", ours[0], image)
     assert_close("alpha", ours[1], alpha)
-    is_visible = (ours[2]["radii"] > 0).all(-1)
+    is_visible = (meta["radii"] > 0).all(-1)
+    assert is_visible.any()
+    # Radii are rounded up to pixels, which a last bit may change.
+    difference = (ours[2]["radii"] - meta["radii"]).abs()
+    assert difference.max() <= 1 and (difference > 0).float().mean() < 0.01
     for name in ("means2d", "depths", "conics", "opacities"):
         assert_close(name, ours[2][name][is_visible], meta[name][is_visible])
     names = ["means", "quats", "scales", "opacities", "colors", "viewmats", "means2d"]
@@ -241,6 +245,33 @@ def test_compiled_functions_give_the_same_bits():
         torch.testing.assert_close(ours, theirs, rtol=0, atol=0)
 
 
+def test_it_has_no_second_derivatives():
+    viewmats, Ks = cameras(1, torch.float64)
+    scene = leaves([*gaussians("random", torch.float64), torch.rand(60, 3, dtype=torch.float64)])
+    image, _, _ = globalsplat.rasterization(*scene, viewmats, Ks, WIDTH, HEIGHT)
+    (gradient,) = torch.autograd.grad(image.square().sum(), scene[:1], create_graph=True)
+    with pytest.raises(RuntimeError, match="can't be differentiated twice"):
+        gradient.sum().backward()
+
+
+def test_radii_of_needles_are_those_of_float64():
+    viewmats, Ks = torch.eye(4)[None], torch.tensor([[[300.0, 0.0, 150.0], [0.0, 300.0, 100.0], [0.0, 0.0, 1.0]]])
+    quats = torch.tensor([[0.9238795, 0.0, 0.0, 0.3826834]])
+    for length in (1.0, 20.0, 200.0):
+        scene = [
+            torch.tensor([[0.0, 0.0, 5.0]]),
+            quats,
+            torch.tensor([[length, 1e-3, 1e-3]]),
+            torch.ones(1),
+            torch.rand(1, 3),
+        ]
+        radii = [
+            globalsplat.rasterization(*(tensor.to(dtype) for tensor in (*scene, viewmats, Ks)), 300, 200)[2]["radii"]
+            for dtype in (torch.float32, torch.float64)
+        ]
+        assert ((radii[0] - radii[1]).abs() <= 1 + 1e-4 * radii[1]).all() and (radii[1] > 100).all()
+
+
 def test_saved_tensors_may_be_moved():
     viewmats, Ks = cameras(1, torch.float32)
     scene = leaves([*gaussians("random", torch.float32), torch.rand(60, 3)])
@@ -321,6 +352,16 @@ def test_wrong_shapes_are_named():
         globalsplat.rasterization(
             means, quats, scales, opacities, colors, viewmats, Ks, WIDTH, HEIGHT, render_mode="rgb"
         )
+    for name, options in {
+        "width": {"width": 0},
+        "eps2d": {"eps2d": -1.0},
+        "far_plane": {"far_plane": float("nan")},
+        "near_plane": {"near_plane": -1.0},
+        "sh_degree": {"sh_degree": -2},
+    }.items():
+        every = {"width": WIDTH, "height": HEIGHT, **options}
+        with pytest.raises(ValueError, match=f"{name} is .*, expected"):
+            globalsplat.rasterization(means, quats, scales, opacities, torch.rand(60, 4, 3), viewmats, Ks, **every)
     with pytest.raises(NotImplementedError, match="degree 3"):
         globalsplat.rasterization(
             means, quats, scales, opacities, torch.rand(60, 25, 3), viewmats, Ks, WIDTH, HEIGHT, sh_degree=4

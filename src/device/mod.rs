@@ -1,5 +1,5 @@
-//! Devices: asynchronous copies from the host to a GPU on a stream of their own, events that time the GPU's work, memory use, and threads that share cores with other processes. On the
-//! CPU the same calls run synchronously.
+//! Devices: asynchronous copies from the host to a GPU on a stream of their own, events that time the GPU's work, memory use, and a guard
+//! for threads that share cores with other processes. On the CPU the same calls run synchronously.
 
 mod memory;
 mod oversubscription;

@@ -185,9 +185,9 @@ mod tests {
     #[test]
     fn idle_team_lives_until_dropped() {
         tch::set_num_threads(3);
-        let crowd = start_idle_team().unwrap();
+        let team = start_idle_team().unwrap();
         assert!(becomes("idle_team", 3), "{}", called("idle_team"));
-        drop(crowd);
+        drop(team);
         assert!(becomes("idle_team", 0), "{}", called("idle_team"));
     }
 
