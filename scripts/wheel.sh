@@ -19,4 +19,4 @@ if ! said="$(PATH="$PWD/.venv/bin:$PATH" .venv/bin/python -m auditwheel repair -
     echo "wheel: $(tail -n 1 <<<"$said")" >&2
     exit 1
 fi
-ls -l "$target"/wheels/*.whl | awk '{ printf "%s: %.1f MB\n", $NF, $5 / 1e6 }'
+du -h --apparent-size "$target"/wheels/*.whl
