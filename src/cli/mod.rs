@@ -23,7 +23,6 @@ mod man;
 mod memory;
 mod model;
 mod option_names;
-#[cfg(target_os = "linux")]
 mod pack;
 mod parity;
 mod progress;
