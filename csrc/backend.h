@@ -71,4 +71,7 @@ struct Backend {
 // which exists to verify gradients.
 const Backend& backend_of(const Tensor& means);
 
+// Returns the device on which that backend computes: that of the means, unless the backend is for another kind of device.
+at::Device backend_device(const Tensor& means);
+
 }  // namespace globalsplat

@@ -53,8 +53,7 @@ Inputs inputs_of(c10::ArrayRef<c10::IValue> of) {
                             of[8].toInt(),
                             projection};
   arguments.check();
-  const at::DeviceType device = backend_of(means).device;
-  return arguments.to_inputs(device == means.device().type() ? means.device() : at::Device(device));
+  return arguments.to_inputs(backend_device(means));
 }
 
 // Replaces an op's arguments by its results, on the device of the means, the first argument.
@@ -100,8 +99,8 @@ void project_op(const c10::OperatorHandle&, Stack* stack) {
   finish(stack, kArguments, out.mean2d, out.conic, out.depth, out.opacity, out.variance, out.visible);
 }
 
-// Shapes of results: rgb [B, C, 3, H, W], alpha and depth [B, C, H, W]; visible, depths and opacities [B, C, N], means2d and variances [B, C, N, 2], conics
-// [B, C, N, 3]. The argument means2d of splat is not read: it is there to receive the gradient of the projected means. The gradients have
+// Shapes of results: rgb [B, C, 3, H, W], alpha and depth [B, C, H, W]; visible, depths and opacities [B, C, N], means2d and variances
+// [B, C, N, 2], conics [B, C, N, 3]. The argument means2d of splat is not read: it is there to receive the gradient of the projected means. The gradients have
 // the order of the arguments that they belong to. Those that aren't requested have no elements.
 TORCH_LIBRARY(globalsplat, library) {
   library.def("splat(" GS_ARGUMENTS ", Tensor? means2d) -> (Tensor rgb, Tensor alpha, Tensor depth, Tensor state)");

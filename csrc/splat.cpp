@@ -21,6 +21,11 @@ const Backend& backend_of(const Tensor& means) {
   return means.device().type() == cuda::backend.device ? cuda::backend : cpu::backend;
 }
 
+at::Device backend_device(const Tensor& means) {
+  const at::DeviceType device = backend_of(means).device;
+  return device == means.device().type() ? means.device() : at::Device(device);
+}
+
 namespace {
 
 using torch::autograd::AutogradContext;
@@ -116,8 +121,7 @@ void run(const SplatArguments& of, rust::Slice<size_t> out) {
   const Arguments a = borrowed(of);
   a.check();
   const at::Device home = a.means.device();
-  const at::DeviceType there = backend_of(a.means).device;
-  const Inputs in = a.to_inputs(there == home.type() ? home : at::Device(there));
+  const Inputs in = a.to_inputs(backend_device(a.means));
   const Gaussians& g = in.gaussians;
   const tensor_list results = Function::apply(g.means, g.scales, g.quaternions, g.opacities, g.sh, in.w2c, in.intrinsics,
                                               in.width, in.height, in.projection);

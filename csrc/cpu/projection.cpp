@@ -51,7 +51,8 @@ Projected project_as(const Inputs& in) {
     return at::zeros(tail, options);
   };
   const auto options = in.gaussians.means.options();
-  const Projected out{zeros({}, at::kLong), zeros({2}, options), zeros({3}, options), zeros({}, options), zeros({3}, options), zeros({}, options), zeros({2}, options)};
+  const Projected out{zeros({}, at::kLong), zeros({2}, options), zeros({3}, options), zeros({}, options), zeros({3}, options),
+                      zeros({}, options), zeros({2}, options)};
   const auto put = [](const Tensor& to, int64_t at, std::initializer_list<T> values) {
     std::copy(values.begin(), values.end(), to.data_ptr<T>() + int64_t(values.size()) * at);
   };
