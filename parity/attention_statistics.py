@@ -20,9 +20,9 @@ from safetensors import safe_open
 
 from parity import reference
 from parity.harness import draw
-from parity.harness.names import reference_config
 from parity.reference.encoder import encode
 from parity.reference.layers import layer_norm, linear
+from parity.reference.names import reference_config
 from parity.reference.normalize import normalize_scene
 from parity.reference.tokens import view_tokens
 

@@ -23,7 +23,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from parity import reference
 from parity.harness import draw
-from parity.harness.names import reference_config
+from parity.reference.names import reference_config
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 SIZE = 256

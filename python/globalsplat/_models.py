@@ -1,5 +1,6 @@
 """The network as a PyTorch module, computed by the reference implementation that the parity checks compare the program with."""
 
+import json
 import os
 from typing import Any, cast
 
@@ -8,6 +9,7 @@ from torch import Tensor, nn
 
 from . import _native
 from .reference.model import forward
+from .reference.names import reference_config
 
 
 class Model(nn.Module):
@@ -65,4 +67,9 @@ def load_model(weights: str | os.PathLike[str] | None = None) -> Model:
         >>> gaussians = model(images, c2w, Ks)
     """
     arrays, config, stage, mix = _native.read_model(weights)
-    return Model(config, {name: torch.from_numpy(array) for name, array in arrays.items()}, stage, mix)
+    return Model(
+        reference_config(json.loads(config)),
+        {name: torch.from_numpy(array) for name, array in arrays.items()},
+        stage,
+        mix,
+    )

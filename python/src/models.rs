@@ -5,7 +5,7 @@ use crate::splat::to_dict;
 use crate::work::{run, run_guarded};
 use globalsplat::Result;
 use globalsplat::data::Holdout;
-use globalsplat::model::{Precision, Stage, Streams};
+use globalsplat::model::{Precision, Stage};
 use globalsplat::reconstruct::{LoadedModel, ModelDtype, ModelFile, load_context, model_weights};
 use numpy::{PyArray, PyArrayMethods};
 use pyo3::exceptions::PyRuntimeError;
@@ -41,19 +41,16 @@ pub fn reconstruct<'py>(
 
 /// Opens the weights in a file, or the bundled ones, for inference.
 pub fn load(weights: Option<&Path>, device: Device, precision: Option<Precision>) -> Result<LoadedModel> {
-    let file = match weights {
-        Some(path) => ModelFile::open(path, &[])?,
-        None => ModelFile::open_bundled()?,
-    };
+    let file = ModelFile::open_or_bundled(weights)?;
     let precision = precision.unwrap_or_else(|| Precision::best_on(device, file.config.model.width));
     file.load_mmap(device, precision)
 }
 
 /// Weights, configuration, curriculum stage and transition of a model.
-type ModelParts<'py> = (Bound<'py, PyDict>, Bound<'py, PyDict>, u32, f64);
+type ModelParts<'py> = (Bound<'py, PyDict>, String, u32, f64);
 
-/// Reads a model for the reference implementation in PyTorch: arrays in float32 by name, the configuration with that implementation's
-/// names, and the stage that the weights were trained to.
+/// Reads a model for the reference implementation in PyTorch: arrays in float32 by name, the program's configuration as JSON, and the
+/// stage that the weights were trained to.
 #[pyfunction]
 pub fn read_model(py: Python<'_>, weights: Option<PathBuf>) -> PyResult<ModelParts<'_>> {
     let model = run(py, || load(weights.as_deref(), Device::Cpu, Some(Precision::F32)))?;
@@ -64,24 +61,8 @@ pub fn read_model(py: Python<'_>, weights: Option<PathBuf>) -> PyResult<ModelPar
         let values = values.map_err(|why| PyRuntimeError::new_err(why.to_string()))?;
         dict.set_item(name, PyArray::from_vec(py, values).reshape(shape)?)?;
     }
-    let sizes = &model.config.model;
-    let config = PyDict::new(py);
-    for (name, value) in [
-        ("patch_size", sizes.patch_size),
-        ("latent_rep_token_amount", sizes.latents),
-        ("dim_latents", sizes.width),
-        ("dim_rays", sizes.ray_width),
-        ("dim_rgb_feat", sizes.rgb_width),
-        ("rounds", sizes.rounds),
-        ("slot_calib_layers_per_round", sizes.self_attention_blocks),
-        ("num_heads", sizes.heads),
-        ("M_max", sizes.candidates),
-        ("sh_degree", sizes.sh_degree),
-    ] {
-        config.set_item(name, value)?;
-    }
-    config.set_item("streams", if sizes.streams == Streams::Dual { "dual" } else { "single" })?;
-    config.set_item("camera_code", sizes.camera_code)?;
+    let config =
+        serde_json::to_string(&model.config.model).map_err(|why| PyRuntimeError::new_err(why.to_string()))?;
     let Stage { index, mix } = model.stage;
     Ok((dict, config, index, mix))
 }

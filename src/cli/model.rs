@@ -35,10 +35,7 @@ pub fn precision(requested: Option<Precision>, device: Device, width: i64) -> Pr
 
 /// Loads the model in `weights`, or the one embedded in this program, to compute in [`precision`].
 pub fn load(weights: Option<&Path>, requested: Option<Precision>, device: Device) -> Result<LoadedModel> {
-    let file = match weights {
-        Some(weights) => ModelFile::open(weights, &[])?,
-        None => ModelFile::open_bundled()?,
-    };
+    let file = ModelFile::open_or_bundled(weights)?;
     let precision = precision(requested, device, file.config.model.width);
     let loaded = file.load_mmap(device, precision)?;
     if !ranks::is_main_process() {

@@ -143,6 +143,14 @@ impl ModelFile {
         Self::from_weights(WeightsFile::from_embedded(BUNDLED_BYTES, Path::new(BUNDLED_MODEL))?, &[])
     }
 
+    /// Opens a file of weights, or the embedded ones if `path` is `None`.
+    ///
+    /// # Errors
+    /// Fails like [`ModelFile::open`].
+    pub fn open_or_bundled(path: Option<&Path>) -> Result<Self> {
+        path.map_or_else(Self::open_bundled, |path| Self::open(path, &[]))
+    }
+
     /// Reads the configuration and the stage of an open weights file. `overrides` change its configuration, as in [`Config::read`].
     ///
     /// # Errors

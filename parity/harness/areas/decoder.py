@@ -6,9 +6,9 @@ import numpy as np
 import torch
 
 from ... import reference
+from ...reference.names import reference_config, with_prefix
 from .. import draw
 from ..draw import integer, normal, uniform
-from ..names import reference_config, with_prefix
 from ..registry import Draw, by, case, reference_for
 
 # Constant offset of the decoder, which is not a parameter: program and reference each define it.

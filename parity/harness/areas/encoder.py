@@ -6,9 +6,9 @@ import numpy as np
 import torch
 
 from ... import reference
+from ...reference.names import reference_config, with_prefix
 from .. import draw
 from ..draw import integer, normal
-from ..names import reference_config, with_prefix
 from ..registry import Draw, by, case, reference_for
 from ..tolerance import Tolerance
 

@@ -1,9 +1,9 @@
 """Cases of the complete model, from images to Gaussians."""
 
 from ... import reference
+from ...reference.names import reference_config
 from .. import draw
 from ..draw import integer, uniform
-from ..names import reference_config
 from ..registry import Draw, by, case, reference_for
 from .decoder import decoder_params, gaussians
 

@@ -1,9 +1,9 @@
 """Cases of the tokenizer, from images and cameras to the tokens that the encoder reads."""
 
 from ... import reference
+from ...reference.names import reference_config, with_prefix
 from .. import draw
 from ..draw import integer, normal
-from ..names import reference_config, with_prefix
 from ..registry import Draw, by, case, reference_for
 
 
