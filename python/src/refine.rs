@@ -5,15 +5,11 @@ use crate::error::to_python;
 use crate::models::device;
 use crate::splat::{Parameters, to_dict};
 use crate::work::run_guarded;
+use globalsplat::Error;
 use globalsplat::data::PhotoSize;
 use globalsplat::refine::{Budget, Initial, RefineConfig, RefineEvent, RefineOptions, RefineSession};
-use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use std::time::Duration;
-
-/// Maximum time in seconds: a year.
-const MAX_SECONDS: f64 = 365. * 24. * 3600.;
 
 /// Options of a refinement, as the Python function's arguments of the same names.
 #[derive(FromPyObject)]
@@ -37,11 +33,13 @@ impl Options {
         capture: &Capture,
         count: Option<usize>,
     ) -> globalsplat::Result<RefineOptions> {
+        let time = Budget::from_seconds(self.seconds)
+            .ok_or_else(|| Error::setting("seconds", self.seconds, "more than 0, up to a year"))?;
         let mut config = RefineConfig::with(&self.settings, count.is_some())?;
         config.antialiased |= self.antialiased;
         let options = RefineOptions {
             config,
-            budget: self.steps.map_or(Budget::Time(Duration::from_secs_f64(self.seconds)), Budget::Steps),
+            budget: self.steps.map_or(time, Budget::Steps),
             views: self.views,
             seed: self.seed,
             correct_poses: self.correct_poses,
@@ -64,10 +62,6 @@ pub fn refine<'py>(
     options: Options,
     progress: Option<Py<PyAny>>,
 ) -> PyResult<(Bound<'py, PyDict>, Vec<String>)> {
-    if !(options.seconds > 0. && options.seconds <= MAX_SECONDS) {
-        let why = format!("seconds is {}, expected more than 0, up to a year", options.seconds);
-        return Err(PyValueError::new_err(why));
-    }
     let initial = initial.map(Parameters::into_splat).transpose()?;
     let count = initial.as_ref().map(|splat| splat.len().max(1));
     let options = options.into_refine_options(capture, count).map_err(to_python)?;

@@ -30,6 +30,17 @@ pub enum MaskBackground {
     Random,
 }
 
+impl Budget {
+    /// Maximum time in seconds: a year.
+    const MAX_SECONDS: f64 = 365. * 24. * 3600.;
+
+    /// Returns a time of that many seconds; `None` unless it is more than 0, up to a year.
+    pub fn from_seconds(seconds: f64) -> Option<Self> {
+        let is_valid = seconds > 0. && seconds <= Self::MAX_SECONDS;
+        is_valid.then(|| Budget::Time(Duration::from_secs_f64(seconds)))
+    }
+}
+
 impl MaskBackground {
     /// Returns red, green and blue of the background of a step.
     pub(super) fn colour(self, random: &mut impl Rng) -> [f32; 3] {

@@ -13,10 +13,7 @@ use globalsplat::data::Holdout;
 use globalsplat::error::Error;
 use globalsplat::refine::{Budget, ExposureCorrection, MaskBackground, RefineConfig, RefineOptions};
 use std::path::PathBuf;
-use std::time::Duration;
 
-/// Maximum of `--seconds`: a year.
-const MAX_SECONDS: f64 = 365. * 24. * 3600.;
 /// Maximum of `--gaussians`.
 const MAX_GAUSSIANS: usize = 10_000_000;
 
@@ -232,9 +229,6 @@ fn parse_gaussians(text: &str) -> Result<GaussianCount, String> {
 
 /// Checks a time in seconds and returns it as a budget.
 pub fn parse_time(seconds: f64) -> Result<Budget> {
-    if !(seconds > 0. && seconds <= MAX_SECONDS) {
-        let why = format!("--seconds is {seconds}, expected more than 0, up to a year");
-        return Err(Error::request(why).into());
-    }
-    Ok(Budget::Time(Duration::from_secs_f64(seconds)))
+    let invalid = || Error::request(format!("--seconds is {seconds}, expected more than 0, up to a year"));
+    Ok(Budget::from_seconds(seconds).ok_or_else(invalid)?)
 }
