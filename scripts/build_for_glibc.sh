@@ -11,6 +11,7 @@ scripts/heartbeat.sh building "${build[@]}"
 mkdir -p "$target/linker"
 printf '#!/bin/sh\nCC="%s" exec "%s" "$@"\n' "$(command -v cc)" "$PWD/scripts/link_for_glibc.sh" >"$target/linker/cc"
 chmod +x "$target/linker/cc"
+scripts/link_for_glibc.sh --check "$target/release/globalsplat" 2>/dev/null && exit # already linked so
 find "$target/release/deps" -samefile "$target/release/globalsplat" -delete
 PATH="$(realpath "$target")/linker:$PATH" scripts/heartbeat.sh linking "${build[@]}"
 scripts/link_for_glibc.sh --check "$target/release/globalsplat"
