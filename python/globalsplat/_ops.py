@@ -11,25 +11,16 @@ from ._native import simd_level as simd_level  # the native module defines the o
 TENSORS, SETTINGS = 7, 7
 
 
-def _result_dtype(means: Tensor) -> torch.dtype:
+def result_dtype(means: Tensor) -> torch.dtype:
+    """Returns the type in which Gaussians are rendered."""
     return torch.float64 if means.dtype == torch.float64 else torch.float32
 
 
-def _splat_fake(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    *_: Any,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _splat_fake(means: Tensor, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    viewmats, (width, height) = inputs[4], inputs[6:8]
     scenes, cameras = viewmats.shape[:2]
     empty = means.new_empty
-    dtype = _result_dtype(means)
+    dtype = result_dtype(means)
     return (
         empty((scenes, cameras, 3, height, width), dtype=dtype),
         empty((scenes, cameras, height, width), dtype=dtype),
@@ -41,7 +32,7 @@ def _splat_fake(
 def _splat_backward_fake(*inputs: Any) -> tuple[Tensor, ...]:
     tensors, (has_viewmats_grad, has_means2d_grad) = inputs[:TENSORS], inputs[-2:]
     means, viewmats = tensors[0], tensors[5]
-    dtype = _result_dtype(means)
+    dtype = result_dtype(means)
     gradients = [means.new_empty(tensor.shape, dtype=dtype) for tensor in tensors[:6]]
     if not has_viewmats_grad:
         gradients[5] = means.new_empty(0, dtype=dtype)
@@ -51,7 +42,7 @@ def _splat_backward_fake(*inputs: Any) -> tuple[Tensor, ...]:
 
 def _project_fake(means: Tensor, *inputs: Any) -> tuple[Tensor, ...]:
     shape = (*inputs[4].shape[:2], means.shape[1])
-    dtype = _result_dtype(means)
+    dtype = result_dtype(means)
     return (
         means.new_empty((*shape, 2), dtype=dtype),
         means.new_empty((*shape, 3), dtype=dtype),

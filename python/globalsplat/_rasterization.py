@@ -6,7 +6,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from . import _ops as _ops  # registers the ops' gradients
+from ._checks import expect, expect_shape
+from ._ops import result_dtype
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 
@@ -131,29 +132,29 @@ def rasterization(
     )
     if sh_degree is not None and sh_degree > 3:
         raise NotImplementedError(f"sh_degree is {sh_degree}, and spherical harmonics are implemented up to degree 3")
-    _expect("sh_degree", sh_degree, sh_degree is None or sh_degree >= 0, "0 to 3, or None")
-    _expect("width", width, width >= 1, "1 or more")
-    _expect("height", height, height >= 1, "1 or more")
-    _expect("eps2d", eps2d, eps2d >= 0.0, "0 or more")
-    _expect("near_plane", near_plane, near_plane >= 0.0, "0 or more")
-    _expect("far_plane", far_plane, far_plane > near_plane, "more than near_plane")
+    expect("sh_degree", sh_degree, sh_degree is None or sh_degree >= 0, "0 to 3, or None")
+    expect("width", width, width >= 1, "1 or more")
+    expect("height", height, height >= 1, "1 or more")
+    expect("eps2d", eps2d, eps2d >= 0.0, "0 or more")
+    expect("near_plane", near_plane, near_plane >= 0.0, "0 or more")
+    expect("far_plane", far_plane, far_plane > near_plane, "more than near_plane")
     has_colors, has_depth = render_mode in ("RGB", "RGB+D", "RGB+ED"), render_mode != "RGB"
-    _expect("render_mode", render_mode, has_colors or render_mode in ("D", "ED"), "RGB, D, ED, RGB+D or RGB+ED")
-    _expect("rasterize_mode", rasterize_mode, rasterize_mode in ("classic", "antialiased"), "classic or antialiased")
+    expect("render_mode", render_mode, has_colors or render_mode in ("D", "ED"), "RGB, D, ED, RGB+D or RGB+ED")
+    expect("rasterize_mode", rasterize_mode, rasterize_mode in ("classic", "antialiased"), "classic or antialiased")
 
     batch, count, cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
     tail = 1 if sh_degree is None else 2
     has_camera_colors = colors.dim() == len(batch) + 2 + tail
     channels = colors.shape[-1]
-    _check("means", means, (*batch, count, 3))
-    _check("quats", quats, (*batch, count, 4))
-    _check("scales", scales, (*batch, count, 3))
-    _check("opacities", opacities, (*batch, count))
-    _check("viewmats", viewmats, (*batch, cameras, 4, 4))
-    _check("Ks", Ks, (*batch, cameras, 3, 3))
+    expect_shape("means", means, *batch, count, 3)
+    expect_shape("quats", quats, *batch, count, 4)
+    expect_shape("scales", scales, *batch, count, 3)
+    expect_shape("opacities", opacities, *batch, count)
+    expect_shape("viewmats", viewmats, *batch, cameras, 4, 4)
+    expect_shape("Ks", Ks, *batch, cameras, 3, 3)
     per_gaussian = (channels,) if sh_degree is None else (colors.shape[-2], 3)
-    _check("colors", colors, (*batch, *((cameras,) if has_camera_colors else ()), count, *per_gaussian))
-    _expect("the number of channels of colors", channels, channels >= 1, "1 or more")
+    expect_shape("colors", colors, *batch, *((cameras,) if has_camera_colors else ()), count, *per_gaussian)
+    expect("the number of channels of colors", channels, channels >= 1, "1 or more")
     for name, tensor in {
         "quats": quats,
         "scales": scales,
@@ -162,11 +163,11 @@ def rasterization(
         "viewmats": viewmats,
         "Ks": Ks,
     }.items():
-        _expect(f"the device of {name}", tensor.device, tensor.device == means.device, f"{means.device}, that of means")
+        expect(f"the device of {name}", tensor.device, tensor.device == means.device, f"{means.device}, that of means")
     if backgrounds is not None:
-        _check("backgrounds", backgrounds, (*batch, cameras, channels))
+        expect_shape("backgrounds", backgrounds, *batch, cameras, channels)
 
-    dtype = torch.float64 if means.dtype == torch.float64 else torch.float32
+    dtype = result_dtype(means)
     scenes = math.prod(batch)
 
     def flat(tensor: Tensor, dims: int) -> Tensor:
@@ -260,13 +261,3 @@ def _refuse(**arguments: bool) -> None:
     names = [name for name, is_used in arguments.items() if is_used]
     if names:
         raise NotImplementedError(f"{', '.join(names)}: implemented only with the default value")
-
-
-def _expect(name: str, value: object, is_valid: bool, expected: str) -> None:
-    if not is_valid:
-        raise ValueError(f"{name} is {value}, expected {expected}")
-
-
-def _check(name: str, tensor: Tensor, shape: tuple[int, ...]) -> None:
-    if tensor.shape != shape:
-        raise ValueError(f"{name} has shape {list(tensor.shape)}, expected {list(shape)}")

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from . import _native
-from . import _ops as _ops  # loads libtorch's CUDA library, if there is one, with PyTorch
+from ._checks import expect, expect_shape
 from ._native import Capture
 from ._splats import Splat, from_splat, to_splat, warn
 
@@ -125,8 +125,7 @@ def refine(
         ("size", size, 1),
         ("seed", seed, 0),
     ):
-        if value is not None and value < least:
-            raise ValueError(f"{name} is {value}, expected {least} or more")
+        expect(name, value, value is None or value >= least, f"{least} or more")
     options = {
         "seconds": seconds,
         "steps": steps,
@@ -152,13 +151,12 @@ def _to_capture(capture: Capture | Path | Tensor, viewmats: Tensor | None = None
         images = capture.detach().cpu()
         if images.is_floating_point():
             images = (images.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
-        if images.dtype != torch.uint8 or images.dim() != 4:
+        if images.dtype != torch.uint8 or images.dim() != 4 or images.shape[3] != 3:
             raise ValueError(
                 f"images are {images.dtype} of shape {list(images.shape)}, expected uint8 or floats [V, H, W, 3]"
             )
-        for name, matrices, side in (("viewmats", viewmats, 4), ("Ks", Ks, 3)):
-            if list(matrices.shape) != [len(images), side, side]:
-                raise ValueError(f"{name} has shape {list(matrices.shape)}, expected {[len(images), side, side]}")
+        expect_shape("viewmats", viewmats, len(images), 4, 4)
+        expect_shape("Ks", Ks, len(images), 3, 3)
         if Ks[:, 0, 1].any():
             raise ValueError("Ks have a skew, expected 0 in row 0, column 1")
         cameras = [np.ascontiguousarray(matrices.detach().cpu().double().numpy()) for matrices in (viewmats, Ks)]

@@ -10,9 +10,7 @@ import numpy.typing as npt
 import torch
 
 from . import _native
-
-#: Value of `eps2d` for which splats are made, in pixels², and for antialiased ones.
-EPS2D, ANTIALIASED_EPS2D = 0.05, 0.1
+from ._checks import expect, expect_shape
 
 Array = Any
 """A NumPy array or a tensor."""
@@ -128,7 +126,7 @@ def to_splat(raw: Mapping[str, Any]) -> Splat:
         "opacities": (1.0 / (1.0 + np.exp(-raw["opacity_logits"].astype(np.float64)))).astype(np.float32),
         "colors": sh,
         "sh_degree": round(sh.shape[1] ** 0.5) - 1,
-        "eps2d": ANTIALIASED_EPS2D if raw["antialiased"] else EPS2D,
+        "eps2d": raw["eps2d"],
         "rasterize_mode": _mode(raw),
     }
 
@@ -147,20 +145,21 @@ def from_splat(splat: Mapping[str, Any] | torch.nn.ParameterDict, activated: boo
     means, scales, opacities = values["means"], values["scales"], values["opacities"]
     count = len(means) if means.ndim else 0
     if opacities.shape == (count, 1):  # as in gsplat's files
-        opacities = values["opacities"] = opacities[:, 0]
-    shapes = {"means": [count, 3], "quats": [count, 4], "scales": [count, 3], "opacities": [count]}
-    for name, shape in shapes.items():
-        if list(values[name].shape) != shape:
-            raise ValueError(f"{name} has shape {list(values[name].shape)}, expected {shape}")
+        opacities = opacities[:, 0]
+    expect_shape("means", means, count, 3)
+    expect_shape("quats", values["quats"], count, 4)
+    expect_shape("scales", scales, count, 3)
+    expect_shape("opacities", opacities, count)
     mode = splat.get("rasterize_mode", "classic")
-    if mode not in ("classic", "antialiased"):
-        raise ValueError(f"rasterize_mode is {mode!r}, expected classic or antialiased")
+    expect("rasterize_mode", repr(mode), mode in ("classic", "antialiased"), "classic or antialiased")
     if activated:
-        for name, is_valid in (("scales", scales >= 0.0), ("opacities", (opacities >= 0.0) & (opacities <= 1.0))):
-            if not is_valid.all():
-                raise ValueError(
-                    f"{name} has {values[name][~is_valid][0]:g}, expected {'0 or more' if name == 'scales' else '0 to 1'}"
-                )
+        for name, array, most, expected in (
+            ("scales", scales, np.inf, "0 or more"),
+            ("opacities", opacities, 1.0, "0 to 1"),
+        ):
+            invalid = array[(array < 0.0) | (array > most)]
+            if len(invalid) > 0:
+                raise ValueError(f"{name} has {invalid[0]:g}, expected {expected}")
         sh = values["colors"]
         with np.errstate(divide="ignore"):
             scales = np.log(scales)

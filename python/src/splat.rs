@@ -4,6 +4,7 @@ use crate::capture::Capture;
 use crate::error::to_python;
 use crate::work::run;
 use globalsplat::io::{ShLimits, Splat, check_writable_splat, fit_splat};
+use globalsplat::render::{ANTIALIASED_EPS2D, DEFAULT_EPS2D};
 use numpy::{PyArray, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -50,6 +51,7 @@ pub fn to_dict(py: Python<'_>, splat: Splat) -> PyResult<Bound<'_, PyDict>> {
     dict.set_item("opacity_logits", array(splat.opacity_logits, &[count])?)?;
     dict.set_item("sh", array(splat.sh.into_flattened(), &[count, bases, 3])?)?;
     dict.set_item("antialiased", splat.antialiased)?;
+    dict.set_item("eps2d", if splat.antialiased { ANTIALIASED_EPS2D } else { DEFAULT_EPS2D })?;
     Ok(dict)
 }
 
