@@ -44,6 +44,7 @@ pub mod reconstruct;
 pub mod refine;
 pub mod render;
 pub mod scene;
+pub mod stereo;
 pub mod train;
 
 pub use error::{Error, Result};

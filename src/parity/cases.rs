@@ -8,7 +8,7 @@ use crate::io::Weights;
 use crate::loss;
 use crate::model::{self, EncodedTokens, GlobalSplat, ModelConfig, Precision, RawOutputs, Stage};
 use crate::optim::Optimizer;
-use crate::refine::depth_search::{ComparedPhoto, search_depths};
+use crate::stereo::depth_search::{ComparedPhoto, search_depths};
 use crate::render::{self, Cameras};
 use crate::scene::{self, Gaussians};
 use crate::train;

@@ -1,11 +1,9 @@
 //! Initial Gaussians from photos, or from photos and points.
 
-use super::depth_map::DepthMap;
 use super::exposures::{ExposureCorrection, LogGains};
-use super::sweep::{PlaneSweepOutput, sweep};
-use super::view_selection::projection;
-use crate::data::{Point, View};
+use crate::data::{Pixels, Point, View};
 use crate::scene::{RawGaussians, SH_C0};
+use crate::stereo::{DepthMap, PlaneSweepOutput, SWEEP_SIDE, SmallPhoto, projection, sweep};
 use glam::DVec3;
 use rand::seq::index::sample;
 use rand::{Rng, SeedableRng};
@@ -53,7 +51,8 @@ pub fn gaussians_from_photos(
     exposures: ExposureCorrection,
     should_continue: impl FnMut(usize) -> bool,
 ) -> Option<InitialScene> {
-    let PlaneSweepOutput { photos, mut depth_maps } = sweep(views, points, should_continue);
+    let photos = views.iter().map(|view| small_photo(view, SWEEP_SIDE)).collect();
+    let PlaneSweepOutput { photos, mut depth_maps } = sweep(photos, points, should_continue);
     if depth_maps.is_empty() {
         return None;
     }
@@ -75,6 +74,13 @@ pub fn gaussians_from_photos(
         }
     };
     Some(InitialScene { gaussians, depth_maps, log_exposures })
+}
+
+/// Downscales a view to at most `longest_side` pixels along its longer side, on the CPU.
+pub(super) fn small_photo(view: &View, longest_side: f64) -> SmallPhoto {
+    let on_cpu = |pixels: &Pixels| pixels.to_float().to_device(Device::Cpu);
+    let (image, mask) = (on_cpu(&view.image), view.mask.as_ref().map(on_cpu));
+    SmallPhoto::new(&view.name, &image, mask.as_ref(), view.camera, longest_side)
 }
 
 /// Returns the indices of the Gaussians that the photos support. A Gaussian must not be in front of a depth that a photo is sure of, and at

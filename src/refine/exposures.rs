@@ -1,9 +1,7 @@
 //! Exposures of photos relative to each other, measured where photos show the same surface, as panoramas are balanced (Brown and Lowe 2007).
 
-use super::depth_map::{DepthMap, numbers, truths};
-use super::small_photo::SmallPhoto;
-use super::view_selection::{nearest_to, projection};
 use crate::scene::Camera;
+use crate::stereo::{DepthMap, SmallPhoto, nearest_to, numbers, projection, truths};
 use glam::DVec3;
 use std::ops::Range;
 use tch::Tensor;
@@ -203,6 +201,7 @@ fn median(values: &mut [f32]) -> f32 {
 mod tests {
     use super::*;
     use crate::data::View;
+    use crate::refine::begin::small_photo;
     use crate::refine::{InitialScene, gaussians_from_photos};
     use crate::scene::{Intrinsics, SH_C0};
     use glam::DMat4;
@@ -229,7 +228,7 @@ mod tests {
     fn exposures_are_measured() {
         let gains = [[1., 1., 1.], [0.8, 0.9, 1.1], [1.3, 1.2, 1.4], [1., 1., 1.]];
         let views: Vec<View> = [-0.5, 0., 0.5, 90.].into_iter().zip(gains).map(|(x, g)| wall(x, g)).collect();
-        let photos: Vec<SmallPhoto> = views.iter().map(|view| SmallPhoto::from_view(view, 128.)).collect();
+        let photos: Vec<SmallPhoto> = views.iter().map(|view| small_photo(view, 128.)).collect();
         let map = |index: usize| {
             let map = DepthMap { camera: photos[index].camera, ..DepthMap::flat(SIDE, SIDE, DEPTH) };
             (index, map)

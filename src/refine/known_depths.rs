@@ -1,6 +1,6 @@
 //! Loss between rendered depths and those that the plane sweep has found.
 
-use super::depth_map::DepthMap;
+use crate::stereo::DepthMap;
 use tch::{Device, Kind, Tensor};
 
 /// Relative difference from which a depth pulls no more: either it is wrong, or the pixel shows something that the depth doesn't belong to.

@@ -4,8 +4,6 @@
 mod begin;
 mod config;
 mod corrections;
-mod depth_map;
-pub(crate) mod depth_search;
 mod exposures;
 mod gaussian_optimizer;
 mod gaussian_params;
@@ -15,16 +13,12 @@ mod options;
 mod photos;
 mod relocate;
 mod session;
-mod small_photo;
 mod state;
-mod sweep;
 mod view_sample;
-mod view_selection;
 
 pub use begin::{InitialScene, gaussians_from_photos};
 pub use config::RefineConfig;
 pub use corrections::{Correction, Corrections};
-pub use depth_map::DepthMap;
 pub use exposures::ExposureCorrection;
 pub use gaussian_optimizer::GaussianOptimizer;
 pub use log::RefineLog;

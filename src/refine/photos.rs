@@ -1,14 +1,13 @@
 //! Photos that a splat is refined on, at several sizes.
 
 use super::config::RefineConfig;
-use super::depth_map::DepthMap;
 use super::known_depths::KnownDepths;
-use super::view_selection::are_near_duplicates;
 use crate::data::{
     Capture, MIN_SHORTER_SIDE, PhotoSize, Pixels, View, ViewBatch, load_views, select_views, view_matrices,
 };
 use crate::error::{Error, Result};
 use crate::scene::{Camera, ImageSize};
+use crate::stereo::{DepthMap, are_near_duplicates, pool_masked};
 use rand::Rng;
 use rand::seq::index::sample;
 use std::collections::BTreeMap;
@@ -251,18 +250,6 @@ impl Photos {
             depths: chosen.iter().map(|&k| group.depths[k].as_ref()).collect(),
         }
     }
-}
-
-/// Downscales images [.., 3, H, W] and their masks [.., 1, H, W] by `pool`. Colours are means over the pixels that count.
-pub(super) fn pool_masked(
-    images: &Tensor,
-    masks: Option<&Tensor>,
-    pool: impl Fn(&Tensor) -> Tensor,
-) -> (Tensor, Option<Tensor>) {
-    const LEAST: f64 = 1e-6;
-    let Some(masks) = masks else { return (pool(images), None) };
-    let weights = pool(masks);
-    (pool(&(images * masks)) / weights.clamp_min(LEAST), Some(weights))
 }
 
 #[cfg(test)]

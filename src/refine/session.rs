@@ -4,7 +4,6 @@
 use super::begin::{InitialScene, gaussians_from_photos};
 use super::config::RefineConfig;
 use super::corrections::{Correction, Corrections};
-use super::depth_map::DepthMap;
 use super::exposures::{ExposureCorrection, LogGains};
 use super::gaussian_optimizer::GaussianOptimizer;
 use super::options::{Budget, RefineOptions};
@@ -18,6 +17,7 @@ use crate::eval::{CaptureScores, ContactSheet, Perceptual, score_views};
 use crate::io::Splat;
 use crate::reconstruct::{LoadedModel, reconstruct, spread_over_path};
 use crate::scene::{Camera, Gaussians, LocalFrame, RawGaussians};
+use crate::stereo::DepthMap;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};

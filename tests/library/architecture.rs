@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 /// Layers, from the highest to the lowest: a module may use those after it, and those in [`GROUND`].
-const LAYERS: [&str; 17] = [
+const LAYERS: [&str; 18] = [
     "cli",
     "parity",
     "bench",
@@ -16,6 +16,7 @@ const LAYERS: [&str; 17] = [
     "optim",
     "loss",
     "data",
+    "stereo",
     "io",
     "ranks",
     "device",

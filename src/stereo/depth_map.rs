@@ -69,11 +69,11 @@ impl DepthMap {
 }
 
 /// Returns the values of a float32 tensor.
-pub(super) fn numbers(t: &Tensor) -> Vec<f32> {
+pub(crate) fn numbers(t: &Tensor) -> Vec<f32> {
     Vec::try_from(t.contiguous().view([-1])).expect("numbers")
 }
 
 /// Returns the values of a Boolean tensor.
-pub(super) fn truths(t: &Tensor) -> Vec<bool> {
+pub(crate) fn truths(t: &Tensor) -> Vec<bool> {
     Vec::try_from(t.contiguous().view([-1])).expect("truths")
 }

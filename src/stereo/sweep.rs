@@ -7,12 +7,12 @@ use super::small_photo::SmallPhoto;
 use super::view_selection::{
     are_near_duplicates, at_octaves, extent, farthest_first, neighbours, projection,
 };
-use crate::data::{Point, View};
 use crate::scene::Camera;
+use globalsplat_capture::Point;
 use tch::{Device, Kind, Tensor};
 
 /// Longer side in pixels of the images that are compared.
-const LONGEST_SIDE: f64 = 128.;
+pub(crate) const SWEEP_SIDE: f64 = 128.;
 /// Number of inverse depths that are tried, evenly spaced from 0 to that of the nearest plane.
 const PLANES: i64 = 128;
 /// Longer side in pixels of the images that are compared to estimate the depth of the scene.
@@ -49,72 +49,119 @@ const NEARER: f64 = 0.02;
 const ROOM: f64 = 1.3;
 
 /// Result of a plane sweep.
-pub(super) struct PlaneSweepOutput {
+pub(crate) struct PlaneSweepOutput {
     /// All views, downscaled.
     pub photos: Vec<SmallPhoto>,
     /// Depths of some of the views, with the views' indices, in their order.
     pub depth_maps: Vec<(usize, DepthMap)>,
 }
 
-/// Computes depths for the pixels of the views. If there are many views, it processes a subset that together shows what all of them show,
+/// Computes depths for the pixels of `photos`. If there are many photos, it processes a subset that together shows what all of them show,
 /// without near duplicates. `points` of the scene, if some are known, determine the nearest depth. `should_continue` is called before each
-/// view with the number of views that are done. If it returns `false`, only these get depths.
-pub(super) fn sweep(
-    views: &[View],
+/// photo with the number of photos that are done. If it returns `false`, only these get depths.
+pub(crate) fn sweep(
+    photos: Vec<SmallPhoto>,
     points: &[Point],
     mut should_continue: impl FnMut(usize) -> bool,
 ) -> PlaneSweepOutput {
-    let small: Vec<SmallPhoto> = views.iter().map(|view| SmallPhoto::from_view(view, LONGEST_SIDE)).collect();
-    let cameras: Vec<Camera> = small.iter().map(|small| small.camera).collect();
-    let coarse: Vec<SmallPhoto> = views.iter().map(|view| SmallPhoto::from_view(view, COARSE_SIDE)).collect();
-    let (mut depths, mut swept): (Vec<f64>, Vec<(usize, DepthMap)>) = (vec![], vec![]);
-    for index in farthest_first(&cameras, MAX_DEPTH_MAPS) {
+    let mut sweep = Sweep::new(&photos, points, PLANES);
+    let mut swept: Vec<(usize, DepthMap)> = vec![];
+    for index in farthest_first(&sweep.cameras, MAX_DEPTH_MAPS) {
         if !should_continue(swept.len()) {
             break;
         }
-        let SceneDepth { median, nearest } = SceneDepth::of(index, &coarse, points);
-        depths.extend(median);
-        let depth = median.unwrap_or_else(|| typical_depth(&depths, extent(&cameras)));
-        let is_new =
-            |(other, _): &(usize, DepthMap)| !are_near_duplicates(&cameras[index], &cameras[*other], depth);
+        let scene = sweep.scene_depth(index);
+        let (this, cameras) = (&photos[index], &sweep.cameras);
+        let is_new = |(other, _): &(usize, DepthMap)| {
+            !are_near_duplicates(&this.camera, &cameras[*other], scene.depth)
+        };
         if swept.iter().all(is_new) {
-            let others = neighbours(index, &cameras, depth);
-            let others: Vec<&SmallPhoto> = others.into_iter().map(|other| &small[other]).collect();
-            swept.push((index, sweep_one(&small[index], &others, nearest, depth)));
+            let InverseDepths { filled, correlation, nearest } = sweep.inverse_depths(index, &scene);
+            let map = DepthMap {
+                photo: this.name.clone(),
+                camera: this.camera,
+                image: this.image.shallow_clone(),
+                depth: filled.clamp_min(nearest / FARTHEST).reciprocal(),
+                sure: correlation.gt(SURE),
+                counted: this.counted(),
+            };
+            swept.push((index, map));
         }
     }
     swept.sort_by_key(|(index, _)| *index);
-    PlaneSweepOutput { photos: small, depth_maps: swept }
+    PlaneSweepOutput { photos, depth_maps: swept }
 }
 
-fn sweep_one(this: &SmallPhoto, others: &[&SmallPhoto], nearest: Option<f64>, depth: f64) -> DepthMap {
-    let nearest = match (nearest, others.first()) {
-        (Some(nearest), _) => nearest,
-        (None, Some(other)) => nearest_of_cameras(this, other).min(NEAREST / depth),
-        // Without other photos no depth can be measured: all pixels get the same depth.
-        (None, None) => 2. / depth,
-    };
-    let (inverse, correlation) = most_alike(this, others, nearest, PLANES);
-    let counted = this.counted();
-    DepthMap {
-        photo: this.name.clone(),
-        camera: this.camera,
-        image: this.image.shallow_clone(),
-        depth: filled(&inverse, &correlation, counted.as_ref()).clamp_min(nearest / FARTHEST).reciprocal(),
-        sure: correlation.gt(SURE),
-        counted,
+/// Photos whose depths are searched, one after the other.
+struct Sweep<'a> {
+    photos: &'a [SmallPhoto],
+    coarse: Vec<SmallPhoto>,
+    cameras: Vec<Camera>,
+    points: &'a [Point],
+    planes: i64,
+    /// Median depths of the photos so far, where they could be estimated.
+    medians: Vec<f64>,
+}
+
+/// Distance of the scene from a photo.
+struct SceneDepth {
+    /// Median depth of what the photo shows.
+    depth: f64,
+    /// Inverse depth of the nearest plane, if points determine it.
+    nearest: Option<f64>,
+}
+
+/// Inverse depths of a photo's pixels.
+struct InverseDepths {
+    /// Inverse depth of every pixel, [h, w]. Where the correlation is low it comes from pixels around.
+    filled: Tensor,
+    /// Correlation with the other photos at the depth where it is highest, [h, w].
+    correlation: Tensor,
+    /// Inverse depth of the nearest plane that was tried.
+    nearest: f64,
+}
+
+impl<'a> Sweep<'a> {
+    fn new(photos: &'a [SmallPhoto], points: &'a [Point], planes: i64) -> Self {
+        let coarse = photos.iter().map(|photo| photo.downscaled(COARSE_SIDE)).collect();
+        let cameras = photos.iter().map(|photo| photo.camera).collect();
+        Sweep { photos, coarse, cameras, points, planes, medians: vec![] }
+    }
+
+    /// Estimates how far the scene is from photo `index`. If the photo itself doesn't tell, uses those that came before.
+    fn scene_depth(&mut self, index: usize) -> SceneDepth {
+        let EstimatedDepth { median, nearest } = EstimatedDepth::of(index, &self.coarse, self.points);
+        self.medians.extend(median);
+        let depth = median.unwrap_or_else(|| typical_depth(&self.medians, extent(&self.cameras)));
+        SceneDepth { depth, nearest }
+    }
+
+    /// Searches the depths of photo `index`, which is about as far from the scene as `scene` says.
+    fn inverse_depths(&self, index: usize, scene: &SceneDepth) -> InverseDepths {
+        let this = &self.photos[index];
+        let others = neighbours(index, &self.cameras, scene.depth);
+        let others: Vec<&SmallPhoto> = others.into_iter().map(|other| &self.photos[other]).collect();
+        let nearest = match (scene.nearest, others.first()) {
+            (Some(nearest), _) => nearest,
+            (None, Some(other)) => nearest_of_cameras(this, other).min(NEAREST / scene.depth),
+            // Without other photos no depth can be measured: all pixels get the same depth.
+            (None, None) => 2. / scene.depth,
+        };
+        let (inverse, correlation) = most_alike(this, &others, nearest, self.planes);
+        let filled = filled(&inverse, &correlation, this.counted().as_ref());
+        InverseDepths { filled, correlation, nearest }
     }
 }
 
-/// Estimated distance of the scene from a photo, before depths per pixel are computed.
-struct SceneDepth {
+/// Distance of the scene as it is estimated from a photo alone, before depths per pixel are computed.
+struct EstimatedDepth {
     /// Median depth of what the photo shows, if it can be estimated.
     median: Option<f64>,
     /// Inverse depth of the nearest plane, if points determine it.
     nearest: Option<f64>,
 }
 
-impl SceneDepth {
+impl EstimatedDepth {
     /// Estimates the depth from the points that the photo shows, else by comparing it with one photo at each of several distances, which
     /// are the extent of all cameras times powers of ½. Photos that are too near show no parallax, and those that are too far show
     /// something else. The number of photos at a distance makes no difference.
@@ -123,7 +170,7 @@ impl SceneDepth {
         if let Some(inverse) = inverse_depths_of(points, &this.camera) {
             let median = Some(1. / inverse[inverse.len() / 2]);
             let last = ((1. - NEARER) * inverse.len() as f64) as usize;
-            return SceneDepth { median, nearest: Some(ROOM * inverse[last]) };
+            return EstimatedDepth { median, nearest: Some(ROOM * inverse[last]) };
         }
         let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
         let compared = at_octaves(index, &cameras, OCTAVES).into_iter().map(|i| measured(this, &photos[i]));
@@ -131,7 +178,7 @@ impl SceneDepth {
         let resolved = agreed.iter().filter(|of| of.planes >= RESOLVED);
         // The farthest photo comes first. A scene without parallax there is at least that far away.
         let best = resolved.max_by(|a, b| a.share.total_cmp(&b.share)).or(agreed.first());
-        SceneDepth { median: best.map(|of| of.depth), nearest: None }
+        EstimatedDepth { median: best.map(|of| of.depth), nearest: None }
     }
 }
 
@@ -231,29 +278,23 @@ mod tests {
         let (side, depth) = (64u32, 4.);
         let intrinsics = Intrinsics { fx: 60., fy: 60., cx: 32., cy: 32. };
         let options = (Kind::Float, Device::Cpu);
-        let view = |at: f64| {
+        let photo = |at: f64, masked: bool| {
             let pixel = |offset: f64| (Tensor::arange(64, options) + 0.5 - 32.) / 60. * depth + offset;
             let x = pixel(at).view([1, 64]);
             let y = pixel(0.).view([64, 1]);
             let wave = ((&x * 5.).sin() * (&y * 4.).cos() + (&x * 11. + &y * 7.).sin()) * 0.25 + 0.5;
             let c2w = DMat4::from_translation(DVec3::new(at, 0., 0.));
             let camera = Camera { intrinsics, c2w, width: side, height: side };
-            View {
-                name: String::new(),
-                image: wave.expand([3, 64, 64], false).contiguous().into(),
-                mask: None,
-                camera,
+            let (image, mask) = (wave.expand([3, 64, 64], false).copy(), Tensor::ones([1, 64, 64], options));
+            // A mask of the left half, where the photos show something else.
+            if masked {
+                image.narrow(2, 0, 24).copy_(&Tensor::rand([3, 64, 24], options));
+                let _ = mask.narrow(2, 0, 24).zero_();
             }
+            SmallPhoto::new("", &image, masked.then_some(&mask), camera, SWEEP_SIDE)
         };
-        let views = [view(-0.5), view(0.), view(0.5)];
-        // A mask of the left half, where the photos show something else.
-        let masked = views.each_ref().map(|view| {
-            let (image, mask) = (view.image.to_float().copy(), Tensor::ones([1, 64, 64], options));
-            image.narrow(2, 0, 24).copy_(&Tensor::rand([3, 64, 24], options));
-            let _ = mask.narrow(2, 0, 24).zero_();
-            View { image: image.into(), mask: Some(mask.into()), ..view.shallow_clone() }
-        });
-        for (_, swept) in sweep(&masked, &[], |_| true).depth_maps {
+        let photos = |masked: bool| [-0.5, 0., 0.5].map(|at| photo(at, masked)).into();
+        for (_, swept) in sweep(photos(true), &[], |_| true).depth_maps {
             let off = (&swept.depth / depth - 1.).abs();
             let counted = swept.counted.unwrap();
             assert_eq!(counted.sum(Kind::Int64).int64_value(&[]), 64 * 40);
@@ -266,19 +307,18 @@ mod tests {
             assert_eq!(sure(0, 24), 0.);
             assert!(sure(24, 40) > 0.6, "{}", sure(24, 40));
         }
-        for (_, swept) in sweep(&views, &[], |_| true).depth_maps {
+        for (_, swept) in sweep(photos(false), &[], |_| true).depth_maps {
             let off = (swept.depth / depth - 1.).abs().median().double_value(&[]);
             assert!(off < 0.02, "{off}");
         }
         // Points show that the scene begins at depth 3, so planes are closer together.
         let point = |i: i32| Point { position: DVec3::new(0.01 * f64::from(i), 0., 3.), colour: [0.; 3] };
         let points: Vec<Point> = (0..40).map(point).collect();
-        let photos: Vec<SmallPhoto> =
-            views.iter().map(|view| SmallPhoto::from_view(view, LONGEST_SIDE)).collect();
-        assert!((SceneDepth::of(1, &photos, &points).nearest.unwrap() - 1.3 / 3.).abs() < 1e-9);
-        assert!(SceneDepth::of(1, &photos, &points[..20]).nearest.is_none());
+        let photos: Vec<SmallPhoto> = photos(false);
+        assert!((EstimatedDepth::of(1, &photos, &points).nearest.unwrap() - 1.3 / 3.).abs() < 1e-9);
+        assert!(EstimatedDepth::of(1, &photos, &points[..20]).nearest.is_none());
         // A single photo has no measurable depth, and the result must not be NaN.
-        let alone = sweep(&views[..1], &[], |_| true).depth_maps;
+        let alone = sweep(vec![photo(0., false)], &[], |_| true).depth_maps;
         assert!(alone[0].1.depth.isfinite().all().int64_value(&[]) == 1);
     }
 }

@@ -1,0 +1,16 @@
+//! Depths of photos by a plane sweep, which needs no weights: for every pixel, the depth at which photos taken from other positions look
+//! most alike.
+
+mod depth_map;
+pub(crate) mod depth_search;
+mod small_photo;
+mod sweep;
+mod view_selection;
+
+pub use depth_map::DepthMap;
+
+// Used by the refinement, which starts from depths.
+pub(crate) use depth_map::{numbers, truths};
+pub(crate) use small_photo::{SmallPhoto, pool_masked};
+pub(crate) use sweep::{PlaneSweepOutput, SWEEP_SIDE, sweep};
+pub(crate) use view_selection::{are_near_duplicates, nearest_to, projection};
