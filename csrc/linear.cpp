@@ -15,6 +15,9 @@
 #include "globalsplat-csrc/src/linear.rs.h"
 #include "processor.h"
 
+// Of MKL, which libtorch has on Intel's and compatible processors, and null elsewhere. Returns the number that this thread had before.
+extern "C" __attribute__((weak)) int MKL_Set_Num_Threads_Local(int count);
+
 namespace globalsplat {
 namespace {
 
@@ -66,11 +69,27 @@ Tensor multiply(const Tensor& xs, const Tensor& weights, const std::optional<Ten
   return mkldnn_linear()->call(xs, weights, bias, "none", c10::List<std::optional<at::Scalar>>(), "");
 }
 
+// Limits MKL to one thread in products that this thread computes. Within a parallel region MKL uses one anyway, but on some processors
+// it chooses the order of its sums by the number of threads that it might use elsewhere.
+class OneMklThread {
+ public:
+  OneMklThread() : before_(MKL_Set_Num_Threads_Local == nullptr ? 0 : MKL_Set_Num_Threads_Local(1)) {}
+  ~OneMklThread() {
+    if (MKL_Set_Num_Threads_Local != nullptr) MKL_Set_Num_Threads_Local(before_);
+  }
+  OneMklThread(const OneMklThread&) = delete;
+  OneMklThread& operator=(const OneMklThread&) = delete;
+
+ private:
+  const int before_;
+};
+
 // Calls task(0) to task(count - 1), distributed over libtorch's threads. On such a thread, oneDNN and MKL use only that thread.
 void run_on_libtorch_threads(int64_t count, const std::function<void(int64_t)>& task) {
   std::atomic<int64_t> next{0};
   const auto take_tasks = [&](char**, const int64_t*, int64_t, int64_t) {
     const at::AutoDispatchBelowAutograd no_gradients;  // this mode is per thread
+    const OneMklThread one_thread;
     for (int64_t i; (i = next.fetch_add(1, std::memory_order_relaxed)) < count;) task(i);
   };
   // at::parallel_for is parallel only in code that is compiled with OpenMP, so this calls a function in libtorch. For a single element it
