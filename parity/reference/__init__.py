@@ -18,6 +18,7 @@ from . import (
     splat,
     stream,
     tokens,
+    warp,
 )
 
 __all__ = [
@@ -38,4 +39,5 @@ __all__ = [
     "splat",
     "stream",
     "tokens",
+    "warp",
 ]

@@ -25,6 +25,15 @@ def plucker_rays(c2w, intrinsic, height, width):
 
     dir = normalize(R ((j + 0.5 - cx) / fx, (i + 0.5 - cy) / fy, 1)),  o = camera centre.
     """
+    direction = pixel_directions(c2w, intrinsic, height, width)
+    direction = direction / direction.norm(dim=-1, keepdim=True)
+    origin = c2w[..., None, None, :3, 3].expand_as(direction)
+    moment = torch.linalg.cross(origin, direction)
+    return torch.cat([moment, direction], dim=-1).movedim(-1, 2)
+
+
+def pixel_directions(c2w, intrinsic, height, width):
+    """Returns the world directions of the pixels, [B, V, H, W, 3], with length 1 along the camera's axis."""
     j = torch.arange(width, dtype=c2w.dtype, device=c2w.device) + 0.5
     i = torch.arange(height, dtype=c2w.dtype, device=c2w.device) + 0.5
     fx, fy = intrinsic[..., 0, 0, None], intrinsic[..., 1, 1, None]
@@ -33,11 +42,7 @@ def plucker_rays(c2w, intrinsic, height, width):
     y = ((i - cy) / fy)[..., :, None].expand(*c2w.shape[:2], height, width)
 
     in_camera = torch.stack([x, y, torch.ones_like(x)], dim=-1)  # [B, V, H, W, 3]
-    direction = torch.einsum("bvrc,bvhwc->bvhwr", c2w[..., :3, :3], in_camera)
-    direction = direction / direction.norm(dim=-1, keepdim=True)
-    origin = c2w[..., None, None, :3, 3].expand_as(direction)
-    moment = torch.linalg.cross(origin, direction)
-    return torch.cat([moment, direction], dim=-1).movedim(-1, 2)
+    return torch.einsum("bvrc,bvhwc->bvhwr", c2w[..., :3, :3], in_camera)
 
 
 def centre_features(centre):

@@ -60,6 +60,7 @@ pub fn bench_refine(
     let photos = Photos::from_batch(ViewBatch {
         images: pictures.rgb,
         masks: None,
+        depths: None,
         c2w,
         w2c: cameras.w2c,
         intrinsics: cameras.intrinsics,

@@ -227,6 +227,7 @@ pub(super) fn synthetic_scene(config: &Config, seed: u64) -> LoadedScene {
         name: String::new(),
         images,
         masks: None,
+        depths: None,
         size,
         cameras: (0..views).map(camera).collect(),
         context,

@@ -4,7 +4,7 @@ use super::pixels::Pixels;
 use super::view::View;
 use crate::model::IMAGENET_MEAN;
 use crate::render::Cameras;
-use crate::scene::{Camera, pose_to_rows};
+use crate::scene::{Camera, RadialWarp, pose_to_rows};
 use glam::DMat4;
 use std::borrow::Borrow;
 use tch::{Device, Kind, Tensor};
@@ -16,6 +16,9 @@ pub struct ViewBatch {
     pub images: Tensor,
     /// Weight of each pixel, `[B, V, 1, H, W]`: 1 where the pixel counts, 0 where it is masked out. `None` if every pixel counts.
     pub masks: Option<Tensor>,
+    /// Depths of the pixels, `[B, V, 2, H, W]`: inverse depth along the camera's axis in the normalized world, and how sure it is, from 0 to
+    /// 1. `None` if the model reads none.
+    pub depths: Option<Tensor>,
     /// Camera-to-world matrices, `[B, V, 4, 4]`.
     pub c2w: Tensor,
     /// World-to-camera matrices, `[B, V, 4, 4]`.
@@ -34,7 +37,7 @@ pub fn view_batch<V: Borrow<View>>(views: &[V], poses: &[DMat4], device: Device)
         let masks: Vec<Pixels> = views.iter().map(|view| view.borrow().mask_or_ones()).collect();
         stack(&masks.iter().collect::<Vec<_>>())
     });
-    ViewBatch::with_images(stack(&images), masks, &[view_matrices(&cameras_at(views, poses), device)])
+    ViewBatch::with_images(stack(&images), masks, None, &[view_matrices(&cameras_at(views, poses), device)])
 }
 
 /// Returns the mask of `images` [.., 3, H, W] whose every pixel counts, [.., 1, H, W].
@@ -67,22 +70,36 @@ pub(crate) fn view_matrices(cameras: &[Camera], device: Device) -> [Tensor; 3] {
 }
 
 impl ViewBatch {
-    /// Builds a batch from `images` `[B, V, 3, H, W]`, their `masks` `[B, V, 1, H, W]` and the `matrices` of B scenes, one result of
-    /// [`view_matrices`] per scene.
-    pub(super) fn with_images(images: Tensor, masks: Option<Tensor>, matrices: &[[Tensor; 3]]) -> Self {
+    /// Builds a batch from `images` `[B, V, 3, H, W]`, their `masks` `[B, V, 1, H, W]` and `depths` `[B, V, 2, H, W]`, and the `matrices` of
+    /// B scenes, one result of [`view_matrices`] per scene.
+    pub(super) fn with_images(
+        images: Tensor,
+        masks: Option<Tensor>,
+        depths: Option<Tensor>,
+        matrices: &[[Tensor; 3]],
+    ) -> Self {
         let cat =
             |which: usize| Tensor::cat(&matrices.iter().map(|scene| &scene[which]).collect::<Vec<_>>(), 0);
-        ViewBatch { images, masks, c2w: cat(0), w2c: cat(1), intrinsics: cat(2) }
+        ViewBatch { images, masks, depths, c2w: cat(0), w2c: cat(1), intrinsics: cat(2) }
     }
 
-    /// Returns the four tensors besides the masks in the order that [`ViewBatch::from_tensors`] takes.
+    /// Returns the four tensors besides the masks and depths in the order that [`ViewBatch::from_tensors`] takes.
     pub(super) fn tensors(&self) -> [&Tensor; 4] {
         [&self.images, &self.c2w, &self.w2c, &self.intrinsics]
     }
 
-    /// Builds a batch from tensors in the order of [`ViewBatch::tensors`], and the masks.
-    pub(super) fn from_tensors([images, c2w, w2c, intrinsics]: [Tensor; 4], masks: Option<Tensor>) -> Self {
-        ViewBatch { images, masks, c2w, w2c, intrinsics }
+    /// Builds a batch from tensors in the order of [`ViewBatch::tensors`], the masks and the depths.
+    pub(super) fn from_tensors(
+        [images, c2w, w2c, intrinsics]: [Tensor; 4],
+        masks: Option<Tensor>,
+        depths: Option<Tensor>,
+    ) -> Self {
+        ViewBatch { images, masks, depths, c2w, w2c, intrinsics }
+    }
+
+    /// Returns the warp that the depths of the views determine; `None` without depths.
+    pub fn radial_warp(&self) -> Option<RadialWarp> {
+        self.depths.as_ref().map(|depths| RadialWarp::new(&self.c2w, &self.intrinsics, depths))
     }
 
     /// Returns the images as a model sees them: masked pixels have the colour that its normalization (spec 3.1) makes 0.
@@ -114,6 +131,7 @@ impl ViewBatch {
         ViewBatch {
             images: select(&self.images),
             masks: self.masks.as_ref().map(select),
+            depths: self.depths.as_ref().map(select),
             c2w: select(&self.c2w),
             w2c: select(&self.w2c),
             intrinsics: select(&self.intrinsics),
@@ -126,6 +144,7 @@ impl ViewBatch {
         ViewBatch {
             images: narrow(&self.images),
             masks: self.masks.as_ref().map(narrow),
+            depths: self.depths.as_ref().map(narrow),
             c2w: narrow(&self.c2w),
             w2c: narrow(&self.w2c),
             intrinsics: narrow(&self.intrinsics),
@@ -144,9 +163,13 @@ impl ViewBatch {
             };
             Tensor::cat(&scenes.iter().map(|scene| masks(scene.borrow())).collect::<Vec<_>>(), 0)
         });
+        // Scenes of a batch come from one loader: all have depths, or none.
+        let depths: Option<Vec<&Tensor>> =
+            scenes.iter().map(|scene| scene.borrow().depths.as_ref()).collect();
         ViewBatch {
             images: cat(|s| &s.images),
             masks,
+            depths: depths.map(|depths| Tensor::cat(&depths, 0)),
             c2w: cat(|s| &s.c2w),
             w2c: cat(|s| &s.w2c),
             intrinsics: cat(|s| &s.intrinsics),

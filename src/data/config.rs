@@ -56,6 +56,9 @@ pub struct DataConfig {
     /// applies to validation, too. Training always uses 1.
     #[serde(alias = "extents")]
     pub scene_scales: Vec<f64>,
+    /// If `true`, a plane sweep estimates a depth for every pixel of the context views, and the model sees the scene with distances
+    /// made about equal (spec 3.5).
+    pub depths: bool,
     /// Maximum number of context views per scene in a training step.
     pub context_views: usize,
     /// Minimum number of context views. If it isn't 0, every step draws the number of context views from this to `context_views`.
@@ -99,6 +102,7 @@ impl Default for DataConfig {
             captures: vec![],
             image_size: [256, 256].into(),
             scene_scales: vec![1.],
+            depths: false,
             context_views: 24,
             min_context_views: 0,
             target_views: 12,

@@ -6,7 +6,7 @@ use super::layers::linear;
 use super::merge::{Candidates, Stage};
 use super::precision::Precision;
 use super::rotation::{normalize, quaternion_from_6d};
-use crate::scene::{Gaussians, sigmoid};
+use crate::scene::{Gaussians, RadialWarp, sigmoid};
 use std::f64::consts::LN_2;
 use tch::{Tensor, nn};
 
@@ -65,6 +65,14 @@ pub struct Decoded {
 }
 
 impl Decoded {
+    /// Moves the Gaussians of the warped world back to the normalized one; without a `warp` they are there already.
+    pub fn restored(self, warp: Option<&RadialWarp>) -> Self {
+        match warp {
+            Some(warp) => Decoded { gaussians: warp.restore(&self.gaussians), ..self },
+            None => self,
+        }
+    }
+
     /// Applies `f` to every tensor.
     pub(crate) fn map(&self, f: impl Fn(&Tensor) -> Tensor) -> Self {
         Decoded {

@@ -51,6 +51,7 @@ pub(crate) use stream::{SelfAttentionBlock, StreamRound};
 pub(crate) use tokens::{IMAGENET_MEAN, RayTokens, RgbTokens, Tokenizer, patchify};
 
 use crate::error::Result;
+use crate::scene::RadialWarp;
 use layers::{ENCODER_STD, init_or_zeros, randn, without_random_init};
 use std::collections::HashSet;
 use tch::{Device, Kind, Tensor, nn};
@@ -109,12 +110,19 @@ impl GlobalSplat {
     /// Runs one forward pass. `images` [B, V, 3, H, W] in [0, 1], `c2w` [B, V, 4, 4] in the normalized scene, `intrinsics` [B, V, 3, 3] in
     /// pixels; H and W are multiples of the patch size.
     pub fn forward(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor, stage: Stage) -> Decoded {
-        self.decode(&self.encode_memory(&self.memory(images, c2w, intrinsics)), stage)
+        self.decode(&self.encode_memory(&self.memory(images, c2w, intrinsics, None)), stage)
     }
 
-    /// Computes the image tokens, [B, V, P, ray width + RGB width]: the first part of [`GlobalSplat::forward`].
-    pub fn tokens(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor) -> Tensor {
-        trace_span!("tokens").in_scope(|| self.tokenizer.forward(images, c2w, intrinsics))
+    /// Computes the image tokens, [B, V, P, ray width + RGB width]: the first part of [`GlobalSplat::forward`]. With a `warp`, the decoded
+    /// Gaussians are those of the warped world, which [`RadialWarp::restore`] moves back.
+    pub fn tokens(
+        &self,
+        images: &Tensor,
+        c2w: &Tensor,
+        intrinsics: &Tensor,
+        warp: Option<&RadialWarp>,
+    ) -> Tensor {
+        trace_span!("tokens").in_scope(|| self.tokenizer.forward(images, c2w, intrinsics, warp))
     }
 
     /// Encodes image tokens into scene tokens that have attended to every view: the second part of [`GlobalSplat::forward`].
@@ -129,16 +137,23 @@ impl GlobalSplat {
 
     /// Computes the encoder's memory from images and cameras. On a CPU without gradients it processes one view at a time, because the image
     /// tokens of many views are large. A GPU has enough memory for all views, and would spend the time on launching small kernels.
-    pub fn memory(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor) -> Memory {
+    pub fn memory(
+        &self,
+        images: &Tensor,
+        c2w: &Tensor,
+        intrinsics: &Tensor,
+        warp: Option<&RadialWarp>,
+    ) -> Memory {
         let tracks_grad = self.encoder.tracks_grad();
         if tracks_grad || images.device() != Device::Cpu {
-            let memory = self.memory_of(&self.tokens(images, c2w, intrinsics));
+            let memory = self.memory_of(&self.tokens(images, c2w, intrinsics, warp));
             // Converts once for all rounds. With gradients the memory stays in float32, in which they are accumulated.
             return if tracks_grad { memory } else { memory.to_kind(self.precision().kind()) };
         }
         let of_view = |view| {
             let [images, c2w, intrinsics] = [images, c2w, intrinsics].map(|t| t.narrow(1, view, 1));
-            self.tokens(&images, &c2w, &intrinsics).squeeze_dim(1)
+            let warp = warp.map(|warp| warp.views(view, 1));
+            self.tokens(&images, &c2w, &intrinsics, warp.as_ref()).squeeze_dim(1)
         };
         self.encoder.memory_of_views(images.size()[1], of_view)
     }
@@ -254,7 +269,7 @@ mod tests {
             let options = (Kind::Float, Device::Cpu);
             let images = Tensor::rand([1, views, 3, 32, 32], options);
             let [c2w, intrinsics] = [4, 3].map(|n| Tensor::eye(n, options).expand([1, views, n, n], false));
-            let (tokens, ops) = record_outermost_ops(|| model.tokens(&images, &c2w, &intrinsics));
+            let (tokens, ops) = record_outermost_ops(|| model.tokens(&images, &c2w, &intrinsics, None));
             const LINEAR_LAYERS: usize = 2;
             (tokens.to_kind(Kind::Double), computing(&without_own_linear_layers(ops)) + LINEAR_LAYERS)
         };

@@ -4,7 +4,7 @@ use super::camera_code::CameraCode;
 use super::config::ModelConfig;
 use super::layers::default_linear;
 use super::precision::Precision;
-use crate::scene::plucker_rays;
+use crate::scene::{RadialWarp, plucker_rays};
 use tch::{Tensor, nn};
 
 /// Mean of ImageNet by channel: the colour that RGB tokens have as 0.
@@ -39,11 +39,21 @@ impl Tokenizer {
     }
 
     /// Computes image tokens, [B, V, P, ray width + RGB width], from `images` [B, V, 3, H, W] in [0, 1], `c2w` [B, V, 4, 4] and
-    /// `intrinsics` [B, V, 3, 3] in pixels.
-    pub fn forward(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor) -> Tensor {
+    /// `intrinsics` [B, V, 3, 3] in pixels. With a `warp`, rays and cameras are those of the warped world.
+    pub fn forward(
+        &self,
+        images: &Tensor,
+        c2w: &Tensor,
+        intrinsics: &Tensor,
+        warp: Option<&RadialWarp>,
+    ) -> Tensor {
         let (height, width) = (images.size()[3], images.size()[4]);
         let rgb = self.rgb.forward(images);
-        let ray = self.ray.forward(c2w, intrinsics, height, width);
+        let (rays, c2w) = match warp {
+            Some(warp) => (warp.rays(c2w, intrinsics), &warp.cameras(c2w)),
+            None => (plucker_rays(c2w, intrinsics, height, width), c2w),
+        };
+        let ray = self.ray.forward(&rays, c2w, intrinsics);
         Tensor::cat(&[ray, rgb], -1)
     }
 }
@@ -92,10 +102,10 @@ impl RayTokens {
         }
     }
 
-    /// Computes ray tokens, [B, V, P, ray width], from `c2w` [B, V, 4, 4] and `intrinsics` [B, V, 3, 3] in pixels.
-    pub fn forward(&self, c2w: &Tensor, intrinsics: &Tensor, height: i64, width: i64) -> Tensor {
-        let rays = plucker_rays(c2w, intrinsics, height, width);
-        let tokens = Precision::F32.linear(&self.project, &patchify(&rays, self.patch_size));
+    /// Computes ray tokens, [B, V, P, ray width], from `rays` [B, V, H, W, 6], `c2w` [B, V, 4, 4] and `intrinsics` [B, V, 3, 3] in pixels.
+    pub fn forward(&self, rays: &Tensor, c2w: &Tensor, intrinsics: &Tensor) -> Tensor {
+        let (height, width) = (rays.size()[2], rays.size()[3]);
+        let tokens = Precision::F32.linear(&self.project, &patchify(rays, self.patch_size));
         match &self.camera_code {
             Some(camera_code) => tokens + camera_code.forward(c2w, intrinsics, height, width).unsqueeze(2),
             None => tokens,

@@ -8,9 +8,9 @@ use crate::io::Weights;
 use crate::loss;
 use crate::model::{self, EncodedTokens, GlobalSplat, ModelConfig, Precision, RawOutputs, Stage};
 use crate::optim::Optimizer;
-use crate::stereo::depth_search::{ComparedPhoto, search_depths};
 use crate::render::{self, Cameras};
-use crate::scene::{self, Gaussians};
+use crate::scene::{self, Gaussians, RadialWarp};
+use crate::stereo::depth_search::{ComparedPhoto, search_depths};
 use crate::train;
 use glam::{DMat4, DVec3};
 use image::RgbImage;
@@ -24,6 +24,7 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
         "patchify" => patchify(request),
         "rgb_tokens" | "ray_tokens" | "tokens" => tokens(request),
         "rays" => rays(request),
+        "radial_warp" => radial_warp(request),
         "camera_code" => camera_code(request),
         "linear" => linear(request),
         "attention" => attention(request),
@@ -169,13 +170,15 @@ fn tokens(request: &Request) -> Result<Answer> {
         "ray_tokens" => {
             let (ray, params) = request.build(|vs| model::RayTokens::new(vs, &config))?;
             let [height, width] = request.image()?;
-            let tokens = ray.forward(request.input("c2w")?, request.input("intrinsics")?, height, width);
+            let (c2w, intrinsics) = (request.input("c2w")?, request.input("intrinsics")?);
+            let rays = scene::plucker_rays(c2w, intrinsics, height, width);
+            let tokens = ray.forward(&rays, c2w, intrinsics);
             return with_params([("tokens", tokens)], params);
         }
         _ => request.build(|vs| model::Tokenizer::new(vs, &config))?,
     };
     let tokens =
-        module.forward(request.input("images")?, request.input("c2w")?, request.input("intrinsics")?);
+        module.forward(request.input("images")?, request.input("c2w")?, request.input("intrinsics")?, None);
     with_params([("tokens", tokens)], params)
 }
 
@@ -195,6 +198,27 @@ fn rays(request: &Request) -> Result<Answer> {
         "rays",
         scene::plucker_rays(request.input("c2w")?, request.input("intrinsics")?, height, width),
     )])
+}
+
+fn radial_warp(request: &Request) -> Result<Answer> {
+    let (c2w, intrinsics) = (request.input("c2w")?, request.input("intrinsics")?);
+    let warp = RadialWarp::new(c2w, intrinsics, request.input("depths")?);
+    let (means, scales) = (request.input("means")?, request.input("scales")?);
+    let others = |width: i64| Tensor::zeros_like(means).narrow(-1, 0, 1).repeat([1, 1, width]);
+    let restored = warp.restore(&Gaussians {
+        means: means.shallow_clone(),
+        scales: scales.shallow_clone(),
+        quaternions: others(4),
+        opacities: others(1).squeeze_dim(-1),
+        sh: others(3).unsqueeze(2),
+        antialiased: false,
+    });
+    outputs([
+        ("rays", warp.rays(c2w, intrinsics)),
+        ("cameras", warp.cameras(c2w)),
+        ("means", restored.means),
+        ("scales", restored.scales),
+    ])
 }
 
 fn camera_code(request: &Request) -> Result<Answer> {
@@ -404,6 +428,7 @@ fn frustum(request: &Request) -> Result<Answer> {
     let views = ViewBatch {
         images: Tensor::zeros([1, 1, 3, height, width], (Kind::Float, request.device)),
         masks: None,
+        depths: None,
         c2w: w2c.inverse(),
         w2c: w2c.shallow_clone(),
         intrinsics: intrinsics.shallow_clone(),

@@ -18,7 +18,7 @@ pub use model_file::{
 pub use spread::spread_over_path;
 
 use crate::config::Config;
-use crate::data::{View, view_batch};
+use crate::data::{View, ViewBatch, view_batch};
 use crate::error::{Error, Result};
 use crate::io::{MappedWeights, Splat};
 use crate::model::{GlobalSplat, Stage};
@@ -27,7 +27,7 @@ use crate::scene::{Gaussians, Placement, Similarity, normalize};
 use glam::{DMat4, DVec3};
 use placement_search::search_placement;
 use std::time::Duration;
-use tch::Device;
+use tch::{Device, Tensor};
 
 /// Model for inference: one from a file, or one that is being trained.
 #[derive(Debug, Clone, Copy)]
@@ -136,13 +136,20 @@ pub fn reconstruct<'a>(
     search_placement(model, photos, &views, &normalization)
 }
 
-/// Runs the model on its device over `views`, the views of each photo, with the photos' `poses` in a normalized world.
-fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4]) -> Result<Gaussians> {
+/// Runs the model on its device over `views`, the views of each photo, with the photos' `poses` in a normalized world. `depths` of the
+/// photos [V, 2, H, W] are those of [`pixel_depths`], in units of the normalized world.
+fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4], depths: Option<&Tensor>) -> Result<Gaussians> {
     let Model { network, config, stage, device, mapped, .. } = model;
     let posed =
         views.iter().zip(poses).flat_map(|(of_photo, &pose)| of_photo.iter().map(move |view| (view, pose)));
     let (views, poses): (Vec<&View>, Vec<DMat4>) = posed.unzip();
-    let batch = view_batch(&views, &poses, device);
+    // All views of a photo have its depths.
+    let repeated = |depths: &Tensor| {
+        let of_photo = views.len() as i64 / depths.size()[0];
+        depths.repeat_interleave_self_int(of_photo, 0, None).unsqueeze(0).to_device(device)
+    };
+    let batch = ViewBatch { depths: depths.map(repeated), ..view_batch(&views, &poses, device) };
+    let warp = batch.radial_warp();
     let images = batch.input_images();
     drop(batch.images);
     let [c2w, intrinsics] = [batch.c2w, batch.intrinsics];
@@ -154,12 +161,12 @@ fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4]) -> Result<Gaussians>
         }
     };
     let decoded = tch::no_grad(|| {
-        let memory = network.memory(&images, &c2w, &intrinsics);
+        let memory = network.memory(&images, &c2w, &intrinsics, warp.as_ref());
         drop(images);
         release_pages();
         let encoded = network.encode_memory_with(&memory, &release_pages);
         drop(memory);
-        network.decode(&encoded, stage).gaussians
+        network.decode(&encoded, stage).restored(warp.as_ref()).gaussians
     });
     Ok(decoded)
 }

@@ -1,14 +1,15 @@
 //! Search for the size and position at which a model sees a scene: the best of several by the error on the input photos (spec 9.9).
 
 use super::{Model, Reconstruction, pass};
-use crate::data::{View, cameras_at};
+use crate::data::{View, cameras_at, view_batch};
 use crate::error::Result;
 use crate::loss::{masked_mse, mse};
 use crate::render::{RenderedView, render_views};
-use crate::scene::{Gaussians, Normalization, Placement};
+use crate::scene::{Gaussians, ImageSize, Normalization, Placement};
+use crate::stereo::pixel_depths;
 use glam::DMat4;
 use std::time::Instant;
-use tch::{Device, Tensor};
+use tch::{Device, Kind, Tensor};
 
 /// Changes of a placement that the search tries: forward shift of the cameras, and the logarithm of the factor that enlarges the scene.
 const SEARCH_OFFSETS: [[f64; 2]; 2] = [[0.15, 0.], [0., 0.1]];
@@ -30,9 +31,14 @@ pub(super) fn search_placement(
     let extents = &model.config.data.scene_scales;
     let several = extents.len() > 1;
     let start = Instant::now();
+    let depths =
+        model.config.data.depths.then(|| depths_of(photos, &normalization.c2w, model.config.data.image_size));
     let attempt = |placement: Placement| -> Result<Attempt> {
         let poses = &normalization.with_placement(placement).c2w[..photos.len()];
-        let gaussians = pass(model, views, poses)?;
+        // Inverse depths shrink as the scene grows, and how sure they are doesn't.
+        let scale = Tensor::from_slice(&[1. / placement.extent, 1.]).to_kind(Kind::Float).view([2, 1, 1]);
+        let depths = depths.as_ref().map(|depths| depths * scale);
+        let gaussians = pass(model, views, poses, depths.as_ref())?;
         let error = if several { error_of(&gaussians, photos, poses)? } else { 0. };
         Ok(Attempt { error, placement, gaussians })
     };
@@ -58,6 +64,15 @@ pub(super) fn search_placement(
     let Normalization { c2w, world_from_normalized } = normalization.with_placement(placement);
     let target_poses = c2w[photos.len()..].to_vec();
     Ok(Reconstruction { gaussians, placement, world_from_normalized, target_poses, forward_time })
+}
+
+/// Returns the depths of `photos` with `poses` in a normalized world, resized to `size`, [V, 2, H, W] ([`pixel_depths`]).
+fn depths_of(photos: &[View], poses: &[DMat4], size: ImageSize) -> Tensor {
+    let batch = view_batch(photos, &poses[..photos.len()], Device::Cpu);
+    let masks = batch.masks.map(|masks| masks.get(0));
+    let depths = pixel_depths(&batch.images.get(0), masks.as_ref(), &cameras_at(photos, poses));
+    let size = [i64::from(size.height), i64::from(size.width)];
+    if depths.size()[2..] == size { depths } else { depths.upsample_bilinear2d(size, false, None, None) }
 }
 
 /// Result of one pass.

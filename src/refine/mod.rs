@@ -411,6 +411,7 @@ mod tests {
             let views = ViewBatch {
                 images: pictures.rgb.ones_like() * 0.3,
                 masks: masked.then(|| full.zeros_like().unsqueeze(2)),
+                depths: None,
                 c2w: cameras.w2c.inverse(),
                 w2c: cameras.w2c.shallow_clone(),
                 intrinsics: cameras.intrinsics.shallow_clone(),
@@ -437,6 +438,7 @@ mod tests {
         let views = ViewBatch {
             images: pictures.rgb,
             masks: None,
+            depths: None,
             c2w,
             w2c: cameras.w2c.shallow_clone(),
             intrinsics,

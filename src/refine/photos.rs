@@ -162,7 +162,7 @@ impl Group {
         let [c2w, w2c, intrinsics] =
             self.matrices.each_ref().map(|matrices| select_views(matrices, positions));
         let masks = self.masks.as_deref().map(stack);
-        ViewBatch { images: stack(&self.images), masks, c2w, w2c, intrinsics }
+        ViewBatch { images: stack(&self.images), masks, depths: None, c2w, w2c, intrinsics }
     }
 
     /// Returns the photos at half their width and height, or as they are if they would become too small. Pixels are rounded to 8 bits.

@@ -4,6 +4,7 @@
 
 mod gaussians;
 mod local_gaussians;
+mod radial_warp;
 mod rays;
 mod splat;
 
@@ -14,5 +15,6 @@ pub use globalsplat_capture::{
     orbit_around_cameras, orbit_around_point, pose_to_rows, smooth_path,
 };
 pub(crate) use globalsplat_splat_file::SH_C0;
+pub use radial_warp::RadialWarp;
 pub(crate) use rays::plucker_rays;
 pub use splat::splat_frame;

@@ -6,6 +6,19 @@ use tch::{Kind, Tensor};
 ///
 /// The inputs are `c2w` [B, V, 4, 4] and `intrinsics` [B, V, 3, 3] in pixels; the result is [B, V, H, W, 6], float32.
 pub fn plucker_rays(c2w: &Tensor, intrinsics: &Tensor, height: i64, width: i64) -> Tensor {
+    let directions = pixel_directions(c2w, intrinsics, height, width);
+    let origins = c2w.to_kind(Kind::Float).narrow(-2, 0, 3).select(-1, 3).unsqueeze(2).unsqueeze(2);
+    plucker(&origins.expand_as(&directions), &directions)
+}
+
+/// Returns the rays [o × d ; d], [.., 6], from `origins` [.., 3] along `directions` [.., 3] of any length.
+pub(super) fn plucker(origins: &Tensor, directions: &Tensor) -> Tensor {
+    let directions = directions / directions.norm_scalaropt_dim(2, [-1i64], true);
+    Tensor::cat(&[origins.linalg_cross(&directions, -1), directions], -1)
+}
+
+/// Returns the world direction of each pixel, [B, V, H, W, 3], float32, with length 1 along the camera's axis.
+pub(super) fn pixel_directions(c2w: &Tensor, intrinsics: &Tensor, height: i64, width: i64) -> Tensor {
     let (c2w, intrinsics) = (c2w.to_kind(Kind::Float), intrinsics.to_kind(Kind::Float));
     let options = (Kind::Float, c2w.device());
     let entry =
@@ -16,12 +29,8 @@ pub fn plucker_rays(c2w: &Tensor, intrinsics: &Tensor, height: i64, width: i64) 
     let x = ((j - entry(0, 2)) / entry(0, 0)).expand([-1, -1, height, -1], false);
     let y = ((i - entry(1, 2)) / entry(1, 1)).expand([-1, -1, -1, width], false);
     let camera = Tensor::stack(&[&x, &y, &x.ones_like()], -1);
-
     let rotation = c2w.narrow(-2, 0, 3).narrow(-1, 0, 3);
     let flat = camera.flatten(2, 3).matmul(&rotation.transpose(-1, -2));
-    let direction = &flat / flat.norm_scalaropt_dim(2, [-1i64], true);
-    let origin = c2w.narrow(-2, 0, 3).select(-1, 3).unsqueeze(2).expand_as(&direction);
-    let rays = Tensor::cat(&[origin.linalg_cross(&direction, -1), direction], -1);
-    let (b, v) = (rays.size()[0], rays.size()[1]);
-    rays.view([b, v, height, width, 6])
+    let (b, v) = (flat.size()[0], flat.size()[1]);
+    flat.view([b, v, height, width, 3])
 }

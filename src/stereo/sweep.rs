@@ -92,6 +92,18 @@ pub(crate) fn sweep(
     PlaneSweepOutput { photos, depth_maps: swept }
 }
 
+/// Computes the inverse depths of all pixels of all `photos`, by `planes` candidates, and the correlation of each with the other photos.
+/// Both are [h, w].
+pub(crate) fn inverse_depths(photos: &[SmallPhoto], planes: i64) -> Vec<[Tensor; 2]> {
+    let mut sweep = Sweep::new(photos, &[], planes);
+    let scenes: Vec<SceneDepth> = (0..photos.len()).map(|index| sweep.scene_depth(index)).collect();
+    let depths = |(index, scene)| {
+        let InverseDepths { filled, correlation, .. } = sweep.inverse_depths(index, scene);
+        [filled, correlation]
+    };
+    scenes.iter().enumerate().map(depths).collect()
+}
+
 /// Photos whose depths are searched, one after the other.
 struct Sweep<'a> {
     photos: &'a [SmallPhoto],

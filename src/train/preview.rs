@@ -1,5 +1,6 @@
 //! Preview image of the training progress.
 
+use super::forward_backward::forward;
 use crate::data::Batch;
 use crate::error::Result;
 use crate::io::{colourize_depth, tile_horizontally};
@@ -15,7 +16,7 @@ pub(super) fn preview(model: &GlobalSplat, batch: &Batch, stage: Stage) -> Resul
     let (shown, target) =
         (context.select(&[middle(&context.images)]), target.select(&[middle(&target.images)]));
     let pictures = tch::no_grad(|| {
-        let decoded = model.forward(&context.input_images(), &context.c2w, &context.intrinsics, stage);
+        let decoded = forward(model, &context, stage);
         render(&decoded.gaussians, &target.cameras(), DEFAULT_EPS2D)
     })?;
     let first = |t: &Tensor| t.select(0, 0).select(0, 0).to_device(Device::Cpu);

@@ -38,6 +38,7 @@ pub(super) fn scenes(count: usize) -> Vec<LoadedScene> {
             name: format!("noise_{number}"),
             images: (0..5 * 3 * SIZE * SIZE).map(|_| random.random()).collect(),
             masks: None,
+            depths: None,
             size: [SIZE, SIZE].into(),
             cameras: (0..5).map(camera).collect(),
             context: vec![0, 1, 2, 3, 4],
@@ -365,7 +366,7 @@ fn a_step_takes_few_kernels() {
         leaf
     };
     let ViewBatch { images, c2w, intrinsics, .. } = &sample.context;
-    let (tokens, forward) = record_outermost_ops(|| network.tokens(images, c2w, intrinsics));
+    let (tokens, forward) = record_outermost_ops(|| network.tokens(images, c2w, intrinsics, None));
     let leaf_of_tokens = with_gradient(&tokens);
     let (_, backward) = record_outermost_ops(|| backward_from_grads(&[(&tokens, &leaf_of_tokens)]));
     // Two layers, forward and for the gradients of their weights.

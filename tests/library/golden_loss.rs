@@ -19,6 +19,7 @@ fn the_frustum_loss_matches() {
     let views = ViewBatch {
         images: Tensor::zeros([2, 4, 3, size, size], (Kind::Float, Device::Cpu)),
         masks: None,
+        depths: None,
         c2w: golden["w2c"].inverse(),
         w2c: golden["w2c"].shallow_clone(),
         intrinsics: golden["intrinsic"].shallow_clone(),

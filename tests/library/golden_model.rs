@@ -67,7 +67,7 @@ fn tokens_and_encoder_match() {
     for case in cases() {
         let (_vs, model, _) = load(&case);
         let (inputs, golden) = (read(&case, "inputs").tensors, read(&case, "encoder").tensors);
-        let tokens = model.tokens(&inputs["images"], &inputs["c2w"], &inputs["intrinsic"]);
+        let tokens = model.tokens(&inputs["images"], &inputs["c2w"], &inputs["intrinsic"], None);
         assert_close("tokens", &tokens, &golden["content_tokens"], OUTPUT_TOLERANCE);
         let encoded = model.encode(&tokens);
         assert_close("geometry", &encoded.geometry, &golden["encoded_geo"], OUTPUT_TOLERANCE);

@@ -116,6 +116,35 @@ fn samples_depend_on_seed_and_number_alone() {
 }
 
 #[test]
+fn depths_come_with_the_context_views() {
+    let folder = tempfile::tempdir().unwrap();
+    let data = Arc::new(groups(folder.path(), &[2, 3, 2]));
+    let load = |depths: bool, threads: usize| {
+        let config = DataConfig { depths, threads, ..config() };
+        scenes(&mut DataLoader::start(&config, 3, data.clone(), 1, 0).unwrap(), 40)
+    };
+    let (plain, with, again) = (load(false, 1), load(true, 1), load(true, 3));
+    assert_same(&with, &plain);
+    let mut unsure = 0;
+    for ((plain, with), again) in plain.iter().zip(&with).zip(&again) {
+        assert!(plain.depths.is_none());
+        assert_eq!(with.depths, again.depths);
+        let depths = with.depths.as_ref().unwrap();
+        let pixels = 16 * 24;
+        assert_eq!(depths.len(), 4 * 2 * pixels);
+        let of = |channel: usize| depths.chunks(pixels).skip(channel).step_by(2).flatten();
+        assert!(of(0).all(|&inverse| inverse.is_finite() && inverse >= 0.));
+        assert!(of(1).all(|sure| (0. ..=1.).contains(sure)));
+        unsure += usize::from(of(1).all(|&sure| sure == 0.));
+    }
+    // A tenth of the samples teaches a model to work without depths.
+    assert!((1..=9).contains(&unsure), "{unsure} of 40");
+    let batch = Batch::from_scenes(&with[..1], Device::Cpu).unwrap();
+    assert_eq!(batch.context.depths.unwrap().size(), [1, 4, 2, 16, 24]);
+    assert!(batch.target.depths.is_none());
+}
+
+#[test]
 fn the_photo_cache_does_not_change_samples() {
     let folder = tempfile::tempdir().unwrap();
     let captures: Vec<Capture> =

@@ -124,7 +124,7 @@ fn a_transition_starts_where_the_stage_before_ended() {
     // At λ = 0 every parent occurs twice, its optical depth split between the two.
     let (_vs, model) = build(&small());
     let [images, c2w, intrinsics] = inputs(2, 16, 16);
-    let encoded = model.encode(&model.tokens(&images, &c2w, &intrinsics));
+    let encoded = model.encode(&model.tokens(&images, &c2w, &intrinsics, None));
     let after = model.decode(&encoded, Stage { index: 2, mix: 0. }).gaussians;
     let before = model.decode(&encoded, Stage { index: 1, mix: 1. }).gaussians;
     let twice = |t: &Tensor| t.repeat_interleave_self_int(2, 1, None);
@@ -313,10 +313,10 @@ fn memory_without_gradients_is_stored_in_bf16() {
     let (_vs, mut model) = build(&small());
     model.set_precision(Precision::Bf16);
     let [images, c2w, intrinsics] = inputs(3, 16, 24);
-    let followed = model.memory(&images, &c2w, &intrinsics);
+    let followed = model.memory(&images, &c2w, &intrinsics, None);
     let of = |memory: &Memory| [&memory.tokens, &memory.common].map(|t| (t.requires_grad(), t.kind()));
     assert_eq!(of(&followed), [(true, Kind::Float), (false, Kind::Float)]);
-    let kept = tch::no_grad(|| model.memory(&images, &c2w, &intrinsics));
+    let kept = tch::no_grad(|| model.memory(&images, &c2w, &intrinsics, None));
     assert_eq!(of(&kept), [(false, Kind::BFloat16), (false, Kind::Float)]);
     // Without gradients, the common part is estimated from some of the views, one view at a time: products of other shapes
     // differ in float32's last digits. The remaining difference is rounding to bfloat16.

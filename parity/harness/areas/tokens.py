@@ -1,9 +1,11 @@
 """Cases of the tokenizer, from images and cameras to the tokens that the encoder reads."""
 
+import numpy as np
+
 from ... import reference
 from ...reference.names import reference_config, with_prefix
 from .. import draw
-from ..draw import integer, normal
+from ..draw import integer, normal, uniform
 from ..registry import Draw, by, case, reference_for
 
 
@@ -69,6 +71,26 @@ def rays(rng):
 def rays_reference(config, params, inputs):
     rays = reference.rays.plucker_rays(inputs["c2w"], inputs["intrinsics"], *config["image"])
     return {"rays": rays.movedim(2, -1)}
+
+
+@case
+def radial_warp(rng):
+    """The warp of scenes to one distance: rays, cameras, and Gaussians moved back. Some scenes have no sure depth."""
+    for batch, count, image, sure in [(1, 2, (12, 16), 1.0), (2, 3, (24, 20), 1.0), (1, 3, (9, 9), 0.0)]:
+        views = draw.views(rng, batch, count, *image)
+        inverse = uniform(rng, 0.02, 1.0, batch, count, 1, *image)
+        depths = np.concatenate([inverse, sure * uniform(rng, 0.0, 1.0, *inverse.shape)], 2)
+        gaussians = {"means": normal(rng, batch, 40, 3), "scales": uniform(rng, 0.01, 0.1, batch, 40, 3)}
+        label = f"{by(batch, count, *image)}{'' if sure else ', nothing sure'}"
+        yield Draw(label, views | {"depths": depths.astype(np.float32)} | gaussians, differentiate=tuple(gaussians))
+
+
+@reference_for("radial_warp")
+def radial_warp_reference(config, params, inputs):
+    c2w, intrinsics = inputs["c2w"], inputs["intrinsics"]
+    warp = reference.warp.RadialWarp(c2w, intrinsics, inputs["depths"])
+    means, scales = warp.restore(inputs["means"], inputs["scales"])
+    return {"rays": warp.rays(c2w, intrinsics), "cameras": warp.cameras(c2w), "means": means, "scales": scales}
 
 
 @case

@@ -13,7 +13,8 @@ use crate::data::augment::Augmentation;
 use crate::data::config::DataConfig;
 use crate::device::Upload;
 use crate::error::{Error, Result, panic_message};
-use crate::scene::{Camera, normalize};
+use crate::scene::{Camera, ImageSize, normalize};
+use crate::stereo::pixel_depths;
 use glam::DVec3;
 use globalsplat_capture::{CHANNELS, Capture, Resampler};
 use image::RgbImage;
@@ -27,10 +28,13 @@ use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Instant;
-use tch::Device;
+use tch::{Device, Kind, Tensor};
 
 /// Far plane of a frustum in units of the capture: these datasets have no metric scale (spec 2.3).
 const FAR: f64 = 4. * 10.;
+
+/// Fraction of the samples whose depths are all unsure, so that a model learns to work without depths, too.
+const DEPTHS_LEFT_OUT: f64 = 0.1;
 
 /// Source of training samples, delivered in order.
 #[derive(Debug)]
@@ -383,8 +387,16 @@ impl Shared {
                 ..Default::default()
             };
         }
+        let start = Instant::now();
+        let depths = config.depths.then(|| {
+            let depths = context_depths(&images, masks.as_deref(), size, &cameras, &context);
+            let is_left_out = random.random_bool(DEPTHS_LEFT_OUT);
+            if is_left_out { zero_sureness(depths) } else { depths }
+        });
+        state.times.depths = start.elapsed().as_secs_f64();
         let (name, times) = (capture.name.clone(), state.times);
-        Ok(LoadedScene { name, images, masks, size, cameras, context, target, far, times })
+        let depths = depths.map(|depths| Vec::try_from(depths.flatten(0, -1)).expect("float32 values"));
+        Ok(LoadedScene { name, images, masks, depths, size, cameras, context, target, far, times })
     }
 
     fn photo(&self, scene_index: SceneIndex, capture: &Capture, view: usize) -> Result<Arc<MaskedPhoto>> {
@@ -410,4 +422,29 @@ fn normalized(cameras: Vec<Camera>, context: &[usize], target: &[usize]) -> Resu
         cameras[position].c2w = c2w;
     }
     Ok((cameras, FAR / normalization.world_from_normalized.scale))
+}
+/// Computes the depths of the images at `context`, [C, 2, H, W] ([`pixel_depths`]). `images` and `masks` have the bytes of all images, of
+/// `size`, with `cameras`.
+fn context_depths(
+    images: &[u8],
+    masks: Option<&[u8]>,
+    size: ImageSize,
+    cameras: &[Camera],
+    context: &[usize],
+) -> Tensor {
+    let [height, width] = [size.height, size.width].map(i64::from);
+    let indices = Tensor::from_slice(&context.iter().map(|&view| view as i64).collect::<Vec<_>>());
+    let chosen = |bytes: &[u8], channels: i64| {
+        let planes = Tensor::from_slice(bytes).view([-1, channels, height, width]);
+        planes.index_select(0, &indices).to_kind(Kind::Float) / 255.
+    };
+    let masks = masks.map(|masks| chosen(masks, 1));
+    let cameras: Vec<Camera> = context.iter().map(|&view| cameras[view]).collect();
+    pixel_depths(&chosen(images, CHANNELS as i64), masks.as_ref(), &cameras)
+}
+
+/// Returns `depths` [C, 2, H, W] with none of them sure.
+fn zero_sureness(depths: Tensor) -> Tensor {
+    let _ = depths.select(1, 1).zero_();
+    depths
 }

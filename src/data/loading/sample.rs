@@ -65,11 +65,13 @@ impl Batch {
                 });
                 images(&masks, &shape)
             });
-            Ok(ViewBatch::with_images(photos, masks.transpose()?, &matrices.collect::<Vec<_>>()))
+            Ok(ViewBatch::with_images(photos, masks.transpose()?, None, &matrices.collect::<Vec<_>>()))
         };
+        let depths: Option<Vec<Tensor>> = scenes.iter().map(LoadedScene::depth_tensor).collect();
+        let context = batch(|scene| &scene.context)?;
         Ok(Batch {
             names: scenes.iter().map(|scene| scene.name.clone()).collect(),
-            context: batch(|scene| &scene.context)?,
+            context: ViewBatch { depths: depths.map(|depths| Tensor::stack(&depths, 0)), ..context },
             target: batch(|scene| &scene.target)?,
             far: Tensor::from_slice(&far).to_kind(Kind::Float),
             paired: false,
@@ -132,6 +134,8 @@ pub(super) struct PendingBatch {
     tensors: PendingCopy<9>,
     /// Masks of the context and target views.
     masks: Option<PendingCopy<2>>,
+    /// Depths of the context views.
+    depths: Option<PendingCopy<1>>,
 }
 
 impl PendingBatch {
@@ -142,7 +146,8 @@ impl PendingBatch {
         let ([a, b, c, d], [e, f, g, h]) = (context.tensors(), target.tensors());
         let masks = context.masks.as_ref().zip(target.masks.as_ref());
         let masks = masks.map(|(context, target)| upload.begin([context, target])).transpose()?;
-        Ok(PendingBatch { names, tensors: upload.begin([a, b, c, d, e, f, g, h, &far])?, masks })
+        let depths = context.depths.as_ref().map(|depths| upload.begin([depths])).transpose()?;
+        Ok(PendingBatch { names, tensors: upload.begin([a, b, c, d, e, f, g, h, &far])?, masks, depths })
     }
 
     /// Waits for the copies and returns the sample on the device.
@@ -157,8 +162,9 @@ impl PendingBatch {
             Some(masks) => masks.wait()?.map(|masks| Some(in_floats(masks))),
             None => [None, None],
         };
-        let context = ViewBatch::from_tensors([in_floats(a), b, c, d], context_masks);
-        let target = ViewBatch::from_tensors([in_floats(e), f, g, h], target_masks);
+        let depths = self.depths.map(|depths| depths.wait().map(|[depths]| depths)).transpose()?;
+        let context = ViewBatch::from_tensors([in_floats(a), b, c, d], context_masks, depths);
+        let target = ViewBatch::from_tensors([in_floats(e), f, g, h], target_masks, None);
         Ok(Batch { names: self.names, context, target, far, paired: false })
     }
 }
@@ -227,6 +233,7 @@ mod tests {
             name: String::new(),
             images: (0..3 * 24).collect(),
             masks,
+            depths: None,
             size: [2, 4].into(),
             cameras: vec![Camera { intrinsics, c2w: DMat4::IDENTITY, width: 4, height: 2 }; 3],
             context: vec![0, 2],

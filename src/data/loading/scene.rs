@@ -2,6 +2,7 @@
 
 use crate::scene::{Camera, ImageSize};
 use std::ops::AddAssign;
+use tch::Tensor;
 
 /// Time in seconds that a thread spent on each part of loading.
 #[derive(Debug, Clone, Copy, Default)]
@@ -14,6 +15,8 @@ pub struct LoadTimes {
     pub resize: f64,
     /// Time for colour jitter.
     pub augment: f64,
+    /// Time for the search of depths.
+    pub depths: f64,
 }
 
 impl AddAssign for LoadTimes {
@@ -22,6 +25,7 @@ impl AddAssign for LoadTimes {
         self.decode += other.decode;
         self.resize += other.resize;
         self.augment += other.augment;
+        self.depths += other.depths;
     }
 }
 
@@ -34,6 +38,9 @@ pub struct LoadedScene {
     pub images: Vec<u8>,
     /// 8-bit weights of the pixels, `[N, H, W]`: 255 where a pixel counts, 0 where it is masked out. `None` if every pixel counts.
     pub masks: Option<Vec<u8>>,
+    /// Depths of the context images, `[C, 2, H, W]`: inverse depth in normalized world coordinates, and how sure it is. `None` if
+    /// the model reads none.
+    pub depths: Option<Vec<f32>>,
     /// Size of all images.
     pub size: ImageSize,
     /// Cameras of the images, in normalized world coordinates.
@@ -46,4 +53,12 @@ pub struct LoadedScene {
     pub far: f64,
     /// Time spent on loading the scene.
     pub times: LoadTimes,
+}
+
+impl LoadedScene {
+    /// Returns the depths as a tensor, `[C, 2, H, W]`.
+    pub(super) fn depth_tensor(&self) -> Option<Tensor> {
+        let [height, width] = [self.size.height, self.size.width].map(i64::from);
+        self.depths.as_ref().map(|depths| Tensor::from_slice(depths).view([-1, 2, height, width]))
+    }
 }
