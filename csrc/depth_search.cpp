@@ -11,34 +11,65 @@
 
 namespace globalsplat {
 
-void search_depths(size_t grey, size_t weight, rust::Slice<const PhotoToCompare> others, float step, int32_t planes,
-                   rust::Slice<size_t> out) {
-  const auto borrowed = [](size_t address) -> const at::Tensor& { return *reinterpret_cast<const at::Tensor*>(address); };
+namespace {
+
+// Photos of a plane sweep. The tensors keep the memory that `sweep` points to.
+struct SweepTensors {
   std::vector<at::Tensor> kept;
-  const auto photo_of = [&](size_t grey_address, size_t weight_address) {
-    const auto data = [&](size_t address) {
-      kept.push_back(borrowed(address).to(at::kCPU, at::kFloat).contiguous());
-      return kept.back().const_data_ptr<float>();
-    };
+  std::vector<raster::ComparedPhoto> compared;
+  raster::PlaneSweep sweep;
+
+  SweepTensors(size_t grey, size_t weight, rust::Slice<const PhotoToCompare> others, float step, int32_t planes, float least_variance,
+               float least_correlation) {
+    TORCH_CHECK(!others.empty() && planes > 0, "there are ", others.size(), " photos to compare and ", planes,
+                " planes, expected 1 or more");
+    for (const PhotoToCompare& other : others) {
+      compared.push_back({photo_of(other.grey, other.weight), {}});
+      std::copy(other.to_pixels.begin(), other.to_pixels.end(), compared.back().to_pixels);
+    }
+    sweep = {photo_of(grey, weight), compared.data(), int(compared.size()), step, least_variance, least_correlation};
+  }
+
+ private:
+  static const at::Tensor& borrowed(size_t address) { return *reinterpret_cast<const at::Tensor*>(address); }
+
+  const float* data(size_t address) {
+    kept.push_back(borrowed(address).to(at::kCPU, at::kFloat).contiguous());
+    return kept.back().const_data_ptr<float>();
+  }
+
+  raster::SweepPhoto photo_of(size_t grey_address, size_t weight_address) {
     const at::Tensor& values = borrowed(grey_address);
     TORCH_CHECK(values.dim() == 2 && values.size(0) >= raster::kPatch && values.size(1) >= raster::kPatch, "a photo has shape ",
                 values.sizes(), ", expected [H, W] with H and W of ", raster::kPatch, " or more");
     TORCH_CHECK(weight_address == 0 || borrowed(weight_address).sizes() == values.sizes(), "the weights of a photo of shape ",
                 values.sizes(), " have another shape");
-    return raster::SweepPhoto{data(grey_address), weight_address == 0 ? nullptr : data(weight_address), int(values.size(1)),
-                              int(values.size(0))};
-  };
-  TORCH_CHECK(!others.empty() && planes > 0, "there are ", others.size(), " photos to compare and ", planes, " planes, expected 1 or more");
-  std::vector<raster::ComparedPhoto> compared;
-  for (const PhotoToCompare& other : others) {
-    compared.push_back({photo_of(other.grey, other.weight), {}});
-    std::copy(other.to_pixels.begin(), other.to_pixels.end(), compared.back().to_pixels);
+    return {data(grey_address), weight_address == 0 ? nullptr : data(weight_address), int(values.size(1)), int(values.size(0))};
   }
-  const raster::PlaneSweep sweep{photo_of(grey, weight), compared.data(), int(compared.size()), step};
+};
+
+// Calls search(sweep, planes, inverse depth, score, number of threads), and puts the two results in `out`.
+template <class Search>
+void run(const Search& search, const raster::PlaneSweep& sweep, int32_t planes, rust::Slice<size_t> out) {
   const at::Tensor inverse_depth = at::empty({sweep.own.height, sweep.own.width}, at::kFloat), score = at::empty_like(inverse_depth);
-  raster::search_depths(sweep, planes, inverse_depth.data_ptr<float>(), score.data_ptr<float>(), get_num_threads());
+  search(sweep, planes, inverse_depth.data_ptr<float>(), score.data_ptr<float>(), get_num_threads());
   out[0] = reinterpret_cast<size_t>(new at::Tensor(inverse_depth));
   out[1] = reinterpret_cast<size_t>(new at::Tensor(score));
+}
+
+}  // namespace
+
+void search_depths(size_t grey, size_t weight, rust::Slice<const PhotoToCompare> others, float step, int32_t planes,
+                   rust::Slice<size_t> out) {
+  const SweepTensors tensors(grey, weight, others, step, planes, 1e-4f, -1);
+  run(raster::search_depths, tensors.sweep, planes, out);
+}
+
+void match_semi_globally(size_t grey, size_t weight, rust::Slice<const PhotoToCompare> others, float step, int32_t planes,
+                         rust::Slice<size_t> out) {
+  // A smooth depth needs less texture. Photos that don't show a pixel say nothing about its depth, like those without any likeness.
+  const SweepTensors tensors(grey, weight, others, step, planes, 1e-5f, 0);
+  run(raster::match_semi_globally, tensors.sweep, planes, out);
 }
 
 }  // namespace globalsplat

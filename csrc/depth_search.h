@@ -16,4 +16,8 @@ struct PhotoToCompare;
 void search_depths(size_t grey, size_t weight, rust::Slice<const PhotoToCompare> others, float step, int32_t planes,
                    rust::Slice<size_t> out);
 
+// Does the same by semi-global matching (kernels/semi_global.h). `out` receives the inverse depth and how sure it is, in [0, 1].
+void match_semi_globally(size_t grey, size_t weight, rust::Slice<const PhotoToCompare> others, float step, int32_t planes,
+                         rust::Slice<size_t> out);
+
 }  // namespace globalsplat

@@ -43,7 +43,13 @@ struct Kernels {
   void (*attention_backward_bf16)(const AttentionHead<Bf16>&, const Bf16Gemm&, const PackedBf16Queries&, float* dq, Rows<Bf16> dk,
                                   Rows<Bf16> dv, float* scratch);
   void (*muon)(const MuonStep&, const MuonMatrix&, float* scratch);  // muon.h
-  void (*sweep_planes)(const PlaneSweep&, int begin, int end, const BestPlanes& out, float* scratch);  // plane_sweep.h
+  // plane_sweep.h
+  void (*sweep_planes)(const PlaneSweep&, int begin, int end, float* scores, float* scratch);
+  void (*patch_variances)(const SweepPhoto&, float least_variance, float* variance, float* scratch);
+  // semi_global.h
+  void (*costs_of_rows)(const MatchedPhoto&, const float* scores, int begin, int end, float* costs);
+  void (*sum_paths)(const MatchedPhoto&, const float* costs, bool backward, float* sums, float* scratch);
+  void (*choose_planes)(const MatchedPhoto&, const PlaneCosts&, float step, int begin, int end, float* inverse_depth, float* sureness);
   int64_t (*multiply_adds)(int64_t rounds, float* out);
 
   template <class T>

@@ -6,6 +6,7 @@
 #include "muon.h"
 #include "plane_sweep.h"
 #include "project.h"
+#include "semi_global.h"
 #include "smoothness.h"
 #include "ssim.h"
 #include "touched_tiles.h"
@@ -30,6 +31,10 @@ const Kernels table = {
     attention_backward_bf16,
     muon,
     sweep_planes,
+    patch_variances,
+    costs_of_rows,
+    sum_paths,
+    choose_planes,
     multiply_adds,
 };
 

@@ -3,7 +3,7 @@
 //
 //   (E[xy] − E[x] E[y]) / √((Var x + ε) (Var y + ε))
 //
-// The means E are over the pixels of the patch that are inside the photo, weighted by the product of both photos' weights. A pixel that
+// ε is the least variance. The means E are over the pixels of the patch that are inside the photo, weighted by the product of both photos' weights. A pixel that
 // another photo doesn't show, or that has too little weight, has the correlation −1 with it. The score of a plane at a pixel is the mean
 // of the better half of its correlations, so that a pixel may be hidden in the other photos.
 #pragma once
@@ -13,8 +13,6 @@
 
 namespace globalsplat::raster::GS_ISA {
 
-// Added to variances, so that noise doesn't correlate.
-inline constexpr float kLeastVariance = 1e-4f;
 // Minimum product of the weights of two pixels that are compared.
 inline constexpr float kLeastWeight = 0.5f;
 // Minimum mean weight of a patch that is compared.
@@ -38,6 +36,27 @@ struct SweepBuffers {
   float* padded[kMoments];
   SweepRow rows[kPatch];
 };
+
+// Divides `memory` of sweep_buffers_size() elements among the buffers.
+GS_INLINE SweepBuffers sweep_buffers(int width, float* memory) {
+  const int64_t stride = sweep_stride(width);
+  const auto take = [&](int64_t count) {
+    float* const taken = memory;
+    memory += count;
+    return taken;
+  };
+  SweepBuffers buffers;
+  for (float*& padded : buffers.padded) {
+    padded = take(stride + 32);
+    for (int i = 0; i < stride + 32; ++i) padded[i] = 0;
+  }
+  for (SweepRow& row : buffers.rows) {
+    for (float*& sums : row.sums) sums = take(stride);
+    row.visible = take(stride);
+    row.weight = take(stride);
+  }
+  return buffers;
+}
 
 GS_INLINE SweepVector interpolate(const float* image, int width, Simd<float>::bits corner, SweepVector right, SweepVector down) {
   const SweepVector a = gather(image, corner), b = gather(image, corner + 1);
@@ -133,7 +152,7 @@ GS_INLINE void stream_rows(int height, const FillRow& fill_row, const RowDone& r
   }
 }
 
-GS_INLINE void compute_own_moments(const SweepPhoto& own, const SweepBuffers& buffers, const OwnMoments& to) {
+GS_INLINE void compute_own_moments(const SweepPhoto& own, float least_variance, const SweepBuffers& buffers, const OwnMoments& to) {
   const int64_t stride = sweep_stride(own.width);
   for (int i = 0; i < stride; ++i) to.each_column[i] = i < own.width ? 1.0f / float(patch_length(i, own.width)) : 0;
   const auto fill_row = [&](int row) {
@@ -151,15 +170,15 @@ GS_INLINE void compute_own_moments(const SweepPhoto& own, const SweepBuffers& bu
       const SweepVector mean = sum_rows(buffers, kX, first, last, i) * scale;
       store<float>(to.mean + row * stride + i, mean);
       store<float>(to.variance + row * stride + i,
-                   subtract_product(mean, mean, sum_rows(buffers, kXX, first, last, i) * scale) + broadcast<float>(kLeastVariance));
+                   subtract_product(mean, mean, sum_rows(buffers, kXX, first, last, i) * scale) + broadcast<float>(least_variance));
     }
   });
 }
 
 // Inserts the correlations of `other` on a plane into the best `votes` of each pixel, [votes, H, stride], in descending order.
 template <bool weighted>
-GS_INLINE void correlate(const SweepPhoto& own, const ComparedPhoto& other, float inverse_depth, const OwnMoments& own_moments,
-                         const SweepBuffers& buffers, int votes, float* best) {
+GS_INLINE void correlate(const SweepPhoto& own, const ComparedPhoto& other, float inverse_depth, float least_variance,
+                         const OwnMoments& own_moments, const SweepBuffers& buffers, int votes, float* best) {
   const int64_t stride = sweep_stride(own.width), plane = stride * own.height;
   const auto vector = [](float value) { return broadcast<float>(value); };
   const auto fill_row = [&](int row) {
@@ -180,13 +199,13 @@ GS_INLINE void correlate(const SweepPhoto& own, const ComparedPhoto& other, floa
         counts = both(counts, both(less_equal(vector(kLeastWeight), load<float>(here.weight + i)), less_equal(vector(kLeastMass), mass)));
         scale = scale / larger(mass, vector(kLeastMass));
         own_mean = sum(kY) * scale;
-        own_variance = subtract_product(own_mean, own_mean, sum(kYY) * scale) + vector(kLeastVariance);
+        own_variance = subtract_product(own_mean, own_mean, sum(kYY) * scale) + vector(least_variance);
       } else {
         own_mean = load<float>(own_moments.mean + row * stride + i);
         own_variance = load<float>(own_moments.variance + row * stride + i);
       }
       const SweepVector mean = sum(kX) * scale;
-      const SweepVector variance = subtract_product(mean, mean, sum(kXX) * scale) + vector(kLeastVariance);
+      const SweepVector variance = subtract_product(mean, mean, sum(kXX) * scale) + vector(least_variance);
       const SweepVector covariance = subtract_product(mean, own_mean, sum(kXY) * scale);
       SweepVector correlation = select(counts, covariance / sqrt(variance * own_variance), vector(-1));
       for (int vote = 0; vote < votes; ++vote) {
@@ -199,8 +218,8 @@ GS_INLINE void correlate(const SweepPhoto& own, const ComparedPhoto& other, floa
   });
 }
 
-// Searches the planes [begin, end): writes the best to `out`, the first of equal ones. `scratch` has sweep_scratch_size() elements.
-inline void sweep_planes(const PlaneSweep& sweep, int begin, int end, const BestPlanes& out, float* scratch) {
+// Computes the scores of the planes [begin, end), [end − begin, H, stride]. `scratch` has sweep_scratch_size() elements.
+inline void sweep_planes(const PlaneSweep& sweep, int begin, int end, float* scores, float* scratch) {
   const SweepPhoto& own = sweep.own;
   const int64_t stride = sweep_stride(own.width), plane = stride * own.height;
   const int votes = sweep_votes(sweep.count);
@@ -211,38 +230,33 @@ inline void sweep_planes(const PlaneSweep& sweep, int begin, int end, const Best
   };
   const OwnMoments own_moments{take(plane), take(plane), take(stride)};
   float* const best = take(votes * plane);
-  SweepBuffers buffers;
-  for (float*& padded : buffers.padded) {
-    padded = take(stride + 32);
-    for (int i = 0; i < stride + 32; ++i) padded[i] = 0;
-  }
-  for (SweepRow& row : buffers.rows) {
-    for (float*& sums : row.sums) sums = take(stride);
-    row.visible = take(stride);
-    row.weight = take(stride);
-  }
-  compute_own_moments(own, buffers, own_moments);
-  for (int64_t i = 0; i < plane; ++i) out.plane[i] = float(begin), out.correlation[i] = -2;
+  const SweepBuffers buffers = sweep_buffers(own.width, scratch);
+  compute_own_moments(own, sweep.least_variance, buffers, own_moments);
   for (int index = begin; index < end; ++index) {
-    for (int64_t i = 0; i < votes * plane; ++i) best[i] = -1;
+    for (int64_t i = 0; i < votes * plane; ++i) best[i] = sweep.least_correlation;
     for (int k = 0; k < sweep.count; ++k) {
       const ComparedPhoto& other = sweep.others[k];
       const float inverse_depth = float(index) * sweep.step;
       if (own.weight != nullptr || other.photo.weight != nullptr)
-        correlate<true>(own, other, inverse_depth, own_moments, buffers, votes, best);
+        correlate<true>(own, other, inverse_depth, sweep.least_variance, own_moments, buffers, votes, best);
       else
-        correlate<false>(own, other, inverse_depth, own_moments, buffers, votes, best);
+        correlate<false>(own, other, inverse_depth, sweep.least_variance, own_moments, buffers, votes, best);
     }
-    const SweepVector each = broadcast<float>(1.0f / float(votes)), this_plane = broadcast<float>(float(index));
+    const SweepVector each = broadcast<float>(1.0f / float(votes));
+    float* const to = scores + (index - begin) * plane;
     for (int64_t i = 0; i < plane; i += kSweepLanes) {
       SweepVector sum = load<float>(best + i);
       for (int vote = 1; vote < votes; ++vote) sum = sum + load<float>(best + vote * plane + i);
-      const SweepVector score = sum * each, held = load<float>(out.correlation + i);
-      const Mask<float> is_better = less(held, score);
-      store<float>(out.correlation + i, select(is_better, score, held));
-      store<float>(out.plane + i, select(is_better, this_plane, load<float>(out.plane + i)));
+      store<float>(to + i, sum * each);
     }
   }
+}
+
+// Writes the variance of the patch around each pixel plus the least variance, [H, stride]. `scratch` has variance_scratch_size() elements.
+inline void patch_variances(const SweepPhoto& photo, float least_variance, float* variance, float* scratch) {
+  const int64_t stride = sweep_stride(photo.width), plane = stride * photo.height;
+  const SweepBuffers buffers = sweep_buffers(photo.width, scratch + plane + stride);
+  compute_own_moments(photo, least_variance, buffers, {scratch, variance, scratch + plane});
 }
 
 }  // namespace globalsplat::raster::GS_ISA

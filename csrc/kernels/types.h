@@ -223,12 +223,8 @@ struct PlaneSweep {
   const ComparedPhoto* others;
   int count;  // of the others, at least 1
   float step;
-};
-
-// Best plane of each pixel, and the correlation there, both [H, sweep_stride(W)].
-struct BestPlanes {
-  float* plane;
-  float* correlation;
+  float least_variance;     // added to variances, so that noise doesn't correlate
+  float least_correlation;  // all lower ones count as this
 };
 
 // Side in pixels of the patches that are compared.
@@ -240,10 +236,43 @@ inline constexpr int64_t sweep_stride(int width) { return (width + 15) / 16 * 16
 // Returns the number of photos, of those compared, whose correlations are averaged.
 inline constexpr int sweep_votes(int count) { return count < 2 ? 1 : count / 2; }
 
+// Returns the number of elements of the buffers for the moments of a photo on a plane.
+inline constexpr int64_t sweep_buffers_size(int width) { return sweep_stride(width) * (kPatch * 8 + 6) + 6 * 32; }
+
 // Returns the number of elements of scratch memory that the search needs.
 inline constexpr int64_t sweep_scratch_size(const PlaneSweep& sweep) {
   const int64_t stride = sweep_stride(sweep.own.width);
-  return stride * (sweep.own.height * (2 + sweep_votes(sweep.count)) + kPatch * 8 + 6 + 1) + 6 * 32;
+  return stride * (sweep.own.height * (2 + sweep_votes(sweep.count)) + 1) + sweep_buffers_size(sweep.own.width);
+}
+
+// Photo whose pixels choose among `planes` planes by semi-global matching; see semi_global.h.
+struct MatchedPhoto {
+  const float* grey;      // [H, W]
+  const float* variance;  // of the patches and least_variance, [H, sweep_stride(W)]
+  float least_variance;
+  int width, height, planes;
+};
+
+// Costs of all planes at each pixel, and their sums along the paths of either half of the directions, [H, W, plane_stride(planes)] each.
+struct PlaneCosts {
+  float *own, *forward, *backward;
+};
+
+// Number of elements between the costs of two pixels of a path: a vector of every instruction set.
+inline constexpr int kPathPadding = 16;
+
+// Returns the stride between the costs of two pixels, a multiple of every instruction set's vectors.
+inline constexpr int64_t plane_stride(int planes) { return (planes + 15) / 16 * 16; }
+
+// Returns the number of elements of scratch memory for sums along paths.
+inline constexpr int64_t path_scratch_size(const MatchedPhoto& photo) {
+  return 8 * ((photo.width + 2) * (plane_stride(photo.planes) + kPathPadding + 1) + kPathPadding);
+}
+
+// Returns the number of elements of scratch memory for the variances of patches.
+inline constexpr int64_t variance_scratch_size(const SweepPhoto& photo) {
+  const int64_t stride = sweep_stride(photo.width);
+  return stride * (photo.height + 1) + sweep_buffers_size(photo.width);
 }
 
 // Parameters of a step of Adam that all elements share; see adam.h.

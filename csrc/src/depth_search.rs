@@ -32,5 +32,18 @@ mod ffi {
             planes: i32,
             out: &mut [usize],
         ) -> Result<()>;
+
+        /// Searches for the depths of a photo by semi-global matching; see `csrc/depth_search.h`.
+        ///
+        /// # Safety
+        /// All addresses must be those of live tensors, or 0 for weights.
+        unsafe fn match_semi_globally(
+            grey: usize,
+            weight: usize,
+            others: &[PhotoToCompare],
+            step: f32,
+            planes: i32,
+            out: &mut [usize],
+        ) -> Result<()>;
     }
 }

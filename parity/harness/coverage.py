@@ -28,7 +28,7 @@ CASES_OF = {
     "src/loss/photometric.rs": ["photometric", "ssim"],
     "src/loss/vgg19.rs": ["vgg19"],
     "crates/capture/src/geometry/normalize.rs": ["scene_normalization"],
-    "src/stereo/depth_search.rs": ["depth_search"],
+    "src/stereo/depth_search.rs": ["depth_search", "semi_global_matching"],
     "src/scene/radial_warp.rs": ["radial_warp"],
     "src/scene/rays.rs": ["rays"],
     "src/render/mod.rs": [

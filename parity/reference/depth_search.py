@@ -1,4 +1,4 @@
-"""Plane sweep: the correlation of a photo with others that are warped onto planes at several depths."""
+"""Plane sweep: the correlation of a photo with others that are warped onto planes at several depths; and semi-global matching."""
 
 import torch
 import torch.nn.functional as F
@@ -8,6 +8,12 @@ LEAST_VARIANCE = 1e-4
 LEAST_WEIGHT = 0.5
 LEAST_MASS = 0.25
 CLOSE = 1e-3  # distance from a threshold within which rounding may decide
+
+MATCHED_LEAST_VARIANCE = 1e-5
+STEP_COST, JUMP_COST, EDGE_RATE = 0.1, 3.0, 10.0
+FAR_BONUS = 0.1
+HALF_MARGIN = 0.05
+DIRECTIONS = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if dy or dx]
 
 
 def patch_means(t):
@@ -24,11 +30,11 @@ def sample(image, x, y):
     return F.grid_sample(images, grid, padding_mode="border", align_corners=False).squeeze(1)
 
 
-def correlations(grey, weight, other, other_weight, to_pixels, inverse_depths):
+def correlations(grey, weight, other, other_weight, to_pixels, inverse_depths, least_variance=LEAST_VARIANCE, limit=CLOSE):
     """Returns the correlation of grey [H, W] with another photo on each plane, and a mask of close calls, [planes, H, W] each.
 
     The weights are None if every pixel counts. A patch's correlation is -1 where the pixel isn't shown or has too
-    little weight.
+    little weight. A call is close within `limit` of a threshold.
     """
     height, width = grey.shape
     rows, columns = (torch.arange(side, dtype=grey.dtype) + 0.5 for side in (height, width))
@@ -38,7 +44,7 @@ def correlations(grey, weight, other, other_weight, to_pixels, inverse_depths):
     x, y = x / z, y / z
     shown = (z > 0.0) & (x >= 0.0) & (x <= other.shape[1]) & (y >= 0.0) & (y <= other.shape[0])
     limits = [z, x, x - other.shape[1], y, y - other.shape[0]]
-    close = torch.stack([limit.abs() for limit in limits]).amin(0) < CLOSE
+    close = torch.stack([limit.abs() for limit in limits]).amin(0) < limit
     own, seen = grey.expand_as(x), sample(other, x, y)
     product = torch.ones_like(seen)
     if weight is not None:
@@ -46,13 +52,13 @@ def correlations(grey, weight, other, other_weight, to_pixels, inverse_depths):
     if other_weight is not None:
         product = product * sample(other_weight, x, y)
     mass = patch_means(product)
-    close |= ((product - LEAST_WEIGHT).abs() < CLOSE) | ((mass - LEAST_MASS).abs() < CLOSE)
+    close |= ((product - LEAST_WEIGHT).abs() < limit) | ((mass - LEAST_MASS).abs() < limit)
 
     def mean(t):
         return patch_means(product * t) / mass.clamp_min(LEAST_MASS)
 
     def variance(t):
-        return mean(t * t) - mean(t) ** 2 + LEAST_VARIANCE
+        return mean(t * t) - mean(t) ** 2 + least_variance
 
     covariance = mean(own * seen) - mean(own) * mean(seen)
     counts = shown & (product >= LEAST_WEIGHT) & (mass >= LEAST_MASS)
@@ -75,3 +81,59 @@ def search(grey, weight, others, other_weights, to_pixels, step, planes):
     plane = torch.where(first > -1.0, planes_of[0], 0)
     doubtful = close.flatten(0, 1).any(0) | ((first - second < CLOSE) & (first > -1.0))
     return plane * step, first, doubtful
+
+
+def path_costs(costs, grey, dy, dx):
+    """Returns the costs [planes, H, W] along the paths in direction (dy, dx)."""
+    if dy == 0:
+        return path_costs(costs.transpose(1, 2), grey.T, dx, 0).transpose(1, 2)
+    if dy < 0:
+        return path_costs(costs.flip(1), grey.flip(0), -dy, dx).flip(1)
+    columns = torch.arange(grey.shape[1]) - dx
+    begins = (columns < 0) | (columns >= grey.shape[1])
+    rows = [costs[:, 0]]
+    for here, grey_here, grey_before in zip(costs.unbind(1)[1:], grey[1:], grey[:-1], strict=True):
+        before = rows[-1].roll(dx, 1)
+        jump = (JUMP_COST / (1.0 + EDGE_RATE * (grey_here - grey_before.roll(dx)).abs())).clamp_min(STEP_COST)
+        least = before.amin(0)
+        beside = F.pad(before, (0, 0, 1, 1), value=torch.inf)
+        stepped = torch.minimum(beside[:-2], beside[2:]) + STEP_COST
+        added = torch.minimum(torch.minimum(before, stepped), least + jump) - least
+        rows.append(torch.where(begins, here, here + added))
+    return torch.stack(rows, 1)
+
+
+def match_semi_globally(grey, weight, others, other_weights, to_pixels, step, planes, limit):
+    """Returns each pixel's inverse depth by semi-global matching, how sure it is, and a mask of the pixels where rounding may decide.
+
+    One pixel's visibility has an effect on all others, so if it is within `limit` of a threshold, all may be wrong.
+    """
+    inverse_depths = step * torch.arange(planes, dtype=grey.dtype)
+    compared = [
+        correlations(
+            grey,
+            weight,
+            other,
+            None if other_weights is None else other_weights[k],
+            to_pixels[k],
+            inverse_depths,
+            MATCHED_LEAST_VARIANCE,
+            limit,
+        )
+        for k, other in enumerate(others)
+    ]
+    stacked, close = (torch.stack(parts) for parts in zip(*compared, strict=True))
+    costs = 1.0 - stacked.clamp_min(0.0).topk(max(len(compared) // 2, 1), 0).values.mean(0)
+    variance = patch_means(grey * grey) - patch_means(grey) ** 2 + MATCHED_LEAST_VARIANCE
+    costs[0] -= FAR_BONUS * MATCHED_LEAST_VARIANCE / variance
+    means = sum(path_costs(costs, grey, dy, dx) for dy, dx in DIRECTIONS) / len(DIRECTIONS)
+    least, best = means.min(0)
+    index = torch.arange(planes)[:, None, None]
+    margin = means.masked_fill((index - best).abs() <= 1, torch.inf).amin(0) - least
+    inner = (best > 0) & (best < planes - 1)
+    before, after = (means.gather(0, (best + by).clamp(0, planes - 1)[None])[0] for by in (-1, 1))
+    vertex = 0.5 * (before - after) / torch.where(inner, before - 2.0 * least + after, 1.0)
+    plane = best + torch.where(inner, vertex, 0.0)
+    sureness = (1.0 - least).clamp(0.0, 1.0) / (1.0 + HALF_MARGIN / margin)
+    second = means.masked_fill(index == best, torch.inf).amin(0)
+    return plane * step, sureness, close.any() | (second - least < CLOSE)

@@ -10,7 +10,7 @@ use crate::model::{self, EncodedTokens, GlobalSplat, ModelConfig, Precision, Raw
 use crate::optim::Optimizer;
 use crate::render::{self, Cameras};
 use crate::scene::{self, Gaussians, RadialWarp};
-use crate::stereo::depth_search::{ComparedPhoto, search_depths};
+use crate::stereo::depth_search::{ComparedPhoto, Search, match_semi_globally, search_depths};
 use crate::train;
 use glam::{DMat4, DVec3};
 use image::RgbImage;
@@ -74,7 +74,8 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
             request.input("photo")?,
             request.number("factor")?,
         )),
-        "depth_search" => depth_search(request),
+        "depth_search" => depth_search(request, search_depths, "correlation"),
+        "semi_global_matching" => depth_search(request, match_semi_globally, "sureness"),
         "sh_soft_cap" => loss_of(loss::sh_soft_cap(request.input("sh")?)),
         "decoder_regularization" => decoder_regularization(request),
         "lpips" => lpips(request),
@@ -368,7 +369,8 @@ fn scene_normalization(request: &Request) -> Result<Answer> {
     ])
 }
 
-fn depth_search(request: &Request) -> Result<Answer> {
+/// Runs `search`, whose second result is called `score`.
+fn depth_search(request: &Request, search: Search, score: &'static str) -> Result<Answer> {
     let (greys, matrices) = (request.input("others")?.unbind(0), request.input("to_pixels")?);
     let weights = request.inputs.get("other_weights").map(|weights| weights.unbind(0));
     let compared = |(index, grey)| {
@@ -379,10 +381,10 @@ fn depth_search(request: &Request) -> Result<Answer> {
     };
     let others = greys.iter().enumerate().map(compared).collect::<Result<Vec<_>>>()?;
     let (step, planes) = (request.number("step")?, request.number("planes")?);
-    let (inverse_depth, correlation) =
-        search_depths(request.input("grey")?, request.inputs.get("weight"), &others, step, planes);
+    let (inverse_depth, scores) =
+        search(request.input("grey")?, request.inputs.get("weight"), &others, step, planes);
     let image = |t: Tensor| t.unsqueeze(0).unsqueeze(0);
-    outputs([("inverse_depth", image(inverse_depth)), ("correlation", image(correlation))])
+    outputs([("inverse_depth", image(inverse_depth)), (score, image(scores))])
 }
 
 fn gaussians_and_cameras(request: &Request) -> Result<(Gaussians, Cameras)> {

@@ -21,6 +21,9 @@ pub struct ComparedPhoto<'a> {
     pub to_pixels: [DVec3; 4],
 }
 
+/// Search for the depths of a photo: [`search_depths`] or [`match_semi_globally`].
+pub type Search = fn(&Tensor, Option<&Tensor>, &[ComparedPhoto], f64, i64) -> (Tensor, Tensor);
+
 /// Returns the inverse depth at which each pixel of `grey` [h, w] looks most alike in the other photos, and the correlation there, both
 /// [h, w], float32 on the CPU. The candidates are the multiples 0 to `planes` − 1 of `step`.
 ///
@@ -37,21 +40,52 @@ pub fn search_depths(
     step: f64,
     planes: i64,
 ) -> (Tensor, Tensor) {
-    let address = |weight: Option<&Tensor>| weight.map_or(0, |weight| weight.as_ptr() as usize);
-    let others: Vec<PhotoToCompare> = others
-        .iter()
-        .map(|other| PhotoToCompare {
-            grey: other.grey.as_ptr() as usize,
-            weight: address(other.weight),
-            to_pixels: std::array::from_fn(|i| other.to_pixels[i % 4][i / 4] as f32),
-        })
-        .collect();
-    let (grey, weight) = (grey.as_ptr() as usize, address(weight));
+    let (others, [grey, weight]) = (addresses(others), [Some(grey), weight].map(address));
+    // SAFETY: the tensors outlive the call.
     let search = |out: &mut [usize]| unsafe {
         kernel::search_depths(grey, weight, &others, step as f32, planes as i32, out)
     };
-    // SAFETY: the tensors outlive the call, and on success the C++ side has stored two new tensors in `out`.
+    two_outputs(search)
+}
+
+/// Returns the inverse depths of the pixels of `grey` [h, w] by semi-global matching, and how sure each is, in [0, 1], both [h, w], float32
+/// on the CPU. The costs are those of the candidates of [`search_depths`]; depths that differ little between pixels cost less
+/// (`csrc/kernels/semi_global.h`).
+///
+/// # Panics
+/// Panics if there are no other photos or no planes, or if shapes don't fit.
+pub fn match_semi_globally(
+    grey: &Tensor,
+    weight: Option<&Tensor>,
+    others: &[ComparedPhoto],
+    step: f64,
+    planes: i64,
+) -> (Tensor, Tensor) {
+    let (others, [grey, weight]) = (addresses(others), [Some(grey), weight].map(address));
+    // SAFETY: the tensors outlive the call.
+    let search = |out: &mut [usize]| unsafe {
+        kernel::match_semi_globally(grey, weight, &others, step as f32, planes as i32, out)
+    };
+    two_outputs(search)
+}
+
+fn address(tensor: Option<&Tensor>) -> usize {
+    tensor.map_or(0, |tensor| tensor.as_ptr() as usize)
+}
+
+fn addresses(others: &[ComparedPhoto]) -> Vec<PhotoToCompare> {
+    let of = |other: &ComparedPhoto| PhotoToCompare {
+        grey: address(Some(other.grey)),
+        weight: address(other.weight),
+        to_pixels: std::array::from_fn(|i| other.to_pixels[i % 4][i / 4] as f32),
+    };
+    others.iter().map(of).collect()
+}
+
+/// Returns the two tensors that `search` of this module's kernels stores.
+fn two_outputs(search: impl FnOnce(&mut [usize]) -> Result<(), cxx::Exception>) -> (Tensor, Tensor) {
+    // SAFETY: on success the C++ side has stored two new tensors.
     let done = unsafe { take_outputs(search) };
-    let [inverse_depth, correlation] = done.unwrap_or_else(|error| panic!("{error}"));
-    (inverse_depth, correlation)
+    let [first, second] = done.unwrap_or_else(|error| panic!("{error}"));
+    (first, second)
 }

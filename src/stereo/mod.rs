@@ -1,6 +1,7 @@
 //! Depths of photos by a plane sweep, which needs no weights: for every pixel, the depth at which photos taken from other positions look
 //! most alike.
 
+mod consistency;
 mod depth_map;
 pub(crate) mod depth_search;
 mod pixel_depths;

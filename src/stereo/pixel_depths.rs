@@ -9,10 +9,8 @@ use tch::{Tensor, no_grad};
 const LONGEST_SIDE: f64 = 96.;
 /// Number of inverse depths that are tried.
 const PLANES: i64 = 64;
-/// Correlation at or below which a depth is only a guess.
-const UNSURE: f64 = 0.5;
-/// How sure a guess is.
-const GUESS: f64 = 0.05;
+/// How sure a depth is at least.
+const LEAST_SURE: f64 = 0.05;
 
 /// Computes the depths of `images` [V, 3, H, W], values in [0, 1], by a plane sweep over small copies of them. `masks` [V, 1, H, W] are 1
 /// where a pixel counts. Returns [V, 2, H, W]: the inverse depth of each pixel along the axis of its camera, in the units of `cameras`, and
@@ -24,10 +22,9 @@ pub(crate) fn pixel_depths(images: &Tensor, masks: Option<&Tensor>, cameras: &[C
             SmallPhoto::new("", &of_view(images), masks.map(of_view).as_ref(), *camera, LONGEST_SIDE)
         };
         let photos: Vec<SmallPhoto> = cameras.iter().enumerate().map(photo).collect();
-        let depths = inverse_depths(&photos, PLANES).into_iter().map(|[inverse, correlation]| {
-            let sure = ((correlation - UNSURE).clamp_min(0.) / (1. - UNSURE)).clamp_min(GUESS);
-            Tensor::stack(&[inverse, sure], 0)
-        });
+        let depths = inverse_depths(&photos, PLANES)
+            .into_iter()
+            .map(|[inverse, sure]| Tensor::stack(&[inverse, sure.clamp_min(LEAST_SURE)], 0));
         let size = [images.size()[2], images.size()[3]];
         Tensor::stack(&depths.collect::<Vec<_>>(), 0).upsample_bilinear2d(size, false, None, None)
     })

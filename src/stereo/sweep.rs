@@ -1,8 +1,9 @@
 //! Depth estimation by a plane sweep (Collins 1996): finds for every pixel the depth at which its neighbourhood looks most alike in photos
 //! taken from other positions. It needs no weights and no points.
 
+use super::consistency::{MatchedDepths, agreement};
 use super::depth_map::DepthMap;
-use super::depth_search::{self, ComparedPhoto};
+use super::depth_search::{ComparedPhoto, Search, match_semi_globally, search_depths};
 use super::small_photo::SmallPhoto;
 use super::view_selection::{
     are_near_duplicates, at_octaves, extent, farthest_first, neighbours, projection,
@@ -37,6 +38,8 @@ const MIN_AGREEING_FRACTION: f64 = 0.05;
 const UNSURE: f64 = 0.5;
 /// Correlation above which a depth is usually right.
 const SURE: f64 = 0.8;
+/// Power of the fraction of photos that agree on a depth that is its weight.
+const AGREEMENT_POWER: i64 = 8;
 /// Number of times that known depths are spread to larger neighbourhoods.
 const SPREADS: usize = 6;
 /// Factor of the weight of the spread depths, each time.
@@ -64,7 +67,7 @@ pub(crate) fn sweep(
     points: &[Point],
     mut should_continue: impl FnMut(usize) -> bool,
 ) -> PlaneSweepOutput {
-    let mut sweep = Sweep::new(&photos, points, PLANES);
+    let mut sweep = Sweep::new(&photos, points);
     let mut swept: Vec<(usize, DepthMap)> = vec![];
     for index in farthest_first(&sweep.cameras, MAX_DEPTH_MAPS) {
         if !should_continue(swept.len()) {
@@ -76,7 +79,10 @@ pub(crate) fn sweep(
             !are_near_duplicates(&this.camera, &cameras[*other], scene.depth)
         };
         if swept.iter().all(is_new) {
-            let InverseDepths { filled, correlation, nearest } = sweep.inverse_depths(index, &scene);
+            let (others, nearest) = sweep.compared_with(index, &scene);
+            let (inverse, correlation) = most_alike(this, &others, nearest, PLANES, search_depths);
+            let weight = (&correlation - UNSURE).clamp_min(0.).square();
+            let filled = filled(&inverse, &weight, this.counted().as_ref());
             let map = DepthMap {
                 photo: this.name.clone(),
                 camera: this.camera,
@@ -92,16 +98,24 @@ pub(crate) fn sweep(
     PlaneSweepOutput { photos, depth_maps: swept }
 }
 
-/// Computes the inverse depths of all pixels of all `photos`, by `planes` candidates, and the correlation of each with the other photos.
-/// Both are [h, w].
+/// Computes the inverse depths of all pixels of all `photos` by semi-global matching among `planes` candidates, and how sure each is, in
+/// [0, 1]: the fraction of the other photos that agree. Both are [h, w]. Depths on which photos disagree come from pixels around.
 pub(crate) fn inverse_depths(photos: &[SmallPhoto], planes: i64) -> Vec<[Tensor; 2]> {
-    let mut sweep = Sweep::new(photos, &[], planes);
+    let mut sweep = Sweep::new(photos, &[]);
     let scenes: Vec<SceneDepth> = (0..photos.len()).map(|index| sweep.scene_depth(index)).collect();
-    let depths = |(index, scene)| {
-        let InverseDepths { filled, correlation, .. } = sweep.inverse_depths(index, scene);
-        [filled, correlation]
+    let matched = |(index, scene)| {
+        let photo: &SmallPhoto = &photos[index];
+        let (others, nearest) = sweep.compared_with(index, scene);
+        let (inverse, sureness) = most_alike(photo, &others, nearest, planes, match_semi_globally);
+        MatchedDepths { photo, inverse, sureness, step: nearest / (planes - 1) as f64 }
     };
-    scenes.iter().enumerate().map(depths).collect()
+    let all: Vec<MatchedDepths> = scenes.iter().enumerate().map(matched).collect();
+    let depths = |(index, of): (usize, &MatchedDepths)| {
+        let agreement = agreement(index, &all);
+        let weight = agreement.pow_tensor_scalar(AGREEMENT_POWER);
+        [filled(&of.inverse, &weight, of.photo.counted().as_ref()), agreement]
+    };
+    all.iter().enumerate().map(depths).collect()
 }
 
 /// Photos whose depths are searched, one after the other.
@@ -110,7 +124,6 @@ struct Sweep<'a> {
     coarse: Vec<SmallPhoto>,
     cameras: Vec<Camera>,
     points: &'a [Point],
-    planes: i64,
     /// Median depths of the photos so far, where they could be estimated.
     medians: Vec<f64>,
 }
@@ -123,21 +136,11 @@ struct SceneDepth {
     nearest: Option<f64>,
 }
 
-/// Inverse depths of a photo's pixels.
-struct InverseDepths {
-    /// Inverse depth of every pixel, [h, w]. Where the correlation is low it comes from pixels around.
-    filled: Tensor,
-    /// Correlation with the other photos at the depth where it is highest, [h, w].
-    correlation: Tensor,
-    /// Inverse depth of the nearest plane that was tried.
-    nearest: f64,
-}
-
 impl<'a> Sweep<'a> {
-    fn new(photos: &'a [SmallPhoto], points: &'a [Point], planes: i64) -> Self {
+    fn new(photos: &'a [SmallPhoto], points: &'a [Point]) -> Self {
         let coarse = photos.iter().map(|photo| photo.downscaled(COARSE_SIDE)).collect();
         let cameras = photos.iter().map(|photo| photo.camera).collect();
-        Sweep { photos, coarse, cameras, points, planes, medians: vec![] }
+        Sweep { photos, coarse, cameras, points, medians: vec![] }
     }
 
     /// Estimates how far the scene is from photo `index`. If the photo itself doesn't tell, uses those that came before.
@@ -148,20 +151,18 @@ impl<'a> Sweep<'a> {
         SceneDepth { depth, nearest }
     }
 
-    /// Searches the depths of photo `index`, which is about as far from the scene as `scene` says.
-    fn inverse_depths(&self, index: usize, scene: &SceneDepth) -> InverseDepths {
-        let this = &self.photos[index];
+    /// Returns the photos that photo `index` is compared with, which is about as far from the scene as `scene` says, and the inverse depth
+    /// of the nearest plane.
+    fn compared_with(&self, index: usize, scene: &SceneDepth) -> (Vec<&'a SmallPhoto>, f64) {
         let others = neighbours(index, &self.cameras, scene.depth);
         let others: Vec<&SmallPhoto> = others.into_iter().map(|other| &self.photos[other]).collect();
         let nearest = match (scene.nearest, others.first()) {
             (Some(nearest), _) => nearest,
-            (None, Some(other)) => nearest_of_cameras(this, other).min(NEAREST / scene.depth),
+            (None, Some(other)) => nearest_of_cameras(&self.photos[index], other).min(NEAREST / scene.depth),
             // Without other photos no depth can be measured: all pixels get the same depth.
             (None, None) => 2. / scene.depth,
         };
-        let (inverse, correlation) = most_alike(this, &others, nearest, self.planes);
-        let filled = filled(&inverse, &correlation, this.counted().as_ref());
-        InverseDepths { filled, correlation, nearest }
+        (others, nearest)
     }
 }
 
@@ -206,7 +207,7 @@ struct Measured {
 
 fn measured(this: &SmallPhoto, other: &SmallPhoto) -> Measured {
     let nearest = nearest_of_cameras(this, other);
-    let (inverse, correlation) = most_alike(this, &[other], nearest, COARSE_PLANES);
+    let (inverse, correlation) = most_alike(this, &[other], nearest, COARSE_PLANES, search_depths);
     let sure = inverse.masked_select(&correlation.gt(SURE));
     let pixels =
         this.counted().map_or(inverse.numel() as i64, |counted| counted.sum(Kind::Int64).int64_value(&[]));
@@ -242,28 +243,27 @@ fn inverse_depths_of(points: &[Point], camera: &Camera) -> Option<Vec<f64>> {
     (inverse.len() >= MIN_POINTS).then_some(inverse)
 }
 
-/// Returns for every pixel the inverse depth at which it looks most alike in the other photos, and the correlation there, both [h, w]. The
-/// candidates are `planes` inverse depths, evenly spaced from 0 to `nearest`.
-fn most_alike(this: &SmallPhoto, others: &[&SmallPhoto], nearest: f64, planes: i64) -> (Tensor, Tensor) {
+/// Returns the inverse depth of every pixel that `search` finds, and the correlation there or how sure it is, both [h, w]. The candidates
+/// are `planes` inverse depths, evenly spaced from 0 to `nearest`.
+fn most_alike(
+    this: &SmallPhoto,
+    others: &[&SmallPhoto],
+    nearest: f64,
+    planes: i64,
+    search: Search,
+) -> (Tensor, Tensor) {
     if others.is_empty() {
         let options = (Kind::Float, Device::Cpu);
         return (Tensor::full(this.size(), nearest / 2., options), Tensor::zeros(this.size(), options));
     }
     let compared: Vec<ComparedPhoto> = others.iter().map(|other| other.compared_with(&this.camera)).collect();
-    depth_search::search_depths(
-        &this.grey,
-        this.weight.as_ref(),
-        &compared,
-        nearest / (planes - 1) as f64,
-        planes,
-    )
+    search(&this.grey, this.weight.as_ref(), &compared, nearest / (planes - 1) as f64, planes)
 }
 
-/// Replaces inverse depths of low correlation by those of reliable pixels around them, the nearest weighted most.
-fn filled(inverse: &Tensor, correlation: &Tensor, counted: Option<&Tensor>) -> Tensor {
+/// Replaces inverse depths of low weight by those of reliable pixels around them, the nearest weighted most.
+fn filled(inverse: &Tensor, weight: &Tensor, counted: Option<&Tensor>) -> Tensor {
     let size = inverse.size();
-    let weight = (correlation - UNSURE).clamp_min(0.).square();
-    let (mut sum, mut weights) = ((inverse * &weight).unsqueeze(0), weight.unsqueeze(0));
+    let (mut sum, mut weights) = ((inverse * weight).unsqueeze(0), weight.unsqueeze(0));
     let (mut total, mut total_weights, mut factor) = (sum.copy(), weights.copy(), 1.);
     for _ in 0..SPREADS {
         let pool = |t: &Tensor| t.avg_pool2d(5, 1, 2, false, true, None);
@@ -322,6 +322,12 @@ mod tests {
         for (_, swept) in sweep(photos(false), &[], |_| true).depth_maps {
             let off = (swept.depth / depth - 1.).abs().median().double_value(&[]);
             assert!(off < 0.02, "{off}");
+        }
+        // By semi-global matching, between planes.
+        for [inverse, sureness] in inverse_depths(&photos(false), 32) {
+            let off = (inverse * depth - 1.).abs().median().double_value(&[]);
+            assert!(off < 0.02, "{off}");
+            assert!(sureness.median().double_value(&[]) > 0.8);
         }
         // Points show that the scene begins at depth 3, so planes are closer together.
         let point = |i: i32| Point { position: DVec3::new(0.01 * f64::from(i), 0., 3.), colour: [0.; 3] };

@@ -57,13 +57,38 @@ def jitter_reference(config, params, inputs):
     return {"image": reference.jitter.jitter(inputs["image"], adjustments)}
 
 
+def photos_to_compare(rng, size, other_size, count, planes, weighted):
+    """Returns inputs and configuration: random patterns from cameras that look in about the same direction; the fifth faces away."""
+    inputs = {"grey": uniform(rng, 0.0, 1.0, *size), "others": uniform(rng, 0.0, 1.0, count, *other_size)}
+    shapes = {"weight": size, "other_weights": (count, *other_size)}
+    for name in weighted:
+        ramp = np.linspace(-0.5, 2.0, shapes[name][-1])
+        inputs[name] = np.clip(ramp + uniform(rng, -0.1, 0.1, *shapes[name]), 0.0, 1.0).astype(np.float32)
+    focal = float(max(size))
+    back = np.array([[1 / focal, 0, -0.5 * size[1] / focal], [0, 1 / focal, -0.5 * size[0] / focal], [0, 0, 1]])
+    there = np.array([[focal, 0, 0.5 * other_size[1]], [0, focal, 0.5 * other_size[0]], [0, 0, 1]])
+    matrices = []
+    for index in range(count):
+        rotation = np.eye(3) + 0.05 * rng.standard_normal((3, 3))
+        if index == 4:
+            rotation[2] *= -1
+        translation = 0.3 * rng.standard_normal((3, 1))
+        matrices.append(there @ np.hstack((rotation @ back, translation)))
+    inputs["to_pixels"] = np.stack(matrices).astype(np.float32)
+    return inputs, {"step": 0.7 / (planes - 1), "planes": planes}
+
+
+def comparison_label(size, other_size, count, planes, weighted):
+    return f"{by(*size)}, {count} of {by(*other_size)}, {planes} planes{''.join(f', {name}' for name in weighted)}"
+
+
 @case
 def depth_search(rng):
     """Photos of random patterns from cameras that look in about the same direction, some with weights, and one that faces away.
 
     The kernel processes a vector of columns and eight planes at a time; the sizes are around multiples of these.
     """
-    for size, other_size, count, planes, weighted in [
+    for shapes in [
         ((9, 9), (9, 9), 1, 2, ()),
         ((20, 33), (27, 41), 2, 9, ()),
         ((24, 32), (24, 32), 4, 16, ()),
@@ -71,35 +96,56 @@ def depth_search(rng):
         ((30, 17), (21, 50), 3, 8, ("other_weights",)),
         ((26, 30), (26, 30), 4, 10, ("weight", "other_weights")),
     ]:
-        inputs = {"grey": uniform(rng, 0.0, 1.0, *size), "others": uniform(rng, 0.0, 1.0, count, *other_size)}
-        shapes = {"weight": size, "other_weights": (count, *other_size)}
-        for name in weighted:
-            ramp = np.linspace(-0.5, 2.0, shapes[name][-1])
-            inputs[name] = np.clip(ramp + uniform(rng, -0.1, 0.1, *shapes[name]), 0.0, 1.0).astype(np.float32)
-        focal = float(max(size))
-        back = np.array([[1 / focal, 0, -0.5 * size[1] / focal], [0, 1 / focal, -0.5 * size[0] / focal], [0, 0, 1]])
-        there = np.array([[focal, 0, 0.5 * other_size[1]], [0, focal, 0.5 * other_size[0]], [0, 0, 1]])
-        matrices = []
-        for index in range(count):
-            rotation = np.eye(3) + 0.05 * rng.standard_normal((3, 3))
-            if index == 4:
-                rotation[2] *= -1
-            translation = 0.3 * rng.standard_normal((3, 1))
-            matrices.append(there @ np.hstack((rotation @ back, translation)))
-        inputs["to_pixels"] = np.stack(matrices).astype(np.float32)
-        config = {"step": 0.7 / (planes - 1), "planes": planes}
-        label = f"{by(*size)}, {count} of {by(*other_size)}, {planes} planes{''.join(f', {name}' for name in weighted)}"
+        inputs, config = photos_to_compare(rng, *shapes)
         doubles = {name: torch.tensor(value).double() for name, value in inputs.items()}
         doubtful = search(config, doubles)[2].numpy()[None, None]
-        yield Draw(label, inputs, config, doubtful=doubtful)
+        yield Draw(comparison_label(*shapes), inputs, config, doubtful=doubtful)
 
 
 def search(config, inputs):
-    names = ("grey", "weight", "others", "other_weights", "to_pixels")
-    return reference.depth_search.search(*(inputs.get(name) for name in names), config["step"], config["planes"])
+    return reference.depth_search.search(*compared(inputs), config["step"], config["planes"])
+
+
+def compared(inputs):
+    return [inputs.get(name) for name in ("grey", "weight", "others", "other_weights", "to_pixels")]
 
 
 @reference_for("depth_search")
 def depth_search_reference(config, params, inputs):
     inverse_depth, correlation, _ = search(config, inputs)
     return {"inverse_depth": inverse_depth[None, None], "correlation": correlation[None, None]}
+
+
+@case
+def semi_global_matching(rng):
+    """Photos like those of depth_search, half of the first without texture.
+
+    The kernel processes a vector of planes at a time; their numbers are around multiples of it.
+    """
+    for shapes in [
+        ((9, 9), (9, 9), 1, 2, ()),
+        ((12, 25), (14, 21), 2, 9, ()),
+        ((16, 18), (16, 18), 4, 33, ()),
+        ((19, 15), (12, 17), 5, 16, ("weight",)),
+        ((15, 22), (15, 22), 4, 17, ("weight", "other_weights")),
+    ]:
+        # Rounding must not decide whether a pixel counts.
+        for _ in range(100):
+            inputs, config = photos_to_compare(rng, *shapes)
+            inputs["grey"][:, : shapes[0][1] // 2] *= 0.02
+            doubles = {name: torch.tensor(value).double() for name, value in inputs.items()}
+            doubtful = match(config, doubles)[2].numpy()[None, None]
+            if not doubtful.all():
+                break
+        yield Draw(comparison_label(*shapes), inputs, config, doubtful=doubtful)
+
+
+def match(config, inputs):
+    limit = 2e-5
+    return reference.depth_search.match_semi_globally(*compared(inputs), config["step"], config["planes"], limit)
+
+
+@reference_for("semi_global_matching")
+def semi_global_matching_reference(config, params, inputs):
+    inverse_depth, sureness, _ = match(config, inputs)
+    return {"inverse_depth": inverse_depth[None, None], "sureness": sureness[None, None]}
