@@ -53,3 +53,35 @@ pub(super) fn agreement(index: usize, all: &[MatchedDepths]) -> Tensor {
     }
     agreeing / total
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::{Camera, Intrinsics};
+    use glam::{DMat4, DVec3};
+
+    /// Three cameras in a row look at a plane at depth 4. One of them has measured a wrong depth for some pixels.
+    #[test]
+    fn a_depth_that_other_photos_contradict_is_unsure() {
+        let options = (Kind::Float, Device::Cpu);
+        let intrinsics = Intrinsics { fx: 60., fy: 60., cx: 32., cy: 24. };
+        let photos = [0., 0.2, 0.4].map(|at| {
+            let c2w = DMat4::from_translation(DVec3::new(at, 0., 0.));
+            let camera = Camera { intrinsics, c2w, width: 64, height: 48 };
+            SmallPhoto::new("", &Tensor::rand([3, 48, 64], options), None, camera, 64.)
+        });
+        let all = [0, 1, 2].map(|index| {
+            let inverse = Tensor::full([48, 64], 0.25, options);
+            if index == 1 {
+                let _ = inverse.narrow(1, 20, 8).fill_(0.4);
+            }
+            let sureness = Tensor::ones([48, 64], options);
+            MatchedDepths { photo: &photos[index], inverse, sureness, step: 0.01 }
+        });
+        let agreement = agreement(1, &all);
+        assert!(agreement.narrow(1, 20, 8).max().double_value(&[]) < 0.1);
+        assert!(agreement.narrow(1, 28, 30).min().double_value(&[]) > 0.9);
+        // Only the first photo shows the first column.
+        assert!(agreement.narrow(1, 0, 1).min().double_value(&[]) > 0.9);
+    }
+}
