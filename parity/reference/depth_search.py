@@ -30,7 +30,9 @@ def sample(image, x, y):
     return F.grid_sample(images, grid, padding_mode="border", align_corners=False).squeeze(1)
 
 
-def correlations(grey, weight, other, other_weight, to_pixels, inverse_depths, least_variance=LEAST_VARIANCE, limit=CLOSE):
+def correlations(
+    grey, weight, other, other_weight, to_pixels, inverse_depths, least_variance=LEAST_VARIANCE, limit=CLOSE
+):
     """Returns the correlation of grey [H, W] with another photo on each plane, and a mask of close calls, [planes, H, W] each.
 
     The weights are None if every pixel counts. A patch's correlation is -1 where the pixel isn't shown or has too
