@@ -1,4 +1,4 @@
-// Semi-global matching (Hirschmüller 2008): smooths the depths that a plane sweep finds. The cost of a plane d at a pixel p is C = 1 − score.
+// Semi-global matching (Hirschmüller 2008): smooths the depths that a plane sweep finds. The cost of plane d at pixel p is C = 1 − score.
 // It is added up along paths that run through the photo in eight directions r:
 //
 //   L(p, d) = C(p, d) + min(L(p − r, d), L(p − r, d ± 1) + P1, min_k L(p − r, k) + P2) − min_k L(p − r, k)
