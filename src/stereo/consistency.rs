@@ -22,6 +22,8 @@ pub(super) struct MatchedDepths<'a> {
     pub sureness: Tensor,
     /// Inverse depth between two planes of the search.
     pub step: f64,
+    /// `false` if there was no photo to compare with.
+    pub is_measured: bool,
 }
 
 /// Returns the fraction of the other photos that agree on each pixel's depth, of those that show its point, [h, w]. Photos that are
@@ -76,7 +78,7 @@ mod tests {
                 let _ = inverse.narrow(1, 20, 8).fill_(0.4);
             }
             let sureness = Tensor::ones([48, 64], options);
-            MatchedDepths { photo: &photos[index], inverse, sureness, step: 0.01 }
+            MatchedDepths { photo: &photos[index], inverse, sureness, step: 0.01, is_measured: true }
         });
         let agreement = agreement(1, &all);
         assert!(agreement.narrow(1, 20, 8).max().double_value(&[]) < 0.1);

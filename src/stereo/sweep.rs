@@ -99,7 +99,8 @@ pub(crate) fn sweep(
 }
 
 /// Computes the inverse depths of all pixels of all `photos` by semi-global matching among `planes` candidates, and how sure each is, in
-/// [0, 1]: the fraction of the other photos that agree. Both are [h, w]. Depths on which photos disagree come from pixels around.
+/// [0, 1]: the fraction of the other photos that agree, and 0 if there is no photo to compare with. Both are [h, w]. Depths on which photos
+/// disagree come from pixels around.
 pub(crate) fn inverse_depths(photos: &[SmallPhoto], planes: i64) -> Vec<[Tensor; 2]> {
     let mut sweep = Sweep::new(photos, &[]);
     let scenes: Vec<SceneDepth> = (0..photos.len()).map(|index| sweep.scene_depth(index)).collect();
@@ -107,11 +108,12 @@ pub(crate) fn inverse_depths(photos: &[SmallPhoto], planes: i64) -> Vec<[Tensor;
         let photo: &SmallPhoto = &photos[index];
         let (others, nearest) = sweep.compared_with(index, scene);
         let (inverse, sureness) = most_alike(photo, &others, nearest, planes, match_semi_globally);
-        MatchedDepths { photo, inverse, sureness, step: nearest / (planes - 1) as f64 }
+        let step = nearest / (planes - 1) as f64;
+        MatchedDepths { photo, inverse, sureness, step, is_measured: !others.is_empty() }
     };
     let all: Vec<MatchedDepths> = scenes.iter().enumerate().map(matched).collect();
     let depths = |(index, of): (usize, &MatchedDepths)| {
-        let agreement = agreement(index, &all);
+        let agreement = if of.is_measured { agreement(index, &all) } else { of.inverse.zeros_like() };
         let weight = agreement.pow_tensor_scalar(AGREEMENT_POWER);
         [filled(&of.inverse, &weight, of.photo.counted().as_ref()), agreement]
     };
