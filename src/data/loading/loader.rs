@@ -423,6 +423,7 @@ fn normalized(cameras: Vec<Camera>, context: &[usize], target: &[usize]) -> Resu
     }
     Ok((cameras, FAR / normalization.world_from_normalized.scale))
 }
+
 /// Computes the depths of the images at `context`, [C, 2, H, W] ([`pixel_depths`]). `images` and `masks` have the bytes of all images, of
 /// `size`, with `cameras`.
 fn context_depths(
