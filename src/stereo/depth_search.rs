@@ -40,12 +40,7 @@ pub fn search_depths(
     step: f64,
     planes: i64,
 ) -> (Tensor, Tensor) {
-    let (others, [grey, weight]) = (addresses(others), [Some(grey), weight].map(address));
-    // SAFETY: the tensors outlive the call.
-    let search = |out: &mut [usize]| unsafe {
-        kernel::search_depths(grey, weight, &others, step as f32, planes as i32, out)
-    };
-    two_outputs(search)
+    run(kernel::search_depths, grey, weight, others, step, planes)
 }
 
 /// Returns the inverse depths of the pixels of `grey` [h, w] by semi-global matching, and how sure each is, in [0, 1], both [h, w], float32
@@ -61,30 +56,35 @@ pub fn match_semi_globally(
     step: f64,
     planes: i64,
 ) -> (Tensor, Tensor) {
-    let (others, [grey, weight]) = (addresses(others), [Some(grey), weight].map(address));
-    // SAFETY: the tensors outlive the call.
-    let search = |out: &mut [usize]| unsafe {
-        kernel::match_semi_globally(grey, weight, &others, step as f32, planes as i32, out)
-    };
-    two_outputs(search)
+    run(kernel::match_semi_globally, grey, weight, others, step, planes)
 }
 
-fn address(tensor: Option<&Tensor>) -> usize {
-    tensor.map_or(0, |tensor| tensor.as_ptr() as usize)
-}
+/// Search as this module's kernels export it: addresses of the photo and its weights, the photos to compare, the step and number of planes,
+/// and where the addresses of two new tensors are stored.
+type Kernel =
+    unsafe fn(usize, usize, &[PhotoToCompare], f32, i32, &mut [usize]) -> Result<(), cxx::Exception>;
 
-fn addresses(others: &[ComparedPhoto]) -> Vec<PhotoToCompare> {
-    let of = |other: &ComparedPhoto| PhotoToCompare {
-        grey: address(Some(other.grey)),
-        weight: address(other.weight),
-        to_pixels: std::array::from_fn(|i| other.to_pixels[i % 4][i / 4] as f32),
-    };
-    others.iter().map(of).collect()
-}
-
-/// Returns the two tensors that `search` of this module's kernels stores.
-fn two_outputs(search: impl FnOnce(&mut [usize]) -> Result<(), cxx::Exception>) -> (Tensor, Tensor) {
-    // SAFETY: on success the C++ side has stored two new tensors.
+fn run(
+    kernel: Kernel,
+    grey: &Tensor,
+    weight: Option<&Tensor>,
+    others: &[ComparedPhoto],
+    step: f64,
+    planes: i64,
+) -> (Tensor, Tensor) {
+    let address = |tensor: Option<&Tensor>| tensor.map_or(0, |tensor| tensor.as_ptr() as usize);
+    let others: Vec<PhotoToCompare> = others
+        .iter()
+        .map(|other| PhotoToCompare {
+            grey: address(Some(other.grey)),
+            weight: address(other.weight),
+            to_pixels: std::array::from_fn(|i| other.to_pixels[i % 4][i / 4] as f32),
+        })
+        .collect();
+    let [grey, weight] = [Some(grey), weight].map(address);
+    // SAFETY: the tensors outlive the call, and on success the C++ side has stored two new tensors in `out`.
+    let search =
+        |out: &mut [usize]| unsafe { kernel(grey, weight, &others, step as f32, planes as i32, out) };
     let done = unsafe { take_outputs(search) };
     let [first, second] = done.unwrap_or_else(|error| panic!("{error}"));
     (first, second)
