@@ -76,8 +76,7 @@ impl RadialWarp {
         no_grad(|| {
             let points = points(c2w, intrinsics, &self.inverse_depths);
             let factors = self.log_factors_at(&points.flatten(1, 3)).neg().exp();
-            let warped = &points
-                * factors.view([points.size()[0], points.size()[1], points.size()[2], points.size()[3], 1]);
+            let warped = points * factors.view_as(&self.inverse_depths).unsqueeze(-1);
             let origins = self.cameras(c2w).narrow(-2, 0, 3).select(-1, 3).unsqueeze(2).unsqueeze(2);
             plucker(&origins.expand_as(&warped), &(warped - origins))
         })

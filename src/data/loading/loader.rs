@@ -388,14 +388,12 @@ impl Shared {
             };
         }
         let start = Instant::now();
-        let depths = config.depths.then(|| {
-            let depths = context_depths(&images, masks.as_deref(), size, &cameras, &context);
-            let is_left_out = random.random_bool(DEPTHS_LEFT_OUT);
-            if is_left_out { zero_sureness(depths) } else { depths }
+        let depths = config.depths.then(|| match random.random_bool(DEPTHS_LEFT_OUT) {
+            true => vec![0.; 2 * context.len() * image_bytes / CHANNELS],
+            false => context_depths(&images, masks.as_deref(), size, &cameras, &context),
         });
         state.times.depths = start.elapsed().as_secs_f64();
         let (name, times) = (capture.name.clone(), state.times);
-        let depths = depths.map(|depths| Vec::try_from(depths.flatten(0, -1)).expect("float32 values"));
         Ok(LoadedScene { name, images, masks, depths, size, cameras, context, target, far, times })
     }
 
@@ -432,7 +430,7 @@ fn context_depths(
     size: ImageSize,
     cameras: &[Camera],
     context: &[usize],
-) -> Tensor {
+) -> Vec<f32> {
     let [height, width] = [size.height, size.width].map(i64::from);
     let indices = Tensor::from_slice(&context.iter().map(|&view| view as i64).collect::<Vec<_>>());
     let chosen = |bytes: &[u8], channels: i64| {
@@ -441,11 +439,6 @@ fn context_depths(
     };
     let masks = masks.map(|masks| chosen(masks, 1));
     let cameras: Vec<Camera> = context.iter().map(|&view| cameras[view]).collect();
-    pixel_depths(&chosen(images, CHANNELS as i64), masks.as_ref(), &cameras)
-}
-
-/// Returns `depths` [C, 2, H, W] with none of them sure.
-fn zero_sureness(depths: Tensor) -> Tensor {
-    let _ = depths.select(1, 1).zero_();
-    depths
+    let depths = pixel_depths(&chosen(images, CHANNELS as i64), masks.as_ref(), &cameras);
+    Vec::try_from(depths.flatten(0, -1)).expect("float32 values")
 }
