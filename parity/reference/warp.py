@@ -9,9 +9,10 @@ from .rays import pixel_directions
 
 DISTANCE = 1.8  # to which the warp moves what the photos show
 FARTHEST = 40.0  # depth of pixels whose inverse depth is smaller
-CELLS = 96  # along each side of the map of directions
+NEAREST = 0.5  # distance of what is closer
+CELLS = 128  # along each side of the map of directions
 BLUR, BLURS, COARSER = (
-    2.0,
+    1.0,
     4,
     0.02,
 )  # the finest blur in cells, their number, and the weight of each relative to the next finer one
@@ -62,7 +63,7 @@ class RadialWarp:
         self.inverse_depths = depths[:, :, 0].clamp(min=1.0 / FARTHEST)
         xs = points(c2w, intrinsic, self.inverse_depths).flatten(1, 3)
         weights = depths[:, :, 1].flatten(1)
-        logs = torch.log(xs.norm(dim=-1) / DISTANCE) * weights
+        logs = torch.log(xs.norm(dim=-1).clamp(min=NEAREST) / DISTANCE) * weights
         maps = []
         for x, log, weight in zip(xs, logs, weights, strict=True):
             places = map_position(x)

@@ -10,10 +10,13 @@ use tch::{Kind, Tensor, no_grad};
 const DISTANCE: f64 = 1.8;
 /// Maximum distance of a pixel. What is farther hardly moves between photos.
 const FARTHEST: f64 = 40.;
+/// Minimum distance of what a pixel shows from the origin, in units of the largest distance between cameras. Cameras see closer points in
+/// very different directions, which one distance per direction from the origin does not describe.
+const NEAREST: f64 = 0.5;
 /// Cells along each side of the map of directions.
-const CELLS: i64 = 96;
+const CELLS: i64 = 128;
 /// Standard deviation, in cells, of the finest blur of the map. Each coarser one has twice that of the one before.
-const BLUR: f64 = 2.;
+const BLUR: f64 = 1.;
 /// Number of blurs. The coarsest fills the directions in which no pixel lies.
 const BLURS: i32 = 4;
 /// Weight of each blur relative to the next finer one.
@@ -40,7 +43,7 @@ impl RadialWarp {
             let inverse_depths = depths.select(2, 0).clamp_min(1. / FARTHEST);
             let points = points(c2w, intrinsics, &inverse_depths).flatten(1, 3); // [B, V·H·W, 3]
             let weights = depths.select(2, 1).flatten(1, 3);
-            let distances = points.norm_scalaropt_dim(2, [-1i64], false);
+            let distances = points.norm_scalaropt_dim(2, [-1i64], false).clamp_min(NEAREST);
             let logs = (&distances / DISTANCE).log() * &weights;
             let sums = histogram(&map_position(&points), &Tensor::stack(&[&logs, &weights], 1));
             let total = |values: &Tensor| values.sum_dim_intlist(1i64, false, Kind::Float);
