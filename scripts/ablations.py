@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Compares the full model with its four ablations, and with bf16, with equal small budgets and several seeds.
+"""Compares the full model with its ablations and additions, and with bf16, with equal small budgets and several seeds.
 
 Prints mean ± standard deviation.
 
@@ -30,7 +30,8 @@ SETTINGS = [
     "model.patch_size=16",
     "model.latents=256",
     "data.image_size=[64, 64]",
-    "data.scene_scales=[1]",
+    "data.depths=false",
+    "data.colour_steps=0",
     "data.context_views=8",
     "data.min_context_views=0",
     "data.window=[8, 12]",
@@ -59,6 +60,9 @@ VARIANTS = {
     # A width with which the model has as many parameters as with two streams.
     "single stream": ["model.streams=single", "model.width=192"],
     "full capacity": ["curriculum.full_capacity=true"],
+    "depths": ["data.depths=true"],
+    "fitted colours": ["data.colour_steps=20"],
+    "depths, fitted colours": ["data.depths=true", "data.colour_steps=20"],
     "full model, bf16": ["train.precision=bf16"],
 }
 # Number of equal parts of a run over which its curve is averaged.

@@ -26,9 +26,14 @@ STAGES = [0.1, 0.2, 0.35, 0.5]
 TRANSITION = 0.05
 
 # Settings for training from scratch: small patches, many scene tokens and Muon only suit weights trained with large
-# patches and few tokens first. The model sees a scene at one scale, because a single pass says more about a shape than
-# the best of several (spec 9.9).
-BASE = ["model.patch_size=16", "model.latents=256", "train.optimizer=adamw", "data.scene_scales=[1]"]
+# patches and few tokens first. Without depths and fitted colours, the scores show what the network has learned.
+BASE = [
+    "model.patch_size=16",
+    "model.latents=256",
+    "train.optimizer=adamw",
+    "data.depths=false",
+    "data.colour_steps=0",
+]
 VARIANTS = {
     "tiny": [],
     "4 to 8 context views": ["data.context_views=8"],

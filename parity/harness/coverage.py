@@ -31,6 +31,7 @@ CASES_OF = {
     "src/stereo/depth_search.rs": ["depth_search", "semi_global_matching"],
     "src/scene/radial_warp.rs": ["radial_warp"],
     "src/scene/rays.rs": ["rays"],
+    "src/reconstruct/colour_fit.rs": ["colour_fit"],
     "src/render/mod.rs": [
         "projection",
         "projection_float32",

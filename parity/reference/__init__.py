@@ -1,6 +1,7 @@
 """GlobalSplat in plain PyTorch: the system's mathematics, one module per part, checked against golden tensors."""
 
 from . import (
+    colour_fit,
     decoder,
     depth_search,
     encoder,
@@ -22,6 +23,7 @@ from . import (
 )
 
 __all__ = [
+    "colour_fit",
     "decoder",
     "depth_search",
     "encoder",

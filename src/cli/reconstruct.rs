@@ -153,8 +153,6 @@ impl Reconstruct {
                 "image_size": input.photo_size(data.image_size),
                 "views": views,
                 "gaussians": count,
-                "extent": reconstruction.placement.extent,
-                "forward": reconstruction.placement.forward,
                 "precision": loaded.model.precision(),
                 "load_seconds": parts["weights"],
                 "seconds": seconds,
@@ -165,10 +163,12 @@ impl Reconstruct {
             }));
         } else {
             let megabytes = bytes as f64 / 1e6;
-            let passes =
-                if data.scene_scales.len() == 1 { "forward pass" } else { "scene shown in several sizes," };
+            let pass = match data.colour_steps {
+                0 => "forward pass",
+                _ => "forward pass and fit of colours",
+            };
             println!(
-                "{}: {count} Gaussians from {views} views, {megabytes:.2} MB; {passes} {seconds:.2} s, peak memory {:.2} GB",
+                "{}: {count} Gaussians from {views} views, {megabytes:.2} MB; {pass} {seconds:.2} s, peak memory {:.2} GB",
                 self.out.display(),
                 peak_memory_bytes() as f64 / 1e9
             );

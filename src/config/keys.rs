@@ -4,9 +4,8 @@ use crate::error::{Error, Result};
 use std::collections::BTreeMap;
 
 /// Former names of keys, which are still accepted, and their current names.
-const RENAMED: [(&str, &str); 7] = [
+const RENAMED: [(&str, &str); 6] = [
     ("data.ahead", "data.prefetch"),
-    ("data.extents", "data.scene_scales"),
     ("data.fewest_context_views", "data.min_context_views"),
     ("data.photo_megabytes", "data.photo_cache_mb"),
     ("train.batch", "train.batch_size"),
@@ -14,8 +13,16 @@ const RENAMED: [(&str, &str); 7] = [
     ("train.pictures_every", "train.log_images_every"),
 ];
 
-/// Gives every key of `table` its current name.
+/// Former keys that are still accepted, but have no effect any more.
+const REMOVED: [&str; 2] = ["data.extents", "data.scene_scales"];
+
+/// Gives every key of `table` its current name, and removes keys without effect.
 pub(super) fn rename_former(table: &mut toml::Table) {
+    for (section, key) in REMOVED.map(dotted) {
+        if let Some(toml::Value::Table(section)) = table.get_mut(section) {
+            section.remove(key);
+        }
+    }
     for (former, current) in RENAMED {
         let ((section, former), (_, current)) = (dotted(former), dotted(current));
         if let Some(toml::Value::Table(section)) = table.get_mut(section)
@@ -73,6 +80,9 @@ pub(super) fn override_key(table: &mut toml::Table, assignment: &str) -> Result<
         Err(_) => toml::Value::String(value.to_string()),
     };
     let key = key.trim();
+    if REMOVED.contains(&key) {
+        return Ok(());
+    }
     let key = RENAMED.iter().find(|(former, _)| *former == key).map_or(key, |(_, current)| current);
     let mut path: Vec<&str> = key.split('.').collect();
     let last = path.pop().ok_or_else(refused)?;
@@ -94,14 +104,13 @@ mod tests {
     /// A file and an override may each use the former or the current name; the result is the same.
     #[test]
     fn former_keys_are_accepted() {
-        let value = |key: &str| if key == "data.extents" { "[0.5]" } else { "3" };
         for (former, current) in RENAMED {
             let parsed = |in_file: &str, set: &[&str]| {
                 let text = match in_file {
                     "" => String::new(),
-                    key => format!("[{}]\n{} = {}\n", dotted(key).0, dotted(key).1, value(former)),
+                    key => format!("[{}]\n{} = 3\n", dotted(key).0, dotted(key).1),
                 };
-                let set: Vec<String> = set.iter().map(|key| format!("{key}={}", value(former))).collect();
+                let set: Vec<String> = set.iter().map(|key| format!("{key}=3")).collect();
                 Config::parse(&text, &set, Path::new("a.toml")).expect("a configuration")
             };
             let expected = parsed("", &[current]);
@@ -114,6 +123,19 @@ mod tests {
                 .to_toml()
                 .replace(&format!("\n{} = ", dotted(current).1), &format!("\n{} = ", dotted(former).1));
             assert_eq!(changed_keys(&former_text, &expected.to_toml()), [""; 0], "{former}");
+        }
+    }
+    /// Keys without effect are accepted in a file and as an override, even if both name them, and aren't written.
+    #[test]
+    fn removed_keys_are_ignored() {
+        for key in REMOVED {
+            let text = format!("[data]\n{} = [0.5, 1]\n", dotted(key).1);
+            for set in REMOVED.map(|key| format!("{key}=[2]")) {
+                let config = Config::parse(&text, &[set], Path::new("a.toml")).expect("a configuration");
+                assert_eq!(config, Config::default());
+                assert_eq!(changed_keys(&text, &config.to_toml()), changed_keys("", &config.to_toml()));
+                assert!(!config.to_toml().contains("scale"), "{}", config.to_toml());
+            }
         }
     }
 }

@@ -51,14 +51,16 @@ pub struct DataConfig {
     pub captures: Vec<String>,
     /// Size [height, width] that images are fitted to.
     pub image_size: ImageSize,
-    /// Scene scales at inference: the largest distance between two cameras is scaled to each of these values. If there are several,
-    /// they and values around the best one are tried, and the splat that reproduces the photos best is kept (spec 9.9). This
-    /// applies to validation, too. Training always uses 1.
-    #[serde(alias = "extents")]
-    pub scene_scales: Vec<f64>,
     /// If `true`, a plane sweep estimates a depth for every pixel of the context views, and the model sees the scene with distances
     /// made about equal (spec 3.5).
     pub depths: bool,
+    /// Number of least-squares steps by which the colours of a reconstruction are fitted to its photos (spec 9.9), in
+    /// validation, too. 0 leaves the network's colours as they are.
+    pub colour_steps: usize,
+    /// Former key for scales of the scene that were tried one by one. It has no effect any more.
+    #[doc(hidden)]
+    #[serde(rename = "scene_scales", alias = "extents", skip_serializing)]
+    pub former_scene_scales: serde::de::IgnoredAny,
     /// Maximum number of context views per scene in a training step.
     pub context_views: usize,
     /// Minimum number of context views. If it isn't 0, every step draws the number of context views from this to `context_views`.
@@ -101,8 +103,9 @@ impl Default for DataConfig {
         DataConfig {
             captures: vec![],
             image_size: [256, 256].into(),
-            scene_scales: vec![1.],
             depths: false,
+            colour_steps: 0,
+            former_scene_scales: serde::de::IgnoredAny,
             context_views: 24,
             min_context_views: 0,
             target_views: 12,
@@ -135,10 +138,10 @@ impl DataConfig {
     pub(crate) fn validation_settings(&self) -> String {
         let scenes = (&self.captures, &self.holdout, &self.validation, self.validation_scenes);
         let views = (self.image_size, self.context_views, self.target_views, self.window);
-        // Omitting the default value keeps the string of runs that began before `extents` existed.
-        let settings = match self.scene_scales == [1.] {
-            true => serde_json::to_string(&(scenes, views)),
-            false => serde_json::to_string(&(scenes, views, &self.scene_scales)),
+        // Omitting the default value keeps the string of runs that began before `colour_steps` existed.
+        let settings = match self.colour_steps {
+            0 => serde_json::to_string(&(scenes, views)),
+            steps => serde_json::to_string(&(scenes, views, steps)),
         };
         settings.expect("numbers and strings")
     }
@@ -175,12 +178,6 @@ impl DataConfig {
         if self.min_context_views > self.context_views {
             let expected = format!("0 to the {} of data.context_views", self.context_views);
             return Err(Error::setting("data.min_context_views", self.min_context_views, expected));
-        }
-        if self.scene_scales.is_empty()
-            || !self.scene_scales.iter().all(|extent| *extent > 0. && extent.is_finite())
-        {
-            let expected = "one or more numbers above 0";
-            return Err(Error::setting("data.scene_scales", format!("{:?}", self.scene_scales), expected));
         }
         let JitterConfig { brightness, contrast, saturation, hue } = self.jitter;
         for (field, value, largest) in [

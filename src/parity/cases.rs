@@ -8,6 +8,7 @@ use crate::io::Weights;
 use crate::loss;
 use crate::model::{self, EncodedTokens, GlobalSplat, ModelConfig, Precision, RawOutputs, Stage};
 use crate::optim::Optimizer;
+use crate::reconstruct::fit_colours;
 use crate::render::{self, Cameras};
 use crate::scene::{self, Gaussians, RadialWarp};
 use crate::stereo::depth_search::{ComparedPhoto, Search, match_semi_globally, search_depths};
@@ -41,6 +42,7 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
         }
         "quaternion" => outputs([("quaternion", model::quaternion_from_6d(request.input("rotations")?))]),
         "scene_normalization" => scene_normalization(request),
+        "colour_fit" => colour_fit(request),
         "projection" => projection(request),
         "rasterizer" => rasterizer(request),
         "mse" => loss_of(loss::mse(request.input("rendered")?, request.input("truth")?)),
@@ -410,6 +412,23 @@ fn rasterizer(request: &Request) -> Result<Answer> {
     let (gaussians, cameras) = gaussians_and_cameras(request)?;
     let rendered = render::render(&gaussians, &cameras, request.number("eps2d")?)?;
     outputs([("rgb", rendered.rgb), ("alpha", rendered.alpha), ("depth", rendered.depth)])
+}
+
+fn colour_fit(request: &Request) -> Result<Answer> {
+    let (gaussians, cameras) = gaussians_and_cameras(request)?;
+    let views = ViewBatch {
+        images: request.input("images")?.shallow_clone(),
+        masks: Some(request.input("masks")?.shallow_clone()),
+        depths: None,
+        c2w: cameras.w2c.inverse(),
+        w2c: cameras.w2c,
+        intrinsics: cameras.intrinsics,
+    };
+    let fitted = fit_colours(&gaussians, &views, request.number("steps")?)?;
+    outputs([
+        ("contributions", render::image_contributions(&gaussians, &views.cameras())?),
+        ("sh", fitted.sh),
+    ])
 }
 
 fn projection(request: &Request) -> Result<Answer> {

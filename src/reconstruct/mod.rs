@@ -1,10 +1,10 @@
 //! Reconstruction of a splat from posed photos: loads a model from its file, selects and fits the views, runs a forward pass, and
 //! transforms the result to the capture's world.
 
+mod colour_fit;
 mod context;
 mod input;
 mod model_file;
-mod placement_search;
 mod published;
 mod spread;
 
@@ -17,16 +17,19 @@ pub use model_file::{
 
 pub use spread::spread_over_path;
 
+// Used by the parity checks, too.
+pub(crate) use colour_fit::fit_colours;
+
 use crate::config::Config;
-use crate::data::{View, ViewBatch, view_batch};
+use crate::data::{View, ViewBatch, cameras_at, view_batch};
 use crate::error::{Error, Result};
 use crate::io::{MappedWeights, Splat};
 use crate::model::{GlobalSplat, Stage};
 use crate::render::transform;
-use crate::scene::{Gaussians, Placement, Similarity, normalize};
+use crate::scene::{Gaussians, ImageSize, Similarity, normalize};
+use crate::stereo::pixel_depths;
 use glam::{DMat4, DVec3};
-use placement_search::search_placement;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 use tch::{Device, Tensor};
 
 /// Model for inference: one from a file, or one that is being trained.
@@ -58,13 +61,11 @@ impl<'a> From<&'a LoadedModel> for Model<'a> {
 pub struct Reconstruction {
     /// Gaussians of one scene, in the normalized world.
     pub gaussians: Gaussians,
-    /// Placement of the cameras in the normalized world.
-    pub placement: Placement,
     /// Transform from the normalized world to the capture's.
     pub world_from_normalized: Similarity,
     /// Poses of the target cameras in the normalized world, camera-to-world.
     pub target_poses: Vec<DMat4>,
-    /// Time from views in memory to Gaussians, over all passes.
+    /// Time from views in memory to Gaussians: depths, the forward pass and the fit of colours.
     pub forward_time: Duration,
 }
 
@@ -92,9 +93,8 @@ impl Reconstruction {
     }
 }
 
-/// Runs the model over `photos`, which are converted to the views that it sees ([`Input`]). If its configuration has several
-/// `data.scene_scales`, the model runs on the scene at each of these sizes and at small changes of the best placement, and the splat that
-/// matches the photos best is kept. `targets` are poses (camera-to-world, in the capture's world) of target views: they take part in the
+/// Runs the model once over `photos`, which are converted to the views that it sees ([`Input`]), with the photos' depths if its configuration
+/// has `data.depths`. Fits the colours to the photos by `data.colour_steps` steps afterwards. `targets` are poses (camera-to-world, in the capture's world) of target views: they take part in the
 /// normalization, as in the paper's protocol. Each photo takes part once, however many views it becomes.
 ///
 /// # Errors
@@ -133,7 +133,32 @@ pub fn reconstruct<'a>(
         photos.iter().map(|photo| photo.camera.c2w).chain(targets.iter().copied()).collect();
     let normalization = normalize(&poses)?;
     let views = photos.iter().map(|photo| model.input.views(photo)).collect::<Result<Vec<_>>>()?;
-    search_placement(model, photos, &views, &normalization)
+    let data = &model.config.data;
+    let start = Instant::now();
+    let (poses, target_poses) = normalization.c2w.split_at(photos.len());
+    let depths = data.depths.then(|| depths_of(photos, poses, data.image_size));
+    let mut gaussians = pass(model, &views, poses, depths.as_ref())?;
+    if data.colour_steps > 0 {
+        let batch = view_batch(photos, poses, model.device);
+        gaussians = fit_colours(&gaussians, &batch, data.colour_steps)?;
+    }
+    // The results are written to files later. This copy waits for a GPU.
+    let gaussians = gaussians.to_device(Device::Cpu);
+    Ok(Reconstruction {
+        gaussians,
+        world_from_normalized: normalization.world_from_normalized,
+        target_poses: target_poses.to_vec(),
+        forward_time: start.elapsed(),
+    })
+}
+
+/// Returns the depths of `photos` with `poses` in a normalized world, resized to `size`, [V, 2, H, W] ([`pixel_depths`]).
+fn depths_of(photos: &[View], poses: &[DMat4], size: ImageSize) -> Tensor {
+    let batch = view_batch(photos, poses, Device::Cpu);
+    let masks = batch.masks.map(|masks| masks.get(0));
+    let depths = pixel_depths(&batch.images.get(0), masks.as_ref(), &cameras_at(photos, poses));
+    let size = [i64::from(size.height), i64::from(size.width)];
+    if depths.size()[2..] == size { depths } else { depths.upsample_bilinear2d(size, false, None, None) }
 }
 
 /// Runs the model on its device over `views`, the views of each photo, with the photos' `poses` in a normalized world. `depths` of the

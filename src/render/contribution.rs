@@ -3,7 +3,7 @@
 use super::{Cameras, default_eps2d, render};
 use crate::error::Result;
 use crate::scene::{Camera, Gaussians, SH_C0};
-use tch::Tensor;
+use tch::{Tensor, with_grad};
 
 /// Returns the contribution of each Gaussian to the images of `cameras`, in pixels: the sum over all pixels of its weight α·T, its opacity
 /// there times the transmittance in front of it. `gaussians` are of one scene, in the cameras' local frame (spec 2.5).
@@ -13,19 +13,27 @@ use tch::Tensor;
 /// # Errors
 /// Fails like [`render`].
 pub fn contributions(gaussians: &Gaussians, cameras: &[Camera]) -> Result<Vec<f32>> {
-    let count = gaussians.count();
-    let colours = Tensor::zeros([1, count, 1, 3], (gaussians.means.kind(), gaussians.means.device()));
+    let mut total = gaussians.opacities.zeros_like();
+    for camera in cameras {
+        total += image_contributions(gaussians, &Cameras::single(camera))?;
+    }
+    Ok(Vec::try_from(total.view([-1]))?)
+}
+
+/// Returns the contribution of each Gaussian to the images of `cameras` together, [B, N], as [`contributions`] does.
+///
+/// # Errors
+/// Fails like [`render`].
+pub(crate) fn image_contributions(gaussians: &Gaussians, cameras: &Cameras) -> Result<Tensor> {
+    let (b, n) = gaussians.opacities.size2()?;
+    let colours = Tensor::zeros([b, n, 1, 3], (gaussians.means.kind(), gaussians.means.device()));
     let colours = colours.set_requires_grad(true);
     let grey = Gaussians { sh: colours.shallow_clone(), ..gaussians.map(Tensor::detach) };
-    for camera in cameras {
-        let image = render(&grey, &Cameras::single(camera), default_eps2d(gaussians))?;
-        image.rgb.select(2, 0).sum(None).backward();
-    }
-    let grad = colours.grad();
-    if !grad.defined() {
-        return Ok(vec![0.; count as usize]);
-    }
-    Ok(Vec::try_from((grad.select(3, 0) / SH_C0).flatten(0, -1))?)
+    let red = with_grad(|| -> Result<Tensor> {
+        let image = render(&grey, cameras, default_eps2d(gaussians))?;
+        Ok(image.rgb.select(2, 0).sum(None))
+    })?;
+    Ok(Tensor::run_backward(&[red], &[colours], false, false)[0].select(3, 0).select(2, 0) / SH_C0)
 }
 
 #[cfg(test)]

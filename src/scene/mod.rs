@@ -11,8 +11,8 @@ mod splat;
 pub(crate) use gaussians::sigmoid;
 pub use gaussians::{Gaussians, RawGaussians};
 pub use globalsplat_capture::{
-    Camera, ImageSize, Intrinsics, LocalFrame, Normalization, Placement, Similarity, normalize,
-    orbit_around_cameras, orbit_around_point, pose_to_rows, smooth_path,
+    Camera, ImageSize, Intrinsics, LocalFrame, Normalization, Similarity, normalize, orbit_around_cameras,
+    orbit_around_point, pose_to_rows, smooth_path,
 };
 pub(crate) use globalsplat_splat_file::SH_C0;
 pub use radial_warp::RadialWarp;

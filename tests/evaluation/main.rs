@@ -3,8 +3,8 @@
 #[path = "../common/mod.rs"]
 mod common;
 
+mod colour_fit;
 mod evaluation;
 mod high_resolution;
-mod placing;
 mod refine;
 mod report;

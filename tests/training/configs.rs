@@ -53,12 +53,13 @@ fn bundled_weights_match_the_configuration_tiny() {
     let tiny = read("tiny");
     assert_eq!(shipped.config.model, tiny.model);
     assert_eq!(shipped.config.data.image_size, tiny.data.image_size);
-    assert_eq!(shipped.config.data.scene_scales, tiny.data.scene_scales);
+    let additions = |config: &Config| (config.data.depths, config.data.colour_steps);
+    assert_eq!(additions(&shipped.config), additions(&tiny));
     assert_eq!(shipped.config.data.context_views, 24, "as reconstruct --help says");
     assert_eq!(shipped.stage, tiny.curriculum.final_stage());
     let fine_tune = read("fine_tune");
     assert_eq!(fine_tune.model, tiny.model, "what goes on from them");
-    assert_eq!(fine_tune.data.scene_scales, tiny.data.scene_scales);
+    assert_eq!(additions(&fine_tune), additions(&tiny));
     let folder = folder().with_file_name("models");
     let files = std::fs::read_dir(&folder).expect("models/").map(|entry| entry.expect("an entry").path());
     let weights: Vec<PathBuf> =

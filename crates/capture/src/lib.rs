@@ -17,7 +17,7 @@ pub use formats::{
     read_camera_path, read_points, write_cameras_json, write_transforms_json,
 };
 pub use geometry::{
-    Camera, ImageSize, Intrinsics, LocalFrame, Normalization, Placement, Similarity, check_pose, normalize,
+    Camera, ImageSize, Intrinsics, LocalFrame, Normalization, Similarity, check_pose, normalize,
     orbit_around_cameras, orbit_around_point, pose_to_rows, smooth_path,
 };
 pub use globalsplat_files::{Error, Result};

@@ -144,3 +144,26 @@ def rasterizer_reference(config, params, inputs):
         return {"rgb": rgb.movedim(-1, 0), "alpha": alpha, "depth": depth}
 
     return map_cameras(inputs, render)
+
+
+@case
+def colour_fit(rng):
+    """Spherical harmonics of all degrees, fitted to images of which some pixels count half or not at all."""
+    for cameras, count, bases, size in [(2, 30, 16, (24, 20)), (3, 20, 4, (16, 16)), (1, 12, 1, (9, 30))]:
+        label, (size, make) = scenes.random_scene(size, 1, cameras, count, bases)
+        config = scenes.settings(size) | {"steps": 6}
+        for _ in range(MOST_TRIES):
+            inputs = make(rng, size)
+            if not doubtful_pixels(config, inputs, DOUBT[np.float64]).any():
+                break
+        inputs["images"] = rng.uniform(0.0, 1.0, (1, cameras, 3, *size))
+        inputs["masks"] = rng.choice([0.0, 0.5, 1.0], (1, cameras, 1, *size))
+        yield Draw(label, inputs, config, tolerance=FLOAT64)
+
+
+@reference_for("colour_fit")
+def colour_fit_reference(config, params, inputs):
+    names = ("means", "scales", "quaternions", "opacities", "sh", "w2c", "intrinsics", "images", "masks")
+    *gaussians, w2cs, intrinsics, images, masks = (inputs[name][0] for name in names)
+    contributions, sh = reference.colour_fit.fit_colours(gaussians, w2cs, intrinsics, images, masks, config["steps"])
+    return {"contributions": contributions[None], "sh": sh[None]}

@@ -8,6 +8,6 @@ mod trajectory;
 
 pub use camera::{Camera, ImageSize, Intrinsics, check_pose, nearest_rigid_of_scaled, pose_to_rows};
 pub use local_frame::LocalFrame;
-pub use normalize::{Normalization, Placement, Similarity, normalize};
+pub use normalize::{Normalization, Similarity, normalize};
 pub use smooth_path::smooth_path;
 pub use trajectory::{orbit_around_cameras, orbit_around_point};

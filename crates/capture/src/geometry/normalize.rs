@@ -37,43 +37,8 @@ pub struct Normalization {
     /// Camera-to-world poses in the normalized world, in the order of the input.
     pub c2w: Vec<DMat4>,
     /// Similarity from the normalized world to the capture's world. Its scale is the largest distance between two camera centres in
-    /// the capture divided by the extent in the normalized world.
+    /// the capture.
     pub world_from_normalized: Similarity,
-}
-
-/// Position and spread of a scene's cameras in the normalized world (spec 9.9). The normalization of spec 2.1 and 2.2 has extent 1.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Placement {
-    /// Largest distance between two camera centres, above 0.
-    pub extent: f64,
-    /// Position of the mean camera on the z axis, along which it looks.
-    pub forward: f64,
-}
-
-impl Placement {
-    /// Returns the placement moved forward by `forward`, with the extent multiplied by exp(`larger`).
-    pub fn with_offset(&self, [forward, larger]: [f64; 2]) -> Self {
-        Placement { extent: self.extent * larger.exp(), forward: self.forward + forward }
-    }
-}
-
-impl Normalization {
-    /// Returns the same cameras with another placement. The placement of `self` must have extent 1 and position 0.
-    pub fn with_placement(&self, Placement { extent, forward }: Placement) -> Self {
-        let offset = DVec3::Z * forward;
-        let moved = |pose: &DMat4| {
-            let mut pose = *pose;
-            pose.w_axis = (pose.w_axis.truncate() * extent + offset).extend(1.);
-            pose
-        };
-        let Similarity { rotation, translation, scale } = self.world_from_normalized;
-        let scale = scale / extent;
-        let translation = translation - scale * (rotation * offset);
-        Normalization {
-            c2w: self.c2w.iter().map(moved).collect(),
-            world_from_normalized: Similarity { rotation, translation, scale },
-        }
-    }
 }
 
 /// Moves the mean camera to the origin, looking along z, and scales the largest distance between two camera centres to 1. If the
@@ -176,29 +141,5 @@ mod tests {
         }
         let still = normalize(&[DMat4::from_translation(DVec3::splat(1e8)); 3]).unwrap();
         assert_eq!(still.world_from_normalized.scale, 1.);
-    }
-
-    #[test]
-    fn in_any_place_the_cameras_are_the_captures() {
-        let pose = |x: f64, z: f64, turn: f64| {
-            DMat4::from_translation(DVec3::new(x, 0.5 * x, z)) * DMat4::from_rotation_y(turn)
-        };
-        let original = [pose(0., 0., 0.), pose(3., 0.4, 0.2), pose(-1., 4., -0.3)];
-        for (extent, forward) in [(1., 0.), (0.25, 0.5), (3., -0.2)] {
-            let with_placement = normalize(&original).unwrap().with_placement(Placement { extent, forward });
-            let Normalization { c2w, world_from_normalized } = with_placement;
-            let centres: Vec<DVec3> = c2w.iter().map(|pose| pose.w_axis.truncate()).collect();
-            let distances = [(0, 1), (0, 2), (1, 2)].map(|(a, b)| centres[a].distance(centres[b]));
-            assert!((distances.into_iter().fold(0., f64::max) - extent).abs() < 1e-12, "{distances:?}");
-            let mean = centres.iter().sum::<DVec3>() / 3.;
-            assert!(mean.abs_diff_eq(DVec3::Z * forward, 1e-12), "{mean}");
-            for (pose, before) in c2w.iter().zip(&original) {
-                let Similarity { rotation, translation, scale } = world_from_normalized;
-                let centre = scale * (rotation * pose.w_axis.truncate()) + translation;
-                assert!(centre.distance(before.w_axis.truncate()) < 1e-12);
-                let axes = rotation * DMat3::from_mat4(*pose);
-                assert!(axes.abs_diff_eq(DMat3::from_mat4(*before), 1e-12));
-            }
-        }
     }
 }
