@@ -48,7 +48,7 @@ def main():
         for label, points in curves.items():
             row(name, label, *(at(points, second) for second in SECONDS))
         plots[name] = curves
-    ticks = range(0, int(arguments.seconds) + 1, 20)
+    ticks = range(0, int(arguments.seconds) + 1, 20 if arguments.seconds >= 20 else 5)
     (arguments.out / "curves.svg").write_text(line_plots(plots, ticks))
 
 
