@@ -21,11 +21,11 @@ def weights(means, scales, quaternions, opacities, w2c, intrinsic, width, height
 def fit_colours(gaussians, w2cs, intrinsics, images, masks, steps):
     """Returns the contributions [N] of Gaussians (means, scales, quaternions, opacities, sh) of one scene in pixels, and
     their SH [N, bases, 3] after some steps of accelerated gradient descent on half the sum of squared errors."""
-    *shapes, sh = gaussians
-    means, bases = shapes[0], sh.shape[1]
+    means, scales, quaternions, opacities, sh = gaussians
+    bases = sh.shape[1]
     height, width = images.shape[-2:]
     cameras = list(zip(w2cs, intrinsics, strict=True))
-    factors = [weights(*shapes, w2c, intrinsic, width, height) for w2c, intrinsic in cameras]
+    factors = [weights(means, scales, quaternions, opacities, *camera, width, height) for camera in cameras]
     contributions = sum(factor.sum(0) for factor in factors)
     degrees = torch.tensor([math.isqrt(basis) for basis in range(bases)], dtype=sh.dtype)
     bounds = bases * (2 * degrees + 1).sqrt() / (4 * math.pi)
