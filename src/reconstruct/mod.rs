@@ -93,9 +93,10 @@ impl Reconstruction {
     }
 }
 
-/// Runs the model once over `photos`, which are converted to the views that it sees ([`Input`]), with the photos' depths if its configuration
-/// has `data.depths`. Fits the colours to the photos by `data.colour_steps` steps afterwards. `targets` are poses (camera-to-world, in the capture's world) of target views: they take part in the
-/// normalization, as in the paper's protocol. Each photo takes part once, however many views it becomes.
+/// Runs the model once over `photos`, all of one size, which are converted to the views that it sees ([`Input`]). If its configuration has
+/// `data.depths`, the model gets the photos' depths, too; `data.colour_steps` steps fit the colours to the photos afterwards. `targets` are
+/// poses (camera-to-world, in the capture's world) of target views: they take part in the normalization, as in the paper's protocol. Each
+/// photo takes part once, however many views it becomes.
 ///
 /// # Errors
 /// Fails with fewer than two photos, with images whose sides aren't multiples of the model's patch size, or if rendering to the photos'
