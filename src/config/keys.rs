@@ -16,11 +16,12 @@ const RENAMED: [(&str, &str); 6] = [
 /// Former keys that are still accepted, but have no effect any more.
 const REMOVED: [&str; 2] = ["data.extents", "data.scene_scales"];
 
-/// Gives every key of `table` its current name, and removes keys without effect.
-pub(super) fn rename_former(table: &mut toml::Table) {
+/// Gives every key of `table` its current name, and removes keys without effect. Returns `true` if it removed any.
+pub(super) fn rename_former(table: &mut toml::Table) -> bool {
+    let mut has_removed = false;
     for (section, key) in REMOVED.map(dotted) {
         if let Some(toml::Value::Table(section)) = table.get_mut(section) {
-            section.remove(key);
+            has_removed |= section.remove(key).is_some();
         }
     }
     for (former, current) in RENAMED {
@@ -31,6 +32,7 @@ pub(super) fn rename_former(table: &mut toml::Table) {
             section.insert(current.into(), value);
         }
     }
+    has_removed
 }
 
 /// Splits `section.key`.

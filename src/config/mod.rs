@@ -50,15 +50,16 @@ impl Config {
     /// # Errors
     /// Returns an error if `text` isn't TOML, a key is unknown, a value has the wrong type, or values don't fit together.
     pub fn parse(text: &str, overrides: &[String], origin: &Path) -> Result<Self> {
-        // Parse the file without overrides first, so that its errors give a line.
+        // Parse the file without overrides first, so that its errors give a line. Keys that were removed would be unknown.
         let mut table: toml::Table = text
             .parse()
             .map_err(|e: toml::de::Error| Error::input(origin, "the file", one_line(&e, text), "TOML"))?;
         let described = |e: toml::de::Error| {
             Error::input(origin, "a key", one_line(&e, text), "a configuration of globalsplat")
         };
-        toml::from_str::<Config>(text).map_err(described)?;
-        rename_former(&mut table);
+        if !rename_former(&mut table) {
+            toml::from_str::<Config>(text).map_err(described)?;
+        }
         for assignment in overrides {
             override_key(&mut table, assignment)?;
             let config: std::result::Result<Config, _> = table.clone().try_into();

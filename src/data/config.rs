@@ -57,10 +57,6 @@ pub struct DataConfig {
     /// Number of least-squares steps by which the colours of a reconstruction are fitted to its photos (spec 9.9), in
     /// validation, too. 0 leaves the network's colours as they are.
     pub colour_steps: usize,
-    /// Former key for scales of the scene that were tried one by one. It has no effect any more.
-    #[doc(hidden)]
-    #[serde(rename = "scene_scales", alias = "extents", skip_serializing)]
-    pub former_scene_scales: serde::de::IgnoredAny,
     /// Maximum number of context views per scene in a training step.
     pub context_views: usize,
     /// Minimum number of context views. If it isn't 0, every step draws the number of context views from this to `context_views`.
@@ -105,7 +101,6 @@ impl Default for DataConfig {
             image_size: [256, 256].into(),
             depths: false,
             colour_steps: 0,
-            former_scene_scales: serde::de::IgnoredAny,
             context_views: 24,
             min_context_views: 0,
             target_views: 12,
