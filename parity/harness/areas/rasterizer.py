@@ -149,16 +149,15 @@ def rasterizer_reference(config, params, inputs):
 @case
 def colour_fit(rng):
     """Spherical harmonics of all degrees, fitted to images of which some pixels count half or not at all."""
-    for cameras, count, bases, size in [(2, 30, 16, (24, 20)), (3, 20, 4, (16, 16)), (1, 12, 1, (9, 30))]:
-        label, (size, make) = scenes.random_scene(size, 1, cameras, count, bases)
-        config = scenes.settings(size) | {"steps": 6}
-        for _ in range(MOST_TRIES):
-            inputs = make(rng, size)
-            if not doubtful_pixels(config, inputs, DOUBT[np.float64]).any():
-                break
-        inputs["images"] = rng.uniform(0.0, 1.0, (1, cameras, 3, *size))
-        inputs["masks"] = rng.choice([0.0, 0.5, 1.0], (1, cameras, 1, *size))
-        yield Draw(label, inputs, config, tolerance=FLOAT64)
+    shapes = [((24, 20), 2, 30, 16), ((16, 16), 3, 20, 4), ((9, 30), 1, 12, 1)]
+    family = dict(scenes.random_scene(size, 1, *counts) for size, *counts in shapes)
+    for scene in splat_draws(rng, "rasterizer", np.float64, family, FLOAT64):
+        cameras, size = scene.inputs["w2c"].shape[1], (scene.config["height"], scene.config["width"])
+        images = {
+            "images": rng.uniform(0.0, 1.0, (1, cameras, 3, *size)),
+            "masks": rng.choice([0.0, 0.5, 1.0], (1, cameras, 1, *size)),
+        }
+        yield Draw(scene.label, scene.inputs | images, scene.config | {"steps": 6}, tolerance=FLOAT64)
 
 
 @reference_for("colour_fit")
