@@ -1,8 +1,10 @@
-//! Initial Gaussians from photos, or from photos and points.
+//! Initial Gaussians from photos, from photos and points, or from known Gaussians that agree with the photos.
 
 use super::exposures::{ExposureCorrection, LogGains};
 use crate::data::{Pixels, Point, View};
-use crate::scene::{RawGaussians, SH_C0};
+use crate::error::Result;
+use crate::render::contributions;
+use crate::scene::{Camera, RawGaussians, SH_C0};
 use crate::stereo::{DepthMap, PlaneSweepOutput, SWEEP_SIDE, SmallPhoto, projection, sweep};
 use glam::DVec3;
 use rand::seq::index::sample;
@@ -39,13 +41,12 @@ pub struct InitialScene {
 }
 
 /// Creates `count` Gaussians at the depths on which the photos agree, and at `points` of the scene, if some are known. The size of each
-/// matches the part of the images that it covers. Those of the `known` Gaussians, at most `count`, that don't contradict the photos are
-/// kept. At least two views are required. `should_continue` is called before each photo with the number of photos that are done. If it
-/// returns `false`, Gaussians are created from the photos that are done, or `None` is returned if there are none.
+/// matches the part of the images that it covers. At least two views are required. `should_continue` is called before each photo with the
+/// number of photos that are done. If it returns `false`, Gaussians are created from the photos that are done, or `None` is returned if there
+/// are none.
 pub fn gaussians_from_photos(
     views: &[View],
     points: &[Point],
-    known: Option<&RawGaussians>,
     count: usize,
     seed: u64,
     exposures: ExposureCorrection,
@@ -64,15 +65,7 @@ pub fn gaussians_from_photos(
         }
     }
     let depth_maps: Vec<DepthMap> = depth_maps.into_iter().map(|(_, map)| map).collect();
-    let sampled = |count: usize| sample_gaussians(&depth_maps, points, count, seed);
-    let gaussians = match known {
-        None => sampled(count),
-        Some(known) => {
-            let kept = known.select(&supported(known, &depth_maps)).to_device(Device::Cpu);
-            let left = count.saturating_sub(kept.means.size()[1] as usize);
-            kept.concat(&sampled(left))
-        }
-    };
+    let gaussians = sample_gaussians(&depth_maps, points, count, seed);
     Some(InitialScene { gaussians, depth_maps, log_exposures })
 }
 
@@ -81,6 +74,24 @@ pub(super) fn small_photo(view: &View, longest_side: f64) -> SmallPhoto {
     let on_cpu = |pixels: &Pixels| pixels.to_float().to_device(Device::Cpu);
     let (image, mask) = (on_cpu(&view.image), view.mask.as_ref().map(on_cpu));
     SmallPhoto::new(&view.name, &image, mask.as_ref(), view.camera, longest_side)
+}
+
+/// Returns at most `count` of the `known` Gaussians, on the CPU: of those that don't contradict the photos of `depth_maps`, the ones that
+/// contribute the most to them.
+///
+/// # Errors
+/// Fails if rendering fails.
+pub(super) fn most_visible(
+    known: &RawGaussians,
+    depth_maps: &[DepthMap],
+    count: usize,
+) -> Result<RawGaussians> {
+    let supported = known.select(&supported(known, depth_maps)).to_device(Device::Cpu);
+    let cameras: Vec<Camera> = depth_maps.iter().map(|map| map.camera).collect();
+    let contributions = contributions(&supported.activate(), &cameras)?;
+    let mut order: Vec<usize> = (0..contributions.len()).collect();
+    order.sort_by(|&a, &b| contributions[b].total_cmp(&contributions[a]));
+    Ok(supported.select(&order.into_iter().take(count).map(|i| i as i64).collect::<Vec<_>>()))
 }
 
 /// Returns the indices of the Gaussians that the photos support. A Gaussian must not be in front of a depth that a photo is sure of, and at
@@ -209,7 +220,7 @@ fn raw(balls: &[IsotropicGaussian]) -> RawGaussians {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::{Camera, Intrinsics};
+    use crate::scene::Camera;
     use glam::DMat4;
 
     /// Gaussians that contradict the photos are removed. Two cameras are sure of a wall at depth 4, the second only in the left half of its
@@ -267,35 +278,28 @@ mod tests {
         assert!((50..85).contains(&left), "{left}");
     }
 
-    /// Known Gaussians are filled up to the requested count. Those that are kept come first, and none is dropped below that count.
+    /// Of known Gaussians, those are kept that don't contradict the photos and contribute the most, up to the requested number.
     #[test]
-    fn known_gaussians_are_filled_up_to_the_count() {
-        let view = |x: f64| {
-            let camera = Camera {
-                intrinsics: Intrinsics { fx: 30., fy: 30., cx: 16., cy: 16. },
-                c2w: DMat4::from_translation(DVec3::new(x, 0., 0.)),
-                width: 32,
-                height: 32,
-            };
-            View {
-                name: String::new(),
-                image: Tensor::zeros([3, 32, 32], (Kind::Float, Device::Cpu)).into(),
-                mask: None,
-                camera,
-            }
+    fn the_most_visible_gaussians_are_kept() {
+        let options = (Kind::Float, Device::Cpu);
+        let wall = DepthMap {
+            sure: Tensor::ones([16, 16], (Kind::Bool, Device::Cpu)),
+            ..DepthMap::flat(16, 16, 4.)
         };
-        let views = [view(0.), view(0.2)];
-        let begun = |known: Option<&RawGaussians>, count: usize, seed: u64| {
-            let off = ExposureCorrection::Off;
-            gaussians_from_photos(&views, &[], known, count, seed, off, |_| true).expect("depths").gaussians
+        // The first is in front of the wall, which a photo is sure of; the others are on it, and the last one is the largest.
+        let means = [[0f32, 0., 2.], [-0.5, 0., 4.], [0.5, 0., 4.]];
+        let known = RawGaussians {
+            means: Tensor::from_slice(means.as_flattened()).view([1, 3, 3]),
+            log_scales: Tensor::from_slice(&[-1f32, -2., -1.]).view([1, 3, 1]).repeat([1, 1, 3]),
+            quaternions: Tensor::from_slice(&[1f32, 0., 0., 0.]).repeat([1, 3, 1]),
+            opacity_logits: Tensor::zeros([1, 3], options),
+            sh: Tensor::zeros([1, 3, 1, 3], options),
         };
-        let known = begun(None, 50, 1);
-        let filled = begun(Some(&known), 80, 2);
-        assert_eq!(filled.means.size(), [1, 80, 3]);
-        // No photo is sure of a depth, as all pixels are black, so all known Gaussians stay.
-        assert!(filled.means.narrow(1, 0, 50).equal(&known.means));
-        assert_eq!(begun(Some(&known), 50, 2).means.size(), [1, 50, 3]);
-        let auto = ExposureCorrection::Auto;
-        assert!(gaussians_from_photos(&views, &[], None, 50, 1, auto, |_| false).is_none());
+        for (count, expected) in [(0, &[][..]), (1, &[2]), (2, &[2, 1]), (9, &[2, 1])] {
+            let kept = most_visible(&known, std::slice::from_ref(&wall), count).unwrap();
+            assert!(kept.means.equal(&known.select(expected).means), "{count}");
+        }
+        let hidden = known.select(&[0]);
+        assert_eq!(most_visible(&hidden, &[wall], 5).unwrap().means.size(), [1, 0, 3]);
     }
 }

@@ -251,9 +251,8 @@ mod tests {
     fn initial_colours_have_the_average_exposure() {
         let gains = [0.8, 1.25, 1.];
         let views: Vec<View> = [-0.5, 0., 0.5].into_iter().zip(gains).map(|(x, g)| wall(x, [g; 3])).collect();
-        let initial = |correction| {
-            gaussians_from_photos(&views, &[], None, 900, 0, correction, |_| true).expect("depths")
-        };
+        let initial =
+            |correction| gaussians_from_photos(&views, &[], 900, 0, correction, |_| true).expect("depths");
         // Brightness of the Gaussians of each photo, relative to all: a third of them come from each.
         let brightness = |scene: &InitialScene| {
             let colours = &scene.gaussians.sh * SH_C0 + 0.5;

@@ -301,8 +301,7 @@ mod tests {
         let _guard = num_threads::change();
         let config = RefineConfig::default();
         let off = ExposureCorrection::Off;
-        let raw =
-            gaussians_from_photos(start, &[], None, 400, seed, off, |_| true).expect("depths").gaussians;
+        let raw = gaussians_from_photos(start, &[], 400, seed, off, |_| true).expect("depths").gaussians;
         let depth = scene_depth(&raw.activate(), views).unwrap();
         let mut optimizer = GaussianOptimizer::new(&raw, depth, &config, 0);
         let photos = Photos::new(views, &[], &config, Device::Cpu);
@@ -366,13 +365,19 @@ mod tests {
         assert!(ignored[1] > 4. * random[1], "{random:?}, {ignored:?}");
     }
 
+    #[test]
+    fn without_any_depths_there_are_no_gaussians() {
+        let [_, views] = wall(false);
+        assert!(gaussians_from_photos(&views, &[], 40, 0, ExposureCorrection::Auto, |_| false).is_none());
+    }
+
     /// The number of Gaussians grows to the requested one, also if no relocation is due.
     #[test]
     fn the_number_of_gaussians_grows() {
         let _guard = num_threads::change();
         let [_, views] = wall(false);
         let off = ExposureCorrection::Off;
-        let raw = gaussians_from_photos(&views, &[], None, 40, 0, off, |_| true).expect("depths").gaussians;
+        let raw = gaussians_from_photos(&views, &[], 40, 0, off, |_| true).expect("depths").gaussians;
         let depth = scene_depth(&raw.activate(), &views).unwrap();
         for relocate_every in [0, 3] {
             let config = RefineConfig { relocate_every, ..RefineConfig::default() };

@@ -1,7 +1,7 @@
 //! Refinement session from a capture to Gaussians: reads the photos, creates the initial Gaussians, optimizes them, and scores them on a
 //! few views during the optimization. All of it shares one budget and uses a local frame of the capture (spec 2.5).
 
-use super::begin::{InitialScene, gaussians_from_photos};
+use super::begin::{InitialScene, gaussians_from_photos, most_visible};
 use super::config::RefineConfig;
 use super::corrections::{Correction, Corrections};
 use super::exposures::{ExposureCorrection, LogGains};
@@ -15,7 +15,7 @@ use crate::data::{Capture, Point, View, read_points};
 use crate::error::{Error, Result};
 use crate::eval::{CaptureScores, ContactSheet, Perceptual, score_views};
 use crate::io::Splat;
-use crate::reconstruct::{LoadedModel, reconstruct, spread_over_path};
+use crate::reconstruct::{LoadedModel, Model, reconstruct, spread_over_path};
 use crate::scene::{Camera, Gaussians, LocalFrame, RawGaussians};
 use crate::stereo::DepthMap;
 use serde::Serialize;
@@ -33,6 +33,8 @@ const FEW_PHOTOS: usize = 2;
 const MAX_SCORING_SHARE: f64 = 0.03;
 /// Maximum fraction of the time for scoring whole held-out views before the optimization, and again for scoring them after it.
 const MAX_WHOLE_SCORING_SHARE: f64 = 0.05;
+/// Divisor of the maximum number of initial Gaussians of a model: 1/`MODEL_SHARE` of all.
+const MODEL_SHARE: usize = 3;
 /// Estimated time for writing the splat and ending the program: a constant, and the time per Gaussian.
 const WRITING_TIME: Duration = Duration::from_millis(200);
 const WRITING_TIME_PER_GAUSSIAN: Duration = Duration::from_micros(2);
@@ -333,7 +335,8 @@ impl<'a> RefineSession<'a> {
             Initial::State(state) => {
                 self.config.antialiased |= state.record.antialiased;
                 if state.record.has_depths {
-                    let _ = self.gaussians_from_photos(None)?.ok_or_else(stopped)?;
+                    let _ =
+                        self.gaussians_from_photos(self.options.initial_gaussians())?.ok_or_else(stopped)?;
                 }
                 let RefineOptions { gaussians, correct_exposures, device, .. } = self.options;
                 if *correct_exposures == ExposureCorrection::Auto {
@@ -351,7 +354,11 @@ impl<'a> RefineSession<'a> {
                     .into_iter()
                     .map(|index| self.photos[index].fitted(data.image_size))
                     .collect::<Result<Vec<_>>>()?;
-                Start::Model(reconstruct(loaded, &context, &[])?.in_world().to_device(self.options.device))
+                // The optimization fits the colours, too.
+                let mut config = loaded.config.clone();
+                config.data.colour_steps = 0;
+                let model = Model { config: &config, ..loaded.into() };
+                Start::Model(reconstruct(model, &context, &[])?.in_world().to_device(self.options.device))
             }
             Initial::Photos => {
                 if self.photos.len() < 2 {
@@ -362,7 +369,8 @@ impl<'a> RefineSession<'a> {
                     let line = "the photos were all taken from one position, so that depth can't be estimated: everything is placed at one distance";
                     warnings.push(format!("{}: {line}", self.capture.name));
                 }
-                let gaussians = self.gaussians_from_photos(None)?.ok_or_else(stopped)?;
+                let gaussians =
+                    self.gaussians_from_photos(self.options.initial_gaussians())?.ok_or_else(stopped)?;
                 warnings.extend(self.exposure_warning());
                 Start::Photos(gaussians)
             }
@@ -586,9 +594,8 @@ impl<'a> RefineSession<'a> {
         ))
     }
 
-    /// Creates the requested number of Gaussians on the session's device, and keeps those of the `known` Gaussians that don't contradict
-    /// the photos. Returns `None` if the work is ended before any photo has depths.
-    fn gaussians_from_photos(&mut self, known: Option<&RawGaussians>) -> Result<Option<RawGaussians>> {
+    /// Creates `count` Gaussians on the session's device. Returns `None` if the work is ended before any photo has depths.
+    fn gaussians_from_photos(&mut self, count: usize) -> Result<Option<RawGaussians>> {
         let to_local = |point: Point| Point { position: self.frame.point_to_local(point.position), ..point };
         let points: Vec<Point> = read_points(self.capture)?.into_iter().map(to_local).collect();
         let (clock, budget, on_event) = (self.clock, self.options.budget, &mut self.on_event);
@@ -602,9 +609,7 @@ impl<'a> RefineSession<'a> {
             !is_stopped && !is_late
         };
         let RefineOptions { seed, correct_exposures: correction, .. } = *self.options;
-        let count = if known.is_some() { self.options.gaussians } else { self.options.initial_gaussians() };
-        let made =
-            gaussians_from_photos(&self.photos, &points, known, count, seed, correction, should_continue);
+        let made = gaussians_from_photos(&self.photos, &points, count, seed, correction, should_continue);
         self.is_stopped |= is_stopped;
         let Some(InitialScene { gaussians, depth_maps, log_exposures }) = made else { return Ok(None) };
         self.depth_maps = depth_maps;
@@ -653,7 +658,7 @@ impl<'a> RefineSession<'a> {
                 (GaussianOptimizer::new(&raw, depth, &config, final_count), depth, None)
             }
             Start::Model(gaussians) => {
-                let raw = self.filled(&gaussians)?;
+                let raw = self.with_gaussians_from_photos(&gaussians)?;
                 let depth = scene_depth(&raw.activate(), &self.photos)?;
                 (GaussianOptimizer::new(&raw, depth, &config, final_count), depth, None)
             }
@@ -737,20 +742,22 @@ impl<'a> RefineSession<'a> {
         Err(Error::input(state.file(), "the refinement", format!("one of {used} already"), expected))
     }
 
-    /// Fills up to the requested number of Gaussians with new ones at the depths on which the photos agree. They also replace Gaussians
-    /// that contradict the photos.
-    fn filled(&mut self, gaussians: &Gaussians) -> Result<RawGaussians> {
+    /// Returns the Gaussians of a model that the photos show best, and new ones at the depths on which the photos agree. As few as from photos
+    /// alone are faster to optimize, and grow to the requested number.
+    fn with_gaussians_from_photos(&mut self, gaussians: &Gaussians) -> Result<RawGaussians> {
         let mut raw = RawGaussians::from_gaussians(gaussians);
-        if self.photos.len() < 2 || gaussians.count() >= self.options.gaussians as i64 {
+        if self.photos.len() < 2 {
             return Ok(raw);
         }
         // Higher spherical harmonics are added later, for all Gaussians at the same time.
         raw.sh = raw.sh.narrow(2, 0, 1);
-        let filled = self.gaussians_from_photos(Some(&raw))?.unwrap_or(raw);
+        let count = self.options.initial_gaussians();
+        let of_model = count / MODEL_SHARE;
+        let Some(new) = self.gaussians_from_photos(count - of_model)? else { return Ok(raw) };
         if let Some(line) = self.exposure_warning() {
             self.warn(&line);
         }
-        Ok(filled)
+        Ok(most_visible(&raw, &self.depth_maps, of_model)?.to_device(self.options.device).concat(&new))
     }
 
     /// Returns `true` if another scoring keeps the total time of scoring below its maximum fraction of the time since the clock began.

@@ -68,6 +68,19 @@ fn photos_alone_become_a_splat() {
     assert!(sheet.is_file());
 }
 
+/// A refinement from a model's reconstruction improves it and has the requested number of Gaussians, even if these are fewer than the model's.
+#[test]
+fn a_reconstruction_becomes_a_splat_of_the_requested_size() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scene, out) = (world(folder.path(), "64"), folder.path().join("a.ply"));
+    let options = ["--from", "weights", "--gaussians", "4000", "--steps", "400", "--holdout", "every:4+1"];
+    let done =
+        run_json(&[&["refine", "--scene", &scene, "--out", arg(&out), "--json"], &options[..]].concat());
+    let (before, after) = (number(&done, "/held_out/before/psnr"), number(&done, "/held_out/after/psnr"));
+    assert!(after > before + 1., "{before} → {after}");
+    assert_eq!(done["gaussians"], 4000);
+}
+
 /// Commands leave out what the masks in a folder cover.
 #[test]
 fn masks_in_a_folder_are_left_out() {
@@ -122,7 +135,7 @@ fn threads_do_not_change_the_bytes() {
         let bytes = |name: &str, threads: &str, seed: &str| {
             let out = folder.path().join(name);
             let mut arguments =
-                vec!["refine", "--scene", &scene, "--out", arg(&out), "--steps", "30", "--seed", seed];
+                vec!["refine", "--scene", &scene, "--out", arg(&out), "--steps", "60", "--seed", seed];
             arguments.extend(["--set", "relocate_every=7"]);
             arguments.extend(options);
             let done = command(&arguments).env("OMP_NUM_THREADS", threads).output().unwrap();
@@ -504,7 +517,7 @@ fn colmap_points_initialize_gaussians() {
         // Nine tenths of the Gaussians are at points, the others on pixels.
         let views = load_all_views(&capture, None).unwrap();
         let off = ExposureCorrection::Off;
-        let scene = gaussians_from_photos(&views, &points, None, 1000, 0, off, |_| true).expect("depths");
+        let scene = gaussians_from_photos(&views, &points, 1000, 0, off, |_| true).expect("depths");
         let begun: Vec<f64> = Vec::try_from(scene.gaussians.means.to_kind(Kind::Double).view([-1])).unwrap();
         let at_points = begun
             .chunks(3)

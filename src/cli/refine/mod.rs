@@ -61,8 +61,8 @@ pub struct Refine {
     /// world's origin, as in UTM coordinates, float32 loses detail
     #[arg(long)]
     local_origin: bool,
-    /// Number of Gaussians, not allowed with --splat; a model's reconstruction may have more. auto: 16384 to 1000000, by --seconds,
-    /// the number of cores and the photos; 16384 with --steps
+    /// Number of Gaussians, not allowed with --splat. auto: 16384 to 1000000, by --seconds, the number of cores and the photos; 16384
+    /// with --steps
     #[arg(long, value_name = "N|auto", default_value = "auto", value_parser = parse_gaussians)]
     gaussians: GaussianCount,
     /// Total time in seconds, from the start of the program to its end
