@@ -2,7 +2,7 @@
 
 use super::neighbours::neighbour_distances;
 use crate::error::{Error, Result};
-use crate::render::{contributions, orbit_around_splat};
+use crate::render::{contributions, largest_contributions, orbit_around_splat};
 use crate::scene::{Camera, Gaussians, splat_frame};
 use glam::{DMat3, DMat4, DVec3};
 use globalsplat_splat_file::Splat;
@@ -114,12 +114,9 @@ impl EditedSplat {
                     [] => orbit_around_splat(&self.splat),
                     cameras => move_cameras(cameras, &self.from_original),
                 };
-                let contributions = self.contributions(&cameras)?;
-                let mut order: Vec<usize> = (0..self.splat.len()).collect();
-                order.sort_by(|&a, &b| contributions[b].total_cmp(&contributions[a]));
-                order.truncate(*count);
-                order.sort_unstable();
-                self.splat = self.splat.select(&order);
+                let mut kept = largest_contributions(&self.contributions(&cameras)?, *count);
+                kept.sort_unstable();
+                self.splat = self.splat.select(&kept);
             }
             SplatEdit::Merge(other) => self.splat = self.splat.merged(other),
         }

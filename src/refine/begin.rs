@@ -3,7 +3,7 @@
 use super::exposures::{ExposureCorrection, LogGains};
 use crate::data::{Pixels, Point, View};
 use crate::error::Result;
-use crate::render::contributions;
+use crate::render::{contributions, largest_contributions};
 use crate::scene::{Camera, RawGaussians, SH_C0};
 use crate::stereo::{DepthMap, PlaneSweepOutput, SWEEP_SIDE, SmallPhoto, projection, sweep};
 use glam::DVec3;
@@ -89,9 +89,8 @@ pub(super) fn most_visible(
     let supported = known.select(&supported(known, depth_maps)).to_device(Device::Cpu);
     let cameras: Vec<Camera> = depth_maps.iter().map(|map| map.camera).collect();
     let contributions = contributions(&supported.activate(), &cameras)?;
-    let mut order: Vec<usize> = (0..contributions.len()).collect();
-    order.sort_by(|&a, &b| contributions[b].total_cmp(&contributions[a]));
-    Ok(supported.select(&order.into_iter().take(count).map(|i| i as i64).collect::<Vec<_>>()))
+    let kept = largest_contributions(&contributions, count).into_iter().map(|index| index as i64);
+    Ok(supported.select(&kept.collect::<Vec<_>>()))
 }
 
 /// Returns the indices of the Gaussians that the photos support. A Gaussian must not be in front of a depth that a photo is sure of, and at

@@ -20,6 +20,14 @@ pub fn contributions(gaussians: &Gaussians, cameras: &[Camera]) -> Result<Vec<f3
     Ok(Vec::try_from(total.view([-1]))?)
 }
 
+/// Returns the indices of the `count` Gaussians, or of all if there are fewer, with the largest `contributions`, the largest first.
+pub(crate) fn largest_contributions(contributions: &[f32], count: usize) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..contributions.len()).collect();
+    order.sort_by(|&a, &b| contributions[b].total_cmp(&contributions[a]));
+    order.truncate(count);
+    order
+}
+
 /// Returns the contribution of each Gaussian to the images of `cameras` together, [B, N], as [`contributions`] does.
 ///
 /// # Errors

@@ -10,7 +10,7 @@ mod views;
 
 use crate::ffi::take_outputs;
 pub use contribution::contributions;
-pub(crate) use contribution::image_contributions;
+pub(crate) use contribution::{image_contributions, largest_contributions};
 pub use harmonics::{compensate_mean_colour, fit_harmonics, shrink_harmonics};
 pub use orbit::{orbit_around_gaussians, orbit_around_splat};
 pub use transform::transform;
