@@ -14,6 +14,7 @@ import pytest
 import torch
 from globalsplat import _torch
 from globalsplat.reference.normalize import normalize_scene
+from globalsplat.reference.splat import sh_colour
 
 # Formats, and the PSNR in dB that a render may lose in each. A .splat has one color of each Gaussian, and is compared with the mean colors.
 FORMATS = {"ply": 0.01, "compressed.ply": 0.3, "sog": 0.3, "spz": 0.3, "splat": 0.3, "glb": 0.01}
@@ -50,11 +51,9 @@ def psnr(image, photo):
 
 def with_mean_colors(splat, capture):
     """Returns the splat with the mean of each Gaussian's colors toward the cameras of the capture, from 0 to 1."""
-    centers = torch.from_numpy(capture.viewmats).float().inverse()[:, :3, 3]
-    x, y, z = torch.nn.functional.normalize(splat["means"] - centers[:, None], dim=-1).mean(0).unbind(-1)
-    basis = torch.stack([torch.ones_like(x), -math.sqrt(3) * y, math.sqrt(3) * z, -math.sqrt(3) * x], -1)
-    limit = math.sqrt(math.pi)  # of SH of degree 0, for colors from 0 to 1
-    return {**splat, "colors": (basis[:, None] @ splat["colors"]).clamp(-limit, limit), "sh_degree": 0}
+    viewmats = torch.from_numpy(capture.viewmats).float()
+    colors = torch.stack([sh_colour(splat["means"], splat["colors"], viewmat) for viewmat in viewmats]).mean(0)
+    return {**splat, "colors": (colors.clamp(max=1.0) - 0.5)[:, None] * math.sqrt(4 * math.pi), "sh_degree": 0}
 
 
 def test_the_program_runs_on_the_installed_torch(tmp_path):
