@@ -7,7 +7,7 @@ export PYTHONUTF8 := 1
 .NOTPARALLEL:
 CARGO ?= cargo
 
-.PHONY: all setup venv weights poses build demo demo-training gpu-bundle test checks parity bench docker clean
+.PHONY: setup venv weights poses build demo demo-training gpu-bundle test bench docker clean
 .DEFAULT_GOAL := build
 
 # Checks the build requirements and reports what is missing; creates .venv with libtorch unless LIBTORCH names another libtorch.
@@ -26,8 +26,11 @@ weights:
 poses:
 	@scripts/setup.sh poses
 
+# What every build, lint and test is compiled with: the same packages with the same features, so that nothing is compiled twice.
+ALL := --release --locked --workspace
+
 build: setup
-	@scripts/heartbeat.sh building $(CARGO) build --release --locked
+	@scripts/heartbeat.sh building $(CARGO) build $(ALL)
 
 # Reconstructs a splat from photos, refines it, and writes an interactive viewer page: at most 3 minutes once the program is built.
 demo: build
@@ -47,92 +50,98 @@ gpu-bundle: build
 	@tar -tzf $(BUNDLE).tar.gz >$(BUNDLE).txt
 	@echo "$(BUNDLE).tar.gz: $$(du -h $(BUNDLE).tar.gz | cut -f1), $$(wc -l <$(BUNDLE).txt) files, listed in $(BUNDLE).txt"
 
-# Packs the program with all that it needs to run on another Linux without a GPU, into target/dist. See docs/start.md.
-.PHONY: dist
-dist: setup
-	@scripts/dist.sh
-
-# Builds the wheel of the Python package, python/, into target/wheels; check-wheel tests it in a fresh virtual environment.
-.PHONY: wheel check-wheel
-wheel: venv
-	@scripts/wheel.sh
-check-wheel: wheel
-	scripts/check_wheel.sh
-
-# Runs every check, even after one has failed; the last line reports how many tests were skipped and which requirement each lacked.
-test:
-	@scripts/count_skips.sh $(MAKE) --no-print-directory --keep-going checks
-
-# The checks for the edit loop: formatting, lints, types of the Python, and the unit tests of the crates without libtorch and of the library.
+# The checks for the edit loop: formatting, lints, types of the Python, unit tests.
 .PHONY: quick
 quick: check-format check-lints check-python
-	env -u LIBTORCH $(CARGO) test --locked --lib $(CRATES)
-	$(CARGO) test --release --locked --lib -p globalsplat -p globalsplat-csrc
+	$(CARGO) test $(ALL) --lib
 
-# WITHOUT names checks to leave out, such as one that has just been run.
-CHECKS := $(filter-out $(WITHOUT),check-crates check-format check-licenses check-lints check-python check-library check-docs check-tests)
+# What every change has to pass. Runs all checks, even after one has failed; the last line reports how many tests were skipped and which
+# requirement each lacked.
+test: build
+	@scripts/count_skips.sh $(MAKE) --no-print-directory --keep-going checks
+CHECKS := check-format check-crates check-lints check-python check-tests parity
 .PHONY: checks $(CHECKS)
-checks: $(CHECKS) parity
-$(filter-out check-crates,$(CHECKS)): venv
-
-# Tests the crates that need neither libtorch nor Python. They run without LIBTORCH, so that none comes to need it.
-CRATES := $(addprefix -p globalsplat-,files torch-file capture splat-file synth sfm)
-check-crates:
-	env -u LIBTORCH $(CARGO) test --locked $(CRATES)
-	env -u LIBTORCH $(CARGO) test --locked -p globalsplat-splat-file --no-default-features
-	env -u LIBTORCH $(CARGO) check --locked -p globalsplat-capture --no-default-features
-# Packages these crates as for crates.io, builds each package by itself, and checks that it has a README and the licenses. Needs cargo
-# 1.90 for packages that depend on each other.
-.PHONY: check-packages
-check-packages:
-	@# Packages of an earlier run have the same version, so cargo would take what it unpacked and compiled of them.
-	@rm -rf target/package target/debug/.fingerprint/globalsplat-* $(or $(CARGO_HOME),~/.cargo)/registry/src/-*/globalsplat-*
-	env -u LIBTORCH $(CARGO) package --locked --allow-dirty $(CRATES)
-	@for package in target/package/*.crate; do for file in README.md LICENSE-MIT LICENSE-APACHE; do \
-	    tar -tzf $$package | grep "/$$file$$" >/dev/null || { echo "$$package has no $$file" >&2; exit 1; }; done; done
+checks: $(CHECKS)
+$(CHECKS): venv
 
 check-format:
 	$(CARGO) fmt --all --check
-# Fails on a crate or a bundled npm package with a license that isn't allowed.
-check-licenses:
-	python3 scripts/licenses.py
+# The crates of CRATES need no libtorch.
+CRATES := files torch-file capture splat-file synth sfm
+check-crates:
+	@for crate in $(CRATES); do ! $(CARGO) tree --locked -e normal,build -p globalsplat-$$crate | grep -E "torch-sys|csrc" \
+	    || { echo "globalsplat-$$crate depends on libtorch" >&2; exit 1; }; done
 check-lints:
-	$(CARGO) clippy --release --locked --workspace --all-targets -- -D warnings
+	$(CARGO) clippy $(ALL) --all-targets -- -D warnings
 # Checks format, lints and types of all Python, with the settings of pyproject.toml.
 check-python:
 	.venv/bin/python -m ruff format --check .
 	.venv/bin/python -m ruff check .
 	.venv/bin/python -m mypy
-# Checks the library without the dependencies that only the program needs.
-check-library:
-	$(CARGO) check --release --locked --lib --no-default-features
-check-docs:
-	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --release --locked --no-deps
 check-tests:
-	$(CARGO) test --release --locked --no-fail-fast -p globalsplat -p globalsplat-csrc
+	$(CARGO) test $(ALL) --no-fail-fast
 
 # Compares every module, loss and kernel with plain PyTorch, and verifies that the comparison detects wrong results (--self-test). Then
-# repeats the comparisons that the CUDA kernels serve, with these kernels emulated on the CPU. The self-test covers a quarter of the cases
-# on each run, and another quarter after each commit.
-SELF_TEST ?= $(shell echo $$(($$(git rev-list --count HEAD 2>/dev/null || echo 0) % 4))/4)
-PARITY := parity-pytest parity-self-test parity-kernels
-.PHONY: $(PARITY)
-parity: $(PARITY)
-$(PARITY): venv build
-
-# Its tests use captures that an example of the library writes.
-parity-pytest:
-	$(CARGO) build --release --locked --example make_rooms
+# repeats the comparisons that the CUDA kernels serve, with these kernels emulated on the CPU.
+SELF_TEST ?= 0/8
+parity: build
+	$(CARGO) build $(ALL) --example make_rooms
 	.venv/bin/python -m pytest -q parity
-parity-self-test:
 	.venv/bin/python -m parity --self-test $(SELF_TEST)
-parity-kernels:
 	.venv/bin/python -m parity --only '[pr][ra]*_float32,photometric,ssim,depth_smoothness' --cuda-on-cpu 1 --self-test $(SELF_TEST)
 
-# The whole self-test instead of a quarter.
-.PHONY: parity-full
-parity-full:
-	$(MAKE) parity SELF_TEST=0/1
+# Everything: `make test`, and what takes longer than it finds. CONTRIBUTING.md says which change needs which part.
+SLOW_CHECKS := check-ignored check-docs check-features check-packages check-licenses check-robustness check-machines check-demos check-dist check-wheel
+.PHONY: test-all slow-checks $(SLOW_CHECKS)
+test-all: build
+	@scripts/count_skips.sh $(MAKE) --no-print-directory --keep-going SELF_TEST=0/1 checks slow-checks
+slow-checks: $(SLOW_CHECKS)
+$(SLOW_CHECKS): venv
+
+# Tests that are marked `ignore`, for their time.
+check-ignored:
+	$(CARGO) test $(ALL) --no-fail-fast -- --ignored
+check-docs:
+	RUSTDOCFLAGS="-D warnings" $(CARGO) doc $(ALL) --no-deps
+# The crates of CRATES without libtorch, with checks of overflow; the library without the program's dependencies, and the crates without
+# their optional ones.
+check-features:
+	env -u LIBTORCH $(CARGO) test --locked $(CRATES:%=-p globalsplat-%)
+	$(CARGO) check --release --locked --lib --no-default-features
+	env -u LIBTORCH $(CARGO) test --locked -p globalsplat-splat-file --no-default-features
+	env -u LIBTORCH $(CARGO) check --locked -p globalsplat-capture --no-default-features
+# Packages the crates that need no libtorch as for crates.io, builds each package by itself, and checks that it has a README and the
+# licenses. Needs cargo 1.90 for packages that depend on each other.
+check-packages:
+	@# Packages of an earlier run have the same version, so cargo would take what it unpacked and compiled of them.
+	@rm -rf target/package target/debug/.fingerprint/globalsplat-* $(or $(CARGO_HOME),~/.cargo)/registry/src/-*/globalsplat-*
+	env -u LIBTORCH $(CARGO) package --locked --allow-dirty $(CRATES:%=-p globalsplat-%)
+	@for package in target/package/*.crate; do for file in README.md LICENSE-MIT LICENSE-APACHE; do \
+	    tar -tzf $$package | grep "/$$file$$" >/dev/null || { echo "$$package has no $$file" >&2; exit 1; }; done; done
+# Fails on a crate or a bundled npm package with a license that isn't allowed.
+check-licenses:
+	python3 scripts/licenses.py
+# Sanitizers and injected write failures: see docs/robustness.md.
+check-robustness: build
+	scripts/sanitize.sh short
+	.venv/bin/python scripts/faults/run.py --short
+# The tests under the conditions of other machines: AVX2 only, no bf16, another user, a folder with a space; one core with SSE2.
+check-machines: build
+	scripts/other_machines.sh
+# The demo on synthetic scenes with its training, and the script for a GPU at a reduced size on the CPU.
+check-demos: build
+	CAPTURES=none OUT=target/demo_training scripts/demo.sh --training --dry-run
+	DEVICE=cpu OUT=target/on_a_gpu scripts/on_a_gpu.sh --dry-run
+# Packs the program with all that it needs to run on another Linux without a GPU, into target/dist. See docs/start.md.
+.PHONY: dist
+dist check-dist: setup
+	@scripts/dist.sh
+# Builds the wheel of the Python package, python/, into target/wheels; check-wheel tests it in a fresh virtual environment.
+.PHONY: wheel
+wheel: venv
+	@scripts/wheel.sh
+check-wheel: wheel
+	scripts/check_wheel.sh
 
 # Benchmarks the loading of training data, and the rasterizer: its speed, and how its time grows with Gaussians and pixels.
 bench: build

@@ -5,7 +5,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 target="${CARGO_TARGET_DIR:-target}"
-build=("${CARGO:-cargo}" build --release --locked)
+build=("${CARGO:-cargo}" build --release --locked --workspace)
 
 scripts/heartbeat.sh building "${build[@]}"
 mkdir -p "$target/linker"

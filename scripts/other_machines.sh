@@ -1,7 +1,6 @@
 #!/usr/bin/env bash
 # Runs tests again under the conditions of other machines:
 #   scripts/other_machines.sh            runs both `ordinary` and `small`
-#   scripts/other_machines.sh sample     runs `ordinary` on a quarter of the tests, another one after each commit, and the demo
 #   scripts/other_machines.sh ordinary   tests on AVX2 without AVX-512 and bf16, as a user who isn't root and has no home, in a
 #                                        folder with a space that only its owner may write to, in another language and time zone,
 #                                        without standard input; then the demo at a reduced size
@@ -32,7 +31,7 @@ for name in "${chosen[@]}"; do
         exit 2
     }
 done
-built="$("${CARGO:-cargo}" test --release --locked --no-run 2>&1)" || {
+built="$("${CARGO:-cargo}" test --release --locked --workspace --no-run 2>&1)" || {
     echo "$built" >&2
     exit 1
 }
@@ -47,13 +46,6 @@ tests="$(sed -nE \
 # processes, out of memory. They run here only if given by name.
 alike=(architecture citations cuda distributed refused_memory viewers)
 
-# With `sample`, one of the given number of shares of the tests runs, another one after each commit.
-shares=4 share="" counted=0
-# Counts a test, and fails if it isn't in the share that runs.
-is_sampled() {
-    [ -z "$share" ] || ((counted++ % shares == share))
-}
-
 failed=()
 # Runs the tests $2…, or all tests, with the command $1, limited to the chosen ones. Prints the missing requirements of skipped tests.
 run() {
@@ -67,7 +59,6 @@ run() {
         lib | main | file:*)
             [[ $# -eq 0 || " $* " == *" ${name#file:} "* ]] || continue
             [[ ${#chosen[@]} -eq 0 || " ${chosen[*]} " == *" ${name#file:} "* ]] || continue
-            is_sampled || continue
             ;;
         *)
             local file module
@@ -80,7 +71,6 @@ run() {
                 else
                     [[ " ${alike[*]} " != *" $module "* ]] || continue
                 fi
-                is_sampled || continue
                 filters+=("$module::")
             done
             [ ${#filters[@]} -gt 0 ] || continue
@@ -158,16 +148,12 @@ run_small() {
 case "${1:-all}" in
 ordinary) run_ordinary ;;
 small) run_small ;;
-sample)
-    share=$(($(git rev-list --count HEAD 2>/dev/null || echo 0) % shares))
-    run_ordinary
-    ;;
 all)
     run_ordinary
     run_small
     ;;
 *)
-    echo "other_machines: unknown machine $1, expected ordinary, small or sample" >&2
+    echo "other_machines: unknown machine $1, expected ordinary or small" >&2
     exit 2
     ;;
 esac
