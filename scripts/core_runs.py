@@ -8,6 +8,8 @@ from zlib import crc32
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PROGRAM = REPOSITORY / "target/release/globalsplat"
+# Arguments of `refine` at the size of the paper's images: photos are cropped and resized.
+SMALL = ["--size", "256x256"]
 
 
 def environment(**more):
@@ -48,26 +50,13 @@ def told(*command):
     return json.loads(subprocess.run([PROGRAM, *command, "--json"], stdout=subprocess.PIPE, check=True).stdout)
 
 
-def files_of(path):
-    """Returns the files that a path refers to: itself, all files in a folder, or index and shards of weights."""
-    index = path if path.name.endswith(".safetensors.index.json") else path.with_name(path.name + ".index.json")
-    if path.is_dir():
-        return sorted(file for file in path.rglob("*") if file.is_file())
-    if index.is_file() and (path == index or not path.exists()):
-        return [
-            index,
-            *sorted({index.with_name(name) for name in json.loads(index.read_text())["weight_map"].values()}),
-        ]
-    return [path] if path.is_file() else []
-
-
 def identity(command):
     """Returns a command's arguments, and a checksum of the files that they refer to, except the argument of --out."""
     inputs = [
         Path(str(argument)) for before, argument in zip(("", *command), command, strict=False) if before != "--out"
     ]
     checksum = 0
-    for file in (file for path in inputs for file in files_of(path)):
+    for file in (file for path in inputs for file in sorted([path, *path.rglob("*")]) if file.is_file()):
         with file.open("rb") as opened:
             while block := opened.read(1 << 20):
                 checksum = crc32(block, checksum)
@@ -84,6 +73,15 @@ def told_once(file, *command):
         partial.write_text(json.dumps(kept))
         partial.rename(file)
     return kept["told"]
+
+
+def refined(file, folder, holdout, seconds, *more):
+    """Refines with further arguments `more`; returns the JSON output, held-out scores included.
+
+    The output is cached in `file`, and the splat is beside it.
+    """
+    command = ["refine", "--scene", folder, "--holdout", holdout, *more]
+    return told_once(file, *command, "--seconds", str(seconds), "--out", file.with_suffix(".ply"))
 
 
 def row(*cells):

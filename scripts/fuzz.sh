@@ -4,7 +4,7 @@
 #   scripts/fuzz.sh [SECONDS each] [READER]…
 # Starts from fuzz/seeds and the corpora of earlier runs in fuzz/corpus. A failing input is saved in fuzz/artifacts. Once the bug is
 # fixed, move the input to fuzz/seeds, where `cargo test` reads it from then on. fuzz/runs.log records the number of inputs per reader.
-# Needs `cargo install cargo-fuzz`; scripts/fuzz_coverage.sh reports the code that the corpora reach.
+# Needs `cargo install cargo-fuzz`.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 seconds=${1:-120}

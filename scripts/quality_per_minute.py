@@ -19,9 +19,8 @@ import shlex
 import statistics
 from pathlib import Path
 
-from core_runs import row, told, told_once
+from core_runs import refined, row, told, told_once
 from line_plots import line_plots
-from refine_runs import refined
 
 # Quantiles of Student's t distribution for 95 % confidence, by the number of samples.
 STUDENT = {2: 12.71, 3: 4.30, 4: 3.18, 5: 2.78, 6: 2.57, 7: 2.45, 8: 2.36}

@@ -10,9 +10,8 @@ meanwhile. Completed runs are not repeated.
 import argparse
 from pathlib import Path
 
-from core_runs import row
+from core_runs import SMALL, refined, row
 from line_plots import line_plots
-from refine_runs import SMALL, refined
 
 STARTS = {"nothing": "photos alone", "weights": "bundled weights"}
 SECONDS = [2, 3, 5, 10, 20, 30, 60]

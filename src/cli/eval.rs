@@ -112,7 +112,7 @@ pub struct Eval {
 impl Eval {
     pub fn run(self) -> Result<()> {
         check_views(self.views)?;
-        let why = "whole and repeated were removed, as they gained nothing: see docs/high_resolution.md";
+        let why = "whole and repeated were removed, as they gained nothing: see docs/experiments.md";
         check_former_option("--views-as", self.views_as.as_deref(), "polyphase", why)?;
         match &self.scene {
             Some(scene) => self.run_scene(scene, device::parse(&self.device)?),

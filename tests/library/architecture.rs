@@ -56,15 +56,13 @@ fn modules_of_a_folder_form_no_cycle() {
     assert!(left.is_empty(), "cycles, or what uses them: {left:?}");
 }
 
-/// Every module has a box in the figure, and a line in CONTRIBUTING.md, where they come in the order of the layers.
+/// Every module has a line in CONTRIBUTING.md, where they come in the order of the layers.
 #[test]
-fn every_module_is_in_the_diagram_and_on_the_page() {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let [figure, page] = ["docs/architecture.svg", "CONTRIBUTING.md"]
-        .map(|file| std::fs::read_to_string(root.join(file)).unwrap_or_else(|e| panic!("{file}: {e}")));
+fn every_module_is_on_the_page() {
+    let page = Path::new(env!("CARGO_MANIFEST_DIR")).join("CONTRIBUTING.md");
+    let page = std::fs::read_to_string(&page).expect("CONTRIBUTING.md");
     let mut below = page.as_str();
     for module in LAYERS.into_iter().chain(["error", "ffi"]) {
-        assert!(figure.contains(&format!(">{module}</tspan>")), "docs/architecture.svg has no box {module}");
         let line = below.find(&format!("\n    {module} "));
         let line = line.unwrap_or_else(|| panic!("{module} is not in its place in CONTRIBUTING.md"));
         below = &below[line + 1..];

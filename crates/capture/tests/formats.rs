@@ -598,7 +598,7 @@ fn a_model_with_a_rig_has_the_poses_of_its_photos() {
     let pose = |[w, x, y, z]: [f64; 4], translation: [f64; 3]| {
         DMat4::from_rotation_translation(DQuat::from_xyzw(x, y, z, w).normalize(), translation.into())
     };
-    // As in scripts/lens_reference.py.
+    // As in the model, which pycolmap 4.2.1 wrote.
     let right_from_left = pose([0.9, 0.1, 0.2, -0.3], [0.3, -0.1, 0.2]);
     for form in ["bin", "txt"] {
         let folder = tempfile::tempdir().unwrap();

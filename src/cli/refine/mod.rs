@@ -153,7 +153,7 @@ impl Refine {
         let options = self.options(holdout)?;
         let needs_model = self.needs_model()?;
         let why =
-            "tokens and both were removed, as they gained nothing over gaussians: see docs/lab_refinement.md";
+            "tokens and both were removed, as they gained nothing over gaussians: see docs/experiments.md";
         check_former_option("--space", self.space.as_deref(), "gaussians", why)?;
         let initial = match self.splat {
             Some(splat) => InitialFile::Splat(splat),
