@@ -36,7 +36,6 @@ mod splat_out;
 mod synth;
 mod train;
 mod view;
-mod watch;
 mod weights_out;
 
 use clap::{CommandFactory, Parser, Subcommand};
@@ -69,7 +68,6 @@ struct Cli {
 enum Command {
     Capture(capture::Capture),
     Train(train::Train),
-    Watch(watch::Watch),
     Eval(eval::Eval),
     Report(report::Report),
     Reconstruct(reconstruct::Reconstruct),
@@ -95,7 +93,6 @@ impl Command {
         match self {
             Command::Capture(command) => command.run(),
             Command::Train(command) => command.run(),
-            Command::Watch(command) => command.run(),
             Command::Eval(command) => command.run(),
             Command::Report(command) => command.run(),
             Command::Reconstruct(command) => command.run(),

@@ -171,7 +171,7 @@ fn record(message: &Message) -> Vec<u8> {
 }
 
 /// Returns the masked CRC-32C of `bytes`, for data that may contain checksums themselves.
-pub(super) fn masked_crc32c(bytes: &[u8]) -> u32 {
+fn masked_crc32c(bytes: &[u8]) -> u32 {
     crc32c(bytes).rotate_right(15).wrapping_add(0xa282_ead8)
 }
 

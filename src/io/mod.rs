@@ -5,7 +5,6 @@ mod depth_colours;
 mod dtype;
 mod edit;
 mod event_file;
-mod event_reader;
 mod images;
 mod mosaic;
 mod neighbours;
@@ -53,7 +52,6 @@ pub(crate) use globalsplat_files::{
 };
 
 pub(crate) use event_file::{EventFile, event_files};
-pub(crate) use event_reader::{EventReader, read_event_image};
 pub(crate) use globalsplat_capture::{PHOTO_EXTENSIONS, read_image_size};
 pub(crate) use images::{enlarge, shrink, subsample, write_jpeg};
 pub(crate) use mosaic::shrink_factor;

@@ -1,4 +1,4 @@
-//! Log of a refinement, for TensorBoard and `globalsplat watch`.
+//! Log of a refinement, for TensorBoard.
 
 use super::session::{EvalPoint, RefineMetrics};
 use crate::error::{Error, Result};

@@ -114,40 +114,6 @@ pub(super) fn add_checkpoints(run: &Path, inputs: &mut InputFiles) {
     [FOLDER, BEST].iter().for_each(|folder| inputs.add_folder(&run.join(folder)));
 }
 
-/// Summary of a checkpoint, for display.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct CheckpointSummary {
-    /// Path of its folder, relative to the run's folder.
-    pub name: String,
-    /// Number of steps done.
-    pub step: u64,
-    /// Total size of its files, in bytes.
-    pub bytes: u64,
-    /// Time since it was saved, in seconds.
-    pub age: u64,
-    /// Validation PSNR of the best checkpoint, in dB; `None` for other checkpoints.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub psnr: Option<f64>,
-}
-
-/// Returns summaries of the run's checkpoints, oldest first, and of its best one. A checkpoint that is being replaced is left out.
-pub(super) fn checkpoint_summaries(run: &Path) -> (Vec<CheckpointSummary>, Option<CheckpointSummary>) {
-    let summary = |path: &PathBuf| {
-        let state = read_state(path).ok()?;
-        let saved = fs::metadata(path.join(STATE_FILE)).and_then(|file| file.modified()).ok()?;
-        Some(CheckpointSummary {
-            name: path.strip_prefix(run).unwrap_or(path).display().to_string(),
-            step: state.step,
-            bytes: state.files.values().map(|(bytes, _)| bytes).sum(),
-            // The clock may have been set back; the age is then 0.
-            age: saved.elapsed().unwrap_or_default().as_secs(),
-            psnr: state.validation.map(|validation| validation.psnr),
-        })
-    };
-    let checkpoints = list_checkpoints(run).unwrap_or_default();
-    (checkpoints.iter().filter_map(summary).collect(), summary(&run.join(BEST)))
-}
-
 /// Cleans up what a run left if it was killed during a save.
 ///
 /// # Errors

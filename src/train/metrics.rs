@@ -30,28 +30,19 @@ pub(super) fn loss_terms(report: &StepReport) -> [(&'static str, f64); Term::ALL
 
 /// Record read from one line of `metrics.jsonl`: a training step, or a validation if `validation` is set; `step` is then the last step
 /// before it. Values that weren't finite are `None`.
-#[derive(Debug, Default, Deserialize)]
-pub(super) struct MetricsRecord {
-    pub step: u64,
+#[derive(Debug, Deserialize)]
+struct MetricsRecord {
+    step: u64,
     #[serde(default)]
-    pub skipped: bool,
-    pub loss: Option<f64>,
-    pub psnr: Option<f64>,
-    pub learning_rate: Option<f64>,
-    #[serde(default)]
-    pub stage: u32,
-    pub mix: Option<f64>,
-    pub samples_per_second: Option<f64>,
-    /// Names of the scenes of a skipped step.
-    #[serde(default)]
-    pub scenes: Vec<String>,
-    pub validation: Option<ValidationRecord>,
+    skipped: bool,
+    psnr: Option<f64>,
+    validation: Option<ValidationRecord>,
 }
 
 /// Scores of a validation.
 #[derive(Debug, Deserialize)]
-pub(super) struct ValidationRecord {
-    pub psnr: Option<f64>,
+struct ValidationRecord {
+    psnr: Option<f64>,
 }
 
 /// Writer of `metrics.jsonl`.

@@ -21,17 +21,15 @@ mod subsets;
 mod tensorboard;
 mod trainer;
 mod validator;
-mod watch;
 
 pub use crate::io::{CONFIG_FILE, METRICS_FILE};
-pub use checkpoint::{CheckpointSummary, MODEL_FILE, best_checkpoint, latest_checkpoint, list_checkpoints};
+pub use checkpoint::{MODEL_FILE, best_checkpoint, latest_checkpoint, list_checkpoints};
 pub use memory_estimate::{MemoryEstimate, largest_fitting_batch};
 pub use metrics::Curves;
 pub use run::{Event, Outcome, Resume, add_run_inputs, retry_on_disk_full, run};
 pub use step_report::StepReport;
 pub use trainer::Trainer;
 pub use validator::{Score, Validator};
-pub use watch::{RunCurves, RunState, WatchedRun};
 
 // The parity checks run each of these functions by itself.
 pub(crate) use curriculum::stage_at;

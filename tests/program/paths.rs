@@ -5,11 +5,9 @@ use crate::common::program::{TINY_CONFIG, command};
 use crate::common::room::write_rooms;
 use serde_json::{Value, json};
 use std::ffi::{OsStr, OsString};
-use std::io::{BufRead, BufReader, Read, Write};
-use std::net::TcpStream;
 use std::os::unix::ffi::OsStrExt;
 use std::path::PathBuf;
-use std::process::{Command, Stdio};
+use std::process::Command;
 
 /// Name of a folder in Latin-1, and its lossy conversion to text.
 const NAME: &[u8] = b"caf\xe9";
@@ -76,7 +74,6 @@ fn names_that_are_not_utf_8() {
 
     write("tiny.toml", &TINY_CONFIG.replace("[data]", "[data]\ncaptures = [\"${ROOMS}/room_000\"]"));
     folder.json(&["train", "--config", "@tiny.toml", "--out", "@run"], &["/checkpoint", "/curves"]);
-    watch(&folder);
     folder.json(&["export", "--run", "@run", "--out", "@tiny.safetensors"], &["/weights"]);
     folder.json(&["import", "--from", "@tiny.safetensors", "--out", "@imported.safetensors"], &["/weights"]);
 
@@ -122,28 +119,4 @@ fn names_that_are_not_utf_8() {
     let page = [&["render", "--html", "@room.html"], &splat[..], &room].concat();
     folder.json(&page, &["/page"]);
     folder.json(&[&["view", "@rooms/room_000/truth.ply"], &room[..]].concat(), &["/page"]);
-}
-
-/// Checks what `watch` prints about the run, and what it serves.
-fn watch(folder: &Folder) {
-    let mut watch =
-        folder.command(&["watch", "@run", "--json"]).stdout(Stdio::piped()).spawn().expect("a program");
-    let mut line = String::new();
-    BufReader::new(watch.stdout.take().expect("a pipe")).read_line(&mut line).expect("a line");
-    let answer = served_state(&line);
-    let _ = (watch.kill(), watch.wait());
-    assert!(line.contains(SHOWN), "{line}");
-    let answer = answer.expect("an answer");
-    assert!(answer.starts_with("HTTP/1.1 200") && answer.contains(SHOWN), "{answer}");
-}
-
-/// Returns the response to a request for `/state` to the server whose URL is in `line`.
-fn served_state(line: &str) -> Option<String> {
-    let report: Value = serde_json::from_str(line).ok()?;
-    let host = report["url"].as_str()?.strip_prefix("http://")?.trim_end_matches('/');
-    let mut stream = TcpStream::connect(host).ok()?;
-    write!(stream, "GET /state HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n").ok()?;
-    let mut answer = String::new();
-    stream.read_to_string(&mut answer).ok()?;
-    Some(answer)
 }

@@ -1,4 +1,4 @@
-//! Tests of training: configurations, runs and their resumption, several processes, the live page.
+//! Tests of training: configurations, runs and their resumption, several processes.
 
 #[path = "../common/mod.rs"]
 mod common;
@@ -6,4 +6,3 @@ mod common;
 mod configs;
 mod distributed;
 mod runs;
-mod watch;

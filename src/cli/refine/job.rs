@@ -62,8 +62,8 @@ pub struct RefineJob {
 /// What a refinement reports besides its result.
 #[derive(Default, Args)]
 pub struct Reports {
-    /// Also write curves of the loss and the scores to a folder: metrics.jsonl and tensorboard, which `globalsplat watch` and
-    /// TensorBoard show during the optimization
+    /// Also write curves of the loss and the scores to a folder: metrics.jsonl and tensorboard, which TensorBoard
+    /// shows during the optimization
     #[arg(long, value_name = "DIR")]
     log: Option<PathBuf>,
     /// Also write an image: photo, render and depth side by side, a row per held-out view, or else per view
