@@ -5,9 +5,9 @@
 //! The output image shows the photo, the initial render, and the final render.
 
 use globalsplat::data::{resize_and_crop, tensor_from_planes};
-use globalsplat::eval::psnr;
 use globalsplat::io::{read_image, tile_horizontally, write_png};
 use globalsplat::loss::{mse, ssim};
+use globalsplat::metrics::psnr;
 use globalsplat::optim::{Optimizer, ParameterGroup, UpdateRule};
 use globalsplat::render::{Cameras, DEFAULT_EPS2D, render};
 use globalsplat::scene::{Camera, ImageSize, Intrinsics, RawGaussians};

@@ -20,8 +20,8 @@
 //! op alone.
 //!
 //! Modules, from the highest level to the lowest; each uses only those after it in this list, and [`scene`]:
-//! [`refine`] optimizes a splat per scene, [`eval`] computes metrics, [`train`] trains, [`reconstruct`] turns photos into
-//! splats, [`config`] defines the configuration of a run, [`optim`] and [`loss`] hold the optimizer and the losses, [`data`]
+//! [`refine`] optimizes a splat per scene, [`eval`] evaluates methods, [`train`] trains, [`reconstruct`] turns photos into
+//! splats, [`metrics`] compares images, [`config`] defines the configuration of a run, [`optim`] and [`loss`] hold the optimizer and the losses, [`data`]
 //! reads captures, [`synth`] generates synthetic scenes, [`io`] reads and writes files, [`ranks`] connects the processes of
 //! distributed training, [`render`] is the differentiable splat op, [`model`] the network, [`scene`] the camera maths.
 
@@ -35,6 +35,7 @@ pub mod eval;
 mod ffi;
 pub mod io;
 pub mod loss;
+pub mod metrics;
 pub mod model;
 pub mod optim;
 #[doc(hidden)]

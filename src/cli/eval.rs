@@ -8,11 +8,11 @@ use globalsplat::data::{Capture, Dataset, Holdout, PhotoSize, Split, View};
 use globalsplat::device::peak_memory_bytes;
 use globalsplat::error::Error;
 use globalsplat::eval::{
-    Baselines, CaptureScores, ContactSheet, DatasetEvaluation, EvalScene, Evaluation, EvaluationIndex,
-    LazyPhotos, Method, Perceptual, REPORT, TABLE, evaluation_files, machine, score_output,
-    weights_fingerprint, write_csv, write_evaluation, write_report,
+    Baselines, DatasetEvaluation, EvalScene, Evaluation, EvaluationIndex, LazyPhotos, Method, REPORT, TABLE,
+    evaluation_files, machine, score_output, weights_fingerprint, write_csv, write_evaluation, write_report,
 };
 use globalsplat::io::{InputFiles, check_writable_dir, check_writable_png, weights_files};
+use globalsplat::metrics::{CaptureScores, ContactSheet, Perceptual};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::{Input, LoadedModel, Model, context_views};
 use globalsplat::scene::ImageSize;
@@ -156,7 +156,7 @@ impl Eval {
         if let Some((path, sheet)) = self.sheet.as_ref().zip(sheet) {
             report_downscaling(path, sheet.write(path)?);
         }
-        if let Some(line) = perceptual.explain_missing(&scores) {
+        if let Some(line) = perceptual.explain_missing(&scores.mean) {
             eprintln!("{line}");
         }
         if self.json {
@@ -172,7 +172,8 @@ impl Eval {
                 object["forward_seconds"] = json!(output.forward_seconds);
             }
             if let Some(Baselines { nearest_photo, mean_photo }) = &baselines {
-                let means = |scores: &CaptureScores| json!({ "psnr": scores.psnr, "ssim": scores.ssim });
+                let means =
+                    |scores: &CaptureScores| json!({ "psnr": scores.mean.psnr, "ssim": scores.mean.ssim });
                 object["baselines"] =
                     json!({ "nearest_photo": means(nearest_photo), "mean_photo": means(mean_photo) });
             }
@@ -183,7 +184,7 @@ impl Eval {
                 for (name, scores) in
                     [("the nearest photo shown", nearest_photo), ("the mean photo shown", mean_photo)]
                 {
-                    println!("{name:<24} {:>8.2} {:>8.4}", scores.psnr, scores.ssim);
+                    println!("{name:<24} {:>8.2} {:>8.4}", scores.mean.psnr, scores.mean.ssim);
                 }
             }
         }
@@ -385,10 +386,10 @@ impl Eval {
             if !group.is_main_process() {
                 continue;
             }
-            if evaluation.summary.lpips_vgg.is_none() || evaluation.summary.lpips_alex.is_none() {
+            if evaluation.summary.mean.lpips_vgg.is_none() || evaluation.summary.mean.lpips_alex.is_none() {
                 let perceptual = Perceptual::find(device)?;
                 let why =
-                    evaluation.scenes.iter().find_map(|scene| perceptual.explain_missing(&scene.scores));
+                    evaluation.scenes.iter().find_map(|scene| perceptual.explain_missing(&scene.scores.mean));
                 why.iter().for_each(|line| eprintln!("{line}"));
             }
             let enlarged = evaluation.scenes.iter().filter(|scene| scene.enlarged).count();
@@ -425,7 +426,7 @@ impl Eval {
         } else {
             for (_, e) in evaluations {
                 let shown = |value: Option<f64>| value.map_or("absent".into(), |value| format!("{value:.4}"));
-                let masked = e.summary.pixel_fraction.map(|fraction| 100. * fraction);
+                let masked = e.summary.mean.pixel_fraction.map(|fraction| 100. * fraction);
                 let masked =
                     masked.map_or(String::new(), |percent| format!(", over {percent:.1} % of the pixels"));
                 println!(
@@ -433,10 +434,10 @@ impl Eval {
                     e.index,
                     e.scenes.len(),
                     e.indexed_scenes,
-                    e.summary.psnr,
-                    e.summary.ssim,
-                    shown(e.summary.lpips_vgg),
-                    shown(e.summary.lpips_alex)
+                    e.summary.mean.psnr,
+                    e.summary.mean.ssim,
+                    shown(e.summary.mean.lpips_vgg),
+                    shown(e.summary.mean.lpips_alex)
                 );
             }
             println!("{}", report.display());
@@ -482,8 +483,8 @@ fn print_table(scores: &CaptureScores) {
     println!("{}: {} views{gaussians}", scores.scene, scores.views.len());
     // Columns without any value are left out.
     let columns = [
-        ("LPIPS-VGG", scores.views.iter().any(|view| view.lpips_vgg.is_some())),
-        ("LPIPS-Alex", scores.views.iter().any(|view| view.lpips_alex.is_some())),
+        ("LPIPS-VGG", scores.views.iter().any(|view| view.scores.lpips_vgg.is_some())),
+        ("LPIPS-Alex", scores.views.iter().any(|view| view.scores.lpips_alex.is_some())),
     ];
     let lpips = |values: [Option<f64>; 2]| -> String {
         let shown = columns.iter().zip(values).filter(|((_, filled), _)| *filled);
@@ -495,12 +496,12 @@ fn print_table(scores: &CaptureScores) {
         columns.iter().filter(|(_, filled)| *filled).map(|(name, _)| format!(" {name:>10}")).collect();
     println!("{:<24} {:>8} {:>8}{names}", "view", "PSNR", "SSIM");
     for view in &scores.views {
-        let lpips = lpips([view.lpips_vgg, view.lpips_alex]);
-        println!("{:<24} {:>8.2} {:>8.4}{lpips}", view.image, view.psnr, view.ssim);
+        let lpips = lpips([view.scores.lpips_vgg, view.scores.lpips_alex]);
+        println!("{:<24} {:>8.2} {:>8.4}{lpips}", view.image, view.scores.psnr, view.scores.ssim);
     }
-    let lpips = lpips([scores.lpips_vgg, scores.lpips_alex]);
-    println!("{:<24} {:>8.2} {:>8.4}{lpips}", "mean", scores.psnr, scores.ssim);
-    if let Some(fraction) = scores.pixel_fraction {
+    let lpips = lpips([scores.mean.lpips_vgg, scores.mean.lpips_alex]);
+    println!("{:<24} {:>8.2} {:>8.4}{lpips}", "mean", scores.mean.psnr, scores.mean.ssim);
+    if let Some(fraction) = scores.mean.pixel_fraction {
         println!("scored over {:.1} % of the pixels: the others are masked out", 100. * fraction);
     }
 }

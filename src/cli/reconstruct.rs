@@ -6,9 +6,7 @@ use super::{check_views, device, model, open_masked_capture, parse_holdout, prin
 use anyhow::Result;
 use clap::Args;
 use globalsplat::data::Capture;
-use globalsplat::device::Stopwatch;
-use globalsplat::device::peak_memory_bytes;
-use globalsplat::eval::process_age;
+use globalsplat::device::{Stopwatch, peak_memory_bytes, process_age};
 use globalsplat::io::{InputFiles, check_writable_splat, weights_files};
 use globalsplat::reconstruct::{Input, Model, load_context, reconstruct};
 use globalsplat::refine::RefineOptions;

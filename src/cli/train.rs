@@ -215,7 +215,7 @@ impl Train {
             validation.iter().map(value).sum::<f64>() / validation.len() as f64
         };
         let curves = self.out.join(CURVES_FILE);
-        let nearest = (!validation.is_empty()).then(|| mean(|v| v.nearest.psnr));
+        let nearest = (!validation.is_empty()).then(|| mean(|v| v.nearest.mean.psnr));
         let mut on_event = |event: Event| {
             if let Event::Notice(text) = event {
                 eprintln!("{text}");
@@ -233,10 +233,10 @@ impl Train {
             });
             if !validation.is_empty() {
                 object["held_out"] = json!({
-                    "psnr": mean(|v| v.ours.psnr),
-                    "ssim": mean(|v| v.ours.ssim),
-                    "nearest_photo_psnr": mean(|v| v.nearest.psnr),
-                    "nearest_photo_ssim": mean(|v| v.nearest.ssim),
+                    "psnr": mean(|v| v.ours.mean.psnr),
+                    "ssim": mean(|v| v.ours.mean.ssim),
+                    "nearest_photo_psnr": mean(|v| v.nearest.mean.psnr),
+                    "nearest_photo_ssim": mean(|v| v.nearest.mean.ssim),
                     "scenes": validation.iter().map(|v| json!({"ours": v.ours, "nearest_photo": v.nearest})).collect::<Vec<_>>(),
                 });
             }
@@ -250,14 +250,14 @@ impl Train {
             for v in validation {
                 println!(
                     "{:<24} {:>10.2} {:>10.4} {:>14.2}",
-                    v.ours.scene, v.ours.psnr, v.ours.ssim, v.nearest.psnr
+                    v.ours.scene, v.ours.mean.psnr, v.ours.mean.ssim, v.nearest.mean.psnr
                 );
             }
-            let (psnr, nearest) = (mean(|v| v.ours.psnr), mean(|v| v.nearest.psnr));
+            let (psnr, nearest) = (mean(|v| v.ours.mean.psnr), mean(|v| v.nearest.mean.psnr));
             println!(
                 "{:<24} {psnr:>10.2} {:>10.4} {nearest:>14.2}   {:+.2} dB",
                 "mean",
-                mean(|v| v.ours.ssim),
+                mean(|v| v.ours.mean.ssim),
                 psnr - nearest
             );
         }

@@ -10,7 +10,7 @@ pub(crate) use memory::{
 };
 pub use memory::{peak_memory_bytes, total_memory_bytes};
 pub use oversubscription::OversubscriptionGuard;
-pub use stopwatch::Stopwatch;
+pub use stopwatch::{Stopwatch, process_age};
 
 use crate::error::Result;
 use crate::ffi::take_outputs;

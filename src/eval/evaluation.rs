@@ -1,6 +1,6 @@
 //! Results of an evaluation over a dataset: the contents of `scores.json`, which the report shows.
 
-use super::scores::CaptureScores;
+use crate::metrics::{CaptureScores, Scores};
 use crate::reconstruct::Input;
 use serde::{Deserialize, Serialize};
 
@@ -12,9 +12,9 @@ use serde::{Deserialize, Serialize};
 ///
 /// # fn main() -> globalsplat::Result<()> {
 /// let evaluation = read_evaluation("results/re10k".as_ref())?;
-/// println!("{} on {}: {:.2} dB", evaluation.method, evaluation.dataset, evaluation.summary.psnr);
+/// println!("{} on {}: {:.2} dB", evaluation.method, evaluation.dataset, evaluation.summary.mean.psnr);
 /// for scene in &evaluation.scenes {
-///     println!("{}: {:.2} dB", scene.scores.scene, scene.scores.psnr);
+///     println!("{}: {:.2} dB", scene.scores.scene, scene.scores.mean.psnr);
 /// }
 /// # Ok(())
 /// # }
@@ -52,19 +52,9 @@ pub struct Evaluation {
 /// Means over scenes, each of which is a mean over its target views.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub struct Summary {
-    /// Mean PSNR in dB.
-    pub psnr: f64,
-    /// Mean structural similarity, computed as in scikit-image.
-    pub ssim: f64,
-    /// Mean LPIPS with VGG-16; `None` if a scene lacks it, for example because the network's weights are missing.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub lpips_vgg: Option<f64>,
-    /// Mean LPIPS with AlexNet; `None` if a scene lacks it, for example because the network's weights are missing.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub lpips_alex: Option<f64>,
-    /// Mean fraction of the pixels that were scored; `None` if all were.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub pixel_fraction: Option<f64>,
+    /// Mean scores.
+    #[serde(flatten)]
+    pub mean: Scores,
     /// Mean number of Gaussians per scene; `None` if no splats were scored.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gaussians: Option<f64>,
@@ -132,20 +122,13 @@ pub struct Failure {
 }
 
 impl Summary {
-    /// Computes the means over `scenes`, at least one. An LPIPS or a number of Gaussians that any scene lacks has no mean.
+    /// Computes the means over `scenes`. A number of Gaussians that any scene lacks has no mean.
     pub fn from_scenes(scenes: &[SceneScores]) -> Self {
-        let mean = |value: &dyn Fn(&CaptureScores) -> Option<f64>| {
-            let values: Option<Vec<f64>> = scenes.iter().map(|scene| value(&scene.scores)).collect();
-            values.map(|values| values.iter().sum::<f64>() / values.len() as f64)
-        };
-        let has_masks = scenes.iter().any(|scene| scene.scores.pixel_fraction.is_some());
+        let gaussians: Option<Vec<i64>> = scenes.iter().map(|scene| scene.scores.gaussians).collect();
+        let mean = |counts: Vec<i64>| counts.iter().sum::<i64>() as f64 / counts.len() as f64;
         Summary {
-            psnr: mean(&|s| Some(s.psnr)).unwrap_or(f64::NAN),
-            ssim: mean(&|s| Some(s.ssim)).unwrap_or(f64::NAN),
-            lpips_vgg: mean(&|s| s.lpips_vgg),
-            lpips_alex: mean(&|s| s.lpips_alex),
-            pixel_fraction: mean(&|s| Some(s.pixel_fraction.unwrap_or(1.))).filter(|_| has_masks),
-            gaussians: mean(&|s| s.gaussians.map(|n| n as f64)),
+            mean: Scores::mean(scenes.iter().map(|scene| &scene.scores.mean)),
+            gaussians: gaussians.map(mean),
         }
     }
 }

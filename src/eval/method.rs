@@ -1,8 +1,6 @@
 //! Methods under evaluation: a model, given splats or given images, for a single scene or a whole dataset.
 
-use super::perceptual::Perceptual;
 use super::scene::EvalScene;
-use super::scores::{CaptureScores, ViewScore, score_view};
 use crate::data::View;
 use crate::device::{peak_device_memory_bytes, peak_memory_bytes};
 use crate::error::{Error, Result};
@@ -10,6 +8,7 @@ use crate::io::{
     InputFiles, PHOTO_EXTENSIONS, Splat, checksum, find_splat, origin_file, read_image, read_splat,
     splat_files, tensor_from_rgb,
 };
+use crate::metrics::{CaptureScores, Perceptual, ViewScore, score_view};
 use crate::reconstruct::{Input, Model, reconstruct};
 use crate::render::{RenderedView, SplatRenderer};
 use crate::scene::{Camera, ImageSize, LocalFrame};
@@ -217,7 +216,7 @@ pub fn score_output(
             ));
             continue;
         }
-        let score = perceptual.add_to(score_view(&image.rgb, &ground_truth)?, &image.rgb, &ground_truth);
+        let score = score_view(&image.rgb, &ground_truth, Some(perceptual))?;
         see(&ground_truth, &image, &score)?;
         scores.push(score);
     }
@@ -225,23 +224,6 @@ pub fn score_output(
         return Err(Error::request(format!("{}: every view to score is masked out as a whole", scene.name)));
     }
     Ok(CaptureScores::from_views(&scene.name, scores, *gaussians))
-}
-
-/// Scores images of the views `ground_truth`, including LPIPS.
-///
-/// # Errors
-/// Fails if an image differs in size from its view.
-pub fn score_with_lpips(
-    scene: &str,
-    images: &[Tensor],
-    ground_truth: &[View],
-    gaussians: Option<i64>,
-    perceptual: &Perceptual,
-) -> Result<CaptureScores> {
-    let score =
-        |(image, view): (&Tensor, &View)| Ok(perceptual.add_to(score_view(image, view)?, image, view));
-    let scores = images.iter().zip(ground_truth).map(score).collect::<Result<_>>()?;
-    Ok(CaptureScores::from_views(scene, scores, gaussians))
 }
 
 /// Finds the image `name` in `folder`, with any of the known extensions.

@@ -46,11 +46,11 @@ pub fn read_evaluation(folder: &Path) -> Result<Evaluation> {
         true => Ok(()),
         false => Err(Error::input(&path, format!("psnr of {name}"), psnr, "0 to 100 dB")),
     };
-    check("the summary", evaluation.summary.psnr)?;
+    check("the summary", evaluation.summary.mean.psnr)?;
     for scene in evaluation.scenes.iter().map(|scene| &scene.scores) {
-        check(&format!("scene {}", scene.scene), scene.psnr)?;
+        check(&format!("scene {}", scene.scene), scene.mean.psnr)?;
         for view in &scene.views {
-            check(&format!("view {} of scene {}", view.image, scene.scene), view.psnr)?;
+            check(&format!("view {} of scene {}", view.image, scene.scene), view.scores.psnr)?;
         }
     }
     Ok(evaluation)
@@ -82,10 +82,10 @@ pub fn write_csv(path: &Path, evaluation: &Evaluation) -> Result<()> {
                 let line = Line {
                     scene: &scene.scores.scene,
                     view: &view.image,
-                    psnr: view.psnr,
-                    ssim: view.ssim,
-                    lpips_vgg: view.lpips_vgg,
-                    lpips_alex: view.lpips_alex,
+                    psnr: view.scores.psnr,
+                    ssim: view.scores.ssim,
+                    lpips_vgg: view.scores.lpips_vgg,
+                    lpips_alex: view.scores.lpips_alex,
                     gaussians: scene.scores.gaussians,
                     forward_seconds: scene.forward_seconds,
                 };

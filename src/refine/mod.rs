@@ -257,7 +257,7 @@ mod tests {
     use super::*;
     use crate::bench::synthetic_gaussians;
     use crate::device::num_threads;
-    use crate::eval::score_views;
+    use crate::metrics::score_views;
     use crate::render::DEFAULT_EPS2D;
     use crate::scene::{ImageSize, Intrinsics, RawGaussians};
     use glam::{DMat4, DVec3};
@@ -331,7 +331,7 @@ mod tests {
                 let splat = refined(&views, &views, None, seed);
                 let scores =
                     score_views("wall", &splat, std::slice::from_ref(&truth), None, |_| true).unwrap();
-                scores.unwrap().psnr
+                scores.unwrap().mean.psnr
             };
             (0..SEEDS).map(psnr).sum::<f64>() / SEEDS as f64
         };

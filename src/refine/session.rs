@@ -13,8 +13,8 @@ use super::view_sample::{SampleScores, ViewSample};
 use super::{Task, refine, scene_depth};
 use crate::data::{Capture, Point, View, read_points};
 use crate::error::{Error, Result};
-use crate::eval::{CaptureScores, ContactSheet, Perceptual, score_views};
 use crate::io::Splat;
+use crate::metrics::{CaptureScores, ContactSheet, Perceptual, score_views};
 use crate::reconstruct::{LoadedModel, Model, reconstruct, spread_over_path};
 use crate::scene::{Camera, Gaussians, LocalFrame, RawGaussians};
 use crate::stereo::DepthMap;
@@ -183,7 +183,7 @@ enum Start<'a> {
 /// let result = session.run()?;
 /// write_splat("room.ply".as_ref(), &result.splat)?;
 /// if let Some([before, after]) = session.score_held_out(&result)? {
-///     println!("held-out views: {:.2} dB before, {:.2} dB after", before.psnr, after.psnr);
+///     println!("held-out views: {:.2} dB before, {:.2} dB after", before.mean.psnr, after.mean.psnr);
 /// }
 /// # Ok(())
 /// # }
@@ -493,7 +493,7 @@ impl<'a> RefineSession<'a> {
             self.representative_views().iter().take(count).map(View::shallow_clone).collect();
         let before = self.score_whole(&result.initial, &views, Some(&perceptual))?;
         let after = self.score_whole(&result.gaussians, &views, Some(&perceptual))?;
-        if let Some(line) = after.as_ref().and_then(|after| perceptual.explain_missing(after)) {
+        if let Some(line) = after.as_ref().and_then(|after| perceptual.explain_missing(&after.mean)) {
             self.warn(&line);
         }
         Ok(before.zip(after).map(<[CaptureScores; 2]>::from))

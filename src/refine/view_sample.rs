@@ -3,7 +3,7 @@
 use super::corrections::Corrections;
 use crate::data::View;
 use crate::error::Result;
-use crate::eval::{CaptureScores, ViewScore, score_views};
+use crate::metrics::{CaptureScores, Scores, score_views};
 use crate::scene::Gaussians;
 use serde::Serialize;
 
@@ -69,16 +69,14 @@ impl ViewSample {
     /// Fails if rendering fails.
     pub fn score(&self, gaussians: &Gaussians) -> Result<Option<SampleScores>> {
         let scores = score_views("sample", gaussians, &self.views, None, |_| true)?;
-        Ok(scores.map(|CaptureScores { psnr, ssim, .. }| SampleScores { psnr, ssim }))
+        Ok(scores.map(|scores| SampleScores { psnr: scores.mean.psnr, ssim: scores.mean.ssim }))
     }
 
     /// Returns the mean scores of the sample, given the `scores` of all views that it was chosen from.
     pub fn select_scores(&self, scores: &CaptureScores) -> SampleScores {
-        let mean = |score: fn(&ViewScore) -> f64| {
-            let sum: f64 = self.indices.iter().map(|&index| score(&scores.views[index])).sum();
-            sum / self.indices.len() as f64
-        };
-        SampleScores { psnr: mean(|view| view.psnr), ssim: mean(|view| view.ssim) }
+        let Scores { psnr, ssim, .. } =
+            Scores::mean(self.indices.iter().map(|&index| &scores.views[index].scores));
+        SampleScores { psnr, ssim }
     }
 }
 
@@ -118,10 +116,13 @@ mod tests {
         assert_eq!(ViewSample::large(&large).indices, [0, 2, 4, 6, 8]);
         let scores = small.score(&gaussians).unwrap().unwrap();
         let of_all = score_views("", &gaussians, &all, None, |_| true).unwrap().unwrap();
-        assert!((of_all.views[0].psnr - 40.).abs() < 0.01 && of_all.views[0].ssim > 0.9, "{of_all:?}");
+        assert!(
+            (of_all.views[0].scores.psnr - 40.).abs() < 0.01 && of_all.views[0].scores.ssim > 0.9,
+            "{of_all:?}"
+        );
         let selected = small.select_scores(&of_all);
         assert!((scores.psnr - selected.psnr).abs() < 1e-9 && (scores.ssim - selected.ssim).abs() < 1e-9);
-        assert!((scores.psnr - of_all.psnr).abs() > 0.01, "{scores:?} {}", of_all.psnr);
+        assert!((scores.psnr - of_all.mean.psnr).abs() > 0.01, "{scores:?} {}", of_all.mean.psnr);
         assert!(ViewSample::small(&[]).score(&gaussians).unwrap().is_none());
     }
 }

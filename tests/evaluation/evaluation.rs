@@ -68,7 +68,11 @@ fn splats_are_scored_by_an_index_from_chunks_and_captures_alike() {
         let names: Vec<&str> = evaluation.scenes.iter().map(|scene| scene.scores.scene.as_str()).collect();
         assert_eq!((names.as_slice(), evaluation.indexed_scenes), (["room_000", "room_002"].as_slice(), 3));
         // The photos were rendered from these splats: the only difference is the photos' 8-bit rounding.
-        assert!(evaluation.summary.psnr > 50. && evaluation.summary.ssim > 0.999, "{:?}", evaluation.summary);
+        assert!(
+            evaluation.summary.mean.psnr > 50. && evaluation.summary.mean.ssim > 0.999,
+            "{:?}",
+            evaluation.summary
+        );
         assert_eq!((evaluation.dataset.as_str(), evaluation.context_views), ("re10k", 3));
         let views: Vec<&str> =
             evaluation.scenes[0].scores.views.iter().map(|view| view.image.as_str()).collect();
@@ -102,8 +106,8 @@ fn an_interrupted_evaluation_resumes() {
     std::fs::write(set.path("out/scenes/room_002.json"), "{\"scene\": \"room_002\", \"psn").unwrap();
     assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
     let second = read_evaluation(&set.path("out")).unwrap();
-    assert_eq!(second.scenes[0].scores.psnr, 99.5);
-    assert_eq!(second.scenes[1].scores.psnr, first.scenes[1].scores.psnr);
+    assert_eq!(second.scenes[0].scores.mean.psnr, 99.5);
+    assert_eq!(second.scenes[1].scores.mean.psnr, first.scenes[1].scores.mean.psnr);
 
     // Scores of another subject must not be mixed with these.
     let splats = set.path("splats");
@@ -126,8 +130,8 @@ fn an_interrupted_evaluation_resumes() {
     assert_eq!(run(&half, set.folder.path()).0, Some(0));
     let half = read_evaluation(&elsewhere).unwrap();
     assert_eq!(half.method, "tiny bf16");
-    assert_ne!(half.scenes[1].scores.psnr, first.scenes[1].scores.psnr);
-    assert!((half.scenes[1].scores.psnr - first.scenes[1].scores.psnr).abs() < 0.2);
+    assert_ne!(half.scenes[1].scores.mean.psnr, first.scenes[1].scores.mean.psnr);
+    assert!((half.scenes[1].scores.mean.psnr - first.scenes[1].scores.mean.psnr).abs() < 0.2);
 
     let index = json!({"room_000": {"context": [0, 1], "target": [3]}});
     set.write_index(&index);
@@ -146,17 +150,17 @@ fn changed_splats_and_new_metrics_are_scored_again() {
     std::fs::copy(splats.join("room_001.ply"), splats.join("room_000.ply")).unwrap();
     assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
     let second = read_evaluation(&set.path("out")).unwrap();
-    assert!(second.scenes[0].scores.psnr < first.scenes[0].scores.psnr - 10.);
-    assert_eq!(second.scenes[1].scores.psnr, first.scenes[1].scores.psnr);
+    assert!(second.scenes[0].scores.mean.psnr < first.scenes[0].scores.mean.psnr - 10.);
+    assert_eq!(second.scenes[1].scores.mean.psnr, first.scenes[1].scores.mean.psnr);
 
     // LPIPS is added once its weights are available.
     if !has_lpips() {
         return;
     }
-    assert!(second.scenes.iter().all(|scene| scene.scores.lpips_alex.is_none()));
+    assert!(second.scenes.iter().all(|scene| scene.scores.mean.lpips_alex.is_none()));
     succeed(&text(&arguments));
     let third = read_evaluation(&set.path("out")).unwrap();
-    assert!(third.scenes.iter().all(|scene| scene.scores.lpips_alex.is_some()));
+    assert!(third.scenes.iter().all(|scene| scene.scores.mean.lpips_alex.is_some()));
 }
 
 /// Replaces the contents of the file at `path` without changing its size or modification time.
@@ -181,7 +185,7 @@ fn changes_of_same_size_and_time_are_scored_again() {
         let (code, _, err) = run(&arguments, set.folder.path());
         assert_eq!(code, Some(0), "{err}");
         let evaluation = read_evaluation(&set.path("out")).unwrap();
-        evaluation.scenes.iter().map(|scene| scene.scores.psnr).collect::<Vec<_>>()
+        evaluation.scenes.iter().map(|scene| scene.scores.mean.psnr).collect::<Vec<_>>()
     };
     let first = psnr();
     // Scores that are reused as long as nothing changes.
@@ -232,7 +236,7 @@ fn sharded_weights_are_identified_by_their_shards() {
     std::fs::remove_dir_all(set.path("out")).unwrap();
     assert_eq!(run(&arguments(&plain), set.folder.path()).0, Some(0));
     let second = read_evaluation(&set.path("out")).unwrap();
-    assert_ne!(first.summary.psnr, second.summary.psnr);
+    assert_ne!(first.summary.mean.psnr, second.summary.mean.psnr);
 }
 
 #[test]

@@ -189,7 +189,7 @@ fn an_evaluation_does_not_resume_at_another_resolution() {
     let (code, _, err) = set.sweep("small", &["--pictures-at", "64"]);
     assert_eq!(code, Some(0), "{err}");
     let small = read_evaluation(&set.path("small")).unwrap();
-    assert_ne!(found.scenes[1].scores.psnr, small.scenes[1].scores.psnr);
+    assert_ne!(found.scenes[1].scores.mean.psnr, small.scenes[1].scores.mean.psnr);
     // The model's own size counts as no setting.
     assert_eq!(set.sweep("plain", &["--views-at", "32", "--pictures-at", "32"]).0, Some(0));
     let (code, _, err) = set.sweep("large", &["--pictures-at", "96"]);

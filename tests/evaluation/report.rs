@@ -3,9 +3,10 @@
 use crate::common::browser::Browser;
 use crate::common::program::{arg, refuse, succeed};
 use globalsplat::eval::{
-    CaptureScores, Efficiency, Evaluation, Failure, SceneScores, Summary, ViewScore, comparison_path,
-    read_evaluation, write_csv, write_evaluation, write_report,
+    Efficiency, Evaluation, Failure, SceneScores, Summary, comparison_path, read_evaluation, write_csv,
+    write_evaluation, write_report,
 };
+use globalsplat::metrics::{CaptureScores, Scores, ViewScore};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
@@ -19,19 +20,13 @@ fn scene(name: &str, psnr: f64, lpips: bool) -> SceneScores {
     let ssim = psnr / 64.; // exact in binary, like all values here, and so exact in JSON
     let view = |i: i32| {
         let psnr = psnr + f64::from(i - 1);
-        ViewScore { image: format!("{i:06}.png"), psnr, ssim, lpips_vgg, lpips_alex, pixel_fraction: None }
+        ViewScore {
+            image: format!("{i:06}.png"),
+            scores: Scores { psnr, ssim, lpips_vgg, lpips_alex, pixel_fraction: None },
+        }
     };
     let views = (0..3).map(view).collect();
-    let scores = CaptureScores {
-        scene: name.into(),
-        psnr,
-        ssim,
-        lpips_vgg,
-        lpips_alex,
-        pixel_fraction: None,
-        gaussians: Some(16_384),
-        views,
-    };
+    let scores = CaptureScores::from_views(name, views, Some(16_384));
     let forward_seconds = Some(0.25);
     SceneScores {
         scores,
@@ -85,7 +80,7 @@ fn made_up(folder: &Path) -> Vec<(PathBuf, Evaluation)> {
     for (folder, evaluation) in &evaluations {
         std::fs::create_dir_all(folder.join("scenes")).unwrap();
         for scene in evaluation.scenes.iter().filter(|scene| scene.scores.scene != "b") {
-            let colour = image::Rgb([90, 120, (scene.scores.psnr * 5.) as u8]);
+            let colour = image::Rgb([90, 120, (scene.scores.mean.psnr * 5.) as u8]);
             image::RgbImage::from_pixel(1036, 256, colour)
                 .save(comparison_path(folder, &scene.scores.scene))
                 .unwrap();

@@ -4,8 +4,9 @@ use crate::common::program::room;
 use crate::common::{captures, has_lpips, rerun_test, skip};
 use glam::{DMat3, DVec3};
 use globalsplat::data::{Capture, PhotoSize, find_captures, open_capture};
-use globalsplat::eval::{CaptureScores, EvalScene, Method, Perceptual, score_output};
+use globalsplat::eval::{EvalScene, Method, score_output};
 use globalsplat::io::{read_splat, write_splat};
+use globalsplat::metrics::{CaptureScores, Perceptual};
 use globalsplat::render::transform;
 use globalsplat::scene::{Gaussians, Similarity};
 use std::path::{Path, PathBuf};
@@ -45,8 +46,8 @@ fn published_splats_reach_their_scores() {
     let perceptual = Perceptual::find(tch::Device::Cpu).expect("weights");
     for (path, capture, [psnr, ssim]) in known(&PUBLISHED) {
         let scores = published_scores(&path, &capture, &perceptual);
-        assert!((scores.psnr - psnr).abs() < 0.01, "{}: PSNR {}", capture.name, scores.psnr);
-        assert!((scores.ssim - ssim).abs() < 0.0005, "{}: SSIM {}", capture.name, scores.ssim);
+        assert!((scores.mean.psnr - psnr).abs() < 0.01, "{}: PSNR {}", capture.name, scores.mean.psnr);
+        assert!((scores.mean.ssim - ssim).abs() < 0.0005, "{}: SSIM {}", capture.name, scores.mean.ssim);
     }
 }
 
@@ -62,9 +63,9 @@ fn published_splats_look_as_they_are_known_to() {
     let perceptual = Perceptual::find(tch::Device::Cpu).expect("weights");
     for (path, capture, [vgg, alex]) in known(&PUBLISHED_LPIPS) {
         let scores = published_scores(&path, &capture, &perceptual);
-        assert!(perceptual.explain_missing(&scores).is_none());
+        assert!(perceptual.explain_missing(&scores.mean).is_none());
         let (found_vgg, found_alex) =
-            (scores.lpips_vgg.expect("LPIPS-VGG"), scores.lpips_alex.expect("LPIPS-Alex"));
+            (scores.mean.lpips_vgg.expect("LPIPS-VGG"), scores.mean.lpips_alex.expect("LPIPS-Alex"));
         assert!((found_vgg - vgg).abs() < 0.0005, "{}: LPIPS-VGG {found_vgg}", capture.name);
         assert!((found_alex - alex).abs() < 0.0005, "{}: LPIPS-Alex {found_alex}", capture.name);
     }
@@ -110,7 +111,7 @@ fn a_moved_splat_looks_the_same_to_moved_cameras() {
         let after = globalsplat::render::render_views(&moved, &moved_cameras).expect("pictures");
         for (a, b) in before.iter().zip(&after) {
             // Not bit-identical: positions of size 10 instead of 1 have fewer fractional digits in float32.
-            assert!(globalsplat::eval::psnr(&b.rgb, &a.rgb) > 60.);
+            assert!(globalsplat::metrics::psnr(&b.rgb, &a.rgb) > 60.);
             assert!(crate::common::relative_error(&b.depth, &(&a.depth * to.scale)) < 1e-3);
         }
     }

@@ -58,7 +58,7 @@ fn camera() -> Camera {
 
 fn psnr_of_pictures(a: &Splat, b: &Splat, camera: Camera) -> f64 {
     let seen = |splat: &Splat| render_views(&Gaussians::from_splat(splat), &[camera]).unwrap().remove(0).rgb;
-    globalsplat::eval::psnr(&seen(a), &seen(b))
+    globalsplat::metrics::psnr(&seen(a), &seen(b))
 }
 
 /// Renders from all sides are the same after a round trip: a wrong sign, order or axis would show from some side.
@@ -172,7 +172,8 @@ fn convert_edits_in_the_given_order() {
         succeed(&["render", "--splat", arg(splat), "--path", arg(path), "--out", arg(&out)]);
         globalsplat::io::tensor_from_rgb(&image::open(&out).unwrap().into_rgb8())
     };
-    let psnr = globalsplat::eval::psnr(&views(&original, &room.join("cameras.json")), &views(&to, &cameras));
+    let psnr =
+        globalsplat::metrics::psnr(&views(&original, &room.join("cameras.json")), &views(&to, &cameras));
     assert!(psnr > 33., "{psnr} dB");
     convert(&["--rotate", "20,-40,100", "--scale", "3", "--translate", "-4,5,-6"]);
     let over = |file: &Path| {
@@ -268,10 +269,10 @@ fn moved_splats_look_the_same() {
     let seen = |splat: &Splat, camera: Camera| {
         globalsplat::render::SplatRenderer::from_splat(splat).render(&[camera]).unwrap().remove(0).rgb
     };
-    let psnr = globalsplat::eval::psnr(&seen(&splat, camera()), &seen(&moved, along));
+    let psnr = globalsplat::metrics::psnr(&seen(&splat, camera()), &seen(&moved, along));
     assert!(psnr > 70., "{psnr} dB");
     let without_colours = Splat { sh: splat.sh.clone(), ..moved };
-    let psnr = globalsplat::eval::psnr(&seen(&splat, camera()), &seen(&without_colours, along));
+    let psnr = globalsplat::metrics::psnr(&seen(&splat, camera()), &seen(&without_colours, along));
     assert!(psnr < 40., "colours matter: {psnr} dB");
 }
 
@@ -313,7 +314,7 @@ fn convert_preserves_the_views_of_a_capture() {
                     "{ending}: {beyond:?} beyond what viewers hold"
                 );
             }
-            globalsplat::eval::psnr_between(&splat, &copy, &cameras).unwrap().unwrap()
+            globalsplat::metrics::psnr_between(&splat, &copy, &cameras).unwrap().unwrap()
         };
         let (cut_off, fitted) = (psnr(&[]), psnr(&["--scene", arg(&room)]));
         assert!(fitted > cut_off + gain, "{ending}: {cut_off} dB cut off, {fitted} dB fitted");
@@ -333,9 +334,9 @@ fn convert_preserves_the_views_of_a_capture() {
         succeed(&[&refine[..], &[arg(to)]].concat());
     }
     let [small, large] = [&out, &own].map(|path| read_splat(path).unwrap());
-    let psnr = globalsplat::eval::psnr_between(&large, &small, &cameras).unwrap().unwrap();
+    let psnr = globalsplat::metrics::psnr_between(&large, &small, &cameras).unwrap().unwrap();
     let cut = fit_splat(&out, &large, &ShLimits::up_to(3), &[]).unwrap();
-    let cut_off = globalsplat::eval::psnr_between(&large, &cut, &cameras).unwrap().unwrap();
+    let cut_off = globalsplat::metrics::psnr_between(&large, &cut, &cameras).unwrap().unwrap();
     assert!(psnr > cut_off + 6., "{psnr} dB, {cut_off} dB cut off");
 }
 

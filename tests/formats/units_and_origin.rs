@@ -5,10 +5,10 @@ use crate::common::program::{arg, globalsplat, refuse, room, succeed};
 use crate::common::{captures, has_viewer};
 use glam::{DMat3, DMat4, DVec3};
 use globalsplat::data::{open_capture, write_cameras_json};
-use globalsplat::eval::psnr;
 use globalsplat::io::{
     Splat, origin_file, read_image, read_splat, tensor_from_rgb, write_local_splat, write_splat,
 };
+use globalsplat::metrics::psnr;
 use globalsplat::render::{SplatRenderer, transform};
 use globalsplat::scene::{Camera, Gaussians, LocalFrame, Similarity};
 use serde_json::{Value, json};

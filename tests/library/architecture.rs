@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 /// Layers, from the highest to the lowest: a module may use those after it, and those in [`GROUND`].
-const LAYERS: [&str; 18] = [
+const LAYERS: [&str; 19] = [
     "cli",
     "parity",
     "bench",
@@ -12,6 +12,7 @@ const LAYERS: [&str; 18] = [
     "eval",
     "train",
     "reconstruct",
+    "metrics",
     "config",
     "optim",
     "loss",

@@ -8,7 +8,7 @@ use super::report::print_result;
 use anyhow::Result;
 use clap::Args;
 use globalsplat::data::{Capture, PhotoSize};
-use globalsplat::eval::process_age;
+use globalsplat::device::process_age;
 use globalsplat::io::{
     InputFiles, check_writable_dir, check_writable_file, check_writable_png, check_writable_splat,
     read_splat, splat_files, weights_files,

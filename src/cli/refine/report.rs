@@ -1,7 +1,7 @@
 //! Output of a refinement's result.
 
 use super::super::print_json;
-use globalsplat::eval::CaptureScores;
+use globalsplat::metrics::CaptureScores;
 use globalsplat::refine::{Correction, EvalPoint, RefineResult, RefineSession, SampleScores};
 use serde_json::json;
 use std::path::Path;
@@ -18,7 +18,7 @@ pub fn print_result(
     let RefineResult { steps, seconds: [begun, ended], shown: [before, after], corrections, .. } = result;
     let (count, photos) = (result.gaussians.count(), session.photos().len());
     // Scores are of the held-out views if there are any, else of the photos.
-    let distances = lpips.map_or([None; 2], |scores| scores.each_ref().map(|scores| scores.lpips_vgg));
+    let distances = lpips.map_or([None; 2], |scores| scores.each_ref().map(|scores| scores.mean.lpips_vgg));
     let (of_photos, of_held_out) =
         if session.held_out().is_empty() { (distances, [None; 2]) } else { ([None; 2], distances) };
     let scores =
@@ -31,7 +31,7 @@ pub fn print_result(
             "shown": { "before": of(before, of_photos[0]), "after": of(after, of_photos[1]) },
         });
         if let Some([before, after]) = held_out {
-            let of = |scores_of: &CaptureScores, lpips| scores(scores_of.psnr, scores_of.ssim, lpips);
+            let of = |of: &CaptureScores, lpips| scores(of.mean.psnr, of.mean.ssim, lpips);
             let scores = session.sample_scores(after);
             let last = EvalPoint { seconds: *ended, steps: *steps, scores };
             let curve: Vec<&EvalPoint> = result.curve.iter().chain([&last]).collect();
@@ -54,7 +54,8 @@ pub fn print_result(
     if let Some([before, after]) = held_out {
         let (scored, all) = (after.views.len(), session.held_out().len());
         let of_all = if scored < all { format!(" of {all}") } else { String::new() };
-        row(format!("{scored}{of_all} views held out"), [before.psnr, after.psnr], after.ssim);
+        let psnr = [before.mean.psnr, after.mean.psnr];
+        row(format!("{scored}{of_all} views held out"), psnr, after.mean.ssim);
     }
     if let [Some(before), Some(after)] = distances {
         println!("LPIPS (VGG) {before:.4} before, {after:.4} after");

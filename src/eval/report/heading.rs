@@ -32,7 +32,7 @@ pub fn heading(title: &str, entries: &[Entry]) -> Markup {
 
 fn card(entry: &Entry) -> Markup {
     let evaluation = entry.evaluation;
-    let mean = evaluation.summary;
+    let mean = evaluation.summary.mean;
     let [height, width] = evaluation.image_size;
     html! {
         article.card {
@@ -48,7 +48,7 @@ fn card(entry: &Entry) -> Markup {
                 @if mean.lpips_alex.is_some() {
                     (tile("LPIPS-Alex", mean.lpips_alex.and_then(numbers::mean).map(|v| decimal(v, 4)), ""))
                 }
-                (tile("Gaussians", mean.gaussians.and_then(numbers::mean).map(|n| thousands(n.round() as u64)), ""))
+                (tile("Gaussians", evaluation.summary.gaussians.and_then(numbers::mean).map(|n| thousands(n.round() as u64)), ""))
             }
             p.fine {
                 @if entry.is_whole() {

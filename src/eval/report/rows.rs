@@ -39,14 +39,14 @@ pub fn rows<'a>(entries: &'a [Entry<'a>], dataset: &str, views: usize) -> Vec<Ro
     });
     let measured = entries.iter().filter(|s| s.dataset == dataset && s.evaluation.context_views == views);
     let ours = measured.map(|entry| {
-        let mean = entry.evaluation.summary;
+        let mean = entry.evaluation.summary.mean;
         Row {
             name: &entry.name,
             measured: Some(entry),
             psnr: numbers::mean(mean.psnr),
             ssim: numbers::mean(mean.ssim),
             lpips: mean.lpips_vgg.and_then(numbers::mean),
-            kilo_gaussians: mean.gaussians.and_then(numbers::mean).map(|n| n * 1e-3),
+            kilo_gaussians: entry.evaluation.summary.gaussians.and_then(numbers::mean).map(|n| n * 1e-3),
         }
     });
     let mut rows: Vec<Row> = theirs.chain(ours).collect();

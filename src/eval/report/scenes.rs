@@ -5,9 +5,9 @@ use super::numbers::{absent, count, decimal, thousands};
 use super::table::{Head, cell, swatch, table};
 use crate::error::{Error, Result};
 use crate::eval::evaluation::SceneScores;
-use crate::eval::scores::{CaptureScores, ViewScore};
 use crate::eval::scores_file::comparison_path;
 use crate::io::read_image_size;
+use crate::metrics::{CaptureScores, ViewScore};
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use maud::{Markup, html};
@@ -28,7 +28,7 @@ struct Scene<'a> {
 
 impl Scene<'_> {
     fn worst(&self) -> f64 {
-        self.scored.iter().map(|(_, scene)| scene.scores.psnr).fold(f64::INFINITY, f64::min)
+        self.scored.iter().map(|(_, scene)| scene.scores.mean.psnr).fold(f64::INFINITY, f64::min)
     }
 }
 
@@ -108,10 +108,10 @@ fn scored(entry: &Entry, scene: &SceneScores, compares: bool) -> Result<Markup> 
 
 fn measures(scores: &CaptureScores) -> Markup {
     html! {
-        span { "PSNR " b { (decimal(scores.psnr, 2)) } " dB" }
-        span { "SSIM " b { (decimal(scores.ssim, 4)) } }
-        span { "LPIPS-VGG " @match scores.lpips_vgg { Some(v) => { b { (decimal(v, 4)) } } None => (absent()) } }
-        @if let Some(v) = scores.lpips_alex { span { "LPIPS-Alex " b { (decimal(v, 4)) } } }
+        span { "PSNR " b { (decimal(scores.mean.psnr, 2)) } " dB" }
+        span { "SSIM " b { (decimal(scores.mean.ssim, 4)) } }
+        span { "LPIPS-VGG " @match scores.mean.lpips_vgg { Some(v) => { b { (decimal(v, 4)) } } None => (absent()) } }
+        @if let Some(v) = scores.mean.lpips_alex { span { "LPIPS-Alex " b { (decimal(v, 4)) } } }
         @if let Some(n) = scores.gaussians { span { b { (thousands(n.unsigned_abs())) } " Gaussians" } }
     }
 }
@@ -125,7 +125,7 @@ fn comparison(entry: &Entry, scores: &CaptureScores) -> Result<Markup> {
     let (width, height) = read_image_size(&path)?;
     let bytes = std::fs::read(&path).map_err(Error::read(&path))?;
     let source = format!("data:image/jpeg;base64,{}", BASE64_STANDARD.encode(bytes));
-    let worst = scores.views.iter().min_by(|a, b| a.psnr.total_cmp(&b.psnr));
+    let worst = scores.views.iter().min_by(|a, b| a.scores.psnr.total_cmp(&b.scores.psnr));
     let view = worst.map_or(String::new(), |view| format!(", view {}", view.image));
     let alt =
         format!("{}{view}, by {}: photo, render, error and depth side by side", scores.scene, entry.name);
@@ -142,11 +142,11 @@ fn comparison(entry: &Entry, scores: &CaptureScores) -> Result<Markup> {
 /// Renders the scores of the views, worst first. The worst view is the one that the comparison image shows.
 fn views(views: &[ViewScore]) -> Markup {
     let mut views: Vec<&ViewScore> = views.iter().collect();
-    views.sort_by(|a, b| a.psnr.total_cmp(&b.psnr));
+    views.sort_by(|a, b| a.scores.psnr.total_cmp(&b.scores.psnr));
     html! {
         @for (i, view) in views.iter().take(LISTED_VIEWS).enumerate() {
             @if i > 0 { ", " }
-            (view.image) " " span.nowrap { (decimal(view.psnr, 2)) " dB" } @if i == 0 { " (shown)" }
+            (view.image) " " span.nowrap { (decimal(view.scores.psnr, 2)) " dB" } @if i == 0 { " (shown)" }
         }
         @if views.len() > LISTED_VIEWS { " and " (count(views.len() - LISTED_VIEWS, "better one")) }
     }
@@ -176,10 +176,10 @@ fn rest(scenes: &[Scene]) -> Markup {
                     th scope="row" { (scene.name) }
                     td { (swatch(entry)) (entry.name) }
                     td { (entry.setting()) }
-                    (cell(Some(decimal(scores.psnr, 2))))
-                    (cell(Some(decimal(scores.ssim, 4))))
-                    (cell(scores.lpips_vgg.map(|v| decimal(v, 4))))
-                    (cell(scores.lpips_alex.map(|v| decimal(v, 4))))
+                    (cell(Some(decimal(scores.mean.psnr, 2))))
+                    (cell(Some(decimal(scores.mean.ssim, 4))))
+                    (cell(scores.mean.lpips_vgg.map(|v| decimal(v, 4))))
+                    (cell(scores.mean.lpips_alex.map(|v| decimal(v, 4))))
                     (cell(scores.gaussians.map(|n| thousands(n.unsigned_abs()))))
                     td { (frames(&scored.target)) }
                 }

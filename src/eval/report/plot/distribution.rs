@@ -16,7 +16,7 @@ const MAX_BINS: f64 = 28.;
 pub fn distributions(entries: &[Entry], dataset: &str) -> Markup {
     let entries = entries.iter().filter(|entry| entry.dataset == dataset && entry.scored() > 0);
     let scenes = entries.clone().flat_map(|entry| &entry.evaluation.scenes);
-    let (worst, best) = bounds(scenes.map(|scene| scene.scores.psnr));
+    let (worst, best) = bounds(scenes.map(|scene| scene.scores.mean.psnr));
     let width = BIN_WIDTHS.into_iter().find(|width| (best - worst) / width <= MAX_BINS).unwrap_or(10.);
     let first = (worst / width).floor();
     html! {
@@ -30,14 +30,14 @@ pub fn distributions(entries: &[Entry], dataset: &str) -> Markup {
 fn histogram(entry: &Entry, first: f64, bins: usize, width: f64) -> Markup {
     let mut counts = vec![0; bins];
     for scene in &entry.evaluation.scenes {
-        let bin = (scene.scores.psnr / width).floor() - first;
+        let bin = (scene.scores.mean.psnr / width).floor() - first;
         counts[(bin as usize).min(bins - 1)] += 1;
     }
     let highest = counts.iter().copied().max().unwrap_or(0);
     let edge = |bin: usize| (first + bin as f64) * width;
     let x = Axis::linear(edge(0), edge(bins), MARGINS.left, WIDTH - MARGINS.right);
     let y = Axis::linear(0., f64::from(highest).max(5.), HEIGHT - MARGINS.bottom, MARGINS.top);
-    let mean = entry.evaluation.summary.psnr;
+    let mean = entry.evaluation.summary.mean.psnr;
     let at = x.pixel(mean);
     let drawing = html! {
         (frame(&x, &y, "PSNR of a scene (dB)", "Scenes", |v| decimal(v, if v.fract() == 0. { 0 } else { 1 })))

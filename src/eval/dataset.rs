@@ -1,11 +1,9 @@
 //! Evaluation of a method over a dataset, by an index: the paper's protocol (spec 9.1). The scores of every scene are stored as soon as
 //! they are computed, so an interrupted evaluation resumes after the last finished scene.
 
-use super::comparison_image::comparison_image;
 use super::evaluation::{Efficiency, Evaluation, Failure, SceneScores, Summary};
 use super::index::EvaluationIndex;
 use super::method::{Method, MethodOutput, score_output};
-use super::perceptual::Perceptual;
 use super::published::known_dataset;
 use super::scene::SceneLoader;
 use super::score_store::{Identity, ScoreStore};
@@ -13,6 +11,7 @@ use super::scores_file::comparison_path;
 use crate::data::{Dataset, OpenGroup, SceneGroup};
 use crate::error::{Error, Result};
 use crate::io::{WeightsFile, checksum, write_jpeg};
+use crate::metrics::{Perceptual, comparison_image};
 use crate::ranks::ProcessGroup;
 use crate::scene::ImageSize;
 use serde::{Deserialize, Serialize};
@@ -27,8 +26,9 @@ use tch::{Device, Tensor};
 /// ```no_run
 /// use globalsplat::data::{Dataset, Split};
 /// use globalsplat::eval::{
-///     DatasetEvaluation, EvaluationIndex, Method, Perceptual, machine, weights_fingerprint, write_evaluation, write_report,
+///     DatasetEvaluation, EvaluationIndex, Method, machine, weights_fingerprint, write_evaluation, write_report,
 /// };
+/// use globalsplat::metrics::Perceptual;
 /// use globalsplat::ranks::ProcessGroup;
 /// use globalsplat::reconstruct::load_model;
 /// use std::path::Path;
@@ -314,7 +314,7 @@ impl DatasetEvaluation<'_> {
         open: impl FnOnce() -> Option<&'a OpenGroup>,
     ) -> Option<SceneScores> {
         let kept = store.read_scores(key)?;
-        if Perceptual::could_add_to(&kept.scores.scores, self.target_size) {
+        if Perceptual::could_add_to(&kept.scores.scores.mean, self.target_size) {
             return None;
         }
         let capture = open()?.capture(key).ok()?;
@@ -351,10 +351,10 @@ impl DatasetEvaluation<'_> {
     fn score_output(&self, mut output: MethodOutput, perceptual: &Perceptual) -> Result<SceneScores> {
         let mut worst: Option<(f64, Tensor)> = None;
         let scores = score_output(&mut output, perceptual, |ground_truth, picture, score| {
-            if worst.as_ref().is_none_or(|(psnr, _)| score.psnr.total_cmp(psnr).is_lt()) {
+            if worst.as_ref().is_none_or(|(psnr, _)| score.scores.psnr.total_cmp(psnr).is_lt()) {
                 let photo = ground_truth.image.to_float();
                 let image = comparison_image(&photo, &picture.rgb, picture.rendered.as_ref());
-                worst = Some((score.psnr, image));
+                worst = Some((score.scores.psnr, image));
             }
             Ok(())
         })?;

@@ -1,19 +1,18 @@
 //! Validation: renders and scores held-out views and scenes during training (spec 8.8).
 
+use super::baselines::nearest_context_baseline;
 use super::photo_source::LazyPhotos;
 use super::scene::split_views;
-use super::scores::{CaptureScores, nearest_context_baseline, score};
 use crate::data::{
     Capture, DataConfig, Dataset, Holdout, SceneGroup, Split, TrainingScenes, View, cameras_at, load_views,
 };
 use crate::error::{Error, Result};
+use crate::metrics::{CaptureScores, score_views};
 use crate::reconstruct::{reconstruct, spread_over_path};
-use crate::render::render_views;
 use crate::train::{Score, Trainer, Validator};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
-use tch::Tensor;
 
 /// Views held out of the training scenes, and scenes that are held out as a whole.
 #[derive(Debug)]
@@ -203,9 +202,10 @@ fn score_scene(
     let model = trainer.as_model();
     let reconstruction = reconstruct(model, &context, &poses)?;
     let gaussians = reconstruction.gaussians.to_device(model.device);
-    let rendered = render_views(&gaussians, &cameras_at(&target, &reconstruction.target_poses))?;
-    let pictures: Vec<Tensor> = rendered.into_iter().map(|rendered| rendered.rgb).collect();
-    let ours = score(name, &pictures, &target, Some(reconstruction.gaussians.count()))?;
+    let cameras = cameras_at(&target, &reconstruction.target_poses);
+    let moved = target.iter().zip(cameras).map(|(view, camera)| View { camera, ..view.shallow_clone() });
+    let moved: Vec<View> = moved.collect();
+    let ours = score_views(name, &gaussians, &moved, None, |_| true)?.expect("a target view");
     let [context, target] = [context, target].map(LazyPhotos::Loaded);
     Ok(HeldOutScores { ours, nearest: nearest_context_baseline(name, &context, &target)? })
 }
@@ -247,7 +247,7 @@ impl Validator for HeldOut {
         }
         let mean =
             |value: fn(&HeldOutScores) -> f64| scores.iter().map(value).sum::<f64>() / scores.len() as f64;
-        let (psnr, ssim) = (mean(|s| s.ours.psnr), mean(|s| s.ours.ssim));
+        let (psnr, ssim) = (mean(|s| s.ours.mean.psnr), mean(|s| s.ours.mean.ssim));
         let score = Score { psnr, ssim, scenes: scores.len(), stage: trainer.stage(), left_out };
         self.scores = scores;
         Ok(Some(score))

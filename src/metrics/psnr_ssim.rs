@@ -1,4 +1,4 @@
-//! Image metrics (spec 9.4), in float64 on values clamped to [0, 1].
+//! PSNR and SSIM of images (spec 9.4), in float64 on values clamped to [0, 1].
 
 use crate::loss::{self, fill_masked, psnr_of_mse};
 use tch::{Kind, Tensor};

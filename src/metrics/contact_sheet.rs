@@ -1,15 +1,21 @@
-//! Contact sheets for visual inspection: ground truth, render and depth side by side.
+//! Images for visual inspection: ground truth, render and depth side by side, of many views or of one.
 
 use crate::data::View;
 use crate::error::Result;
-use crate::io::{Mosaic, colourize_depth, enlarge, shrink, subsample};
+use crate::io::{Mosaic, colourize_depth, enlarge, shrink, shrink_factor, subsample, tile_horizontally};
 use crate::render::{RenderedView, render_views};
 use crate::scene::Gaussians;
 use std::path::Path;
-use tch::Tensor;
+use tch::{Kind, Tensor};
 
 /// Height in pixels that small images are enlarged to, or a little less.
 const HEIGHT: i64 = 256;
+
+/// Mean error over the channels from which on the brightest color is used.
+const FULL_ERROR: f64 = 0.25;
+
+/// Maximum number of pixels of a comparison image, which is displayed in a page.
+const MAX_PIXELS: i64 = 1 << 24;
 
 /// A sheet with a row per view: photo, render, depth. Large images of many views are shrunk.
 #[derive(Debug)]
@@ -55,4 +61,21 @@ impl ContactSheet {
         self.0.write(path)?;
         Ok(shrunk_by)
     }
+}
+
+/// Returns the comparison image of a view, `[3, H, W']` in [0, 1]: the photo, the image, its error and the depth side by side. Large images
+/// are shrunk. The depth is left out if `rendered` is `None`.
+pub fn comparison_image(ground_truth: &Tensor, image: &Tensor, rendered: Option<&RenderedView>) -> Tensor {
+    let size = image.size();
+    let factor = shrink_factor(4 * size[1] * size[2], MAX_PIXELS);
+    let (ground_truth, image) = (shrink(ground_truth, factor), shrink(&image.clamp(0., 1.), factor));
+    let error = (&image - &ground_truth).abs().mean_dim([0i64].as_slice(), false, Kind::Float) / FULL_ERROR;
+    // Color map: black, red, yellow, white.
+    let heat = Tensor::stack(&[&error * 3., &error * 3. - 1., &error * 3. - 2.], 0).clamp(0., 1.);
+    let mut images = vec![ground_truth, image, heat];
+    if let Some(rendered) = rendered {
+        let [depth, alpha] = [&rendered.depth, &rendered.alpha].map(|numbers| subsample(numbers, factor));
+        images.push(colourize_depth(&depth, &alpha));
+    }
+    tile_horizontally(&images)
 }

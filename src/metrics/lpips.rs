@@ -1,7 +1,7 @@
 //! LPIPS in evaluation, with the networks whose weights are installed.
 
-use super::metrics::mean_weight;
-use super::scores::{CaptureScores, ViewScore};
+use super::Scores;
+use super::psnr_ssim::mean_weight;
 use crate::data::View;
 use crate::error::Result;
 use crate::io::{WEIGHTS_VARIABLE, find_pretrained, pretrained_folders};
@@ -28,18 +28,15 @@ impl Perceptual {
         Ok(Perceptual { vgg: load(LpipsNetwork::Vgg16)?, alex: load(LpipsNetwork::AlexNet)? })
     }
 
-    /// Returns `score` with the LPIPS distances between an image `[3, H, W]`, clamped to [0, 1], and the photo `ground_truth`, over the
-    /// pixels that count (spec 7.9). A distance is `None` if its network is missing or the view is too small for it.
-    pub(super) fn add_to(&self, score: ViewScore, image: &Tensor, ground_truth: &View) -> ViewScore {
-        ViewScore {
-            lpips_vgg: distance(self.vgg.as_ref(), image, ground_truth),
-            lpips_alex: distance(self.alex.as_ref(), image, ground_truth),
-            ..score
-        }
+    /// Sets the LPIPS distances of `scores` between an image `[3, H, W]`, clamped to [0, 1], and the photo `ground_truth`, over the pixels
+    /// that count (spec 7.9). A distance is `None` if its network is missing or the view is too small for it.
+    pub(super) fn add_to(&self, scores: &mut Scores, image: &Tensor, ground_truth: &View) {
+        scores.lpips_vgg = distance(self.vgg.as_ref(), image, ground_truth);
+        scores.lpips_alex = distance(self.alex.as_ref(), image, ground_truth);
     }
 
     /// Returns `true` if `scores` lack a distance that the installed weights could compute for views of `size`.
-    pub fn could_add_to(scores: &CaptureScores, size: ImageSize) -> bool {
+    pub fn could_add_to(scores: &Scores, size: ImageSize) -> bool {
         let side = i64::from(size.height.min(size.width));
         let networks = [(LpipsNetwork::Vgg16, scores.lpips_vgg), (LpipsNetwork::AlexNet, scores.lpips_alex)];
         networks.into_iter().any(|(network, score)| {
@@ -50,7 +47,7 @@ impl Perceptual {
     }
 
     /// Explains why `scores`, to which the available distances have been added, lack a distance. Returns `None` if they lack none.
-    pub fn explain_missing(&self, scores: &CaptureScores) -> Option<String> {
+    pub fn explain_missing(&self, scores: &Scores) -> Option<String> {
         let networks = [
             (LpipsNetwork::Vgg16, &self.vgg, scores.lpips_vgg),
             (LpipsNetwork::AlexNet, &self.alex, scores.lpips_alex),
