@@ -5,7 +5,6 @@
     python parity/run.py --self-test             also checks that wrong results are detected
     python parity/run.py --self-test 2/5         checks this for every fifth case, beginning with the third
     python parity/run.py --only '*float32,ssim' --cuda-on-cpu 1    runs the CUDA kernels, emulated on the CPU
-    python parity/run.py --self-test --markdown docs/parity.md     also writes a report
 
 Exits with 1 if a comparison fails, and with 2 if the request is wrong.
 """
@@ -13,7 +12,6 @@ Exits with 1 if a comparison fails, and with 2 if the request is wrong.
 import argparse
 import json
 import os
-import shlex
 import shutil
 import sys
 import time
@@ -21,7 +19,6 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from parity.harness.areas import CASES
-from parity.harness.document import format_document
 from parity.harness.exchange import ProgramError, program
 from parity.harness.runner import run_cases
 from parity.harness.table import as_json, self_test_report, table
@@ -61,7 +58,6 @@ def arguments(argv):
         const=(0, 1),
         help="perturb correct results and check detection, of all cases, or of those whose index modulo N is K",
     )
-    parser.add_argument("--markdown", metavar="FILE", type=Path, help="write docs/parity.md, a line per case, to FILE")
     parser.add_argument("--json", metavar="FILE", type=Path, help="write all results to FILE")
     parser.add_argument(
         "--binary",
@@ -71,20 +67,6 @@ def arguments(argv):
         help="the program (default: target/release/globalsplat)",
     )
     return parser.parse_args(argv)
-
-
-def command(options):
-    """Returns the command line, without paths that are specific to this machine."""
-    words = ["python", "parity/run.py"]
-    for name, default in (("only", "*"), ("seed", 0), ("repeat", 1), ("device", "cpu")):
-        value = getattr(options, name)
-        words += [] if value == default else [f"--{name}", str(value)]
-    words += [] if options.cuda_on_cpu is None else ["--cuda-on-cpu", str(options.cuda_on_cpu)]
-    words += ["--self-test"] if options.self_test else []
-    words += ["{}/{}".format(*options.self_test)] if options.self_test not in (None, (0, 1)) else []
-    path = options.markdown.resolve()
-    words += ["--markdown", str(path.relative_to(REPOSITORY) if path.is_relative_to(REPOSITORY) else path.name)]
-    return shlex.join(words)
 
 
 def progress(text):
@@ -126,8 +108,6 @@ def main(argv=None):
     if options.self_test:
         undetected = sum(len(result.missed) for result in results)
         print(self_test_report(results))
-    if options.markdown:
-        options.markdown.write_text(format_document(results, command(options), options.device), encoding="utf-8")
     if options.json:
         about = {"seed": options.seed, "repeat": options.repeat, "device": options.device}
         options.json.write_text(json.dumps(as_json(results, **about), indent=1) + "\n")

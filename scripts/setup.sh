@@ -13,7 +13,7 @@ missing() {
     exit 2
 }
 
-# Downloads the LPIPS weights with any available Python: the script needs no packages.
+# Downloads the LPIPS weights.
 weights() {
     local python=.venv/bin/python
     [ -x "$python" ] || python="${PYTHON:-python3}"

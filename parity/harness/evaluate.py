@@ -7,7 +7,6 @@ import torch
 
 from .areas import REFERENCES
 from .close_calls import FlippedDecisions
-from .exchange import read_request, write_answer
 
 
 class Evaluation:
@@ -49,17 +48,3 @@ class Evaluation:
             name: (torch.zeros_like(leaf) if gradient is None else gradient).detach().numpy()
             for (name, leaf), gradient in zip(self.leaves.items(), gradients, strict=True)
         }
-
-
-def answer_files(requests, answers, on_progress=lambda done: None):
-    """Answers a folder of requests with the reference instead of the program, in the precision of the requests."""
-    for done, path in enumerate(sorted(requests.glob("*.npz")), start=1):
-        request = read_request(path)
-        kinds = {array.dtype for array in [*request.params.values(), *request.inputs.values()]}
-        double = np.dtype(np.float64) in kinds
-        evaluation = Evaluation(request, torch.float64 if double else torch.float32)
-        answer = evaluation.output_arrays()
-        if request.cotangents:
-            answer |= evaluation.gradient_arrays(request.cotangents)
-        write_answer(answers / path.name, answer)
-        on_progress(done)

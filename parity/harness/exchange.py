@@ -44,22 +44,6 @@ def write_request(path, request):
     np.savez(path, **arrays)
 
 
-def read_request(path):
-    with np.load(path) as file:
-        arrays = dict(file)
-    case = json.loads(bytes(arrays.pop("case")))
-    request = Request(case["case"], case["config"], differentiate=tuple(case["differentiate"]))
-    groups = {"param": request.params, "in": request.inputs, "cot": request.cotangents}
-    for key, value in arrays.items():
-        prefix, name = key.split(".", 1)
-        groups[prefix][name] = value
-    return request
-
-
-def write_answer(path, arrays):
-    np.savez(path, **arrays)
-
-
 def read_answer(path):
     """Reads an answer as arrays by name. An error or a missing answer is returned as `error` alone."""
     if not path.exists():

@@ -9,17 +9,6 @@ from .layers import gelu, linear
 CENTRE_FREQUENCIES = (1.0, 2.0, 4.0, 8.0)  # times pi
 
 
-def check_intrinsics(intrinsic, height, width):
-    """Checks intrinsic [..., 3, 3] in pixels. Raises ValueError if they are invalid for an image of this size."""
-    fx, fy = intrinsic[..., 0, 0], intrinsic[..., 1, 1]
-    cx, cy = intrinsic[..., 0, 2], intrinsic[..., 1, 2]
-    if not bool(((fx > 0) & (fy > 0)).all()):
-        raise ValueError("intrinsics: focal lengths must be positive")
-    inside = (cx >= -1) & (cx <= width + 1) & (cy >= -1) & (cy <= height + 1)
-    if not bool(inside.all()):
-        raise ValueError(f"intrinsics: the principal point lies more than one pixel outside of {width}x{height}")
-
-
 def plucker_rays(c2w, intrinsic, height, width):
     """Returns the rays [B, V, 6, H, W] of c2w [B, V, 4, 4] and intrinsic [B, V, 3, 3], with channels (o x dir, dir).
 
@@ -54,7 +43,6 @@ def centre_features(centre):
 
 def camera_code(params, c2w, intrinsic, height, width):
     """Returns a code per view, [B, V, ray width]: W [MLP(log fx/W, log fy/H, cx/W, cy/H) ; features of the centre]."""
-    check_intrinsics(intrinsic, height, width)
     features = torch.stack(
         [
             torch.log(intrinsic[..., 0, 0] / width),

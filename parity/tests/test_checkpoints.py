@@ -140,8 +140,7 @@ def lightning(weights, prefix="model."):
     }
 
 
-@pytest.mark.parametrize("legacy", [False, True])
-@pytest.mark.parametrize("protocol", [2, 3, 4, 5])
+@pytest.mark.parametrize("legacy, protocol", [(False, 2), (False, 5), (True, 2), (True, 4)])
 def test_checkpoints_of_lightning_are_read(weights, tmp_path, legacy, protocol):
     file = tmp_path / "last.ckpt"
     torch.save(lightning(weights), file, pickle_protocol=protocol, _use_new_zipfile_serialization=not legacy)
@@ -155,9 +154,7 @@ def test_checkpoints_of_lightning_are_read(weights, tmp_path, legacy, protocol):
     assert "4 attention heads" in told["taken_for"] and "don't tell" not in told["taken_for"]
 
 
-@pytest.mark.parametrize(
-    "prefix", ["", "model.", "module.", "module.model.", "model.module.", "model._orig_mod.", "net.inner."]
-)
+@pytest.mark.parametrize("prefix", ["", "module.model.", "model._orig_mod.", "net.inner."])
 def test_names_are_found_behind_any_prefix(weights, tmp_path, prefix):
     file = tmp_path / "model.pt"
     torch.save({prefix + name: tensor for name, tensor in weights.items()}, file)
@@ -326,9 +323,10 @@ class Runs:
         return self.call
 
 
-@pytest.mark.parametrize("legacy", [False, True])
-@pytest.mark.parametrize("protocol", [2, 4])
-@pytest.mark.parametrize("place", ["beside", "inside", "as a parameter"])
+@pytest.mark.parametrize(
+    "legacy, protocol, place",
+    [(False, 2, "beside"), (True, 4, "inside"), (False, 4, "as a parameter"), (True, 2, "beside")],
+)
 def test_what_would_run_code_is_refused_and_not_run(weights, tmp_path, legacy, protocol, place):
     trap = tmp_path / "trap"
     calls = {
