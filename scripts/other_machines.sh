@@ -42,9 +42,9 @@ tests="$(sed -nE \
     -e 's#^ *Executable tests/([a-z]+)/main\.rs \((.*)\)$#\1 \2#p' \
     -e 's#^ *Executable tests/([a-z_]+)\.rs \((.*)\)$#file:\1 \2#p' <<<"$built")"
 
-# Tests that do not depend on these conditions and are slow or only check text: output of compilers and other programs, reductions across
-# processes, out of memory. They run here only if given by name.
-alike=(architecture citations cuda distributed refused_memory viewers)
+# Tests that do not depend on these conditions and are slow: output of compilers and other programs, reductions across processes. They run
+# here only if given by name.
+alike=(cuda distributed viewers)
 
 failed=()
 # Runs the tests $2…, or all tests, with the command $1, limited to the chosen ones. Prints the missing requirements of skipped tests.

@@ -2,7 +2,7 @@
 
 use crate::capture::Capture;
 use crate::splat::to_dict;
-use crate::work::{run, run_guarded};
+use crate::work::run;
 use globalsplat::Result;
 use globalsplat::data::Holdout;
 use globalsplat::model::{Precision, Stage};
@@ -23,7 +23,7 @@ pub fn reconstruct<'py>(
     views: Option<usize>,
     cuda: Option<usize>,
 ) -> PyResult<(Bound<'py, PyDict>, Vec<String>)> {
-    let (mut splat, assumed) = run_guarded(py, || {
+    let (mut splat, assumed) = run(py, || {
         let model = load(weights.as_deref(), device(cuda), None)?;
         let data = &model.config.data;
         let count = views.unwrap_or(data.context_views);

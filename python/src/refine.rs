@@ -4,7 +4,7 @@ use crate::capture::Capture;
 use crate::error::to_python;
 use crate::models::device;
 use crate::splat::{Parameters, to_dict};
-use crate::work::run_guarded;
+use crate::work::run;
 use globalsplat::Error;
 use globalsplat::data::PhotoSize;
 use globalsplat::refine::{Budget, Initial, RefineConfig, RefineEvent, RefineOptions, RefineSession};
@@ -66,7 +66,7 @@ pub fn refine<'py>(
     let count = initial.as_ref().map(|splat| splat.len().max(1));
     let options = options.into_refine_options(capture, count).map_err(to_python)?;
     let (mut warnings, mut raised) = (vec![], None);
-    let refined = run_guarded(py, || {
+    let refined = run(py, || {
         let on_event = |event: RefineEvent| {
             if let RefineEvent::Warning(line) = event {
                 warnings.push(line.to_string());

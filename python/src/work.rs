@@ -2,20 +2,10 @@
 
 use crate::error::to_python;
 use globalsplat::Result;
-use globalsplat::device::OversubscriptionGuard;
 use globalsplat_files::panic_message;
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-
-/// Runs the network or an optimization like [`run`], and meanwhile keeps libtorch's threads from spinning while other processes need the
-/// cores.
-pub fn run_guarded<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T> + Send) -> PyResult<T> {
-    run(py, || {
-        let _guard = OversubscriptionGuard::start();
-        work()
-    })
-}
 
 /// Runs `work` while other Python threads run. Errors of libtorch that the library doesn't expect arrive as panics, and become exceptions
 /// as well.

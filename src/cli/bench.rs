@@ -2,7 +2,7 @@ use super::bench_attention::Attention;
 use super::bench_model::Model;
 use super::bench_refine::Refine;
 use super::bench_train::Train;
-use super::{device, memory, open_capture, parse_size, print_json, progress, warn};
+use super::{device, open_capture, parse_size, print_json, progress, warn};
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use globalsplat::bench::{
@@ -95,7 +95,6 @@ pub struct Raster {
 
 impl Raster {
     pub fn run(self) -> Result<()> {
-        memory::keep();
         if let Some(threads) = self.threads {
             tch::set_num_threads(i32::from(threads).max(1));
         }

@@ -1,4 +1,4 @@
-use super::{device, memory, parse_size, print_json};
+use super::{device, parse_size, print_json};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::bench::{RefineReport, bench_refine};
@@ -32,7 +32,6 @@ pub struct Refine {
 
 impl Refine {
     pub fn run(self) -> Result<()> {
-        memory::keep();
         let config = RefineConfig::with(&self.set, true)?;
         let (size, device) = (parse_size(&self.size)?, device::parse(&self.device)?);
         let report = bench_refine(self.gaussians as usize, size, &config, self.steps, device)?;

@@ -1,5 +1,5 @@
 use super::bench_common::{print_parts, print_sections, read_config};
-use super::{memory, print_json, ranks};
+use super::{print_json, ranks};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::bench::{DistributedCost, Part, TrainReport, bench_train};
@@ -72,7 +72,6 @@ impl Train {
         if let Some(set) = self.set.iter().find(|set| set.trim_start().starts_with("train.batch")) {
             return Err(Error::request(format!("--set {set}: expected --batch N")).into());
         }
-        memory::keep_for(&config.train);
         let report = match self.batch {
             Batch::Scenes(scenes) => {
                 config.train.batch_size = scenes;

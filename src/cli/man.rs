@@ -1,6 +1,9 @@
+//! Descriptions of the command line for other programs: man pages and shell completions.
+
 use super::{command_line, print_json};
 use anyhow::Result;
 use clap::{Args, Command};
+use clap_complete::Shell;
 use clap_mangen::Man as Page;
 use clap_mangen::roff::{Roff, roman};
 use globalsplat::Error;
@@ -8,6 +11,28 @@ use globalsplat::io::{check_writable_dir, write_atomically};
 use serde_json::json;
 use std::io::{self, Write};
 use std::path::PathBuf;
+
+/// Print a script with which a shell completes the names of commands and options.
+#[derive(Args)]
+#[command(
+    after_help = "Examples:\n  globalsplat completions bash > ~/.local/share/bash-completion/completions/globalsplat\n  \
+    globalsplat completions zsh > ~/.zfunc/_globalsplat\n  \
+    globalsplat completions fish > ~/.config/fish/completions/globalsplat.fish"
+)]
+pub struct Completions {
+    /// Shell that reads the script
+    #[arg(value_enum)]
+    shell: Shell,
+}
+
+impl Completions {
+    pub fn run(self) -> Result<()> {
+        let mut script = vec![];
+        clap_complete::generate(self.shell, &mut command_line(), "globalsplat", &mut script);
+        print!("{}", String::from_utf8(script)?);
+        Ok(())
+    }
+}
 
 /// Write man pages: globalsplat.1, and one for every command, as in globalsplat-reconstruct.1.
 #[derive(Args)]

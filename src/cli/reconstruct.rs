@@ -1,5 +1,4 @@
 use super::capture::SceneSource;
-use super::memory::keep_during;
 use super::refine::{InitialFile, RefineJob, Reports, parse_time};
 use super::signals::StopRequest;
 use super::{check_views, device, model, open_masked_capture, parse_holdout, print_json, splat_out};
@@ -120,8 +119,7 @@ impl Reconstruct {
         };
         let count = self.views.unwrap_or(data.context_views);
         let size = input.photo_size(data.image_size);
-        let photos = stopwatch
-            .time("photos", || keep_during(|| load_context(&capture, holdout, Some(count), size)))?;
+        let photos = stopwatch.time("photos", || load_context(&capture, holdout, Some(count), size))?;
         if let Some(line) = fitting(&capture, photos.len(), input, data.image_size) {
             eprintln!("{line}");
         }

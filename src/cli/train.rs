@@ -1,4 +1,4 @@
-use super::{memory, print_json, progress, ranks, stop_flag, warn_of_many};
+use super::{print_json, progress, ranks, stop_flag, warn_of_many};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::config::Config;
@@ -67,7 +67,6 @@ impl Train {
         let (group, device) = ranks::join(&self.device)?;
         let (is_main_process, count) = (group.is_main_process(), group.world_size());
         let config = Config::read(&self.config, &self.set)?;
-        memory::keep_for(&config.train);
         let resume = match self.resume.to_str() {
             Some("auto") => Resume::Auto,
             Some("never") => Resume::Never,

@@ -75,7 +75,7 @@ fn flatten(key: &str, value: toml::Value, into: &mut BTreeMap<String, toml::Valu
 
 /// Sets the key that `assignment`, `section.key=value`, names in `table`.
 pub(super) fn override_key(table: &mut toml::Table, assignment: &str) -> Result<()> {
-    let refused = || Error::request(format!("override {assignment}: expected section.key=value"));
+    let refused = || Error::request(format!("--set {assignment}: expected section.key=value"));
     let (key, value) = assignment.split_once('=').ok_or_else(refused)?;
     let value: toml::Value = match format!("value = {value}").parse::<toml::Table>() {
         Ok(mut parsed) => parsed.remove("value").ok_or_else(refused)?,

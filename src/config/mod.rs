@@ -64,7 +64,7 @@ impl Config {
             override_key(&mut table, assignment)?;
             let config: std::result::Result<Config, _> = table.clone().try_into();
             config.map_err(|e: toml::de::Error| {
-                Error::request(format!("override {assignment}: {}", e.message().replace('\n', " ")))
+                Error::request(format!("--set {assignment}: {}", e.message().replace('\n', " ")))
             })?;
         }
         let config: Config = table.try_into().map_err(described)?;

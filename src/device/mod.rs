@@ -1,15 +1,13 @@
-//! Devices: asynchronous copies from the host to a GPU on a stream of their own, events that time the GPU's work, memory use, and a guard
-//! for threads that share cores with other processes. On the CPU the same calls run synchronously.
+//! Devices: asynchronous copies from the host to a GPU on a stream of their own, events that time the GPU's work, and memory use. On the
+//! CPU the same calls run synchronously.
 
 mod memory;
-mod oversubscription;
 mod stopwatch;
 
 pub(crate) use memory::{
     peak_device_memory_bytes, peak_memory_bytes_on, reset_peak_memory, resident_memory_bytes,
 };
 pub use memory::{peak_memory_bytes, total_memory_bytes};
-pub use oversubscription::OversubscriptionGuard;
 pub use stopwatch::{Stopwatch, process_age};
 
 use crate::error::Result;

@@ -141,7 +141,7 @@ impl DatasetEvaluation<'_> {
                 format!("{ours} by its name and {theirs} by that of {}", root.display())
             }
         };
-        Err(Error::input(&index.file, "the dataset", found, "a single one, or its name"))
+        Err(Error::input(&index.file, "the dataset", found, "a single one, as --dataset names"))
     }
 
     /// Scores the scenes that the index and the dataset have in common. `on_progress` is called with the number of finished scenes and the
@@ -437,7 +437,7 @@ mod tests {
         ] {
             let error = name(root, index).unwrap_err().to_string();
             assert!(error.contains(&format!("{index}: the dataset is {found}")), "{error}");
-            assert!(error.ends_with("expected a single one, or its name"), "{error}");
+            assert!(error.ends_with("expected a single one, as --dataset names"), "{error}");
         }
     }
 }

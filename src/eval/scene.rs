@@ -113,7 +113,7 @@ pub(super) fn split_views(capture: &Capture, holdout: Holdout) -> Result<(Vec<us
     let (context, held_out) = capture.split(holdout);
     if held_out.is_empty() || context.len() < 2 {
         let split = format!("{} context and {} target views", context.len(), held_out.len());
-        let expected = "2 and 1 at least (by holdout or data.holdout, every:N)";
+        let expected = "2 and 1 at least (--holdout or data.holdout, every:N)";
         return Err(Error::input(capture.file(), format!("the split by {holdout}"), split, expected));
     }
     Ok((context, held_out))

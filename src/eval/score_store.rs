@@ -54,12 +54,7 @@ impl ScoreStore {
         if let (false, Some(name)) = (file.exists(), others.into_iter().find(|name| out.join(name).exists()))
         {
             let found = format!("a folder with a {name} that no evaluation wrote");
-            return Err(Error::input(
-                out,
-                "the output",
-                found,
-                "a folder of its own (choose another output folder)",
-            ));
+            return Err(Error::input(out, "the output", found, "a folder of its own (choose another --out)"));
         }
         let store = ScoreStore::new(out);
         std::fs::create_dir_all(&store.scenes).map_err(Error::write(&store.scenes))?;
@@ -75,7 +70,7 @@ impl ScoreStore {
             return match serde_json::from_slice::<Identity>(&text) {
                 Ok(found) if found == *identity => Ok(store),
                 Ok(found) => {
-                    let expected = format!("{} (choose another output folder)", wanted(identity));
+                    let expected = format!("{} (choose another --out)", wanted(identity));
                     Err(Error::input(&file, "the evaluation", format!("of {}", wanted(&found)), expected))
                 }
                 Err(e) => Err(Error::input(

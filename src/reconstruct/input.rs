@@ -32,7 +32,7 @@ impl Input {
             let expected = format!(
                 "a multiple of the {side} pixels that the model sees, with sides of {MAX_SIDE} at most: {side}, {twice}, {thrice}, …"
             );
-            return Err(Error::setting("the height of the photos", height, expected));
+            return Err(Error::setting("--views-at", height, expected));
         }
         Ok(Input { phase })
     }
@@ -74,9 +74,7 @@ mod tests {
         for height in [0, 16, 48, 97, 12_288, u32::MAX] {
             let error = Input::with_height(height, trained).unwrap_err().to_string();
             assert!(
-                error.starts_with(&format!(
-                    "the height of the photos is {height}, expected a multiple of the 32"
-                )),
+                error.starts_with(&format!("--views-at is {height}, expected a multiple of the 32")),
                 "{error}"
             );
             assert!(error.ends_with("32, 64, 96, …"), "{error}");

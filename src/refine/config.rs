@@ -138,7 +138,7 @@ impl RefineConfig {
         let defaults = if from_splat { RefineConfig::from_splat() } else { RefineConfig::default() };
         let mut table = toml::Table::try_from(&defaults).expect("values that TOML can represent");
         for assignment in overrides {
-            let error = |why: &str| Error::request(format!("override {assignment}: {why}"));
+            let error = |why: &str| Error::request(format!("--set {assignment}: {why}"));
             let set: toml::Table = assignment.parse().map_err(|_| error("expected KEY=VALUE"))?;
             if set.len() != 1 {
                 return Err(error("expected KEY=VALUE"));
@@ -291,7 +291,7 @@ mod tests {
             ("view=3", "unknown field"),
         ] {
             let message = with(assignment).expect_err(assignment).to_string();
-            assert!(message.starts_with(&format!("override {assignment}: ")), "{message}");
+            assert!(message.starts_with(&format!("--set {assignment}: ")), "{message}");
             assert!(message.contains(expected), "{message}");
         }
         assert_eq!(with("resolution_schedule=[]").unwrap().schedule(1024), [0.; 0]);

@@ -87,8 +87,9 @@ pub fn list_checkpoints(run: &Path) -> Result<Vec<PathBuf>> {
 /// # Errors
 /// Returns an error if there is no checkpoint, a folder can't be read, or the checkpoint is damaged.
 pub fn latest_checkpoint(run: &Path) -> Result<PathBuf> {
-    let none =
-        || Error::input(run, "the run", "without a checkpoint", "a folder that `globalsplat train` made");
+    let none = || {
+        Error::input(run, "the run", "without a checkpoint", "a folder that `globalsplat train --out` made")
+    };
     let latest = list_checkpoints(run)?.pop().ok_or_else(none)?;
     check(&latest)?;
     Ok(latest)

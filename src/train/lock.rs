@@ -37,7 +37,7 @@ impl RunLock {
                     run,
                     "the run",
                     found,
-                    "a run that no other process trains (choose another output folder)",
+                    "a run that no other process trains (choose another --out)",
                 ));
             }
             Err(TryLockError::Error(e)) => return Err(Error::write(&path)(e)),

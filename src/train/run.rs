@@ -108,7 +108,7 @@ fn check_output_folder(out: &Path) -> Result<()> {
     }
     match [CONFIG_FILE, METRICS_FILE].into_iter().find(|name| out.join(name).exists()) {
         Some(name) => {
-            let expected = "a folder of its own (choose another output folder)";
+            let expected = "a folder of its own (choose another --out)";
             Err(Error::input(
                 out,
                 "the run's folder",
@@ -356,7 +356,7 @@ fn begin(
             let later = |of: &&PathBuf| check(of).map_or(true, |other| other.step > step);
             if let Some(later) = checkpoints.iter().rev().find(later) {
                 let expected = format!(
-                    "none after step {step} (choose another output folder, or Resume::Auto to go on from the last one)"
+                    "none after step {step} (choose another --out, or --resume auto to go on from the last one)"
                 );
                 let found = later.file_name().unwrap_or_default().display();
                 return Err(Error::input(out, "the last checkpoint", found, expected));
@@ -368,7 +368,7 @@ fn begin(
             trainer.load_initial_weights().map(|()| None)
         }
         Resume::Never => {
-            let expected = "none with Resume::Never (choose another output folder)";
+            let expected = "none with --resume never (choose another --out)";
             Err(Error::input(out, "the run", "one with checkpoints", expected))
         }
         Resume::Auto => {
@@ -384,12 +384,7 @@ fn begin(
                 }
             }
             let found = format!("broken, all {} of them", checkpoints.len());
-            Err(Error::input(
-                out,
-                "the run's checkpoints",
-                found,
-                "a whole one (choose another output folder)",
-            ))
+            Err(Error::input(out, "the run's checkpoints", found, "a whole one (choose another --out)"))
         }
     }
 }

@@ -1,11 +1,8 @@
-//! Tests of the library alone: the model, the splat op, losses and loading against golden tensors and twins; the architecture and
-//! citations.
+//! Tests of the library alone: the model, the splat op, losses and loading against golden tensors and references.
 
 #[path = "../common/mod.rs"]
 mod common;
 
-mod architecture;
-mod citations;
 mod fuzz_seeds;
 mod golden_loss;
 mod golden_model;

@@ -223,7 +223,7 @@ impl Purpose {
             (Ok(size), _) => Ok(size),
             (Err(_), Purpose::Cameras(Some(ImageSize { width, height }))) => Ok((width, height)),
             (Err(_), Purpose::Cameras(None)) => {
-                let expected = "one in the file, a photo to be asked, or a size for all photos";
+                let expected = "one in the file, a photo to be asked, or --size WxH";
                 Err(Error::input(file, format!("the size of {field}"), "missing", expected))
             }
             (Err(e), Purpose::Photos) => Err(e),

@@ -3,7 +3,7 @@
 use super::super::capture::SceneSource;
 use super::super::progress::{self, Progress};
 use super::super::signals::StopRequest;
-use super::super::{memory, model, open_masked_capture, report_downscaling, splat_out, warn};
+use super::super::{model, open_masked_capture, report_downscaling, splat_out, warn};
 use super::report::print_result;
 use anyhow::Result;
 use clap::Args;
@@ -21,7 +21,6 @@ use globalsplat::refine::{
 use globalsplat::scene::{Camera, LocalFrame};
 use std::cell::RefCell;
 use std::path::PathBuf;
-use std::sync::Once;
 use std::time::{Duration, Instant};
 
 /// Maximum number of cameras for which a splat's colours are fitted to the range of its file format.
@@ -78,7 +77,6 @@ impl RefineJob {
     pub fn run(mut self) -> Result<()> {
         let age = process_age().unwrap_or_default();
         let now = Instant::now();
-        memory::return_large_tensors();
         check_writable_splat(&self.out)?;
         splat_out::check_origin(&self.out, self.local_origin)?;
         if let Some(sheet) = &self.reports.sheet {
@@ -124,11 +122,7 @@ impl RefineJob {
         let steps = if let Initial::State(state) = initial { state.steps() } else { 0 };
         let log = self.reports.log.as_ref().map(|folder| RefineLog::create(folder, steps)).transpose()?;
         let log = RefCell::new(log);
-        let keeps_memory = Once::new();
         let on_event = |event: RefineEvent| {
-            if matches!(event, RefineEvent::Optimizing { .. }) {
-                keeps_memory.call_once(memory::keep);
-            }
             bar.tell(event);
             write_event(&mut log.borrow_mut(), event);
             !stop.is_requested()
