@@ -5,7 +5,7 @@ use super::parts::{Part, PartRecorder};
 use super::peak_throughput::PeakThroughput;
 use super::train::synthetic_scene;
 use crate::config::Config;
-use crate::data::{Batch, ViewBatch};
+use crate::data::Batch;
 use crate::device::Stopwatch;
 use crate::device::{peak_memory_bytes_on, reset_peak_memory};
 use crate::error::Result;
@@ -64,10 +64,10 @@ pub fn bench_model(
     let context = Batch::from_scenes(&[synthetic_scene(config, 0)], device)?.context;
     let stage = config.curriculum.final_stage();
     let peak = PeakThroughput::new(precision, device);
-    let ViewBatch { images, c2w, intrinsics, .. } = &context;
+    let input = context.model_input();
     let forward = || -> Result<f64> {
         let mut watch = Stopwatch::new(device);
-        drop(no_grad(|| watch.time("pass", || model.forward(images, c2w, intrinsics, stage))));
+        drop(no_grad(|| watch.time("pass", || model.forward(&input, stage))));
         Ok(1e3 * watch.sections()?[0].1.as_secs_f64())
     };
     let (mut parts, mut passes, mut products) = (PartRecorder::default(), vec![], vec![]);

@@ -6,7 +6,7 @@ use globalsplat::device::total_memory_bytes;
 use globalsplat::error::Error;
 use globalsplat::io::{WEIGHTS_VARIABLE, find_ffmpeg, find_pretrained};
 use globalsplat::loss::LpipsNetwork;
-use globalsplat::model::{Precision, are_denormals_flushed};
+use globalsplat::model::Precision;
 use globalsplat::ranks::Backends;
 use globalsplat::reconstruct::BUNDLED_MODEL;
 use globalsplat::render::cpu::{libtorch_simd_level, simd_level};
@@ -62,7 +62,6 @@ impl Doctor {
         let (together, ffmpeg) = (Backends::built_in(), find_ffmpeg());
         let colmap = Colmap::find().map(|colmap| colmap.to_string()).map_err(|why| why.to_string());
         let precision = Precision::fastest_on(Device::Cpu);
-        let denormals = if are_denormals_flushed() { "taken for 0" } else { "kept" };
         if self.json {
             let found: serde_json::Map<_, _> = weights
                 .into_iter()
@@ -77,7 +76,6 @@ impl Doctor {
                 "precision": precision,
                 "threads": threads,
                 "cores": cores,
-                "denormals": denormals,
                 "driver": or_error(&driver, |driver| json!(cuda_version(driver.version))),
                 "gpus": driver.as_ref().map_or(json!([]), |driver| gpus(driver, &prepared, &unusable)),
                 "nvrtc": or_error(&nvrtc, |nvrtc| json!({
@@ -107,7 +105,6 @@ impl Doctor {
             &format!("{precision} (the fastest for wide models on this CPU, which --precision auto takes)"),
         );
         line("threads", &format!("{threads} on {cores} cores (OMP_NUM_THREADS sets them)"));
-        line("denormals", &format!("{denormals} (many processors are slow with numbers below 1.2e-38)"));
         let of = |built: bool, without: &'static str| if built { "built in" } else { without };
         line(
             "torchrun",

@@ -134,8 +134,8 @@ pub fn main() -> ExitCode {
     };
     // Errors stay one sentence.
     globalsplat_csrc::render::disable_stack_traces();
-    // This must precede the start of other threads.
-    globalsplat::model::flush_denormals();
+    // Denormals halve the speed of training on some processors. This must precede the start of other threads.
+    globalsplat_csrc::processor::flush_denormals();
     // Errors of libtorch that the library's own checks don't catch arrive as panics: the user still gets one sentence, and with
     // RUST_BACKTRACE=1 a backtrace.
     panic::set_hook(Box::new(|panic| {

@@ -2,9 +2,9 @@
 
 use super::pixels::Pixels;
 use super::view::View;
-use crate::model::IMAGENET_MEAN;
+use crate::model::{IMAGENET_MEAN, ModelInput};
 use crate::render::Cameras;
-use crate::scene::{Camera, RadialWarp, pose_to_rows};
+use crate::scene::{Camera, pose_to_rows};
 use glam::DMat4;
 use std::borrow::Borrow;
 use tch::{Device, Kind, Tensor};
@@ -97,20 +97,21 @@ impl ViewBatch {
         ViewBatch { images, masks, depths, c2w, w2c, intrinsics }
     }
 
-    /// Returns the warp that the depths of the views determine; `None` without depths.
-    pub fn radial_warp(&self) -> Option<RadialWarp> {
-        self.depths.as_ref().map(|depths| RadialWarp::new(&self.c2w, &self.intrinsics, depths))
-    }
-
-    /// Returns the images as a model sees them: masked pixels have the colour that its normalization (spec 3.1) makes 0.
-    pub fn input_images(&self) -> Tensor {
-        match &self.masks {
+    /// Returns the views as a model sees them: masked pixels have the color that its normalization (spec 3.1) makes 0.
+    pub fn model_input(&self) -> ModelInput {
+        let images = match &self.masks {
             Some(masks) => {
                 let neutral =
                     Tensor::from_slice(&IMAGENET_MEAN).view([3, 1, 1]).to_device(self.images.device());
                 neutral.lerp_tensor(&self.images, masks)
             }
             None => self.images.shallow_clone(),
+        };
+        ModelInput {
+            images,
+            c2w: self.c2w.shallow_clone(),
+            intrinsics: self.intrinsics.shallow_clone(),
+            depths: self.depths.as_ref().map(Tensor::shallow_clone),
         }
     }
 

@@ -1,14 +1,13 @@
-//! The decoder: linear heads, and the activations that turn their outputs into Gaussians (spec 5.1, 5.2 and 5.5).
+//! The decoder: linear heads, the merging of candidates, and the activations that turn both into Gaussians (spec 5).
 
 use super::config::ModelConfig;
 use super::encoder::EncodedTokens;
 use super::layers::linear;
-use super::merge::{Candidates, Stage};
 use super::precision::Precision;
-use super::rotation::{normalize, quaternion_from_6d};
 use crate::scene::{Gaussians, RadialWarp, sigmoid};
+use serde::{Deserialize, Serialize};
 use std::f64::consts::LN_2;
-use tch::{Tensor, nn};
+use tch::{Kind, Tensor, nn};
 
 /// Standard deviation of the initial weights of the geometry heads.
 const GEOMETRY_STD: f64 = 1e-2;
@@ -29,6 +28,22 @@ const LOGIT_RANGE: [f64; 2] = [-13., 6.];
 const MIN_SCALE: f64 = 1e-4;
 /// Scale above which scales are penalized (the clamp lies further out).
 pub(crate) const MAX_SCALE: f64 = 0.05;
+
+/// Position in the coarse-to-fine curriculum.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Stage {
+    /// Stage index s: every scene token is decoded into 2^s Gaussians.
+    pub index: u32,
+    /// Progress λ in [0, 1] of the transition from stage s − 1; 1 at stage 0.
+    pub mix: f64,
+}
+
+impl Stage {
+    /// Returns stage `index` with its transition completed.
+    pub fn complete(index: u32) -> Self {
+        Stage { index, mix: 1. }
+    }
+}
 
 /// Outputs of the heads before any clamp, for the regularizers of `loss`.
 #[derive(Debug)]
@@ -65,8 +80,8 @@ pub struct Decoded {
 }
 
 impl Decoded {
-    /// Moves the Gaussians of the warped world back to the normalized one; without a `warp` they are there already.
-    pub fn restored(self, warp: Option<&RadialWarp>) -> Self {
+    /// Moves the Gaussians of the warped world back to the normalized one. Without a `warp` they are there already.
+    pub(super) fn unwarp(self, warp: Option<&RadialWarp>) -> Self {
         match warp {
             Some(warp) => Decoded { gaussians: warp.restore(&self.gaussians), ..self },
             None => self,
@@ -195,10 +210,128 @@ impl Decoder {
     }
 }
 
+/// Upper bound of log u = log(1 − α), so that an opacity of 0 still has a finite logit.
+const MAX_LOG_U: f64 = -1e-12;
+
+/// Five quantities before activation, of candidates, [B, M, K, ..], or of merged Gaussians, [B, M, G, ..].
+#[derive(Debug)]
+pub(crate) struct Candidates {
+    pub positions: Tensor,      // [.., 3]
+    pub log_scales: Tensor,     // [.., 3]
+    pub rotations: Tensor,      // [.., 6]
+    pub opacity_logits: Tensor, // [.., 1]
+    pub sh: Tensor,             // [.., bases · 3]
+}
+
+impl Candidates {
+    /// Returns the Gaussians of `stage`, blended with those of the previous stage during a transition. `gate` is [B, M, K].
+    pub fn at_stage(&self, gate: &Tensor, stage: Stage) -> Candidates {
+        let merged = self.merge(gate, 1 << stage.index);
+        if stage.index == 0 || stage.mix >= 1. {
+            return merged;
+        }
+        let expanded = self.merge(gate, 1 << (stage.index - 1)).expand();
+        let mix = |old: &Tensor, new: &Tensor| old * (1. - stage.mix) + new * stage.mix;
+        Candidates {
+            positions: mix(&expanded.positions, &merged.positions),
+            log_scales: mix(&expanded.log_scales, &merged.log_scales),
+            rotations: mix(&expanded.rotations, &merged.rotations),
+            opacity_logits: mix(&expanded.opacity_logits, &merged.opacity_logits),
+            sh: mix(&expanded.sh, &merged.sh),
+        }
+    }
+
+    /// Merges every b = K / `groups` consecutive candidates with weights w = softmax(gate). Positions, rotations and SH are weighted means;
+    /// scales grow by b^(1/3), as b volumes are merged into one; log u = Σ w log(1 − α).
+    fn merge(&self, gate: &Tensor, groups: i64) -> Candidates {
+        let (b, m, k) = gate.size3().expect("[B, M, K]");
+        let members = k / groups;
+        // Reduce along the last dimension: along others, the bits of the result depend on the number of threads.
+        let weights = gate.view([b, m, groups, members]).softmax(-1, None::<Kind>).unsqueeze(-1);
+        let weighted = |t: &Tensor| {
+            let grouped = t.view([b, m, groups, members, -1]);
+            (&weights * grouped).sum_dim_intlist([3i64].as_slice(), false, None::<Kind>)
+        };
+        Candidates {
+            positions: weighted(&self.positions),
+            log_scales: weighted(&self.log_scales) + (members as f64).ln() / 3.,
+            rotations: weighted(&self.rotations),
+            opacity_logits: logit_from_log_u(&weighted(&log_u_from_logit(&self.opacity_logits))),
+            sh: weighted(&self.sh),
+        }
+    }
+
+    /// Repeats every Gaussian twice, consecutively, each copy with half of the volume and half of the optical depth log u.
+    fn expand(&self) -> Candidates {
+        let twice = |t: &Tensor| t.repeat_interleave_self_int(2, 2, None);
+        Candidates {
+            positions: twice(&self.positions),
+            log_scales: twice(&(&self.log_scales - LN_2 / 3.)),
+            rotations: twice(&self.rotations),
+            opacity_logits: twice(&logit_from_log_u(&(log_u_from_logit(&self.opacity_logits) * 0.5))),
+            sh: twice(&self.sh),
+        }
+    }
+}
+
+/// Computes log(1 − sigmoid(x)) = log sigmoid(−x).
+fn log_u_from_logit(logit: &Tensor) -> Tensor {
+    (-logit).log_sigmoid()
+}
+
+/// Computes logit(1 − u) = log(1 − e^{log u}) − log u.
+fn logit_from_log_u(log_u: &Tensor) -> Tensor {
+    let log_u = log_u.clamp_max(MAX_LOG_U);
+    (-log_u.expm1()).log() - log_u
+}
+
+/// Minimum norm that vectors are divided by.
+const EPS: f64 = 1e-8;
+
+/// Divides each vector along the last dimension by its length, clamped to at least 1e-8.
+pub(super) fn normalize(xs: &Tensor) -> Tensor {
+    xs / xs.norm_scalaropt_dim(2, [-1i64], true).clamp_min(EPS)
+}
+
+/// Computes rotation matrices, [.., 3, 3], from `rotations` [.., 6]. b1 = normalize(first), b2 = normalize(second − (b1·second) b1), b3 =
+/// b1 × b2 are the ROWS of the result.
+pub fn rotation_matrix_from_6d(rotations: &Tensor) -> Tensor {
+    let (first, second) = (rotations.narrow(-1, 0, 3), rotations.narrow(-1, 3, 3));
+    let b1 = normalize(&first);
+    let along = (&b1 * &second).sum_dim_intlist([-1i64].as_slice(), true, None::<Kind>);
+    let b2 = normalize(&(second - along * &b1));
+    let b3 = b1.linalg_cross(&b2, -1);
+    Tensor::stack(&[b1, b2, b3], -2)
+}
+
+/// Computes the quaternion (w, x, y, z), w ≥ 0, of [`rotation_matrix_from_6d`]; the result is [.., 4].
+///
+/// 4 q qᵀ is linear in the matrix, and each of its rows is a multiple of q. The row with the largest diagonal entry (at least 1) is far
+/// from zero, so normalizing it loses no precision.
+pub fn quaternion_from_6d(rotations: &Tensor) -> Tensor {
+    let matrix = rotation_matrix_from_6d(rotations).flatten(-2, -1).unbind(-1);
+    let [m00, m01, m02, m10, m11, m12, m20, m21, m22] =
+        <[Tensor; 9]>::try_from(matrix).expect("nine entries");
+    let rows = [
+        [&m00 + &m11 + &m22 + 1., &m21 - &m12, &m02 - &m20, &m10 - &m01],
+        [&m21 - &m12, &m00 - &m11 - &m22 + 1., &m10 + &m01, &m02 + &m20],
+        [&m02 - &m20, &m10 + &m01, &m11 - &m00 - &m22 + 1., &m12 + &m21],
+        [&m10 - &m01, &m20 + &m02, &m21 + &m12, &m22 - &m00 - &m11 + 1.],
+    ];
+    let rows = rows.map(|row| Tensor::stack(&row, -1));
+    let rows = Tensor::stack(&rows, -2); // [.., 4, 4]
+    let largest = rows.diagonal(0, -2, -1).argmax(-1, true).unsqueeze(-1); // [.., 1, 1]
+    let mut index = largest.size();
+    *index.last_mut().expect("a last dimension") = 4;
+    let row = rows.gather(-2, &largest.expand(&index, false), false).squeeze_dim(-2);
+    let sign = row.narrow(-1, 0, 1).ge(0.).to_kind(row.kind()) * 2. - 1.;
+    normalize(&row) * sign
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use tch::{Device, Kind};
+    use tch::Device;
 
     #[test]
     fn bf16_is_for_appearance_alone() {

@@ -1,9 +1,10 @@
-//! Layers that streams and mixers are built from, with the initializations of spec 4.4.
+//! Layers that the model is built from, with the initializations of spec 4.4. Each records the time and the work of its part of a pass.
 
-use super::flops::record_flops;
-use super::precision::Precision;
+use super::precision::{Precision, record_flops};
+use globalsplat_csrc::attention as ours;
+use globalsplat_csrc::processor::{Bf16Support, cpu_bf16_support};
 use std::cell::Cell;
-use tch::{Tensor, nn, nn::Module};
+use tch::{Device, Kind, Tensor, nn, nn::Module};
 use tracing::trace_span;
 
 /// Standard deviation of the initial weights of the encoder's linear layers and of learned tokens.
@@ -46,8 +47,13 @@ pub(super) fn default_linear(vs: nn::Path, inputs: i64, outputs: i64, bias: bool
     nn::linear(vs, inputs, outputs, nn::LinearConfig { ws_init: uniform, bs_init: Some(uniform), bias })
 }
 
+/// Applies `layer` to `xs`: a projection of a stream to queries, to queries, keys and values, or of attention's output.
+pub(super) fn project(layer: &nn::Linear, xs: &Tensor, precision: Precision) -> Tensor {
+    trace_span!("queries and outputs").in_scope(|| precision.linear(layer, xs))
+}
+
 /// Epsilon of layer normalization.
-pub(super) const LAYER_NORM_EPS: f64 = 1e-5;
+const LAYER_NORM_EPS: f64 = 1e-5;
 
 /// Creates a layer normalization over the last dimension.
 pub(super) fn layer_norm(vs: nn::Path, width: i64) -> nn::LayerNorm {
@@ -58,6 +64,16 @@ pub(super) fn layer_norm(vs: nn::Path, width: i64) -> nn::LayerNorm {
 pub(super) fn normalize(norm: &nn::LayerNorm, xs: &Tensor) -> Tensor {
     trace_span!("norms").in_scope(|| {
         let out = norm.forward(xs);
+        record_flops(0, 0, &[xs, &out]);
+        out
+    })
+}
+
+/// Normalizes `xs` over the last dimension without γ and β.
+pub(super) fn normalize_without_affine(xs: &Tensor) -> Tensor {
+    trace_span!("norms").in_scope(|| {
+        let width = *xs.size().last().expect("a last dimension");
+        let out = xs.layer_norm([width], None::<&Tensor>, None::<&Tensor>, LAYER_NORM_EPS, true);
         record_flops(0, 0, &[xs, &out]);
         out
     })
@@ -117,4 +133,210 @@ impl Mlp {
 /// Computes x Φ(x) with the cumulative normal distribution Φ, in place if no gradients are needed.
 pub(super) fn gelu(mut xs: Tensor) -> Tensor {
     if xs.requires_grad() { xs.gelu("none") } else { xs.gelu_("none") }
+}
+
+/// Computes softmax(q kᵀ / √(d/h)) v over `heads` heads (spec 4.2), by our own kernel where it is fastest and by libtorch elsewhere. q is
+/// [B, n, d], k and v are [B, m, d]; the result is [B, n, d] and of their kind.
+pub(crate) fn attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
+    let out = dispatch_attention(q, k, v, heads);
+    let size = q.size();
+    let flops = 4 * size[0] * size[1] * k.size()[1] * size[2];
+    // The backward pass recomputes the scores, and computes gradients of queries, keys, attention weights and values.
+    record_flops(flops, if out.requires_grad() { 5 * flops / 2 } else { 0 }, &[q, k, v, &out]);
+    out
+}
+
+fn dispatch_attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
+    let (kind, width, all) = (q.kind(), q.size()[2] / heads, [q, k, v]);
+    let fits = |t: &&Tensor| t.device() == Device::Cpu && t.kind() == kind && t.size()[1] > 0;
+    if !all.iter().all(fits) {
+        return attention_libtorch(q, k, v, heads);
+    }
+    let takes = |is_bf16| ours::supports_attention(width, is_bf16).unwrap_or_else(|error| panic!("{error}"));
+    match kind {
+        Kind::Float if takes(false) => attention_cpu_kernel(all, heads),
+        Kind::BFloat16 if takes(true) => attention_cpu_kernel(all, heads),
+        // Our kernel lacks bf16 products on this CPU, and libtorch's bf16 kernel is fast only with tiles (AMX): compute in float32.
+        Kind::BFloat16 if cpu_bf16_support() != Bf16Support::Tiles && takes(false) => {
+            attention_cpu_kernel(all.map(|t| t.to_kind(Kind::Float)).each_ref(), heads).to_kind(kind)
+        }
+        _ => attention_libtorch(q, k, v, heads),
+    }
+}
+
+fn attention_cpu_kernel(all: [&Tensor; 3], heads: i64) -> Tensor {
+    let [q, k, v] = all.map(|t| t.as_ptr() as usize);
+    // SAFETY: the tensors outlive the call, which on success returns the address of a new one.
+    let out = unsafe { ours::attention(q, k, v, heads) }.unwrap_or_else(|error| panic!("{error}"));
+    unsafe { Tensor::from_ptr(out as *mut torch_sys::C_tensor) }
+}
+
+/// Computes [`attention`] with libtorch, on any device and for any kind and width.
+pub(crate) fn attention_libtorch(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
+    let split = |t: &Tensor| {
+        let (b, n, d) = t.size3().expect("[B, n, d]");
+        t.view([b, n, heads, d / heads]).transpose(1, 2) // [B, h, n, d/h]
+    };
+    // The strides are those of the linear layers, the kinds agree and there is no mask. libtorch's fused kernels then take the tensors
+    // without a copy, provided that a head's width is a multiple of 8.
+    Tensor::scaled_dot_product_attention(
+        &split(q),
+        &split(k),
+        &split(v),
+        None::<&Tensor>,
+        0.,
+        false,
+        None,
+        false,
+    )
+    .transpose(1, 2)
+    .flatten(2, 3)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use globalsplat_csrc::render::{set_num_threads, simd_level};
+    use globalsplat_test_kit::exit_code_of_test;
+    use std::path::Path;
+    use tch::no_grad;
+
+    const NAMES: [&str; 3] = ["attn_out", "slots", "tokens"];
+
+    /// Returns the output and the gradients of queries, keys and values, for sizes that are split among threads: blocks of 516 queries and
+    /// of 384 keys, each with a remainder.
+    fn answers() -> Vec<Tensor> {
+        let of = |n: i64| {
+            // Irregular values without the random generator, which other tests share.
+            let numbers = Tensor::arange(2 * n * 3 * 64, (Kind::Double, Device::Cpu)).square().sin() * 1.5;
+            numbers.to_kind(Kind::Float).view([2, n, 3 * 64]).set_requires_grad(true)
+        };
+        let (slots, memory) = (of(530), of(1000));
+        let (of_slots, of_memory) = (slots.chunk(3, -1), memory.chunk(3, -1));
+        let seen = attention(&of_slots[0], &of_memory[1], &of_memory[2], 2);
+        let among = attention(&of_slots[0], &of_slots[1], &of_slots[2], 2);
+        ((&seen + among) * seen.detach().cos()).sum(Kind::Float).backward();
+        vec![seen.detach(), slots.grad(), memory.grad()]
+    }
+
+    #[test]
+    fn any_number_of_threads_gives_the_same_bits() {
+        let expected = answers();
+        for threads in [1, 2, 3] {
+            set_num_threads(threads);
+            let found = answers();
+            set_num_threads(0);
+            assert!(expected.iter().zip(&found).all(|(a, b)| a.equal(b)), "{threads} threads");
+        }
+    }
+
+    #[test]
+    fn bf16_attention_matches_float64() {
+        let of = |n: i64, width: i64, phase: f64| {
+            let numbers = Tensor::arange(2 * n * width, (Kind::Double, Device::Cpu)).square() + phase;
+            (numbers.sin() * 1.5).to_kind(Kind::BFloat16).view([2, n, width])
+        };
+        // Returns the output of `attend`, and the gradients.
+        let answers = |all: &[Tensor; 4], attend: &dyn Fn([&Tensor; 3]) -> Tensor| {
+            let [q, k, v, slope] = all;
+            let leaves = [q, k, v].map(|t| t.detach().set_requires_grad(true));
+            let seen = attend(leaves.each_ref());
+            (&seen * slope).sum(Kind::Float).backward();
+            std::iter::once(seen.detach()).chain(leaves.iter().map(Tensor::grad)).collect::<Vec<_>>()
+        };
+        // Whole and partial blocks of keys and queries, a head width that needs padding, and more than one panel of columns.
+        for (queries, keys, heads, width) in
+            [(70, 300, 3, 64), (5, 1, 1, 8), (130, 256, 2, 40), (65, 513, 1, 128), (200, 131, 1, 72)]
+        {
+            if !ours::supports_attention(width, true).unwrap() {
+                let why = "this processor has no products of bfloat16 numbers";
+                return globalsplat_test_kit::skip_on_this_processor("bfloat16 products", why);
+            }
+            let rows = [(queries, 0.), (keys, 1.), (keys, 2.), (queries, 3.)];
+            let all = rows.map(|(count, phase)| of(count, heads * width, phase));
+            let found = answers(&all, &|[q, k, v]| attention(q, k, v, heads));
+            assert_eq!((found[0].kind(), found[0].size()), (Kind::BFloat16, all[0].size()));
+            let exact = answers(&all.each_ref().map(|t| t.to_kind(Kind::Double)), &|[q, k, v]| {
+                attention_libtorch(q, k, v, heads)
+            });
+            for (name, (found, exact)) in ["seen", "dq", "dk", "dv"].iter().zip(found.iter().zip(&exact)) {
+                // With a single key, the scores have zero gradients.
+                let size = exact.norm().double_value(&[]).max(1e-3);
+                let error = (found - exact).norm().double_value(&[]) / size;
+                // The output, the attention weights and the gradients of scores are rounded to 8 bits.
+                assert!(
+                    error < 5e-3,
+                    "{name}, {queries} queries, {keys} keys, {heads} heads of {width}: {error:.1e}"
+                );
+            }
+            let same = |others: Vec<Tensor>| found.iter().zip(&others).all(|(a, b)| a.equal(b));
+            for threads in [1, 3] {
+                set_num_threads(threads);
+                let alone = answers(&all, &|[q, k, v]| attention(q, k, v, heads));
+                set_num_threads(0);
+                assert!(same(alone), "{threads} threads change what is seen");
+            }
+            // Rows with a stride, as in chunks of one layer's output.
+            let apart = |t: &Tensor| Tensor::cat(&[t, t, t], -1).chunk(3, -1).swap_remove(1);
+            let strided = answers(&all, &|[q, k, v]| attention(&apart(q), &apart(k), &apart(v), heads));
+            assert!(same(strided), "strides change what is seen");
+        }
+    }
+
+    #[test]
+    fn instruction_sets_agree() {
+        // The instruction set is chosen once per process, so this test runs itself in a new process for every set, which computes and
+        // saves.
+        const OUT: &str = "GLOBALSPLAT_TEST_OUT";
+        const UNSUPPORTED: i32 = 77;
+        if let Some(out) = std::env::var_os(OUT) {
+            if simd_level().is_err() {
+                std::process::exit(UNSUPPORTED);
+            }
+            let named: Vec<_> = NAMES.into_iter().zip(answers()).collect();
+            return Tensor::write_safetensors(&named, out).expect("a writable file");
+        }
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let expected = answers();
+        for level in ["avx512", "avx2", "neon", "portable"] {
+            let out = folder.path().join(level);
+            let variables = [("GLOBALSPLAT_SIMD", Path::new(level)), (OUT, &out)];
+            let code = exit_code_of_test("model::layers::tests::instruction_sets_agree", &variables);
+            if code == Some(UNSUPPORTED) {
+                continue;
+            }
+            assert_eq!(code, Some(0), "{level}");
+            let found = Tensor::read_safetensors(&out).expect("what was written");
+            assert_eq!(found.len(), NAMES.len());
+            for (name, found) in &found {
+                let place = NAMES.iter().position(|known| known == name).expect("a name that was written");
+                let expected = &expected[place];
+                let error = (found - expected).norm() / expected.norm();
+                assert!(error.double_value(&[]) < 1e-6, "{level}: {name} differs by {error}");
+            }
+        }
+    }
+
+    #[test]
+    fn shapes_that_dont_fit_are_refused() {
+        let of = |n: i64, d: i64| Tensor::zeros([1, n, d], (Kind::Float, Device::Cpu));
+        let refused = |q: &Tensor, k: &Tensor, v: &Tensor, heads: i64| {
+            let [q, k, v] = [q, k, v].map(|t| t.as_ptr() as usize);
+            unsafe { ours::attention(q, k, v, heads) }.expect_err("refused").to_string()
+        };
+        let said = refused(&of(3, 16), &of(4, 16), &of(5, 16), 2);
+        assert!(said.contains("keys [1, 4, 16] and values [1, 5, 16], expected"), "{said}");
+        let said = refused(&of(3, 18), &of(4, 18), &of(4, 18), 2);
+        assert!(
+            said.contains("have 2 heads, expected a head width of at most 128 that is a multiple of 4"),
+            "{said}"
+        );
+        let double = of(3, 16).to_kind(Kind::Double);
+        let said = refused(&double, &double, &double, 2);
+        assert!(said.contains("must be float32 on the CPU"), "{said}");
+        // Attention to no keys is left to libtorch.
+        let nothing = of(0, 16);
+        let seen = no_grad(|| attention(&of(3, 16), &nothing, &nothing, 2));
+        assert_eq!(seen.size(), [1, 3, 16]);
+    }
 }

@@ -3,52 +3,30 @@
 //! Parameters have the names of the published weights. A model trained here and one published by the authors differ only in the file
 //! format.
 
-mod attention;
-mod autograd;
-mod camera_code;
 mod config;
 mod decoder;
-mod denormals;
 mod encoder;
-mod flops;
-mod growth;
 mod layers;
-mod memory;
-mod merge;
-mod mixer;
 mod precision;
-mod recompute;
-mod rotation;
-mod shapes;
-mod stream;
 mod tokens;
 
-pub use config::{ModelConfig, Streams};
-pub use decoder::{Decoded, RawOutputs};
-pub use denormals::{are_denormals_flushed, flush_denormals};
+pub use config::{MODULES, ModelConfig, Streams};
+pub use decoder::{Decoded, RawOutputs, Stage};
 pub use encoder::EncodedTokens;
-pub use memory::Memory;
-pub use merge::Stage;
 pub use precision::Precision;
 pub(crate) use precision::convolve;
-pub use shapes::MODULES;
+pub use tokens::ImageTokens;
 
 // Used by training, which runs the model in parts and grows smaller models into larger ones.
-pub(crate) use autograd::{backward_from_grads, leaf, tracks_grad};
-pub(crate) use growth::Growth;
-pub(crate) use recompute::CheckpointedRounds;
+pub(crate) use config::Growth;
+pub(crate) use encoder::CheckpointedRounds;
 
 // Used by the parity checks, which run every module by itself.
-pub(crate) use attention::{attention, attention_libtorch};
-pub(crate) use camera_code::CameraCode;
-pub(crate) use decoder::{Decoder, MAX_SCALE};
-pub(crate) use encoder::Encoder;
-pub(crate) use growth::{repeat_scene_tokens, shrink_patch_weights, split_opacity_bias};
-pub(crate) use merge::Candidates;
-pub(crate) use mixer::Mixer;
-pub(crate) use rotation::{quaternion_from_6d, rotation_matrix_from_6d};
-pub(crate) use stream::{SelfAttentionBlock, StreamRound};
-pub(crate) use tokens::{IMAGENET_MEAN, RayTokens, RgbTokens, Tokenizer, patchify};
+pub(crate) use config::{repeat_scene_tokens, shrink_patch_weights, split_opacity_bias};
+pub(crate) use decoder::{Candidates, Decoder, MAX_SCALE, quaternion_from_6d, rotation_matrix_from_6d};
+pub(crate) use encoder::{Encoder, Mixer, SelfAttentionBlock, StreamRound};
+pub(crate) use layers::{attention, attention_libtorch};
+pub(crate) use tokens::{CameraCode, IMAGENET_MEAN, RayTokens, RgbTokens, Tokenizer, patchify};
 
 use crate::error::Result;
 use crate::scene::RadialWarp;
@@ -56,6 +34,34 @@ use layers::{ENCODER_STD, init_or_zeros, randn, without_random_init};
 use std::collections::HashSet;
 use tch::{Device, Kind, Tensor, nn};
 use tracing::trace_span;
+
+/// Posed images of B scenes, V views each, as the model sees them.
+#[derive(Debug)]
+pub struct ModelInput {
+    /// Images in [0, 1], [B, V, 3, H, W]. H and W are multiples of the patch size.
+    pub images: Tensor,
+    /// Poses, camera-to-world, in the normalized scene, [B, V, 4, 4].
+    pub c2w: Tensor,
+    /// Intrinsics in pixels, [B, V, 3, 3].
+    pub intrinsics: Tensor,
+    /// Inverse depth of each pixel along the camera's axis in units of the normalized scene, and its confidence from 0 to 1,
+    /// [B, V, 2, H, W], for a model that was trained with `data.depths`.
+    pub depths: Option<Tensor>,
+}
+
+impl ModelInput {
+    /// Returns the warp that the depths determine (spec 3.5), in which the model sees the scene; `None` without depths.
+    pub fn radial_warp(&self) -> Option<RadialWarp> {
+        self.depths.as_ref().map(|depths| RadialWarp::new(&self.c2w, &self.intrinsics, depths))
+    }
+
+    /// Returns one view of every scene, without depths.
+    fn view(&self, view: i64) -> Self {
+        let [images, c2w, intrinsics] =
+            [&self.images, &self.c2w, &self.intrinsics].map(|t| t.narrow(1, view, 1));
+        ModelInput { images, c2w, intrinsics, depths: None }
+    }
+}
 
 /// The complete model: tokenizer, encoder and decoder.
 #[derive(Debug)]
@@ -107,76 +113,56 @@ impl GlobalSplat {
         Ok(model)
     }
 
-    /// Runs one forward pass. `images` [B, V, 3, H, W] in [0, 1], `c2w` [B, V, 4, 4] in the normalized scene, `intrinsics` [B, V, 3, 3] in
-    /// pixels; H and W are multiples of the patch size.
-    pub fn forward(&self, images: &Tensor, c2w: &Tensor, intrinsics: &Tensor, stage: Stage) -> Decoded {
-        self.decode(&self.encode_memory(&self.memory(images, c2w, intrinsics, None)), stage)
+    /// Runs one forward pass, which consists of [`GlobalSplat::tokens`], [`GlobalSplat::encode`] and [`GlobalSplat::decode`], and returns
+    /// the Gaussians in the normalized scene.
+    pub fn forward(&self, input: &ModelInput, stage: Stage) -> Decoded {
+        let warp = input.radial_warp();
+        let encoded = self.encode(&self.tokens(input, warp.as_ref()));
+        self.decode(&encoded, warp.as_ref(), stage)
     }
 
-    /// Computes the image tokens, [B, V, P, ray width + RGB width]: the first part of [`GlobalSplat::forward`]. With a `warp`, the decoded
-    /// Gaussians are those of the warped world, which [`RadialWarp::restore`] moves back.
-    pub fn tokens(
-        &self,
-        images: &Tensor,
-        c2w: &Tensor,
-        intrinsics: &Tensor,
-        warp: Option<&RadialWarp>,
-    ) -> Tensor {
-        trace_span!("tokens").in_scope(|| self.tokenizer.forward(images, c2w, intrinsics, warp))
-    }
-
-    /// Encodes image tokens into scene tokens that have attended to every view: the second part of [`GlobalSplat::forward`].
-    pub fn encode(&self, tokens: &Tensor) -> EncodedTokens {
-        self.encode_memory(&self.memory_of(tokens))
-    }
-
-    /// Computes the encoder's memory from image tokens [B, V, P, token width].
-    fn memory_of(&self, tokens: &Tensor) -> Memory {
-        self.encoder.memory(&tokens.flatten(1, 2))
-    }
-
-    /// Computes the encoder's memory from images and cameras. On a CPU without gradients it processes one view at a time, because the image
-    /// tokens of many views are large. A GPU has enough memory for all views, and would spend the time on launching small kernels.
-    pub fn memory(
-        &self,
-        images: &Tensor,
-        c2w: &Tensor,
-        intrinsics: &Tensor,
-        warp: Option<&RadialWarp>,
-    ) -> Memory {
+    /// Computes the image tokens of the scene that `warp` warps, if there is one. On a CPU without gradients it processes one view at a
+    /// time, because the tokens of many views are large. A GPU has enough memory for all views, and would spend the time on launching small
+    /// kernels.
+    pub fn tokens(&self, input: &ModelInput, warp: Option<&RadialWarp>) -> ImageTokens {
         let tracks_grad = self.encoder.tracks_grad();
-        if tracks_grad || images.device() != Device::Cpu {
-            let memory = self.memory_of(&self.tokens(images, c2w, intrinsics, warp));
-            // Converts once for all rounds. With gradients the memory stays in float32, in which they are accumulated.
-            return if tracks_grad { memory } else { memory.to_kind(self.precision().kind()) };
+        if tracks_grad || input.images.device() != Device::Cpu {
+            let tokens = self.tokens_at_once(input, warp);
+            // Converts once for all rounds. With gradients the tokens stay in float32, in which they are accumulated.
+            return if tracks_grad { tokens } else { tokens.to_kind(self.precision().kind()) };
         }
-        let of_view = |view| {
-            let [images, c2w, intrinsics] = [images, c2w, intrinsics].map(|t| t.narrow(1, view, 1));
+        self.encoder.image_tokens_of_views(input.images.size()[1], |view| {
             let warp = warp.map(|warp| warp.views(view, 1));
-            self.tokens(&images, &c2w, &intrinsics, warp.as_ref()).squeeze_dim(1)
-        };
-        self.encoder.memory_of_views(images.size()[1], of_view)
+            self.raw_tokens(&input.view(view), warp.as_ref()).squeeze_dim(1)
+        })
     }
 
-    /// Encodes the memory into scene tokens: [`GlobalSplat::encode`] without the computation of the memory.
-    pub fn encode_memory(&self, memory: &Memory) -> EncodedTokens {
-        self.encode_memory_with(memory, &|| ())
+    fn tokens_at_once(&self, input: &ModelInput, warp: Option<&RadialWarp>) -> ImageTokens {
+        self.encoder.image_tokens(&self.raw_tokens(input, warp).flatten(1, 2))
     }
 
-    /// Runs [`GlobalSplat::encode_memory`] and calls `after_layers` after every few layers. All but a few weights are used exactly once, so
-    /// the caller can release the memory of those that were used so far.
-    pub fn encode_memory_with(&self, memory: &Memory, after_layers: &dyn Fn()) -> EncodedTokens {
-        self.encoder.forward(&self.scene_tokens, memory, after_layers)
+    /// Computes the image tokens before their normalization, [B, V, P, ray width + RGB width].
+    fn raw_tokens(&self, input: &ModelInput, warp: Option<&RadialWarp>) -> Tensor {
+        trace_span!("tokens").in_scope(|| self.tokenizer.forward(input, warp))
     }
 
-    /// Runs [`GlobalSplat::encode`] with activation checkpointing: the backward pass recomputes every round.
-    pub(crate) fn encode_checkpointed(&self, tokens: &Tensor) -> (EncodedTokens, CheckpointedRounds<'_>) {
-        self.encoder.forward_checkpointed(&self.scene_tokens, self.memory_of(tokens))
+    /// Encodes image tokens into scene tokens that have attended to every view.
+    pub fn encode(&self, tokens: &ImageTokens) -> EncodedTokens {
+        self.encoder.forward(&self.scene_tokens, tokens)
     }
 
-    /// Decodes scene tokens into the Gaussians of `stage`: the last part of [`GlobalSplat::forward`].
-    pub fn decode(&self, encoded: &EncodedTokens, stage: Stage) -> Decoded {
-        trace_span!("heads").in_scope(|| self.decoder.forward(encoded, stage))
+    /// Runs [`GlobalSplat::encode`] with activation checkpointing for `tokens` that collect gradients ([`ImageTokens::leaf`]): the backward
+    /// pass recomputes every round.
+    pub(crate) fn encode_checkpointed<'a>(
+        &'a self,
+        tokens: &'a ImageTokens,
+    ) -> (EncodedTokens, CheckpointedRounds<'a>) {
+        self.encoder.forward_checkpointed(&self.scene_tokens, tokens)
+    }
+
+    /// Decodes scene tokens into the Gaussians of `stage`, and moves them from the scene that `warp` warps back to the normalized one.
+    pub fn decode(&self, encoded: &EncodedTokens, warp: Option<&RadialWarp>, stage: Stage) -> Decoded {
+        trace_span!("heads").in_scope(|| self.decoder.forward(encoded, stage)).unwarp(warp)
     }
 
     /// Sets the precision of matrix products; the default is float32.
@@ -212,46 +198,39 @@ pub(crate) fn scene_tokens(vs: &nn::Path, config: &ModelConfig) -> Tensor {
     vs.var("scene_tokens", &[config.latents, config.width], init)
 }
 
+// A backward pass in several parts: the forward pass is cut at detached tensors that collect the gradients.
+
+/// Returns a detached copy of `output` that requires a gradient: the input of the next part, where that part's backward pass ends.
+pub(crate) fn leaf(output: &Tensor) -> Tensor {
+    output.detach().set_requires_grad(true)
+}
+
+/// Returns `true` if gradients will flow back to `t` from what is computed from it now. `t.requires_grad()` is not enough: a leaf, and a
+/// view of one, report their own flag even where gradients are disabled.
+pub(crate) fn tracks_grad(t: &Tensor) -> bool {
+    t.sum(Kind::Float).requires_grad()
+}
+
+/// Continues the backward pass from the `outputs` of a part, each paired with the detached copy that holds its gradient.
+///
+/// tch can't start a backward pass with given gradients. The sum of the products of outputs and gradients has exactly these gradients.
+pub(crate) fn backward_from_grads(outputs: &[(&Tensor, &Tensor)]) {
+    let products = outputs.iter().filter_map(|(output, leaf)| {
+        let gradient = leaf.grad();
+        gradient.defined().then(|| (*output * gradient).sum(Kind::Float))
+    });
+    if let Some(objective) = products.reduce(|a, b| a + b) {
+        objective.backward();
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use globalsplat_csrc::ops::{computing, record_outermost_ops, without_own_linear_layers};
-    use std::cell::Cell;
 
-    /// A pass that releases the memory of weights after every few layers holds few weights at a time.
-    #[test]
-    fn encoding_reports_after_every_few_layers() {
-        let config = ModelConfig {
-            latents: 4,
-            width: 16,
-            heads: 2,
-            rgb_width: 8,
-            ray_width: 8,
-            rounds: 3,
-            self_attention_blocks: 2,
-            ..Default::default()
-        };
-        let vs = nn::VarStore::new(Device::Cpu);
-        let model = GlobalSplat::new(&vs.root(), &config).unwrap();
-        let calls = Cell::new(0);
-        tch::no_grad(|| {
-            let tokens = Tensor::rand([1, 2, 5, config.token_width()], (Kind::Float, Device::Cpu));
-            let memory = model.memory_of(&tokens);
-            let encoded = model.encode_memory_with(&memory, &|| calls.set(calls.get() + 1));
-            assert!(encoded.geometry.equal(&model.encode_memory(&memory).geometry));
-        });
-        // Queries, twice keys and values, their common part, outputs and the MLP, then three for each block.
-        let of_stream = 6 + 3 * 2;
-        // The projection of the slots, and in each round both streams and the mixer.
-        assert_eq!(calls.get(), 1 + 3 * (2 * of_stream + 1));
-    }
-
-    /// A pass launches a bounded number of kernels, whatever the number of photos. On a GPU, a pass of the main model takes about as long
-    /// as the host needs to launch its kernels.
-    #[test]
-    fn a_pass_takes_few_kernels() {
-        // The layers of the main model, but narrow. In float64 and with an odd number of heads, the CPU takes the same code path as a GPU.
-        let config = ModelConfig {
+    fn narrow() -> ModelConfig {
+        ModelConfig {
             latents: 16,
             width: 24,
             heads: 3,
@@ -259,27 +238,64 @@ mod tests {
             ray_width: 8,
             candidates: 4,
             ..Default::default()
-        };
+        }
+    }
+
+    /// Returns `views` random images of 32×32 pixels from one camera.
+    fn input(views: i64) -> ModelInput {
+        let options = (Kind::Float, Device::Cpu);
+        let images = Tensor::rand([1, views, 3, 32, 32], options);
+        let c2w = Tensor::eye(4, options).expand([1, views, 4, 4], false);
+        let intrinsics = Tensor::from_slice(&[32f32, 0., 16., 0., 32., 16., 0., 0., 1.]).view([3, 3]);
+        ModelInput { images, c2w, intrinsics: intrinsics.expand([1, views, 3, 3], false), depths: None }
+    }
+
+    /// Depths reach the network through [`GlobalSplat::forward`], and its Gaussians are those of the normalized scene.
+    #[test]
+    fn a_forward_pass_with_depths_sees_and_restores_the_warped_scene() {
+        let vs = nn::VarStore::new(Device::Cpu);
+        let model = GlobalSplat::new(&vs.root(), &narrow()).unwrap();
+        let (plain, stage) = (input(2), Stage::complete(2));
+        let depth = |inverse: f64| Tensor::full([1, 2, 32, 32], inverse, (Kind::Float, Device::Cpu));
+        let depths = Some(Tensor::stack(&[depth(0.2), depth(1.)], 2));
+        let [images, c2w, intrinsics] =
+            [&plain.images, &plain.c2w, &plain.intrinsics].map(Tensor::shallow_clone);
+        let deep = ModelInput { images, c2w, intrinsics, depths };
+        let warp = deep.radial_warp().expect("depths");
+        let scene_tokens = model.encode(&model.tokens(&deep, Some(&warp)));
+        let expected = warp.restore(&model.decode(&scene_tokens, None, stage).gaussians);
+        let found = model.forward(&deep, stage).gaussians;
+        assert!(found.means.equal(&expected.means) && found.scales.equal(&expected.scales));
+        assert!(!found.means.allclose(&model.forward(&plain, stage).gaussians.means, 0.1, 0.1, false));
+        // One view after the other, as without gradients.
+        let one_by_one = tch::no_grad(|| model.forward(&deep, stage)).gaussians;
+        assert!(one_by_one.means.allclose(&expected.means, 1e-4, 1e-4, false));
+    }
+
+    /// A pass launches a bounded number of kernels, whatever the number of photos. On a GPU, a pass of the main model takes about as long
+    /// as the host needs to launch its kernels.
+    #[test]
+    fn a_pass_takes_few_kernels() {
+        // The layers of the main model, but narrow. In float64 and with an odd number of heads, the CPU takes the same code path as a GPU.
+        let config = narrow();
         assert_eq!((config.rounds, config.self_attention_blocks), (4, 2), "the main model's");
         let mut vs = nn::VarStore::new(Device::Cpu);
         let mut model = GlobalSplat::new(&vs.root(), &config).unwrap();
         vs.freeze();
         // Rays are float32. There our own linear layers run in blocks on libtorch's threads, so they are counted separately.
         let of_tokens = |views: i64| {
-            let options = (Kind::Float, Device::Cpu);
-            let images = Tensor::rand([1, views, 3, 32, 32], options);
-            let [c2w, intrinsics] = [4, 3].map(|n| Tensor::eye(n, options).expand([1, views, n, n], false));
-            let (tokens, ops) = record_outermost_ops(|| model.tokens(&images, &c2w, &intrinsics, None));
+            let (tokens, ops) = record_outermost_ops(|| model.tokens_at_once(&input(views), None));
             const LINEAR_LAYERS: usize = 2;
-            (tokens.to_kind(Kind::Double), computing(&without_own_linear_layers(ops)) + LINEAR_LAYERS)
+            (tokens, computing(&without_own_linear_layers(ops)) + LINEAR_LAYERS)
         };
         let (few, many) = (of_tokens(2), of_tokens(24));
         vs.double();
         model.fold_weights();
-        let pass = |(tokens, of_tokens): (Tensor, usize)| {
-            let (_, ops) = record_outermost_ops(|| {
-                model.decode(&model.encode_memory(&model.memory_of(&tokens)), Stage::complete(2))
-            });
+        let pass = |(tokens, of_tokens): (ImageTokens, usize)| {
+            let [centered, mean] = [tokens.centered, tokens.mean].map(|t| t.to_kind(Kind::Double));
+            let tokens = ImageTokens { centered, mean };
+            let (_, ops) =
+                record_outermost_ops(|| model.decode(&model.encode(&tokens), None, Stage::complete(2)));
             of_tokens + computing(&ops)
         };
         let kernels = pass(many);

@@ -1,6 +1,5 @@
-//! Precision of matrix products (spec 1.3).
+//! Precision of matrix products (spec 1.3), and the products themselves, which record their floating-point operations.
 
-use super::flops::record_flops;
 use globalsplat_csrc::linear::linear;
 use globalsplat_csrc::processor::{Bf16Support, cpu_bf16_support, gpu_has_bf16};
 use serde::{Deserialize, Serialize};
@@ -8,9 +7,10 @@ use std::fmt;
 use std::str::FromStr;
 use tch::nn::Module;
 use tch::{Device, Kind, Tensor, nn};
+use tracing::trace;
 
 /// Precision of the encoder's linear layers and attention, of the decoder's appearance head, and of the network of L_perc. Everything else
-/// is always float32: weights and their gradients, norms, the common part of values, accumulation within softmax and products, residual
+/// is always float32: weights and their gradients, norms, the mean value, accumulation within softmax and products, residual
 /// streams; tokens and geometry heads, whose products are few and which determine positions; geometry and rendering; the differences of
 /// features.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -91,6 +91,13 @@ fn backward_flops(flops: i64, both: [&Tensor; 2], out: &Tensor) -> i64 {
         true => flops * both.iter().filter(|t| t.requires_grad()).count() as i64,
         false => 0,
     }
+}
+
+/// Records work in the current `tracing` span: `flops` floating-point operations of matrix products in the forward pass, `backward_flops`
+/// in the backward pass (0 if no gradient is needed), and the bytes of `tensors`, the inputs and outputs.
+pub(super) fn record_flops(flops: i64, backward_flops: i64, tensors: &[&Tensor]) {
+    let bytes = |t: &&Tensor| t.numel() * t.kind().elt_size_in_bytes();
+    trace!(flops, backward_flops, bytes = tensors.iter().map(bytes).sum::<usize>() as i64);
 }
 
 /// Returns the ReLU of `layer` applied to `images`, [B, C, H, W].

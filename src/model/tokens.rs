@@ -1,13 +1,15 @@
-//! Image tokens: the colours of a patch, and the rays along which it is seen (spec 3.1 and 3.2).
+//! Image tokens: the colors of a patch, the rays along which it is seen and the camera that sees it (spec 3), normalized for the encoder.
 
-use super::camera_code::CameraCode;
 use super::config::ModelConfig;
-use super::layers::default_linear;
+use super::layers::{default_linear, gelu, normalize_without_affine};
 use super::precision::Precision;
+use super::{ModelInput, leaf};
 use crate::scene::{RadialWarp, plucker_rays};
-use tch::{Tensor, nn};
+use std::f64::consts::PI;
+use tch::{Kind, Tensor, nn, nn::Module};
+use tracing::trace_span;
 
-/// Mean of ImageNet by channel: the colour that RGB tokens have as 0.
+/// Mean of ImageNet by channel: the color that RGB tokens have as 0.
 pub const IMAGENET_MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 const IMAGENET_STD: [f32; 3] = [0.229, 0.224, 0.225];
 /// Number of values per ray: moment and direction.
@@ -38,15 +40,9 @@ impl Tokenizer {
         Tokenizer { rgb: RgbTokens::new(vs, config), ray: RayTokens::new(vs, config) }
     }
 
-    /// Computes image tokens, [B, V, P, ray width + RGB width], from `images` [B, V, 3, H, W] in [0, 1], `c2w` [B, V, 4, 4] and
-    /// `intrinsics` [B, V, 3, 3] in pixels. With a `warp`, rays and cameras are those of the warped world.
-    pub fn forward(
-        &self,
-        images: &Tensor,
-        c2w: &Tensor,
-        intrinsics: &Tensor,
-        warp: Option<&RadialWarp>,
-    ) -> Tensor {
+    /// Computes raw image tokens, [B, V, P, ray width + RGB width]. With a `warp`, rays and cameras are those of the warped world.
+    pub fn forward(&self, input: &ModelInput, warp: Option<&RadialWarp>) -> Tensor {
+        let ModelInput { images, c2w, intrinsics, .. } = input;
         let (height, width) = (images.size()[3], images.size()[4]);
         let rgb = self.rgb.forward(images);
         let (rays, c2w) = match warp {
@@ -109,6 +105,150 @@ impl RayTokens {
         match &self.camera_code {
             Some(camera_code) => tokens + camera_code.forward(c2w, intrinsics, height, width).unsqueeze(2),
             None => tokens,
+        }
+    }
+}
+
+/// Width of the intrinsics features.
+const INTRINSICS_WIDTH: i64 = 64;
+/// Frequencies of the camera centre's encoding, in units of π.
+const FREQUENCIES: [f64; 4] = [1., 2., 4., 8.];
+/// Width of the encoded camera centre: the centre, its sines and its cosines.
+const CENTRE_WIDTH: i64 = 3 + 2 * 3 * FREQUENCIES.len() as i64;
+
+/// Camera code (spec 3.3): one vector per view that distinguishes cameras beyond their Plücker rays. An MLP encodes the intrinsics, sines and
+/// cosines encode the camera centre, and one linear layer joins both.
+#[derive(Debug)]
+pub(crate) struct CameraCode {
+    intrinsics_in: nn::Linear,
+    intrinsics_out: nn::Linear,
+    project: nn::Linear,
+}
+
+impl CameraCode {
+    pub fn new(vs: &nn::Path, width: i64) -> Self {
+        let mlp = vs / "k_mlp";
+        CameraCode {
+            intrinsics_in: default_linear(&mlp / "0", 4, INTRINSICS_WIDTH, true),
+            intrinsics_out: default_linear(&mlp / "2", INTRINSICS_WIDTH, INTRINSICS_WIDTH, true),
+            project: default_linear(vs / "proj", INTRINSICS_WIDTH + CENTRE_WIDTH, width, true),
+        }
+    }
+
+    /// Computes the camera code, [B, V, width]. `c2w` is [B, V, 4, 4], `intrinsics` [B, V, 3, 3] in pixels of a `height` × `width` image.
+    pub fn forward(&self, c2w: &Tensor, intrinsics: &Tensor, height: i64, width: i64) -> Tensor {
+        let entry = |row: i64, column: i64| intrinsics.select(-2, row).select(-1, column);
+        let (w, h) = (width as f64, height as f64);
+        let features = [(entry(0, 0) / w).log(), (entry(1, 1) / h).log(), entry(0, 2) / w, entry(1, 2) / h];
+        let features = Tensor::stack(&features, -1); // [B, V, 4]
+        let intrinsics = gelu(self.intrinsics_in.forward(&features));
+        let intrinsics = gelu(self.intrinsics_out.forward(&intrinsics));
+
+        let centre = c2w.narrow(-2, 0, 3).select(-1, 3); // [B, V, 3]
+        let phases: Vec<Tensor> = FREQUENCIES.iter().map(|f| &centre * (f * PI)).collect();
+        let phases = Tensor::cat(&phases, -1); // frequency-major, xyz inside
+        let code = Tensor::cat(&[intrinsics, centre, phases.sin(), phases.cos()], -1); // [B, V, 64 + 27]
+        self.project.forward(&code)
+    }
+}
+
+/// Maximum number of views from which the mean token is estimated if views are computed one by one, where using all of them costs time.
+const VIEWS_OF_MEAN: usize = 4;
+
+/// Tokens that the slots attend to: learned tokens and the raw image tokens of all views, normalized (spec 4.1) and split into their mean and
+/// the differences from it. Tokens are much alike: most of what a photo's patches encode of their rays and of their camera is the same for
+/// all photos. If only the differences are rounded to 8 bits, scores distinguish thousands of patches as they do in float32.
+#[derive(Debug)]
+pub struct ImageTokens {
+    /// Difference of each token from the mean, [B, m, token width].
+    pub centered: Tensor,
+    /// Mean of the tokens, or an estimate of it, [B, 1, token width] in float32, without gradients: the result doesn't depend on what is
+    /// taken as the mean.
+    pub mean: Tensor,
+}
+
+impl ImageTokens {
+    /// Normalizes and centers `tokens` [B, m, token width] in float32. The gradients of all rounds flow back to them and are accumulated in
+    /// float32.
+    pub(crate) fn new(tokens: &Tensor) -> Self {
+        let tokens = normalize_without_affine(tokens);
+        trace_span!("norms").in_scope(|| {
+            let mean = tokens.detach().mean_dim(1, true, None);
+            ImageTokens { centered: tokens - &mean, mean }
+        })
+    }
+
+    /// Builds the tokens from `registers` [1, r, token width] and `views` views, for products in `precision`. `view` computes the raw tokens
+    /// of one view, [B, P, token width], and is called for one view after the other. All tokens in float32 would take much memory, so a few
+    /// views are computed twice: their mean is close to that of all.
+    pub(super) fn from_views(
+        registers: &Tensor,
+        views: i64,
+        view: impl Fn(i64) -> Tensor,
+        precision: Precision,
+    ) -> Self {
+        let view = |n| normalize_without_affine(&view(n));
+        let few = (0..views).step_by((views as usize).div_ceil(VIEWS_OF_MEAN)).map(view);
+        let mean_of_view = |t: &Tensor| trace_span!("norms").in_scope(|| t.mean_dim(1, false, None));
+        let (sizes, means): (Vec<_>, Vec<_>) = few.map(|t| (t.size(), mean_of_view(&t))).unzip();
+        let mean = Tensor::stack(&means, 1).mean_dim(1, true, None);
+
+        let (batch, patches, width) = (sizes[0][0], sizes[0][1], sizes[0][2]);
+        let learned = registers.size()[1];
+        let size = [batch, learned + views * patches, width];
+        let centered = Tensor::empty(size, (precision.kind(), mean.device()));
+        let put = |first, of: Tensor| {
+            trace_span!("norms").in_scope(|| centered.narrow(1, first, of.size()[1]).copy_(&(of - &mean)));
+        };
+        put(0, normalize_without_affine(registers));
+        (0..views).for_each(|n| put(learned + n * patches, view(n)));
+        ImageTokens { centered, mean }
+    }
+
+    /// Returns the tokens with their differences converted to `kind`.
+    pub(super) fn to_kind(&self, kind: Kind) -> Self {
+        ImageTokens { centered: self.centered.to_kind(kind), mean: self.mean.shallow_clone() }
+    }
+
+    /// Returns a detached copy that collects the gradients.
+    pub(crate) fn leaf(&self) -> Self {
+        ImageTokens { centered: leaf(&self.centered), mean: self.mean.shallow_clone() }
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use tch::Device;
+
+    /// Returns irregular values between −1 and 1 without random numbers; each `step` gives other values.
+    pub(in super::super) fn uneven(step: f64, size: &[i64]) -> Tensor {
+        let numbers = Tensor::arange(size.iter().product::<i64>(), (Kind::Double, Device::Cpu));
+        (numbers.square() * step).sin().to_kind(Kind::Float).view(size)
+    }
+
+    /// Returns tokens [2, `count`, 24] that are close to one another.
+    pub(in super::super) fn alike(count: i64) -> Tensor {
+        uneven(0.7, &[24]) + 0.05 * uneven(1., &[2, count, 24])
+    }
+
+    #[test]
+    fn views_make_the_same_tokens_one_by_one() {
+        let registers = alike(2).get(0).unsqueeze(0);
+        let from_views = |views: i64| {
+            let tokens = alike(5 * views);
+            let view = |n| tokens.narrow(1, 5 * n, 5);
+            let all = Tensor::cat(&[&registers.expand([2, -1, -1], false), &tokens], 1);
+            (ImageTokens::new(&all), ImageTokens::from_views(&registers, views, view, Precision::F32))
+        };
+        let largest = |t: Tensor| t.abs().max().double_value(&[]);
+        for views in [1, 3, 9] {
+            let (at_once, one_by_one) = from_views(views);
+            let whole = |tokens: &ImageTokens| &tokens.centered + &tokens.mean;
+            assert!(largest(whole(&at_once) - whole(&one_by_one)) < 1e-6, "{views} views");
+            // A twentieth of each token is its own, by construction of `alike`.
+            let [own, apart] = [&at_once, &one_by_one].map(|tokens| largest(tokens.centered.shallow_clone()));
+            assert!(apart < 1.5 * own && apart < 0.2 * largest(whole(&at_once)), "{own} {apart}");
         }
     }
 }

@@ -6,7 +6,7 @@ use crate::data::{self, ViewBatch};
 use crate::error::{Error, Result};
 use crate::io::Weights;
 use crate::loss;
-use crate::model::{self, EncodedTokens, GlobalSplat, ModelConfig, Precision, RawOutputs, Stage};
+use crate::model::{self, EncodedTokens, GlobalSplat, ModelConfig, ModelInput, Precision, RawOutputs, Stage};
 use crate::optim::Optimizer;
 use crate::reconstruct::fit_colours;
 use crate::render::{self, Cameras};
@@ -122,6 +122,12 @@ impl Request {
             .map_err(|e| Error::request(format!("{}: config: {e}", self.case)))
     }
 
+    fn model_input(&self) -> Result<ModelInput> {
+        let input = |name: &str| self.input(name).map(Tensor::shallow_clone);
+        let [images, c2w, intrinsics] = [input("images")?, input("c2w")?, input("intrinsics")?];
+        Ok(ModelInput { images, c2w, intrinsics, depths: None })
+    }
+
     fn stage(&self) -> Result<Stage> {
         Ok(Stage { index: self.number("stage")?, mix: self.number("mix")? })
     }
@@ -180,8 +186,7 @@ fn tokens(request: &Request) -> Result<Answer> {
         }
         _ => request.build(|vs| model::Tokenizer::new(vs, &config))?,
     };
-    let tokens =
-        module.forward(request.input("images")?, request.input("c2w")?, request.input("intrinsics")?, None);
+    let tokens = module.forward(&request.model_input()?, None);
     with_params([("tokens", tokens)], params)
 }
 
@@ -261,15 +266,15 @@ fn attention(request: &Request) -> Result<Answer> {
 fn stream_round(request: &Request) -> Result<Answer> {
     let config = request.model_config()?;
     let (module, params) = request.build(|vs| model::StreamRound::new(vs, &config))?;
-    let (slots, memory) = (request.input("slots")?, model::Memory::new(request.input("memory")?));
-    with_params([("slots", module.forward(slots, &memory, Precision::F32, &|| ()))], params)
+    let (slots, tokens) = (request.input("slots")?, model::ImageTokens::new(request.input("memory")?));
+    with_params([("slots", module.forward(slots, &tokens, Precision::F32))], params)
 }
 
 fn self_attention_block(request: &Request) -> Result<Answer> {
     let config = request.model_config()?;
     let (module, params) =
         request.build(|vs| model::SelfAttentionBlock::new(vs, config.width, config.heads))?;
-    with_params([("slots", module.forward(request.input("slots")?, Precision::F32, &|| ()))], params)
+    with_params([("slots", module.forward(request.input("slots")?, Precision::F32))], params)
 }
 
 fn mixer(request: &Request) -> Result<Answer> {
@@ -286,8 +291,7 @@ fn encoder(request: &Request) -> Result<Answer> {
         let scene_tokens = model::scene_tokens(vs, &config);
         (scene_tokens, model::Encoder::new(&(vs / "slot_encoder"), &config))
     })?;
-    let memory = encoder.memory(request.input("tokens")?);
-    let encoded = encoder.forward(&scene_tokens, &memory, &|| ());
+    let encoded = encoder.forward(&scene_tokens, &encoder.image_tokens(request.input("tokens")?));
     with_params([("geometry", encoded.geometry), ("appearance", encoded.appearance)], params)
 }
 
@@ -355,8 +359,7 @@ fn whole_model(request: &Request) -> Result<Answer> {
     config.check()?;
     let (module, params) =
         request.build(|vs| GlobalSplat::new(vs, &config).expect("a checked configuration"))?;
-    let (images, c2w) = (request.input("images")?, request.input("c2w")?);
-    decoded(module.forward(images, c2w, request.input("intrinsics")?, request.stage()?), params)
+    decoded(module.forward(&request.model_input()?, request.stage()?), params)
 }
 
 fn scene_normalization(request: &Request) -> Result<Answer> {

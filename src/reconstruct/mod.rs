@@ -138,7 +138,7 @@ pub fn reconstruct<'a>(
     let start = Instant::now();
     let (poses, target_poses) = normalization.c2w.split_at(photos.len());
     let depths = data.depths.then(|| depths_of(photos, poses, data.image_size));
-    let mut gaussians = pass(model, &views, poses, depths.as_ref())?;
+    let mut gaussians = run_model(model, &views, poses, depths.as_ref())?;
     if data.colour_steps > 0 {
         let batch = view_batch(photos, poses, model.device);
         gaussians = fit_colours(&gaussians, &batch, data.colour_steps)?;
@@ -164,8 +164,13 @@ fn depths_of(photos: &[View], poses: &[DMat4], size: ImageSize) -> Tensor {
 
 /// Runs the model on its device over `views`, the views of each photo, with the photos' `poses` in a normalized world. `depths` of the
 /// photos [V, 2, H, W] are those of [`pixel_depths`], in units of the normalized world.
-fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4], depths: Option<&Tensor>) -> Result<Gaussians> {
-    let Model { network, config, stage, device, mapped, .. } = model;
+fn run_model(
+    model: Model,
+    views: &[Vec<View>],
+    poses: &[DMat4],
+    depths: Option<&Tensor>,
+) -> Result<Gaussians> {
+    let Model { network, config, stage, device, .. } = model;
     let posed =
         views.iter().zip(poses).flat_map(|(of_photo, &pose)| of_photo.iter().map(move |view| (view, pose)));
     let (views, poses): (Vec<&View>, Vec<DMat4>) = posed.unzip();
@@ -175,24 +180,7 @@ fn pass(model: Model, views: &[Vec<View>], poses: &[DMat4], depths: Option<&Tens
         depths.repeat_interleave_self_int(of_photo, 0, None).unsqueeze(0).to_device(device)
     };
     let batch = ViewBatch { depths: depths.map(repeated), ..view_batch(&views, &poses, device) };
-    let warp = batch.radial_warp();
-    let images = batch.input_images();
-    drop(batch.images);
-    let [c2w, intrinsics] = [batch.c2w, batch.intrinsics];
-    config.model.check_image(images.size()[3], images.size()[4])?;
-    // A pass reads nearly every weight exactly once, so pages of weights can be released as soon as their layers are done.
-    let release_pages = || {
-        if let Some(mapped) = &mapped {
-            mapped.release_pages();
-        }
-    };
-    let decoded = tch::no_grad(|| {
-        let memory = network.memory(&images, &c2w, &intrinsics, warp.as_ref());
-        drop(images);
-        release_pages();
-        let encoded = network.encode_memory_with(&memory, &release_pages);
-        drop(memory);
-        network.decode(&encoded, stage).restored(warp.as_ref()).gaussians
-    });
-    Ok(decoded)
+    let input = batch.model_input();
+    config.model.check_image(input.images.size()[3], input.images.size()[4])?;
+    Ok(tch::no_grad(|| network.forward(&input, stage)).gaussians)
 }

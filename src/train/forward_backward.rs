@@ -5,11 +5,11 @@
 //! encoder can recompute its rounds instead of storing them, and each module can be timed.
 
 use crate::config::Config;
-use crate::data::{Batch, ViewBatch};
+use crate::data::Batch;
 use crate::device::Stopwatch;
 use crate::error::Result;
 use crate::loss::{PerceptualLoss, StepFraction, depth_pixels, losses};
-use crate::model::{Decoded, GlobalSplat, Stage, backward_from_grads, leaf};
+use crate::model::{GlobalSplat, Stage, backward_from_grads, leaf};
 use crate::ranks::ProcessGroup;
 use crate::render::{DEFAULT_EPS2D, RenderOutput, render};
 use tch::{Tensor, no_grad};
@@ -36,11 +36,10 @@ impl ForwardBackward<'_> {
     ) -> Result<Tensor> {
         let context = &batch.context;
         let model = self.model;
-        let warp = context.radial_warp();
-        let tokens = stopwatch.time("tokens", || {
-            model.tokens(&context.input_images(), &context.c2w, &context.intrinsics, warp.as_ref())
-        });
-        let tokens_leaf = leaf(&tokens);
+        let input = context.model_input();
+        let warp = input.radial_warp();
+        let tokens = stopwatch.time("tokens", || model.tokens(&input, warp.as_ref()));
+        let tokens_leaf = tokens.leaf();
         let (encoded, kept) = stopwatch.time("encoder", || match self.config.train.checkpoint_rounds {
             true => {
                 let (encoded, kept) = model.encode_checkpointed(&tokens_leaf);
@@ -49,8 +48,7 @@ impl ForwardBackward<'_> {
             false => (model.encode(&tokens_leaf), None),
         });
         let encoded_leaves = encoded.map(leaf);
-        let decoded =
-            stopwatch.time("decoder", || model.decode(&encoded_leaves, self.stage).restored(warp.as_ref()));
+        let decoded = stopwatch.time("decoder", || model.decode(&encoded_leaves, warp.as_ref(), self.stage));
         let decoded_leaves = decoded.map(leaf);
         let cameras = batch.target.cameras();
         let RenderOutput { rgb, alpha, depth } =
@@ -76,7 +74,8 @@ impl ForwardBackward<'_> {
                 kept.backward();
             }
         });
-        stopwatch.time("tokens backward", || backward_from_grads(&[(&tokens, &tokens_leaf)]));
+        stopwatch
+            .time("tokens backward", || backward_from_grads(&[(&tokens.centered, &tokens_leaf.centered)]));
         Ok(losses.packed())
     }
 
@@ -97,17 +96,10 @@ impl ForwardBackward<'_> {
     pub fn depth_pixels(&self, batch: &Batch) -> Result<Tensor> {
         let context = &batch.context;
         no_grad(|| {
-            let decoded = forward(self.model, context, self.stage);
+            let decoded = self.model.forward(&context.model_input(), self.stage);
             let rendered = render(&decoded.gaussians, &batch.target.cameras(), DEFAULT_EPS2D)?;
             let alpha = rendered.alpha.chunk(2, 0);
             Ok(depth_pixels([&alpha[0], &alpha[1]], batch.target_masks().as_ref()))
         })
     }
-}
-
-/// Runs one forward pass over the views `context`.
-pub(super) fn forward(model: &GlobalSplat, context: &ViewBatch, stage: Stage) -> Decoded {
-    let warp = context.radial_warp();
-    let memory = model.memory(&context.input_images(), &context.c2w, &context.intrinsics, warp.as_ref());
-    model.decode(&model.encode_memory(&memory), stage).restored(warp.as_ref())
 }

@@ -1,6 +1,5 @@
 //! Preview image of the training progress.
 
-use super::forward_backward::forward;
 use crate::data::Batch;
 use crate::error::Result;
 use crate::io::{colourize_depth, tile_horizontally};
@@ -16,7 +15,7 @@ pub(super) fn preview(model: &GlobalSplat, batch: &Batch, stage: Stage) -> Resul
     let (shown, target) =
         (context.select(&[middle(&context.images)]), target.select(&[middle(&target.images)]));
     let pictures = tch::no_grad(|| {
-        let decoded = forward(model, &context, stage);
+        let decoded = model.forward(&context.model_input(), stage);
         render(&decoded.gaussians, &target.cameras(), DEFAULT_EPS2D)
     })?;
     let first = |t: &Tensor| t.select(0, 0).select(0, 0).to_device(Device::Cpu);

@@ -2,10 +2,10 @@
 
 use super::{Trainer, subsets};
 use crate::config::{Config, TrainConfig};
-use crate::data::{Batch, Capture, LoadTimes, LoadedScene, ViewBatch};
+use crate::data::{Batch, Capture, LoadTimes, LoadedScene};
 use crate::device::{Stopwatch, num_threads};
 use crate::loss::{LossConfig, Losses, PerceptualKind, PerceptualLoss, StepFraction, Term, Vgg19, losses};
-use crate::model::{ModelConfig, Precision, Stage, Streams, backward_from_grads, leaf};
+use crate::model::{ImageTokens, ModelConfig, Precision, Stage, Streams, backward_from_grads, leaf};
 use crate::render::{DEFAULT_EPS2D, RenderOutput, render};
 use crate::scene::{Camera, Intrinsics};
 use glam::{DMat4, DVec3};
@@ -230,9 +230,7 @@ fn masked_pixels_contribute_nothing_to_a_step() {
 
     let trainer = far_from_the_start(&config);
     let sample = black.paired(&subsets(black.context_views(), 0));
-    let ViewBatch { c2w, intrinsics, .. } = &sample.context;
-    let decoded =
-        tch::no_grad(|| trainer.model.forward(&sample.context.input_images(), c2w, intrinsics, STAGE));
+    let decoded = tch::no_grad(|| trainer.model.forward(&sample.context.model_input(), STAGE));
     let RenderOutput { rgb, alpha, depth } =
         render(&decoded.gaussians, &sample.target.cameras(), DEFAULT_EPS2D).expect("pictures");
     let rendered = RenderOutput { rgb: leaf(&rgb), alpha: leaf(&alpha), depth: leaf(&depth) };
@@ -313,8 +311,7 @@ fn a_step_in_parts_matches_one_backward_pass() {
         let config = config(ModelConfig { streams, ..small() }, TrainConfig::default());
         let plain = of_model(&config, |trainer| {
             let sample = sample.paired(&subsets(sample.context_views(), 0));
-            let ViewBatch { images, c2w, intrinsics, .. } = &sample.context;
-            let decoded = trainer.model.forward(images, c2w, intrinsics, STAGE);
+            let decoded = trainer.model.forward(&sample.context.model_input(), STAGE);
             let pictures =
                 render(&decoded.gaussians, &sample.target.cameras(), DEFAULT_EPS2D).expect("pictures");
             let perceptual = trainer.perceptual.as_ref();
@@ -365,14 +362,13 @@ fn a_step_takes_few_kernels() {
         leaf.sum(leaf.kind()).backward();
         leaf
     };
-    let ViewBatch { images, c2w, intrinsics, .. } = &sample.context;
-    let (tokens, forward) = record_outermost_ops(|| network.tokens(images, c2w, intrinsics, None));
-    let leaf_of_tokens = with_gradient(&tokens);
-    let (_, backward) = record_outermost_ops(|| backward_from_grads(&[(&tokens, &leaf_of_tokens)]));
+    let (tokens, forward) = record_outermost_ops(|| network.tokens(&sample.context.model_input(), None));
+    let leaf_of_tokens = with_gradient(&tokens.centered);
+    let (_, backward) = record_outermost_ops(|| backward_from_grads(&[(&tokens.centered, &leaf_of_tokens)]));
     // Two layers, forward and for the gradients of their weights.
     let of_tokens = computing(&without_own_linear_layers([forward, backward].concat())) + 2 * 2;
 
-    let decoded = network.decode(&network.encode(&tokens), STAGE).map(leaf);
+    let decoded = network.decode(&network.encode(&tokens), None, STAGE).map(leaf);
     let cameras = sample.target.cameras();
     let pictures = render(&decoded.gaussians, &cameras, DEFAULT_EPS2D).expect("pictures");
     let (_, of_losses) = record_outermost_ops(|| {
@@ -382,8 +378,9 @@ fn a_step_takes_few_kernels() {
     });
 
     trainer.vs.double();
-    let tokens = leaf(&tokens.to_kind(Kind::Double));
-    let (decoded, forward) = record_outermost_ops(|| network.decode(&network.encode(&tokens), STAGE));
+    let [centered, mean] = [tokens.centered, tokens.mean].map(|t| t.to_kind(Kind::Double));
+    let tokens = ImageTokens { centered: leaf(&centered), mean };
+    let (decoded, forward) = record_outermost_ops(|| network.decode(&network.encode(&tokens), None, STAGE));
     let leaves = decoded.map(with_gradient);
     let (_, backward) = record_outermost_ops(|| backward_from_grads(&decoded.zip_tensors(&leaves)));
     let counts = [of_tokens, computing(&forward), computing(&backward), computing(&of_losses)];
@@ -398,8 +395,7 @@ fn a_step_makes_only_expected_device_copies() {
     {
         let train = TrainConfig { micro_batch, checkpoint_rounds, precision, ..Default::default() };
         of_model(&config(small(), train), |trainer| {
-            let ViewBatch { images, c2w, intrinsics, .. } = &sample.context;
-            let (decoded, ops) = record_ops(|| trainer.model.forward(images, c2w, intrinsics, STAGE));
+            let (decoded, ops) = record_ops(|| trainer.model.forward(&sample.context.model_input(), STAGE));
             assert_eq!(count_device_copies(&ops), 0, "an inference");
             let is_fused = |op: &&String| {
                 op.starts_with("aten::_scaled_dot_product_flash_attention") || *op == "globalsplat::attention"

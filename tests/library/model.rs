@@ -1,7 +1,7 @@
 //! The model's parameters, variants and image sizes.
 
 use globalsplat::config::Config;
-use globalsplat::model::{GlobalSplat, Memory, ModelConfig, Precision, Stage, Streams};
+use globalsplat::model::{GlobalSplat, ImageTokens, ModelConfig, ModelInput, Precision, Stage, Streams};
 use globalsplat::reconstruct::{LoadedModel, ModelDtype, ModelFile, save_model};
 use std::collections::BTreeMap;
 use tch::{Device, Kind, Tensor, nn};
@@ -25,14 +25,14 @@ fn small() -> ModelConfig {
 }
 
 /// Returns `views` images of noise from cameras in a row.
-fn inputs(views: i64, height: i64, width: i64) -> [Tensor; 3] {
+fn input(views: i64, height: i64, width: i64) -> ModelInput {
     let options = (Kind::Float, Device::Cpu);
     let images = Tensor::rand([1, views, 3, height, width], options);
     let c2w = Tensor::eye(4, options).repeat([1, views, 1, 1]);
     c2w.select(3, 3).select(2, 0).copy_(&Tensor::linspace(-0.5, 0.5, views, options).unsqueeze(0));
     let (w, h) = (width as f32, height as f32);
     let intrinsics = Tensor::from_slice(&[w, 0., w / 2., 0., w, h / 2., 0., 0., 1.]).view([3, 3]);
-    [images, c2w, intrinsics.repeat([1, views, 1, 1])]
+    ModelInput { images, c2w, intrinsics: intrinsics.repeat([1, views, 1, 1]), depths: None }
 }
 
 #[test]
@@ -82,7 +82,7 @@ fn plucker_only_has_no_camera_code() {
 
 #[test]
 fn every_variant_decodes_the_expected_number_of_gaussians() {
-    let [images, c2w, intrinsics] = inputs(3, 16, 24);
+    let input = input(3, 16, 24);
     let variants = [
         (small(), 3, 12 * 8),
         (small(), 4, 12 * 16),
@@ -95,7 +95,7 @@ fn every_variant_decodes_the_expected_number_of_gaussians() {
     for (config, stage, count) in variants {
         let (_vs, model) = build(&config);
         for mix in [0., 0.3, 1.] {
-            let decoded = model.forward(&images, &c2w, &intrinsics, Stage { index: stage, mix });
+            let decoded = model.forward(&input, Stage { index: stage, mix });
             let g = &decoded.gaussians;
             assert_eq!(g.means.size(), [1, count, 3], "{config:?}");
             assert_eq!(g.sh.size(), [1, count, config.sh_bases(), 3]);
@@ -113,8 +113,8 @@ fn every_variant_decodes_the_expected_number_of_gaussians() {
 fn the_number_of_gaussians_does_not_depend_on_the_number_of_views() {
     let (_vs, model) = build(&small());
     for views in [2, 5] {
-        let [images, c2w, intrinsics] = inputs(views, 16, 16);
-        let decoded = model.forward(&images, &c2w, &intrinsics, Stage::complete(3));
+        let input = input(views, 16, 16);
+        let decoded = model.forward(&input, Stage::complete(3));
         assert_eq!(decoded.gaussians.count(), 12 * 8);
     }
 }
@@ -123,10 +123,10 @@ fn the_number_of_gaussians_does_not_depend_on_the_number_of_views() {
 fn a_transition_starts_where_the_stage_before_ended() {
     // At λ = 0 every parent occurs twice, its optical depth split between the two.
     let (_vs, model) = build(&small());
-    let [images, c2w, intrinsics] = inputs(2, 16, 16);
-    let encoded = model.encode(&model.tokens(&images, &c2w, &intrinsics, None));
-    let after = model.decode(&encoded, Stage { index: 2, mix: 0. }).gaussians;
-    let before = model.decode(&encoded, Stage { index: 1, mix: 1. }).gaussians;
+    let input = input(2, 16, 16);
+    let encoded = model.encode(&model.tokens(&input, None));
+    let after = model.decode(&encoded, None, Stage { index: 2, mix: 0. }).gaussians;
+    let before = model.decode(&encoded, None, Stage { index: 1, mix: 1. }).gaussians;
     let twice = |t: &Tensor| t.repeat_interleave_self_int(2, 1, None);
     assert!(crate::common::largest_error(&after.means, &twice(&before.means)) < 1e-6);
     assert!(crate::common::largest_error(&after.sh, &twice(&before.sh)) < 1e-6);
@@ -146,11 +146,11 @@ fn bf16_is_float32_but_for_its_rounding() {
             let value = random.symmetric(&variable.size()) * 0.3 + if is_norm { 1. } else { 0. };
             tch::no_grad(|| variable.copy_(&value));
         }
-        let [_, c2w, intrinsics] = inputs(3, 16, 24);
         let images = random.uniform(&[1, 3, 3, 16, 24]).to_kind(Kind::Float);
+        let input = ModelInput { images, ..input(3, 16, 24) };
         let mut run = |precision| {
             model.set_precision(precision);
-            let decoded = model.forward(&images, &c2w, &intrinsics, Stage::complete(3));
+            let decoded = model.forward(&input, Stage::complete(3));
             let g = decoded.gaussians.map(Tensor::shallow_clone);
             vs.trainable_variables().iter_mut().for_each(|variable| variable.zero_grad());
             (g.means.square().sum(Kind::Float) + g.sh.square().sum(Kind::Float)).backward();
@@ -198,72 +198,11 @@ fn weights_of_a_file_in_bf16_are_kept_in_it() {
     assert!(bytes(&kept, Kind::BFloat16) > 0);
     assert_eq!(bytes(&kept, Kind::Float) + 2 * bytes(&kept, Kind::BFloat16), bytes(&cast, Kind::Float));
 
-    let [images, c2w, intrinsics] = inputs(3, 16, 24);
-    let [cast, kept] = [&cast, &kept]
-        .map(|loaded| tch::no_grad(|| loaded.model.forward(&images, &c2w, &intrinsics, stage).gaussians));
+    let input = input(3, 16, 24);
+    let [cast, kept] =
+        [&cast, &kept].map(|loaded| tch::no_grad(|| loaded.model.forward(&input, stage).gaussians));
     assert!(cast.means.equal(&kept.means) && cast.scales.equal(&kept.scales) && cast.sh.equal(&kept.sh));
     assert!(cast.quaternions.equal(&kept.quaternions) && cast.opacities.equal(&kept.opacities));
-}
-
-/// Returns the resident bytes of the process that are mapped from `file`, as Linux counts them.
-#[cfg(target_os = "linux")]
-fn resident(file: &std::path::Path) -> u64 {
-    let maps = std::fs::read_to_string("/proc/self/smaps").unwrap();
-    let name = file.canonicalize().unwrap().display().to_string();
-    let (mut is_of_file, mut kilobytes) = (false, 0);
-    for line in maps.lines() {
-        let first = line.split_whitespace().next().unwrap_or_default();
-        if first.contains('-') {
-            // A line with a range of addresses, and the mapped file at its end.
-            is_of_file = line.ends_with(&name);
-        } else if first == "Rss:" && is_of_file {
-            kilobytes += line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap();
-        }
-    }
-    1000 * kilobytes
-}
-
-#[test]
-fn mapped_weights_give_the_outputs_of_copied_weights() {
-    let model = ModelConfig { width: 64, heads: 4, ..small() };
-    let config = Config { model, ..Default::default() };
-    let (vs, _) = build(&config.model);
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("model.safetensors");
-    let stage = config.curriculum.final_stage();
-    for (dtype, precision) in [(ModelDtype::F32, Precision::F32), (ModelDtype::BF16, Precision::Bf16)] {
-        save_model(&path, &vs, &config, stage, dtype).unwrap();
-        let open = || ModelFile::open(&path, &[]).unwrap();
-        let copied = open().load(Device::Cpu, precision).unwrap();
-        let lies = open().load_mmap(Device::Cpu, precision).unwrap();
-        let mapped = lies.mapped.expect("a mapped file");
-        assert!(copied.mapped.is_none());
-        let [images, c2w, intrinsics] = inputs(3, 16, 24);
-        let same = |loaded: &LoadedModel| {
-            let of = |loaded: &LoadedModel| {
-                tch::no_grad(|| loaded.model.forward(&images, &c2w, &intrinsics, stage).gaussians)
-            };
-            let (a, b) = (of(&copied), of(loaded));
-            // The memory alignment of a tensor may affect the order of summation.
-            let pairs = [(&a.means, &b.means), (&a.opacities, &b.opacities), (&a.sh, &b.sh)];
-            pairs.iter().all(|(a, b)| crate::common::relative_error(b, a) < 1e-5)
-        };
-        assert!(same(&lies), "{dtype:?}");
-        #[cfg(target_os = "linux")]
-        {
-            let bytes = std::fs::metadata(&path).unwrap().len();
-            let used = resident(&path);
-            mapped.release_pages();
-            let left = resident(&path);
-            assert!(2 * used > bytes && 8 * left < bytes, "{dtype:?}: {used} of {bytes} bytes, then {left}");
-        }
-        assert!(same(&lies), "{dtype:?}: read again");
-        // Pages that are written to become private copies.
-        let before = std::fs::read(&path).unwrap();
-        tch::no_grad(|| lies.vs.variables().values().for_each(|t| drop(t.shallow_clone().fill_(1.))));
-        assert!(!same(&lies) && std::fs::read(&path).unwrap() == before);
-        mapped.release_pages();
-    }
 }
 
 #[test]
@@ -309,20 +248,20 @@ fn configurations_out_of_range_are_refused() {
 }
 
 #[test]
-fn memory_without_gradients_is_stored_in_bf16() {
+fn tokens_without_gradients_are_stored_in_bf16() {
     let (_vs, mut model) = build(&small());
     model.set_precision(Precision::Bf16);
-    let [images, c2w, intrinsics] = inputs(3, 16, 24);
-    let followed = model.memory(&images, &c2w, &intrinsics, None);
-    let of = |memory: &Memory| [&memory.tokens, &memory.common].map(|t| (t.requires_grad(), t.kind()));
-    assert_eq!(of(&followed), [(true, Kind::Float), (false, Kind::Float)]);
-    let kept = tch::no_grad(|| model.memory(&images, &c2w, &intrinsics, None));
-    assert_eq!(of(&kept), [(false, Kind::BFloat16), (false, Kind::Float)]);
-    // Without gradients, the common part is estimated from some of the views, one view at a time: products of other shapes
-    // differ in float32's last digits. The remaining difference is rounding to bfloat16.
-    let whole = |memory: &Memory| memory.tokens.to_kind(Kind::Double) + &memory.common;
-    let off = (whole(&kept) - whole(&followed)).abs();
+    let input = input(3, 16, 24);
+    let tracked = model.tokens(&input, None);
+    let of = |tokens: &ImageTokens| [&tokens.centered, &tokens.mean].map(|t| (t.requires_grad(), t.kind()));
+    assert_eq!(of(&tracked), [(true, Kind::Float), (false, Kind::Float)]);
+    let rounded = tch::no_grad(|| model.tokens(&input, None));
+    assert_eq!(of(&rounded), [(false, Kind::BFloat16), (false, Kind::Float)]);
+    // Without gradients, the mean is estimated from some of the views, one view at a time: products of other shapes differ in float32's
+    // last digits. The remaining difference is rounding to bfloat16.
+    let whole = |tokens: &ImageTokens| tokens.centered.to_kind(Kind::Double) + &tokens.mean;
+    let off = (whole(&rounded) - whole(&tracked)).abs();
     let rounding =
-        kept.tokens.to_kind(Kind::Double).abs() * 2f64.powi(-8) + whole(&followed).abs().max() * 1e-6;
+        rounded.centered.to_kind(Kind::Double).abs() * 2f64.powi(-8) + whole(&tracked).abs().max() * 1e-6;
     assert_eq!(off.le_tensor(&rounding).all().int64_value(&[]), 1);
 }

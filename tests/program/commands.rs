@@ -33,8 +33,6 @@ fn doctor_reports_the_installation() {
     assert!(["avx512", "avx2", "neon", "portable"].contains(&report["simd"].as_str().unwrap()));
     assert!(report["libtorch"].as_str().unwrap().starts_with("2."));
     assert!(report["ffmpeg"].is_string() || report["ffmpeg"]["absent"].is_string());
-    let denormals = report["denormals"].as_str().unwrap();
-    assert!(denormals == "taken for 0" || cfg!(not(target_arch = "x86_64")), "{denormals}");
 }
 
 #[test]
