@@ -276,43 +276,6 @@ def test_safetensors_cross_both_ways(model, weights, tmp_path):
     assert same(read, {n: t.half().float() for n, t in weights.items()}) and told["taken_for"]
 
 
-def test_shards_have_an_index_as_hugging_faces(model, weights, tmp_path):
-    out = tmp_path / "large.safetensors"
-    told = succeed("import", "--from", model, "--out", out, "--max-shard-size", "20KB")
-    index = tmp_path / "large.safetensors.index.json"
-    assert told["weights"] == str(index) and not out.exists()
-    described = json.loads(index.read_text())
-    assert described["metadata"]["total_size"] == sum(t.numel() * 4 for t in weights.values())
-    shards = sorted(set(described["weight_map"].values()))
-    count = len(shards)
-    assert count > 2 and shards == [f"large-{i + 1:05}-of-{count:05}.safetensors" for i in range(count)]
-    state = {}
-    for name in shards:
-        part = load_file(tmp_path / name)
-        assert set(part) == {tensor for tensor, file in described["weight_map"].items() if file == name}
-        assert len(part) == 1 or sum(t.numel() * 4 for t in part.values()) <= 20_000
-        state.update(part)
-    assert same(state, weights)
-    # The weights can be named by the index, or by the name that a single file would have.
-    for file in [index, out]:
-        read, _ = imported(file, tmp_path / "again.safetensors")
-        assert same(read, weights)
-    (tmp_path / shards[1]).unlink()
-    assert shards[1] in refuse("import", "--from", index, "--out", tmp_path / "c.safetensors")
-    # No command overwrites its own input, or writes a file that would be mistaken for existing shards.
-    assert "a file that this command reads" in refuse("import", "--from", model, "--out", model)
-    single = tmp_path / "single.safetensors"
-    single.write_bytes(model.read_bytes())
-    error = refuse("import", "--from", model, "--out", single, "--max-shard-size", "1KB")
-    assert "would be read instead of the shards" in error
-    config = model.with_name("config.toml")
-    as_torch = ["--config", config, "--format", "torch", "--out", tmp_path / "a.ckpt", "--max-shard-size", "1KB"]
-    assert "a checkpoint for torch is one file" in refuse("export", *as_torch)
-    described["weight_map"]["scene_tokens"] = "../model.safetensors"
-    index.write_text(json.dumps(described))
-    assert "in the folder of the index" in refuse("import", "--from", index, "--out", tmp_path / "c.safetensors")
-
-
 class Runs:
     """Object that makes Python call a function when it is unpickled."""
 

@@ -43,7 +43,7 @@ pub fn reconstruct<'py>(
 pub fn load(weights: Option<&Path>, device: Device, precision: Option<Precision>) -> Result<LoadedModel> {
     let file = ModelFile::open_or_bundled(weights)?;
     let precision = precision.unwrap_or_else(|| Precision::best_on(device, file.config.model.width));
-    file.load_mmap(device, precision)
+    file.load(device, precision)
 }
 
 /// Weights, configuration, curriculum stage and transition of a model.

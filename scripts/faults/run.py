@@ -426,11 +426,6 @@ def operations(bench, only):
         "train": lambda: training("train", False),
         "train, resumed": lambda: training("train, resumed", True),
         "export": aged("export", export),
-        "export, shards": aged(
-            "export, shards",
-            [*export, "--max-shard-size", "80KB"],
-            completed_by="model.safetensors.index.json",
-        ),
         "reconstruct": aged("reconstruct", reconstruct),
         "reconstruct --local-origin": aged("reconstruct --local-origin", [*reconstruct, "--local-origin"]),
         "refine --local-origin": aged("refine --local-origin", refine),

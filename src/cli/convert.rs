@@ -6,11 +6,11 @@ use glam::{DMat4, DVec3};
 use globalsplat::Error;
 use globalsplat::data::write_transforms_json;
 use globalsplat::io::{
-    InputFiles, ShLimits, Splat, SplatEdit, WriteOptions, check_writable_file, check_writable_splat,
-    edit_splat, fit_splat, move_cameras, read_splat, read_splat_without_invalid, splat_files,
+    InputFiles, ShLimits, Splat, WriteOptions, check_writable_file, check_writable_splat, fit_splat,
+    read_splat, read_splat_without_invalid, splat_files,
 };
 use globalsplat::metrics::psnr_between;
-use globalsplat::render::orbit_around_splat;
+use globalsplat::render::{SplatEdit, edit_splat, move_cameras, orbit_around_splat};
 use globalsplat::scene::{Camera, LocalFrame, splat_frame};
 use serde_json::{Value, json};
 use std::cmp::Ordering;

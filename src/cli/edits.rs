@@ -3,7 +3,8 @@
 use super::open_capture;
 use clap::{Arg, ArgAction, ArgMatches, Args, Command, FromArgMatches};
 use glam::{DMat4, DQuat, DVec3};
-use globalsplat::io::{InputFiles, SplatEdit, read_splat_without_invalid, splat_files};
+use globalsplat::io::{InputFiles, read_splat_without_invalid, splat_files};
+use globalsplat::render::SplatEdit;
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::path::PathBuf;
 

@@ -11,7 +11,7 @@ use globalsplat::eval::{
     Baselines, DatasetEvaluation, EvalScene, Evaluation, EvaluationIndex, LazyPhotos, Method, REPORT, TABLE,
     evaluation_files, machine, score_output, weights_fingerprint, write_csv, write_evaluation, write_report,
 };
-use globalsplat::io::{InputFiles, check_writable_dir, check_writable_png, weights_files};
+use globalsplat::io::{InputFiles, check_writable_dir, check_writable_png};
 use globalsplat::metrics::{CaptureScores, ContactSheet, Perceptual};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::{Input, LoadedModel, Model, context_views};
@@ -271,7 +271,7 @@ impl Eval {
     fn inputs<'a>(&self, methods: impl Iterator<Item = Method<'a>>) -> InputFiles {
         let mut inputs = InputFiles::default();
         match &self.weights {
-            Some(weights) => inputs.add_all(weights_files(weights)),
+            Some(weights) => inputs.add(weights),
             None => methods.for_each(|method| method.add_input_files(&mut inputs)),
         }
         inputs

@@ -2,7 +2,7 @@ use super::weights_out::{Format, WeightsOut};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
 use globalsplat::config::Config;
-use globalsplat::io::{InputFiles, weights_files};
+use globalsplat::io::InputFiles;
 use globalsplat::model::GlobalSplat;
 use globalsplat::reconstruct::load_model;
 use globalsplat::train::{MODEL_FILE, add_run_inputs, best_checkpoint, latest_checkpoint};
@@ -15,8 +15,7 @@ use tch::{Device, nn};
 #[command(group(ArgGroup::new("source").required(true)))]
 #[command(
     after_help = "Examples:\n  globalsplat export --run runs/first_light --out model.safetensors --dtype bf16\n  \
-    globalsplat export --run runs/first_light --format torch --out model.ckpt\n  \
-    globalsplat export --weights model.safetensors --dtype bf16 --max-shard-size 100MB --out shards/model.safetensors"
+    globalsplat export --run runs/first_light --format torch --out model.ckpt"
 )]
 pub struct Export {
     /// Folder of a run
@@ -25,7 +24,7 @@ pub struct Export {
     /// Export the run's best weights by validation, instead of the newest
     #[arg(long, conflicts_with_all = ["config", "weights"])]
     best: bool,
-    /// Export the weights of this file: safetensors, in one file or in shards, or a checkpoint
+    /// Export the weights of this file: safetensors or a checkpoint
     #[arg(long, value_name = "FILE", group = "source")]
     weights: Option<PathBuf>,
     /// Export newly initialized weights of a configuration instead, as at the start of training
@@ -42,9 +41,9 @@ impl Export {
     pub fn run(self) -> Result<()> {
         let mut inputs = InputFiles::default();
         self.run.iter().for_each(|run| add_run_inputs(run, &mut inputs));
-        self.weights.iter().for_each(|weights| inputs.add_all(weights_files(weights)));
+        self.weights.iter().for_each(|weights| inputs.add(weights));
         self.config.iter().for_each(|config| inputs.add(config));
-        self.out.check(self.format, &inputs)?;
+        self.out.check(&inputs)?;
         let mut note = None;
         let (vs, config, stage) = match (&self.run, &self.weights, &self.config) {
             (Some(run), ..) => {

@@ -1,7 +1,7 @@
 use super::weights_out::{Format, WeightsOut};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::io::{InputFiles, weights_files};
+use globalsplat::io::InputFiles;
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::ModelFile;
 use serde_json::json;
@@ -32,8 +32,8 @@ pub struct Import {
 impl Import {
     pub fn run(self) -> Result<()> {
         let mut inputs = InputFiles::default();
-        inputs.add_all(weights_files(&self.from));
-        self.out.check(Format::Safetensors, &inputs)?;
+        inputs.add(&self.from);
+        self.out.check(&inputs)?;
         let file = ModelFile::open(&self.from, &self.set)?;
         let left_out = file.left_out;
         let loaded = file.load(Device::Cpu, Precision::F32)?;

@@ -37,7 +37,7 @@ pub fn precision(requested: Option<Precision>, device: Device, width: i64) -> Pr
 pub fn load(weights: Option<&Path>, requested: Option<Precision>, device: Device) -> Result<LoadedModel> {
     let file = ModelFile::open_or_bundled(weights)?;
     let precision = precision(requested, device, file.config.model.width);
-    let loaded = file.load_mmap(device, precision)?;
+    let loaded = file.load(device, precision)?;
     if !ranks::is_main_process() {
         return Ok(loaded);
     }

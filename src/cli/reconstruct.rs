@@ -6,7 +6,7 @@ use anyhow::Result;
 use clap::Args;
 use globalsplat::data::Capture;
 use globalsplat::device::{Stopwatch, peak_memory_bytes, process_age};
-use globalsplat::io::{InputFiles, check_writable_splat, weights_files};
+use globalsplat::io::{InputFiles, check_writable_splat};
 use globalsplat::reconstruct::{Input, Model, load_context, reconstruct};
 use globalsplat::refine::RefineOptions;
 use globalsplat::scene::{ImageSize, LocalFrame};
@@ -110,7 +110,7 @@ impl Reconstruct {
         let capture = stopwatch.time("photos", || open_masked_capture(&scene, self.masks.as_deref()))?;
         let mut inputs = InputFiles::default();
         capture.add_input_files(&mut inputs);
-        self.weights.iter().for_each(|path| inputs.add_all(weights_files(path)));
+        self.weights.iter().for_each(|path| inputs.add(path));
         inputs.check_file(&self.out)?;
         let data = &loaded.config.data;
         let input = match self.views_at {

@@ -5,11 +5,12 @@ use globalsplat::Error;
 use globalsplat::data::{Capture, ChunkWriter, SyntheticDataset, load_views, read_pictures};
 use globalsplat::eval::{EvaluationIndex, SceneFrames};
 use globalsplat::io::{
-    InputFiles, check_writable_dir, check_writable_png, tile_horizontally, tile_vertically, write_npy,
+    InputFiles, check_writable_dir, check_writable_png, tile_horizontally, tile_vertically, write_atomically,
     write_png,
 };
 use globalsplat::scene::ImageSize;
 use globalsplat::synth::VideoSettings;
+use npyz::WriterBuilder;
 use rayon::prelude::*;
 use serde_json::json;
 use std::collections::BTreeMap;
@@ -155,7 +156,16 @@ impl Synth {
 
     fn write_depths(&self, file: &Path, capture: &Capture) -> Result<(), Error> {
         let depths: Vec<f32> = (0..capture.len()).filter_map(|view| capture.depth(view)).flatten().collect();
-        write_npy(file, &[self.frames, self.size, self.size], &depths)
+        write_atomically(file, |writer| {
+            let write = || {
+                let shape = [self.frames, self.size, self.size];
+                let mut npy =
+                    npyz::WriteOptions::new().default_dtype().shape(&shape).writer(writer).begin_nd()?;
+                npy.extend(&depths)?;
+                npy.finish()
+            };
+            write().map_err(Error::write(file))
+        })
     }
 }
 

@@ -5,7 +5,7 @@ use globalsplat::config::Config;
 use globalsplat::data::{BadData, Capture, Dataset, SceneGroups, Split, TrainingScenes};
 use globalsplat::error::Error;
 use globalsplat::eval::{HeldOut, HeldOutScores, write_curves};
-use globalsplat::io::{InputFiles, check_writable_dir, weights_files};
+use globalsplat::io::{InputFiles, check_writable_dir};
 use globalsplat::loss::{Term, psnr_of_mse};
 use globalsplat::train::{
     CONFIG_FILE, Event, METRICS_FILE, Outcome, Resume, Trainer, Validator, retry_on_disk_full, run,
@@ -142,7 +142,7 @@ impl Train {
         for path in config.data.validation_paths()? {
             Dataset::open(&path, Split::Test)?.add_input_files(&self.out, &mut inputs);
         }
-        self.from.iter().for_each(|path| inputs.add_all(weights_files(path)));
+        self.from.iter().for_each(|path| inputs.add(path));
         inputs.check_folder(&self.out)?;
         let files = [CONFIG_FILE, METRICS_FILE, CURVES_FILE].map(|name| self.out.join(name));
         Ok(files.iter().try_for_each(|file| inputs.check_file(file))?)

@@ -95,15 +95,15 @@ pub struct DatasetEvaluation<'a> {
     pub group: &'a ProcessGroup,
 }
 
-/// Returns a string that identifies the model in the file `weights`, for [`DatasetEvaluation::fingerprint`]: the file's name and a checksum
-/// of all its files.
+/// Returns a string that identifies the model in the file `weights`, for [`DatasetEvaluation::fingerprint`]: the file's name and its
+/// checksum.
 ///
 /// # Errors
 /// Fails if a file can't be read.
 pub fn weights_fingerprint(weights: &Path) -> Result<String> {
     let weights = WeightsFile::open(weights)?;
     let name = weights.path().file_name().unwrap_or_default();
-    Ok(format!("{} {:08x}", name.display(), checksum(weights.files())?))
+    Ok(format!("{} {:08x}", name.display(), checksum([weights.path()])?))
 }
 
 /// Results of a rank for its share of the scenes.

@@ -1,14 +1,17 @@
-//! Weights in safetensors files, whose metadata hold the configuration that rebuilds their model, and in checkpoints.
+//! Weights of models: safetensors files, whose metadata hold the configuration that rebuilds their model, and checkpoints that torch.save
+//! wrote.
 
-use super::dtype::to_dtype;
+use super::write_atomically;
 use crate::error::{Error, Result};
-use globalsplat_files::{PartialFile, write_temporary};
 use globalsplat_torch_file as torch_file;
-use globalsplat_torch_file::Dtype;
+use globalsplat_torch_file::{Array, Dtype, TorchFile, Value, is_torch_file, row_major};
+use memmap2::{Mmap, MmapOptions};
 use safetensors::tensor::TensorView;
-use std::collections::{BTreeMap, HashMap};
-use std::path::Path;
-use tch::{Device, Tensor, nn};
+use safetensors::{SafeTensorError, SafeTensors};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::fs::File;
+use std::path::{Path, PathBuf};
+use tch::{Device, Kind, Tensor, nn};
 
 /// Contents of a safetensors file.
 #[derive(Debug)]
@@ -17,6 +20,17 @@ pub struct Weights {
     pub tensors: BTreeMap<String, Tensor>,
     /// Metadata of the file, its `__metadata__`.
     pub metadata: HashMap<String, String>,
+}
+
+impl Weights {
+    /// Copies the weights into the variables of `vs`, which keep their type and device.
+    ///
+    /// # Errors
+    /// Returns an error if names or shapes don't match, before anything is copied: it names the first mismatch and counts the others.
+    pub fn load_into(&self, vs: &nn::VarStore, file: &Path) -> Result<()> {
+        let shapes = self.tensors.iter().map(|(name, t)| (name.as_str(), t.size())).collect();
+        fit(vs, &shapes, file, |name, variable| Ok(variable.f_copy_(&self.tensors[name])?))
+    }
 }
 
 /// Writes a safetensors file atomically.
@@ -28,18 +42,6 @@ pub fn write_weights(
     tensors: &BTreeMap<String, Tensor>,
     metadata: HashMap<String, String>,
 ) -> Result<()> {
-    Ok(write_weights_partially(path, tensors, metadata)?.persist()?)
-}
-
-/// Writes a file like [`write_weights`], but leaves it under its temporary name until [`PartialFile::persist`] is called.
-///
-/// # Errors
-/// Returns the errors of [`write_weights`].
-pub(super) fn write_weights_partially(
-    path: &Path,
-    tensors: &BTreeMap<String, Tensor>,
-    metadata: HashMap<String, String>,
-) -> Result<PartialFile> {
     let stored = Stored::all(tensors)?;
     let views = stored.iter().map(|(name, s)| Ok((name, s.view()?))).collect::<Result<Vec<_>>>()?;
     let failed = |e: &dyn std::fmt::Display| {
@@ -47,14 +49,24 @@ pub(super) fn write_weights_partially(
     };
     let mut bytes = safetensors::serialize(views, Some(metadata)).map_err(|e| failed(&e))?;
     sort_header(&mut bytes).map_err(|e| failed(&e))?;
-    let (header, tensors) = bytes.split_at(8 + header_length(&bytes));
-    let padding = header.len().next_multiple_of(ALIGNMENT) - header.len();
-    let length = (header.len() - 8 + padding) as u64;
-    write_temporary(path, |writer| {
-        let parts = [&length.to_le_bytes(), &header[8..], &[b' '; ALIGNMENT][..padding], tensors];
-        parts.into_iter().try_for_each(|part| writer.write_all(part)).map_err(Error::write(path))
-    })
+    write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
 }
+
+/// Sorts the metadata in the header. They come in the order of a hash map, which differs between processes; sorted, equal weights give
+/// equal bytes.
+fn sort_header(bytes: &mut [u8]) -> serde_json::Result<()> {
+    let (length, rest) = bytes.split_at_mut(HEADER_LENGTH);
+    let length = u64::from_le_bytes((&*length).try_into().expect("eight bytes")) as usize;
+    let header: serde_json::Map<String, serde_json::Value> = serde_json::from_slice(&rest[..length])?;
+    let sorted = serde_json::to_vec(&header)?;
+    // The header keeps its length, which includes padding with spaces.
+    rest[..sorted.len()].copy_from_slice(&sorted);
+    rest[sorted.len()..length].fill(b' ');
+    Ok(())
+}
+
+/// Number of bytes of the header's length, at the start of a safetensors file.
+const HEADER_LENGTH: usize = 8;
 
 /// Writes a checkpoint in the format of torch.save atomically, with `weights` as its state dict and their metadata beside it. `torch.load`
 /// and Lightning read it without any of our code.
@@ -68,28 +80,6 @@ pub fn write_checkpoint(path: &Path, weights: &Weights) -> Result<()> {
         .map(|(name, s)| torch_file::TensorView { name, dtype: s.dtype, shape: &s.shape, bytes: &s.bytes })
         .collect();
     Ok(torch_file::write_checkpoint(path, &tensors, &weights.metadata)?)
-}
-
-/// Alignment of the tensors' bytes in a file. Kernels of libtorch round differently where a mapped file's values aren't aligned to 16
-/// bytes.
-const ALIGNMENT: usize = 64;
-
-/// Returns the length of the header, which follows the eight bytes that hold it.
-fn header_length(bytes: &[u8]) -> usize {
-    u64::from_le_bytes(bytes[..8].try_into().expect("eight bytes")) as usize
-}
-
-/// Sorts the metadata in the header. They come in the order of a hash map, which differs between processes; sorted, equal weights give
-/// equal bytes.
-fn sort_header(bytes: &mut [u8]) -> serde_json::Result<()> {
-    let length = header_length(bytes);
-    let rest = &mut bytes[8..];
-    let header: serde_json::Map<String, serde_json::Value> = serde_json::from_slice(&rest[..length])?;
-    let sorted = serde_json::to_vec(&header)?;
-    // The header keeps its length, which includes padding with spaces.
-    rest[..sorted.len()].copy_from_slice(&sorted);
-    rest[sorted.len()..length].fill(b' ');
-    Ok(())
 }
 
 /// A tensor's bytes in row-major order, with its type and shape.
@@ -125,19 +115,8 @@ impl Stored {
     }
 }
 
-impl Weights {
-    /// Copies the weights into the variables of `vs`, which keep their type and device.
-    ///
-    /// # Errors
-    /// Returns an error if names or shapes don't match, before anything is copied: it names the first mismatch and counts the others.
-    pub fn load_into(&self, vs: &nn::VarStore, file: &Path) -> Result<()> {
-        let shapes = self.tensors.iter().map(|(name, t)| (name.as_str(), t.size())).collect();
-        fit(vs, &shapes, file, |name, variable| Ok(variable.f_copy_(&self.tensors[name])?))
-    }
-}
-
 /// Fills every variable of `vs` with `copy`, if the names and shapes are those of the tensors in `file`.
-pub(super) fn fit(
+fn fit(
     vs: &nn::VarStore,
     shapes: &BTreeMap<&str, Vec<i64>>,
     file: &Path,
@@ -169,23 +148,320 @@ pub(super) fn fit(
     tch::no_grad(|| variables.into_iter().try_for_each(|(name, mut variable)| copy(&name, &mut variable)))
 }
 
+/// Reads a safetensors file of float32, bfloat16 or float16 tensors, or another format that [`WeightsFile::open`] supports.
+///
+/// # Errors
+/// Returns the errors of [`WeightsFile::open`] and [`WeightsFile::read`].
+pub fn read_weights(path: &Path) -> Result<Weights> {
+    WeightsFile::open(path)?.read()
+}
+
+/// Returns `true` if `path` has an extension that is usual for weights.
+pub fn is_weights_name(path: &Path) -> bool {
+    let name = path.to_string_lossy().to_ascii_lowercase();
+    let endings = [".safetensors", ".ckpt", ".pt", ".pth"];
+    endings.iter().any(|ending| name.ends_with(ending))
+}
+
+/// Weights in a file, none of which have been read yet.
+#[derive(Debug)]
+pub struct WeightsFile {
+    path: PathBuf,
+    bytes: Bytes,
+    arrays: BTreeMap<String, Array>,
+    metadata: HashMap<String, String>,
+}
+
+/// Contents of a file: mapped, or embedded in the program.
+#[derive(Debug)]
+enum Bytes {
+    Mapped(Mmap),
+    Embedded(&'static [u8]),
+}
+
+impl Bytes {
+    fn map(path: &Path) -> Result<Self> {
+        let read = Error::read(path);
+        let file = match File::open(path).and_then(|file| Ok((file.metadata()?.is_dir(), file))) {
+            Ok((false, file)) => file,
+            Ok((true, _)) => return Err(read(std::io::ErrorKind::IsADirectory.into())),
+            Err(e) => return Err(read(e)),
+        };
+        // SAFETY: our own files are replaced as a whole, never changed in place. If another program truncates a file that is being read,
+        // this process is killed.
+        Ok(Bytes::Mapped(unsafe { MmapOptions::new().map_copy_read_only(&file) }.map_err(read)?))
+    }
+
+    fn get(&self) -> &[u8] {
+        match self {
+            Bytes::Mapped(map) => map,
+            Bytes::Embedded(bytes) => bytes,
+        }
+    }
+}
+
+impl WeightsFile {
+    /// Opens a safetensors file, or a file that torch.save wrote: a state dict, or a checkpoint with one. Nothing in a checkpoint is
+    /// executed.
+    ///
+    /// # Errors
+    /// Returns an error if the file can't be read, is damaged or has none of these formats, or if a tensor has a type that weights don't
+    /// have.
+    pub fn open(path: &Path) -> Result<Self> {
+        Self::from_bytes(Bytes::map(path)?, path)
+    }
+
+    /// Opens weights that are embedded in the program; errors call them `path`.
+    pub(crate) fn from_embedded(bytes: &'static [u8], path: &Path) -> Result<Self> {
+        Self::from_bytes(Bytes::Embedded(bytes), path)
+    }
+
+    fn from_bytes(bytes: Bytes, path: &Path) -> Result<Self> {
+        let (arrays, metadata) = match is_torch_file(bytes.get()) {
+            true => state_dict(&TorchFile::parse(path, bytes.get())?, path)?,
+            false => safetensors(bytes.get(), path)?,
+        };
+        Ok(WeightsFile { path: path.to_owned(), bytes, arrays, metadata })
+    }
+
+    /// Returns the path of the file.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Returns the file's `__metadata__`, or for a checkpoint the strings beside its state dict, and settings that shapes don't determine.
+    pub fn metadata(&self) -> &HashMap<String, String> {
+        &self.metadata
+    }
+
+    /// Returns the names of all tensors.
+    pub fn names(&self) -> impl ExactSizeIterator<Item = &str> {
+        self.arrays.keys().map(String::as_str)
+    }
+
+    /// Returns the type and shape of every tensor, by name.
+    pub fn shapes(&self) -> BTreeMap<String, (Kind, Vec<i64>)> {
+        let shape = |array: &Array| (to_kind(array.dtype), dimensions(&array.shape));
+        self.arrays.iter().map(|(name, array)| (name.clone(), shape(array))).collect()
+    }
+
+    /// Renames every tensor with `rename`, and drops those for which it returns `None`.
+    pub fn rename_tensors(self, rename: impl Fn(&str) -> Option<String>) -> Self {
+        let arrays =
+            self.arrays.into_iter().filter_map(|(name, array)| Some((rename(&name)?, array))).collect();
+        WeightsFile { arrays, ..self }
+    }
+
+    /// Reads all weights into memory.
+    ///
+    /// # Errors
+    /// Returns libtorch's error.
+    pub fn read(&self) -> Result<Weights> {
+        let tensors = self.arrays.iter().map(|(name, array)| Ok((name.clone(), self.tensor(array)?)));
+        Ok(Weights { tensors: tensors.collect::<Result<_>>()?, metadata: self.metadata.clone() })
+    }
+
+    /// Copies the weights into the variables of `vs`, which keep their type and device.
+    ///
+    /// # Errors
+    /// Returns an error if names, shapes or types don't match, before anything is copied: it reports the first name or shape and counts the
+    /// others.
+    pub fn load_into(&self, vs: &nn::VarStore) -> Result<()> {
+        if let Some((name, array)) = self.arrays.iter().find(|(_, array)| !array.dtype.is_float()) {
+            let field = format!("tensor {name}");
+            return Err(Error::input(&self.path, field, array.dtype, "F32, BF16 or F16"));
+        }
+        let shapes = self.arrays.iter().map(|(name, a)| (name.as_str(), dimensions(&a.shape))).collect();
+        fit(
+            vs,
+            &shapes,
+            &self.path,
+            |name, variable| Ok(variable.f_copy_(&self.tensor(&self.arrays[name])?)?),
+        )
+    }
+
+    fn tensor(&self, array: &Array) -> Result<Tensor> {
+        let bytes = &self.bytes.get()[array.bytes.clone()];
+        let count = bytes.len() / array.dtype.size();
+        let numbers = Tensor::f_from_data_size(bytes, &[count as i64], to_kind(array.dtype))?;
+        Ok(numbers
+            .f_as_strided(dimensions(&array.shape), dimensions(&array.strides), None)?
+            .f_contiguous()?)
+    }
+}
+
+fn dimensions(sizes: &[usize]) -> Vec<i64> {
+    sizes.iter().map(|&size| size as i64).collect()
+}
+
+/// Returns the locations of the tensors of a safetensors file in its `bytes`.
+fn safetensors(bytes: &[u8], path: &Path) -> Result<Contents> {
+    let broken = |e: SafeTensorError| {
+        Error::input(path, "the file", format!("broken ({e})"), "safetensors, or what torch.save writes")
+    };
+    let (header_length, header) = SafeTensors::read_metadata(bytes).map_err(broken)?;
+    let mut arrays = BTreeMap::new();
+    for (name, info) in header.tensors() {
+        let dtype = match info.dtype {
+            safetensors::Dtype::F32 => Dtype::F32,
+            safetensors::Dtype::F64 => Dtype::F64,
+            safetensors::Dtype::BF16 => Dtype::BF16,
+            safetensors::Dtype::F16 => Dtype::F16,
+            safetensors::Dtype::I64 => Dtype::I64,
+            other => {
+                let (field, found) = (format!("tensor {name}"), format!("{other:?}"));
+                return Err(Error::input(path, field, found, "F32, BF16 or F16"));
+            }
+        };
+        let (from, to) = info.data_offsets;
+        let start = HEADER_LENGTH + header_length;
+        let shape = info.shape.clone();
+        let strides = row_major(&shape);
+        arrays.insert(name, Array { dtype, shape, strides, bytes: start + from..start + to });
+    }
+    Ok((arrays, header.metadata().clone().unwrap_or_default()))
+}
+
+/// Arrays by name, and metadata.
+type Contents = (BTreeMap<String, Array>, HashMap<String, String>);
+
+/// Keys under which a checkpoint may hold its state dict. Lightning uses the first.
+const STATE_DICT_KEYS: [&str; 3] = ["state_dict", "model_state_dict", "model"];
+/// Names of settings that the shapes of weights don't determine. A setting is used wherever it occurs in a checkpoint, if all occurrences
+/// have the same value.
+const SETTINGS: [&str; 1] = ["num_heads"];
+
+/// Returns the tensors of the state dict in `file`, which was read from `path`. The metadata are the strings beside the state dict, and
+/// settings.
+///
+/// # Errors
+/// Returns an error if there is no state dict, or if a tensor is broken.
+fn state_dict(file: &TorchFile, path: &Path) -> Result<Contents> {
+    let TorchFile { values, storages } = file;
+    let refuse = |found: &str| {
+        Err(Error::input(path, "the contents", found, "a state dict, or a checkpoint with a state_dict"))
+    };
+    let root = match values.get(values.root) {
+        Value::Dict(items) => items,
+        other => return refuse(other.type_name()),
+    };
+    let inner = STATE_DICT_KEYS.iter().find_map(|place| match values.find(root, place) {
+        Some(Value::Dict(items)) => Some(items),
+        _ => None,
+    });
+    let mut arrays = BTreeMap::new();
+    for &(key, value) in inner.unwrap_or(root) {
+        let (&Value::Str(name), tensor @ Value::Tensor { .. }) = (values.get(key), values.get(value)) else {
+            continue;
+        };
+        let array = Array::locate(values, storages, tensor).map_err(|why| {
+            Error::input(path, format!("tensor {name}"), format!("broken: it {why}"), "a whole one")
+        })?;
+        arrays.insert(name.to_string(), array);
+    }
+    if arrays.is_empty() {
+        return refuse("a dict without tensors");
+    }
+    let mut metadata = HashMap::new();
+    for &(key, value) in root {
+        if let (&Value::Str(key), &Value::Str(text)) = (values.get(key), values.get(value)) {
+            metadata.insert(key.to_string(), text.to_string());
+        }
+    }
+    for setting in SETTINGS {
+        let said = values.iter().filter_map(|value| match value {
+            Value::Dict(items) | Value::Object(items) => values.find(items, setting),
+            _ => None,
+        });
+        let said: BTreeSet<i64> = said.filter_map(Value::as_int).collect();
+        if let (Some(number), 1) = (said.first(), said.len()) {
+            metadata.insert(setting.to_string(), number.to_string());
+        }
+    }
+    Ok((arrays, metadata))
+}
+
+/// Types that files and libtorch share.
+const DTYPES: [(Dtype, Kind); 15] = [
+    (Dtype::U8, Kind::Uint8),
+    (Dtype::I8, Kind::Int8),
+    (Dtype::I16, Kind::Int16),
+    (Dtype::I32, Kind::Int),
+    (Dtype::I64, Kind::Int64),
+    (Dtype::F16, Kind::Half),
+    (Dtype::BF16, Kind::BFloat16),
+    (Dtype::F32, Kind::Float),
+    (Dtype::F64, Kind::Double),
+    (Dtype::Bool, Kind::Bool),
+    (Dtype::C64, Kind::ComplexFloat),
+    (Dtype::C128, Kind::ComplexDouble),
+    (Dtype::QI8, Kind::QInt8),
+    (Dtype::QU8, Kind::QUInt8),
+    (Dtype::QI32, Kind::QInt32),
+];
+
+/// Returns libtorch's name of `dtype`.
+fn to_kind(dtype: Dtype) -> Kind {
+    DTYPES.iter().find(|(d, _)| *d == dtype).expect("every type").1
+}
+
+/// Returns the type of `kind` in a file.
+///
+/// # Errors
+/// Returns an error if files have no such type.
+fn to_dtype(kind: Kind) -> Result<Dtype> {
+    let dtype = DTYPES.iter().find(|(_, k)| *k == kind).map(|(dtype, _)| *dtype);
+    dtype.ok_or_else(|| Error::failed(format!("tensors of kind {kind:?} are not stored")))
+}
+
+/// Environment variable that names the folder of pretrained weights; if it is set, no other folder is searched.
+pub const WEIGHTS_VARIABLE: &str = "GLOBALSPLAT_WEIGHTS";
+
+/// Returns the folders that may contain pretrained weights, in order of preference.
+pub fn pretrained_folders() -> Vec<PathBuf> {
+    match std::env::var_os(WEIGHTS_VARIABLE) {
+        Some(folder) => vec![folder.into()],
+        None => vec!["weights".into(), concat!(env!("CARGO_MANIFEST_DIR"), "/weights").into()],
+    }
+}
+
+/// Returns the file `name` in the first folder of pretrained weights that has it: the one that [`WEIGHTS_VARIABLE`] names, or else
+/// `weights` in the current folder, or else the folder in which `make weights` put them when this program was built.
+pub fn find_pretrained(name: &str) -> Option<PathBuf> {
+    pretrained_folders().into_iter().map(|folder| folder.join(name)).find(|path| path.is_file())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use tch::Kind;
 
     #[test]
-    fn tensors_are_aligned_whatever_the_metadata() {
-        let folder = tempfile::tempdir().expect("a temporary folder");
-        let file = folder.path().join("a.safetensors");
-        let tensors = BTreeMap::from([("a".to_string(), Tensor::arange(5, (Kind::Float, Device::Cpu)))]);
-        for length in 0..70 {
-            let metadata = HashMap::from([("text".to_string(), "x".repeat(length))]);
-            write_weights(&file, &tensors, metadata).expect("a file");
-            let bytes = std::fs::read(&file).expect("a file");
-            assert_eq!((8 + header_length(&bytes)) % ALIGNMENT, 0, "{length}");
-            let read = safetensors::SafeTensors::deserialize(&bytes).expect("safetensors");
-            assert_eq!(read.tensor("a").expect("a tensor").data()[4..8], 1f32.to_le_bytes());
+    fn sizes_match_libtorch() {
+        for (dtype, kind) in DTYPES {
+            assert_eq!(dtype.size(), kind.elt_size_in_bytes(), "{dtype}");
+            assert_eq!((to_kind(dtype), to_dtype(kind).unwrap()), (kind, dtype));
+        }
+        assert!(to_dtype(Kind::ComplexHalf).is_err());
+    }
+
+    /// Every number of 16 bits, and numbers of 64 bits around the limits of float32 and between two of its values.
+    #[test]
+    fn numbers_are_rounded_as_by_libtorch() {
+        let words: Vec<u8> = (0..=u16::MAX).flat_map(u16::to_le_bytes).collect();
+        let mantissas = [0u64, 1, 0x1000_0000, 0x1000_0001, 0x2fff_ffff, 0x3000_0000, 0xf_ffff_f000_0000];
+        let doubles: Vec<u8> = (0..4096u64)
+            .flat_map(|top| mantissas.map(|mantissa| top << 52 | mantissa))
+            .flat_map(u64::to_le_bytes)
+            .collect();
+        for (dtype, bytes) in [(Dtype::F16, &words), (Dtype::BF16, &words), (Dtype::F64, &doubles)] {
+            let count = bytes.len() / dtype.size();
+            let array = Array { dtype, shape: vec![count], strides: vec![1], bytes: 0..bytes.len() };
+            let found = array.to_f32(bytes).unwrap();
+            let tensor = Tensor::from_data_size(bytes, &[count as i64], to_kind(dtype));
+            let expected = Vec::<f32>::try_from(tensor.to_kind(Kind::Float)).unwrap();
+            for (found, expected) in found.into_iter().zip(expected) {
+                assert_eq!(found.to_bits(), expected.to_bits(), "{dtype}: {found}, {expected}");
+            }
         }
     }
 }

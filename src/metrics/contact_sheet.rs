@@ -2,8 +2,8 @@
 
 use crate::data::View;
 use crate::error::Result;
-use crate::io::{Mosaic, colourize_depth, enlarge, shrink, shrink_factor, subsample, tile_horizontally};
-use crate::render::{RenderedView, render_views};
+use crate::io::{Mosaic, enlarge, shrink, shrink_factor, subsample, tile_horizontally};
+use crate::render::{RenderedView, colourize_depth, render_views};
 use crate::scene::Gaussians;
 use std::path::Path;
 use tch::{Kind, Tensor};

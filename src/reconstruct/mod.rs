@@ -23,7 +23,7 @@ pub(crate) use colour_fit::fit_colours;
 use crate::config::Config;
 use crate::data::{View, ViewBatch, cameras_at, view_batch};
 use crate::error::{Error, Result};
-use crate::io::{MappedWeights, Splat};
+use crate::io::Splat;
 use crate::model::{GlobalSplat, Stage};
 use crate::render::transform;
 use crate::scene::{Gaussians, ImageSize, Similarity, normalize};
@@ -45,14 +45,12 @@ pub struct Model<'a> {
     pub device: Device,
     /// Conversion of photos to the views that the model sees.
     pub input: Input,
-    /// Mapped files that hold the weights, if these weren't copied.
-    pub mapped: Option<MappedWeights>,
 }
 
 impl<'a> From<&'a LoadedModel> for Model<'a> {
     fn from(loaded: &'a LoadedModel) -> Self {
-        let LoadedModel { model: network, config, stage, vs, mapped, .. } = loaded;
-        Model { network, config, stage: *stage, device: vs.device(), input: Input::PLAIN, mapped: *mapped }
+        let LoadedModel { model: network, config, stage, vs, .. } = loaded;
+        Model { network, config, stage: *stage, device: vs.device(), input: Input::PLAIN }
     }
 }
 

@@ -3,7 +3,7 @@
 use super::published::{CHECKPOINT_PREFIX, assumed, configuration, is_ours, model_tensors};
 use crate::config::Config;
 use crate::error::{Error, Result};
-use crate::io::{MappedWeights, Weights, WeightsFile, write_checkpoint, write_weights};
+use crate::io::{Weights, WeightsFile, write_checkpoint, write_weights};
 use crate::model::{GlobalSplat, Precision, Stage};
 use std::collections::HashMap;
 use std::path::Path;
@@ -38,8 +38,6 @@ pub struct LoadedModel {
     pub stage: Stage,
     /// Weights of the network. Those of linear layers are in the precision of passes.
     pub vs: nn::VarStore,
-    /// Mapped files that hold the weights that weren't copied. These weights must not be written to.
-    pub mapped: Option<MappedWeights>,
     /// Description of the assumed model, if the file has no configuration.
     pub assumed: Option<String>,
 }
@@ -191,28 +189,6 @@ impl ModelFile {
     /// # Errors
     /// Fails if the weights don't fit the configuration.
     pub fn load(self, device: Device, precision: Precision) -> Result<LoadedModel> {
-        self.build(device, precision, |weights, vs| weights.load_into(vs).map(|()| None))
-    }
-
-    /// Builds the model for inference only. On the CPU, weights that linear layers use in their stored type stay in the mapped file, and
-    /// the operating system reads them on demand. The file must not be changed in place meanwhile. On other devices this is
-    /// [`ModelFile::load`].
-    ///
-    /// # Errors
-    /// Fails if the weights don't fit the configuration.
-    pub fn load_mmap(self, device: Device, precision: Precision) -> Result<LoadedModel> {
-        match device {
-            Device::Cpu => self.build(device, precision, |weights, vs| weights.load_mmap(vs).map(Some)),
-            _ => self.load(device, precision),
-        }
-    }
-
-    fn build(
-        self,
-        device: Device,
-        precision: Precision,
-        fill: impl FnOnce(WeightsFile, &nn::VarStore) -> Result<Option<MappedWeights>>,
-    ) -> Result<LoadedModel> {
         // Checked before a model of the configured size is allocated.
         let numbers: i64 =
             self.weights.shapes().values().map(|(_, shape)| shape.iter().product::<i64>()).sum();
@@ -224,11 +200,11 @@ impl ModelFile {
         let mut vs = nn::VarStore::new(device);
         let mut model = GlobalSplat::uninitialized(&mut vs, &self.config.model, precision)?;
         let ModelFile { weights, config, stage, assumed, .. } = self;
-        let mapped = fill(weights, &vs)?;
+        weights.load_into(&vs)?;
         if device != Device::Cpu {
             model.fold_weights();
         }
-        Ok(LoadedModel { model, config, stage, vs, mapped, assumed })
+        Ok(LoadedModel { model, config, stage, vs, assumed })
     }
 }
 

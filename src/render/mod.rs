@@ -3,6 +3,8 @@
 mod contribution;
 pub mod cpu;
 pub mod cuda;
+mod depth_colours;
+mod edit;
 mod harmonics;
 mod orbit;
 mod transform;
@@ -11,6 +13,8 @@ mod views;
 use crate::ffi::take_outputs;
 pub use contribution::contributions;
 pub(crate) use contribution::{image_contributions, largest_contributions};
+pub use depth_colours::{DepthScale, colourize_depth, depth_colours};
+pub use edit::{EditedSplat, SplatEdit, edit_splat, move_cameras};
 pub use harmonics::{compensate_mean_colour, fit_harmonics, shrink_harmonics};
 pub use orbit::{orbit_around_gaussians, orbit_around_splat};
 pub use transform::transform;

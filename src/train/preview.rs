@@ -2,9 +2,9 @@
 
 use crate::data::Batch;
 use crate::error::Result;
-use crate::io::{colourize_depth, tile_horizontally};
+use crate::io::tile_horizontally;
 use crate::model::{GlobalSplat, Stage};
-use crate::render::{DEFAULT_EPS2D, render};
+use crate::render::{DEFAULT_EPS2D, colourize_depth, render};
 use tch::{Device, Tensor};
 
 /// Renders a preview of the first scene of `batch`, which isn't paired: a context photo, a target photo, its rendered image, its depth

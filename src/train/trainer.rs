@@ -529,6 +529,6 @@ impl Trainer {
     pub fn as_model(&self) -> Model<'_> {
         let stage = self.stage();
         let (network, config, device) = (&self.model, &self.config, self.vs.device());
-        Model { network, config, stage, device, input: Input::PLAIN, mapped: None }
+        Model { network, config, stage, device, input: Input::PLAIN }
     }
 }

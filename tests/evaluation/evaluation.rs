@@ -4,7 +4,7 @@ use crate::common::has_lpips;
 use crate::common::program::{arg, command, fail, refuse, room, rooms, succeed, text, tiny_weights};
 use globalsplat::data::{Dataset, Split};
 use globalsplat::eval::read_evaluation;
-use globalsplat::io::{Weights, read_image, read_weights, write_png, write_sharded};
+use globalsplat::io::{read_image, write_png};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
@@ -207,36 +207,6 @@ fn changes_of_same_size_and_time_are_scored_again() {
     std::fs::write(set.path(cameras), moved.to_string()).unwrap();
     let fourth = psnr();
     assert!(fourth[0] != third[0] && fourth[1] == 99.5, "another camera: {third:?} and {fourth:?}");
-}
-
-#[test]
-fn sharded_weights_are_identified_by_their_shards() {
-    let set = Set::new();
-    let weights = read_weights(&tiny_weights(set.folder.path(), &set.path("captures"))).unwrap();
-    let plain = set.path("sharded.safetensors");
-    let index = write_sharded(&plain, &weights, 20_000).unwrap();
-    let index_text = std::fs::read(&index).unwrap();
-    let arguments =
-        |weights: &Path| set.arguments(&["--precision", "f32", "--weights", arg(weights)], "chunks");
-    // The name that they would have as one file, and the name of the index, give the same fingerprint.
-    for name in [&plain, &index] {
-        let (code, _, err) = run(&arguments(name), set.folder.path());
-        assert_eq!(code, Some(0), "{err}");
-    }
-    let first = read_evaluation(&set.path("out")).unwrap();
-    let scale = |tensor: tch::Tensor| tensor * 1.5;
-    let tensors = weights.tensors.into_iter().map(|(name, tensor)| (name, scale(tensor))).collect();
-    write_sharded(&plain, &Weights { tensors, ..weights }, 20_000).unwrap();
-    assert_eq!(std::fs::read(&index).unwrap(), index_text, "the index alone doesn't tell");
-    for name in [&plain, &index] {
-        let error = refuse(&text(&arguments(name)));
-        let expected = "evaluation.json: the evaluation is of sharded.safetensors.index.json";
-        assert!(error.contains(expected) && error.contains("choose another --out"), "{error}");
-    }
-    std::fs::remove_dir_all(set.path("out")).unwrap();
-    assert_eq!(run(&arguments(&plain), set.folder.path()).0, Some(0));
-    let second = read_evaluation(&set.path("out")).unwrap();
-    assert_ne!(first.summary.mean.psnr, second.summary.mean.psnr);
 }
 
 #[test]

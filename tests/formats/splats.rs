@@ -265,7 +265,7 @@ fn moved_splats_look_the_same() {
         glam::DVec3::new(3., -1., 2.),
     );
     let moved = splat.transformed(&matrix).unwrap();
-    let along = globalsplat::io::move_cameras(&[camera()], &matrix)[0];
+    let along = globalsplat::render::move_cameras(&[camera()], &matrix)[0];
     let seen = |splat: &Splat, camera: Camera| {
         globalsplat::render::SplatRenderer::from_splat(splat).render(&[camera]).unwrap().remove(0).rgb
     };

@@ -397,27 +397,22 @@ fn inspect_describes_splats_captures_and_weights() {
     assert!(weights["configuration"].as_str().unwrap().contains("latents = 16"));
 }
 
-/// Weights of any file are exported: rounded, in shards, for torch, and back.
+/// Weights of any file are exported: rounded, for torch, and back.
 #[test]
 fn any_weights_are_exported() {
     let (folder, room) = room();
     let weights = tiny_weights(folder.path(), &room);
     let at = |name: &str| folder.path().join(name);
-    std::fs::create_dir(at("shards")).unwrap();
     let export = |from: &Path, to: &Path, more: &[&str]| {
         json(&[&["export", "--weights", arg(from), "--out", arg(to), "--json"], more].concat())
     };
     let rounded = export(&weights, &at("bf16.safetensors"), &["--dtype", "bf16"]);
     assert!(rounded["bytes"].as_u64().unwrap() < std::fs::metadata(&weights).unwrap().len() * 2 / 3);
-    let sharded = export(&weights, &at("shards/model.safetensors"), &["--max-shard-size", "20KB"]);
-    export(Path::new(sharded["weights"].as_str().unwrap()), &at("joined.safetensors"), &[]);
     export(&weights, &at("model.ckpt"), &["--format", "torch"]);
     export(&at("model.ckpt"), &at("back.safetensors"), &[]);
     export(&weights, &at("again.safetensors"), &[]);
     let again = std::fs::read(at("again.safetensors")).unwrap();
-    for name in ["joined.safetensors", "back.safetensors"] {
-        assert_eq!(std::fs::read(at(name)).unwrap(), again, "{name}");
-    }
+    assert_eq!(std::fs::read(at("back.safetensors")).unwrap(), again);
     let error = refuse(&["export", "--weights", arg(&weights), "--out", arg(&weights)]);
     assert!(error.contains("tiny.safetensors"), "{error}");
     let usage =

@@ -4,7 +4,7 @@
 use crate::common::program::{
     arg, command, fail, globalsplat, refuse, room, rooms, succeed, text, tiny_config, tiny_weights, train,
 };
-use globalsplat::io::{read_image, read_splat, read_weights};
+use globalsplat::io::{read_image, read_splat};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::fs;
@@ -134,11 +134,7 @@ fn splats_and_weights_replace_nothing_that_is_read() {
     symlink(&cameras, &as_splat).unwrap();
     symlink(&files.weights, &as_weights).unwrap();
     symlink(&files.splat, &as_page).unwrap();
-    let shards = files.at("shards.safetensors");
     let config = tiny_config(files.folder.path(), &files.room);
-    let sharded = ["--max-shard-size", "20KB"];
-    succeed(&[&["export", "--config", arg(&config), "--out", arg(&shards)][..], &sharded].concat());
-    let index = files.at("shards.safetensors.index.json");
     let run = files.at("run");
     succeed(&text(&train(&config, &run, &["train.steps=2"])));
     let checkpoint = run.join("checkpoints/step-00000002/model.safetensors");
@@ -151,15 +147,12 @@ fn splats_and_weights_replace_nothing_that_is_read() {
             &[&made[..], &["--out", as_splat]].concat(),
             &[&made[..], &["--out", as_weights]].concat(),
             &[&made[..], &["--refine", "1s", "--out", as_weights]].concat(),
-            &["reconstruct", "--weights", arg(&shards), "--scene", room, "--out", as_splat],
             &["refine", "--scene", room, "--steps", "1", "--out", as_splat],
             &["convert", splat, as_splat, "--scene", room],
             &["export", "--config", config, "--out", config],
             &["export", "--run", arg(&run), "--out", arg(&checkpoint)],
             &["export", "--run", arg(&run), "--out", arg(&run.join("config.toml"))],
             &["import", "--from", weights, "--out", weights],
-            &[&["import", "--from", arg(&shards), "--out", arg(&shards)][..], &sharded].concat(),
-            &[&["import", "--from", arg(&index), "--out", arg(&shards)][..], &sharded].concat(),
         ],
     );
     if Path::new(env!("CARGO_MANIFEST_DIR")).join("web/dist/page.js").exists() {
@@ -384,10 +377,6 @@ fn endings_are_the_same_in_capitals() {
     let _ = globalsplat(&["render", "--splat", splat, "--scene", room, "--out", arg(&files.at("film.MP4"))]);
     assert!(!files.at("film.MP4").is_dir());
     succeed(&["convert", splat, arg(&files.at("room.SPZ"))]);
-    let config = tiny_config(files.folder.path(), &files.room);
-    let shards = files.at("model.SAFETENSORS");
-    succeed(&["export", "--config", arg(&config), "--out", arg(&shards), "--max-shard-size", "20KB"]);
-    read_weights(&shards).unwrap();
 }
 
 #[test]
@@ -406,25 +395,6 @@ fn output_image_names_do_not_collide() {
     assert_eq!((files, names(&out).len()), (18, 18));
     succeed(&text(&render));
     assert_eq!(read_image(&out.join("000_depth.png")).unwrap().dimensions(), (40, 40));
-}
-
-#[test]
-fn shards_are_replaced_together_or_not_at_all() {
-    let (folder, room) = room();
-    let (config, out) = (tiny_config(folder.path(), &room), folder.path().join("out"));
-    let model = out.join("model.safetensors");
-    let export = ["export", "--config", arg(&config), "--max-shard-size", "20KB", "--out", arg(&model)]
-        .map(String::from);
-    succeed(&text(&export));
-    let shards: Vec<_> = names(&out).into_iter().filter(|name| name.ends_with(".safetensors")).collect();
-    assert!(shards.len() > 2, "{shards:?}");
-    // Make the last shard unwritable.
-    fs::remove_file(out.join(&shards[shards.len() - 1])).unwrap();
-    fs::create_dir(out.join(&shards[shards.len() - 1])).unwrap();
-    let before = contents(&out);
-    fs::write(&config, fs::read_to_string(&config).unwrap().replace("[train]", "[train]\nseed = 7")).unwrap();
-    let output = globalsplat(&text(&export));
-    assert!(!output.status.success() && contents(&out) == before);
 }
 
 #[test]

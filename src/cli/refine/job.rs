@@ -11,7 +11,7 @@ use globalsplat::data::{Capture, PhotoSize};
 use globalsplat::device::process_age;
 use globalsplat::io::{
     InputFiles, check_writable_dir, check_writable_file, check_writable_png, check_writable_splat,
-    read_splat, splat_files, weights_files,
+    read_splat, splat_files,
 };
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::spread_over_path;
@@ -191,7 +191,7 @@ impl RefineJob {
         let mut inputs = InputFiles::default();
         capture.add_input_files(&mut inputs);
         if let InitialFile::Model(Some(weights)) = &self.initial {
-            inputs.add_all(weights_files(weights));
+            inputs.add(weights);
         }
         inputs.check_file(&self.out)?;
         if let InitialFile::Splat(splat) = &self.initial {

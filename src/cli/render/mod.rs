@@ -9,10 +9,10 @@ use clap::{ArgGroup, Args};
 use glam::DVec3;
 use globalsplat::data::{Capture, Holdout};
 use globalsplat::error::Error;
-use globalsplat::io::{DepthScale, InputFiles, read_splat, splat_files, tiled_size, weights_files};
+use globalsplat::io::{InputFiles, read_splat, splat_files, tiled_size};
 use globalsplat::model::Precision;
 use globalsplat::reconstruct::{load_context, reconstruct};
-use globalsplat::render::{RenderedView, SplatRenderer};
+use globalsplat::render::{DepthScale, RenderedView, SplatRenderer};
 use globalsplat::scene::{Camera, Gaussians, ImageSize};
 use output::Output;
 use serde_json::json;
@@ -179,7 +179,7 @@ impl Render {
     /// Returns the input files, which no output may replace.
     fn inputs(&self, capture: Option<&Capture>) -> InputFiles {
         let mut inputs = InputFiles::default();
-        self.weights.iter().for_each(|path| inputs.add_all(weights_files(path)));
+        self.weights.iter().for_each(|path| inputs.add(path));
         self.splat.iter().for_each(|splat| inputs.add_all(splat_files(splat)));
         capture.inspect(|capture| capture.add_input_files(&mut inputs));
         inputs

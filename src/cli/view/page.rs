@@ -8,8 +8,7 @@ use glam::DVec3;
 use globalsplat::data::Capture;
 use globalsplat::error::Error;
 use globalsplat::io::{
-    self, ShLimits, Splat, WriteOptions, check_writable_file, fit_splat, write_atomically,
-    write_local_splat_with,
+    ShLimits, Splat, WriteOptions, check_writable_file, fit_splat, write_atomically, write_local_splat_with,
 };
 use globalsplat::scene::{Camera, Gaussians};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
@@ -159,7 +158,7 @@ fn help() -> Markup {
 
 /// Returns an SVG filter that maps greyscale depth to the colours of `render --depth`, and keeps empty pixels black.
 fn depth_colours() -> Markup {
-    let colours = io::depth_colours();
+    let colours = globalsplat::render::depth_colours();
     let table = |channel: usize| -> String {
         let values = colours[1..].iter().map(|colour| format!(" {:.3}", colour[channel]));
         std::iter::once("0".into()).chain(values).collect()

@@ -184,15 +184,6 @@ pub fn weights(bytes: &[u8]) {
     let _ = load_model(&file, Device::Cpu);
 }
 
-/// Reads `bytes` as an index of one shard, `part.safetensors`, with a tensor `a`.
-pub fn shard_index(bytes: &[u8]) {
-    let header = r#"{"a":{"dtype":"F32","shape":[1],"data_offsets":[0,4]}}"#;
-    let part = [&(header.len() as u64).to_le_bytes()[..], header.as_bytes(), &[0; 4]].concat();
-    file("shard_index", "part.safetensors", &part);
-    let index = file("shard_index", "model.safetensors.index.json", bytes);
-    let _ = read_weights(&index);
-}
-
 pub fn configuration(bytes: &[u8]) {
     let _ = std::str::from_utf8(bytes).map(|text| Config::parse(text, &[], Path::new("config.toml")));
 }

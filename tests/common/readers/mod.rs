@@ -20,7 +20,7 @@ use std::sync::OnceLock;
 pub type Reader = fn(&[u8]);
 
 /// Readers, by the names of fuzz targets and of the folders of their seeds.
-pub const READERS: [(&str, Reader); 34] = [
+pub const READERS: [(&str, Reader); 33] = [
     ("antimatter", files::antimatter),
     ("camera_path", files::camera_path),
     ("cameras_json", files::cameras_json),
@@ -48,7 +48,6 @@ pub const READERS: [(&str, Reader); 34] = [
     ("made_weights", made_models::weights),
     ("photo", files::photo),
     ("ply", files::ply),
-    ("shard_index", files::shard_index),
     ("sog", files::sog),
     ("splat_origin", files::splat_origin),
     ("spz", files::spz),

@@ -1,7 +1,7 @@
 //! Colours for depth that people can compare: equal steps look equally large.
 
+use super::SplatRenderer;
 use crate::error::Result;
-use crate::render::SplatRenderer;
 use crate::scene::{Camera, ImageSize};
 use tch::{Kind, Tensor};
 

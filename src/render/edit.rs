@@ -1,11 +1,12 @@
 //! Edits of a splat: moving it, removing Gaussians, and joining splats.
 
-use super::neighbours::neighbour_distances;
+use super::{contributions, largest_contributions, orbit_around_splat};
 use crate::error::{Error, Result};
-use crate::render::{contributions, largest_contributions, orbit_around_splat};
 use crate::scene::{Camera, Gaussians, splat_frame};
 use glam::{DMat3, DMat4, DVec3};
 use globalsplat_splat_file::Splat;
+use kd_tree::KdTree;
+use rayon::prelude::*;
 
 /// Contribution to all images, in pixels, below which cameras don't see a Gaussian.
 const MIN_CONTRIBUTION: f32 = 1e-3;
@@ -138,7 +139,7 @@ impl EditedSplat {
     }
 
     fn filter_floaters(&mut self, factor: f32) {
-        let distances = neighbour_distances(&self.splat.means, NEIGHBOURS);
+        let distances = neighbor_distances(&self.splat.means, NEIGHBOURS);
         let mut sorted = distances.clone();
         sorted.sort_unstable_by(f32::total_cmp);
         let median = sorted.get(sorted.len() / 2).copied().unwrap_or(0.);
@@ -152,5 +153,41 @@ impl EditedSplat {
         let frame = splat_frame(&self.splat);
         let gaussians = Gaussians::from_splat(&self.splat).to_local(&frame, self.splat.origin);
         contributions(&gaussians, &frame.cameras_to_local(cameras))
+    }
+}
+
+/// Returns the distance of each point to its `k`th nearest other point; infinite if there are fewer.
+fn neighbor_distances(points: &[[f32; 3]], k: usize) -> Vec<f32> {
+    let tree = KdTree::build_by_ordered_float(points.to_vec());
+    let distance = |point: &[f32; 3]| {
+        // The nearest of all points is the point itself.
+        let nearest = tree.nearests(point, k + 1);
+        nearest.get(k).map_or(f32::INFINITY, |neighbor| neighbor.squared_distance.sqrt())
+    };
+    points.par_iter().map(distance).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn distances_are_those_of_all_pairs() {
+        let coordinate = |seed: usize| ((seed as f32 * 12.9898).sin() * 43_758.547).fract();
+        let points: Vec<[f32; 3]> = (0..500)
+            .map(|k| [0, 1, 2].map(|axis| coordinate(3 * k + axis)))
+            .chain([[5.; 3], [5.; 3]])
+            .collect();
+        let found = neighbor_distances(&points, 4);
+        for (index, point) in points.iter().enumerate() {
+            let distance =
+                |other: &[f32; 3]| point.iter().zip(other).map(|(a, b)| (a - b).powi(2)).sum::<f32>();
+            let others = points.iter().enumerate().filter(|(other, _)| *other != index);
+            let mut all: Vec<f32> = others.map(|(_, other)| distance(other).sqrt()).collect();
+            all.sort_by(f32::total_cmp);
+            assert_eq!(found[index], all[3], "point {index}");
+        }
+        assert_eq!(neighbor_distances(&points[..3], 3), [f32::INFINITY; 3]);
+        assert!(neighbor_distances(&[], 3).is_empty());
     }
 }
