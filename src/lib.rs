@@ -38,6 +38,7 @@ pub mod loss;
 pub mod metrics;
 pub mod model;
 pub mod optim;
+#[cfg(feature = "cli")]
 #[doc(hidden)]
 pub mod parity;
 pub mod ranks;

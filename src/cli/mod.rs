@@ -15,8 +15,6 @@ mod device;
 mod doctor;
 mod edits;
 mod eval;
-mod export;
-mod import;
 mod inspect;
 mod man;
 mod model;
@@ -33,7 +31,7 @@ mod splat_out;
 mod synth;
 mod train;
 mod view;
-mod weights_out;
+mod weights;
 
 use clap::{CommandFactory, Parser, Subcommand};
 use globalsplat::Error;
@@ -71,8 +69,8 @@ enum Command {
     Render(render::Render),
     View(view::View),
     Convert(convert::Convert),
-    Export(export::Export),
-    Import(import::Import),
+    Export(weights::Export),
+    Import(weights::Import),
     Synth(synth::Synth),
     Pack(pack::Pack),
     Inspect(inspect::Inspect),

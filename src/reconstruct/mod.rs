@@ -6,16 +6,13 @@ mod context;
 mod input;
 mod model_file;
 mod published;
-mod spread;
 
-pub use context::{context_views, load_context};
+pub use context::{context_views, load_context, spread_over_path};
 pub use input::Input;
 pub use model_file::{
     BUNDLED_MODEL, CONFIG_KEY, LoadedModel, ModelDtype, ModelFile, STAGE_KEY, bundled_model, load_model,
     model_weights, save_checkpoint, save_model,
 };
-
-pub use spread::spread_over_path;
 
 // Used by the parity checks, too.
 pub(crate) use colour_fit::fit_colours;

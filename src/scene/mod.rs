@@ -3,7 +3,6 @@
 //! All cameras use OpenCV axes: x right, y down, z forward. Poses are camera-to-world.
 
 mod gaussians;
-mod local_gaussians;
 mod radial_warp;
 mod rays;
 mod splat;

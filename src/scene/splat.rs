@@ -1,4 +1,5 @@
-//! Conversions between Gaussians, which are tensors, and splats, which are plain arrays as files hold them.
+//! Conversions between Gaussians, which are tensors, and splats, which are plain arrays as files hold them, and between the world and
+//! local frames (spec 2.5).
 
 use super::{Gaussians, LocalFrame, RawGaussians};
 use crate::error::{Error, Result};
@@ -66,4 +67,88 @@ fn rows<const N: usize>(tensor: &Tensor) -> Result<Vec<[f32; N]>> {
 /// Returns the local frame in which a splat is rendered (spec 2.5).
 pub fn splat_frame(splat: &Splat) -> LocalFrame {
     Gaussians::from_splat(splat).local_frame(splat.origin)
+}
+
+impl Gaussians {
+    /// Returns the local frame of one scene, whose means are relative to `origin`. The local origin is the median of the means along
+    /// each axis. 16 local units are the median of a mean's distance from it plus the Gaussian's largest scale. If the Gaussians have
+    /// no extent, or there are none, a local unit is a world unit.
+    ///
+    /// # Panics
+    /// Panics if there is more than one scene.
+    pub fn local_frame(&self, origin: DVec3) -> LocalFrame {
+        let means: Vec<DVec3> = values(&self.means).chunks_exact(3).map(DVec3::from_slice).collect();
+        let largest = values(&self.scales.amax([-1i64].as_slice(), false));
+        let about_zero = LocalFrame::from_spheres(&means, &largest);
+        LocalFrame { origin: origin + about_zero.origin, ..about_zero }
+    }
+
+    /// Converts the Gaussians to local coordinates, keeping the dtype. Their means are relative to `origin`, in world units. The
+    /// conversion is computed in float64.
+    pub fn to_local(&self, frame: &LocalFrame, origin: DVec3) -> Self {
+        self.resized(origin - frame.origin, 1. / frame.scale)
+    }
+
+    /// Converts local Gaussians to world units, keeping the dtype. The resulting means are relative to the origin of `frame`.
+    pub fn to_world_units(&self, frame: &LocalFrame) -> Self {
+        self.resized(DVec3::ZERO, frame.scale)
+    }
+
+    /// Returns the Gaussians translated by `by` and then scaled about zero by `factor`.
+    fn resized(&self, by: DVec3, factor: f64) -> Self {
+        let double = |t: &Tensor| t.to_kind(Kind::Double);
+        let by = Tensor::from_slice(&by.to_array()).to_device(self.means.device());
+        let means = ((double(&self.means) + by) * factor).to_kind(self.means.kind());
+        let scales = (double(&self.scales) * factor).to_kind(self.scales.kind());
+        Gaussians { means, scales, ..self.map(Tensor::shallow_clone) }
+    }
+}
+
+fn values(tensor: &Tensor) -> Vec<f64> {
+    Vec::try_from(tensor.detach().to_kind(Kind::Double).flatten(0, -1)).expect("numbers of one scene")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn gaussians(factor: f32) -> Gaussians {
+        let numbers = |n: i64, from: f64, to: f64| {
+            Tensor::linspace(from, to, n, (Kind::Double, Device::Cpu)).sin().to_kind(Kind::Float)
+        };
+        Gaussians {
+            means: numbers(60, 0., 17.).view([1, 20, 3]) * f64::from(factor),
+            scales: (numbers(60, 1., 50.).view([1, 20, 3]) + 1.1) * f64::from(factor),
+            quaternions: numbers(80, 0., 30.).view([1, 20, 4]),
+            opacities: numbers(20, 0., 1.).view([1, 20]),
+            sh: numbers(60, 0., 9.).view([1, 20, 1, 3]),
+            antialiased: false,
+        }
+    }
+
+    #[test]
+    fn scaling_by_a_power_of_two_keeps_the_local_bits() {
+        let splat = gaussians(1.);
+        let frame = splat.local_frame(DVec3::ZERO);
+        for exponent in [-40, -20, -3, 5, 20, 40] {
+            let factor = f64::from(exponent).exp2();
+            let scaled = gaussians(factor as f32);
+            let other = scaled.local_frame(DVec3::ZERO);
+            assert_eq!((other.origin, other.scale), (frame.origin * factor, frame.scale * factor));
+            let (a, b) = (splat.to_local(&frame, DVec3::ZERO), scaled.to_local(&other, DVec3::ZERO));
+            assert!(a.means.equal(&b.means) && a.scales.equal(&b.scales), "2^{exponent}");
+        }
+    }
+
+    #[test]
+    fn local_coordinates_far_from_the_origin_are_exact() {
+        let (splat, offset) = (gaussians(1.), DVec3::new(5e6, 4e5, -1e8));
+        let frame = splat.local_frame(offset);
+        assert!(frame.origin.distance(offset) < 1.);
+        let back = splat.to_local(&frame, offset).to_world_units(&frame);
+        let moved = frame.origin - offset;
+        let expected = &splat.means - Tensor::from_slice(&moved.to_array()).to_kind(Kind::Float);
+        let off = |a: &Tensor, b: &Tensor| (a - b).abs().max().double_value(&[]);
+        assert!(off(&back.means, &expected) < 1e-6 && off(&back.scales, &splat.scales) < 1e-6);
+    }
 }

@@ -4,9 +4,7 @@
 mod common;
 
 mod fuzz_seeds;
-mod golden_loss;
-mod golden_model;
-mod golden_scene;
+mod golden;
 mod loader;
 mod model;
 mod perceptual;

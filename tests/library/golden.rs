@@ -1,10 +1,13 @@
-//! The model matches tensors that an independent implementation computed: outputs within 1e-5 and gradients within 1e-4
-//! relative L2, for every case in the golden folder.
+//! The model, losses and the normalization of scenes match tensors that an independent implementation computed: outputs within 1e-5 and
+//! gradients within 1e-4 relative L2.
 
-use crate::common::{golden, largest_error, relative_error, rerun_test};
+use crate::common::{golden, largest_error, relative_error};
+use glam::DMat4;
+use globalsplat::data::ViewBatch;
 use globalsplat::io::{Weights, read_weights};
-use globalsplat::loss::decoder_regularization;
+use globalsplat::loss::{decoder_regularization, frustum, sh_soft_cap};
 use globalsplat::model::{GlobalSplat, ModelConfig, ModelInput, Stage};
+use globalsplat::scene::{normalize, pose_to_rows};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use tch::{Device, Kind, Tensor, nn};
@@ -141,18 +144,63 @@ fn every_stage_matches_in_values_and_gradients() {
     }
 }
 
+/// Returns the tensors of a file in the golden folder; `None` without a golden folder.
+fn golden_file(name: &str) -> Option<BTreeMap<String, Tensor>> {
+    Some(read(&golden()?, name).tensors)
+}
+
 #[test]
-fn missing_golden_tensors_are_reported() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let (empty, absent) = (folder.path(), folder.path().join("absent"));
-    for name in
-        ["golden_model::the_encoder_matches", "golden_model::every_stage_matches_in_values_and_gradients"]
-    {
-        let run = |golden: &Path, strict: &str| {
-            rerun_test(name, &[("GLOBALSPLAT_GOLDEN", golden), ("GLOBALSPLAT_NO_SKIPS", Path::new(strict))])
-        };
-        assert_eq!(run(&absent, ""), (true, "golden tensors\n".into()));
-        assert_eq!(run(&absent, "1"), (false, String::new()));
-        assert_eq!(run(empty, ""), (false, String::new()));
+fn the_frustum_loss_matches() {
+    let Some(golden) = golden_file("frustum_loss") else { return };
+    // The file doesn't contain the size of the images, but the principal points determine it.
+    let size = (golden["intrinsic"].double_value(&[0, 0, 0, 2]) * 2.).round() as i64;
+    let views = ViewBatch {
+        images: Tensor::zeros([2, 4, 3, size, size], (Kind::Float, Device::Cpu)),
+        masks: None,
+        depths: None,
+        c2w: golden["w2c"].inverse(),
+        w2c: golden["w2c"].shallow_clone(),
+        intrinsics: golden["intrinsic"].shallow_clone(),
+    };
+    let means = golden["means"].copy().set_requires_grad(true);
+    let loss = frustum(&means, &views, &golden["max_depth"]);
+    assert!(largest_error(&loss.view([1]), &golden["loss"]) < 1e-5 * golden["loss"].double_value(&[0]));
+    loss.backward();
+    assert!(relative_error(&means.grad(), &golden["grad_means"]) < 1e-4);
+}
+
+#[test]
+fn the_soft_cap_of_spherical_harmonics_matches() {
+    let Some(golden) = golden_file("sh_softcap") else { return };
+    let sh = golden["sh"].copy().set_requires_grad(true);
+    let loss = sh_soft_cap(&sh);
+    assert!(relative_error(&loss.view([1]), &golden["reg"]) < 1e-5);
+    loss.backward();
+    assert!(relative_error(&sh.grad(), &golden["grad"]) < 1e-4);
+}
+
+#[test]
+fn the_normalization_of_one_and_of_many_cameras_matches() {
+    let Some(golden) = golden_file("scene_normalization") else { return };
+    let tensor = |poses: &[DMat4]| {
+        let rows: Vec<f64> = poses.iter().flat_map(pose_to_rows).collect();
+        Tensor::from_slice(&rows).view([-1, 4, 4])
+    };
+    let values = Vec::<f64>::try_from(golden["c2w"].to_kind(Kind::Double).flatten(0, -1)).expect("numbers");
+    let poses: Vec<DMat4> =
+        values.chunks_exact(16).map(|rows| DMat4::from_cols_slice(rows).transpose()).collect();
+    let many = normalize(&poses).expect("cameras");
+    assert!(largest_error(&tensor(&many.c2w), &golden["norm_c2w"]) < 1e-6);
+    let w2c: Vec<DMat4> = many.c2w.iter().map(DMat4::inverse).collect();
+    assert!(largest_error(&tensor(&w2c), &golden["norm_w2c"]) < 1e-6);
+    let similarity = many.world_from_normalized;
+    assert!((similarity.scale / golden["scene_scale"].double_value(&[0]) - 1.).abs() < 1e-6);
+    for (pose, before) in many.c2w.iter().zip(&poses) {
+        let center =
+            similarity.scale * (similarity.rotation * pose.w_axis.truncate()) + similarity.translation;
+        assert!(center.distance(before.w_axis.truncate()) < 1e-9, "the similarity leads back");
     }
+    let one = normalize(&poses[..1]).expect("a camera");
+    assert!(largest_error(&tensor(&one.c2w), &golden["single_norm_c2w"]) < 1e-6);
+    assert_eq!(one.world_from_normalized.scale, golden["single_scene_scale"].double_value(&[0]));
 }

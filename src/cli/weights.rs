@@ -1,0 +1,185 @@
+//! The commands `export` and `import`, which write weights.
+
+use super::{model, print_json};
+use anyhow::Result;
+use clap::{ArgGroup, Args, ValueEnum};
+use globalsplat::config::Config;
+use globalsplat::io::{InputFiles, check_writable_file, write_weights};
+use globalsplat::model::{GlobalSplat, Precision, Stage};
+use globalsplat::reconstruct::{ModelDtype, ModelFile, load_model, model_weights, save_checkpoint};
+use globalsplat::train::{MODEL_FILE, add_run_inputs, best_checkpoint, latest_checkpoint};
+use serde_json::{Value, json};
+use std::path::PathBuf;
+use tch::{Device, nn};
+
+/// Write weights with their configuration, as safetensors or as a checkpoint for torch: a run's newest or best, or those of any file.
+#[derive(Args)]
+#[command(group(ArgGroup::new("source").required(true)))]
+#[command(
+    after_help = "Examples:\n  globalsplat export --run runs/first_light --out model.safetensors --dtype bf16\n  \
+    globalsplat export --run runs/first_light --format torch --out model.ckpt"
+)]
+pub struct Export {
+    /// Folder of a run
+    #[arg(long, value_name = "RUN", group = "source")]
+    run: Option<PathBuf>,
+    /// Export the run's best weights by validation, instead of the newest
+    #[arg(long, conflicts_with_all = ["config", "weights"])]
+    best: bool,
+    /// Export the weights of this file: safetensors or a checkpoint
+    #[arg(long, value_name = "FILE", group = "source")]
+    weights: Option<PathBuf>,
+    /// Export newly initialized weights of a configuration instead, as at the start of training
+    #[arg(long, value_name = "FILE", group = "source")]
+    config: Option<PathBuf>,
+    /// Format: safetensors, or a checkpoint that torch.load reads, in the authors' layout
+    #[arg(long, value_enum, default_value = "safetensors")]
+    format: Format,
+    #[command(flatten)]
+    out: WeightsOut,
+}
+
+impl Export {
+    pub fn run(self) -> Result<()> {
+        let mut inputs = InputFiles::default();
+        self.run.iter().for_each(|run| add_run_inputs(run, &mut inputs));
+        self.weights.iter().for_each(|weights| inputs.add(weights));
+        self.config.iter().for_each(|config| inputs.add(config));
+        self.out.check(&inputs)?;
+        let mut note = None;
+        let (vs, config, stage) = match (&self.run, &self.weights, &self.config) {
+            (Some(run), ..) => {
+                let checkpoint = if self.best { best_checkpoint(run)? } else { latest_checkpoint(run)? };
+                let loaded = load_model(&checkpoint.join(MODEL_FILE), Device::Cpu)?;
+                (loaded.vs, loaded.config, loaded.stage)
+            }
+            (None, Some(weights), _) => {
+                let loaded = load_model(weights, Device::Cpu)?;
+                note = loaded.assumed.map(|assumed| format!("taken for {assumed}"));
+                (loaded.vs, loaded.config, loaded.stage)
+            }
+            (None, None, config) => {
+                let config = Config::read(config.as_ref().expect("clap asks for one of the three"), &[])?;
+                tch::manual_seed(config.train.seed as i64);
+                let vs = nn::VarStore::new(Device::Cpu);
+                GlobalSplat::new(&vs.root(), &config.model)?;
+                let stage = config.curriculum.final_stage();
+                (vs, config, stage)
+            }
+        };
+        self.out.write(&vs, &config, stage, self.format, (json!({}), note))
+    }
+}
+
+/// Convert weights from the authors' checkpoint or any state dict to safetensors with a configuration.
+///
+/// The model's shape is inferred from the tensors; optimizer state, other networks and settings beside them are ignored.
+/// Nothing in the file is executed: a file that would run code in Python is refused. Settings that shapes don't determine, the
+/// number of attention heads and the final stage of the model, default to the paper's and are reported; --set overrides them.
+#[derive(Args)]
+#[command(
+    after_help = "Examples:\n  globalsplat import --from globalsplat_16k.ckpt --out model.safetensors\n  \
+    globalsplat import --from dense_32k.ckpt --set curriculum.final_stage=4 --out model.safetensors"
+)]
+pub struct Import {
+    /// File that torch.save or Lightning wrote, or a safetensors file with or without a configuration
+    #[arg(long, value_name = "FILE")]
+    from: PathBuf,
+    /// Override a key of the configuration, as in model.heads=4; may be given more than once
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    #[command(flatten)]
+    out: WeightsOut,
+}
+
+impl Import {
+    pub fn run(self) -> Result<()> {
+        let mut inputs = InputFiles::default();
+        inputs.add(&self.from);
+        self.out.check(&inputs)?;
+        let file = ModelFile::open(&self.from, &self.set)?;
+        let left_out = file.left_out;
+        let loaded = file.load(Device::Cpu, Precision::F32)?;
+        let notes: Vec<String> = loaded
+            .assumed
+            .iter()
+            .map(|assumed| format!("taken for {assumed}"))
+            .chain((left_out > 0).then(|| format!("{left_out} other tensors left out")))
+            .collect();
+        let note = (!notes.is_empty()).then(|| notes.join("; "));
+        let more = json!({ "taken_for": loaded.assumed, "left_out": left_out });
+        self.out.write(&loaded.vs, &loaded.config, loaded.stage, Format::Safetensors, (more, note))
+    }
+}
+
+#[derive(Args)]
+struct WeightsOut {
+    /// Output file
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Data type of the stored weights
+    #[arg(long, value_enum, default_value = "f32")]
+    dtype: Dtype,
+    /// Print the result as one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum Dtype {
+    F32,
+    Bf16,
+}
+
+/// File format of weights.
+#[derive(Clone, Copy, PartialEq, ValueEnum)]
+enum Format {
+    Safetensors,
+    /// A checkpoint for torch.load, in the authors' layout
+    Torch,
+}
+
+impl WeightsOut {
+    /// Returns an error, before the work, if the output couldn't be written, or would replace one of `inputs`.
+    fn check(&self, inputs: &InputFiles) -> Result<()> {
+        check_writable_file(&self.out)?;
+        Ok(inputs.check_file(&self.out)?)
+    }
+
+    /// Writes the variables of `vs` and reports it; the JSON output also gets the entries of `more`, the text output `note`.
+    fn write(
+        &self,
+        vs: &nn::VarStore,
+        config: &Config,
+        stage: Stage,
+        format: Format,
+        (more, note): (Value, Option<String>),
+    ) -> Result<()> {
+        let dtype = match self.dtype {
+            Dtype::F32 => ModelDtype::F32,
+            Dtype::Bf16 => ModelDtype::BF16,
+        };
+        let weights = model_weights(vs, config, stage, dtype);
+        match format {
+            Format::Safetensors => write_weights(&self.out, &weights.tensors, weights.metadata)?,
+            Format::Torch => save_checkpoint(&self.out, weights)?,
+        }
+        let bytes = std::fs::metadata(&self.out)?.len();
+        let parameters: usize = vs.trainable_variables().iter().map(|t| t.numel()).sum();
+        if self.json {
+            let mut report = json!({ "weights": self.out.to_string_lossy(), "parameters": parameters, "bytes": bytes, "stage": stage });
+            for (key, value) in more.as_object().into_iter().flatten() {
+                report[key] = value.clone();
+            }
+            print_json(&report);
+        } else {
+            let notes: String = [model::early_stage(stage, config), note]
+                .into_iter()
+                .flatten()
+                .map(|n| format!(", {n}"))
+                .collect();
+            println!("{}: {parameters} parameters, {:.1} MB{notes}", self.out.display(), bytes as f64 / 1e6);
+        }
+        Ok(())
+    }
+}
