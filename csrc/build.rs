@@ -17,7 +17,7 @@ const BRIDGES: [&str; 13] = [
     "src/ops.rs",
     "src/optim.rs",
     "src/processor.rs",
-    "src/ranks.rs",
+    "src/distributed.rs",
     "src/render.rs",
     "src/tensor_memory.rs",
 ];

@@ -1,6 +1,6 @@
 // Ranks on GPUs. The program isn't linked to libtorch's CUDA library, which is loaded when a GPU is requested. The functions that create an
 // NCCL group are therefore looked up by name, and everything else goes through c10d's virtual functions.
-#include "ranks.h"
+#include "distributed.h"
 
 #if __has_include(<nccl.h>) && __has_include(<cuda_runtime.h>) && __has_include(<crt/host_config.h>) && __has_include(<nv/target>)
 #define GLOBALSPLAT_NCCL 1

@@ -15,7 +15,7 @@
 #include "ops.cpp"
 #include "optim.cpp"
 #include "processor.cpp"
-#include "ranks.cpp"
+#include "distributed.cpp"
 #include "splat.cpp"
 #include "tensor_memory.cpp"
 #include "threads.cpp"

@@ -30,6 +30,7 @@ pub mod bench;
 pub mod config;
 pub mod data;
 pub mod device;
+pub mod distributed;
 pub mod error;
 pub mod eval;
 mod ffi;
@@ -41,7 +42,6 @@ pub mod optim;
 #[cfg(feature = "cli")]
 #[doc(hidden)]
 pub mod parity;
-pub mod ranks;
 pub mod reconstruct;
 pub mod refine;
 pub mod render;

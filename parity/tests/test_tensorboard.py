@@ -21,7 +21,7 @@ CONFIG = """
 model = { latents = 16, width = 32, rgb_width = 32, ray_width = 16, rounds = 1, self_attention_blocks = 1, heads = 4, candidates = 4 }
 curriculum = { final_stage = 2, boundaries = [2, 4], transition = 2 }
 loss = { perceptual = "none", decoder_opacity = true }
-train = { steps = 12, batch = 2, checkpoint_every = 4, validate_every = 4, log_every = 3, log_images_every = 5 }
+train = { steps = 12, batch_size = 2, checkpoint_every = 4, validate_every = 4, log_every = 3, log_images_every = 5 }
 [data]
 captures = ["CAPTURES"]
 image_size = [32, 32]

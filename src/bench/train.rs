@@ -8,10 +8,10 @@ use crate::data::{Batch, Capture, LoadTimes, LoadedScene};
 use crate::device::Stopwatch;
 use crate::device::Upload;
 use crate::device::peak_memory_bytes_on;
+use crate::distributed::ProcessGroup;
 use crate::error::Result;
 use crate::loss::{PerceptualKind, PerceptualLoss};
 use crate::model::Precision;
-use crate::ranks::ProcessGroup;
 use crate::scene::{Camera, ImageSize, Intrinsics};
 use crate::train::{COMMUNICATION, Trainer};
 use glam::{DMat4, DVec3};
@@ -95,7 +95,6 @@ pub fn bench_train(
     steps: usize,
     device: Device,
     group: ProcessGroup,
-    shards_optimizer: bool,
 ) -> Result<TrainReport> {
     let mut config = config.clone();
     config.curriculum.full_capacity = true;
@@ -104,10 +103,7 @@ pub fn bench_train(
     }
     let (rank, ranks) = (group.rank(), group.world_size());
     let trainer = Trainer::new(&config, Arc::new(Vec::<Capture>::new()), device)?;
-    let mut trainer = match shards_optimizer {
-        true => trainer.with_group(group).with_sharded_optimizer(),
-        false => trainer.with_group(group),
-    };
+    let mut trainer = trainer.with_group(group);
     trainer.broadcast_state()?;
     let seeds = (rank * config.train.batch_size) as u64..;
     let scenes: Vec<LoadedScene> =
@@ -193,7 +189,7 @@ fn measure_distributed_cost(
     }
     let communication = communication.into_stats().0;
     let gradient_bytes = trainer.gradient_bytes();
-    trainer.group().leave()?;
+    trainer.group().shutdown()?;
     let mut apart = trainer.with_group(ProcessGroup::single());
     Ok(DistributedCost {
         ranks,

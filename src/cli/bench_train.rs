@@ -1,12 +1,12 @@
 use super::bench_common::{print_parts, print_sections, read_config};
-use super::{print_json, ranks};
+use super::{distributed, print_json};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::bench::{DistributedCost, Part, TrainReport, bench_train};
 use globalsplat::config::Config;
 use globalsplat::device::total_memory_bytes;
+use globalsplat::distributed::ProcessGroup;
 use globalsplat::error::{Error, panic_message};
-use globalsplat::ranks::ProcessGroup;
 use globalsplat::train::largest_fitting_batch;
 use serde_json::json;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
@@ -41,9 +41,6 @@ pub struct Train {
     /// Device: cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
     device: String,
-    /// Shard the optimizer's moments across the processes that torchrun started
-    #[arg(long)]
-    shard_optimizer: bool,
     /// Print the measurements as one JSON object
     #[arg(long)]
     json: bool,
@@ -66,7 +63,7 @@ fn parse_batch(text: &str) -> Result<Batch, String> {
 
 impl Train {
     pub fn run(self) -> Result<()> {
-        let (group, device) = ranks::join(&self.device)?;
+        let (group, device) = distributed::join(&self.device)?;
         let is_main_process = group.is_main_process();
         let mut config = read_config(self.config.as_deref(), &self.set)?;
         if let Some(set) = self.set.iter().find(|set| set.trim_start().starts_with("train.batch")) {
@@ -75,7 +72,7 @@ impl Train {
         let report = match self.batch {
             Batch::Scenes(scenes) => {
                 config.train.batch_size = scenes;
-                bench_train(&config, self.steps as usize, device, group, self.shard_optimizer)?
+                bench_train(&config, self.steps as usize, device, group)?
             }
             Batch::Auto if group.world_size() > 1 => {
                 return Err(Error::request("--batch auto: expected a number under torchrun").into());
@@ -111,7 +108,7 @@ impl Train {
         loop {
             let batch = config.train.batch_size;
             let (steps, alone) = (self.steps as usize, ProcessGroup::single());
-            let bench = || bench_train(&config, steps, device, alone, self.shard_optimizer);
+            let bench = || bench_train(&config, steps, device, alone);
             let is_refused = |why: &str| batch > 1 && why.contains("out of memory");
             match catch_unwind(AssertUnwindSafe(bench)) {
                 Ok(Err(error)) if is_refused(&error.to_string()) => {}

@@ -3,11 +3,11 @@ use anyhow::Result;
 use clap::Args;
 use globalsplat::config::Config;
 use globalsplat::device::total_memory_bytes;
+use globalsplat::distributed::Backends;
 use globalsplat::error::Error;
 use globalsplat::io::{WEIGHTS_VARIABLE, find_ffmpeg, find_pretrained};
 use globalsplat::loss::LpipsNetwork;
 use globalsplat::model::Precision;
-use globalsplat::ranks::Backends;
 use globalsplat::reconstruct::BUNDLED_MODEL;
 use globalsplat::render::cpu::{libtorch_simd_level, simd_level};
 use globalsplat::render::cuda::{

@@ -1,6 +1,6 @@
 use super::{
-    check_former_option, check_views, device, model, open_masked_capture, parse_holdout, parse_photo_size,
-    print_json, progress, ranks, report_downscaling, stop_flag, warn, warn_of_many,
+    check_former_option, check_views, device, distributed, model, open_masked_capture, parse_holdout,
+    parse_photo_size, print_json, progress, report_downscaling, stop_flag, warn, warn_of_many,
 };
 use anyhow::Result;
 use clap::{ArgGroup, Args};
@@ -261,7 +261,7 @@ impl Eval {
             Some(height) => Input::with_height(height, trained)?,
             None => Input::PLAIN,
         };
-        if !input.is_plain() && ranks::is_main_process() {
+        if !input.is_plain() && distributed::is_main_process() {
             eprintln!("photos are cut and resized to {}", model::describe_input(input, trained));
         }
         Ok(Some(Model { input, ..loaded.into() }))
@@ -325,7 +325,7 @@ impl Eval {
 /// Evaluation of a dataset.
 impl Eval {
     fn run_dataset(&self) -> Result<()> {
-        let (group, device) = ranks::join(&self.device)?;
+        let (group, device) = distributed::join(&self.device)?;
         let (Some(data), Some(out)) = (&self.data, &self.out) else { unreachable!("clap asks for both") };
         let indices =
             self.index.iter().map(|file| EvaluationIndex::read(file)).collect::<Result<Vec<_>, _>>()?;
@@ -401,7 +401,7 @@ impl Eval {
             write_csv(&folder.join(TABLE), &evaluation)?;
             evaluations.push((folder, evaluation));
         }
-        group.leave()?;
+        group.shutdown()?;
         if !group.is_main_process() {
             return Ok(());
         }

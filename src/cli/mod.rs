@@ -12,6 +12,7 @@ mod bench_train;
 mod capture;
 mod convert;
 mod device;
+mod distributed;
 mod doctor;
 mod edits;
 mod eval;
@@ -21,7 +22,6 @@ mod model;
 mod pack;
 mod parity;
 mod progress;
-mod ranks;
 mod reconstruct;
 mod refine;
 mod render;
@@ -123,7 +123,7 @@ pub fn main() -> ExitCode {
     let cli = match Cli::try_parse() {
         Ok(cli) => cli,
         Err(e) => {
-            if ranks::is_main_process() {
+            if distributed::is_main_process() {
                 let _ = e.print();
             }
             // clap returns --help and --version as errors too, with exit code 0.
@@ -145,7 +145,7 @@ pub fn main() -> ExitCode {
     }));
     let result = panic::catch_unwind(|| {
         if !cli.command.is_shared() {
-            ranks::refuse()?;
+            distributed::require_single_process()?;
         }
         cli.command.run()
     });
@@ -164,7 +164,6 @@ pub fn main() -> ExitCode {
             FAILED
         }
     };
-    ranks::leave(code != DONE);
     ExitCode::from(code)
 }
 
@@ -173,7 +172,7 @@ const PRINTING: &str = "failed printing to stdout: ";
 
 /// Prints an error to standard error. Errors from below the program's own checks are reworded for the user.
 fn print_error(message: &str, is_secondary: bool) {
-    let Some(message) = ranks::message_to_print(message, is_secondary) else { return };
+    let Some(message) = distributed::message_to_print(message, is_secondary) else { return };
     if message.contains("DefaultCPUAllocator") || message.contains("std::bad_alloc") {
         eprintln!("globalsplat: out of memory");
     } else if let Some((_, why)) = message.split_once(PRINTING) {
@@ -261,7 +260,7 @@ fn open_masked_capture(path: &Path, masks: Option<&Path>) -> globalsplat::Result
 
 /// Prints warnings about what is ignored or changed in an input, one per line.
 fn warn(lines: &[String]) {
-    if ranks::is_main_process() {
+    if distributed::is_main_process() {
         lines.iter().for_each(|line| eprintln!("{line}"));
     }
 }

@@ -1,6 +1,6 @@
 //! Shared code for `--weights`, `--precision auto|f32|bf16` and `--views-at`.
 
-use super::ranks;
+use super::distributed;
 use globalsplat::config::Config;
 use globalsplat::model::{Precision, Stage};
 use globalsplat::reconstruct::{BUNDLED_MODEL, Input, LoadedModel, ModelFile};
@@ -26,7 +26,7 @@ pub fn precision(requested: Option<Precision>, device: Device, width: i64) -> Pr
     let precision = requested.unwrap_or_else(|| Precision::best_on(device, width));
     if precision == Precision::Bf16
         && Precision::fastest_on(device) == Precision::F32
-        && ranks::is_main_process()
+        && distributed::is_main_process()
     {
         eprintln!("--precision bf16: slower than f32 here, as there are no instructions for it");
     }
@@ -38,7 +38,7 @@ pub fn load(weights: Option<&Path>, requested: Option<Precision>, device: Device
     let file = ModelFile::open_or_bundled(weights)?;
     let precision = precision(requested, device, file.config.model.width);
     let loaded = file.load(device, precision)?;
-    if !ranks::is_main_process() {
+    if !distributed::is_main_process() {
         return Ok(loaded);
     }
     if let Some(assumed) = &loaded.assumed {

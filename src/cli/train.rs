@@ -1,4 +1,4 @@
-use super::{print_json, progress, ranks, stop_flag, warn_of_many};
+use super::{distributed, print_json, progress, stop_flag, warn_of_many};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::config::Config;
@@ -51,9 +51,6 @@ pub struct Train {
     /// Device: cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
     device: String,
-    /// Shard the optimizer's moments across the processes that torchrun started, for less memory; checkpoints are the same
-    #[arg(long)]
-    shard_optimizer: bool,
     /// Print the result as one JSON object
     #[arg(long)]
     json: bool,
@@ -64,7 +61,7 @@ const CURVES_FILE: &str = "curves.svg";
 
 impl Train {
     pub fn run(self) -> Result<()> {
-        let (group, device) = ranks::join(&self.device)?;
+        let (group, device) = distributed::join(&self.device)?;
         let (is_main_process, count) = (group.is_main_process(), group.world_size());
         let config = Config::read(&self.config, &self.set)?;
         let resume = match self.resume.to_str() {
@@ -101,9 +98,6 @@ impl Train {
         }
 
         let mut trainer = trainer.with_group(group);
-        if self.shard_optimizer {
-            trainer = trainer.with_sharded_optimizer();
-        }
         if count > 1 && is_main_process {
             eprintln!("{count} processes train together: {} scenes in a step", trainer.batch());
         }
@@ -113,7 +107,7 @@ impl Train {
         let outcome = self.train(&config, &mut trainer, &mut held_out, &resume, &stop)?;
         let seconds = start.elapsed().as_secs_f64();
         let bad_data = trainer.bad_data();
-        trainer.group().leave()?;
+        trainer.group().shutdown()?;
         if !is_main_process {
             return Ok(());
         }

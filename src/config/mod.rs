@@ -2,20 +2,18 @@
 //!
 //! The sections `data`, `loss` and `model` are defined in the modules of these names; the sections on training are defined here.
 
-mod curriculum;
 mod keys;
 mod train;
 
-pub use curriculum::CurriculumConfig;
 pub(crate) use keys::changed_keys;
-pub use train::{OptimizerKind, TrainConfig};
+pub use train::{CurriculumConfig, OptimizerKind, TrainConfig};
 
 use crate::data::DataConfig;
 use crate::error::{Error, Result};
 use crate::loss::LossConfig;
 use crate::model::ModelConfig;
 use crate::scene::ImageSize;
-use keys::{override_key, rename_former};
+use keys::override_key;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -50,16 +48,14 @@ impl Config {
     /// # Errors
     /// Returns an error if `text` isn't TOML, a key is unknown, a value has the wrong type, or values don't fit together.
     pub fn parse(text: &str, overrides: &[String], origin: &Path) -> Result<Self> {
-        // Parse the file without overrides first, so that its errors give a line. Keys that were removed would be unknown.
+        // Parse the file without overrides first, so that its errors give a line.
         let mut table: toml::Table = text
             .parse()
             .map_err(|e: toml::de::Error| Error::input(origin, "the file", one_line(&e, text), "TOML"))?;
         let described = |e: toml::de::Error| {
             Error::input(origin, "a key", one_line(&e, text), "a configuration of globalsplat")
         };
-        if !rename_former(&mut table) {
-            toml::from_str::<Config>(text).map_err(described)?;
-        }
+        toml::from_str::<Config>(text).map_err(described)?;
         for assignment in overrides {
             override_key(&mut table, assignment)?;
             let config: std::result::Result<Config, _> = table.clone().try_into();

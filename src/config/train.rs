@@ -1,7 +1,7 @@
-//! Configuration of training: optimizer, schedule, checkpoints and logs.
+//! Configuration of training: curriculum, optimizer, schedule, checkpoints and logs.
 
 use crate::error::{Error, Result};
-use crate::model::Precision;
+use crate::model::{ModelConfig, Precision, Stage};
 use serde::{Deserialize, Serialize};
 
 /// Optimizer of the encoder's matrices. AdamW updates all other weights.
@@ -23,7 +23,6 @@ pub struct TrainConfig {
     /// Number of optimizer steps.
     pub steps: u64,
     /// Number of scenes in a step. With several processes, the number of scenes of each process.
-    #[serde(alias = "batch")]
     pub batch_size: usize,
     /// Number of scenes that go through the model at a time, or 0 for all scenes of a step at once. A smaller number needs less memory; the
     /// gradient is still that of the whole step. If `loss.consistency_depth` is used, a step in several slices takes one more forward pass:
@@ -53,12 +52,10 @@ pub struct TrainConfig {
     pub validate_every: u64,
     /// Maximum number of consecutive steps with a loss or gradient that isn't finite. Such steps are skipped; training fails when this many
     /// have been skipped in a row.
-    #[serde(alias = "max_skipped")]
     pub max_nonfinite_steps: u64,
     /// Number of steps between scalars in the TensorBoard log. `metrics.jsonl` has the values of every step.
     pub log_every: u64,
     /// Number of steps between images in the TensorBoard log, or 0 for no images.
-    #[serde(alias = "pictures_every")]
     pub log_images_every: u64,
 }
 
@@ -115,6 +112,62 @@ impl TrainConfig {
         }
         if !(0. ..=1.).contains(&self.warmup) {
             return Err(Error::setting("train.warmup", self.warmup, "a fraction from 0 to 1"));
+        }
+        Ok(())
+    }
+}
+
+/// Coarse-to-fine curriculum (spec 8.7).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct CurriculumConfig {
+    /// Stage in which training ends and that inference uses. In stage s, a scene token has 2^s Gaussians.
+    pub final_stage: u32,
+    /// Steps at which stages 1, 2, … begin, in ascending order. Entries beyond the final stage are ignored.
+    pub boundaries: Vec<u64>,
+    /// Number of steps after a boundary over which λ rises from 0 to 1.
+    pub transition: u64,
+    /// If `true`, training is in the final stage from the first step on (an ablation).
+    pub full_capacity: bool,
+}
+
+impl Default for CurriculumConfig {
+    fn default() -> Self {
+        CurriculumConfig {
+            final_stage: 3,
+            boundaries: vec![10_000, 20_000, 50_000],
+            transition: 2_000,
+            full_capacity: false,
+        }
+    }
+}
+
+impl CurriculumConfig {
+    /// Returns the stage that inference uses, complete.
+    pub fn final_stage(&self) -> Stage {
+        Stage::complete(self.final_stage)
+    }
+
+    /// Checks that the values are valid and fit `model`.
+    ///
+    /// # Errors
+    /// Returns an error that names the first invalid field.
+    pub(super) fn check(&self, model: &ModelConfig) -> Result<()> {
+        let CurriculumConfig { final_stage, boundaries, full_capacity, .. } = self;
+        if *final_stage > model.max_stage() {
+            let expected = format!("{} at most: model.candidates is {}", model.max_stage(), model.candidates);
+            return Err(Error::setting("curriculum.final_stage", final_stage, expected));
+        }
+        if !full_capacity && boundaries.len() < *final_stage as usize {
+            let expected = format!("a step for each of the {final_stage} stages after the first");
+            return Err(Error::setting("curriculum.boundaries", format!("{boundaries:?}"), expected));
+        }
+        if !boundaries.is_sorted() {
+            return Err(Error::setting(
+                "curriculum.boundaries",
+                format!("{boundaries:?}"),
+                "ascending steps",
+            ));
         }
         Ok(())
     }

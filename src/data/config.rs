@@ -60,7 +60,6 @@ pub struct DataConfig {
     /// Maximum number of context views per scene in a training step.
     pub context_views: usize,
     /// Minimum number of context views. If it isn't 0, every step draws the number of context views from this to `context_views`.
-    #[serde(alias = "fewest_context_views")]
     pub min_context_views: usize,
     /// Number of target views per scene that renderings are compared with in a training step.
     pub target_views: usize,
@@ -87,10 +86,8 @@ pub struct DataConfig {
     /// Number of loader threads; 0 for one per core.
     pub threads: usize,
     /// Number of scenes to prefetch.
-    #[serde(alias = "ahead")]
     pub prefetch: usize,
     /// Size limit of the photo cache in 10⁶ bytes. Decoded photos are kept only if all of them together fit.
-    #[serde(alias = "photo_megabytes")]
     pub photo_cache_mb: u64,
 }
 

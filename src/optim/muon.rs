@@ -1,7 +1,7 @@
 //! Muon (Jordan et al. 2024). A matrix is updated along the nearest matrix to the running mean of its gradients whose singular values are
 //! all about equal. So directions with small gradients are learned as fast as others (spec 8.5).
 
-use super::address::addresses;
+use super::addresses;
 use globalsplat_csrc::optim::{self as ffi, MuonOptions};
 use std::collections::BTreeMap;
 use tch::{Device, Kind, Tensor, no_grad};

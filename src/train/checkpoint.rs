@@ -14,10 +14,9 @@ use crate::io::{
 use crate::reconstruct::{ModelDtype, save_model};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use std::fs;
-use std::io::Read;
+use std::fs::{self, File, OpenOptions, TryLockError};
+use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
-use tch::Tensor;
 
 const FOLDER: &str = "checkpoints";
 const BEST: &str = "best";
@@ -26,6 +25,7 @@ const PREFIX: &str = "step-";
 pub const MODEL_FILE: &str = "model.safetensors";
 const OPTIMIZER_FILE: &str = "optimizer.safetensors";
 const STATE_FILE: &str = "state.json";
+const LOCK_FILE: &str = ".lock";
 /// Our files in a checkpoint's folder. The state comes first, because without it there is no checkpoint.
 const FILES: [&str; 3] = [STATE_FILE, MODEL_FILE, OPTIMIZER_FILE];
 /// Files whose checksums are in the state, in the order of their names.
@@ -153,7 +153,7 @@ pub(super) fn keep_best(run: &Path, checkpoint: &Path, validation: Validation) -
             let (from, to) = (checkpoint.join(name), folder.join(name));
             if fs::hard_link(&from, &to).is_err() {
                 fs::copy(&from, &to).map_err(Error::write(&to))?;
-                fs::File::open(&to).and_then(|file| file.sync_all()).map_err(Error::write(&to))?;
+                File::open(&to).and_then(|file| file.sync_all()).map_err(Error::write(&to))?;
             }
         }
         write_state(folder, &state)
@@ -166,16 +166,15 @@ impl Trainer {
         run.join(FOLDER).join(folder_name(self.step))
     }
 
-    /// Saves a checkpoint under `run` with the optimizer's state `optimizer`, and returns its folder. Removes the oldest checkpoints beyond
-    /// those to keep.
+    /// Saves a checkpoint under `run` and returns its folder. Removes the oldest checkpoints beyond those to keep.
     ///
     /// # Errors
     /// Returns an error if files can't be written. Older checkpoints then stay complete.
-    pub(super) fn save(&self, run: &Path, optimizer: &BTreeMap<String, Tensor>) -> Result<PathBuf> {
+    pub(super) fn save(&self, run: &Path) -> Result<PathBuf> {
         let path = self.checkpoint(run);
         replace_dir(&path, &FILES, |folder| {
             save_model(&folder.join(MODEL_FILE), &self.vs, &self.config, self.stage(), ModelDtype::F32)?;
-            write_weights(&folder.join(OPTIMIZER_FILE), optimizer, Default::default())?;
+            write_weights(&folder.join(OPTIMIZER_FILE), &self.optimizer.state(), Default::default())?;
             let files = CHECKED_FILES.map(|name| Ok((name.into(), checksum(&folder.join(name))?)));
             let files = files.into_iter().collect::<Result<_>>()?;
             let (step, samples) = (self.step, self.samples);
@@ -265,7 +264,7 @@ fn write_state(checkpoint: &Path, state: &State) -> Result<()> {
 
 /// Returns the size and CRC-32 of a file.
 fn checksum(path: &Path) -> Result<(u64, u32)> {
-    let mut file = fs::File::open(path).map_err(Error::read(path))?;
+    let mut file = File::open(path).map_err(Error::read(path))?;
     let (mut buffer, mut hasher, mut size) = (vec![0; 1 << 20], crc32fast::Hasher::new(), 0);
     loop {
         match file.read(&mut buffer).map_err(Error::read(path))? {
@@ -275,5 +274,46 @@ fn checksum(path: &Path) -> Result<(u64, u32)> {
                 size += count as u64;
             }
         }
+    }
+}
+
+/// Lock that limits a run's folder to one training process; two would overwrite each other's checkpoints. It is released when it is dropped, or when the process ends for any reason.
+#[derive(Debug)]
+pub(super) struct RunLock {
+    _file: File,
+}
+
+impl RunLock {
+    /// Returns `true` if a run ever locked the folder `run`.
+    pub(super) fn was_ever_locked(run: &Path) -> bool {
+        run.join(LOCK_FILE).exists()
+    }
+
+    /// Locks the folder `run`, which must exist.
+    ///
+    /// # Errors
+    /// Returns an error that gives the ID of the other process if the folder is locked.
+    pub(super) fn take(run: &Path) -> Result<Self> {
+        let path = run.join(LOCK_FILE);
+        let options = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path);
+        let mut file = options.map_err(Error::write(&path))?;
+        match file.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => {
+                let mut holder = String::new();
+                let _ = file.read_to_string(&mut holder);
+                let found = format!("in use by process {}", holder.trim());
+                return Err(Error::input(
+                    run,
+                    "the run",
+                    found,
+                    "a run that no other process trains (choose another --out)",
+                ));
+            }
+            Err(TryLockError::Error(e)) => return Err(Error::write(&path)(e)),
+        }
+        let written = file.set_len(0).and_then(|()| write!(file, "{}", std::process::id()));
+        written.map_err(Error::write(&path))?;
+        Ok(RunLock { _file: file })
     }
 }

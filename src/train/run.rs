@@ -1,20 +1,18 @@
 //! Training run, from its current state to the last step, with checkpoints on the way.
 
 use super::checkpoint::{
-    Validation, add_checkpoints, best_score, check, keep_best, latest_checkpoint, list_checkpoints,
+    RunLock, Validation, add_checkpoints, best_score, check, keep_best, latest_checkpoint, list_checkpoints,
     prune_checkpoints, recover,
 };
 use super::is_due;
-use super::lock::RunLock;
-use super::metrics::MetricsWriter;
-use super::step_report::StepReport;
-use super::tensorboard::TensorBoard;
+use super::logs::{MetricsWriter, TensorBoard};
+use super::step::StepReport;
 use super::trainer::Trainer;
-use super::validator::{Score, Validator};
 use super::{CONFIG_FILE, METRICS_FILE};
 use crate::config::{TrainConfig, changed_keys};
 use crate::error::{Error, Result};
 use crate::io::{InputFiles, event_files, write_atomically};
+use crate::model::Stage;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -58,6 +56,37 @@ pub struct Outcome {
     pub skipped: u64,
 }
 
+/// Mean scores over all held-out views or scenes.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Score {
+    /// Mean PSNR over the scenes, in dB.
+    pub psnr: f64,
+    /// Mean SSIM over the scenes.
+    pub ssim: f64,
+    /// Number of scenes.
+    pub scenes: usize,
+    /// Stage at which the model was evaluated: the one that it has been trained to.
+    pub stage: Stage,
+    /// Reasons why scenes were left out, each listed once.
+    pub left_out: Vec<String>,
+}
+
+/// Evaluation of a model on data that training doesn't use.
+pub trait Validator {
+    /// Returns the number of scenes. Ranks compare it to check that they evaluate the same scenes.
+    fn scenes(&self) -> usize;
+
+    /// Returns the score of the model as it is now, or `None` if `should_continue`, which is called at intervals, returns `false`.
+    ///
+    /// # Errors
+    /// Returns an error if no scene can be used, or if the evaluation fails.
+    fn validate(
+        &mut self,
+        trainer: &Trainer,
+        should_continue: &mut dyn FnMut() -> bool,
+    ) -> Result<Option<Score>>;
+}
+
 /// Trains into the folder `out`, which no other process may use for training at the same time. `on_event` is called with every event and
 /// returns whether to continue. If it returns `false`, the run saves a checkpoint and stops. `validator` scores the model at intervals and
 /// at the end.
@@ -75,7 +104,7 @@ pub fn run(
     mut on_event: impl FnMut(Event) -> bool,
 ) -> Result<Outcome> {
     let writes = trainer.group.is_main_process();
-    let begun = writes.then(|| RunLogger::open(trainer, out, resume, &mut on_event)).transpose()?;
+    let opened = writes.then(|| RunLogger::open(trainer, out, resume, &mut on_event)).transpose()?;
     trainer.broadcast_state()?;
     let held_out = validator.as_ref().map(|validator| validator.scenes());
     let expected = trainer.group.broadcast_object(writes.then_some(held_out))?;
@@ -86,11 +115,11 @@ pub fn run(
             "this rank has {found} held-out scenes, expected {expected}, as the first one"
         )));
     }
-    let validated = begun.as_ref().map(|(logger, _)| logger.metrics.last_validated_step());
+    let validated = opened.as_ref().map(|(logger, _)| logger.metrics.last_validated_step());
     let validated = trainer.group.broadcast_object(validated)?;
-    let saved = begun.as_ref().map(|(_, saved)| saved.clone());
+    let saved = opened.as_ref().map(|(_, saved)| saved.clone());
     let saved = trainer.group.broadcast_object(saved)?;
-    let logger = begun.map(|(logger, _)| logger);
+    let logger = opened.map(|(logger, _)| logger);
     Run { trainer, out, validator, on_event, logger, validated, asked_to_stop: false }.train(saved)
 }
 
@@ -142,7 +171,7 @@ impl RunLogger {
         check_output_folder(out)?;
         let lock = RunLock::take(out)?;
         recover(out)?;
-        let begun = begin(trainer, out, resume, on_event)?;
+        let saved = begin(trainer, out, resume, on_event)?;
         let config = out.join(CONFIG_FILE);
         let toml = trainer.config.to_toml();
         let changes = match std::fs::read_to_string(&config) {
@@ -168,7 +197,7 @@ impl RunLogger {
             on_event(Event::Notice(format!("{e}; the best checkpoint is determined again")));
             None
         });
-        Ok((RunLogger { _lock: lock, metrics, tensorboard, best, settings }, begun))
+        Ok((RunLogger { _lock: lock, metrics, tensorboard, best, settings }, saved))
     }
 
     fn log_step(
@@ -224,7 +253,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
                 should_continue = match self.validate(&checkpoint) {
                     // A failed write or a lost rank isn't a problem of the held-out data.
                     Err(e) if e.is_failed_write() || e.is_distributed() => return Err(e),
-                    Err(e) => self.tell(Event::Notice(format!("a validation is left out: {e}"))),
+                    Err(e) => self.emit(Event::Notice(format!("a validation is left out: {e}"))),
                     should_continue => should_continue?,
                 };
                 saved = Some(checkpoint);
@@ -245,7 +274,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
                 logger.log_step(&mut self.on_event, &report, samples_per_second)?;
             }
             should_continue =
-                self.tell(Event::Step { report: &report, samples_per_second }) && report.should_continue;
+                self.emit(Event::Step { report: &report, samples_per_second }) && report.should_continue;
             if report.skipped {
                 skipped += 1;
                 skipped_in_a_row += 1;
@@ -274,7 +303,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             match self.validate(&checkpoint) {
                 Err(e) if e.is_failed_write() || e.is_distributed() => return Err(e),
                 Err(e) => {
-                    self.tell(Event::Notice(format!("the last validation is left out: {e}")));
+                    self.emit(Event::Notice(format!("the last validation is left out: {e}")));
                 }
                 // If the validation was stopped before its end, the run isn't complete, and the same command repeats the validation.
                 Ok(_) => complete = self.validated == Some(self.trainer.step.saturating_sub(1)),
@@ -285,16 +314,15 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
 
     /// Reports an event and returns whether to continue. If there are several ranks, always returns `true`: a request to stop reaches all
     /// ranks with the next step, so that they stop together.
-    fn tell(&mut self, event: Event) -> bool {
+    fn emit(&mut self, event: Event) -> bool {
         self.asked_to_stop |= !(self.on_event)(event);
         self.trainer.group.world_size() > 1 || !self.asked_to_stop
     }
 
     /// Saves a checkpoint on the first rank. Returns the checkpoint's folder on all ranks, even if it isn't written yet.
     fn save(&mut self) -> Result<PathBuf> {
-        let optimizer = self.trainer.optimizer_state()?;
         match &self.logger {
-            Some(_) => retry_on_disk_full(&mut self.on_event, || self.trainer.save(self.out, &optimizer)),
+            Some(_) => retry_on_disk_full(&mut self.on_event, || self.trainer.save(self.out)),
             None => Ok(self.trainer.checkpoint(self.out)),
         }
     }
@@ -322,7 +350,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             }
         }
         self.validated = Some(step);
-        Ok(self.tell(Event::Validation(&score)))
+        Ok(self.emit(Event::Validation(&score)))
     }
 
     /// Returns the error for too many skipped steps in a row.

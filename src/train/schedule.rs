@@ -1,6 +1,8 @@
-//! Learning rate schedule (spec 8.6).
+//! What depends on the number of a step alone: its learning rate (spec 8.6), its stage of the curriculum (spec 8.7), and the subsets of
+//! its context views that are compared (spec 7.8).
 
-use crate::config::TrainConfig;
+use crate::config::{CurriculumConfig, TrainConfig};
+use crate::model::Stage;
 use std::f64::consts::PI;
 
 /// Learning rate at the start of the warm-up, as a share of the peak.
@@ -21,6 +23,37 @@ pub fn learning_rate(config: &TrainConfig, step: u64) -> f64 {
     floor + 0.5 * (peak - floor) * (1. + (PI * progress).cos())
 }
 
+/// Returns the stage of `step`, counted from 0. λ rises from 0 at a boundary to 1 `transition` steps later.
+pub fn stage_at(config: &CurriculumConfig, step: u64) -> Stage {
+    if config.full_capacity {
+        return config.final_stage();
+    }
+    let boundaries = &config.boundaries[..config.boundaries.len().min(config.final_stage as usize)];
+    let passed = boundaries.iter().take_while(|&&boundary| step >= boundary).count();
+    match passed.checked_sub(1).map(|last| boundaries[last]) {
+        Some(boundary) if step - boundary < config.transition => {
+            Stage { index: passed as u32, mix: (step - boundary) as f64 / config.transition as f64 }
+        }
+        _ => Stage::complete(passed as u32),
+    }
+}
+
+/// Returns the positions of the two subsets of `views` ordered context views at `step`. Both have the first and the last view. Of the views
+/// in between, odd positions go to the first subset and even ones to the second; on odd steps it is the other way round. The smaller
+/// subset is padded with the last view. Needs at least two views.
+pub fn subsets(views: usize, step: u64) -> [Vec<usize>; 2] {
+    let last = views - 1;
+    let subset = |parity: usize| {
+        let middle = (1..last).filter(|position| position % 2 == parity);
+        std::iter::once(0).chain(middle).chain([last]).collect::<Vec<_>>()
+    };
+    let (mut odd, mut even) = (subset(1), subset(0));
+    let longer = odd.len().max(even.len());
+    odd.resize(longer, last);
+    even.resize(longer, last);
+    if step.is_multiple_of(2) { [odd, even] } else { [even, odd] }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -38,5 +71,44 @@ mod tests {
         near((6_600 + 220_000) / 2, 0.5 * (5e-4 + 1e-5));
         near(220_000, 1e-5);
         near(300_000, 1e-5);
+    }
+
+    #[test]
+    fn the_paper_s_curriculum() {
+        let config = CurriculumConfig::default();
+        let at = |step| {
+            let stage = stage_at(&config, step);
+            (stage.index, stage.mix)
+        };
+        assert_eq!(at(0), (0, 1.));
+        assert_eq!(at(9_999), (0, 1.));
+        assert_eq!(at(10_000), (1, 0.));
+        assert_eq!(at(11_000), (1, 0.5));
+        assert_eq!(at(12_000), (1, 1.));
+        assert_eq!(at(20_500), (2, 0.25));
+        assert_eq!(at(50_000), (3, 0.));
+        assert_eq!(at(219_999), (3, 1.));
+    }
+
+    #[test]
+    fn boundaries_beyond_the_final_stage_are_ignored() {
+        let config = CurriculumConfig { final_stage: 1, ..Default::default() };
+        assert_eq!(stage_at(&config, 60_000), Stage::complete(1));
+        let config = CurriculumConfig { final_stage: 0, ..Default::default() };
+        assert_eq!(stage_at(&config, 60_000), Stage::complete(0));
+    }
+
+    #[test]
+    fn full_capacity_starts_at_the_end() {
+        let config = CurriculumConfig { full_capacity: true, ..Default::default() };
+        assert_eq!(stage_at(&config, 0), Stage::complete(3));
+    }
+
+    #[test]
+    fn ends_are_shared_and_the_middle_alternates() {
+        assert_eq!(subsets(7, 0), [vec![0, 1, 3, 5, 6], vec![0, 2, 4, 6, 6]]);
+        assert_eq!(subsets(7, 1), [vec![0, 2, 4, 6, 6], vec![0, 1, 3, 5, 6]]);
+        assert_eq!(subsets(2, 0), [vec![0, 1], vec![0, 1]]);
+        assert_eq!(subsets(24, 0).map(|s| s.len()), [13, 13]);
     }
 }

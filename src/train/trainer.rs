@@ -1,23 +1,19 @@
 //! Training step, and the state that it changes.
 
-use super::curriculum::stage_at;
-use super::forward_backward::ForwardBackward;
+use super::gradients::{ForwardBackward, ModelReplica, gradients_in_parallel};
 use super::is_due;
-use super::parallel_slices::{ModelReplica, gradients_in_parallel};
+use super::logs::preview;
 use super::parameter_groups::{in_backward_order, parameter_groups};
-use super::preview::preview;
-use super::schedule::learning_rate;
-use super::step_report::StepReport;
-use super::step_sync::{StepSums, StepSync};
-use super::subsets::subsets;
+use super::schedule::{learning_rate, stage_at, subsets};
+use super::step::{StepReport, StepSums, StepSync};
 use crate::config::{Config, changed_keys};
 use crate::data::{BadData, BadSceneReport, Batch, BatchShard, DataLoader, SceneGroups};
 use crate::device::Stopwatch;
+use crate::distributed::{Buckets, ProcessGroup};
 use crate::error::{Error, Result};
 use crate::loss::{Losses, PerceptualLoss, StepFraction};
 use crate::model::{GlobalSplat, Growth, Precision, Stage};
 use crate::optim::Optimizer;
-use crate::ranks::{Buckets, ProcessGroup};
 use crate::reconstruct::{Input, Model, ModelFile};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -72,8 +68,6 @@ pub struct Trainer {
     /// Process group of the ranks that make every step together, each with its own samples.
     pub(super) group: ProcessGroup,
     buckets: Buckets,
-    /// `true` if each rank has only the moments of its share of the parameters.
-    shards_optimizer: bool,
 }
 
 impl Trainer {
@@ -107,7 +101,6 @@ impl Trainer {
             loader,
             group,
             buckets,
-            shards_optimizer: false,
         })
     }
 
@@ -120,11 +113,6 @@ impl Trainer {
             in_backward_order(&self.vs).into_iter().map(|(_, value)| value).collect();
         let buckets = Buckets::new(&group, &parameters);
         Trainer { group, buckets, ..self }
-    }
-
-    /// Shards the optimizer's moments over the ranks, from the start of the run. Checkpoints have all moments.
-    pub fn with_sharded_optimizer(self) -> Self {
-        Trainer { shards_optimizer: true, ..self }
     }
 
     /// Makes [`run`](super::run) start from the weights in the file `path`, which [`ModelFile`] reads, if it has no checkpoint yet. They
@@ -233,9 +221,6 @@ impl Trainer {
             Ok((sums, skipped))
         })?;
         let StepSums { losses, sync, gradient_norm } = sums;
-        if !skipped && self.optimizer.is_sharded() {
-            stopwatch.time("parameters", || self.broadcast_parameters())?;
-        }
         if !sync.has_equal_gradients(self.group.world_size()) {
             return Err(Error::failed(
                 "ranks have different parameters: were they started with the same program?",
@@ -271,46 +256,6 @@ impl Trainer {
         let sums = StepSync::of_rank(is_asked_to_stop, has_bad_data, gradients).to_tensor(losses);
         self.group.all_reduce(&sums)?;
         Ok(sums)
-    }
-
-    /// Broadcasts the parameters that each rank has updated to all others.
-    fn broadcast_parameters(&self) -> Result<()> {
-        for part in 0..self.group.world_size() {
-            let parameters: Vec<&Tensor> = self.optimizer.shard_parameters(part).collect();
-            if parameters.is_empty() {
-                continue;
-            }
-            let flat = Tensor::cat(&parameters.iter().map(|t| t.detach().view(-1)).collect::<Vec<_>>(), 0);
-            self.group.broadcast(part, &flat)?;
-            if part != self.group.rank() {
-                let sizes: Vec<i64> = parameters.iter().map(|t| t.numel() as i64).collect();
-                for (parameter, value) in parameters.into_iter().zip(flat.split_with_sizes(sizes, 0)) {
-                    parameter.detach().copy_(&value.view_as(parameter));
-                }
-            }
-        }
-        Ok(())
-    }
-
-    /// Returns the complete state of the optimizer, collected from its shards. All ranks call this. If the optimizer is sharded, only the
-    /// first rank gets the moments.
-    ///
-    /// # Errors
-    /// Returns an error if another rank is gone.
-    pub(super) fn optimizer_state(&self) -> Result<BTreeMap<String, Tensor>> {
-        if !self.optimizer.is_sharded() {
-            return Ok(self.optimizer.state());
-        }
-        self.optimizer.state_by(|moment, shape, part| {
-            let own = part == self.group.rank();
-            let moment = if own {
-                moment.shallow_clone()
-            } else {
-                Tensor::empty(shape, (Kind::Float, self.vs.device()))
-            };
-            self.group.broadcast(part, &moment)?;
-            Ok(if self.group.is_main_process() { moment.to_device(Device::Cpu) } else { Tensor::new() })
-        })
     }
 
     /// Exchanges the bad data that the ranks found, so that every rank counts all of it.
@@ -353,26 +298,20 @@ impl Trainer {
         // Variables that aren't trained are copied, too.
         let variables: BTreeMap<String, Tensor> = self.vs.variables().into_iter().collect();
         let moments = self.optimizer.moments();
-        variables.values().chain(moments).try_for_each(|t| self.group.broadcast(0, t))?;
-        if self.shards_optimizer {
-            self.optimizer.shard(self.group.rank(), self.group.world_size());
-        }
+        variables.values().chain(moments).try_for_each(|t| self.group.broadcast(t))?;
         Ok(())
     }
 
     /// Checks that this rank has the configuration and scenes of the first one. The locations of the data may differ between machines.
     fn check_same_as_first_rank(&self) -> Result<()> {
-        let own = (self.config.to_toml(), self.scenes.sizes(), self.shards_optimizer);
-        let (config, scenes, shards) =
+        let own = (self.config.to_toml(), self.scenes.sizes());
+        let (config, scenes) =
             self.group.broadcast_object(self.group.is_main_process().then(|| own.clone()))?;
         let mut changed = changed_keys(&config, &own.0);
         // A change has the form `key first → own`.
         changed.retain(|change| {
             !["data.captures ", "data.validation "].iter().any(|key| change.starts_with(key))
         });
-        if shards != own.2 {
-            changed.push(format!("shards_optimizer {shards} → {}", own.2));
-        }
         if !changed.is_empty() {
             let changed = changed.join(", ");
             return Err(Error::failed(format!(

@@ -34,7 +34,7 @@ perceptual = "none"
 
 [train]
 steps = 6
-batch = 1
+batch_size = 1
 checkpoint_every = 2
 "#;
 

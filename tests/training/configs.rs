@@ -5,12 +5,12 @@ use globalsplat::config::Config;
 use globalsplat::data::TrainingScenes;
 use globalsplat::io::read_weights;
 use globalsplat::loss::Term;
-use globalsplat::model::{GlobalSplat, Streams};
+use globalsplat::model::Streams;
 use globalsplat::reconstruct::{BUNDLED_MODEL, bundled_model};
 use globalsplat::train::{MemoryEstimate, Trainer};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use tch::{Device, Kind, nn};
+use tch::{Device, Kind};
 
 fn folder() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("configs")
@@ -21,26 +21,13 @@ fn read(name: &str) -> Config {
 }
 
 #[test]
-fn every_configuration_builds_its_model() {
-    let mut count = 0;
+fn every_configuration_builds_a_model_whose_steps_fit_into_a_large_gpu() {
     for entry in std::fs::read_dir(folder()).expect("configs/") {
         let path = entry.expect("an entry").path();
         let config = Config::read(&path, &[]).unwrap_or_else(|e| panic!("{e}"));
         // Round trip through TOML.
         let again = Config::parse(&config.to_toml(), &[], &path).expect("a configuration");
         assert_eq!(again, config, "{}", path.display());
-        let vs = nn::VarStore::new(Device::Cpu);
-        GlobalSplat::new(&vs.root(), &config.model).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
-        count += 1;
-    }
-    assert!(count >= 11);
-}
-
-#[test]
-fn steps_fit_into_the_memory_of_a_large_gpu() {
-    for entry in std::fs::read_dir(folder()).expect("configs/") {
-        let path = entry.expect("an entry").path();
-        let config = Config::read(&path, &[]).expect("a configuration");
         let bytes = MemoryEstimate::new(&config, Device::Cuda(0)).expect("a model").total();
         // A GPU has 80 GB. The rest is a margin for memory that the estimate doesn't include.
         assert!(bytes < 60_000_000_000, "{}: {:.1} GB", path.display(), bytes as f64 * 1e-9);

@@ -22,7 +22,7 @@ const TIMEOUT: Duration = Duration::from_secs(60);
 /// Serializes the tests: each uses all cores of a small machine.
 fn turn() -> Option<MutexGuard<'static, ()>> {
     static TURN: Mutex<()> = Mutex::new(());
-    if !globalsplat_csrc::ranks::has_gloo() {
+    if !globalsplat_csrc::distributed::has_gloo() {
         skip(
             "Gloo",
             "the program was built without Gloo; install libgloo-dev, touch csrc/build.rs and build again",
@@ -73,23 +73,6 @@ impl Started {
         command.args(["--standalone", "--no-python", &format!("--nproc-per-node={count}")]).args(options);
         command.arg(env!("CARGO_BIN_EXE_globalsplat")).args(arguments).env("OMP_NUM_THREADS", "1");
         Started::start(vec![command])
-    }
-
-    /// Starts one rank on each of two simulated machines, by torchruns that rendezvous; each torchrun may restart its ranks
-    /// once.
-    fn by_two_torchruns(torchrun: &Path, arguments: &[&str]) -> Self {
-        let port = free_port();
-        let machine = || {
-            let mut command = Command::new(torchrun);
-            command.args(["--no-python", "--nnodes=2", "--nproc-per-node=1", "--max-restarts=1"]);
-            command.args(["--rdzv-backend=c10d", "--rdzv-id=test", "--local-addr=127.0.0.1"]);
-            command.arg(format!("--rdzv-endpoint=127.0.0.1:{port}"));
-            // scripts/slurm_train.sh has this setting, too.
-            command.env("TORCH_DISABLE_SHARE_RDZV_TCP_STORE", "1").env("OMP_NUM_THREADS", "1");
-            command.arg(env!("CARGO_BIN_EXE_globalsplat")).args(arguments);
-            command
-        };
-        Started::start(vec![machine(), machine()])
     }
 
     /// Starts `count` ranks with only the environment variables that every launcher sets.
@@ -343,7 +326,7 @@ fn a_run_goes_on_with_another_number_of_ranks() {
     let Some(_turn) = turn() else { return };
     let (folder, config) = data(5);
     let [one, many] = ["one", "many"].map(|name| folder.path().join(name));
-    let settings = |batch| ["train.steps=24", "train.checkpoint_every=100", batch];
+    let settings = |batch| ["train.steps=12", "train.checkpoint_every=100", batch];
     succeed(&text(&train(&config, &one, &settings("train.batch_size=6"))));
 
     let arguments = train(&config, &many, &settings("train.batch_size=3"));
@@ -356,7 +339,7 @@ fn a_run_goes_on_with_another_number_of_ranks() {
     let [sentence] = sentences(&ended[0].err)[..] else { panic!("one sentence: {}", ended[0].err) };
     assert!(sentence.starts_with("stopped; ") && sentence.contains("the same command resumes"), "{sentence}");
     let done = metrics(&many).0.len();
-    assert!((4..24).contains(&done) && checkpoints(&many) == [done as u64], "{done} steps");
+    assert!((4..12).contains(&done) && checkpoints(&many) == [done as u64], "{done} steps");
 
     succeed_together(3, &text(&train(&config, &many, &settings("train.batch_size=2"))));
     assert_same_steps(&many, &one);
@@ -368,11 +351,11 @@ fn ranks_that_die_are_survived_to_the_same_bits() {
     let Some(torchrun) = torchrun() else { return };
     let (folder, config) = data(8);
     let [whole, run] = ["whole", "run"].map(|name| folder.path().join(name));
-    let settings = ["train.steps=40", "train.checkpoint_every=2", "train.validate_every=10"];
+    let settings = ["train.steps=20", "train.checkpoint_every=2", "train.validate_every=10"];
     succeed_together(2, &text(&train(&config, &whole, &settings)));
 
     let arguments = train(&config, &run, &settings);
-    let mut started = Started::by_torchrun(&torchrun, 2, &["--max-restarts=3"], &text(&arguments));
+    let mut started = Started::by_torchrun(&torchrun, 2, &["--max-restarts=2"], &text(&arguments));
     // Kill a rank within a step.
     started.wait_for("a step", || (metrics(&run).0.len() >= 5).then_some(()));
     let second = started.rank(1, 0);
@@ -387,36 +370,19 @@ fn ranks_that_die_are_survived_to_the_same_bits() {
         }
         signal(first, libc::SIGCONT);
     }
-    // Kill a rank within a validation: its checkpoint exists, but its score never appears, however long the first rank runs.
-    let second = started.rank(1, 2);
-    let unfinished_validation = || {
-        let ((steps, validations), saved) = (metrics(&run), checkpoints(&run).pop());
-        let done = steps.len() as u64;
-        let due = done > 0 && done.is_multiple_of(10) && saved == Some(done);
-        (due && !numbers(&validations).contains(&(done - 1))).then_some(())
-    };
-    loop {
-        started.wait_for("a validation", unfinished_validation);
-        hold(second);
-        sleep(Duration::from_millis(300));
-        if unfinished_validation().is_some() {
-            break signal(second, libc::SIGKILL);
-        }
-        signal(second, libc::SIGCONT);
-    }
     let ended = started.end().remove(0);
     assert_eq!(ended.code, Some(0), "{}", ended.err);
     let messages = sentences(&ended.err);
     let is_lost = |message: &&str| {
         message.contains("distributed communication failed") && message.contains("restart the processes")
     };
-    assert!(messages.len() == 3 && messages.iter().all(is_lost), "one sentence for each: {messages:?}");
+    assert!(messages.len() == 2 && messages.iter().all(is_lost), "one sentence for each: {messages:?}");
 
     assert_same_bits(&run, &whole);
     assert_same_steps(&run, &whole);
     let (steps, validations) = metrics(&run);
-    assert_eq!(numbers(&steps), (0..40).collect::<Vec<_>>(), "every step once");
-    assert_eq!(numbers(&validations), [9, 19, 29, 39]);
+    assert_eq!(numbers(&steps), (0..20).collect::<Vec<_>>(), "every step once");
+    assert_eq!(numbers(&validations), [9, 19]);
     let [a, b] = [&run, &whole].map(|run| fs::read(run.join("best/state.json")).unwrap());
     assert!(a == b, "the best checkpoint, by the same score");
     assert_eq!(
@@ -424,26 +390,6 @@ fn ranks_that_die_are_survived_to_the_same_bits() {
         2,
         "what the kills left is cleared away"
     );
-}
-
-#[test]
-fn ranks_of_two_machines_are_started_again() {
-    let Some(_turn) = turn() else { return };
-    let Some(torchrun) = torchrun() else { return };
-    let (folder, config) = data(4);
-    let [whole, run] = ["whole", "run"].map(|name| folder.path().join(name));
-    let settings = ["train.steps=30", "train.checkpoint_every=4"];
-    succeed_together(2, &text(&train(&config, &whole, &settings)));
-    let mut started = Started::by_two_torchruns(&torchrun, &text(&train(&config, &run, &settings)));
-    started.wait_for("a checkpoint", || (metrics(&run).0.len() > 8).then_some(()));
-    // Killing the first rank, which hosts the store, restarts everything.
-    let first = started.rank(0, 0);
-    signal(first, libc::SIGKILL);
-    for (machine, ended) in started.end().into_iter().enumerate() {
-        assert_eq!(ended.code, Some(0), "machine {machine}: {}", ended.err);
-    }
-    assert_same_bits(&run, &whole);
-    assert_eq!(numbers(&metrics(&run).0), (0..30).collect::<Vec<_>>(), "every step once");
 }
 
 /// Returns `Some` while a checkpoint is being written that is newer than all complete ones.
@@ -454,108 +400,6 @@ fn unfinished_save(run: &Path) -> Option<()> {
         name.strip_prefix(".step-")?.strip_suffix(".globalsplat-partial")?.parse::<u64>().ok()
     });
     (partial.max()? > checkpoints(run).pop().unwrap_or(0)).then_some(())
-}
-
-#[test]
-fn a_rank_that_dies_ends_all_with_one_sentence() {
-    let Some(_turn) = turn() else { return };
-    let Some(torchrun) = torchrun() else { return };
-    let (folder, config) = data(4);
-    let run = folder.path().join("run");
-    let arguments = train(&config, &run, &["train.steps=40", "train.checkpoint_every=4"]);
-    let mut started = Started::by_torchrun(&torchrun, 2, &[], &text(&arguments));
-    started.wait_for("a checkpoint", || (metrics(&run).0.len() > 8).then_some(()));
-    let begun = Instant::now();
-    let second = started.rank(1, 0);
-    signal(second, libc::SIGKILL);
-    let ended = started.end().remove(0);
-    assert!(begun.elapsed() < TIMEOUT && ended.code != Some(0), "{:?}", ended.code);
-    let [sentence] = sentences(&ended.err)[..] else { panic!("one sentence: {}", ended.err) };
-    let expected =
-        ["distributed communication failed (", "); restart the processes to resume from the last checkpoint"];
-    assert!(expected.iter().all(|part| sentence.contains(part)), "{sentence}");
-
-    // One process resumes a run of two.
-    let saved = checkpoints(&run).pop().unwrap();
-    assert!((8..40).contains(&saved), "{saved}");
-    succeed(&text(&arguments));
-    assert_eq!(numbers(&metrics(&run).0), (0..40).collect::<Vec<_>>());
-    let state = fs::read(globalsplat::train::latest_checkpoint(&run).unwrap().join("state.json")).unwrap();
-    let state: Value = serde_json::from_slice(&state).unwrap();
-    assert_eq!(state["samples"].as_u64(), Some(2 * saved + (40 - saved)));
-}
-
-#[test]
-fn a_rank_that_hangs_ends_all_with_one_sentence() {
-    let Some(turn) = turn() else { return };
-    let Some(torchrun) = torchrun() else { return };
-    let (folder, config) = data(2);
-    let run = folder.path().join("run");
-    let arguments = train(&config, &run, &["train.steps=1000000", "train.checkpoint_every=100000"]);
-    let mut started = Started::by_torchrun(&torchrun, 2, &[], &text(&arguments));
-    started.wait_for("a step", || (metrics(&run).0.len() > 2).then_some(()));
-    let [first, second] = [0, 1].map(|rank| started.rank(rank, 0));
-    let begun = Instant::now();
-    hold(second);
-    // All processes are blocked: other tests may run.
-    drop(turn);
-    while state(first).is_some_and(|(state, _)| state != 'Z') {
-        assert!(begun.elapsed() < TIMEOUT, "the first rank still waits");
-        sleep(Duration::from_millis(20));
-    }
-    assert_eq!(sentences(&started.read_output("err0")), ["rank 1 of 2 sent no heartbeat for 25 seconds"]);
-    // torchrun would wait for it half a minute longer.
-    signal(second, libc::SIGKILL);
-    let ended = started.end().remove(0);
-    assert_ne!(ended.code, Some(0));
-    assert_eq!(sentences(&ended.err).len(), 1, "{}", ended.err);
-}
-
-#[test]
-fn ranks_load_ahead_from_step_to_step() {
-    let Some(_turn) = turn() else { return };
-    let (folder, config) = data(2);
-    let run = folder.path().join("run");
-    let arguments = train(&config, &run, &["train.steps=1000000", "train.checkpoint_every=100000"]);
-    let mut started = Started::by_environment(2, &text(&arguments));
-    let ranks: Vec<u32> = started.processes.iter().map(Child::id).collect();
-    let mut loaders_after = |steps: usize| {
-        started.wait_for("a step", || (metrics(&run).0.len() >= steps).then_some(()));
-        ranks.iter().map(|&rank| threads(rank, "loader-")).collect::<Vec<_>>()
-    };
-    let (before, after) = (loaders_after(2), loaders_after(8));
-    assert!(before.iter().all(|threads| !threads.is_empty()) && before == after, "{before:?} {after:?}");
-}
-
-/// Returns the threads of a process whose names begin with `name`.
-fn threads(process: u32, name: &str) -> Vec<String> {
-    let threads = fs::read_dir(format!("/proc/{process}/task")).unwrap().map(|entry| entry.unwrap().path());
-    let is_called =
-        |thread: &PathBuf| fs::read_to_string(thread.join("comm")).is_ok_and(|of| of.starts_with(name));
-    threads.filter(is_called).map(|thread| arg(&thread).to_string()).collect()
-}
-
-#[test]
-fn ranks_that_are_asked_to_stop_save_first() {
-    let Some(_turn) = turn() else { return };
-    let Some(torchrun) = torchrun() else { return };
-    let (folder, config) = data(4);
-    let [whole, run] = ["whole", "run"].map(|name| folder.path().join(name));
-    let settings = ["train.steps=100", "train.checkpoint_every=100"];
-    succeed_together(2, &text(&train(&config, &whole, &settings)));
-    let arguments = train(&config, &run, &settings);
-    let mut started = Started::by_torchrun(&torchrun, 2, &[], &text(&arguments));
-    started.wait_for("a step", || (metrics(&run).0.len() > 5).then_some(()));
-    signal(started.processes[0].id(), libc::SIGTERM);
-    let ended = started.end().remove(0);
-    assert_ne!(ended.code, Some(0));
-    let [sentence] = sentences(&ended.err)[..] else { panic!("one sentence: {}", ended.err) };
-    let done = metrics(&run).0.len();
-    let saved = format!("stopped; {}/checkpoints/step-{done:08} is complete", arg(&run));
-    assert!(sentence.starts_with(&saved) && sentence.ends_with("the same command resumes"), "{sentence}");
-    assert!(done < 100 && checkpoints(&run) == [done as u64]);
-    succeed_together(2, &text(&arguments));
-    assert_same_bits(&run, &whole);
 }
 
 #[test]
@@ -579,24 +423,9 @@ fn an_error_is_printed_once() {
         let err: String = ended.iter().map(|of| of.err.as_str()).collect();
         let [sentence] = sentences(&err)[..] else { panic!("{setting}: one sentence: {err}") };
         assert!(sentence.contains(expected) && !sentence.contains("communication failed"), "{sentence}");
+        // The other rank's communication fails, which doesn't change the exit code of the first.
+        assert_eq!(ended[0].code, Some(2), "{setting}: {err}");
     }
-}
-
-/// The first rank hosts the store, and waits for the other one after its failure. That must not change its exit code.
-#[test]
-fn an_invalid_request_that_only_the_first_rank_detects_exits_with_2() {
-    let Some(_turn) = turn() else { return };
-    let (folder, config) = data(2);
-    let run = folder.path().join("run");
-    fs::create_dir(&run).unwrap();
-    fs::write(run.join("config.toml"), "").unwrap();
-    let ended = Started::by_environment(2, &text(&train(&config, &run, &[]))).end();
-    assert_eq!((ended[0].code, ended[1].code), (Some(2), Some(1)), "{}{}", ended[0].err, ended[1].err);
-    let [sentence] = sentences(&ended[0].err)[..] else { panic!("one sentence: {}", ended[0].err) };
-    assert!(
-        sentence.contains("config.toml that no run wrote") && sentences(&ended[1].err).is_empty(),
-        "{sentence}"
-    );
 }
 
 #[test]
@@ -605,15 +434,11 @@ fn ranks_with_different_training_are_refused() {
     let (folder, config) = data(2);
     let (_more, more) = data(3);
     let run = folder.path().join("run");
-    let mut shards = train(&config, &run, &[]);
-    shards.push("--shard-optimizer".into());
     let others = [
         (
             train(&config, &run, &["train.seed=5"]),
             "configuration differs from the first rank's: train.seed 0 → 5",
         ),
-        (train(&config, &run, &["data.flip=true"]), "data.flip false → true"),
-        (shards, "--shard-optimizer false → true"),
         (train(&more, &run, &[]), "this rank's training scenes differ from the first rank's: 3 of 3"),
     ];
     let first = train(&config, &run, &[]);

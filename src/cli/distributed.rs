@@ -1,13 +1,13 @@
 //! Distributed runs: this process as one of several that `torchrun` started.
 
 use super::device;
+use globalsplat::distributed::{DistributedEnv, ProcessGroup, Rendezvous};
 use globalsplat::error::{Error, Result};
-use globalsplat::ranks::{DistributedEnv, ProcessGroup, Watchdog};
 use std::sync::OnceLock;
 use tch::Device;
 
 /// Connection to the other processes, if there are any.
-static WATCH: OnceLock<Watchdog> = OnceLock::new();
+static RENDEZVOUS: OnceLock<Rendezvous> = OnceLock::new();
 
 /// Joins the group of processes started together with this one, to work on the device called `name`: `cuda` means a GPU of its
 /// own for each process.
@@ -15,13 +15,8 @@ pub fn join(name: &str) -> Result<(ProcessGroup, Device)> {
     let Some(dist_env) = DistributedEnv::from_env()? else {
         return Ok((ProcessGroup::single(), device::parse(name)?));
     };
-    let watch = Watchdog::start(&dist_env, |why| {
-        why.iter().for_each(|why| eprintln!("globalsplat: {why}"));
-        // Work that waits for a hung rank is abandoned.
-        // SAFETY: nothing runs after it.
-        unsafe { libc::_exit(super::FAILED.into()) }
-    })?;
-    let watch = WATCH.get_or_init(|| watch);
+    let rendezvous = Rendezvous::connect(dist_env.clone())?;
+    let rendezvous = RENDEZVOUS.get_or_init(|| rendezvous);
     // The processes of a machine share its cores, as torchrun divides libtorch's threads.
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let threads = (cores / dist_env.local_world_size).max(1);
@@ -40,7 +35,7 @@ pub fn join(name: &str) -> Result<(ProcessGroup, Device)> {
         }
         name => device::parse(name)?,
     };
-    Ok((ProcessGroup::join(&dist_env, watch.store(), device)?, device))
+    Ok((ProcessGroup::join(rendezvous, device)?, device))
 }
 
 /// Returns `true` in the process that prints messages on behalf of all.
@@ -49,7 +44,7 @@ pub fn is_main_process() -> bool {
 }
 
 /// Returns an error if torchrun started several processes for a command that can't be distributed.
-pub fn refuse() -> Result<()> {
+pub fn require_single_process() -> Result<()> {
     let by_torchrun = std::env::var_os("TORCHELASTIC_RUN_ID").is_some();
     let Ok(Some(DistributedEnv { rank, ranks, .. })) = DistributedEnv::from_env() else { return Ok(()) };
     match (by_torchrun, rank) {
@@ -65,15 +60,8 @@ pub fn refuse() -> Result<()> {
 /// Returns the error message that this process should print, or `None` if another process reports it.
 /// `is_secondary` is `true` for a failed collective, which is usually the consequence of another rank's error.
 pub fn message_to_print(message: &str, is_secondary: bool) -> Option<String> {
-    match WATCH.get() {
-        Some(watch) => watch.message_to_print(message, is_secondary),
+    match RENDEZVOUS.get() {
+        Some(rendezvous) => rendezvous.message_to_print(message, is_secondary),
         None => Some(message.into()),
-    }
-}
-
-/// Leaves the group of processes; the last call of a process.
-pub fn leave(failed: bool) {
-    if let Some(watch) = WATCH.get() {
-        watch.leave(failed);
     }
 }

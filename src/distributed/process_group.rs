@@ -1,19 +1,23 @@
-//! Collectives of all ranks, by c10d. Every rank calls them in the same order.
+//! Collectives of all ranks and their summed gradients, by c10d. Every rank calls them in the same order.
 
-use super::dist_env::DistributedEnv;
+use super::env::Rendezvous;
 use crate::error::{Error, Result};
-use crate::ffi::take_outputs;
 use cxx::UniquePtr;
-use globalsplat_csrc::ranks as ffi;
+use globalsplat_csrc::distributed as ffi;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::fmt;
 use tch::{Device, Tensor};
 
-/// Timeout of a collective, in seconds: 20 days, in practice as long as the processes live. [`super::Watchdog`] notices a rank that is
-/// gone. The collective waits for a rank that has more to do, writes to a slow disk, or waits for free space on a full one. The timeout in
-/// milliseconds fits into 32 bits.
-pub(super) const COLLECTIVE_TIMEOUT_SECONDS: i64 = 20 * 24 * 60 * 60;
+/// Timeout of a collective, in seconds. It also covers waiting for a rank that has more scenes to evaluate, or that waits for free space on
+/// a full disk, so it is longer than c10d's default of half an hour.
+const COLLECTIVE_TIMEOUT_SECONDS: i64 = 2 * 60 * 60;
+/// Maximum size of a bucket, in bytes: the bucket size of torch's DistributedDataParallel.
+const MAX_BUCKET_BYTES: i64 = 25 << 20;
+/// Minimum size of a bucket, in bytes. Smaller buckets take longer to start than to send.
+const MIN_BUCKET_BYTES: i64 = 1 << 20;
+/// Number of buckets of a small network, so that all but the last can be sent while the backward pass is running.
+const MIN_BUCKETS: i64 = 8;
 
 /// Process group of all ranks, as seen by one of them.
 pub struct ProcessGroup {
@@ -33,7 +37,7 @@ impl fmt::Debug for ProcessGroup {
 }
 
 /// Returns the error for a failed collective. The cause is almost always that another rank is gone.
-pub(super) fn distributed_error(why: cxx::Exception) -> Error {
+fn distributed_error(why: cxx::Exception) -> Error {
     Error::Distributed { message: why.what().lines().next().unwrap_or_default().to_string() }
 }
 
@@ -59,43 +63,34 @@ impl ProcessGroup {
         ProcessGroup { inner: None, rank: 0, ranks: 1, local_world_size: 1, device: Device::Cpu }
     }
 
-    /// Joins the group of all ranks at `store`, for collectives on `device`: by Gloo on CPUs, by NCCL on GPUs.
+    /// Joins the group of all ranks that meet at `rendezvous`, for collectives on `device`: by Gloo on CPUs, by NCCL on GPUs.
     ///
     /// # Errors
     /// Returns an error if the build lacks this backend, or if other ranks don't join.
-    pub fn join(dist_env: &DistributedEnv, store: &ffi::Store, device: Device) -> Result<Self> {
-        ProcessGroup::join_with_timeout(dist_env, store, device, COLLECTIVE_TIMEOUT_SECONDS)
-    }
-
-    /// Joins a group like [`ProcessGroup::join`], with a timeout of `seconds` for collectives.
-    pub(super) fn join_with_timeout(
-        dist_env: &DistributedEnv,
-        store: &ffi::Store,
-        device: Device,
-        seconds: i64,
-    ) -> Result<Self> {
+    pub fn join(rendezvous: &Rendezvous, device: Device) -> Result<Self> {
+        let Rendezvous { store, env } = rendezvous;
         let without = |what: &str, install: &str| {
             Error::request(format!(
                 "this program was built without {what}, which {} processes need: {install}, then `touch csrc/build.rs` and build \
                  again",
-                dist_env.ranks
+                env.ranks
             ))
         };
-        let (rank, ranks) = (dist_env.rank as i32, dist_env.ranks as i32);
+        let (rank, ranks) = (env.rank as i32, env.ranks as i32);
         let Backends { gloo, nccl } = Backends::built_in();
         let inner = match device {
             Device::Cuda(_) if !nccl => {
                 let install = "install what requirements.txt pins beside libtorch's wheel";
                 return Err(without("NCCL", install));
             }
-            Device::Cuda(_) => ffi::new_nccl_group(store, rank, ranks, seconds),
+            Device::Cuda(_) => ffi::new_nccl_group(store, rank, ranks, COLLECTIVE_TIMEOUT_SECONDS),
             _ if !gloo => {
                 return Err(without(
                     "Gloo",
                     "install its headers (Debian and Ubuntu: apt install libgloo-dev)",
                 ));
             }
-            _ => ffi::new_gloo_group(store, rank, ranks, seconds),
+            _ => ffi::new_gloo_group(store, rank, ranks, COLLECTIVE_TIMEOUT_SECONDS),
         };
         let inner = Some(inner.map_err(|e| {
             let why = e.what().lines().next().unwrap_or_default().to_string();
@@ -103,9 +98,9 @@ impl ProcessGroup {
         })?);
         Ok(ProcessGroup {
             inner,
-            rank: dist_env.rank,
-            ranks: dist_env.ranks,
-            local_world_size: dist_env.local_world_size,
+            rank: env.rank,
+            ranks: env.ranks,
+            local_world_size: env.local_world_size,
             device,
         })
     }
@@ -130,16 +125,12 @@ impl ProcessGroup {
         self.rank == 0
     }
 
-    pub(super) fn inner(&self) -> Option<&ffi::ProcessGroup> {
-        self.inner.as_deref()
-    }
-
     /// Shuts the group down after the last collective, if there was no error. All ranks call this.
     ///
     /// # Errors
     /// Returns an error if another rank is gone.
-    pub fn leave(&self) -> Result<()> {
-        self.inner.as_ref().map_or(Ok(()), |inner| inner.shut_down().map_err(distributed_error))
+    pub fn shutdown(&self) -> Result<()> {
+        self.inner.as_ref().map_or(Ok(()), |inner| inner.shutdown().map_err(distributed_error))
     }
 
     /// Replaces `tensor` by its sum over all ranks, in place (an all-reduce). It has the same shape and kind on all ranks.
@@ -154,16 +145,14 @@ impl ProcessGroup {
         }
     }
 
-    /// Replaces `tensor` by that of rank `from`, in place (a broadcast). It has the same shape and kind on all ranks.
+    /// Replaces `tensor` by that of the first rank, in place. It has the same shape and kind on all ranks.
     ///
     /// # Errors
     /// Returns an error if another rank is gone.
-    pub fn broadcast(&self, from: usize, tensor: &Tensor) -> Result<()> {
+    pub fn broadcast(&self, tensor: &Tensor) -> Result<()> {
         match &self.inner {
             // SAFETY: the tensor is alive, and the caller doesn't use it during the call.
-            Some(inner) => {
-                unsafe { inner.broadcast(tensor.as_ptr() as usize, from as i32) }.map_err(distributed_error)
-            }
+            Some(inner) => unsafe { inner.broadcast(tensor.as_ptr() as usize) }.map_err(distributed_error),
             None => Ok(()),
         }
     }
@@ -178,11 +167,11 @@ impl ProcessGroup {
         }
         let bytes = rmp_serde::to_vec_named(&value).expect("a serializable value");
         let lengths = self.all_gather(&Tensor::from_slice(&[bytes.len() as i64]))?;
-        let lengths = Vec::<i64>::try_from(lengths.view(-1)).expect("whole numbers");
+        let lengths = Vec::<i64>::try_from(lengths.view(-1)).expect("an int64 for each rank");
         let longest = *lengths.iter().max().expect("a rank") as usize;
         let padded = [bytes.as_slice(), &vec![0; longest - bytes.len()]].concat();
-        let all =
-            Vec::<u8>::try_from(self.all_gather(&Tensor::from_slice(&padded))?.view(-1)).expect("bytes");
+        let all = self.all_gather(&Tensor::from_slice(&padded))?;
+        let all = Vec::<u8>::try_from(all.view(-1)).expect("a row of bytes for each rank");
         let value = lengths.iter().enumerate().map(|(rank, &length)| {
             let bytes = &all[rank * longest..][..length as usize];
             rmp_serde::from_slice(bytes)
@@ -201,13 +190,60 @@ impl ProcessGroup {
         value.ok_or_else(|| Error::failed("rank 0 sent no value"))
     }
 
-    /// Returns the tensors of all ranks, stacked along a new first dimension, on the CPU.
-    fn all_gather(&self, tensor: &Tensor) -> Result<Tensor> {
-        let inner = self.inner.as_deref().expect("other ranks");
-        let tensor = tensor.to_device(self.device);
-        // SAFETY: the tensor is alive, and on success the C++ side has stored a new tensor at `out`.
-        let [all] = unsafe { take_outputs(|out| inner.all_gather(tensor.as_ptr() as usize, out)) }
-            .map_err(distributed_error)?;
-        Ok(all.to_device(Device::Cpu))
+    /// Returns the whole numbers `[N]` of all ranks, stacked along a new first dimension, on the CPU: the sum of tensors that are 0 except in
+    /// a rank's own row.
+    fn all_gather(&self, numbers: &Tensor) -> Result<Tensor> {
+        let rows = Tensor::zeros([self.ranks as i64, numbers.numel() as i64], (numbers.kind(), self.device));
+        rows.get(self.rank as i64).copy_(numbers);
+        self.all_reduce(&rows)?;
+        Ok(rows.to_device(Device::Cpu))
+    }
+}
+
+/// Gradient buckets of a network's parameters, which are summed over all ranks while the backward pass is still running.
+pub struct Buckets {
+    /// C++ implementation, or `None` if the group has only one rank.
+    inner: Option<UniquePtr<ffi::Buckets>>,
+}
+
+impl fmt::Debug for Buckets {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str("Buckets")
+    }
+}
+
+impl Buckets {
+    /// Creates the buckets of `parameters`, leaf tensors of one kind on one device. They are approximately in the order in which the
+    /// backward pass computes their gradients; the order must be the same on all ranks.
+    ///
+    /// # Panics
+    /// Panics if the parameters differ in kind or device, or aren't leaves that require gradients.
+    pub fn new(group: &ProcessGroup, parameters: &[Tensor]) -> Self {
+        let bytes: usize = parameters.iter().map(|t| t.numel() * t.kind().elt_size_in_bytes()).sum();
+        let bytes = (bytes as i64 / MIN_BUCKETS).clamp(MIN_BUCKET_BYTES, MAX_BUCKET_BYTES);
+        Buckets::with_bucket_bytes(group, parameters, bytes)
+    }
+
+    pub(super) fn with_bucket_bytes(group: &ProcessGroup, parameters: &[Tensor], bytes: i64) -> Self {
+        let addresses: Vec<usize> = parameters.iter().map(|t| t.as_ptr() as usize).collect();
+        // SAFETY: the tensors outlive the call; the C++ side holds references of its own to what it keeps.
+        let inner = group.inner.as_deref().map(|group| unsafe { ffi::buckets(group, &addresses, bytes) });
+        Buckets { inner: inner.transpose().expect("leaves of one kind") }
+    }
+
+    /// Marks the start of the last backward pass of a step. From now on it computes each parameter's gradient once, or not at all.
+    pub fn begin(&self) {
+        if let Some(inner) = &self.inner {
+            inner.begin();
+        }
+    }
+
+    /// Waits until the gradients are the sums over all ranks. Returns the number of gradients, which must be the same on all ranks.
+    ///
+    /// # Errors
+    /// Returns an error if another rank is gone.
+    pub fn finish(&self) -> Result<usize> {
+        let Some(inner) = &self.inner else { return Ok(0) };
+        inner.finish().map_err(distributed_error)
     }
 }

@@ -1,51 +1,43 @@
 //! Distributed processes (ranks) that work together, on one machine or on many. `torchrun` starts them, and libtorch's c10d connects them.
 //! A program that runs alone is the only rank of its group; all collectives are then no-ops.
 
-mod buckets;
-mod dist_env;
-mod group;
-mod watchdog;
+mod env;
+mod process_group;
 
-pub use buckets::Buckets;
-pub use dist_env::DistributedEnv;
-pub use group::{Backends, ProcessGroup};
-pub use watchdog::Watchdog;
+pub use env::{DistributedEnv, Rendezvous};
+pub use process_group::{Backends, Buckets, ProcessGroup};
 
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use globalsplat_csrc::ranks as ffi;
+    use globalsplat_csrc::distributed as ffi;
+    use std::net::TcpListener;
+    use std::sync::Barrier;
     use tch::{Device, Kind, Tensor};
 
     /// Runs `work` on every rank of a group of `ranks` ranks, each in its own thread, and returns the results.
     pub(crate) fn run_on_ranks<T: Send>(ranks: usize, work: impl Fn(ProcessGroup) -> T + Sync) -> Vec<T> {
-        run_on_ranks_with_timeout(ranks, group::COLLECTIVE_TIMEOUT_SECONDS, work)
-    }
-
-    fn run_on_ranks_with_timeout<T: Send>(
-        ranks: usize,
-        seconds: i64,
-        work: impl Fn(ProcessGroup) -> T + Sync,
-    ) -> Vec<T> {
-        let store = ffi::connect("127.0.0.1", 0, true, "test", 60).expect("a store");
+        let port =
+            TcpListener::bind("127.0.0.1:0").and_then(|socket| socket.local_addr()).expect("a port").port();
         // A rank that leaves before all ranks have joined would fail the join, not the test.
-        let have_met = std::sync::Barrier::new(ranks);
+        let have_met = Barrier::new(ranks);
         std::thread::scope(|scope| {
             let rank = |rank| {
-                let (store, have_met, work) =
-                    (store.clone_connection().expect("a connection"), &have_met, &work);
+                let (have_met, work) = (&have_met, &work);
+                let host = "127.0.0.1".into();
+                let env = DistributedEnv {
+                    rank,
+                    ranks,
+                    local_rank: rank,
+                    local_world_size: ranks,
+                    restarts: 0,
+                    host,
+                    port,
+                    is_agent_store: false,
+                };
                 scope.spawn(move || {
-                    let dist_env = DistributedEnv {
-                        rank,
-                        ranks,
-                        local_rank: rank,
-                        local_world_size: ranks,
-                        restarts: 0,
-                        host: "127.0.0.1".into(),
-                        port: 0,
-                        is_agent_store: true,
-                    };
-                    let group = ProcessGroup::join_with_timeout(&dist_env, &store, Device::Cpu, seconds);
+                    let rendezvous = Rendezvous::connect(env).expect("a store");
+                    let group = ProcessGroup::join(&rendezvous, Device::Cpu);
                     have_met.wait();
                     work(group.expect("a group"))
                 })
@@ -74,42 +66,23 @@ pub(crate) mod tests {
                 let sum = Tensor::full([2, 3], f64::from(number), (Kind::Float, Device::Cpu));
                 group.all_reduce(&sum).expect("a sum");
                 let copy = Tensor::from_slice(&[number]);
-                group.broadcast(ranks - 1, &copy).expect("a copy");
+                group.broadcast(&copy).expect("a copy");
                 // A list of a different length on each rank, a NaN, and a nested `None`, which JSON can't represent.
-                let said = (vec![group.rank(); group.rank()], f64::NAN, Some(None::<u64>));
-                let heard = group.all_gather_object(said).expect("words");
+                let value = (vec![group.rank(); group.rank()], f64::NAN, Some(None::<u64>));
+                let gathered = group.all_gather_object(value).expect("values");
                 let first =
-                    group.broadcast_object(group.is_main_process().then_some(None::<u64>)).expect("a word");
-                (Vec::<f32>::try_from(sum.view(-1)).unwrap(), copy.double_value(&[0]), heard, first)
+                    group.broadcast_object(group.is_main_process().then_some(None::<u64>)).expect("a value");
+                (Vec::<f32>::try_from(sum.view(-1)).unwrap(), copy.double_value(&[0]), gathered, first)
             });
             let expected = (1..=ranks).sum::<usize>() as f32;
-            for (sum, copy, heard, first) in found {
+            for (sum, copy, gathered, first) in found {
                 assert_eq!(sum, vec![expected; 6]);
-                assert_eq!(copy, ranks as f64);
+                assert_eq!(copy, 1.);
                 assert_eq!(first, None);
-                for (rank, (list, number, _)) in heard.iter().enumerate() {
-                    assert!(*list == vec![rank; rank] && number.is_nan(), "{heard:?}");
+                for (rank, (list, number, _)) in gathered.iter().enumerate() {
+                    assert!(*list == vec![rank; rank] && number.is_nan(), "{gathered:?}");
                 }
             }
-        }
-    }
-
-    /// Ranks wait for a slower rank, as in `eval --data`, where all ranks gather their results when each has processed its scenes.
-    #[test]
-    fn collectives_wait_for_slow_ranks() {
-        if !can_meet() {
-            return;
-        }
-        const { assert!(group::COLLECTIVE_TIMEOUT_SECONDS > 7 * 24 * 60 * 60) };
-        // c10d fails after its timeout. Joining must also take less than the timeout, even on a busy machine.
-        for (timeout, work, is_heard) in [(5, 7, false), (group::COLLECTIVE_TIMEOUT_SECONDS, 2, true)] {
-            let found = run_on_ranks_with_timeout(2, timeout, |group| {
-                if group.rank() == 1 {
-                    std::thread::sleep(std::time::Duration::from_secs(work));
-                }
-                group.all_gather_object(group.rank())
-            });
-            assert_eq!(found[0].is_ok(), is_heard, "a timeout of {timeout} s: {:?}", found[0]);
         }
     }
 

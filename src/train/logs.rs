@@ -1,14 +1,19 @@
-//! Metrics of a run, written to `metrics.jsonl`: one line for every step and for every validation.
+//! Logs of a run: `metrics.jsonl`, with one line for every step and for every validation, and `RUN/tensorboard`, with one event file for
+//! every time that the run was started or resumed.
 
-use super::METRICS_FILE;
-use super::step_report::StepReport;
-use super::validator::Score;
+use super::run::Score;
+use super::step::StepReport;
+use super::{METRICS_FILE, is_due};
+use crate::data::Batch;
 use crate::error::{Error, Result};
-use crate::io::{AppendFile, write_atomically};
+use crate::io::{AppendFile, EventFile, tile_horizontally, write_atomically};
 use crate::loss::Term;
+use crate::model::{GlobalSplat, Stage};
+use crate::render::{DEFAULT_EPS2D, colourize_depth, render};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::Path;
+use tch::{Device, Tensor};
 
 /// Returns the values that describe a step, with their names, except the terms of its loss.
 pub(super) fn step_values(report: &StepReport, samples_per_second: f64) -> [(&'static str, f64); 7] {
@@ -149,6 +154,71 @@ impl Curves {
         let training = steps.chunks(steps.len().div_ceil(max_points as usize)).map(mean).collect();
         Ok(Curves { training, held_out })
     }
+}
+
+/// Event file of the current start of the run.
+#[derive(Debug)]
+pub(super) struct TensorBoard {
+    file: EventFile,
+    /// Number of steps between scalars.
+    every: u64,
+}
+
+impl TensorBoard {
+    /// Creates a new file in the run's folder. Call [`TensorBoard::start`] next.
+    pub fn create(run: &Path, every: u64) -> Result<Self> {
+        Ok(TensorBoard { file: EventFile::create_for(run)?, every })
+    }
+
+    /// Records that the run continues with `step`. Earlier events of this step and of later ones become void.
+    pub fn start(&mut self, step: u64) -> Result<()> {
+        self.file.start(step)
+    }
+
+    pub fn log_step(&mut self, report: &StepReport, samples_per_second: f64) -> Result<()> {
+        if !is_due(self.every, report.step) {
+            return Ok(());
+        }
+        let tagged = |group: &'static str| move |(name, value)| (format!("{group}/{name}"), value);
+        let values = step_values(report, samples_per_second).map(tagged("train"));
+        let terms = loss_terms(report).map(tagged("loss"));
+        self.file.write_scalars(report.step, &[&values[..], &terms].concat())
+    }
+
+    pub fn log_picture(&mut self, report: &StepReport) -> Result<()> {
+        match &report.picture {
+            Some(picture) => self.file.write_image(report.step, "train/views", picture),
+            None => Ok(()),
+        }
+    }
+
+    /// Logs the validation scores after step `step`.
+    pub fn log_validation(&mut self, step: u64, score: &Score) -> Result<()> {
+        let values = [
+            ("validation/psnr", score.psnr),
+            ("validation/ssim", score.ssim),
+            ("validation/stage", f64::from(score.stage.index)),
+        ];
+        self.file.write_scalars(step, &values.map(|(tag, value)| (tag.to_string(), value)))
+    }
+}
+
+/// Renders a preview of the first scene of `batch`, which isn't paired: a context photo, a target photo, its rendered image, its depth
+/// and its accumulated opacity, side by side, `[3, H, W']` in [0, 1] on the CPU.
+pub(super) fn preview(model: &GlobalSplat, batch: &Batch, stage: Stage) -> Result<Tensor> {
+    let Batch { context, target, .. } = batch.slice(0, 1);
+    let middle = |views: &Tensor| views.size()[1] as usize / 2;
+    let (shown, target) =
+        (context.select(&[middle(&context.images)]), target.select(&[middle(&target.images)]));
+    let pictures = tch::no_grad(|| {
+        let decoded = model.forward(&context.model_input(), stage);
+        render(&decoded.gaussians, &target.cameras(), DEFAULT_EPS2D)
+    })?;
+    let first = |t: &Tensor| t.select(0, 0).select(0, 0).to_device(Device::Cpu);
+    let (photo, ground_truth, rgb) = (first(&shown.images), first(&target.images), first(&pictures.rgb));
+    let (depth, alpha) = (first(&pictures.depth), first(&pictures.alpha));
+    let grey = alpha.unsqueeze(0).expand([3, -1, -1], false);
+    Ok(tile_horizontally(&[photo, ground_truth, rgb.clamp(0., 1.), colourize_depth(&depth, &alpha), grey]))
 }
 
 #[cfg(test)]

@@ -1,8 +1,18 @@
-//! Rank of this process among those that `torchrun` started, read from the environment.
+//! Rank of this process among those that `torchrun` started, and the store through which they meet.
 
 use crate::error::{Error, Result};
+use cxx::UniquePtr;
+use globalsplat_csrc::distributed as ffi;
 use std::env;
 use std::str::FromStr;
+use std::time::Duration;
+
+/// Timeout for ranks to connect and for a store operation, in seconds.
+const CONNECT_TIMEOUT_SECONDS: i64 = 300;
+/// Time that a rank waits when it only sees a failed collective, so that the rank that caused the failure can print its error first.
+const REPORT_GRACE: Duration = Duration::from_secs(2);
+/// Key of the number of ranks that wanted to print an error. The first one prints it.
+const MESSAGE_CLAIMS: &str = "message_claims";
 
 /// Position of a process among the processes that were started together.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -89,15 +99,53 @@ impl<F: Fn(&str) -> Option<String>> Variables<F> {
     }
 }
 
+/// Connection to the store that all ranks share. It also chooses the rank that prints an error for all.
+pub struct Rendezvous {
+    pub(super) store: UniquePtr<ffi::Store>,
+    pub(super) env: DistributedEnv,
+}
+
+impl Rendezvous {
+    /// Connects to the store, which the first rank hosts if `torchrun` doesn't.
+    ///
+    /// # Errors
+    /// Returns an error if the store can't be reached.
+    pub fn connect(env: DistributedEnv) -> Result<Self> {
+        let is_server = !env.is_agent_store && env.rank == 0;
+        // torchrun's store outlives a restart, so each restart uses its own key prefix.
+        let restart = if env.is_agent_store { env.restarts } else { 0 };
+        let prefix = format!("globalsplat/{restart}");
+        let store = ffi::connect(&env.host, env.port, is_server, &prefix, CONNECT_TIMEOUT_SECONDS);
+        let store = store.map_err(|e| {
+            let why = e.what().lines().next().unwrap_or_default().to_string();
+            let DistributedEnv { rank, ranks, host, port, .. } = &env;
+            Error::failed(format!("rank {rank} of {ranks} can't reach the others at {host}:{port}: {why}"))
+        })?;
+        Ok(Rendezvous { store, env })
+    }
+
+    /// Returns the message that this rank should print for its failure `error`, or `None` if another rank has printed one. `is_secondary` is
+    /// `true` for a failed collective, which is usually the consequence of another rank's error. If the store is unreachable, the first rank
+    /// of each machine gets the message.
+    pub fn message_to_print(&self, error: &str, is_secondary: bool) -> Option<String> {
+        if is_secondary {
+            std::thread::sleep(REPORT_GRACE);
+        }
+        let should_print = match self.store.add(MESSAGE_CLAIMS, 1) {
+            Ok(claims) => claims == 1,
+            Err(_) => self.env.local_rank == 0,
+        };
+        let prefix = match self.env.rank {
+            0 => String::new(),
+            rank => format!("rank {rank} of {}: ", self.env.ranks),
+        };
+        should_print.then(|| prefix + error)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn dist_env(variables: &[(&str, &str)]) -> Result<Option<DistributedEnv>> {
-        let find =
-            |name: &str| variables.iter().find(|(of, _)| *of == name).map(|(_, value)| value.to_string());
-        DistributedEnv::from_variables(find)
-    }
 
     const ALL: [(&str, &str); 8] = [
         ("WORLD_SIZE", "8"),
@@ -110,52 +158,56 @@ mod tests {
         ("TORCHELASTIC_USE_AGENT_STORE", "True"),
     ];
 
+    fn parse(variables: &[(&str, &str)]) -> Result<Option<DistributedEnv>> {
+        let find = |name: &str| {
+            variables.iter().find(|(known, _)| *known == name).map(|(_, value)| value.to_string())
+        };
+        DistributedEnv::from_variables(find)
+    }
+
     #[test]
     fn torchrun_is_understood() {
-        let found = dist_env(&ALL).unwrap().unwrap();
-        let host = "node-0".to_string();
         let expected = DistributedEnv {
             rank: 5,
             ranks: 8,
             local_rank: 1,
             local_world_size: 4,
             restarts: 2,
-            host,
+            host: "node-0".into(),
             port: 29500,
             is_agent_store: true,
         };
-        assert_eq!(found, expected);
+        assert_eq!(parse(&ALL).unwrap(), Some(expected.clone()));
         // Other launchers set at least these variables.
-        let others = dist_env(&[ALL[0], ALL[1], ALL[4], ALL[5]]).unwrap().unwrap();
-        assert_eq!((others.local_rank, others.local_world_size, others.is_agent_store), (0, 1, false));
-    }
-
-    #[test]
-    fn single_process_needs_no_variables() {
-        assert_eq!(dist_env(&[]).unwrap(), None);
-        assert_eq!(dist_env(&[("RANK", "0")]).unwrap(), None);
-        assert_eq!(dist_env(&[("WORLD_SIZE", "1"), ("RANK", "0")]).unwrap(), None);
+        let others = parse(&[ALL[0], ALL[1], ALL[4], ALL[5]]).unwrap();
+        let defaults = DistributedEnv {
+            local_rank: 0,
+            local_world_size: 1,
+            restarts: 0,
+            is_agent_store: false,
+            ..expected
+        };
+        assert_eq!(others, Some(defaults));
+        for alone in [&[][..], &[("RANK", "0")], &[("WORLD_SIZE", "1"), ("RANK", "0")]] {
+            assert_eq!(parse(alone).unwrap(), None);
+        }
     }
 
     #[test]
     fn a_broken_environment_is_one_sentence() {
-        let error = |variables: &[(&str, &str)]| dist_env(variables).unwrap_err().to_string();
+        let error = |variables: &[(&str, &str)]| parse(variables).unwrap_err().to_string();
         let missing = error(&ALL[..5]);
         assert!(
             missing.starts_with("the environment's MASTER_PORT is missing, expected the value that torchrun"),
             "{missing}"
         );
-        let wrong = |name: &str, value: &'static str| {
-            error(&ALL.map(|(of, kept)| (of, if of == name { value } else { kept })))
-        };
-        assert_eq!(
-            wrong("WORLD_SIZE", "many"),
-            "the environment's WORLD_SIZE is many, expected a whole number"
-        );
-        assert_eq!(
-            wrong("MASTER_PORT", "70000"),
-            "the environment's MASTER_PORT is 70000, expected a whole number"
-        );
-        assert_eq!(wrong("RANK", "8"), "the environment's RANK is 8, expected less than WORLD_SIZE, 8");
+        for (name, value, expected) in [
+            ("WORLD_SIZE", "many", "a whole number"),
+            ("MASTER_PORT", "70000", "a whole number"),
+            ("RANK", "8", "less than WORLD_SIZE, 8"),
+        ] {
+            let found = error(&ALL.map(|(known, kept)| (known, if known == name { value } else { kept })));
+            assert_eq!(found, format!("the environment's {name} is {value}, expected {expected}"));
+        }
     }
 }

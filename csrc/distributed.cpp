@@ -1,8 +1,7 @@
-#include "ranks.h"
+#include "distributed.h"
 
 #include <ATen/core/grad_mode.h>
 #include <ATen/ops/cat.h>
-#include <ATen/ops/empty.h>
 #include <ATen/ops/zeros.h>
 #include <torch/csrc/autograd/function_hook.h>
 #include <torch/csrc/autograd/variable.h>
@@ -47,8 +46,6 @@ c10::intrusive_ptr<c10d::Work> start_one_at_a_time(const Start& start) {
 Store::Store(c10::intrusive_ptr<c10d::Store> store) : store_(std::move(store)) {}
 Store::~Store() = default;
 
-std::unique_ptr<Store> Store::clone_connection() const { return std::make_unique<Store>(store_->clone()); }
-
 int64_t Store::add(rust::Str key, int64_t amount) const { return store_->add(string(key), amount); }
 
 std::unique_ptr<Store> connect(rust::Str host, uint16_t port, bool is_server, rust::Str prefix, int64_t seconds) {
@@ -82,7 +79,7 @@ std::unique_ptr<ProcessGroup> new_gloo_group([[maybe_unused]] const Store& store
 ProcessGroup::ProcessGroup(Ranks ranks) : ranks_(std::move(ranks)) {}
 ProcessGroup::~ProcessGroup() = default;
 
-void ProcessGroup::shut_down() const { ranks_->shutdown(); }
+void ProcessGroup::shutdown() const { ranks_->shutdown(); }
 
 void ProcessGroup::all_reduce(size_t tensor) const {
   const at::NoGradGuard no_grad;
@@ -90,23 +87,10 @@ void ProcessGroup::all_reduce(size_t tensor) const {
   start_one_at_a_time([&] { return ranks_->allreduce(tensors); })->wait();
 }
 
-void ProcessGroup::broadcast(size_t tensor, int32_t from) const {
+void ProcessGroup::broadcast(size_t tensor) const {
   const at::NoGradGuard no_grad;
   std::vector<at::Tensor> tensors{borrowed_tensor(tensor).detach()};
-  c10d::BroadcastOptions options;
-  options.rootRank = from;
-  start_one_at_a_time([&] { return ranks_->broadcast(tensors, options); })->wait();
-}
-
-void ProcessGroup::all_gather(size_t tensor, rust::Slice<size_t> out) const {
-  const at::NoGradGuard no_grad;
-  std::vector<at::Tensor> inputs{borrowed_tensor(tensor).contiguous()};
-  auto sizes = inputs[0].sizes().vec();
-  sizes.insert(sizes.begin(), ranks_->getSize());
-  const at::Tensor all = at::empty(sizes, inputs[0].options());
-  std::vector<std::vector<at::Tensor>> outputs{all.unbind(0)};
-  start_one_at_a_time([&] { return ranks_->allgather(outputs, inputs); })->wait();
-  out[0] = reinterpret_cast<size_t>(new at::Tensor(all));
+  start_one_at_a_time([&] { return ranks_->broadcast(tensors); })->wait();
 }
 
 // State shared by the parameters' hooks. Backward passes of one step run one after the other, each in one thread.
