@@ -1,10 +1,8 @@
-// Robustness checks of the rasterizer, for all inputs and failures of the system: no data race, no out-of-bounds access, no deadlock, no
-// memory leak, and results that don't depend on the number of threads. scripts/sanitize.sh builds and runs this with sanitizers.
+// Robustness checks of the kernels for all inputs: no data race, no out-of-bounds access, no deadlock, no memory leak, and results that
+// don't depend on the number of threads. scripts/sanitize.sh builds and runs this with sanitizers.
 //
 //   checks CHECK short|long     prints how many renders, forward and backward, or calls were checked
-//   checks orders short N       runs without the N-th barrier of the GPU kernels, which must be detected
 //   checks simd                 prints the instruction set
-//   checks barriers             prints the number of barriers in these kernels
 #include <signal.h>
 #include <sys/wait.h>
 #include <unistd.h>
@@ -18,7 +16,6 @@
 #include <cstring>
 #include <functional>
 #include <memory>
-#include <new>
 #include <stdexcept>
 #include <string>
 #include <thread>
@@ -30,7 +27,6 @@
 #include "../kernels/multi_head_attention.h"
 #include "../kernels/optim.h"
 #include "../kernels/parallel.h"
-#include "injected_failures.h"
 #include "scenes.h"
 #include "schedules.h"
 
@@ -164,7 +160,7 @@ void for_both(const Scene<double>& scene, const Check& check) {
   check(as<double>(scene));
 }
 
-// Renders on one thread, without simulated failures.
+// Renders on one thread.
 template <class T>
 Render<T> expected(const Scene<T>& scene) {
   Render<T> render(scene, 1);
@@ -247,47 +243,14 @@ int64_t check_losses(const std::vector<int>& thread_counts) {
   return count;
 }
 
-// Reference for a step of Muon (muon.h), which doesn't transpose X, in scalar float64 code.
-std::vector<double> muon_reference(const raster::MuonStep& step, const raster::MuonMatrix& of) {
-  const auto [rows, columns] = std::array<int64_t, 2>{of.rows, of.columns};
-  std::vector<double> x(size_t(rows * columns));
-  double squares = 0;
-  for (size_t k = 0; k < x.size(); ++k) {
-    const double g = of.gradient[k], m = of.first[k] + (1 - step.beta) * (g - of.first[k]);
-    x[k] = g + step.beta * (m - g);
-    squares += x[k] * x[k];
-  }
-  for (double& number : x) number /= std::sqrt(squares) + 1e-7;
-  // left [rows, inner] · right [inner, across]
-  const auto product = [](const std::vector<double>& left, const std::vector<double>& right, int64_t inner, int64_t across) {
-    std::vector<double> out(left.size() / size_t(inner) * size_t(across));
-    for (int64_t i = 0; i < int64_t(out.size()) / across; ++i)
-      for (int64_t k = 0; k < inner; ++k)
-        for (int64_t j = 0; j < across; ++j) out[size_t(i * across + j)] += left[size_t(i * inner + k)] * right[size_t(k * across + j)];
-    return out;
-  };
-  for (int round = 0; round < 5; ++round) {
-    std::vector<double> across(x.size());
-    for (int64_t i = 0; i < rows; ++i)
-      for (int64_t j = 0; j < columns; ++j) across[size_t(j * rows + i)] = x[size_t(i * columns + j)];
-    const std::vector<double> square = product(x, across, columns, rows);
-    const std::vector<double> once = product(square, x, rows, columns), twice = product(square, once, rows, columns);
-    for (size_t k = 0; k < x.size(); ++k) x[k] = 3.4445 * x[k] - 4.7750 * once[k] + 2.0315 * twice[k];
-  }
-  const double rate = step.rate * 0.2 * std::sqrt(double(std::max(rows, columns)));
-  for (size_t k = 0; k < x.size(); ++k) x[k] = (1 - step.decay) * of.value[k] - rate * x[k];
-  return x;
-}
-
-// Steps of Muon on matrices of all shapes, with exactly the scratch memory that they request.
+// Steps of Muon on matrices of all shapes, with exactly the scratch memory that they request. parity/ compares their values.
 int64_t check_muon(const std::vector<int>& thread_counts) {
   const raster::MuonStep step{0.1, 0.01, 0.95};
-  std::vector<std::vector<float>> numbers;
-  std::vector<raster::MuonMatrix> all;
-  const auto draw = [&] {
+  const auto stepped = [&](int num_threads) {
+    begin("steps of Muon, " + std::to_string(num_threads) + " threads");
     Random random(12);
-    numbers.clear();
-    all.clear();
+    std::vector<std::vector<float>> numbers;
+    std::vector<raster::MuonMatrix> all;
     for (const auto& [rows, columns] : {std::array<int64_t, 2>{1, 1}, {1, 7}, {7, 1}, {20, 33}, {21, 23}, {128, 128}, {200, 65}}) {
       for (int of = 0; of < 3; ++of) {
         const std::vector<double> drawn = random.uniform(size_t(rows * columns), -1, 1);
@@ -296,25 +259,12 @@ int64_t check_muon(const std::vector<int>& thread_counts) {
       const size_t last = numbers.size() - 1;
       all.push_back({numbers[last - 2].data(), numbers[last].data(), numbers[last - 1].data(), rows, columns});
     }
-  };
-  draw();
-  for (const raster::MuonMatrix& matrix : all) {
-    begin("a step of Muon on " + std::to_string(matrix.rows) + " × " + std::to_string(matrix.columns));
-    const std::vector<double> expected = muon_reference(step, matrix);
-    const size_t bytes = sizeof(float) * size_t(raster::muon_scratch_size(matrix.rows, matrix.columns));
-    const std::unique_ptr<float, decltype(&std::free)> scratch(static_cast<float*>(std::aligned_alloc(64, bytes)), std::free);
-    raster::kernels().muon(step, matrix, scratch.get());
-    for (size_t k = 0; k < expected.size(); ++k)
-      expect(std::abs(matrix.value[k] - expected[k]) < 1e-5, "a step of Muon goes elsewhere");
-  }
-  const std::vector<std::vector<float>> one = numbers;
-  for (const int num_threads : thread_counts) {
-    begin("steps of Muon, " + std::to_string(num_threads) + " threads");
-    draw();
     raster::muon(step, all, num_threads);
-    for (size_t k = 0; k < one.size(); ++k) expect(same(numbers[k], one[k]), "threads change a step of Muon");
-  }
-  return int64_t(all.size() + thread_counts.size());
+    return numbers;
+  };
+  const std::vector<std::vector<float>> one = stepped(1);
+  for (const int num_threads : thread_counts) expect(stepped(num_threads) == one, "threads change a step of Muon");
+  return int64_t(thread_counts.size());
 }
 
 std::vector<raster::Bf16> cut_to_bf16(const std::vector<float>& numbers) {
@@ -469,56 +419,12 @@ int64_t callers(bool is_short) {
   return callers_of<float>(scenes, rounds) + callers_of<double>(scenes, rounds);
 }
 
-// Returns once `num_threads` threads are working at the same time.
-void wait_for_threads(int num_threads) {
-  std::atomic<int> arrived{0};
-  parallel_for(num_threads, num_threads, [&](int64_t) {
-    ++arrived;
-    while (arrived < num_threads) std::this_thread::yield();
-  });
-}
-
-Scene<double> small_scene() {
-  Random random(10);
-  return random_scene(random, "small", 20, 20, 2, 2, 40, 4);
-}
-
-// Failures to create all threads or some of them, and other uses of parallel_for().
+// Calls from tasks, and tasks that fail.
 int64_t threads(bool is_short) {
-  const Scene<float> scene = as<float>(small_scene());
-  Render<float> one = expected(scene);
-  int64_t count = 0;
-  const auto renders = [&](const char* what) {
-    begin(what);
-    Render<float> render(scene, 8);
-    render.draw();
-    render.backward();
-    render.expect_bits_of(one);
-    ++count;
-  };
-  fail_thread_creation();
-  renders("every thread refused");
-  renders("every thread refused again");
-
-  begin("no memory for a thread");
-  allow_thread_creation();
   std::atomic<int64_t> sum{0};
   const std::function<void(int64_t)> add = [&](int64_t i) { sum += i; };
-  fail_allocations(0, true);
-  parallel_for(8, 100, add);
-  expect(stop_failing_allocations() > 0 && sum == 4950, "the work wasn't done on the caller");
-  ++count;
-
-  wait_for_threads(3);
-  fail_thread_creation();
-  renders("the first two threads given, the others refused");
-  allow_thread_creation();
-  renders("threads refused before");
-  begin("threads given at last");
-  wait_for_threads(8);
-  ++count;
-
-  for (int round = 0; round < (is_short ? 20 : 1000); ++round) {
+  const int rounds = is_short ? 20 : 1000;
+  for (int round = 0; round < rounds; ++round) {
     begin("a call from a task");
     sum = 0;
     parallel_for(4, 10, [&](int64_t) { parallel_for(4, 100, add); });
@@ -537,51 +443,8 @@ int64_t threads(bool is_short) {
     sum = 0;
     parallel_for(4, 100, add);
     expect(sum == 4950, "the next call doesn't do its work");
-    count += 3;
   }
-  return count;
-}
-
-// Failures of every single allocation of a render, and of all allocations from one on.
-template <class T>
-int64_t memory_of(const Scene<T>& scene, int num_threads, bool all_after) {
-  begin("memory refused, " + type_name<T>() + ", " + std::to_string(num_threads) + " threads");
-  Render<T> one = expected(scene), render(scene, num_threads);
-  wait_for_threads(num_threads);
-  for (int64_t n = 0;; ++n) {
-    alarm(kTimeoutSeconds);
-    const int64_t before = count_live_blocks();
-    bool caught = false;
-    fail_allocations(n, all_after);
-    try {
-      render.draw();
-      render.backward();
-    } catch (const std::bad_alloc&) {
-      caught = true;
-    }
-    const int64_t refused = stop_failing_allocations();
-    render.drop();
-    expect(caught == (refused > 0), "the exception doesn't reach the caller");
-    expect(count_live_blocks() == before, "memory is lost");
-    if (!caught) {
-      expect(n > 0, "nothing asks for memory");
-      render.expect_bits_of(one);
-      return n;
-    }
-    render.draw();
-    render.backward();
-    render.expect_bits_of(one);
-    render.drop();
-  }
-}
-
-int64_t memory(bool is_short) {
-  int64_t count = 0;
-  for_both(small_scene(), [&](const auto& scene) {
-    for (const int num_threads : is_short ? std::vector<int>{3} : std::vector<int>{1, 2, 8})
-      for (const bool all_after : {false, true}) count += memory_of(scene, num_threads, all_after);
-  });
-  return count;
+  return 3 * rounds;
 }
 
 // The GPU kernels give the same results in other orders of blocks and threads.
@@ -613,7 +476,8 @@ int64_t orders(bool is_short) {
 
 // A child process renders correctly; it has a copy of everything but the threads.
 int64_t children(bool is_short) {
-  const Scene<float> scene = as<float>(small_scene());
+  Random random(10);
+  const Scene<float> scene = as<float>(random_scene(random, "small", 20, 20, 2, 2, 40, 4));
   Render<float> one = expected(scene);
   const auto render_as = [&](const char* what) {
     begin(what);
@@ -647,7 +511,6 @@ int main(int count, char** arguments) {
   } known[] = {{"bits", checks::bits},
                {"callers", checks::callers},
                {"threads", checks::threads},
-               {"memory", checks::memory},
                {"orders", checks::orders},
                {"children", checks::children}};
   signal(SIGALRM, checks::on_timeout);
@@ -660,16 +523,11 @@ int main(int count, char** arguments) {
       return 1;  // GLOBALSPLAT_SIMD names a set that isn't available
     }
   }
-  if (check == "barriers") {
-    std::printf("%d\n", cuda::emulated::barriers());
-    return 0;
-  }
-  if (count == 4) cuda::emulated::skip_barrier(std::atoi(arguments[3]));
   for (const auto& one : known)
-    if (check == one.name && (count == 3 || count == 4)) {
+    if (check == one.name && count == 3) {
       std::printf("%lld\n", static_cast<long long>(one.run(std::strcmp(arguments[2], "short") == 0)));
       return 0;
     }
-  std::fprintf(stderr, "checks simd, or bits, callers, threads, memory, orders or children, and short or long\n");
+  std::fprintf(stderr, "checks simd, or bits, callers, threads, orders or children, and short or long\n");
   return 2;
 }

@@ -26,8 +26,4 @@ struct Kernel {
 };
 const Kernel* kernel_named(const char* name);  // null if there is none
 
-// Number of barriers in the source, and a function that makes threads skip one of them from now on, to test that this is detected.
-int barriers();
-void skip_barrier(int place);
-
 }  // namespace globalsplat::cuda::emulated

@@ -29,8 +29,6 @@ constexpr Kernel kKernels[] = {
 
 }  // namespace
 
-int barriers() { return __COUNTER__; }
-
 const Kernel* kernel_named(const char* name) {
   for (const Kernel& kernel : kKernels)
     if (std::strcmp(kernel.name, name) == 0) return &kernel;

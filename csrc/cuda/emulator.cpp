@@ -100,7 +100,6 @@ Block& block() {
   return *own;
 }
 
-int skipped_barrier = -1;  // the barrier that all threads skip
 
 // Fills uninitialized memory with values that differ every time and are often NaN.
 void fill_with_garbage(void* memory, size_t bytes, std::mt19937_64& random) {
@@ -186,25 +185,23 @@ Index block_index() { return block().index; }
 Index block_size() { return block().size; }
 Index grid_size() { return block().grid; }
 
-void sync_block(int place) {
-  if (place == skipped_barrier) return;
+void sync_block() {
   wait_at_barrier(block().waiting, int(block().size.x));
   GS_TSAN(__tsan_acquire(&block().waiting));
 }
 
-void sync_warp(int place) {
-  if (place == skipped_barrier) return;
+void sync_warp() {
   Warp& warp = own_warp();
   warp.place = -1;
   wait_at_barrier(warp.waiting, 32);
   GS_TSAN(__tsan_acquire(&warp.waiting));
 }
 
-bool sync_block_or(int place, bool given) {
+bool sync_block_or(bool given) {
   const unsigned turn = current().votes++ % 2;
   block().votes[turn] |= given;
   if (block().waiting.count + 1 == int(block().size.x)) block().votes[1 - turn] = false;  // all threads have read it
-  sync_block(place);
+  sync_block();
   return block().votes[turn];
 }
 
@@ -228,8 +225,6 @@ void* shared_memory(size_t bytes) {
   if (used > kSharedMemory) std::abort();
   return memory;
 }
-
-void skip_barrier(int place) { skipped_barrier = place; }
 
 Memory Emulator::allocate(size_t bytes) const {
   if (bytes == 0) return Memory();  // as for an empty tensor

@@ -17,8 +17,8 @@
 #define blockIdx (::globalsplat::cuda::emulated::block_index())
 #define blockDim (::globalsplat::cuda::emulated::block_size())
 #define gridDim (::globalsplat::cuda::emulated::grid_size())
-#define __syncthreads() ::globalsplat::cuda::emulated::sync_block(__COUNTER__)
-#define __syncwarp() ::globalsplat::cuda::emulated::sync_warp(__COUNTER__)
+#define __syncthreads() ::globalsplat::cuda::emulated::sync_block()
+#define __syncwarp() ::globalsplat::cuda::emulated::sync_warp()
 
 namespace globalsplat::cuda::emulated {
 
@@ -30,11 +30,11 @@ Index block_index();
 Index block_size();
 Index grid_size();
 
-// Barriers of a block's, or of a warp's, threads. `place` identifies the call in the source.
-void sync_block(int place);
-void sync_warp(int place);
+// Barriers of a block's, or of a warp's, threads.
+void sync_block();
+void sync_warp();
 // Barrier that also returns true if any of the block's threads passed true.
-bool sync_block_or(int place, bool given);
+bool sync_block_or(bool given);
 // Exchanges values among the threads of a warp: `out` receives all 32. It doesn't order other memory accesses. All threads must call it
 // from the same line.
 void exchange(int line, uint64_t given, uint64_t (&out)[32]);
@@ -81,7 +81,7 @@ inline int own_lane() { return int(thread_index().x % 32); }
 #define __ballot_sync(mask, given) ::globalsplat::cuda::emulated::ballot(__LINE__, given)
 #define __any_sync(mask, given) (__ballot_sync(mask, given) != 0)
 #define __match_any_sync(mask, given) ::globalsplat::cuda::emulated::match_any(__LINE__, given)
-#define __syncthreads_or(given) ::globalsplat::cuda::emulated::sync_block_or(__COUNTER__, given)
+#define __syncthreads_or(given) ::globalsplat::cuda::emulated::sync_block_or(given)
 
 inline int __popc(unsigned bits) { return __builtin_popcount(bits); }
 inline int __ffs(int bits) { return __builtin_ffs(bits); }
