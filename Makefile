@@ -145,9 +145,8 @@ check-wheel: wheel
 
 # Benchmarks the loading of training data, and the rasterizer: its speed, and how its time grows with Gaussians and pixels.
 bench: build
-	@target/release/globalsplat bench loader
 	@target/release/globalsplat bench raster
-	@target/release/globalsplat bench raster --scaling --repeats 5
+	@target/release/globalsplat bench model
 
 # Builds docs/ as a book, into target/book. Needs mdbook. Its links and shell commands are checked by the tests.
 .PHONY: book

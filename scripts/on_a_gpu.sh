@@ -125,12 +125,12 @@ part() { # NAME SECONDS COMMAND…
     hand_out
 }
 
-# Runs a benchmark as a part: saves its figures as JSON, and adds them as tables to the report.
+# Runs a benchmark as a part: saves its figures as JSON, and adds them to the report.
 bench() { # NAME SECONDS ARGUMENTS…
     local name=$1 seconds=$2
     shift 2
     # shellcheck disable=SC2016 # expanded by the inner shell
-    part "$name" "$seconds" bash -c 'figures=$1 python=$2; shift 2; "$@" --json >"$figures" && "$python" scripts/show_figures.py "$figures"' \
+    part "$name" "$seconds" bash -c 'figures=$1 python=$2; shift 2; "$@" --json >"$figures" && "$python" -m json.tool "$figures"' \
         bench "$work/figures/$name.json" "$python" "$globalsplat" bench "$@"
 }
 

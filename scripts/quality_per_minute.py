@@ -9,8 +9,8 @@ variant is a name and arguments of `refine`, as in `--variant large "--size 1008
 the defaults are measured. All splats are scored by `globalsplat eval` on the same pixels: the held-out views with the
 longer side --size, or their own if it is smaller. --peer scores the splats of another program alike:
 DIR/CAPTURE.SECONDS.SEED.ply, from the other views. Prints a Markdown table of mean PSNR, SSIM and LPIPS (VGG, if
-`make weights` was run) over the seeds, with the 95 % confidence interval of PSNR, and writes the curves to
-OUT/curves.svg. Every result is kept in OUT and not repeated. Run nothing else meanwhile.
+`make weights` was run) over the seeds, with the 95 % confidence interval of PSNR. Every result is kept in OUT and not
+repeated. Run nothing else meanwhile.
 """
 
 import argparse
@@ -20,7 +20,6 @@ import statistics
 from pathlib import Path
 
 from core_runs import refined, row, told, told_once
-from line_plots import line_plots
 
 # Quantiles of Student's t distribution for 95 % confidence, by the number of samples.
 STUDENT = {2: 12.71, 3: 4.30, 4: 3.18, 5: 2.78, 6: 2.57, 7: 2.45, 8: 2.36}
@@ -79,10 +78,8 @@ def main():
         parser.error("expected --capture or --synthetic")
     row("capture", "method", "time", "steps", "Gaussians", "PSNR, dB", "SSIM", "LPIPS")
     row(*["---"] * 8)
-    plots = {}
     for folder, *holdout in captures:
         holdout, capture_name = holdout[0] if holdout else "every:8", Path(folder).name.split("#")[-1]
-        curves = plots.setdefault(capture_name, {})
         for seconds in arguments.seconds:
             results = {name: [] for name, _ in [*variants, *arguments.peer]}
             for seed in range(arguments.seeds):
@@ -110,9 +107,6 @@ def main():
                         mean(values_of("ssim", found), 3),
                         mean(values_of("lpips_vgg", found), 3),
                     )
-                    curves.setdefault(name, []).append((seconds, statistics.mean(values_of("psnr", found))))
-    if len(arguments.seconds) > 1:
-        (arguments.out / "curves.svg").write_text(line_plots(plots, sorted(arguments.seconds), is_logarithmic=True))
 
 
 if __name__ == "__main__":

@@ -3,98 +3,16 @@
 use super::{Measured, Section, TimingStats};
 use crate::device::{Stopwatch, peak_memory_bytes_on, reset_peak_memory, resident_memory_bytes};
 use crate::error::Result;
-use crate::render::cpu::{StageTimes, count_pairs, multiply_add_peak, simd_level, stage_times};
+use crate::render::cpu::{PairCounts, StageTimes, count_pairs, multiply_add_peak, simd_level, stage_times};
 use crate::render::cuda::{kernel_times, measure_kernels};
 use crate::render::{Cameras, RenderOutput, default_eps2d, render};
 use crate::scene::{Gaussians, ImageSize};
 use glam::{DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use serde::Serialize;
+use serde_json::{Value, json};
 use std::f64::consts::TAU;
 use tch::{Device, Kind, Tensor, no_grad};
-
-/// Results of [`bench_raster`]. All times are milliseconds per view.
-#[derive(Debug, Serialize)]
-pub struct RasterReport {
-    /// Instruction set of the CPU kernels.
-    pub simd: String,
-    /// Device that holds the Gaussians: `cpu`, or `cuda:` and the GPU's index.
-    pub device: String,
-    /// Number of threads.
-    pub threads: i32,
-    /// Number of Gaussians in the scene.
-    pub gaussians: i64,
-    /// Number of cameras per call.
-    pub views: i64,
-    /// Width of an image, in pixels.
-    pub width: i64,
-    /// Height of an image, in pixels.
-    pub height: i64,
-    /// Time of a call without gradients.
-    pub forward: TimingStats,
-    /// Time of a call that records gradients and of its backward pass.
-    pub forward_backward: TimingStats,
-    /// Stages on the CPU, of the call with gradients, or kernels on a GPU, in the order of execution. All launches of a kernel are added
-    /// up.
-    pub stages: Vec<Section>,
-    /// Comparison of a GPU's results with the CPU's.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub against_cpu: Vec<TensorComparison>,
-    /// Number of pairs to blend, per view.
-    pub pairs: Pairs,
-    /// Blending throughput, on the CPU only.
-    pub rates: Option<Rates>,
-    /// Peak memory during the calls minus the memory before them, in bytes, including images and gradients: memory of tensors on a GPU,
-    /// resident memory on the CPU.
-    pub working_bytes: u64,
-}
-
-/// Comparison of one tensor of a GPU's results with the CPU's.
-#[derive(Debug, Serialize)]
-pub struct TensorComparison {
-    /// Name of the tensor, such as `rgb` or `gradient of means`.
-    pub tensor: &'static str,
-    /// Number of elements.
-    #[serde(rename = "numbers")]
-    pub elements: i64,
-    /// Number of elements that aren't bit-identical.
-    #[serde(rename = "other_bits")]
-    pub differing_elements: i64,
-    /// Relative L2 difference; NaN or infinite if the CPU's tensor is zero.
-    pub relative_difference: f64,
-}
-
-/// Number of pairs to blend in a view.
-#[derive(Debug, Serialize)]
-pub struct Pairs {
-    /// Number of (tile, splat) pairs.
-    pub tile_entries: f64,
-    /// Number of (pixel, splat) pairs whose α is computed.
-    pub evaluated: f64,
-    /// Number of (pixel, splat) pairs that are blended.
-    pub contributing: f64,
-}
-
-/// Blending throughput, compared with the peak of the machine.
-#[derive(Debug, Serialize)]
-pub struct Rates {
-    /// Throughput of all threads with multiply-adds alone, in GFLOP/s.
-    pub peak_gflops: f64,
-    /// Throughput of blending.
-    pub blend: Rate,
-    /// Throughput of the backward pass of blending.
-    pub blend_backward: Rate,
-}
-
-/// Throughput in contributing pairs.
-#[derive(Debug, Serialize)]
-pub struct Rate {
-    /// Contributing pairs per second, in 10⁹.
-    pub gpairs_per_second: f64,
-    /// Floating-point operations that these pairs need per second, as a fraction of the multiply-add throughput.
-    pub share_of_peak: f64,
-}
 
 /// Floating-point operations per pair in `csrc/kernels/pixel.h`: offset 2, p and r 4, exponent 4, 2^e 15, cap 1, T 2, w 1, and A, C and D
 /// 9.
@@ -111,11 +29,13 @@ const BLEND_BACKWARD: &str = "blend backward";
 /// Duration of the multiply-add measurement, in seconds.
 const PEAK_SECONDS: f64 = 0.2;
 
-/// Times `repeats` calls of the rasterizer without gradients and as many with gradients, alternating between them.
+/// Times `repeats` calls of the rasterizer without gradients and as many with gradients, alternating between them. Returns milliseconds per
+/// view: of a call without gradients, and of one that records them with its backward pass; of the stages on the CPU, or of the kernels on a
+/// GPU, whose results are also compared with the CPU's. `working_bytes` is the peak memory during the calls minus that before them.
 ///
 /// # Errors
 /// Fails if [`render()`] fails.
-pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) -> Result<RasterReport> {
+pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) -> Result<Value> {
     let device = gaussians.means.device();
     let views = cameras.w2c.size()[0] * cameras.w2c.size()[1];
     let per_view = |seconds: f64| seconds * 1e3 / views as f64;
@@ -146,38 +66,42 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
     }
     let working_bytes = peak_memory_bytes_on(device).saturating_sub(memory_before);
     let counts = count_pairs(gaussians, cameras, default_eps2d(gaussians))?;
-    let pairs = Pairs {
-        tile_entries: counts.tile_entries as f64 / views as f64,
-        evaluated: counts.evaluated as f64 / views as f64,
-        contributing: counts.contributing as f64 / views as f64,
-    };
     let (stages, rates, against_cpu) = match device {
         Device::Cpu => {
             let stages = sections(&stages, per_view);
-            let rates = rates(&stages, &pairs);
-            (stages, Some(rates), vec![])
+            let rates = rates(&stages, &counts, views as f64);
+            (stages, rates, vec![])
         }
-        _ => (time_kernels(gaussians, cameras, repeats)?, None, compare_with_cpu(gaussians, cameras)?),
+        _ => (time_kernels(gaussians, cameras, repeats)?, Value::Null, compare_with_cpu(gaussians, cameras)?),
     };
-    Ok(RasterReport {
-        simd: simd_level()?,
-        device: match device {
+    let pairs = |count: i64| count as f64 / views as f64;
+    let mut report = json!({
+        "simd": simd_level()?,
+        "device": match device {
             Device::Cuda(number) => format!("cuda:{number}"),
             _ => "cpu".into(),
         },
-        threads: tch::get_num_threads(),
-        gaussians: gaussians.count(),
-        views,
-        width: cameras.width,
-        height: cameras.height,
-        forward: TimingStats::from_milliseconds(forward),
-        forward_backward: TimingStats::from_milliseconds(forward_backward),
-        stages,
-        against_cpu,
-        pairs,
-        rates,
-        working_bytes,
-    })
+        "threads": tch::get_num_threads(),
+        "gaussians": gaussians.count(),
+        "views": views,
+        "width": cameras.width,
+        "height": cameras.height,
+        "forward": TimingStats::from_milliseconds(forward),
+        "forward_backward": TimingStats::from_milliseconds(forward_backward),
+        "stages": stages,
+        // (tile, splat) pairs, and (pixel, splat) pairs whose α is computed and that are blended, per view.
+        "pairs": {
+            "tile_entries": pairs(counts.tile_entries),
+            "evaluated": pairs(counts.evaluated),
+            "contributing": pairs(counts.contributing),
+        },
+        "rates": rates,
+        "working_bytes": working_bytes,
+    });
+    if !against_cpu.is_empty() {
+        report["against_cpu"] = against_cpu.into();
+    }
+    Ok(report)
 }
 
 /// Returns an objective that depends on every element of every image.
@@ -204,18 +128,18 @@ fn time_kernels(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) -> Res
 }
 
 /// Compares the images and gradients of a GPU with the CPU's.
-fn compare_with_cpu(gaussians: &Gaussians, cameras: &Cameras) -> Result<Vec<TensorComparison>> {
+fn compare_with_cpu(gaussians: &Gaussians, cameras: &Cameras) -> Result<Vec<Value>> {
     let gpu = render_with_gradients(gaussians, cameras)?;
     let cpu = render_with_gradients(&gaussians.to_device(Device::Cpu), &cameras.to_device(Device::Cpu))?;
     let compare = |((tensor, gpu), (_, cpu)): (&(&'static str, Tensor), &(&'static str, Tensor))| {
         let gpu = gpu.to_device(Device::Cpu);
         let bits = |t: &Tensor| t.contiguous().view_dtype(Kind::Int);
-        TensorComparison {
-            tensor,
-            elements: cpu.numel() as i64,
-            differing_elements: bits(&gpu).not_equal_tensor(&bits(cpu)).sum(Kind::Int64).int64_value(&[]),
-            relative_difference: (&gpu - cpu).norm().double_value(&[]) / cpu.norm().double_value(&[]),
-        }
+        json!({
+            "tensor": tensor,
+            "numbers": cpu.numel(),
+            "other_bits": bits(&gpu).not_equal_tensor(&bits(cpu)).sum(Kind::Int64).int64_value(&[]),
+            "relative_difference": (&gpu - cpu).norm().double_value(&[]) / cpu.norm().double_value(&[]),
+        })
     };
     Ok(gpu.iter().zip(&cpu).map(compare).collect())
 }
@@ -253,18 +177,20 @@ fn sections(stages: &[StageTimes], per_view: impl Fn(f64) -> f64) -> Vec<Section
     ]
 }
 
-fn rates(stages: &[Section], pairs: &Pairs) -> Rates {
+/// Returns the throughput of blending in 10⁹ contributing pairs per second, and the operations that these pairs need as a fraction of the
+/// throughput of multiply-adds alone.
+fn rates(stages: &[Section], counts: &PairCounts, views: f64) -> Value {
     let peak = multiply_add_peak(PEAK_SECONDS);
     let rate = |name: &str, operations: f64| {
         let stage = stages.iter().find(|stage| stage.name == name).expect("every stage has a section");
-        let per_second = pairs.contributing / (stage.milliseconds.median * 1e-3);
-        Rate { gpairs_per_second: per_second * 1e-9, share_of_peak: per_second * operations / peak }
+        let per_second = counts.contributing as f64 / views / (stage.milliseconds.median * 1e-3);
+        json!({ "gpairs_per_second": per_second * 1e-9, "share_of_peak": per_second * operations / peak })
     };
-    Rates {
-        peak_gflops: peak * 1e-9,
-        blend: rate(BLEND, FORWARD_OPERATIONS),
-        blend_backward: rate(BLEND_BACKWARD, BACKWARD_OPERATIONS),
-    }
+    json!({
+        "peak_gflops": peak * 1e-9,
+        "blend": rate(BLEND, FORWARD_OPERATIONS),
+        "blend_backward": rate(BLEND_BACKWARD, BACKWARD_OPERATIONS),
+    })
 }
 
 /// Returns a synthetic scene that resembles a trained one, and `views` cameras that move past it, from a fixed seed. Projected sizes,

@@ -10,7 +10,7 @@ use crate::refine::{
 use crate::render::cpu::stage_times;
 use crate::render::{DEFAULT_EPS2D, render};
 use crate::scene::{ImageSize, RawGaussians};
-use serde::Serialize;
+use serde_json::{Value, json};
 use std::time::Duration;
 use tch::Device;
 
@@ -19,30 +19,8 @@ const PHOTOS: usize = 8;
 /// Number of steps before the measurement starts.
 const WARM_UP: u64 = 5;
 
-/// Results of [`bench_refine`].
-#[derive(Debug, Serialize)]
-pub struct RefineReport {
-    /// Number of Gaussians in the splat.
-    pub gaussians: i64,
-    /// Number of images per step.
-    pub views: usize,
-    /// Size of the images, `[height, width]`.
-    pub size: [u32; 2],
-    /// Number of threads.
-    pub threads: i32,
-    /// Number of measured steps.
-    pub steps: u64,
-    /// Time of a whole step.
-    pub milliseconds: TimingStats,
-    /// Mean time of each part of a step in milliseconds, in the order of execution.
-    pub sections: Vec<(&'static str, f64)>,
-    /// Share of the time that isn't rendering, forward or backward. `None` on a GPU: only the CPU rasterizer reports the time of its
-    /// backward pass.
-    pub other_share: Option<f64>,
-}
-
 /// Times `steps` steps on `device`, with photos of `size` of a synthetic scene with `count` Gaussians. The optimization starts from these
-/// Gaussians.
+/// Gaussians. `sections` are means per step; `other_share`, of all but rendering, is null on a GPU, where no backward pass is timed alone.
 ///
 /// # Errors
 /// Fails if the rasterizer fails.
@@ -52,7 +30,7 @@ pub fn bench_refine(
     config: &RefineConfig,
     steps: u64,
     device: Device,
-) -> Result<RefineReport> {
+) -> Result<Value> {
     let (gaussians, cameras) = synthetic_gaussians(count, PHOTOS, size);
     let (gaussians, cameras) = (gaussians.to_device(device), cameras.to_device(device));
     let pictures = tch::no_grad(|| render(&gaussians, &cameras, DEFAULT_EPS2D))?;
@@ -102,14 +80,14 @@ pub fn bench_refine(
     let of_render = |(name, _): &&(&str, f64)| name.starts_with("render");
     let rendering: f64 = sections.iter().filter(of_render).map(|section| section.1).sum();
     let all: f64 = whole.iter().sum::<f64>() / steps as f64;
-    Ok(RefineReport {
-        gaussians: gaussians.count(),
-        views: config.views,
-        size: size.into(),
-        threads: tch::get_num_threads(),
-        steps,
-        milliseconds: TimingStats::from_milliseconds(whole),
-        sections,
-        other_share: (device == Device::Cpu).then_some(1. - rendering / all),
-    })
+    Ok(json!({
+        "gaussians": gaussians.count(),
+        "views": config.views,
+        "size": size,
+        "threads": tch::get_num_threads(),
+        "steps": steps,
+        "milliseconds": TimingStats::from_milliseconds(whole),
+        "sections": sections,
+        "other_share": (device == Device::Cpu).then_some(1. - rendering / all),
+    }))
 }

@@ -1,23 +1,18 @@
 //! Benchmark of a training step: the time of its parts, and its memory use.
 
-use super::parts::{Part, PartRecorder};
-use super::peak_throughput::PeakThroughput;
-use super::{Measured, Section, TimingStats};
+use super::{Measured, PartRecorder, PeakThroughput};
 use crate::config::Config;
 use crate::data::{Batch, Capture, LoadTimes, LoadedScene};
-use crate::device::Stopwatch;
-use crate::device::Upload;
-use crate::device::peak_memory_bytes_on;
+use crate::device::{Stopwatch, Upload, peak_memory_bytes_on};
 use crate::distributed::ProcessGroup;
 use crate::error::Result;
 use crate::loss::{PerceptualKind, PerceptualLoss};
-use crate::model::Precision;
 use crate::scene::{Camera, ImageSize, Intrinsics};
 use crate::train::{COMMUNICATION, Trainer};
 use glam::{DMat4, DVec3};
 use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use serde::Serialize;
+use serde_json::{Value, json};
 use std::sync::Arc;
 use tch::Device;
 
@@ -26,84 +21,21 @@ const PRODUCTS: usize = 5;
 /// Far plane of the synthetic scenes' frusta.
 const FAR: f64 = 40.;
 
-/// Results of [`bench_train`].
-#[derive(Debug, Serialize)]
-pub struct TrainReport {
-    /// Number of scenes per step.
-    pub scenes: usize,
-    /// Number of context photos per scene, which the model sees.
-    pub context_views: usize,
-    /// Number of target views per scene, which are rendered and compared.
-    pub target_views: usize,
-    /// Size of context and target views, `[height, width]`.
-    pub size: [u32; 2],
-    /// Number of Gaussians per scene.
-    pub gaussians: i64,
-    /// Network of L_perc.
-    pub perceptual: PerceptualKind,
-    /// Number of threads.
-    pub threads: i32,
-    /// Number of slices of a step that run in parallel on these threads. Sections, parts and the peak throughput are those of the first
-    /// slice, with its share of the threads.
-    pub slices_at_once: usize,
-    /// Number of measured steps.
-    pub steps: usize,
-    /// Time of a whole step.
-    pub milliseconds: TimingStats,
-    /// Sections of a step, in the order of execution.
-    pub sections: Vec<Section>,
-    /// Parts of all forward passes, including the rounds that are recomputed by checkpointing, with the operations of their backward
-    /// passes.
-    pub parts: Vec<Part>,
-    /// Precision of matrix products.
-    pub precision: Precision,
-    /// Throughput of a product of large matrices in the same precision, in GFLOP/s.
-    pub peak_gflops: f64,
-    /// Peak memory in bytes: that of the GPU's tensors, or that of the process.
-    pub peak_bytes: u64,
-    /// Cost of distributed training; `None` for a single process.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub together: Option<DistributedCost>,
-}
-
-/// Cost of distributed training with several ranks.
-#[derive(Debug, Serialize)]
-pub struct DistributedCost {
-    /// Number of ranks.
-    pub ranks: usize,
-    /// Scenes per second of all ranks together.
-    pub scenes_per_second: f64,
-    /// Time of a step without communication, with all ranks running at the same time.
-    pub apart_milliseconds: TimingStats,
-    /// Time of summing the gradients over all ranks when nothing overlaps with it.
-    pub communication_milliseconds: TimingStats,
-    /// Share of this communication that overlaps with the backward pass, in the step with the shortest wait. Other steps include waiting
-    /// for slower ranks.
-    pub hidden: f64,
-    /// Size of the gradients, in bytes.
-    pub gradient_bytes: u64,
-}
-
 /// Times `steps` training steps (at least one) with `config`, at the final stage of the curriculum. The scenes are synthetic: images of
 /// random noise, and cameras on a short path. L_perc is left out if its weights are missing. Sections and parts are timed by the clock of
-/// the device. With several ranks, all of them call this function, each with scenes of its own.
+/// the device; parts are those of all forward passes, with the operations of their backward passes. Of several slices in parallel they are
+/// those of the first, with its share of the threads. With several ranks, all of them call this function, each with scenes of its own.
 ///
 /// # Errors
 /// Fails if the [`Trainer`] fails or another rank is gone.
-pub fn bench_train(
-    config: &Config,
-    steps: usize,
-    device: Device,
-    group: ProcessGroup,
-) -> Result<TrainReport> {
+pub fn bench_train(config: &Config, steps: usize, device: Device, group: ProcessGroup) -> Result<Value> {
     let mut config = config.clone();
     config.curriculum.full_capacity = true;
     if !PerceptualLoss::weights_file(&config.loss)?.is_file() {
         config.loss.perceptual = PerceptualKind::None;
     }
     let (rank, ranks) = (group.rank(), group.world_size());
-    let trainer = Trainer::new(&config, Arc::new(Vec::<Capture>::new()), device)?;
-    let mut trainer = trainer.with_group(group);
+    let mut trainer = Trainer::new(&config, Arc::new(Vec::<Capture>::new()), device)?.with_group(group);
     trainer.broadcast_state()?;
     let seeds = (rank * config.train.batch_size) as u64..;
     let scenes: Vec<LoadedScene> =
@@ -118,31 +50,34 @@ pub fn bench_train(
     tch::set_num_threads(threads / slices_at_once as i32);
     let products = (0..=PRODUCTS).map(|_| peak.time()).skip(1).collect::<Result<Vec<_>>>();
     tch::set_num_threads(threads);
-    let peak_gflops = peak.gflops(TimingStats::from_milliseconds(products?).min);
-    let (milliseconds, sections) = measured.into_stats();
+    let peak_gflops = peak.gflops(products?);
+    let (milliseconds, sections) = (measured.total(), measured.sections());
     let waited = sections.iter().find(|section| section.name == COMMUNICATION);
     let together = waited.map(|waited| {
         let scenes_per_second = 1e3 * (ranks * scenes.len()) as f64 / milliseconds.median;
         measure_distributed_cost(trainer, &scenes, steps, &upload, scenes_per_second, waited.milliseconds.min)
     });
-    Ok(TrainReport {
-        scenes: scenes.len(),
-        context_views: config.data.context_views,
-        target_views: config.data.target_views,
-        size: config.data.image_size.into(),
-        gaussians: config.model.latents << config.curriculum.final_stage,
-        perceptual: config.loss.perceptual,
-        threads,
-        slices_at_once,
-        steps,
-        milliseconds,
-        sections,
-        parts: parts.into_stats(peak_gflops),
-        precision,
-        peak_gflops,
-        peak_bytes,
-        together: together.transpose()?,
-    })
+    let mut report = json!({
+        "scenes": scenes.len(),
+        "context_views": config.data.context_views,
+        "target_views": config.data.target_views,
+        "size": config.data.image_size,
+        "gaussians": config.model.latents << config.curriculum.final_stage,
+        "perceptual": config.loss.perceptual,
+        "threads": threads,
+        "slices_at_once": slices_at_once,
+        "steps": steps,
+        "milliseconds": milliseconds,
+        "sections": sections,
+        "parts": parts.into_stats(peak_gflops),
+        "precision": precision,
+        "peak_gflops": peak_gflops,
+        "peak_bytes": peak_bytes,
+    });
+    if let Some(together) = together.transpose()? {
+        report["together"] = together;
+    }
+    Ok(report)
 }
 
 /// Times `steps` steps, after one that warms up caches, threads and the GPU's libraries.
@@ -169,7 +104,8 @@ fn measure(
     Ok(measured)
 }
 
-/// Times the ranks' communication without steps, and their steps without communication.
+/// Times the ranks' communication without steps, and their steps without communication. `waited` is the shortest time in milliseconds that a
+/// step waited for communication: `hidden` is the share of the communication that overlaps with that step's backward pass.
 fn measure_distributed_cost(
     trainer: Trainer,
     scenes: &[LoadedScene],
@@ -177,7 +113,7 @@ fn measure_distributed_cost(
     upload: &Upload,
     scenes_per_second: f64,
     waited: f64,
-) -> Result<DistributedCost> {
+) -> Result<Value> {
     let ranks = trainer.group().world_size();
     let mut communication = Measured::default();
     for step in 0..=steps {
@@ -187,20 +123,19 @@ fn measure_distributed_cost(
             communication.add(&mut watch)?;
         }
     }
-    let communication = communication.into_stats().0;
+    let communication = communication.total();
     let gradient_bytes = trainer.gradient_bytes();
     trainer.group().shutdown()?;
     let mut apart = trainer.with_group(ProcessGroup::single());
-    Ok(DistributedCost {
-        ranks,
-        scenes_per_second,
-        apart_milliseconds: measure(&mut apart, scenes, steps, upload, &mut PartRecorder::default())?
-            .into_stats()
-            .0,
-        communication_milliseconds: communication,
-        hidden: (1. - waited / communication.median).clamp(0., 1.),
-        gradient_bytes,
-    })
+    let apart = measure(&mut apart, scenes, steps, upload, &mut PartRecorder::default())?;
+    Ok(json!({
+        "ranks": ranks,
+        "scenes_per_second": scenes_per_second,
+        "apart_milliseconds": apart.total(),
+        "communication_milliseconds": communication,
+        "hidden": (1. - waited / communication.median).clamp(0., 1.),
+        "gradient_bytes": gradient_bytes,
+    }))
 }
 
 /// Returns a scene of random noise with as many views as a step takes. Context and target views are disjoint.

@@ -1,19 +1,19 @@
-use super::bench_attention::Attention;
-use super::bench_model::Model;
-use super::bench_refine::Refine;
-use super::bench_train::Train;
-use super::{device, open_capture, parse_size, print_json, progress, warn};
+use super::{device, model, open_capture, parse_size, print_json, ranks, warn};
 use anyhow::Result;
 use clap::{Args, Subcommand};
-use globalsplat::bench::{
-    RasterReport, TimingStats, bench_loader, bench_raster, bench_synth, synthetic_gaussians, synthetic_videos,
-};
-use globalsplat::data::{DataConfig, TrainingScenes, load_all_views, view_batch};
-use globalsplat::error::Error;
-use globalsplat::io::{check_writable_dir, read_splat};
-use globalsplat::scene::{Gaussians, ImageSize};
+use globalsplat::bench::{bench_model, bench_raster, bench_refine, bench_train, synthetic_gaussians};
+use globalsplat::config::Config;
+use globalsplat::data::{load_all_views, view_batch};
+use globalsplat::device::total_memory_bytes;
+use globalsplat::error::{Error, panic_message};
+use globalsplat::io::read_splat;
+use globalsplat::ranks::ProcessGroup;
+use globalsplat::refine::RefineConfig;
+use globalsplat::scene::Gaussians;
+use globalsplat::train::largest_fitting_batch;
+use serde_json::{Map, Value};
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::path::PathBuf;
-use std::sync::Arc;
 use tch::Device;
 
 /// Measure the speed of the program's parts on this machine.
@@ -26,24 +26,18 @@ pub struct Bench {
 
 #[derive(Subcommand)]
 enum Part {
-    Attention(Attention),
     Raster(Raster),
-    Loader(Loader),
     Model(Model),
     Refine(Refine),
-    Synth(Synth),
     Train(Train),
 }
 
 impl Bench {
     pub fn run(self) -> Result<()> {
         match self.part {
-            Part::Attention(attention) => attention.run(),
             Part::Raster(raster) => raster.run(),
-            Part::Loader(loader) => loader.run(),
             Part::Model(model) => model.run(),
             Part::Refine(refine) => refine.run(),
-            Part::Synth(synth) => synth.run(),
             Part::Train(train) => train.run(),
         }
     }
@@ -51,6 +45,26 @@ impl Bench {
     /// Returns `true` if the processes that torchrun started share the work.
     pub fn is_shared(&self) -> bool {
         matches!(self.part, Part::Train(_))
+    }
+}
+
+/// Options of every benchmark.
+#[derive(Args)]
+struct Common {
+    /// Device: cpu, cuda or cuda:N
+    #[arg(long, default_value = "cpu")]
+    device: String,
+    /// Print the measurements as one JSON object
+    #[arg(long)]
+    json: bool,
+}
+
+impl Common {
+    fn print(&self, report: &Value) {
+        match report {
+            Value::Object(report) if !self.json => print_report(report),
+            report => print_json(report),
+        }
     }
 }
 
@@ -76,25 +90,18 @@ pub struct Raster {
     /// Image size of the synthetic scene's cameras
     #[arg(long, value_name = "WxH", default_value = "256x256", conflicts_with = "splat")]
     size: String,
-    /// Print a scaling table instead: synthetic scenes of 16K to 1M Gaussians, one camera of 256x256 to 1920x1080
-    #[arg(long, conflicts_with_all = ["splat", "gaussians", "cameras", "size"])]
-    scaling: bool,
-    /// Device: cpu, cuda or cuda:N
-    #[arg(long, default_value = "cpu")]
-    device: String,
     /// Number of threads; by default all cores
     #[arg(long, value_name = "N")]
     threads: Option<u16>,
     /// Number of timed calls
     #[arg(long, value_name = "N", default_value_t = 30)]
     repeats: u32,
-    /// Print the measurements as one JSON object
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    common: Common,
 }
 
 impl Raster {
-    pub fn run(self) -> Result<()> {
+    fn run(self) -> Result<()> {
         if let Some(threads) = self.threads {
             tch::set_num_threads(i32::from(threads).max(1));
         }
@@ -105,10 +112,7 @@ impl Raster {
             return Err(Error::request("--gaussians and --cameras are expected to be 1 or more").into());
         }
         // The device is parsed before tensors are created, so that a missing one is reported immediately.
-        let device = device::parse(&self.device)?;
-        if self.scaling {
-            return self.scaling(device);
-        }
+        let device = device::parse(&self.common.device)?;
         let (gaussians, cameras) = match (&self.splat, &self.scene) {
             (Some(splat), Some(scene)) => {
                 let splat = read_splat(splat)?;
@@ -122,218 +126,242 @@ impl Raster {
             }
             _ => synthetic_gaussians(self.gaussians, self.cameras, parse_size(&self.size)?),
         };
-        let gaussians = gaussians.to_device(device);
-        let cameras = cameras.to_device(device);
-        let report = bench_raster(&gaussians, &cameras, self.repeats as usize)?;
-        if self.json {
-            print_json(&serde_json::to_value(&report)?);
-        } else {
-            print_report(&report);
-        }
+        let (gaussians, cameras) = (gaussians.to_device(device), cameras.to_device(device));
+        self.common.print(&bench_raster(&gaussians, &cameras, self.repeats as usize)?);
         Ok(())
     }
 }
 
-/// Benchmark the loader, from chunks of JPEGs to augmented training samples in tensors, stage by stage.
+/// Benchmark a forward pass, photos to Gaussians, part by part, on photos of noise and with newly initialized weights.
 ///
-/// Without --data the input is synthetic: chunks of 640x360 video. Samples have the paper's shape, 24 context and 12 target
-/// views of 256x256.
+/// Without --config the model is the paper's main model, 256x256 pixels.
 #[derive(Args)]
-#[command(after_help = "Examples:\n  globalsplat bench loader\n  \
-    globalsplat bench loader --data datasets/re10k --threads 8 --samples 10000 --json")]
-pub struct Loader {
-    /// Dataset, of which the split `train` is used, or captures
-    #[arg(long, value_name = "ROOT")]
-    data: Option<PathBuf>,
-    /// Write the synthetic data into this folder and keep them
-    #[arg(long, value_name = "DIR", conflicts_with = "data")]
-    keep: Option<PathBuf>,
-    /// Number of loader threads; by default one per core
-    #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true)]
-    threads: u16,
-    /// Number of measured samples
-    #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..))]
-    samples: u64,
-    /// Print the measurements as one JSON object
-    #[arg(long)]
-    json: bool,
+#[command(after_help = "Examples:\n  globalsplat bench model\n  \
+    globalsplat bench model --config configs/tiny.toml --views 12\n  \
+    globalsplat bench model --device cuda --precision bf16 --repeats 50 --json")]
+pub struct Model {
+    #[command(flatten)]
+    config: Configuration,
+    /// Number of input photos
+    #[arg(long, value_name = "N", default_value_t = 24, value_parser = clap::value_parser!(u16).range(1..))]
+    views: u16,
+    /// Number of measured passes
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..))]
+    repeats: u32,
+    /// Precision of matrix products: f32, bf16, or auto: bf16 for wide models if the device has instructions for it
+    #[arg(long, default_value = "auto")]
+    precision: String,
+    #[command(flatten)]
+    common: Common,
 }
 
-impl Loader {
-    pub fn run(self) -> Result<()> {
-        let temporary = tempfile::tempdir()?;
-        let root = match (&self.data, &self.keep) {
-            (Some(data), _) => data.clone(),
-            (None, keep) => {
-                let root = keep.as_deref().unwrap_or(temporary.path());
-                check_writable_dir(root)?;
-                synthetic_videos(root)?;
-                root.to_owned()
+/// Configuration to measure; without a file, the defaults, which are the paper's main model.
+#[derive(Args)]
+struct Configuration {
+    /// Configuration file; see configs/
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Override a key of the configuration, as in train.checkpoint_rounds=true
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+}
+
+impl Configuration {
+    fn read(&self) -> Result<Config> {
+        Ok(match &self.config {
+            Some(file) => Config::read(file, &self.set)?,
+            None => Config::parse("", &self.set, "the defaults".as_ref())?,
+        })
+    }
+}
+
+impl Model {
+    fn run(self) -> Result<()> {
+        let device = device::parse(&self.common.device)?;
+        let requested = model::parse_precision(&self.precision)?;
+        let mut config = self.config.read()?;
+        let precision = model::precision(requested, device, config.model.width);
+        config.data.context_views = self.views.into();
+        self.common.print(&bench_model(&config, precision, self.repeats as usize, device)?);
+        Ok(())
+    }
+}
+
+/// Benchmark a step of `refine`, part by part, on a synthetic scene.
+#[derive(Args)]
+#[command(
+    after_help = "Examples:\n  globalsplat bench refine\n  globalsplat bench refine --size 64x64 --set views=4"
+)]
+pub struct Refine {
+    /// Number of Gaussians in the splat
+    #[arg(long, value_name = "N", default_value_t = 16_384, value_parser = clap::value_parser!(u32).range(1..))]
+    gaussians: u32,
+    /// Size of the photos
+    #[arg(long, value_name = "WxH", default_value = "256x256")]
+    size: String,
+    /// Number of measured steps
+    #[arg(long, value_name = "N", default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..))]
+    steps: u64,
+    /// Override a setting of the refinement
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    #[command(flatten)]
+    common: Common,
+}
+
+impl Refine {
+    fn run(self) -> Result<()> {
+        let config = RefineConfig::with(&self.set, true)?;
+        let (size, device) = (parse_size(&self.size)?, device::parse(&self.common.device)?);
+        self.common.print(&bench_refine(self.gaussians as usize, size, &config, self.steps, device)?);
+        Ok(())
+    }
+}
+
+/// Benchmark a training step, part by part, on synthetic scenes: photos of noise, all Gaussians visible.
+///
+/// Without --config the model is the paper's main model, 24 context and 12 target views of 256x256. L_perc is included if its
+/// weights are found. Under torchrun the report includes the cost of distributed training: the time of a step without
+/// communication, of communication alone, and how much of that the backward pass hides.
+#[derive(Args)]
+#[command(after_help = "Examples:\n  globalsplat bench train\n  \
+    globalsplat bench train --config configs/first_light.toml --steps 20\n  \
+    globalsplat bench train --set train.checkpoint_rounds=true --json\n  \
+    globalsplat bench train --device cuda --batch auto\n  \
+    torchrun --no-python --nproc-per-node=2 target/release/globalsplat bench train --config configs/tiny.toml")]
+pub struct Train {
+    #[command(flatten)]
+    config: Configuration,
+    /// Number of scenes per step; auto takes the largest of train.batch_size, half of it, a quarter, … that fits into the device's
+    /// memory without train.micro_batch
+    #[arg(long, value_name = "N", default_value = "1", value_parser = parse_batch)]
+    batch: Batch,
+    /// Number of measured steps
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..))]
+    steps: u32,
+    #[command(flatten)]
+    common: Common,
+}
+
+/// Number of scenes per step, as `--batch` takes it.
+#[derive(Debug, Clone, Copy)]
+enum Batch {
+    Auto,
+    Scenes(usize),
+}
+
+fn parse_batch(text: &str) -> Result<Batch, String> {
+    match text.parse() {
+        Ok(scenes @ 1..=65535) => Ok(Batch::Scenes(scenes)),
+        _ if text == "auto" => Ok(Batch::Auto),
+        _ => Err("expected auto, or a number from 1 to 65535".into()),
+    }
+}
+
+impl Train {
+    fn run(self) -> Result<()> {
+        let (group, device) = ranks::join(&self.common.device)?;
+        let is_main_process = group.is_main_process();
+        let mut config = self.config.read()?;
+        if let Some(set) = self.config.set.iter().find(|set| set.trim_start().starts_with("train.batch")) {
+            return Err(Error::request(format!("--set {set}: expected --batch N")).into());
+        }
+        let report = match self.batch {
+            Batch::Scenes(scenes) => {
+                config.train.batch_size = scenes;
+                bench_train(&config, self.steps as usize, device, group)?
             }
+            Batch::Auto if group.world_size() > 1 => {
+                return Err(Error::request("--batch auto: expected a number under torchrun").into());
+            }
+            Batch::Auto => self.bench_what_fits(config, device)?,
         };
-        let scenes = Arc::new(TrainingScenes::find(&[root])?);
-        let config = DataConfig { threads: self.threads.into(), ..Default::default() };
-        let report = bench_loader(&config, scenes, self.samples)?;
-        if self.json {
-            print_json(&serde_json::to_value(&report)?);
-            return Ok(());
-        }
-        let [height, width] = report.size;
-        println!(
-            "{:.2} samples/s, {:.0} views/s of {width}x{height}, {} threads, {} samples",
-            report.samples_per_second, report.views_per_second, report.threads, report.samples
-        );
-        let times = &report.milliseconds;
-        println!("{:<12} {:>8}", "stage", "ms");
-        for (stage, milliseconds) in [
-            ("read", times.read),
-            ("decode", times.decode),
-            ("resize", times.resize),
-            ("augment", times.augment),
-            ("to tensor", times.to_tensor),
-        ] {
-            println!("{stage:<12} {milliseconds:>8.3}");
-        }
-        println!("per decoded photo of a thread; {} photos for {} views", report.photos, report.views);
-        let megabytes = |bytes: u64| bytes as f64 * 1e-6;
-        println!(
-            "resident memory after each tenth of the samples {} MB, {:.0} MB at the most",
-            report
-                .resident_by_tenth
-                .iter()
-                .map(|&bytes| format!("{:.0}", megabytes(bytes)))
-                .collect::<Vec<_>>()
-                .join(" "),
-            megabytes(report.resident_peak)
-        );
-        Ok(())
-    }
-}
-
-impl Raster {
-    fn scaling(&self, device: Device) -> Result<()> {
-        let mut reports = vec![];
-        let bar = progress::bar((GAUSSIANS.len() * SIZES.len()) as u64, "scenes");
-        for count in GAUSSIANS {
-            for (width, height) in SIZES {
-                let (gaussians, cameras) = synthetic_gaussians(count, 1, ImageSize { width, height });
-                let (gaussians, cameras) = (gaussians.to_device(device), cameras.to_device(device));
-                reports.push(bench_raster(&gaussians, &cameras, self.repeats as usize)?);
-                bar.inc(1);
-            }
-        }
-        bar.finish_and_clear();
-        if self.json {
-            print_json(&serde_json::to_value(&reports)?);
-            return Ok(());
-        }
-        println!(
-            "median milliseconds, forward / forward and backward, {}, {} threads, {}",
-            reports[0].device, reports[0].threads, reports[0].simd
-        );
-        print!("{:>10}", "Gaussians");
-        for (width, height) in SIZES {
-            print!(" {:>17}", format!("{width}x{height}"));
-        }
-        println!();
-        for row in reports.chunks(SIZES.len()) {
-            print!("{:>10}", row[0].gaussians);
-            for r in row {
-                print!(" {:>17}", format!("{:.1} / {:.1}", r.forward.median, r.forward_backward.median));
-            }
-            println!();
+        if is_main_process {
+            self.common.print(&report);
         }
         Ok(())
     }
-}
 
-/// Gaussian counts (rows) and image sizes (columns) of the scaling table.
-const GAUSSIANS: [usize; 4] = [16_384, 65_536, 262_144, 1_048_576];
-const SIZES: [(u32, u32); 4] = [(256, 256), (512, 512), (1024, 1024), (1920, 1080)];
-
-fn print_report(r: &RasterReport) {
-    println!(
-        "{} Gaussians, {} views of {}x{} in one call, {}, {} threads, {}",
-        r.gaussians, r.views, r.width, r.height, r.device, r.threads, r.simd
-    );
-    println!("{:<18} {:>8} {:>8} {:>8}", "ms per view", "median", "min", "p75");
-    let row = |name: &str, s: &TimingStats| {
-        println!("{name:<18} {:>8.3} {:>8.3} {:>8.3}", s.median, s.min, s.upper_quartile);
-    };
-    row("forward", &r.forward);
-    row("forward+backward", &r.forward_backward);
-    for stage in &r.stages {
-        row(&format!("  {}", stage.name), &stage.milliseconds);
-    }
-    for comparison in &r.against_cpu {
-        println!(
-            "{:<24} {} of {} elements differ from the CPU's, relative difference {:.1e}",
-            comparison.tensor,
-            comparison.differing_elements,
-            comparison.elements,
-            comparison.relative_difference
-        );
-    }
-    let millions = |n: f64| n * 1e-6;
-    println!(
-        "(pixel, splat) pairs of a view: {:.2} M contribute, {:.2} M are evaluated; {:.0} (tile, splat) pairs",
-        millions(r.pairs.contributing),
-        millions(r.pairs.evaluated),
-        r.pairs.tile_entries
-    );
-    if let Some(rates) = &r.rates {
-        println!(
-            "multiply-adds alone reach {:.0} GFLOP/s; of it, by what contributing pairs ask for:",
-            rates.peak_gflops
-        );
-        for (name, rate) in [("blend", &rates.blend), ("blend backward", &rates.blend_backward)] {
-            println!(
-                "  {name:<16} {:>6.2} Gpairs/s {:>6.1} %",
-                rate.gpairs_per_second,
-                1e2 * rate.share_of_peak
+    /// Runs the benchmark with the batch size that fits by the estimate; if a GPU still runs out of memory, halves it and tries
+    /// again.
+    fn bench_what_fits(&self, mut config: Config, device: Device) -> Result<Value> {
+        let wanted = config.train.batch_size;
+        let bytes = total_memory_bytes(device).unwrap_or(u64::MAX);
+        let (fits, refused) = largest_fitting_batch(&config, bytes, device)?;
+        if let Some(refused) = refused {
+            let [more, bytes] = [refused.total(), bytes].map(|bytes| bytes as f64 * 1e-9);
+            eprintln!(
+                "--batch auto: {fits} of {wanted} scenes; {} would take {more:.1} GB, the device has {bytes:.1} GB",
+                refused.batch
             );
         }
-    }
-    println!("working memory {:.0} MB", r.working_bytes as f64 * 1e-6);
-}
-
-/// Benchmark the synthesis of videos: views per second on one core, four rays per pixel, with shadows.
-#[derive(Args)]
-#[command(after_help = "Example:\n  globalsplat bench synth --size 256")]
-pub struct Synth {
-    /// Number of synthetic scenes
-    #[arg(long, value_name = "N", default_value_t = 16, value_parser = clap::value_parser!(u64).range(1..))]
-    videos: u64,
-    /// Number of views per scene
-    #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u32).range(2..=10_000))]
-    frames: u32,
-    /// Side of a view in pixels
-    #[arg(long, value_name = "PIXELS", default_value_t = 128, value_parser = clap::value_parser!(u32).range(16..=8192))]
-    size: u32,
-    /// Print the measurements as one JSON object
-    #[arg(long)]
-    json: bool,
-}
-
-impl Synth {
-    fn run(self) -> Result<()> {
-        let bar = progress::bar(self.videos, "scenes");
-        let report = bench_synth(self.videos, self.frames as usize, self.size, || bar.inc(1));
-        bar.finish_and_clear();
-        if self.json {
-            print_json(&serde_json::to_value(&report)?);
-            return Ok(());
+        config.train.batch_size = fits;
+        config.train.micro_batch = 0;
+        loop {
+            let batch = config.train.batch_size;
+            let bench = || bench_train(&config, self.steps as usize, device, ProcessGroup::single());
+            let is_refused = |why: &str| batch > 1 && why.contains("out of memory");
+            match catch_unwind(AssertUnwindSafe(bench)) {
+                Ok(Err(error)) if is_refused(&error.to_string()) => {}
+                Ok(done) => return Ok(done?),
+                Err(panic) if is_refused(panic_message(&*panic)) => {}
+                Err(panic) => resume_unwind(panic),
+            }
+            config.train.batch_size = batch / 2;
+            eprintln!("--batch auto: {} scenes; there was too little memory for {batch}", batch / 2);
         }
-        let [height, width] = report.size;
-        println!(
-            "{} scenes of {} triangles, {} views of {width}x{height}, {} rays a pixel and their shadows",
-            report.videos, report.triangles, report.views, report.rays_per_pixel
-        );
-        println!(
-            "{:.1} views/s on one core, {:.2} 10^6 rays/s",
-            report.views_per_second, report.megarays_per_second
-        );
-        println!("{:.2} s to build a scene, all cores", report.seconds_per_world);
-        Ok(())
+    }
+}
+
+/// Prints the values of a report, and then a row for every time in it, with what else is known of the same part.
+fn print_report(report: &Map<String, Value>) {
+    let is_time = |value: &Value| value.get("median").is_some();
+    let is_table =
+        |value: &Value| value.as_array().is_some_and(|rows| rows.iter().any(|row| !row.is_number()));
+    let (tables, values): (Vec<_>, Vec<_>) =
+        report.iter().partition(|(_, value)| is_time(value) || is_table(value) || value.is_object());
+    println!(
+        "{}",
+        values.iter().map(|(name, value)| format_value(name, value)).collect::<Vec<_>>().join(", ")
+    );
+    for (name, value) in tables {
+        match value {
+            Value::Array(rows) => rows.iter().for_each(print_row),
+            Value::Object(value) if !value.contains_key("median") => {
+                print!("{name}: ");
+                print_report(value);
+            }
+            time => print_time(name, time, ""),
+        }
+    }
+}
+
+/// Prints a part of a report: an object with a name and a time, a pair of a name and a mean time, or an object of values.
+fn print_row(row: &Value) {
+    match row {
+        Value::Array(pair) => println!("{:<28} {:>10.3} ms", pair[0].as_str().unwrap_or(""), pair[1]),
+        Value::Object(values) => {
+            let others = values.iter().filter(|(name, _)| !["name", "milliseconds"].contains(&name.as_str()));
+            let others: Vec<String> = others.map(|(name, value)| format_value(name, value)).collect();
+            match values.get("milliseconds") {
+                Some(time) => print_time(values["name"].as_str().unwrap_or(""), time, &others.join(", ")),
+                None => println!("{}", others.join(", ")),
+            }
+        }
+        other => println!("{other}"),
+    }
+}
+
+fn print_time(name: &str, time: &Value, others: &str) {
+    let [median, min, p75] =
+        ["median", "least", "upper_quartile"].map(|key| time[key].as_f64().unwrap_or(f64::NAN));
+    println!("{name:<28} {median:>10.3} ms median, {min:>10.3} min, {p75:>10.3} p75  {others}");
+}
+
+fn format_value(name: &str, value: &Value) -> String {
+    match (value.as_f64().filter(|number| number.fract() != 0.), value) {
+        (Some(number), _) => format!("{name} {number:.4}"),
+        (None, Value::String(text)) => format!("{name} {text}"),
+        (None, other) => format!("{name} {other}"),
     }
 }

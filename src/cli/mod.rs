@@ -4,11 +4,6 @@
 //! everything else to standard error.
 
 mod bench;
-mod bench_attention;
-mod bench_common;
-mod bench_model;
-mod bench_refine;
-mod bench_train;
 mod capture;
 mod convert;
 mod device;

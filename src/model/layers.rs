@@ -172,7 +172,7 @@ fn attention_cpu_kernel(all: [&Tensor; 3], heads: i64) -> Tensor {
 }
 
 /// Computes [`attention`] with libtorch, on any device and for any kind and width.
-pub(crate) fn attention_libtorch(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
+fn attention_libtorch(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor {
     let split = |t: &Tensor| {
         let (b, n, d) = t.size3().expect("[B, n, d]");
         t.view([b, n, heads, d / heads]).transpose(1, 2) // [B, h, n, d/h]

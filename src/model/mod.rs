@@ -25,7 +25,7 @@ pub(crate) use encoder::CheckpointedRounds;
 pub(crate) use config::{repeat_scene_tokens, shrink_patch_weights, split_opacity_bias};
 pub(crate) use decoder::{Candidates, Decoder, MAX_SCALE, quaternion_from_6d, rotation_matrix_from_6d};
 pub(crate) use encoder::{Encoder, Mixer, SelfAttentionBlock, StreamRound};
-pub(crate) use layers::{attention, attention_libtorch};
+pub(crate) use layers::attention;
 pub(crate) use tokens::{CameraCode, IMAGENET_MEAN, RayTokens, RgbTokens, Tokenizer, patchify};
 
 use crate::error::Result;

@@ -267,7 +267,7 @@ fn weights_files_without_a_model() {
 #[test]
 fn options_that_do_not_apply() {
     let data = ["eval", "--weights", "w", "--data", "d", "--index", "i.json", "--out", "o"];
-    let model_options = [["--views-at", "64"], ["--views", "3"], ["--precision", "bf16"]];
+    let model_options = [["--views", "4"], ["--views", "3"], ["--precision", "bf16"]];
     let dataset_options = [["--index", "i.json"], ["--size", "64"], ["--name", "n"]];
     let scene_options = [["--holdout", "every:3"], ["--views", "3"], ["--sheet", "s.png"]];
     let commands: [(&[&str], [[&str; 2]; 3]); 4] = [

@@ -459,7 +459,10 @@ fn a_run_goes_from_photos_to_a_splat() {
         );
     }
     let curves = std::fs::read_to_string(run.join("curves.svg")).unwrap();
-    assert!(curves.matches("<polyline").count() == 3 && curves.contains("held out"), "{curves}");
+    assert!(
+        curves.contains("in training") && curves.contains("held out") && curves.contains("nearest photo"),
+        "{curves}"
+    );
     // Without --weights, the embedded weights are used. One line reports how the photos were selected and resized.
     let output =
         globalsplat(&["reconstruct", "--scene", arg(&room), "--views", "5", "--out", arg(&splat), "--json"]);
@@ -657,14 +660,4 @@ fn training_on_chunks_reports_skipped_scenes() {
     let err = String::from_utf8_lossy(&refused.stderr);
     assert_eq!(refused.status.code(), Some(1), "{err}");
     assert!(err.contains("1 of 3 scenes were skipped") && err.contains("data.max_bad_share"), "{err}");
-}
-
-#[test]
-fn bench_loader_reports_the_time_of_stages() {
-    let report = json(&["bench", "loader", "--samples", "10", "--json"]);
-    assert!(report["views_per_second"].as_f64().unwrap() > 1.);
-    assert_eq!(report["resident_by_tenth"].as_array().unwrap().len(), 10);
-    for stage in ["read", "decode", "resize", "augment", "to_tensor"] {
-        assert!(report["milliseconds"][stage].as_f64().unwrap() > 0., "{stage}");
-    }
 }

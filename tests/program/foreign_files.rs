@@ -94,23 +94,6 @@ fn pack_replaces_no_chunk_but_one_that_it_would_write() {
 }
 
 #[test]
-fn made_up_videos_leave_folders_alone() {
-    let folder = tempfile::tempdir().unwrap();
-    let file = put(folder.path().join("frames/video_000/0000.jpg"));
-    globalsplat::bench::synthetic_videos(folder.path()).unwrap();
-    assert_kept(&file);
-    let mut names: Vec<_> =
-        std::fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
-    names.sort();
-    assert!(
-        names
-            .iter()
-            .all(|name| name == "frames" || name == "index.json" || !arg(name.as_ref()).starts_with('.'))
-    );
-    assert!(names.contains(&"index.json".into()));
-}
-
-#[test]
 fn pictures_are_not_put_over_photos() {
     let (_folder, room) = room();
     let before = contents(&room);
