@@ -1,13 +1,13 @@
-use super::{device, model, open_capture, parse_size, print_json, ranks, warn};
+use super::{device, distributed, model, open_capture, parse_size, print_json, warn};
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use globalsplat::bench::{bench_model, bench_raster, bench_refine, bench_train, synthetic_gaussians};
 use globalsplat::config::Config;
 use globalsplat::data::{load_all_views, view_batch};
 use globalsplat::device::total_memory_bytes;
+use globalsplat::distributed::ProcessGroup;
 use globalsplat::error::{Error, panic_message};
 use globalsplat::io::read_splat;
-use globalsplat::ranks::ProcessGroup;
 use globalsplat::refine::RefineConfig;
 use globalsplat::scene::Gaussians;
 use globalsplat::train::largest_fitting_batch;
@@ -260,7 +260,7 @@ fn parse_batch(text: &str) -> Result<Batch, String> {
 
 impl Train {
     fn run(self) -> Result<()> {
-        let (group, device) = ranks::join(&self.common.device)?;
+        let (group, device) = distributed::join(&self.common.device)?;
         let is_main_process = group.is_main_process();
         let mut config = self.config.read()?;
         if let Some(set) = self.config.set.iter().find(|set| set.trim_start().starts_with("train.batch")) {

@@ -1,6 +1,6 @@
 use super::{
-    check_former_option, check_views, device, distributed, model, open_masked_capture, parse_holdout,
-    parse_photo_size, print_json, progress, report_downscaling, stop_flag, warn, warn_of_many,
+    check_views, device, distributed, model, open_masked_capture, parse_holdout, parse_photo_size,
+    print_json, progress, report_downscaling, stop_flag, warn, warn_of_many,
 };
 use anyhow::Result;
 use clap::{ArgGroup, Args};
@@ -14,7 +14,7 @@ use globalsplat::eval::{
 use globalsplat::io::{InputFiles, check_writable_dir, check_writable_png};
 use globalsplat::metrics::{CaptureScores, ContactSheet, Perceptual};
 use globalsplat::model::Precision;
-use globalsplat::reconstruct::{Input, LoadedModel, Model, context_views};
+use globalsplat::reconstruct::{LoadedModel, Model, context_views};
 use globalsplat::scene::ImageSize;
 use serde_json::json;
 use std::ops::RangeInclusive;
@@ -37,8 +37,7 @@ use tch::Device;
 #[command(group(ArgGroup::new("photos").required(true)))]
 #[command(after_help = "Examples:\n  globalsplat eval --splat scene.ply --scene captures/room --json\n  \
     globalsplat eval --weights model.safetensors --scene captures/room --holdout every:8 --sheet views.png\n  \
-    globalsplat eval --weights model.safetensors --data re10k --index re10k_24v.json --out results/re10k\n  \
-    globalsplat eval --weights model.safetensors --scene captures/room --holdout every:8 --views-at 512 --pictures-at 512")]
+    globalsplat eval --weights model.safetensors --data re10k --index re10k_24v.json --out results/re10k")]
 pub struct Eval {
     /// Weights: a file that `export` or `import` wrote, or a checkpoint (.ckpt)
     #[arg(long, value_name = "FILE", group = "subject")]
@@ -79,19 +78,13 @@ pub struct Eval {
     /// Number of input photos, spread along the camera path; by default all that are not held out
     #[arg(long, value_name = "N", conflicts_with_all = ["splat", "renders", "data"])]
     views: Option<usize>,
-    /// Height of the model's input photos in pixels, a multiple of the height it was trained with
-    #[arg(long, value_name = "PIXELS", conflicts_with_all = ["splat", "renders"])]
-    views_at: Option<u32>,
-    /// Former option. Its other values than `polyphase` are refused
-    #[arg(long, hide = true, requires = "views_at")]
-    views_as: Option<String>,
     /// Height of the scored images in pixels, in the shape of the model's images, or square; by default the size of the model's
     /// images, for images from other methods 256 on a dataset, and on one capture the size of its photos
     #[arg(long, value_name = "PIXELS")]
-    pictures_at: Option<u32>,
+    render_height: Option<u32>,
     /// Size of the scored images of a splat or of another method on one capture: their longer side, as in 1600, or WxH, to which
     /// photos are cropped and resized; by default the size of the photos
-    #[arg(long, value_name = "N|WxH", conflicts_with_all = ["weights", "data", "pictures_at"])]
+    #[arg(long, value_name = "N|WxH", conflicts_with_all = ["weights", "data", "render_height"])]
     size: Option<String>,
     /// Also write an image: photo, render and depth side by side, a row per view; downscaled if it would have more than 64
     /// million pixels
@@ -112,8 +105,6 @@ pub struct Eval {
 impl Eval {
     pub fn run(self) -> Result<()> {
         check_views(self.views)?;
-        let why = "whole and repeated were removed, as they gained nothing: see docs/experiments.md";
-        check_former_option("--views-as", self.views_as.as_deref(), "polyphase", why)?;
         match &self.scene {
             Some(scene) => self.run_scene(scene, device::parse(&self.device)?),
             None => self.run_dataset(),
@@ -136,9 +127,9 @@ impl Eval {
             inputs.check_file(sheet)?;
         }
         let loaded = self.load_model(device)?;
-        let model = self.model(loaded.as_ref())?;
+        let model = loaded.as_ref().map(Model::from);
         let scene = self.one_scene(&capture, model)?;
-        if self.chooses_size() && scene.enlarged {
+        if self.render_height.is_some() && scene.enlarged {
             eprintln!("{}: {}", scene.name, model::ENLARGED);
         }
         let mut output = self.method(model).render_targets(scene, device)?;
@@ -162,13 +153,10 @@ impl Eval {
         if self.json {
             let mut object = serde_json::to_value(&scores)?;
             object["peak_memory_bytes"] = peak_memory.into();
-            if let Some(Model { input, config, .. }) = model {
-                let (photos, size) = (scene.context.len(), config.data.image_size);
+            if let Some(Model { config, .. }) = model {
                 object["image_size"] = json!(self.target_size(model)?);
-                object["input"] = json!({
-                    "photos": photos, "image_size": input.photo_size(size),
-                    "views": photos * input.views_of_photo(),
-                });
+                object["input"] =
+                    json!({ "photos": scene.context.len(), "image_size": config.data.image_size });
                 object["forward_seconds"] = json!(output.forward_seconds);
             }
             if let Some(Baselines { nearest_photo, mean_photo }) = &baselines {
@@ -198,18 +186,18 @@ impl Eval {
             let holdout = self.holdout.as_deref().map(parse_holdout).transpose()?;
             let size = match &self.size {
                 Some(size) => parse_photo_size(size)?,
-                None => self.pictures_at.map_or(PhotoSize::Own, |_| PhotoSize::Exactly(target_size)),
+                None => self.render_height.map_or(PhotoSize::Own, |_| PhotoSize::Exactly(target_size)),
             };
             return Ok(EvalScene::without_context(capture, holdout, size)?);
         };
-        let photo_size = model.input.photo_size(model.config.data.image_size);
+        let photo_size = model.config.data.image_size;
         Ok(EvalScene::held_out(capture, self.holdout(model)?, self.views, photo_size, target_size)?)
     }
 
     /// Scores the baselines that use only the input photos of `scene`, at the size of the scored images.
     fn baselines(&self, capture: &Capture, model: Model, scene: &EvalScene) -> Result<Baselines> {
         let size = self.target_size(Some(model))?;
-        let photos = match size == model.input.photo_size(model.config.data.image_size) {
+        let photos = match size == model.config.data.image_size {
             true => LazyPhotos::Loaded(scene.context.iter().map(View::shallow_clone).collect()),
             false => {
                 let shown = context_views(capture, self.holdout(model)?, self.views);
@@ -226,21 +214,16 @@ impl Eval {
         }
     }
 
-    /// Returns `true` if the user chose a size that may exceed the resolution of the photos.
-    fn chooses_size(&self) -> bool {
-        self.views_at.is_some() || self.pictures_at.is_some()
-    }
-
     /// Returns the size of the scored images.
     fn target_size(&self, model: Option<Model>) -> Result<ImageSize> {
         let default = model.map_or(PROTOCOL_SIZE.into(), |model| model.config.data.image_size);
-        let Some(height) = self.pictures_at else { return Ok(default) };
+        let Some(height) = self.render_height else { return Ok(default) };
         let aspect = f64::from(default.width) / f64::from(default.height);
         let width = (f64::from(height) * aspect).round() as u32;
-        if !(PICTURE_SIDES.contains(&height) && PICTURE_SIDES.contains(&width)) {
-            let (least, most) = (PICTURE_SIDES.start(), PICTURE_SIDES.end());
+        if !(RENDER_SIDES.contains(&height) && RENDER_SIDES.contains(&width)) {
+            let (least, most) = (RENDER_SIDES.start(), RENDER_SIDES.end());
             let why = format!(
-                "--pictures-at is {height}, expected pictures with sides of {least} to {most} pixels"
+                "--render-height is {height}, expected images with sides of {least} to {most} pixels"
             );
             return Err(Error::request(why).into());
         }
@@ -251,20 +234,6 @@ impl Eval {
         let requested = model::parse_precision(&self.precision)?;
         let load = |path: &PathBuf| model::load(Some(path), requested, device);
         Ok(self.weights.as_ref().map(load).transpose()?)
-    }
-
-    /// Returns the model and the way it gets its input photos.
-    fn model<'a>(&self, loaded: Option<&'a LoadedModel>) -> Result<Option<Model<'a>>> {
-        let Some(loaded) = loaded else { return Ok(None) };
-        let trained = loaded.config.data.image_size;
-        let input = match self.views_at {
-            Some(height) => Input::with_height(height, trained)?,
-            None => Input::PLAIN,
-        };
-        if !input.is_plain() && distributed::is_main_process() {
-            eprintln!("photos are cut and resized to {}", model::describe_input(input, trained));
-        }
-        Ok(Some(Model { input, ..loaded.into() }))
     }
 
     /// Returns the input files of the evaluation; for a dataset, `methods` has one method per scene.
@@ -341,7 +310,7 @@ impl Eval {
         check_writable_dir(out)?;
         self.check_outputs(&dataset, out, indices.iter().zip(&folders))?;
         let (loaded, path) = (self.load_model(device)?, self.path());
-        let model = self.model(loaded.as_ref())?;
+        let model = loaded.as_ref().map(Model::from);
         let target_size = self.target_size(model)?;
         let fingerprint = self.fingerprint()?;
         let stop = stop_flag()?;
@@ -353,16 +322,10 @@ impl Eval {
                 Some(Precision::Bf16) => " bf16",
                 _ => "",
             };
-            let setting = match (model, self.views_at) {
-                (Some(Model { input, .. }), Some(height)) if !input.is_plain() => {
-                    format!("{precision} polyphase {height}")
-                }
-                _ => precision.into(),
-            };
-            let sweep = DatasetEvaluation {
+            let evaluation = DatasetEvaluation {
                 method: self.method(model),
-                name: self.name.clone().unwrap_or(stem + &setting),
-                fingerprint: fingerprint.clone() + &setting,
+                name: self.name.clone().unwrap_or(stem + precision),
+                fingerprint: fingerprint.clone() + precision,
                 dataset: &dataset,
                 root: data,
                 dataset_name,
@@ -374,7 +337,7 @@ impl Eval {
                 group: &group,
             };
             let bar = progress::bar_on_first_rank(group.is_main_process(), 0, "scenes");
-            let evaluation = sweep.run(
+            let evaluation = evaluation.run(
                 || Perceptual::find(device),
                 |done, of| {
                     bar.set_length(of as u64);
@@ -393,7 +356,7 @@ impl Eval {
                 why.iter().for_each(|line| eprintln!("{line}"));
             }
             let enlarged = evaluation.scenes.iter().filter(|scene| scene.enlarged).count();
-            if self.chooses_size() && enlarged > 0 {
+            if self.render_height.is_some() && enlarged > 0 {
                 eprintln!("{enlarged} of {} scenes: {}", evaluation.scenes.len(), model::ENLARGED);
             }
             warn_of_many(evaluation.scenes.iter().flat_map(|scene| &scene.warnings));
@@ -407,17 +370,17 @@ impl Eval {
         }
         let report = out.join(REPORT);
         write_report(&report, &evaluations)?;
-        self.tell(&report, &evaluations)
+        self.print_summaries(&report, &evaluations)
     }
 
-    fn tell(&self, report: &Path, evaluations: &[(PathBuf, Evaluation)]) -> Result<()> {
+    fn print_summaries(&self, report: &Path, evaluations: &[(PathBuf, Evaluation)]) -> Result<()> {
         if self.json {
             let summaries: Vec<_> = evaluations
                 .iter()
                 .map(|(folder, e)| {
                     json!({
                         "folder": folder.to_string_lossy(), "index": e.index, "dataset": e.dataset, "context_views": e.context_views,
-                        "input": e.input, "image_size": e.image_size, "scenes": e.scenes.len(), "indexed_scenes": e.indexed_scenes, "summary": e.summary,
+                        "image_size": e.image_size, "scenes": e.scenes.len(), "indexed_scenes": e.indexed_scenes, "summary": e.summary,
                         "efficiency": e.efficiency, "failures": e.failures,
                     })
                 })
@@ -459,7 +422,7 @@ impl Eval {
 /// Size of the protocol's images, [height, width] (spec 9.1).
 const PROTOCOL_SIZE: [u32; 2] = [256, 256];
 /// Allowed sides of scored images in pixels: SSIM uses windows of 11×11.
-const PICTURE_SIDES: RangeInclusive<u32> = 11..=16_384;
+const RENDER_SIDES: RangeInclusive<u32> = 11..=16_384;
 
 /// Returns the output folder of each index's scores: `out` itself if there is only one index.
 fn folders(out: &Path, indices: &[EvaluationIndex]) -> Result<Vec<PathBuf>> {

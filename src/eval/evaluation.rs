@@ -1,8 +1,14 @@
-//! Results of an evaluation over a dataset: the contents of `scores.json`, which the report shows.
+//! Results of an evaluation over a dataset, and their files: `scores.json` for programs and the report, `scores.csv` for spreadsheets, and
+//! the comparison images of the scenes.
 
+use crate::error::{Error, Result};
+use crate::io::{write_atomically, write_json};
 use crate::metrics::{CaptureScores, Scores};
-use crate::reconstruct::Input;
+use crate::render::cpu::simd_level;
 use serde::{Deserialize, Serialize};
+use std::ops::RangeInclusive;
+use std::path::{Path, PathBuf};
+use tch::Device;
 
 /// Scores of one method (a model, given splats or given images) on the scenes of one index. [`DatasetEvaluation`](super::DatasetEvaluation)
 /// computes them.
@@ -29,9 +35,6 @@ pub struct Evaluation {
     pub index: String,
     /// Number of context views of every scene.
     pub context_views: usize,
-    /// Conversion of the context photos into the model's views; `None` if no model was run.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub input: Option<Input>,
     /// `[height, width]` of the images that were scored.
     pub image_size: [u32; 2],
     /// Number of scenes that the index names; the dataset may hold fewer.
@@ -165,6 +168,111 @@ pub fn scene_file_name(scene: &str) -> String {
     }
     let plain: String = scene.chars().take(LONGEST).map(|c| if harmless(c) { c } else { '_' }).collect();
     format!("{plain}-{:08x}", crc32fast::hash(scene.as_bytes()))
+}
+
+/// Range of PSNR in dB for images in [0, 1]: identical images have 100. The margin allows for rounding of means.
+const POSSIBLE_PSNR: RangeInclusive<f64> = -0.001..=100.001;
+
+pub(super) const SCORES: &str = "scores.json";
+/// Name of the file of scores for spreadsheets.
+pub const TABLE: &str = "scores.csv";
+/// Name of the report's page.
+pub const REPORT: &str = "report.html";
+
+/// Returns the path of the comparison image of a scene's worst view in the evaluation's folder: ground truth, render, error and depth side
+/// by side.
+pub fn comparison_path(folder: &Path, scene: &str) -> PathBuf {
+    folder.join("scenes").join(format!("{}.jpg", scene_file_name(scene)))
+}
+
+/// Writes `folder/scores.json`.
+///
+/// # Errors
+/// Fails if the file can't be written.
+pub fn write_evaluation(folder: &Path, evaluation: &Evaluation) -> Result<()> {
+    Ok(write_json(&folder.join(SCORES), evaluation)?)
+}
+
+/// Reads `folder/scores.json`.
+///
+/// # Errors
+/// Fails if the file is missing, isn't valid JSON, lacks a field, or has a PSNR outside 0 to 100 dB, which can't be plotted.
+pub fn read_evaluation(folder: &Path) -> Result<Evaluation> {
+    let path = folder.join(SCORES);
+    let text = std::fs::read_to_string(&path).map_err(Error::read(&path))?;
+    let evaluation: Evaluation = serde_json::from_str(&text).map_err(|e| {
+        let found = format!("not the scores of an evaluation ({e})");
+        Error::input(&path, "the file", found, "what globalsplat eval writes")
+    })?;
+    let check = |name: &str, psnr: f64| match POSSIBLE_PSNR.contains(&psnr) {
+        true => Ok(()),
+        false => Err(Error::input(&path, format!("psnr of {name}"), psnr, "0 to 100 dB")),
+    };
+    check("the summary", evaluation.summary.mean.psnr)?;
+    for scene in evaluation.scenes.iter().map(|scene| &scene.scores) {
+        check(&format!("scene {}", scene.scene), scene.mean.psnr)?;
+        for view in &scene.views {
+            check(&format!("view {} of scene {}", view.image, scene.scene), view.scores.psnr)?;
+        }
+    }
+    Ok(evaluation)
+}
+
+/// A line of `scores.csv`.
+#[derive(Serialize)]
+struct Line<'a> {
+    scene: &'a str,
+    view: &'a str,
+    psnr: f64,
+    ssim: f64,
+    lpips_vgg: Option<f64>,
+    lpips_alex: Option<f64>,
+    gaussians: Option<i64>,
+    forward_seconds: Option<f64>,
+}
+
+/// Writes a line for every scene and target view to `path`. Missing values are left empty.
+///
+/// # Errors
+/// Fails if the file can't be written.
+pub fn write_csv(path: &Path, evaluation: &Evaluation) -> Result<()> {
+    write_atomically(path, |writer| {
+        let refused = |e: csv::Error| Error::write(path)(std::io::Error::other(e));
+        let mut writer = csv::Writer::from_writer(writer);
+        for scene in &evaluation.scenes {
+            for view in &scene.scores.views {
+                let line = Line {
+                    scene: &scene.scores.scene,
+                    view: &view.image,
+                    psnr: view.scores.psnr,
+                    ssim: view.scores.ssim,
+                    lpips_vgg: view.scores.lpips_vgg,
+                    lpips_alex: view.scores.lpips_alex,
+                    gaussians: scene.scores.gaussians,
+                    forward_seconds: scene.forward_seconds,
+                };
+                writer.serialize(line).map_err(refused)?;
+            }
+        }
+        writer.flush().map_err(Error::write(path))
+    })
+}
+
+/// Returns the processor, its number of cores, the SIMD level, and the device unless it is the CPU, such as
+/// `Intel(R) Xeon(R), 2 cores, avx512`.
+///
+/// # Errors
+/// Fails if `GLOBALSPLAT_SIMD` names a SIMD level that this machine doesn't have.
+pub fn machine(device: Device) -> Result<String> {
+    let cpu_info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let model_name = cpu_info.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
+    let processor = model_name.map_or(std::env::consts::ARCH, |(_, name)| name.trim());
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let gpu = match device {
+        Device::Cpu => String::new(),
+        other => format!(", {other:?}"),
+    };
+    Ok(format!("{processor}, {cores} cores, {}{gpu}", simd_level()?))
 }
 
 #[cfg(test)]

@@ -1,8 +1,7 @@
 //! Validation: renders and scores held-out views and scenes during training (spec 8.8).
 
-use super::baselines::nearest_context_baseline;
-use super::photo_source::LazyPhotos;
-use super::scene::split_views;
+use super::method::nearest_context_baseline;
+use super::scene::{LazyPhotos, split_views};
 use crate::data::{
     Capture, DataConfig, Dataset, Holdout, SceneGroup, Split, TrainingScenes, View, cameras_at, load_views,
 };

@@ -3,7 +3,7 @@
 use crate::common::has_lpips;
 use crate::common::program::{arg, command, fail, refuse, room, rooms, succeed, text, tiny_weights};
 use globalsplat::data::{Dataset, Split};
-use globalsplat::eval::read_evaluation;
+use globalsplat::eval::{SceneScores, read_evaluation};
 use globalsplat::io::{read_image, write_png};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -139,30 +139,6 @@ fn an_interrupted_evaluation_resumes() {
     assert!(error.contains("choose another --out"), "{error}");
 }
 
-#[test]
-fn changed_splats_and_new_metrics_are_scored_again() {
-    let set = Set::new();
-    let splats = set.path("splats");
-    let arguments = set.arguments(&["--splat", arg(&splats)], "captures");
-    assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
-    let first = read_evaluation(&set.path("out")).unwrap();
-    // Replace a splat by that of another scene.
-    std::fs::copy(splats.join("room_001.ply"), splats.join("room_000.ply")).unwrap();
-    assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
-    let second = read_evaluation(&set.path("out")).unwrap();
-    assert!(second.scenes[0].scores.mean.psnr < first.scenes[0].scores.mean.psnr - 10.);
-    assert_eq!(second.scenes[1].scores.mean.psnr, first.scenes[1].scores.mean.psnr);
-
-    // LPIPS is added once its weights are available.
-    if !has_lpips() {
-        return;
-    }
-    assert!(second.scenes.iter().all(|scene| scene.scores.mean.lpips_alex.is_none()));
-    succeed(&text(&arguments));
-    let third = read_evaluation(&set.path("out")).unwrap();
-    assert!(third.scenes.iter().all(|scene| scene.scores.mean.lpips_alex.is_some()));
-}
-
 /// Replaces the contents of the file at `path` without changing its size or modification time.
 fn replace_unnoticed(path: &Path, mut bytes: Vec<u8>) {
     let metadata = std::fs::metadata(path).unwrap();
@@ -207,6 +183,15 @@ fn changes_of_same_size_and_time_are_scored_again() {
     std::fs::write(set.path(cameras), moved.to_string()).unwrap();
     let fourth = psnr();
     assert!(fourth[0] != third[0] && fourth[1] == 99.5, "another camera: {third:?} and {fourth:?}");
+
+    // LPIPS is added once its weights are available.
+    if !has_lpips() {
+        return;
+    }
+    let has_lpips = |scene: &SceneScores| scene.scores.mean.lpips_alex.is_some();
+    assert!(!read_evaluation(&set.path("out")).unwrap().scenes.iter().any(has_lpips));
+    succeed(&text(&arguments));
+    assert!(read_evaluation(&set.path("out")).unwrap().scenes.iter().all(has_lpips));
 }
 
 #[test]
@@ -303,29 +288,6 @@ fn external_renders_are_scored_by_an_index() {
 }
 
 #[test]
-fn a_scene_that_fails_is_named_and_the_others_are_scored() {
-    let set = Set::new();
-    let splats = set.path("splats");
-    let arguments = set.arguments(&["--splat", arg(&splats)], "captures");
-    let photo = set.path("captures/room_002/images/003.png");
-    let bytes = std::fs::read(&photo).unwrap();
-    std::fs::write(&photo, &bytes[..bytes.len() / 2]).unwrap();
-    let (code, _, err) = run(&arguments, set.folder.path());
-    assert_eq!(code, Some(1), "{err}");
-    assert!(err.contains("room_002: ") && err.contains("images/003.png: the image is undecodable"), "{err}");
-    assert!(err.contains("1 scenes could not be scored"), "{err}");
-    let evaluation = read_evaluation(&set.path("out")).unwrap();
-    assert_eq!((evaluation.scenes.len(), evaluation.failures.len()), (1, 1));
-    assert_eq!(evaluation.failures[0].scene, "room_002");
-
-    // Once the photo is repaired, the same command does the rest.
-    std::fs::write(&photo, bytes).unwrap();
-    assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
-    let evaluation = read_evaluation(&set.path("out")).unwrap();
-    assert_eq!((evaluation.scenes.len(), evaluation.failures.len()), (2, 0));
-}
-
-#[test]
 fn several_indices_make_one_report() {
     let set = Set::new();
     let splats = set.path("splats");
@@ -366,34 +328,23 @@ fn ambiguous_dataset_names_are_refused() {
     ambiguous.extend(["--dataset".into(), "ACID".into()]);
     assert_eq!(run(&ambiguous, set.folder.path()).0, Some(0));
     assert_eq!(read_evaluation(&set.path("out")).unwrap().dataset, "acid");
+}
 
-    // The folder name decides; a part of a word doesn't count.
-    for folder in ["acid/test", "placid/test"] {
-        std::fs::create_dir_all(set.path(folder)).unwrap();
-        for file in ["000000.torch", "index.json"] {
-            std::fs::copy(set.path("chunks").join(file), set.path(folder).join(file)).unwrap();
-        }
-    }
-    for (folder, index, name) in [
-        ("acid", "acid_from_re10k_3v.json", "acid"),
-        ("acid/test", "acid_from_re10k_3v.json", "acid"),
-        ("placid/test", "index_3v.json", "placid"),
-    ] {
-        std::fs::remove_dir_all(set.path("out")).unwrap();
-        let (code, _, err) = run(&named(folder, index), set.folder.path());
+#[test]
+fn images_are_scored_at_the_height_that_is_asked_for() {
+    let set = Set::new();
+    let (room, splat) = (set.path("captures/room_000"), set.path("splats/room_000.ply"));
+    let arguments = ["eval", "--splat", arg(&splat), "--scene", arg(&room), "--json", "--render-height"];
+    let psnr = |height: &str| -> Value {
+        let output = [&arguments[..], &[height]].concat();
+        let (code, out, err) =
+            run(&output.iter().map(|a| a.to_string()).collect::<Vec<_>>(), set.folder.path());
         assert_eq!(code, Some(0), "{err}");
-        assert_eq!(read_evaluation(&set.path("out")).unwrap().dataset, name);
-    }
-    let error = refuse(&text(&named("acid/test", "re10k_3v.json")));
-    assert!(error.contains("acid") && error.contains("re10k") && error.contains("--dataset"), "{error}");
-
-    // Another dataset whose folder has the same name.
-    let error = refuse(&text(&named("acid/test", "index_3v.json")));
-    assert!(
-        error.contains("evaluation.json: the evaluation is of ") && error.contains("placid/test"),
-        "{error}"
-    );
-    assert!(error.contains("choose another --out"), "{error}");
+        serde_json::from_str::<Value>(&out).unwrap()["psnr"].clone()
+    };
+    assert!(psnr("256").as_f64() > psnr("64").as_f64(), "the photos were rendered at 256");
+    let error = refuse(&[&arguments[..], &["8"]].concat());
+    assert!(error.contains("--render-height is 8, expected images with sides of 11 to 16384"), "{error}");
 }
 
 #[test]
@@ -421,14 +372,19 @@ fn invalid_indices_are_refused() {
 }
 
 #[test]
-fn the_first_scene_that_can_be_judged_warms_up() {
+fn a_scene_that_fails_is_named_and_the_first_of_the_others_warms_up() {
     let set = Set::new();
     let weights = tiny_weights(set.folder.path(), &set.path("captures"));
-    std::fs::write(set.path("captures/room_000/images/000.png"), "no photo").unwrap();
+    let photo = set.path("captures/room_000/images/000.png");
+    let bytes = std::fs::read(&photo).unwrap();
+    std::fs::write(&photo, &bytes[..bytes.len() / 2]).unwrap();
     let frames = json!({"context": [0, 2, 4], "target": [1, 3]});
     set.write_index(&json!({"room_000": frames, "room_001": frames, "room_002": frames}));
-    let (code, _, err) = run(&set.arguments(&["--weights", arg(&weights)], "captures"), set.folder.path());
+    let arguments = set.arguments(&["--weights", arg(&weights)], "captures");
+    let (code, _, err) = run(&arguments, set.folder.path());
     assert_eq!(code, Some(1), "{err}");
+    assert!(err.contains("room_000: ") && err.contains("images/000.png: the image is undecodable"), "{err}");
+    assert!(err.contains("1 scenes could not be scored"), "{err}");
     let evaluation = read_evaluation(&set.path("out")).unwrap();
     assert_eq!((evaluation.scenes.len(), evaluation.failures.len()), (2, 1));
     let efficiency = evaluation.efficiency.expect("a model's cost");
@@ -437,6 +393,12 @@ fn the_first_scene_that_can_be_judged_warms_up() {
     let [first, second] = evaluation.scenes.as_slice() else { panic!("two scenes") };
     assert!(first.warm_up && first.peak_memory_bytes.is_some());
     assert!(!second.warm_up && second.peak_memory_bytes.is_none());
+
+    // Once the photo is repaired, the same command does the rest.
+    std::fs::write(&photo, bytes).unwrap();
+    assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
+    let evaluation = read_evaluation(&set.path("out")).unwrap();
+    assert_eq!((evaluation.scenes.len(), evaluation.failures.len()), (3, 0));
 }
 
 #[test]

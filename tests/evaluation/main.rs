@@ -5,6 +5,5 @@ mod common;
 
 mod colour_fit;
 mod evaluation;
-mod high_resolution;
 mod refine;
 mod report;

@@ -48,7 +48,6 @@ fn evaluation(method: &str, dataset: &str, context_views: usize, scenes: Vec<Sce
         dataset: dataset.into(),
         index: format!("{dataset}_{context_views}.json"),
         context_views,
-        input: None,
         image_size: [256, 256],
         indexed_scenes: scenes.len(),
         summary: Summary::from_scenes(&scenes),

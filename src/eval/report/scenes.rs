@@ -1,11 +1,9 @@
 //! Scores scene by scene, worst first: comparison images of the worst scenes, and the scores of all.
 
-use super::entry::{Entry, dataset_name};
-use super::numbers::{absent, count, decimal, thousands};
-use super::table::{Head, cell, swatch, table};
+use super::entries::{Entry, absent, count, dataset_name, decimal, thousands};
+use super::tables::{Head, cell, swatch, table};
 use crate::error::{Error, Result};
-use crate::eval::evaluation::SceneScores;
-use crate::eval::scores_file::comparison_path;
+use crate::eval::evaluation::{SceneScores, comparison_path};
 use crate::io::read_image_size;
 use crate::metrics::{CaptureScores, ViewScore};
 use base64::Engine;
@@ -88,7 +86,7 @@ fn scored(entry: &Entry, scene: &SceneScores, compares: bool) -> Result<Markup> 
         div.scored {
             p.scores {
                 @if compares {
-                    span.who { (swatch(entry)) (entry.name) ", " (count(scene.context.len(), "context view")) }
+                    span.who { (swatch(entry.color)) (entry.name) ", " (count(scene.context.len(), "context view")) }
                 }
                 (measures(&scene.scores))
                 @if let Some(seconds) = scene.forward_seconds { span { "time " b { (decimal(seconds, 2)) } " s" } }
@@ -174,7 +172,7 @@ fn rest(scenes: &[Scene]) -> Markup {
                 @let scores = &scored.scores;
                 tr {
                     th scope="row" { (scene.name) }
-                    td { (swatch(entry)) (entry.name) }
+                    td { (swatch(entry.color)) (entry.name) }
                     td { (entry.setting()) }
                     (cell(Some(decimal(scores.mean.psnr, 2))))
                     (cell(Some(decimal(scores.mean.ssim, 4))))
