@@ -1,14 +1,16 @@
-//! Fuzz target that every fuzz binary shares: the name of the binary selects the reader.
+//! Fuzz target of every reader: the environment variable `FUZZ_READER` selects one by its name.
 #![no_main]
 
-#[path = "../../tests/common/readers/mod.rs"]
-#[allow(dead_code)] // every target uses only one
+#[path = "../../tests/common/readers.rs"]
 mod readers;
 
 use std::sync::OnceLock;
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     static READER: OnceLock<readers::Reader> = OnceLock::new();
-    let named = || readers::READERS.iter().find(|(name, _)| *name == env!("CARGO_BIN_NAME"));
-    READER.get_or_init(|| named().expect("a reader of that name").1)(bytes);
+    let find = || {
+        let name = std::env::var("FUZZ_READER").expect("FUZZ_READER is set");
+        readers::READERS.iter().find(|(reader, _)| *reader == name).expect("a reader of that name").1
+    };
+    READER.get_or_init(find)(bytes);
 });

@@ -28,7 +28,7 @@ const MIN_CUT: f32 = 0.01;
 /// PSNR between both, over eight views around the splat or over the capture's cameras.
 ///
 /// SPZ stores coefficients within ±1, a SOG a few sets of coefficients for all Gaussians, and a .splat only one coefficient per
-/// colour channel; viewers for browsers keep no more of a PLY's coefficients, either (--for-viewers). With a capture, the
+/// colour channel; viewers for browsers keep no more of a PLY's coefficients, either (--clamp-sh). With a capture, the
 /// coefficients are fitted to look the same from its cameras; otherwise values out of range are clamped, which may cost much
 /// quality.
 ///
@@ -40,7 +40,7 @@ const MIN_CUT: f32 = 0.01;
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat convert room.ply room.spz\n  \
     globalsplat convert room.ply small.spz --sh-degree 1 --scene captures/room\n  \
-    globalsplat convert room.ply shared.ply --for-viewers --scene captures/room\n  \
+    globalsplat convert room.ply shared.ply --clamp-sh --scene captures/room\n  \
     globalsplat convert room.ply table.sog --up z --crop-sphere 0,0,0,2 --filter-floaters --scale 10")]
 pub struct Convert {
     /// Input splat: .ply, .compressed.ply, .sog, meta.json, .spz, .splat, .glb, .gltf or .ksplat
@@ -55,7 +55,7 @@ pub struct Convert {
     /// Keep within what viewers for browsers show, whatever the format holds: a Gaussian's own colour in [0, 1], other
     /// coefficients within ±1
     #[arg(long)]
-    for_viewers: bool,
+    clamp_sh: bool,
     /// Minimize the loss for the cameras of this capture, and report the loss over them
     #[arg(long, value_name = "PATH")]
     scene: Option<PathBuf>,
@@ -67,7 +67,7 @@ pub struct Convert {
     /// origin, as in UTM coordinates, float32 and the formats' own number types lose detail
     #[arg(long)]
     local_origin: bool,
-    /// Version of SPZ, 2 to 4; by default 4, or with --for-viewers 3, because some viewers don't read 4
+    /// Version of SPZ, 2 to 4; by default 4, or with --clamp-sh 3, because some viewers don't read 4
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..=4))]
     spz_version: Option<u32>,
     /// Remove Gaussians with values that aren't finite; `convert` always does, and scripts for splat-transform may say so
@@ -126,15 +126,15 @@ impl Convert {
         let cameras = move_cameras(&cameras, &edited.from_original);
         let original = edited.splat;
         let degree = self.sh_degree.map_or(original.sh_degree, |degree| degree as usize);
-        let limits = match self.for_viewers {
-            true => ShLimits::for_viewers(degree),
+        let limits = match self.clamp_sh {
+            true => ShLimits::of_viewers(degree),
             false => ShLimits::up_to(degree),
         };
         let fit = |cameras: &[Camera]| fit_splat(&self.to, &original, &limits, cameras);
         let fitted = match &capture {
             Some(_) => Some(fit(&cameras)?),
             // The writer clamps by itself.
-            None if !self.for_viewers => None,
+            None if !self.clamp_sh => None,
             None => Some(fit(&[])?),
         };
         let written = fitted.as_ref().unwrap_or(&original).with_sh_degree(degree);
@@ -145,7 +145,7 @@ impl Convert {
             None => splat_frame(&original).origin,
         });
         let begin = Instant::now();
-        let spz_version = self.spz_version.unwrap_or(if self.for_viewers { 3 } else { 4 });
+        let spz_version = self.spz_version.unwrap_or(if self.clamp_sh { 3 } else { 4 });
         splat_out::write_with(&self.to, &written, origin, &WriteOptions { spz_version })?;
         let written_at = Instant::now();
         let copy = read_splat(&self.to)?;
@@ -158,7 +158,7 @@ impl Convert {
         }
         let cameras = if capture.is_some() { cameras } else { orbit_around_splat(&moved) };
         if capture.is_none() {
-            self.tell_cut(&original, &fit(&[])?);
+            self.warn_clamped(&original, &fit(&[])?);
         }
         let psnr = psnr_between(&moved, &copy, &cameras)?;
         // What the file's format costs, without what the edits change.
@@ -197,7 +197,7 @@ impl Convert {
     }
 
     /// Warns if coefficients are out of the representable range and no capture was given to fit the others to.
-    fn tell_cut(&self, original: &Splat, held: &Splat) {
+    fn warn_clamped(&self, original: &Splat, held: &Splat) {
         let coefficients = |index: usize| {
             let pairs = original.sh_of(index).iter().zip(held.sh_of(index));
             pairs.flat_map(|(original, held)| original.iter().zip(held))
@@ -209,7 +209,7 @@ impl Convert {
         let share = 100. * cut as f64 / (3 * held.sh.len()) as f64;
         if cut > 0 {
             let share = if share < 0.05 { "less than 0.1".into() } else { format!("{share:.1}") };
-            let who = if self.for_viewers { "viewers hold" } else { "the format holds" };
+            let who = if self.clamp_sh { "viewers hold" } else { "the format holds" };
             eprintln!(
                 "{}: {share} % of the colours' coefficients are beyond what {who} and cut off; --scene, with the cameras that \
                  matter, loses less",

@@ -12,7 +12,7 @@ use std::path::PathBuf;
 #[derive(Debug, Clone)]
 enum EditArgument {
     Edit(SplatEdit),
-    SeenBy(PathBuf),
+    PruneUnseen(PathBuf),
     Merge(PathBuf),
 }
 
@@ -83,11 +83,11 @@ const OPTIONS: [EditOption; 13] = [
         |text| edit(SplatEdit::FilterFloaters(positive(text)?)),
     ),
     (
-        "seen-by",
+        "prune-unseen",
         "SCENE",
         "Remove Gaussians that no camera of this capture sees: those that contribute less than a thousandth of a pixel to all views \
          together",
-        |text| Ok(EditArgument::SeenBy(text.into())),
+        |text| Ok(EditArgument::PruneUnseen(text.into())),
     ),
     (
         "decimate",
@@ -174,7 +174,7 @@ impl Edits {
         let mut read = |argument: &EditArgument| -> globalsplat::Result<SplatEdit> {
             Ok(match argument {
                 EditArgument::Edit(edit) => edit.clone(),
-                EditArgument::SeenBy(path) => {
+                EditArgument::PruneUnseen(path) => {
                     let capture = open_capture(path)?;
                     capture.add_input_files(inputs);
                     SplatEdit::SeenBy(capture.cameras())
@@ -201,7 +201,7 @@ impl Args for Edits {
                 .help_heading("Edits, applied in the order in which they are given")
                 .action(ArgAction::Append)
                 // Paths that begin with a hyphen are rare, and a forgotten value isn't the next option.
-                .allow_hyphen_values(!["merge", "seen-by"].contains(&name))
+                .allow_hyphen_values(!["merge", "prune-unseen"].contains(&name))
                 .value_parser(move |text: &str| parser(text).map(|argument| (text.to_owned(), argument)));
             match name {
                 "filter-floaters" => {

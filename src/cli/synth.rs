@@ -29,7 +29,7 @@ const CHUNK_BYTES: usize = 20_000_000;
 #[derive(Args)]
 #[command(after_help = "Examples:\n  \
     globalsplat synth --out scenes/train --scenes 2000\n  \
-    globalsplat synth --out scenes/test --scenes 50 --first 2000 --sheet scenes.png")]
+    globalsplat synth --out scenes/test --scenes 50 --first 2000 --contact-sheet scenes.png")]
 pub struct Synth {
     /// Folder for index.json, 000000.torch, …
     #[arg(long, value_name = "DIR")]
@@ -57,7 +57,7 @@ pub struct Synth {
     depth: bool,
     /// Also write an overview image, a row per video
     #[arg(long, value_name = "FILE")]
-    sheet: Option<PathBuf>,
+    contact_sheet: Option<PathBuf>,
     /// Print the result as one JSON object
     #[arg(long)]
     json: bool,
@@ -68,7 +68,7 @@ const SHEET: (usize, usize) = (16, 8);
 
 impl Synth {
     pub fn run(self) -> Result<()> {
-        if let Some(sheet) = &self.sheet {
+        if let Some(sheet) = &self.contact_sheet {
             check_writable_png(sheet)?;
         }
         let pictures = self.pictures.as_deref().map(read_pictures).transpose()?.unwrap_or_default();
@@ -77,7 +77,7 @@ impl Synth {
         let on_walls = self.pictures.iter().filter_map(|folder| folder.read_dir().ok()).flatten().flatten();
         on_walls.for_each(|picture| inputs.add_photo(&picture.path()));
         inputs.check_folder(&self.out)?;
-        self.sheet.iter().try_for_each(|sheet| inputs.check_file(sheet))?;
+        self.contact_sheet.iter().try_for_each(|sheet| inputs.check_file(sheet))?;
         let size = ImageSize { height: self.size as u32, width: self.size as u32 };
         let settings = VideoSettings { frames: self.frames as usize, size, pictures };
         let videos = SyntheticDataset::new(self.seed, self.first, self.scenes, settings);
@@ -90,7 +90,7 @@ impl Synth {
         let (mut index, mut rows) = (BTreeMap::new(), vec![]);
         let mut note = |capture: &Capture| -> Result<(), Error> {
             index.insert(capture.name.clone(), SceneFrames::alternating(capture.len()));
-            if self.sheet.is_some() && rows.len() < SHEET.0 {
+            if self.contact_sheet.is_some() && rows.len() < SHEET.0 {
                 rows.push(sheet_row(capture)?);
             }
             bar.inc(1);
@@ -106,7 +106,7 @@ impl Synth {
                     self.write_depths(&file, &videos.capture(number)?)?;
                 }
                 // A sheet shows images as they were rendered, not the JPEGs of a chunk.
-                match self.sheet.is_some() && number < SHEET.0 {
+                match self.contact_sheet.is_some() && number < SHEET.0 {
                     true => note(&videos.capture(number)?),
                     false => note(capture),
                 }
@@ -132,7 +132,7 @@ impl Synth {
         }
         let index = EvaluationIndex { file: self.out.join("evaluation_index.json"), scenes: index };
         index.write()?;
-        if let Some(sheet) = &self.sheet {
+        if let Some(sheet) = &self.contact_sheet {
             write_png(sheet, &tile_vertically(&rows))?;
         }
         // This must be last: a folder with the index of its chunks is finished, and nothing more is written there.
@@ -143,11 +143,11 @@ impl Synth {
             print_json(&json!({
                 "out": self.out.to_string_lossy(), "scenes": scenes, "chunks": chunks, "index": index.file.to_string_lossy(),
                 "depth": self.depth.then_some(depths.to_string_lossy()),
-                "sheet": self.sheet.as_deref().map(Path::to_string_lossy),
+                "contact_sheet": self.contact_sheet.as_deref().map(Path::to_string_lossy),
             }));
         } else {
             println!("{out}: {scenes} videos of {} photos in {chunks} chunks", self.frames);
-            if let Some(sheet) = &self.sheet {
+            if let Some(sheet) = &self.contact_sheet {
                 println!("{}: the first of them", sheet.display());
             }
         }

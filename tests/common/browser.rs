@@ -2,14 +2,12 @@
 //!
 //! Communication is by the DevTools protocol over two pipes (`--remote-debugging-pipe`): a JSON object, then a zero byte.
 
-use globalsplat::io::write_png;
 use serde_json::{Value, json};
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, Command, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
-use tch::Tensor;
 use tempfile::TempDir;
 
 /// Timeout after which an unresponsive browser counts as hung.
@@ -193,29 +191,5 @@ impl Drop for Browser {
         }
         let _ = self.process.kill();
         let _ = self.process.wait();
-    }
-}
-
-/// Temporary folder for a test's screenshots. It is deleted when the test passes. When the test fails, the folder stays and its
-/// path is printed.
-pub struct Screenshots(Option<TempDir>);
-
-impl Screenshots {
-    pub fn create() -> Self {
-        Screenshots(Some(tempfile::tempdir().expect("a folder")))
-    }
-
-    /// Writes an image [3, H, W] to `<name>.png`.
-    pub fn save(&self, name: &str, picture: &Tensor) {
-        let folder = self.0.as_ref().expect("a folder until it is dropped");
-        write_png(&folder.path().join(format!("{name}.png")), picture).expect("a PNG");
-    }
-}
-
-impl Drop for Screenshots {
-    fn drop(&mut self) {
-        if let Some(folder) = self.0.take().filter(|_| std::thread::panicking()) {
-            println!("screenshots: {}", folder.keep().display());
-        }
     }
 }

@@ -16,15 +16,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Scales and origins, among them kilometres, UTM and ECEF coordinates.
-const PLACES: [(f64, [f64; 3]); 7] = [
-    (1e-6, [0.; 3]),
-    (1e-3, [0.; 3]),
-    (37., [-4., 3., 5.]),
-    (1e6, [0.; 3]),
-    (1., [448_265.12, 5_411_920.65, 135.4]),
-    (1e3, [1e8, -1e8, 1e8]),
-    (1., [-1e8, 3e7, 7e6]),
-];
+const PLACES: [(f64, [f64; 3]); 4] =
+    [(1e-6, [0.; 3]), (37., [-4., 3., 5.]), (1., [448_265.12, 5_411_920.65, 135.4]), (1e3, [1e8, -1e8, 1e8])];
 
 /// Returns the similarity transform of such a scale and origin.
 fn to_place((scale, offset): (f64, [f64; 3])) -> Similarity {
@@ -126,17 +119,8 @@ fn powers_of_two_change_no_bit() {
         // This format stores linear scales.
         let (out, pictures) = (of(&format!("{name}.splat")), of(&format!("{name}.png")));
         succeed(&["reconstruct", "--scene", arg(scene), "--views", "3", "--out", arg(&out)]);
-        succeed(&[
-            "render",
-            "--splat",
-            arg(&out),
-            "--scene",
-            arg(scene),
-            "--depth",
-            "--alpha",
-            "--out",
-            arg(&pictures),
-        ]);
+        let render = ["render", "--splat", arg(&out), "--scene", arg(scene), "--depth", "--alpha"];
+        succeed(&[&render[..], &["--out", arg(&pictures)]].concat());
         (Gaussians::from_splat(&read_splat(&out).unwrap()), fs::read(&pictures).unwrap())
     };
     let (plain, pictures) = made(&room, "plain");
@@ -203,7 +187,7 @@ fn a_local_origin_keeps_the_detail() {
     let (folder, room) = room();
     let ground_truth = read_splat(&room.join("truth.ply")).unwrap();
     let of = |name: &str| folder.path().join(name);
-    let to = to_place(PLACES[4]);
+    let to = to_place(PLACES[2]);
     let offset = to.translation;
     let (scene, local, world) = (of("scene"), of("local.ply"), of("world.ply"));
     write_moved(&room, &scene, &to);
@@ -222,7 +206,7 @@ fn a_local_origin_keeps_the_detail() {
     assert!(psnr(&local) > psnr(&world) + 10., "{} {}", psnr(&local), psnr(&world));
 
     // Relative to the capture's centre, in every format; an older splat's origin is replaced.
-    for ending in ["ply", "compressed.ply", "spz", "splat"] {
+    for ending in ["ply", "spz"] {
         let copy = of(&format!("copy.{ending}"));
         let convert = ["convert", arg(&local), arg(&copy), "--scene", arg(&scene)];
         let output = globalsplat(&[&convert[..], &["--local-origin"]].concat());
@@ -280,23 +264,13 @@ fn origins_that_are_none_are_refused() {
     ] {
         refused(bad, &["inspect", arg(&splat)]);
     }
-    let (out, page, scene) = (folder.path().join("out.ply"), folder.path().join("out.html"), arg(&room));
-    for command in [
-        &["render", "--splat", arg(&splat), "--scene", scene, "--out", arg(folder.path())][..],
-        &["eval", "--splat", arg(&splat), "--scene", scene],
-        &["convert", arg(&splat), arg(&out)],
-        &["refine", "--splat", arg(&splat), "--scene", scene, "--steps", "1", "--out", arg(&out)],
-    ] {
-        refused("{\"origin\": null}", command);
-    }
-    if has_viewer() {
-        let render = ["render", "--splat", arg(&splat), "--scene", scene, "--html", arg(&page)];
-        refused("{\"origin\": null}", &render);
-    }
+    let out = folder.path().join("out.ply");
+    refused("{\"origin\": null}", &["convert", arg(&splat), arg(&out)]);
 }
 
 /// A real capture gets the same scores in kilometres and in UTM coordinates.
 #[test]
+#[ignore = "make test-all: four reconstructions of a capture"]
 fn real_captures_score_the_same_anywhere() {
     let Some(capture) = captures().map(|mut captures| captures.swap_remove(0)) else { return };
     let folder = tempfile::tempdir().unwrap();
@@ -312,8 +286,8 @@ fn real_captures_score_the_same_anywhere() {
     let plain = score(&capture, "plain.ply");
     // Synthetic rooms have walls whose Gaussians are equally far from a camera, in an order that rotations change; photos have
     // none.
-    let turned = Similarity { rotation: DMat3::from_rotation_y(0.9), ..to_place(PLACES[2]) };
-    for place in [to_place(PLACES[0]), to_place(PLACES[5]), turned] {
+    let turned = Similarity { rotation: DMat3::from_rotation_y(0.9), ..to_place(PLACES[1]) };
+    for place in [to_place(PLACES[0]), to_place(PLACES[3]), turned] {
         let scene = of("scene");
         write_moved(&capture, &scene, &place);
         let other = score(&scene, "moved.ply");

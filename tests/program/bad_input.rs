@@ -369,7 +369,7 @@ fn unwritable_outputs_are_refused_before_the_work() {
     let photo = folder.path().join("sheet.jpg");
     for command in [
         &["eval", "--splat", arg(&splat), "--scene", arg(&room), "--sheet", arg(&photo)][..],
-        &["synth", "--out", arg(&folder.path().join("worlds")), "--sheet", arg(&photo)],
+        &["synth", "--out", arg(&folder.path().join("worlds")), "--contact-sheet", arg(&photo)],
     ] {
         assert_says(&refuse(command), &["sheet.jpg", "the image's file extension is another, expected .png"]);
     }

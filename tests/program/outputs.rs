@@ -119,7 +119,7 @@ fn pictures_replace_nothing_that_is_read() {
             &["eval", "--splat", splat, "--scene", room, "--sheet", link],
             &["eval", "--weights", weights, "--scene", room, "--sheet", hard],
             &["refine", "--splat", splat, "--scene", room, "--steps", "1", "--out", splat, "--sheet", photo],
-            &["synth", "--out", arg(&files.at("worlds")), "--pictures", images, "--sheet", photo],
+            &["synth", "--out", arg(&files.at("worlds")), "--pictures", images, "--contact-sheet", photo],
             &["synth", "--out", images, "--pictures", images],
         ],
     );

@@ -65,9 +65,19 @@ fn names_that_are_not_utf_8() {
     let write = |name: &str, text: &str| std::fs::write(folder.0.join(name), text).expect("a file");
 
     write_rooms(&folder.0.join("rooms"), 2, 9, 40).expect("rooms");
-    let videos =
-        ["synth", "--out", "@videos", "--frames", "9", "--size", "64", "--depth", "--sheet", "@s.png"];
-    folder.json(&videos, &["/out", "/index", "/depth", "/sheet"]);
+    let videos = [
+        "synth",
+        "--out",
+        "@videos",
+        "--frames",
+        "9",
+        "--size",
+        "64",
+        "--depth",
+        "--contact-sheet",
+        "@s.png",
+    ];
+    folder.json(&videos, &["/out", "/index", "/depth", "/contact_sheet"]);
     let pack = |out: &str| folder.succeed(&["pack", "@rooms", "--out", out, "--json"]);
     assert!(pack("@chunks").contains(SHOWN));
     assert!(!pack("chunks_too").contains(SHOWN), "a path as it was given");

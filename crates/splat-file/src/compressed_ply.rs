@@ -1,7 +1,7 @@
 //! PlayCanvas' compressed PLY (spec 10.12). Each Gaussian has four words of 32 bits, and a byte for each SH coefficient above degree 0.
 //! Positions, scales and colours are quantized between the bounds of a chunk of 256 Gaussians.
 
-use crate::formats::{Codec, Contents, WriteOptions, Writer};
+use crate::codec::{Codec, Contents, WriteOptions, Writer};
 use crate::invalid::InvalidGaussians;
 use crate::morton::morton_order;
 use crate::ply::degree_of_rest;

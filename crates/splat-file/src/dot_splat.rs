@@ -1,10 +1,10 @@
 //! antimatter15's `.splat` format: 32 bytes per Gaussian and nothing else (spec 10.14).
 
-use crate::formats::{Codec, Contents, WriteOptions, Writer, is_recognized};
+use crate::codec::{Codec, Contents, WriteOptions, Writer};
 use crate::invalid::InvalidGaussians;
 use crate::rotations::normalized;
 use crate::splat::{log_of_scale, logit_of_opacity};
-use crate::{Error, Result, SH_C0, ShLimits, Splat};
+use crate::{Error, Result, SH_C0, ShLimits, Splat, gltf, ply, sog, spz};
 use globalsplat_files::write_atomically;
 use std::path::Path;
 
@@ -13,6 +13,10 @@ pub(crate) const CODEC: Option<Codec> = Some(Codec { read, writer: Some(Writer::
 
 /// Number of bytes of a Gaussian: position and scale, float32 each, then colour, opacity and rotation, a byte each.
 const BYTES: usize = 32;
+
+/// Functions that recognize the other formats by their first bytes.
+const MAGICS: [fn(&[u8]) -> bool; 4] =
+    [ply::recognizes, sog::recognizes, spz::recognizes, gltf::recognizes_glb];
 
 /// Reads a `.splat`, whose colours don't depend on the view direction.
 ///
@@ -87,7 +91,7 @@ fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
             gaussian.extend(splat.unit_quaternion(index).map(|part| (part * 128. + 128.).round() as u8));
             // If the first bytes are the magic number of another format, the lowest bit of the position is flipped, so that readers don't
             // take the file for that format.
-            if place == 0 && is_recognized(&gaussian) {
+            if place == 0 && MAGICS.iter().any(|recognizes| recognizes(&gaussian)) {
                 gaussian[0] ^= 1;
             }
             writer.write_all(&gaussian).map_err(Error::write(path))?;

@@ -1,57 +1,13 @@
 //! File formats of splats: a module for each format, and an entry in [`FORMATS`]. The extension determines the format that is written; a
 //! file that is read is recognized by its contents, where that is possible.
 
-use crate::invalid::InvalidGaussians;
+use crate::codec::{Codec, Contents, WriteOptions, Writer};
 use crate::origin::{origin_file, read_origin, write_with_origin};
 use crate::rotations::drop_missing_rotations;
 use crate::{Error, Result, ShLimits, Splat, compressed_ply, dot_splat, gltf, ksplat, ply, sog, spz};
 use glam::DVec3;
 use globalsplat_files::check_writable_file;
 use std::path::{Path, PathBuf};
-
-/// Choices within a format.
-#[derive(Debug, Clone)]
-pub struct WriteOptions {
-    /// Version of SPZ, 2 to 4. Programs from before 2026 read versions up to 3.
-    pub spz_version: u32,
-}
-
-impl Default for WriteOptions {
-    fn default() -> Self {
-        WriteOptions { spz_version: 4 }
-    }
-}
-
-/// Contents of a file as a format's reader returns them, before its Gaussians are checked.
-pub(crate) struct Contents {
-    pub splat: Splat,
-    pub invalid: InvalidGaussians,
-}
-
-/// Functions of a format.
-pub(crate) struct Codec {
-    pub read: fn(&Path, &[u8]) -> Result<Contents>,
-    /// Functions that write the format, or `None` if it is only read.
-    pub writer: Option<Writer>,
-}
-
-/// Functions that write a format.
-pub(crate) struct Writer {
-    pub write: fn(&Path, &Splat, &WriteOptions) -> Result<()>,
-    pub limits: fn() -> ShLimits,
-    /// Function that rounds SH coefficients above degree 0 as the format does, if it has a palette of them.
-    pub round_sh: Option<fn(&Splat) -> Splat>,
-}
-
-impl Writer {
-    /// Creates the functions of a format without a palette.
-    pub const fn new(
-        write: fn(&Path, &Splat, &WriteOptions) -> Result<()>,
-        limits: fn() -> ShLimits,
-    ) -> Self {
-        Writer { write, limits, round_sh: None }
-    }
-}
 
 /// A splat file format.
 struct Format {
@@ -258,11 +214,6 @@ fn read_contents(path: &Path) -> Result<Contents> {
 /// Returns the format whose magic number `bytes` begin with.
 fn recognize(bytes: &[u8]) -> Option<&'static Format> {
     FORMATS.iter().find(|format| (format.recognizes)(bytes))
-}
-
-/// Returns `true` if readers would recognize `bytes` as the beginning of a file in another format than `.splat`.
-pub(crate) fn is_recognized(bytes: &[u8]) -> bool {
-    recognize(bytes).is_some()
 }
 
 /// Creates the splat from the valid Gaussians of a file that has `all` in total, without those that have no rotation.

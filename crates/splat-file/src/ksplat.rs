@@ -1,7 +1,7 @@
 //! mkkellogg's `.ksplat` format, versions 0.1 and later, which is only read. A header of 4,096 bytes and one of 1,024 bytes per section
 //! are followed by the sections. From compression level 1, positions are relative to the centres of buckets of Gaussians.
 
-use crate::formats::{Codec, Contents};
+use crate::codec::{Codec, Contents};
 use crate::invalid::InvalidGaussians;
 use crate::splat::{log_of_scale, logit_of_opacity};
 use crate::{Error, Result, SH_C0, Splat};

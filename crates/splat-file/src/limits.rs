@@ -22,7 +22,7 @@ impl ShLimits {
 
     /// Returns the limits of browser viewers, which apply to any file format: Spark and Babylon.js store the view-independent colour of a
     /// Gaussian in [0, 1] and the other coefficients within ±1, one byte each.
-    pub fn for_viewers(degree: usize) -> Self {
+    pub fn of_viewers(degree: usize) -> Self {
         let dc = 0.5 / SH_C0;
         ShLimits { degree, dc: -dc..=dc, rest: -1. ..=127. / 128. }
     }

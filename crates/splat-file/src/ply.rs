@@ -3,7 +3,7 @@
 //! A vertex has x y z, nx ny nz (zeros), f_dc_0..2, f_rest_*, opacity (a logit), scale_0..2 (logs), rot_0..3 (w, x, y, z). f_rest is
 //! channel-major: all reds, all greens, all blues. Files are written as float32, binary, little-endian.
 
-use crate::formats::{Codec, Contents, WriteOptions, Writer};
+use crate::codec::{Codec, Contents, WriteOptions, Writer};
 use crate::invalid::InvalidGaussians;
 use crate::ply_body::columns;
 use crate::ply_header::{Header, Scalar};

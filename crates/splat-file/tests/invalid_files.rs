@@ -3,8 +3,8 @@
 mod common;
 
 use common::{
-    assert_says, body_of_ply, endings, files_with_invalid_values, files_without_a_rotation, random_splat,
-    refused, refused_file, set, small_gaussians, write_changed_ply, write_ply, written,
+    Random, assert_says, body_of_ply, endings, files_with_invalid_values, files_without_a_rotation,
+    random_splat, refused, refused_file, set, small_gaussians, write_changed_ply, write_ply, written,
 };
 use globalsplat_splat_file::{read_splat, read_splat_without_invalid, write_splat};
 
@@ -13,73 +13,65 @@ fn in_header(bytes: &mut Vec<u8>, from: &str, to: &str) {
     bytes.splice(at..at + from.len(), to.bytes());
 }
 
+/// Checks the errors for files of `ending` after a change of a header, each with what is replaced, its replacement and the error.
+fn assert_headers_are_refused(ending: &str, cases: &[(&str, &str, &str)]) {
+    for (from, to, message) in cases {
+        assert_says(&refused(ending, |bytes| in_header(bytes, from, to)), &[message]);
+    }
+}
+
 #[test]
 fn bad_plys() {
-    let header = |from: &'static str, to: &'static str| refused("ply", |bytes| in_header(bytes, from, to));
-    assert_says(&header("little", "middle"), &["the format is binary_middle_endian", "ascii"]);
-    assert_says(&header("format", "comment"), &["the line format is missing"]);
-    assert_says(
-        &header("vertex 300", "vertex many"),
-        &["rows of the element vertex is many", "a whole number"],
+    assert_headers_are_refused(
+        "ply",
+        &[
+            ("little", "middle", "the format is binary_middle_endian"),
+            ("format", "comment", "the line format is missing"),
+            ("vertex 300", "vertex many", "rows of the element vertex is many, expected a whole number"),
+            ("element vertex 300\n", "", "the property x is without an element"),
+            ("element vertex", "element point", "the element vertex is missing"),
+            ("float opacity", "float half opacity", "the type of opacity is \"float half\""),
+            ("float opacity", "list float opacity", "the type of opacity"),
+            ("float opacity", "list uchar float opacity", "property opacity is a list"),
+            ("f_rest_8", "f_rest_9", "f_rest_* is 8 properties"),
+            ("vertex 300", "vertex 18446744073709551615", "the body is cut short"),
+            ("binary_little_endian", "ascii", "in row 0 of vertex is"),
+            (
+                "element vertex",
+                "element face 1000000000000\nproperty list uchar int i\nelement vertex",
+                "the body is cut short",
+            ),
+        ],
     );
-    assert_says(&header("element vertex 300\n", ""), &["the property x is without an element"]);
-    assert_says(&header("element vertex", "element point"), &["the element vertex is missing"]);
-    assert_says(&header("float opacity", "half opacity"), &["the type of opacity is half"]);
-    assert_says(&header("float opacity", "float half opacity"), &["the type of opacity is \"float half\""]);
-    assert_says(&header("float opacity", "list float opacity"), &["the type of opacity"]);
-    assert_says(&header("float opacity", "list uchar float opacity"), &["property opacity is a list"]);
-    assert_says(&header("f_rest_8", "f_rest_9"), &["f_rest_* is 8 properties", "0, 9, 24 or 45"]);
-    assert_says(&header("vertex 300", "vertex 1000000000"), &["the body is cut short", "104000000000 bytes"]);
-    assert_says(&header("vertex 300", "vertex 18446744073709551615"), &["the body is cut short"]);
-    assert_says(&header("binary_little_endian", "ascii"), &["in row 0 of vertex is", "expected a number"]);
-    let list = |kind: &str| {
-        let line = format!("element face 1000000000000\nproperty list {kind} int i\nelement vertex");
-        refused("ply", |bytes| in_header(bytes, "element vertex", &line))
-    };
-    assert_says(&list("uchar"), &["the body is cut short"]);
-    let lengths = |length: f64| {
-        let line = "element face 1\nproperty list double int i\nelement vertex";
-        refused("ply", |bytes| {
-            in_header(bytes, "element vertex", line);
+    for (length, message) in [
+        (-1., "the length of the list i in row 0 of face is -1, expected a whole number"),
+        (f64::NAN, "the length of the list i in row 0 of face is NaN"),
+        (1e300, "the body is cut short"),
+    ] {
+        let error = refused("ply", |bytes| {
+            in_header(bytes, "element vertex", "element face 1\nproperty list double int i\nelement vertex");
             let body = body_of_ply(bytes);
-            bytes.splice(body..body, length.to_le_bytes());
-        })
-    };
-    assert_says(&lengths(-1.), &["the length of the list i in row 0 of face is -1", "a whole number"]);
-    assert_says(&lengths(f64::NAN), &["the length of the list i", "NaN"]);
-    assert_says(&lengths(1e300), &["the body is cut short"]);
+            bytes.splice(body..body, f64::to_le_bytes(length));
+        });
+        assert_says(&error, &[message]);
+    }
 }
 
 #[test]
 fn bad_compressed_plys() {
-    let header =
-        |from: &'static str, to: &'static str| refused("compressed.ply", |bytes| in_header(bytes, from, to));
-    assert_says(&header("element chunk", "element chunks"), &["the element chunk is missing"]);
-    assert_says(
-        &header("element chunk 2", "element chunk 1"),
-        &["the number of chunks is 1, expected 2 for 300"],
+    assert_headers_are_refused(
+        "compressed.ply",
+        &[
+            ("element chunk", "element chunks", "the element chunk is missing"),
+            ("element chunk 2", "element chunk 1", "the number of chunks is 1, expected 2 for 300"),
+            ("vertex 300", "vertex 4000000000", "the body is cut short"),
+            ("float max_b", "float most_b", "property max_b is missing"),
+            ("uint packed_scale", "int packed_scale", "the type of packed_scale is another, expected uint"),
+            ("uchar f_rest_3", "char f_rest_3", "the type of f_rest_3 is another, expected uchar"),
+            ("element sh 300", "element sh 299", "rows of the element sh is 299, expected 300"),
+            ("uchar f_rest_8", "uchar f_rest_x", "f_rest_* is 8 properties"),
+        ],
     );
-    assert_says(&header("vertex 300", "vertex 4000000000"), &["the body is cut short"]);
-    assert_says(&header("float max_b", "float most_b"), &["property max_b is missing"]);
-    assert_says(
-        &header("uint packed_scale", "int packed_scale"),
-        &["the type of packed_scale is another", "uint"],
-    );
-    assert_says(&header("uchar f_rest_3", "char f_rest_3"), &["the type of f_rest_3 is another", "uchar"]);
-    assert_says(
-        &header("element sh 300", "element sh 299"),
-        &["rows of the element sh is 299, expected 300"],
-    );
-    assert_says(&header("uchar f_rest_8", "uchar f_rest_x"), &["f_rest_* is 8 properties"]);
-    assert_says(
-        &refused("compressed.ply", |bytes| bytes.truncate(bytes.len() - 1)),
-        &["the body is cut short"],
-    );
-    let bound = refused("compressed.ply", |bytes| {
-        let body = body_of_ply(bytes);
-        bytes[body..body + 4].copy_from_slice(&f32::NAN.to_le_bytes());
-    });
-    assert_says(&bound, &["min_x of chunk 0 is NaN", "a finite number"]);
 }
 
 #[test]
@@ -89,11 +81,39 @@ fn bad_splats() {
         &["the length is 33 bytes", "32 bytes for each"],
     );
     assert_says(&refused("splat", |bytes| bytes.clear()), &["the length is 0 bytes"]);
-    let number = |at: usize, value: f32| {
-        refused("splat", |bytes| bytes[64 + at..][..4].copy_from_slice(&value.to_le_bytes()))
-    };
-    assert_says(&number(4, f32::NAN), &["the position of Gaussian 2 is NaN", "finite numbers"]);
-    assert_says(&number(20, -1.), &["the scale of Gaussian 2 is -1", "0 or more"]);
+}
+
+/// No truncated or changed file of any format makes its reader panic, or allocate what the file can't hold.
+#[test]
+fn random_changes_are_read_or_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut random = Random::new(8);
+    let mut files: Vec<(&str, Vec<u8>)> = endings()
+        .map(|ending| {
+            let path = written(folder.path(), &format!("whole.{ending}"), &random_splat(40, 1, 9));
+            (ending, std::fs::read(path).unwrap())
+        })
+        .collect();
+    files.push(("ksplat", include_bytes!("files/level_1.ksplat").to_vec()));
+    for (ending, whole) in files {
+        let path = folder.path().join(format!("a.{ending}"));
+        for round in 0..100 {
+            let mut bytes = whole.clone();
+            // Headers are at the beginning of most files.
+            let limit = if round % 2 == 0 { bytes.len().min(512) } else { bytes.len() };
+            for _ in 0..3 {
+                bytes[(random.uniform() * limit as f32) as usize] = (random.uniform() * 256.) as u8;
+            }
+            if round % 4 == 0 {
+                bytes.truncate((random.uniform() * bytes.len() as f32) as usize);
+            }
+            std::fs::write(&path, bytes).unwrap();
+            if let Err(error) = read_splat(&path) {
+                assert_eq!(error.to_string().lines().count(), 1, "{error}");
+                assert!(error.is_invalid_request(), "{error}");
+            }
+        }
+    }
 }
 
 /// Values that a format can't store are refused, and nothing is written.

@@ -2,10 +2,10 @@
 
 use super::light::{Light, Sky};
 use super::mesh::Mesh;
+use super::objects;
 use super::scene_builder::{SceneBuilder, standing};
 use super::shapes::height_field;
 use super::texture::Purpose;
-use super::things;
 use super::walk::CameraSpace;
 use glam::{Affine3A, Vec3, vec2, vec3};
 
@@ -56,28 +56,28 @@ pub(super) fn landscape(builder: &mut SceneBuilder, sky: &Sky) -> CameraSpace {
     };
     for _ in 0..builder.within(0..10) {
         let transform = spot(builder, 8., 60.);
-        things::house(builder, transform);
+        objects::house(builder, transform);
     }
     for _ in 0..builder.within(0..22) {
         let (transform, tall) = (spot(builder, 3., 50.), builder.within(2. ..9.));
-        things::tree(builder, transform, tall);
+        objects::tree(builder, transform, tall);
     }
     for _ in 0..builder.within(0..14) {
         let transform = spot(builder, 1.5, 25.);
-        things::bush(builder, transform);
+        objects::bush(builder, transform);
     }
     for _ in 0..builder.within(0..10) {
         let (transform, size) = (spot(builder, 1.5, 25.), builder.log_uniform(0.3, 3.));
-        things::rock(builder, transform, size);
+        objects::rock(builder, transform, size);
     }
     for _ in 0..builder.within(0..3) {
         let (transform, length) = (spot(builder, 3., 20.), builder.within(3. ..15.));
-        things::fence(builder, transform, length);
+        objects::fence(builder, transform, length);
     }
     for _ in 0..builder.within(2..12) {
         let transform = spot(builder, 1., 0.6 * wide);
         match builder.chance(0.4) {
-            true => things::furniture(builder, transform),
+            true => objects::furniture(builder, transform),
             false => {
                 let size = vec3(
                     builder.log_uniform(0.3, 4.),
@@ -85,7 +85,7 @@ pub(super) fn landscape(builder: &mut SceneBuilder, sky: &Sky) -> CameraSpace {
                     builder.log_uniform(0.3, 4.),
                 );
                 let count = builder.within(1..8);
-                things::heap(builder, size, transform, count);
+                objects::heap(builder, size, transform, count);
             }
         }
     }
@@ -114,12 +114,12 @@ pub(super) fn outside(builder: &mut SceneBuilder, size: Vec3) {
         let at = middle + far * vec3(turn.cos(), 0., turn.sin());
         let transform = standing(at, builder.angle());
         match builder.within(0..4) {
-            0 if far > reach + 9. => things::house(builder, transform),
+            0 if far > reach + 9. => objects::house(builder, transform),
             1 | 2 => {
                 let tall = builder.within(2. ..8.) + below;
-                things::tree(builder, transform, tall);
+                objects::tree(builder, transform, tall);
             }
-            _ => things::bush(builder, transform),
+            _ => objects::bush(builder, transform),
         }
     }
 }

@@ -3,11 +3,11 @@
 use super::light::{Light, Sky};
 use super::material::Material;
 use super::mesh::Mesh;
+use super::objects;
 use super::outdoors::outside;
 use super::scene_builder::{SceneBuilder, standing};
 use super::shapes::{cone, cuboid, superellipsoid};
 use super::texture::Purpose;
-use super::things;
 use super::walk::CameraSpace;
 use glam::{Affine3A, Mat3, Quat, Vec2, Vec3, vec2, vec3};
 use std::f32::consts::FRAC_PI_2;
@@ -185,7 +185,7 @@ fn build_wall(builder: &mut SceneBuilder, wall: &Wall, height: f32, material: &M
         }
         let middle = Affine3A::from_translation((0.5 * (from + to)).extend(0.02));
         if builder.chance(0.4) {
-            things::curtains(builder, transform * middle, size);
+            objects::curtains(builder, transform * middle, size);
         }
     }
     let (tall, wood) = (builder.within(0.05..0.15), frame);
@@ -248,7 +248,7 @@ fn furnish(builder: &mut SceneBuilder, size: Vec3, walls: &[Wall]) {
                 wall.openings.iter().any(|o| o.is_door && reached > o.from.x - 0.8 && reached < o.to.x + 0.8);
             if !blocks_door && builder.chance(0.7) {
                 let turn = if builder.chance(0.85) { 0. } else { builder.angle() };
-                things::furniture(builder, transform * standing(spot, turn));
+                objects::furniture(builder, transform * standing(spot, turn));
             }
             reached += builder.within(0.9..2.4);
         }
@@ -258,8 +258,8 @@ fn furnish(builder: &mut SceneBuilder, size: Vec3, walls: &[Wall]) {
             if wall.is_free(reached - 0.4, reached + 0.4) && builder.chance(0.6) {
                 let spot = Affine3A::from_translation(vec3(reached, builder.within(1.2..1.9), 0.));
                 match builder.chance(0.08) {
-                    true => things::mirror(builder, transform * spot),
-                    false => things::picture(builder, transform * spot),
+                    true => objects::mirror(builder, transform * spot),
+                    false => objects::picture(builder, transform * spot),
                 }
             }
             reached += builder.within(0.7..2.2);
@@ -271,10 +271,10 @@ fn furnish(builder: &mut SceneBuilder, size: Vec3, walls: &[Wall]) {
         let spot = vec3(builder.within(0.25..0.75) * size.x, 0., builder.within(0.25..0.75) * size.z);
         let turn =
             if builder.chance(0.5) { FRAC_PI_2 * builder.within(0..4) as f32 } else { builder.angle() };
-        things::furniture(builder, standing(spot, turn));
+        objects::furniture(builder, standing(spot, turn));
     }
     let floor = Affine3A::from_translation(vec3(0.5 * size.x, 0., 0.5 * size.z));
-    things::clutter(builder, 0.9 * vec2(size.x, size.z), floor, 8);
+    objects::clutter(builder, 0.9 * vec2(size.x, size.z), floor, 8);
 }
 
 /// Adds ceiling and hanging lamps of one colour tone, and the sun if it can shine in.
@@ -350,7 +350,7 @@ pub(super) fn box_of_shapes(builder: &mut SceneBuilder, sky: &mut Sky) -> Camera
     for _ in 0..builder.within(12..45) {
         let part =
             vec3(builder.log_uniform(0.15, 2.), builder.log_uniform(0.15, 2.), builder.log_uniform(0.15, 2.));
-        let mesh = things::plain(builder, part);
+        let mesh = objects::plain(builder, part);
         let material = builder.material(Purpose::Thing);
         let mut spot = size * vec3(builder.within(0. ..1.), builder.within(0. ..1.), builder.within(0. ..1.));
         let mut turn = Quat::from_axis_angle(builder.direction(), builder.angle());

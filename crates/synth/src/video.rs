@@ -5,8 +5,8 @@ use super::scene_builder::SceneBuilder;
 use super::sensor::{PixelRng, Sensor};
 use super::texture::Texture;
 use super::tracer::{SampleChoice, Tracer};
-use super::walk::{CameraSpace, Exhibit, walk};
-use super::{outdoors, room, things};
+use super::walk::{CameraSpace, OrbitTarget, walk};
+use super::{objects, outdoors, room};
 use glam::{DMat3, DMat4, DVec2, DVec3, Vec2, Vec3, vec2, vec3};
 use globalsplat_capture::{Camera, ImageSize, Intrinsics, Lens};
 use image::RgbImage;
@@ -61,9 +61,9 @@ impl Video {
 
     fn attempt(random: ChaCha8Rng, settings: &VideoSettings) -> Option<Video> {
         let mut builder = SceneBuilder::new(random, settings.pictures.clone());
-        let (place, exhibit, sky) = world(&mut builder);
+        let (place, orbit_target, sky) = world(&mut builder);
         let tracer = Tracer::new(std::mem::take(&mut builder.contents), sky);
-        let poses = walk(&mut builder, &tracer, place, exhibit, settings.frames)?;
+        let poses = walk(&mut builder, &tracer, place, orbit_target, settings.frames)?;
         let cameras = cameras(&mut builder, poses, settings.size);
         let seen = mean_light(&tracer, &cameras);
         let sensor = Sensor::draw(&mut builder, seen);
@@ -157,21 +157,21 @@ impl fmt::Debug for Video {
 }
 
 /// Builds a random scene, mostly rooms: people often photograph them, and they are the hardest to reconstruct.
-fn world(builder: &mut SceneBuilder) -> (CameraSpace, Option<Exhibit>, Sky) {
+fn world(builder: &mut SceneBuilder) -> (CameraSpace, Option<OrbitTarget>, Sky) {
     let mut sky = outdoors::sky(builder);
     let place = match builder.within(0..100) {
         0..55 => room::room(builder, &mut sky),
         55..75 => room::box_of_shapes(builder, &mut sky),
         _ => outdoors::landscape(builder, &sky),
     };
-    let exhibit = builder.chance(EXHIBITS).then(|| match place.walls {
+    let orbit_target = builder.chance(EXHIBITS).then(|| match place.walls {
         Some(behind) if builder.chance(HUNG) => {
             let (spot, front) = on_a_wall(builder, place, behind);
-            things::hung(builder, spot, front)
+            objects::hung(builder, spot, front)
         }
-        _ => things::exhibit(builder, (0.5 * (place.min + place.max)).with_y(0.)),
+        _ => objects::orbit_target(builder, (0.5 * (place.min + place.max)).with_y(0.)),
     });
-    (place, exhibit, sky)
+    (place, orbit_target, sky)
 }
 
 /// Returns a position on a wall, and the direction away from the wall.

@@ -28,7 +28,7 @@ pub(super) struct CameraSpace {
 
 /// An object that the video shows.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Exhibit {
+pub(super) struct OrbitTarget {
     pub middle: Vec3,
     /// Radius of a ball that roughly encloses the object, in metres.
     pub radius: f32,
@@ -91,19 +91,21 @@ impl Path {
 }
 
 /// Returns camera-to-world poses of `frames` images, x right, y down, z forward, or `None` if there is no free path. If there is an
-/// exhibit, most paths orbit it.
+/// orbit_target, most paths orbit it.
 pub(super) fn walk(
     builder: &mut SceneBuilder,
     tracer: &Tracer,
     place: CameraSpace,
-    exhibit: Option<Exhibit>,
+    orbit_target: Option<OrbitTarget>,
     frames: usize,
 ) -> Option<Vec<DMat4>> {
     for attempt in 0..TRIES {
         // Paths get shorter with every attempt.
         let patience = 1. - attempt as f32 / TRIES as f32;
-        let path = match exhibit {
-            Some(exhibit) if builder.chance(0.85) => Some(orbit_path(builder, exhibit, place, patience)),
+        let path = match orbit_target {
+            Some(orbit_target) if builder.chance(0.85) => {
+                Some(orbit_path(builder, orbit_target, place, patience))
+            }
             _ => walk_path(builder, tracer, place, patience),
         };
         if path.is_some_and(|path| is_free(&path, tracer, place, patience)) {
@@ -115,8 +117,13 @@ pub(super) fn walk(
 }
 
 /// Creates a hand-held path around an object, from a short distance.
-fn orbit_path(builder: &mut SceneBuilder, exhibit: Exhibit, place: CameraSpace, patience: f32) -> Path {
-    let Exhibit { middle, radius, front } = exhibit;
+fn orbit_path(
+    builder: &mut SceneBuilder,
+    orbit_target: OrbitTarget,
+    place: CameraSpace,
+    patience: f32,
+) -> Path {
+    let OrbitTarget { middle, radius, front } = orbit_target;
     let away = 1.2 * radius + builder.log_uniform(0.3, 2.);
     let height = (middle.y + builder.within(-0.4..0.9) * away).max(place.min.y + 0.2);
     let side = builder.one_of(&[-1., 1.]);
@@ -283,7 +290,7 @@ mod tests {
         for i in 0..400 {
             let front = (i % 2 == 0).then_some(Vec3::X);
             let path =
-                orbit_path(&mut builder, Exhibit { middle: Vec3::ZERO, radius: 0.5, front }, place, 1.);
+                orbit_path(&mut builder, OrbitTarget { middle: Vec3::ZERO, radius: 0.5, front }, place, 1.);
             let seen: Vec<(Vec3, Vec3, f32)> = (0..=16).map(|i| path.at(i as f32 / 16.)).collect();
             let pitches = seen.iter().map(|(_, towards, _)| towards.normalize().y.asin());
             let (lowest, highest) = pitches.fold((f32::MAX, f32::MIN), |(a, b), y| (a.min(y), b.max(y)));

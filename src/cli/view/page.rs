@@ -74,7 +74,7 @@ pub fn write_page(
 fn spz(splat: &Splat, cameras: &[Camera]) -> Result<Vec<u8>> {
     let folder = tempfile::tempdir()?;
     let file = folder.path().join("scene.spz");
-    let fitted = fit_splat(&file, splat, &ShLimits::for_viewers(splat.sh_degree), cameras)?;
+    let fitted = fit_splat(&file, splat, &ShLimits::of_viewers(splat.sh_degree), cameras)?;
     // Spark doesn't read newer versions.
     write_local_splat_with(&file, &fitted, &WriteOptions { spz_version: 3 })?;
     Ok(std::fs::read(file)?)

@@ -11,7 +11,7 @@ mod write;
 pub(crate) use write::buffer_file;
 
 use crate::ShLimits;
-use crate::formats::{Codec, Writer};
+use crate::codec::{Codec, Writer};
 
 /// Functions of `.glb`.
 pub(crate) const GLB_CODEC: Option<Codec> =

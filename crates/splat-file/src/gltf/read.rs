@@ -6,7 +6,7 @@ use super::json::{Primitive, Splatting};
 use super::scene::MeshNode;
 use super::{COLOUR_SPACE, EXTENSION, KERNEL, POINTS, SPZ_EXTENSION, sh_attribute, turn_rotation_back};
 use crate::axes::Axes;
-use crate::formats::Contents;
+use crate::codec::Contents;
 use crate::invalid::InvalidGaussians;
 use crate::splat::{log_of_scale, logit_of_opacity};
 use crate::{Error, Result, SH_C0, Splat, spz};

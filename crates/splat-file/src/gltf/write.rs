@@ -3,7 +3,7 @@
 use super::container::encode_percent;
 use super::{COLOUR_SPACE, EXTENSION, KERNEL, MAGIC, POINTS, sh_attribute, turn_rotation};
 use crate::axes::Axes;
-use crate::formats::WriteOptions;
+use crate::codec::WriteOptions;
 use crate::{Error, Result, SH_C0, Splat};
 use globalsplat_files::{write_atomically, write_temporary};
 use serde_json::{Map, Value, json};

@@ -2,7 +2,7 @@
 
 use super::container::{Image, Reader, encode_all, write_files, write_zip};
 use super::palette::{Codebook, Palette};
-use crate::formats::{Codec, Contents, WriteOptions, Writer};
+use crate::codec::{Codec, Contents, WriteOptions, Writer};
 use crate::invalid::InvalidGaussians;
 use crate::morton::morton_order;
 use crate::rotations::{from_smallest_three, smallest_three};

@@ -4,6 +4,7 @@ use super::IMAGES;
 use crate::{Error, Result};
 use globalsplat_files::{PartialFile, check_regular, parent_of, write_atomically};
 use image_webp::{ColorType, EncoderParams, WebPDecoder, WebPEncoder};
+use rayon::prelude::*;
 use std::io::{Cursor, Read, Write};
 use std::path::Path;
 use zip::write::FileOptions;
@@ -113,10 +114,7 @@ pub fn encode_all(path: &Path, images: Vec<(&'static str, Image)>) -> Result<Vec
             .map_err(|why| Error::failed(format!("{}: {name} can't be encoded: {why}", path.display())))?;
         Ok((name, file))
     };
-    std::thread::scope(|scope| {
-        let threads: Vec<_> = images.into_iter().map(|image| scope.spawn(move || encode(image))).collect();
-        threads.into_iter().map(|thread| thread.join().expect("the encoder doesn't panic")).collect()
-    })
+    images.into_par_iter().map(encode).collect()
 }
 
 /// Encodes an image with and without prediction of pixels from their neighbours, and returns the smaller file.

@@ -1,7 +1,7 @@
 //! Vector quantization by k-means, without random numbers: the result depends on neither the number of threads nor a seed.
 
+use rayon::prelude::*;
 use std::collections::HashMap;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// Number of values in a codebook, whose indices are bytes.
 const CODEBOOK: usize = 256;
@@ -90,15 +90,15 @@ impl Palette {
         let mut members = vec![vec![]; coarse];
         coarse_of.iter().enumerate().for_each(|(index, &cluster)| members[cluster as usize].push(index));
         members.retain(|members| !members.is_empty());
-        let parts = in_parallel(members.len(), |cluster| {
-            let members = &members[cluster];
+        let divide = |members: &Vec<usize>| {
             let own: Vec<f32> =
                 members.iter().flat_map(|&index| &vectors[index * dim..][..dim]).copied().collect();
             let share = (members.len() * (size - coarse) / count + 1).min(members.len());
             let centroids = means_of_clusters(&own, dim, share);
             let labels = assign_serially(&own, dim, &Lanes::new(&centroids, dim));
             (centroids, labels)
-        });
+        };
+        let parts: Vec<_> = members.par_iter().map(divide).collect();
         let mut palette = Palette { centroids: vec![], labels: vec![0; count] };
         for (members, (centroids, labels)) in members.iter().zip(parts) {
             let first = (palette.centroids.len() / dim) as u32;
@@ -202,33 +202,8 @@ fn assign_serially(vectors: &[f32], dim: usize, lanes: &Lanes) -> Vec<u32> {
 fn assign(vectors: &[f32], dim: usize, centroids: &[f32]) -> Vec<u32> {
     const PART: usize = 1 << 12;
     let lanes = Lanes::new(centroids, dim);
-    let parts: Vec<&[f32]> = vectors.chunks(PART * dim).collect();
-    in_parallel(parts.len(), |part| assign_serially(parts[part], dim, &lanes)).concat()
-}
-
-/// Returns the results of `task` for 0 to `count`, computed on all cores.
-fn in_parallel<T: Send>(count: usize, task: impl Fn(usize) -> T + Sync) -> Vec<T> {
-    let next = AtomicUsize::new(0);
-    let threads = std::thread::available_parallelism().map_or(1, usize::from).min(count);
-    let work = || {
-        let mut results = vec![];
-        loop {
-            let index = next.fetch_add(1, Ordering::Relaxed);
-            if index >= count {
-                return results;
-            }
-            results.push((index, task(index)));
-        }
-    };
-    let mut results = std::thread::scope(|scope| {
-        let threads: Vec<_> = (0..threads).map(|_| scope.spawn(work)).collect();
-        threads
-            .into_iter()
-            .flat_map(|thread| thread.join().expect("the task doesn't panic"))
-            .collect::<Vec<_>>()
-    });
-    results.sort_by_key(|(index, _)| *index);
-    results.into_iter().map(|(_, result)| result).collect()
+    let labels = vectors.par_chunks(PART * dim).map(|part| assign_serially(part, dim, &lanes));
+    labels.collect::<Vec<_>>().concat()
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 
 use super::container::{self, Description, Streams};
 use crate::axes::Axes;
-use crate::formats::{Codec, Contents, WriteOptions, Writer};
+use crate::codec::{Codec, Contents, WriteOptions, Writer};
 use crate::invalid::InvalidGaussians;
 use crate::rotations::normalized;
 use crate::splat::logit_of_opacity;

@@ -11,7 +11,7 @@ pub(crate) use codec::CODEC;
 
 /// The functions of the format are absent from a build without the feature `spz`.
 #[cfg(not(feature = "spz"))]
-pub(crate) const CODEC: Option<crate::formats::Codec> = None;
+pub(crate) const CODEC: Option<crate::codec::Codec> = None;
 
 /// First bytes of every version, after gzip is decompressed.
 const MAGIC: [u8; 4] = *b"NGSP";

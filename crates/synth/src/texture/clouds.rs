@@ -2,10 +2,10 @@
 
 use rand_chacha::ChaCha8Rng;
 
-use super::chance::{Chance, unit_of};
 use super::field::Field;
 use super::noise::{fractal, ridged, smooth, warped};
 use super::palette::Palette;
+use super::rng::{RandomValues, unit_of};
 use super::voronoi::Voronoi;
 use super::{Canvas, Purpose, SIZE, Surface};
 

@@ -3,7 +3,7 @@
 use glam::{Vec2, Vec2Swizzles};
 use rand_chacha::ChaCha8Rng;
 
-use super::chance::Chance;
+use super::rng::RandomValues;
 use super::voronoi::Voronoi;
 
 /// Arrangement of pieces.

@@ -3,8 +3,8 @@
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
 
-use super::chance::Chance;
 use super::palette::{self, Palette, luminance};
+use super::rng::RandomValues;
 use super::shape;
 use super::{Canvas, Purpose, SIZE, Surface};
 

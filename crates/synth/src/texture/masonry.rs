@@ -3,11 +3,11 @@
 use glam::Vec2;
 use rand_chacha::ChaCha8Rng;
 
-use super::chance::{Chance, unit_of};
 use super::field::Field;
 use super::layout::Layout;
 use super::noise::{fractal, smooth};
 use super::palette::{self, Palette, luminance};
+use super::rng::{RandomValues, unit_of};
 use super::shape::smoothstep;
 use super::voronoi::Voronoi;
 use super::{Canvas, Purpose, SIZE, Surface};

@@ -4,7 +4,6 @@
 //! weathered.
 
 mod canvas;
-mod chance;
 mod clouds;
 mod field;
 mod layout;
@@ -16,6 +15,7 @@ mod panels;
 mod patterns;
 mod pictures;
 mod plain;
+mod rng;
 mod scatter;
 mod shape;
 mod stone;
@@ -29,8 +29,8 @@ use image::RgbImage;
 use rand_chacha::ChaCha8Rng;
 
 use canvas::Canvas;
-use chance::Chance;
 use field::Field;
+use rng::RandomValues;
 
 /// Width in pixels of all textures except pictures.
 const SIZE: usize = 256;

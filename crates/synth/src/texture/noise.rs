@@ -3,8 +3,8 @@
 use glam::Vec2;
 use rand_chacha::ChaCha8Rng;
 
-use super::chance::Chance;
 use super::field::Field;
+use super::rng::RandomValues;
 
 /// Interpolates a lattice of random values by cubic B-splines: about in [-1, 1], with `cells` per repeat in x and y.
 pub(super) fn smooth(random: &mut ChaCha8Rng, size: usize, cells: [usize; 2]) -> Field {

@@ -4,7 +4,7 @@ use glam::Vec3;
 use rand_chacha::ChaCha8Rng;
 
 use super::Purpose;
-use super::chance::Chance;
+use super::rng::RandomValues;
 
 /// Colours of one kind in sRGB, as 0xrrggbb.
 pub(super) type Theme = &'static [u32];

@@ -3,10 +3,10 @@
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
 
-use super::chance::Chance;
 use super::marks::{Script, ink_for};
 use super::noise::{fractal, smooth};
 use super::palette::{self, Palette};
+use super::rng::RandomValues;
 use super::shape::{self, smoothstep};
 use super::{Canvas, Purpose, SIZE, Surface};
 

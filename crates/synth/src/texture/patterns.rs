@@ -3,9 +3,9 @@
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
 
-use super::chance::{Chance, unit_of};
 use super::layout::Layout;
 use super::palette::Palette;
+use super::rng::{RandomValues, unit_of};
 use super::shape;
 use super::voronoi::Voronoi;
 use super::{Canvas, Purpose, SIZE, Surface};

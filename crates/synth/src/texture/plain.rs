@@ -3,9 +3,9 @@
 use glam::Vec3;
 use rand_chacha::ChaCha8Rng;
 
-use super::chance::Chance;
 use super::noise::{fractal, smooth};
 use super::palette::{self, Palette};
+use super::rng::RandomValues;
 use super::{Canvas, Purpose, SIZE, Surface};
 
 /// Draws an even colour with a slightly uneven coat of paint.

@@ -3,9 +3,9 @@
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
 
-use super::chance::Chance;
 use super::noise::fractal;
 use super::palette::{self, Palette};
+use super::rng::RandomValues;
 use super::shape;
 use super::{Canvas, Purpose, SIZE, Surface};
 

@@ -3,10 +3,10 @@
 use glam::Vec2;
 use rand_chacha::ChaCha8Rng;
 
-use super::chance::{Chance, unit_of};
 use super::layout::Layout;
 use super::noise::{fractal, ridged, smooth, warped};
 use super::palette::{self, Palette};
+use super::rng::{RandomValues, unit_of};
 use super::shape::{self, smoothstep};
 use super::voronoi::Voronoi;
 use super::{Canvas, Purpose, SIZE, Surface};

@@ -3,10 +3,10 @@
 use glam::Vec2;
 use rand_chacha::ChaCha8Rng;
 
-use super::chance::{Chance, unit_of};
 use super::noise::{fractal, smooth};
 use super::palette::Palette;
 use super::patterns::Motif;
+use super::rng::{RandomValues, unit_of};
 use super::shape::{self, smoothstep};
 use super::{Canvas, Purpose, SIZE, Surface};
 

@@ -3,7 +3,7 @@
 use glam::{IVec2, Vec2};
 use rand_chacha::ChaCha8Rng;
 
-use super::chance::Chance;
+use super::rng::RandomValues;
 
 /// Voronoi diagram of one point in each square of a grid over the repeat.
 pub(super) struct Voronoi {

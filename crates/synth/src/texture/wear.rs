@@ -4,9 +4,9 @@ use glam::Vec3;
 use rand_chacha::ChaCha8Rng;
 
 use super::Purpose;
-use super::chance::Chance;
 use super::noise::{fractal, ridged, smooth};
 use super::palette;
+use super::rng::RandomValues;
 use super::shape::smoothstep;
 use super::{Canvas, SIZE};
 
