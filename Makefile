@@ -67,7 +67,7 @@ $(CHECKS): venv
 check-format:
 	$(CARGO) fmt --all --check
 # The crates of CRATES need no libtorch.
-CRATES := files torch-file capture splat-file synth sfm
+CRATES := files torch-file capture splat-file synth colmap
 check-crates:
 	@for crate in $(CRATES); do ! $(CARGO) tree --locked -e normal,build -p globalsplat-$$crate | grep -E "torch-sys|csrc" \
 	    || { echo "globalsplat-$$crate depends on libtorch" >&2; exit 1; }; done

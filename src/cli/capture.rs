@@ -6,7 +6,7 @@ use anyhow::Result;
 use clap::Args;
 use globalsplat::Error;
 use globalsplat::io::check_writable_dir;
-use globalsplat_sfm::{
+use globalsplat_colmap::{
     CaptureOptions, CaptureProgress, CaptureReport, Colmap, Matching, PoseOptions, VideoOptions, VideoPass,
     make_capture,
 };

@@ -14,7 +14,7 @@ use globalsplat::render::cuda::{
     CodeFormat, Driver, KernelOrigin, KernelResources, Nvrtc, cache_folder, load_kernels, parse_resources,
 };
 use globalsplat::train::MemoryEstimate;
-use globalsplat_sfm::Colmap;
+use globalsplat_colmap::Colmap;
 use serde_json::{Value, json};
 use std::fmt::Display;
 use std::path::PathBuf;

@@ -1,7 +1,7 @@
 //! Decoding and encoding of photos.
 
 use super::heif::{HEADER_BYTES, HeifHeader};
-use super::jpeg::{END_MARKER, check_jpeg, jpeg_size};
+use super::jpeg::{decode_jpeg, jpeg_size};
 use globalsplat_files::{Error, Result, panic_message};
 use image::codecs::jpeg::JpegEncoder;
 use image::metadata::Orientation;
@@ -153,7 +153,7 @@ struct Decoded {
     image: DynamicImage,
     orientation: Orientation,
     format: Option<ImageFormat>,
-    /// `true` if the file holds three channels, whatever they were decoded to, and has an end marker.
+    /// `true` if the file holds three channels, whatever they were decoded to.
     is_rgb: bool,
 }
 
@@ -183,30 +183,20 @@ fn decode(encoded: &[u8], file: &Path) -> Result<Decoded> {
         return Err(Error::input(file, "the image", found, "8 or 16 bits for each of its colours"));
     }
     decoder.set_limits(limits).map_err(undecodable(file))?;
-    let is_rgb = match format {
-        Some(ImageFormat::Jpeg) => {
-            let damaged =
-                |why| Error::input(file, "the image", format!("undecodable ({why})"), SUPPORTED_IMAGES);
-            let checked = check_jpeg(encoded).map_err(damaged)?;
-            if !checked.is_marked {
-                // Without the marker the decoder leaves the last rows grey, though none of their data is missing.
-                let decoded = decode(&[encoded, &END_MARKER].concat(), file)?;
-                return Ok(Decoded { is_rgb: false, ..decoded });
-            }
-            checked.components == Some(3)
-        }
-        Some(ImageFormat::Png) => encoded.get(PNG_COLOUR_TYPE) == Some(&PNG_RGB),
-        _ => false,
-    };
     // Unreadable EXIF data isn't an error, because the pixels may still be usable.
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    let refuse = |why| Error::input(file, "the image", format!("undecodable ({why})"), SUPPORTED_IMAGES);
     // The decoders of some rare formats panic.
-    let image = panic::catch_unwind(AssertUnwindSafe(|| DynamicImage::from_decoder(decoder)));
-    let panicked = |why: Box<dyn Any + Send>| {
-        let found = format!("undecodable (the decoder failed: {})", panic_message(&*why));
-        Error::input(file, "the image", found, SUPPORTED_IMAGES)
-    };
-    let image = image.map_err(panicked)?.map_err(undecodable(file))?;
+    let image = panic::catch_unwind(AssertUnwindSafe(|| match format {
+        Some(ImageFormat::Jpeg) => decode_jpeg(encoded).map_err(refuse),
+        _ => {
+            let components = if encoded.get(PNG_COLOUR_TYPE) == Some(&PNG_RGB) { 3 } else { 4 };
+            DynamicImage::from_decoder(decoder).map(|image| (image, components)).map_err(undecodable(file))
+        }
+    }));
+    let panicked = |why: Box<dyn Any + Send>| refuse(format!("the decoder failed: {}", panic_message(&*why)));
+    let (image, components) = image.map_err(panicked)??;
+    let is_rgb = components == 3 && matches!(format, Some(ImageFormat::Jpeg | ImageFormat::Png));
     Ok(Decoded { image, orientation, format, is_rgb })
 }
 

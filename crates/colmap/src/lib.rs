@@ -8,8 +8,9 @@ mod record;
 mod video;
 
 pub use colmap::{CAMERA_MODELS, Colmap, VARIABLE};
-pub use estimate::{Matching, PoseOptions, PoseProgress, PoseReport, Step, estimate_poses};
+pub use estimate::{PoseOptions, PoseProgress, estimate_poses};
 pub use globalsplat_files::{Error, Result};
 pub use make_capture::{CaptureOptions, CaptureProgress, CaptureReport, VideoRecord, make_capture};
 pub use photos::SkippedPhoto;
+pub use record::{Matching, PoseReport, Step};
 pub use video::{VideoFrames, VideoOptions, VideoPass, VideoProgress, extract_frames, is_video};

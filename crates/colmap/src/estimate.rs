@@ -4,17 +4,13 @@ use crate::colmap::{
     CAMERA_MODELS, Colmap, Command, ModelSummary, Outcome, exhaustive_pairs, model_folders, read_models,
     sequential_pairs,
 };
-use crate::make_capture::VIDEO_FILE;
 use crate::photos::{FoundPhoto, Photo, SkippedPhoto, find_photos, import_photos};
-use crate::record::{FILE, Record};
+use crate::record::{FILE, Matching, PoseReport, Record, Step, VIDEO_FILE, format_first};
 use globalsplat_capture::MASKS_FOLDER;
 use globalsplat_files::{Error, Result, write_atomically};
-use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
-use std::fmt;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 use std::time::Instant;
 
 /// Maximum number of photos of which every pair is matched by default.
@@ -57,34 +53,7 @@ const FISHEYE_MODELS: [(&str, usize, usize); 7] = [
 ];
 
 /// Share of the photos below which a report says what to try.
-const FEW_PLACED: f64 = 0.8;
-
-/// How pairs of photos to match are chosen.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Matching {
-    /// [`Matching::Exhaustive`] for up to 200 photos, otherwise [`Matching::Sequential`].
-    #[default]
-    Auto,
-    /// Every pair.
-    Exhaustive,
-    /// Each photo with the 10 next ones in order of their names, every pair among 64 photos spread evenly, and each photo with those taken
-    /// nearby if photos have GPS positions.
-    Sequential,
-}
-
-impl FromStr for Matching {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        match text {
-            "auto" => Ok(Matching::Auto),
-            "exhaustive" => Ok(Matching::Exhaustive),
-            "sequential" => Ok(Matching::Sequential),
-            _ => Err("expected auto, exhaustive or sequential".into()),
-        }
-    }
-}
+const FEW_REGISTERED: f64 = 0.8;
 
 /// Settings of [`estimate_poses`].
 #[derive(Debug, Clone, Default)]
@@ -101,32 +70,6 @@ pub struct PoseOptions {
     pub keeps_finished: bool,
 }
 
-/// Steps of [`estimate_poses`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Step {
-    /// Photos are checked and linked.
-    Photos,
-    /// Features are detected in photos.
-    Features,
-    /// Features of pairs of photos are matched.
-    Pairs,
-    /// Photos are placed.
-    Poses,
-}
-
-impl Step {
-    /// Returns what the step counts.
-    pub fn unit(self) -> &'static str {
-        match self {
-            Step::Photos => "photos checked",
-            Step::Features => "photos with features",
-            Step::Pairs => "pairs matched",
-            Step::Poses => "photos placed",
-        }
-    }
-}
-
 /// Progress of [`estimate_poses`].
 #[derive(Debug, Clone, Copy)]
 pub struct PoseProgress {
@@ -136,64 +79,6 @@ pub struct PoseProgress {
     pub done: usize,
     /// Number of photos or pairs in all.
     pub total: usize,
-}
-
-/// Result of [`estimate_poses`].
-#[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct PoseReport {
-    /// Version of COLMAP, as `pycolmap 4.2.1`.
-    pub colmap: String,
-    /// Number of photos found.
-    pub photos: usize,
-    /// Number of photos in the largest model.
-    pub placed: usize,
-    /// Number of photos of each model, the largest first. Readers of captures use the largest.
-    pub models: Vec<usize>,
-    /// Mean reprojection error of the largest model in pixels.
-    pub reprojection_error: f64,
-    /// Number of points of the largest model.
-    pub points: usize,
-    /// Line about files in the folder that aren't photos.
-    pub other_files: Option<String>,
-    /// Photos that are damaged, show nothing, or are identical to another.
-    pub skipped: Vec<SkippedPhoto>,
-    /// Names of the other photos that aren't in the largest model.
-    pub unplaced: Vec<String>,
-    /// Sentences on what to try if few photos were placed.
-    pub advice: Vec<String>,
-    /// Seconds that each step took.
-    pub seconds: BTreeMap<Step, f64>,
-}
-
-/// Formats the result in sentences, one per line.
-impl fmt::Display for PoseReport {
-    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        let PoseReport { photos, placed, points, reprojection_error, .. } = self;
-        write!(
-            f,
-            "{placed} of {photos} photos placed, {points} points, reprojection error {reprojection_error:.2} pixels"
-        )?;
-        if self.models.len() > 1 {
-            write!(f, "\n{} separate models, of which the largest is used", self.models.len())?;
-        }
-        self.other_files.iter().try_for_each(|line| write!(f, "\n{line}"))?;
-        if !self.skipped.is_empty() {
-            let skipped = self.skipped.iter().map(|photo| format!("{} ({})", photo.name, photo.reason));
-            write!(f, "\nnot used: {}", format_first(skipped))?;
-        }
-        if !self.unplaced.is_empty() {
-            write!(f, "\nnot placed: {}", format_first(self.unplaced.iter().cloned()))?;
-        }
-        self.advice.iter().try_for_each(|sentence| write!(f, "\n{sentence}"))
-    }
-}
-
-/// Joins the first few of `items`, and the number of the others.
-fn format_first(items: impl ExactSizeIterator<Item = String>) -> String {
-    const SHOWN: usize = 5;
-    let others = items.len().saturating_sub(SHOWN);
-    let shown = items.take(SHOWN).collect::<Vec<_>>().join(", ");
-    if others > 0 { format!("{shown} and {others} more") } else { shown }
 }
 
 /// Estimates the poses of the photos in the folder `photos` by `colmap`, on all cores, and writes a capture to the folder `out`: the photos
@@ -207,7 +92,7 @@ fn format_first(items: impl ExactSizeIterator<Item = String>) -> String {
 ///
 /// # Errors
 /// Returns an error if there are fewer than two different photos; if `out` contains something else, or the capture of other photos; if
-/// COLMAP fails; or if it places no photo.
+/// COLMAP fails; or if it registers no photo.
 pub fn estimate_poses(
     photos: &Path,
     out: &Path,
@@ -238,7 +123,7 @@ pub fn estimate_poses(
             Step::Photos => estimate.import(photos),
             Step::Features => estimate.extract_features(),
             Step::Pairs => estimate.match_pairs(),
-            Step::Poses => estimate.place_photos(),
+            Step::Poses => estimate.run_mapper(),
         };
         if estimate.record.report.is_none() {
             *estimate.record.seconds.entry(step).or_default() += start.elapsed().as_secs_f64();
@@ -500,7 +385,7 @@ impl Estimate<'_> {
         Ok(Outcome::Finished)
     }
 
-    fn place_photos(&mut self) -> Result<Outcome> {
+    fn run_mapper(&mut self) -> Result<Outcome> {
         if self.record.report.is_some() {
             return Ok(Outcome::Finished);
         }
@@ -521,14 +406,14 @@ impl Estimate<'_> {
             .option("Mapper.filter_max_reproj_error", MAX_REPROJECTION_ERROR * reduction)
             .option("Mapper.ba_refine_principal_point", refines_centre);
         let outcome = self.run(mapper, Step::Poses, 0, self.photos().len());
-        // COLMAP's program fails with this message if it places no photo, which is reported in other words.
+        // COLMAP's program fails with this message if it registers no photo, which is reported in other words.
         let is_without_model = |why: &Error| why.to_string().contains("sparse model");
         let is_empty = fs::read_dir(&partial).map_err(Error::read(&partial))?.next().is_none();
         match outcome {
             Ok(Outcome::Stopped) => return Ok(Outcome::Stopped),
-            Ok(_) if is_empty => return Err(none_placed(self.photos().len(), self.out)),
+            Ok(_) if is_empty => return Err(none_registered(self.photos().len(), self.out)),
             Err(why) if is_empty && is_without_model(&why) => {
-                return Err(none_placed(self.photos().len(), self.out));
+                return Err(none_registered(self.photos().len(), self.out));
             }
             outcome => outcome?,
         };
@@ -540,20 +425,20 @@ impl Estimate<'_> {
         Ok(Outcome::Finished)
     }
 
-    /// Adjusts the models in `sparse` with a loss that weighs wrong matches less than the squared errors by which COLMAP has placed the photos.
+    /// Adjusts the models in `sparse` with a loss that weighs wrong matches less than the squared errors by which COLMAP has registered the photos.
     /// Does nothing without pycolmap.
     fn adjust_robustly(&mut self, sparse: &Path, refines_centre: bool) -> Result<Outcome> {
         if !self.colmap.is_python {
             return Ok(Outcome::Finished);
         }
         let total = self.photos().len();
-        let placed = read_models(sparse)?.first().map_or(0, |model| model.names.len());
+        let registered = read_models(sparse)?.first().map_or(0, |model| model.names.len());
         for folder in model_folders(sparse)? {
             let adjustment = Command::new("bundle_adjuster")
                 .path("input_path", &folder)
                 .path("output_path", &folder)
                 .option("refine_principal_point", refines_centre);
-            if self.run(adjustment, Step::Poses, placed, total)? == Outcome::Stopped {
+            if self.run(adjustment, Step::Poses, registered, total)? == Outcome::Stopped {
                 return Ok(Outcome::Stopped);
             }
         }
@@ -563,24 +448,24 @@ impl Estimate<'_> {
     fn report(&self) -> Result<PoseReport> {
         let mut models = read_models(&self.out.join("sparse"))?.into_iter();
         let Some(largest) = models.next().filter(|model| model.names.len() >= 2) else {
-            return Err(none_placed(self.photos().len(), self.out));
+            return Err(none_registered(self.photos().len(), self.out));
         };
         let ModelSummary { names, points, error } = largest;
-        let placed: BTreeSet<&str> = names.iter().map(String::as_str).collect();
-        let unplaced = self.photos().iter().filter(|photo| !placed.contains(photo.name.as_str()));
-        let unplaced: Vec<String> = unplaced.map(|photo| photo.name.clone()).collect();
+        let registered: BTreeSet<&str> = names.iter().map(String::as_str).collect();
+        let unregistered = self.photos().iter().filter(|photo| !registered.contains(photo.name.as_str()));
+        let unregistered: Vec<String> = unregistered.map(|photo| photo.name.clone()).collect();
         let models: Vec<usize> =
             [names.len()].into_iter().chain(models.map(|model| model.names.len())).collect();
         Ok(PoseReport {
             colmap: self.record.colmap.clone(),
             photos: self.record.found.len(),
-            placed: names.len(),
+            registered: names.len(),
             reprojection_error: error,
             points,
             other_files: None,
             skipped: self.record.skipped.clone(),
             advice: self.advice(&models),
-            unplaced,
+            unregistered,
             models,
             seconds: self.record.seconds.clone(),
         })
@@ -589,7 +474,7 @@ impl Estimate<'_> {
     /// Returns what to try if the largest of `models` has few of the photos.
     fn advice(&self, models: &[usize]) -> Vec<String> {
         let mut advice = vec![];
-        if models[0] as f64 >= FEW_PLACED * self.photos().len() as f64 {
+        if models[0] as f64 >= FEW_REGISTERED * self.photos().len() as f64 {
             return advice;
         }
         if models.len() > 1 {
@@ -599,7 +484,7 @@ impl Estimate<'_> {
             );
         }
         advice.push(
-            "Photos are placed if they overlap others by two thirds, are sharp, and show surfaces with texture.".into(),
+            "Photos are registered if they overlap others by two thirds, are sharp, and show surfaces with texture.".into(),
         );
         if self.record.camera_model.is_none() {
             advice.push(
@@ -664,10 +549,10 @@ fn too_few(folder: &Path, total: usize, skipped: &[SkippedPhoto]) -> Error {
     Error::input(folder, "the number of photos", found, "2 or more different ones")
 }
 
-/// Returns the error if none of `count` photos was placed.
-fn none_placed(count: usize, out: &Path) -> Error {
+/// Returns the error if none of `count` photos was registered.
+fn none_registered(count: usize, out: &Path) -> Error {
     Error::failed(format!(
-        "COLMAP placed none of the {count} photos: they may overlap too little, be blurred, lack texture, show different places, or be \
+        "COLMAP registered none of the {count} photos: they may overlap too little, be blurred, lack texture, show different places, or be \
          taken from a single point; see {}",
         out.join("colmap.log").display()
     ))

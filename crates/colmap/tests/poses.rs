@@ -2,7 +2,7 @@
 
 use glam::DMat4;
 use globalsplat_capture::{Camera, Lens, open_capture};
-use globalsplat_sfm::{Colmap, Matching, PoseOptions, PoseReport, Step, estimate_poses};
+use globalsplat_colmap::{Colmap, Matching, PoseOptions, PoseReport, Step, estimate_poses};
 use globalsplat_synth::{Video, VideoSettings};
 use globalsplat_test_kit::{pose_errors, skip};
 use image::RgbImage;
@@ -66,7 +66,7 @@ fn poses_are_those_of_the_scene_and_a_stopped_estimate_continues() {
     stop_at(Step::Pairs, 0);
     let (report, steps) = estimate(&photos, &out, &options, &colmap);
     assert_eq!(steps, [Step::Pairs, Step::Poses].into(), "features are detected once");
-    assert_eq!((report.photos, report.placed, report.unplaced.len()), (12, 10, 0), "{report}");
+    assert_eq!((report.photos, report.registered, report.unregistered.len()), (12, 10, 0), "{report}");
     let skipped: Vec<&str> = report.skipped.iter().map(|photo| photo.name.as_str()).collect();
     assert_eq!(skipped, ["copy.png", "damaged.png"]);
     assert!(report.other_files.as_ref().is_some_and(|line| line.ends_with("left out: text.png")), "{report}");
@@ -87,7 +87,7 @@ fn poses_are_those_of_the_scene_and_a_stopped_estimate_continues() {
     assert!(steps.is_empty() && again.points == report.points);
     let sequential = PoseOptions { matching: Matching::Sequential, ..options };
     let (again, steps) = estimate(&photos, &out, &sequential, &colmap);
-    assert_eq!((again.placed, steps), (10, [Step::Pairs, Step::Poses].into()));
+    assert_eq!((again.registered, steps), (10, [Step::Pairs, Step::Poses].into()));
 
     // Other photos don't replace a capture.
     std::fs::remove_file(photos.join("05.png")).unwrap();
@@ -109,7 +109,7 @@ fn fisheyes_without_a_known_focal_length_are_placed() {
     }
     let options = PoseOptions { camera_model: Some("SIMPLE_FISHEYE".into()), ..Default::default() };
     let (report, _) = estimate(&photos, &out, &options, &colmap);
-    assert_eq!((report.placed, report.unplaced.len()), (8, 0), "{report}");
+    assert_eq!((report.registered, report.unregistered.len()), (8, 0), "{report}");
 }
 
 #[test]
@@ -124,7 +124,7 @@ fn masked_pixels_have_no_features() {
     }
     let options = PoseOptions { masks: Some(masks), ..Default::default() };
     let error = estimate_poses(&photos, &out, &options, &colmap, &mut |_| true).unwrap_err().to_string();
-    assert!(error.starts_with("COLMAP placed none of the 10 photos: "), "{error}");
+    assert!(error.starts_with("COLMAP registered none of the 10 photos: "), "{error}");
 }
 
 #[test]
@@ -138,7 +138,7 @@ fn photos_that_share_nothing_are_an_error() {
         let error = estimate_poses(&photos, &out, &options, &colmap, &mut |_| true).unwrap_err();
         assert!(!error.is_invalid_request(), "{error}");
         let error = error.to_string();
-        assert!(error.starts_with(&format!("COLMAP placed none of the {count} photos: ")), "{error}");
+        assert!(error.starts_with(&format!("COLMAP registered none of the {count} photos: ")), "{error}");
         assert_eq!(error.lines().count(), 1);
         std::fs::remove_dir_all(&out).unwrap();
         (2..count).for_each(|index| std::fs::remove_file(photos.join(format!("{index}.png"))).unwrap());

@@ -1,7 +1,7 @@
 //! Captures of videos, up to the first command of COLMAP.
 #![cfg(unix)]
 
-use globalsplat_sfm::{CaptureOptions, CaptureProgress, Colmap, VideoOptions, make_capture};
+use globalsplat_colmap::{CaptureOptions, CaptureProgress, Colmap, VideoOptions, make_capture};
 use globalsplat_test_kit::skip;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;

@@ -178,7 +178,7 @@ fn is_interrupted(status: ExitStatus) -> bool {
     }
 }
 
-/// Returns the number of photos that a line of COLMAP's log reports: those with features, or those placed so far.
+/// Returns the number of photos that a line of COLMAP's log reports: those with features, or those registered so far.
 fn count_in(line: &str) -> Option<usize> {
     let number = |text: &str| -> Option<usize> {
         let end = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());

@@ -1,6 +1,6 @@
 //! Frames of videos that ffmpeg makes of a picture that moves in a known way.
 
-use globalsplat_sfm::{
+use globalsplat_colmap::{
     Result, VideoFrames, VideoOptions, VideoPass, VideoProgress, extract_frames, is_video,
 };
 use globalsplat_test_kit::{rerun_test, skip};

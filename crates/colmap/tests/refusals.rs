@@ -3,7 +3,7 @@
 
 #![cfg(unix)]
 
-use globalsplat_sfm::{CaptureOptions, Colmap, PoseOptions, estimate_poses, make_capture};
+use globalsplat_colmap::{CaptureOptions, Colmap, PoseOptions, estimate_poses, make_capture};
 use globalsplat_test_kit::skip;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;

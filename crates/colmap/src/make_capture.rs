@@ -1,15 +1,13 @@
 //! Captures from photos or a video.
 
 use crate::colmap::Colmap;
-use crate::estimate::{Matching, PoseOptions, PoseProgress, PoseReport, estimate_poses};
+use crate::estimate::{PoseOptions, PoseProgress, estimate_poses};
+use crate::record::{Matching, PoseReport, VIDEO_FILE};
 use crate::video::{VideoOptions, VideoProgress, extract_frames};
 use globalsplat_files::{Error, Result, read_text, write_json};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::time::UNIX_EPOCH;
-
-/// Name of the file that records which video the frames are from, in the capture's folder.
-pub(crate) const VIDEO_FILE: &str = "video.json";
 
 /// Options of [`make_capture`].
 #[derive(Debug, Clone, Default)]

@@ -1,0 +1,177 @@
+//! The file that records how far an estimate of poses has come, so that the same call continues it, and the settings and results in it.
+
+use crate::photos::{FoundPhoto, Photo, SkippedPhoto};
+use globalsplat_files::{Error, Result, read_text, write_json};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+/// Name of the file, in the capture's folder.
+pub(crate) const FILE: &str = "capture.json";
+/// Name of the file that records which video the frames are from, in the capture's folder.
+pub(crate) const VIDEO_FILE: &str = "video.json";
+
+/// How pairs of photos to match are chosen.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Matching {
+    /// [`Matching::Exhaustive`] for up to 200 photos, otherwise [`Matching::Sequential`].
+    #[default]
+    Auto,
+    /// Every pair.
+    Exhaustive,
+    /// Each photo with the 10 next ones in order of their names, every pair among 64 photos spread evenly, and each photo with those taken
+    /// nearby if photos have GPS positions.
+    Sequential,
+}
+
+impl FromStr for Matching {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "auto" => Ok(Matching::Auto),
+            "exhaustive" => Ok(Matching::Exhaustive),
+            "sequential" => Ok(Matching::Sequential),
+            _ => Err("expected auto, exhaustive or sequential".into()),
+        }
+    }
+}
+
+/// Steps of an estimate of poses.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Step {
+    /// Photos are checked and linked.
+    Photos,
+    /// Features are detected in photos.
+    Features,
+    /// Features of pairs of photos are matched.
+    Pairs,
+    /// The mapper registers photos.
+    Poses,
+}
+
+impl Step {
+    /// Returns what the step counts.
+    pub fn unit(self) -> &'static str {
+        match self {
+            Step::Photos => "photos checked",
+            Step::Features => "photos with features",
+            Step::Pairs => "pairs matched",
+            Step::Poses => "photos registered",
+        }
+    }
+}
+
+/// Result of an estimate of poses.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct PoseReport {
+    /// Version of COLMAP, as `pycolmap 4.2.1`.
+    pub colmap: String,
+    /// Number of photos found.
+    pub photos: usize,
+    /// Number of photos in the largest model.
+    pub registered: usize,
+    /// Number of photos of each model, the largest first. Readers of captures use the largest.
+    pub models: Vec<usize>,
+    /// Mean reprojection error of the largest model in pixels.
+    pub reprojection_error: f64,
+    /// Number of points of the largest model.
+    pub points: usize,
+    /// Line about files in the folder that aren't photos.
+    pub other_files: Option<String>,
+    /// Photos that are damaged, show nothing, or are identical to another.
+    pub skipped: Vec<SkippedPhoto>,
+    /// Names of the other photos that aren't in the largest model.
+    pub unregistered: Vec<String>,
+    /// Sentences on what to try if few photos were registered.
+    pub advice: Vec<String>,
+    /// Seconds that each step took.
+    pub seconds: BTreeMap<Step, f64>,
+}
+
+/// Formats the result in sentences, one per line.
+impl fmt::Display for PoseReport {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        let PoseReport { photos, registered, points, reprojection_error, .. } = self;
+        write!(
+            f,
+            "{registered} of {photos} photos registered, {points} points, reprojection error {reprojection_error:.2} pixels"
+        )?;
+        if self.models.len() > 1 {
+            write!(f, "\n{} separate models, of which the largest is used", self.models.len())?;
+        }
+        self.other_files.iter().try_for_each(|line| write!(f, "\n{line}"))?;
+        if !self.skipped.is_empty() {
+            let skipped = self.skipped.iter().map(|photo| format!("{} ({})", photo.name, photo.reason));
+            write!(f, "\nnot used: {}", format_first(skipped))?;
+        }
+        if !self.unregistered.is_empty() {
+            write!(f, "\nnot registered: {}", format_first(self.unregistered.iter().cloned()))?;
+        }
+        self.advice.iter().try_for_each(|sentence| write!(f, "\n{sentence}"))
+    }
+}
+
+/// Joins the first few of `items`, and the number of the others.
+pub(crate) fn format_first(items: impl ExactSizeIterator<Item = String>) -> String {
+    const SHOWN: usize = 5;
+    let others = items.len().saturating_sub(SHOWN);
+    let shown = items.take(SHOWN).collect::<Vec<_>>().join(", ");
+    if others > 0 { format!("{shown} and {others} more") } else { shown }
+}
+
+/// How far an estimate has come, and for which photos and settings.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(crate) struct Record {
+    /// Version of COLMAP, as `pycolmap 4.2.1`.
+    pub colmap: String,
+    /// Camera model, or `None` to choose it by the number of photos.
+    pub camera_model: Option<String>,
+    /// Choice of pairs.
+    pub matching: Matching,
+    /// Folder of masks that the user named.
+    pub masks: Option<PathBuf>,
+    /// Photos in the folder of the user.
+    pub found: Vec<FoundPhoto>,
+    /// Photos in the folder of images, once they are all there.
+    pub photos: Option<Vec<Photo>>,
+    /// Photos that aren't used.
+    pub skipped: Vec<SkippedPhoto>,
+    /// `true` if the database has a camera for each group of photos.
+    pub has_cameras: bool,
+    /// `true` if the database has the features of all photos.
+    pub has_features: bool,
+    /// Number of pairs whose features are matched.
+    pub matched_pairs: usize,
+    /// Seconds that each step took, in all calls together.
+    pub seconds: BTreeMap<Step, f64>,
+    /// The result.
+    pub report: Option<PoseReport>,
+}
+
+impl Record {
+    /// Reads the record in the folder `out`, if there is one.
+    ///
+    /// # Errors
+    /// Returns an error if the file isn't a record.
+    pub fn read(out: &Path) -> Result<Option<Self>> {
+        let file = out.join(FILE);
+        if !file.exists() {
+            return Ok(None);
+        }
+        let refuse = |why| Error::input(&file, "the contents", why, "what an earlier run wrote");
+        serde_json::from_str(&read_text(&file)?).map(Some).map_err(refuse)
+    }
+
+    /// Writes the record to the folder `out`.
+    ///
+    /// # Errors
+    /// Returns an error if the file can't be written.
+    pub fn write(&self, out: &Path) -> Result<()> {
+        write_json(&out.join(FILE), self)
+    }
+}
