@@ -13,4 +13,4 @@ pub use globalsplat_files::{Error, Result};
 pub use make_capture::{CaptureOptions, CaptureProgress, CaptureReport, VideoRecord, make_capture};
 pub use photos::SkippedPhoto;
 pub use record::{Matching, PoseReport, Step};
-pub use video::{VideoFrames, VideoOptions, VideoPass, VideoProgress, extract_frames, is_video};
+pub use video::{VideoFrames, VideoOptions, VideoPass, VideoProgress, extract_frames};

@@ -58,8 +58,7 @@ pub(crate) fn find_photos(folder: &Path) -> Result<(Vec<FoundPhoto>, Option<Stri
     let describe = |path: &PathBuf| {
         let bytes = fs::metadata(path).map_err(Error::read(path))?.len();
         let name = path.strip_prefix(folder).unwrap_or(path).to_string_lossy();
-        let name = if cfg!(windows) { name.replace('\\', "/") } else { name.into_owned() };
-        Ok(FoundPhoto { name, bytes, checksum: checksum([path])? })
+        Ok(FoundPhoto { name: name.into_owned(), bytes, checksum: checksum([path])? })
     };
     let found = list.photos.par_iter().map(describe).collect::<Result<_>>()?;
     Ok((found, list.warning()))

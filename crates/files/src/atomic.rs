@@ -316,31 +316,19 @@ fn target_of(path: &Path, is_expected: fn(&Metadata) -> bool, expected: &str) ->
 }
 
 fn kind_name(kind: FileType) -> &'static str {
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::FileTypeExt;
-        if kind.is_fifo() {
-            return "a FIFO";
-        }
-        if kind.is_socket() {
-            return "a socket";
-        }
-        if kind.is_block_device() || kind.is_char_device() {
-            return "a device";
-        }
+    use std::os::unix::fs::FileTypeExt;
+    match kind {
+        _ if kind.is_fifo() => "a FIFO",
+        _ if kind.is_socket() => "a socket",
+        _ if kind.is_block_device() || kind.is_char_device() => "a device",
+        _ if kind.is_dir() => "a folder",
+        _ => "a file",
     }
-    if kind.is_dir() { "a folder" } else { "a file" }
 }
 
-#[cfg(unix)]
 fn writable_by_owner(mut permissions: fs::Permissions) -> fs::Permissions {
     use std::os::unix::fs::PermissionsExt;
     permissions.set_mode(permissions.mode() & 0o777 | 0o200);
-    permissions
-}
-
-#[cfg(not(unix))]
-fn writable_by_owner(permissions: fs::Permissions) -> fs::Permissions {
     permissions
 }
 
@@ -404,18 +392,10 @@ fn remove_abandoned(place: &Path) -> io::Result<bool> {
 
 /// Returns `true` if `file` is the file or folder at `place`.
 fn is_at(file: &File, place: &Path) -> bool {
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::MetadataExt;
-        let id = |metadata: Metadata| (metadata.dev(), metadata.ino());
-        let there = place.symlink_metadata().map(id);
-        file.metadata().map(id).is_ok_and(|own| there.is_ok_and(|there| there == own))
-    }
-    #[cfg(not(unix))]
-    {
-        let _ = file;
-        place.exists()
-    }
+    use std::os::unix::fs::MetadataExt;
+    let id = |metadata: Metadata| (metadata.dev(), metadata.ino());
+    let there = place.symlink_metadata().map(id);
+    file.metadata().map(id).is_ok_and(|own| there.is_ok_and(|there| there == own))
 }
 
 /// Returns the path to which the folder at `path` is moved while it is replaced.
@@ -547,7 +527,6 @@ mod tests {
         assert!(check_writable_file(&root.path().join("x".repeat(256))).unwrap_err().is_invalid_request());
     }
 
-    #[cfg(unix)]
     #[test]
     fn links_are_followed_and_anything_else_is_refused() {
         use std::os::unix::fs::symlink;
@@ -592,7 +571,6 @@ mod tests {
         assert_eq!(names(root.path()), ["below", "dangling", "fifo", "loop", "socket", "to_fifo", "twice"]);
     }
 
-    #[cfg(unix)]
     #[test]
     fn permissions_are_preserved() {
         use std::os::unix::fs::PermissionsExt;

@@ -150,6 +150,15 @@ pub fn panic_message(panic: &(dyn Any + Send)) -> &str {
     text.lines().next().unwrap_or(text)
 }
 
+/// Returns `true` if `error`, of starting a program by its name, means that no folder of the PATH contains the program.
+///
+/// Without permission to enter one of the folders, the operating system reports a lack of permission, even if no other folder contains the
+/// program.
+pub fn is_program_missing(error: &std::io::Error) -> bool {
+    use std::io::ErrorKind::{NotFound, PermissionDenied};
+    matches!(error.kind(), NotFound | PermissionDenied)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

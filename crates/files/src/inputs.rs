@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::Path;
 
-/// Files that a command reads. Files are compared by identity (device and inode; canonical path where there are none), so other paths and
+/// Files that a command reads. Files are compared by identity (device and inode), so other paths and
 /// links to an input are recognized.
 #[derive(Debug, Clone, Default)]
 pub struct InputFiles {
@@ -21,11 +21,8 @@ enum InputKind {
     Other,
 }
 
-/// Identifier of a file or folder: device and inode on Unix, the canonical path elsewhere.
-#[cfg(unix)]
+/// Device and inode of a file or folder.
 type FileId = (u64, u64);
-#[cfg(not(unix))]
-type FileId = std::path::PathBuf;
 
 impl InputFiles {
     /// Adds `file`, if it exists.
@@ -103,15 +100,9 @@ impl InputFiles {
     }
 }
 
-#[cfg(unix)]
 fn file_id(path: &Path) -> Option<FileId> {
     use std::os::unix::fs::MetadataExt;
     fs::metadata(path).ok().map(|file| (file.dev(), file.ino()))
-}
-
-#[cfg(not(unix))]
-fn file_id(path: &Path) -> Option<FileId> {
-    path.canonicalize().ok()
 }
 
 #[cfg(test)]
@@ -144,7 +135,6 @@ mod tests {
         inputs.check_folder(other.path()).expect("no folder of photos");
     }
 
-    #[cfg(unix)]
     #[test]
     fn links_to_folders_are_followed_once() {
         use std::os::unix::fs::symlink;

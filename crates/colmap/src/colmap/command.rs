@@ -163,19 +163,11 @@ fn send_lines(pipe: impl Read + Send + 'static, sender: Sender<String>) {
 
 /// Returns `true` if a process was ended by a request to stop.
 fn is_interrupted(status: ExitStatus) -> bool {
-    #[cfg(unix)]
-    {
-        const SIGHUP: i32 = 1;
-        const SIGINT: i32 = 2;
-        const SIGTERM: i32 = 15;
-        use std::os::unix::process::ExitStatusExt;
-        matches!(status.signal(), Some(SIGHUP | SIGINT | SIGTERM))
-    }
-    #[cfg(not(unix))]
-    {
-        let _ = status;
-        false
-    }
+    const SIGHUP: i32 = 1;
+    const SIGINT: i32 = 2;
+    const SIGTERM: i32 = 15;
+    use std::os::unix::process::ExitStatusExt;
+    matches!(status.signal(), Some(SIGHUP | SIGINT | SIGTERM))
 }
 
 /// Returns the number of photos that a line of COLMAP's log reports: those with features, or those registered so far.

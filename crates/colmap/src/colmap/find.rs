@@ -117,13 +117,12 @@ fn parse_version(version: &str) -> Option<(u32, u32)> {
 
 /// Returns the Pythons that may have pycolmap.
 fn python_programs() -> Vec<PathBuf> {
-    const IN_ENVIRONMENT: &str = if cfg!(windows) { "Scripts/python.exe" } else { "bin/python" };
     let program = std::env::current_exe().unwrap_or_default();
     let folders = [Path::new("")].into_iter().chain(program.ancestors().skip(1));
     let local = folders.map(|folder| folder.join(".venv"));
     let active =
         ["VIRTUAL_ENV", "CONDA_PREFIX"].map(std::env::var_os).into_iter().flatten().map(PathBuf::from);
-    let pythons = local.chain(active).map(|environment| environment.join(IN_ENVIRONMENT));
+    let pythons = local.chain(active).map(|environment| environment.join("bin/python"));
     pythons.filter(|python| python.is_file()).chain(["python3".into()]).collect()
 }
 

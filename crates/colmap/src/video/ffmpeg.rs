@@ -36,15 +36,15 @@ impl Probe {
     }
 }
 
-/// Asks ffprobe about the video at `path`. The inner error says why the file isn't a video.
+/// Asks ffprobe about the video at `path`.
 ///
 /// # Errors
-/// Returns an error if there is no ffprobe.
-pub(super) fn probe(path: &Path) -> Result<Result<Probe>> {
+/// Returns an error if there is no ffprobe, or one that says why the file isn't a video.
+pub(super) fn probe(path: &Path) -> Result<Probe> {
     let mut command = command("ffprobe");
     command.args(["-v", "error", "-of", "json", "-show_streams", "-show_format"]).arg(absolute(path)?);
     let output = run(path, command)?;
-    let no_video = |found: &str| Ok(Err(Error::input(path, "the content", found, "a video")));
+    let no_video = |found: &str| Err(Error::input(path, "the content", found, "a video"));
     if !output.status.success() {
         let said = String::from_utf8_lossy(&output.stderr);
         let why = said.lines().map(|line| message_of(line, path)).next().unwrap_or_default();
@@ -82,7 +82,7 @@ pub(super) fn probe(path: &Path) -> Result<Result<Probe>> {
         Some(frames.parse::<f64>().ok()? / seconds.parse::<f64>().ok().filter(|seconds| *seconds > 0.)?)
     });
     let declared_frames = number(&stream["nb_frames"]) as usize;
-    Ok(Ok(Probe {
+    Ok(Probe {
         stream: stream["index"].as_u64().unwrap_or(0),
         declared_frames: (declared_frames > 0).then_some(declared_frames),
         duration: number(&stream["duration"]).max(number(&found["format"]["duration"])),
@@ -91,7 +91,7 @@ pub(super) fn probe(path: &Path) -> Result<Result<Probe>> {
         is_interlaced: ["tt", "bb", "tb", "bt"].contains(&text(&stream["field_order"]).as_str()),
         is_undeclared_hd: stream["color_space"].as_str().is_none_or(|space| space == "unknown")
             && area(stream) >= 1280 * 720,
-    }))
+    })
 }
 
 /// Runs the passes of ffmpeg over a video.

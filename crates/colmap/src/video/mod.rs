@@ -70,16 +70,6 @@ impl VideoFrames {
 /// Maximum number of frames: the filter of the second pass, which lists them, has to fit into a command line.
 const MAX_FRAMES: usize = 2000;
 
-/// Returns `true` if ffmpeg finds moving pictures in the file at `path`: neither a photo nor the cover of an audio file. Returns `false`
-/// for folders and for files that ffmpeg can't read.
-///
-/// # Errors
-/// Returns an error if there is nothing at `path` or no ffmpeg on the PATH.
-pub fn is_video(path: &Path) -> Result<bool> {
-    let metadata = std::fs::metadata(path).map_err(Error::read(path))?;
-    Ok(metadata.is_file() && ffmpeg::probe(path)?.is_ok())
-}
-
 /// Writes frames of `video` as JPEGs `frame_00001.jpg`, `frame_00002.jpg`, … to `folder`. The video is divided into stretches in which the
 /// picture moves equally far, and the sharpest frame of each is chosen; a camera at rest adds no frames. A cut starts a new stretch.
 /// Frames are upright, progressive and with square pixels; HDR becomes SDR. Replaces the frames of an earlier call in `folder`; its
@@ -104,7 +94,7 @@ pub fn extract_frames(
     if !metadata.is_file() {
         return Err(Error::input(video, "the path", "no file", "a video"));
     }
-    let probe = ffmpeg::probe(video)??;
+    let probe = ffmpeg::probe(video)?;
     let converter = Converter::new(video, &probe)?;
     let mut warnings = converter.warnings.clone();
 

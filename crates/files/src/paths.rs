@@ -1,8 +1,9 @@
-//! Expansion of environment variables in paths of a configuration.
+//! Paths as users write them: environment variables in a path of a configuration, and `FILE#KEY`, an entry of a file.
 
 use crate::{Error, Result};
-use std::ffi::OsString;
-use std::path::PathBuf;
+use std::ffi::{OsStr, OsString};
+use std::os::unix::ffi::OsStrExt;
+use std::path::{Path, PathBuf};
 
 /// Returns `text` with `${NAME}` and `${NAME:-default}` replaced by environment variables. An empty variable counts as unset. A default
 /// can't contain `}` or another variable; an unclosed `${` stays as it is.
@@ -35,6 +36,17 @@ fn expand(text: &str, lookup: impl Fn(&str) -> Option<OsString>) -> Result<OsStr
     }
     expanded.push(rest);
     Ok(expanded)
+}
+
+/// Returns the possible splits of `path` into a file and a key, one for each `#` in it from the first on: keys and folders may contain the
+/// sign too. Keys are text; bytes that aren't UTF-8 are replaced.
+pub fn split_keyed_path(path: &Path) -> impl DoubleEndedIterator<Item = (PathBuf, String)> {
+    let bytes = path.as_os_str().as_bytes();
+    let signs = (0..bytes.len()).filter(move |&at| bytes[at] == b'#');
+    signs.map(move |at| {
+        let file = PathBuf::from(OsStr::from_bytes(&bytes[..at]));
+        (file, String::from_utf8_lossy(&bytes[at + 1..]).into_owned())
+    })
 }
 
 #[cfg(test)]
