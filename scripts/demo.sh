@@ -84,7 +84,7 @@ show() {
     name="$(name_of "$1")"
     mkdir -p "$3"
     "$globalsplat" reconstruct --device "$device" --weights "$2" --scene "$1" --holdout every:3+1 --out "$3/$name.ply"
-    "$globalsplat" eval --device "$device" --weights "$2" --scene "$1" --holdout every:3+1 --views 24 --sheet "$3/${name}_held_out.png" >/dev/null
+    "$globalsplat" eval --device "$device" --weights "$2" --scene "$1" --holdout every:3+1 --views 24 --contact-sheet "$3/${name}_held_out.png" >/dev/null
     "$globalsplat" render --splat "$3/$name.ply" --scene "$1" --orbit --depth --size 256x256 --out "$3/${name}_orbit.gif" >/dev/null
 }
 
@@ -104,7 +104,7 @@ if ! $training; then
     echo "LOOK: $out/shipped/${first}_held_out.png has held-out views (photo, ours, depth), ${first}_orbit.gif an orbit," \
         "${first}.ply the splat for any 3DGS viewer"
     mkdir -p "$out/refined"
-    "$globalsplat" refine --scene "${scenes[0]}" --holdout every:3+1 --seconds "$seconds" --sheet "$out/refined/${first}_held_out.png" \
+    "$globalsplat" refine --scene "${scenes[0]}" --holdout every:3+1 --seconds "$seconds" --contact-sheet "$out/refined/${first}_held_out.png" \
         --out "$out/refined/$first.ply"
     echo "LOOK: $out/refined/${first}_held_out.png has the same views after $seconds s of refinement on these photos, without weights"
     if "$globalsplat" doctor --json | grep -q '"viewer": *true'; then

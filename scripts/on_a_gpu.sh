@@ -168,8 +168,8 @@ part refine_scene 20 "$globalsplat" synth --out "$work/scene" --scenes 1 --frame
 part refine_photos 60 "$globalsplat" refine --scene "$scene" --device "$device" --steps "$steps" --correct-poses --correct-exposures \
     --out "$work/photos.ply"
 part refine_splat 60 "$globalsplat" refine --scene "$scene" --device "$device" --steps "$steps" --splat "$work/photos.ply" \
-    --holdout every:4 --sheet "$work/views.png" --out "$work/splat.ply"
-part refine_weights 60 "$globalsplat" refine --scene "$scene" --device "$device" --steps "$steps" --from weights --gaussians 20000 \
+    --holdout every:4 --contact-sheet "$work/views.png" --out "$work/splat.ply"
+part refine_weights 60 "$globalsplat" refine --scene "$scene" --device "$device" --steps "$steps" --init model --gaussians 20000 \
     --correct-exposures --out "$work/weights.ply"
 bench raster_million 60 raster "${large[@]}" --device "$device"
 if [ "$device" != cpu ] && command -v ncu >"$work/found"; then

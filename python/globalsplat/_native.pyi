@@ -48,7 +48,8 @@ def reconstruct(
 def refine(
     capture: Capture,
     initial: Mapping[str, Any] | None,
-    options: Mapping[str, Any],
+    options: str,
+    cuda: int | None,
     progress: Callable[[int, float | None], object] | None,
 ) -> tuple[dict[str, Any], list[str]]: ...
 def read_model(weights: Path | None) -> tuple[dict[str, Floats], str, int, float]: ...

@@ -131,15 +131,14 @@ def refine(
         "steps": steps,
         "gaussians": gaussians,
         "views": views,
-        "size": size,
+        "size": None if size is None else str(size),
         "seed": seed,
         "antialiased": antialiased,
         "correct_poses": correct_poses,
-        "settings": [f"{name}={json.dumps(value)}" for name, value in (settings or {}).items()],
-        "cuda": _cuda_index(device),
+        "set": [f"{name}={json.dumps(value)}" for name, value in (settings or {}).items()],
     }
     initial = None if splat is None else from_splat(splat)
-    raw, lines = _native.refine(_to_capture(capture), initial, options, progress)
+    raw, lines = _native.refine(_to_capture(capture), initial, json.dumps(options), _cuda_index(device), progress)
     warn(lines)
     return _to_tensors(raw, device)
 

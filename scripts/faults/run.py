@@ -366,12 +366,12 @@ def operations(bench, only):
     reconstruct = ["reconstruct", "--weights", weights, "--scene", room, "--out", out / "room.ply", "--json"]
     quick = ["--views", 3, "--size", "24x24", "--gaussians", 400, "--steps", 4]
     refine = ["refine", "--scene", room, *quick, "--out", out / "room.ply", "--local-origin"]
-    refine += ["--sheet", out / "sheet.png", "--json"]
+    refine += ["--contact-sheet", out / "sheet.png", "--json"]
     far = inputs / "far.ply"
     shutil.copy(splat, far)
     (inputs / "far.ply.origin.json").write_text(json.dumps({"origin": [5e6, 4e5, 100.0]}))
     convert = ["convert", far, out / "far.spz", "--local-origin", "--json"]
-    score = ["eval", "--splat", splat, "--scene", room, "--json", "--sheet", out / "sheet.png"]
+    score = ["eval", "--splat", splat, "--scene", room, "--json", "--contact-sheet", out / "sheet.png"]
     report = ["report", inputs / "evaluation", "--out", out / "report.html", "--json"]
     orbit = ["render", "--splat", splat, "--size", "24x24", "--orbit", "--frames", 3, "--json", "--out"]
 
@@ -403,7 +403,7 @@ def operations(bench, only):
         return Operation(bench, "pack", command, once=True).take()
 
     def filmed():
-        more = ["--depth", "--sheet", out / "sheet.png"]
+        more = ["--depth", "--contact-sheet", out / "sheet.png"]
         command = ["synth", "--out", out, "--scenes", 2, "--frames", 3, "--size", 16, *more, "--json"]
         # Older files, without the index that marks the folder as complete.
         return Operation(bench, "synth", command, once=True).age(drop=["000000.torch", "index.json"])

@@ -5,7 +5,7 @@ use crate::data::ViewBatch;
 use crate::device::Stopwatch;
 use crate::error::Result;
 use crate::refine::{
-    Budget, Corrections, GaussianOptimizer, Photos, Reached, RefineConfig, Task, refine_timed,
+    Budget, Corrections, GaussianOptimizer, Photos, TrainProgress, RefineConfig, OptimizeArgs, refine_timed,
 };
 use crate::render::cpu::stage_times;
 use crate::render::{DEFAULT_EPS2D, render};
@@ -45,20 +45,20 @@ pub fn bench_refine(
     });
     let mut optimizer = GaussianOptimizer::new(&RawGaussians::from_gaussians(&gaussians), 1., config, 0);
     let mut none = Corrections::none();
-    let task = |steps| Task {
+    let args = |steps| OptimizeArgs {
         photos: &photos,
         depth: 1.,
         config,
         budget: Budget::Steps(steps),
         seed: 0,
         background: None,
-        reached: Reached::default(),
+        progress: TrainProgress::default(),
     };
-    refine_timed(&mut optimizer, &mut none, &task(WARM_UP), &mut Stopwatch::default(), |_| true)?;
+    refine_timed(&mut optimizer, &mut none, &args(WARM_UP), &mut Stopwatch::default(), |_| true)?;
 
     let mut stopwatch = Stopwatch::new(device);
     let (mut whole, mut before, mut backward) = (vec![], Duration::ZERO, 0.);
-    refine_timed(&mut optimizer, &mut none, &task(steps), &mut stopwatch, |at| {
+    refine_timed(&mut optimizer, &mut none, &args(steps), &mut stopwatch, |at| {
         whole.push(1e3 * (at.elapsed - before).as_secs_f64());
         before = at.elapsed;
         let stages = stage_times();

@@ -30,9 +30,8 @@ mod weights;
 
 use clap::{CommandFactory, Parser, Subcommand};
 use globalsplat::Error;
-use globalsplat::data::{Capture, Holdout, PhotoSize};
+use globalsplat::data::{Capture, Holdout};
 use globalsplat::error::panic_message;
-use globalsplat::refine::MIN_SIDE;
 use globalsplat::scene::ImageSize;
 use std::backtrace::{Backtrace, BacktraceStatus};
 use std::panic;
@@ -191,21 +190,6 @@ fn parse_size(text: &str) -> Result<ImageSize, Error> {
     match sides {
         Some((width @ 1..=16384, height @ 1..=16384)) => Ok(ImageSize { width, height }),
         _ => Err(Error::request(format!("--size {text}: expected WxH, as in 640x480, up to 16384x16384"))),
-    }
-}
-
-/// Parses the size of photos as `--size` takes it: the longer side, or a size that they are cropped and resized to.
-fn parse_photo_size(text: &str) -> Result<PhotoSize, Error> {
-    let is_in_range = |side| (MIN_SIDE..=16384).contains(&side);
-    match (text.parse(), parse_size(text)) {
-        (Ok(longest), _) if is_in_range(longest) => Ok(PhotoSize::Within(longest)),
-        (_, Ok(size)) if is_in_range(size.width) && is_in_range(size.height) => Ok(PhotoSize::Exactly(size)),
-        _ => {
-            let expected = format!(
-                "the longer side, as in 1600, or WxH, as in 640x480, with sides of {MIN_SIDE} to 16384"
-            );
-            Err(Error::request(format!("--size {text}: expected {expected}")))
-        }
     }
 }
 

@@ -1,5 +1,5 @@
 use super::capture::SceneSource;
-use super::refine::{InitialFile, RefineJob, Reports, parse_time};
+use super::refine::{Refine, Reports};
 use super::signals::StopRequest;
 use super::{check_views, device, model, open_masked_capture, parse_holdout, print_json, splat_out};
 use anyhow::Result;
@@ -46,7 +46,7 @@ pub struct Reconstruct {
     /// Held-out views: every:N, every:N+K, or none for only the capture's own test split
     #[arg(long, value_name = "WHICH", default_value = "none")]
     holdout: String,
-    /// Also refine the splat on all input photos for this time, as `refine --from weights` does; as in 60s or 2m
+    /// Also refine the splat on all input photos for this time, as `refine --init model` does; as in 60s or 2m
     #[arg(long, value_name = "TIME", value_parser = parse_seconds, conflicts_with_all = ["precision", "views_at"])]
     refine: Option<f64>,
     /// Write coordinates relative to the centre of the cameras, which is stored in a file beside the splat: far from the
@@ -67,25 +67,25 @@ pub struct Reconstruct {
 impl Reconstruct {
     /// Reconstructs the same splat and then optimizes its Gaussians for `seconds`.
     fn run_refined(self, seconds: f64) -> Result<()> {
-        let holdout = parse_holdout(&self.holdout)?;
-        let budget = parse_time(seconds)?;
-        let device = device::parse(&self.device)?;
-        let options = RefineOptions { budget, holdout, views: self.views, device, ..Default::default() };
-        let (gaussians, size) = (Some(options.gaussians), Some(options.size));
-        let initial = InitialFile::Model(self.weights);
-        let Reconstruct { scene, masks, out, local_origin, json, .. } = self;
-        let (resume, reports) = (false, Reports::default());
-        RefineJob {
+        let options = RefineOptions {
+            seconds,
+            holdout: parse_holdout(&self.holdout)?,
+            views: self.views,
+            ..Default::default()
+        };
+        let Reconstruct { weights, scene, masks, out, local_origin, device, json, .. } = self;
+        Refine {
+            splat: None,
+            init: Some("model".into()),
+            weights,
             scene,
             masks,
             out,
-            initial,
-            options,
-            gaussians,
-            size,
-            resume,
+            resume: false,
             local_origin,
-            reports,
+            options,
+            reports: Reports::default(),
+            device,
             json,
         }
         .run()

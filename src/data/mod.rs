@@ -28,7 +28,7 @@ pub use loading::{
     BadData, Batch, BatchShard, DataLoader, LoadTimes, LoadedScene, SceneGroups, TrainingScenes,
 };
 pub(crate) use photo_size::MIN_SHORTER_SIDE;
-pub use photo_size::PhotoSize;
+pub use photo_size::{MIN_SIDE, PhotoSize};
 pub use pixels::Pixels;
 pub use polyphase::polyphase;
 pub use view::{View, load_all_views, load_views, tensor_from_planes};

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 /// [`super::scene_depth`] computes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
+#[allow(non_snake_case)] // gsplat's name for the higher spherical harmonics
 pub struct RefineConfig {
     /// Number of views in a step.
     pub views: usize,
@@ -21,32 +22,32 @@ pub struct RefineConfig {
     /// up to degree 1, and 0.2 up to higher degrees.
     pub sh_every: Option<f64>,
     /// Initial learning rate of the means, in scene depths, for up to 16,384 Gaussians. For N it is multiplied by (16,384 / N)^0.75.
-    pub means: f64,
+    pub lr_means: f64,
     /// Final learning rate of the means, relative to the initial one. The decay is exponential.
-    pub means_end: f64,
+    pub lr_means_final_factor: f64,
     /// Learning rate of the logarithms of scales.
-    pub log_scales: f64,
+    pub lr_scales: f64,
     /// Learning rate of the quaternions.
-    pub quaternions: f64,
+    pub lr_quats: f64,
     /// Learning rate of the logits of opacities.
-    pub opacity_logits: f64,
-    /// Learning rate of the colours, the spherical harmonics of degree 0.
-    pub colours: f64,
-    /// Learning rate of the higher spherical harmonics, relative to that of the colours.
-    pub harmonics: f64,
+    pub lr_opacities: f64,
+    /// Learning rate of the spherical harmonics of degree 0.
+    pub lr_sh0: f64,
+    /// Learning rate of the higher spherical harmonics, relative to that of degree 0.
+    pub lr_shN_factor: f64,
     /// Final value of all other learning rates of Gaussians, relative to the initial ones. The decay is exponential.
     pub lr_final_factor: f64,
     /// Initial learning rate of the cameras' rotations, in radians, and translations, in scene depths, if poses are corrected, for photos of up
     /// to 256 pixels. For N pixels it is multiplied by 256 / N. It falls to a fifth.
-    pub poses: f64,
+    pub lr_poses: f64,
     /// Initial learning rate of the logarithms of exposures, if exposures are corrected. It falls to a fifth.
-    pub exposures: f64,
+    pub lr_exposures: f64,
     /// Weight of the loss 1 − SSIM. The weight of the L1 loss is one minus this.
     pub ssim_weight: f64,
     /// Weight of the penalty on the mean opacity.
-    pub opacity: f64,
+    pub opacity_reg: f64,
     /// Weight of the penalty on the mean scale in scene depths.
-    pub scale: f64,
+    pub scale_reg: f64,
     /// Weight of the loss [`crate::loss::depth_smoothness`].
     pub depth_smoothness_weight: f64,
     /// Initial weight of the relative difference between rendered depths and those on which the photos agree. It falls to 0 in the first half
@@ -59,7 +60,7 @@ pub struct RefineConfig {
     /// Number of steps between relocations of dead Gaussians; 0 disables relocation.
     pub relocate_every: u64,
     /// Displacement of relocated Gaussians, in standard deviations of the Gaussian that they are moved onto.
-    pub spread: f64,
+    pub relocation_noise: f64,
     /// Opacity at or below which a Gaussian is dead.
     pub prune_opacity: f64,
     /// Fraction of the optimization after which Gaussians are no longer relocated, and their parameters are averaged.
@@ -74,46 +75,29 @@ impl Default for RefineConfig {
             antialiased: false,
             sh_degree: None,
             sh_every: None,
-            means: 2e-3,
-            means_end: 0.02,
-            log_scales: 2e-2,
-            quaternions: 2e-3,
-            opacity_logits: 3e-2,
-            colours: 5e-3,
-            harmonics: 0.1,
+            lr_means: 2e-3,
+            lr_means_final_factor: 0.02,
+            lr_scales: 2e-2,
+            lr_quats: 2e-3,
+            lr_opacities: 3e-2,
+            lr_sh0: 5e-3,
+            lr_shN_factor: 0.1,
             lr_final_factor: 0.6,
-            poses: 5e-4,
-            exposures: 5e-3,
+            lr_poses: 5e-4,
+            lr_exposures: 5e-3,
             ssim_weight: 0.4,
-            opacity: 1e-3,
-            scale: 0.,
+            opacity_reg: 1e-3,
+            scale_reg: 0.,
             depth_smoothness_weight: 0.7,
             depth_weight: 1.,
             initial_gaussians: 0.2,
             grow_until: 0.6,
             relocate_every: 50,
-            spread: 0.7,
+            relocation_noise: 0.7,
             prune_opacity: 0.01,
             relocate_until: 0.8,
         }
     }
-}
-
-/// Former names of keys, which are still accepted, and their current names.
-const RENAMED: [(&str, &str); 5] = [
-    ("dead", "prune_opacity"),
-    ("others_end", "lr_final_factor"),
-    ("similar", "ssim_weight"),
-    ("sizes", "resolution_schedule"),
-    ("smooth", "depth_smoothness_weight"),
-];
-
-/// Former key that is no longer accepted, the learning rate of tokens.
-const REMOVED: &str = "tokens";
-
-/// Returns the current name of a key, which may be a former name.
-fn current_name(key: String) -> String {
-    RENAMED.iter().find(|(former, _)| *former == key).map_or(key, |(_, current)| current.to_string())
 }
 
 /// Longer side of photos, in pixels, from which the learning rate of poses falls.
@@ -143,10 +127,7 @@ impl RefineConfig {
             if set.len() != 1 {
                 return Err(error("expected KEY=VALUE"));
             }
-            if set.contains_key(REMOVED) {
-                return Err(error("only Gaussians are optimized, and no longer a model's tokens"));
-            }
-            table.extend(set.into_iter().map(|(key, value)| (current_name(key), value)));
+            table.extend(set);
             let config: RefineConfig =
                 table.clone().try_into().map_err(|e| error(&e.message().replace('\n', " ")))?;
             config.check().map_err(|expected| error(&format!("expected {expected}")))?;
@@ -160,16 +141,16 @@ impl RefineConfig {
     /// Returns the expected range of the first value that is out of range.
     pub fn check(&self) -> std::result::Result<(), &'static str> {
         let rates = [
-            self.means,
-            self.log_scales,
-            self.quaternions,
-            self.opacity_logits,
-            self.colours,
-            self.harmonics,
-            self.poses,
-            self.exposures,
+            self.lr_means,
+            self.lr_scales,
+            self.lr_quats,
+            self.lr_opacities,
+            self.lr_sh0,
+            self.lr_shN_factor,
+            self.lr_poses,
+            self.lr_exposures,
         ];
-        let weights = [self.opacity, self.scale, self.depth_smoothness_weight, self.depth_weight];
+        let weights = [self.opacity_reg, self.scale_reg, self.depth_smoothness_weight, self.depth_weight];
         let is_inner_fraction = |&fraction: &f64| 0. < fraction && fraction < 1.;
         let schedule = self.resolution_schedule.as_deref().unwrap_or_default();
         // Comparisons with NaN are false, so NaN fails every rule.
@@ -182,7 +163,7 @@ impl RefineConfig {
             (self.sh_every.is_none_or(|every| 0. < every && every.is_finite()), "a finite number above 0"),
             (rates.iter().all(|rate| (0. ..=10.).contains(rate)), "0 to 10"),
             (
-                [self.means_end, self.lr_final_factor].iter().all(|&end| 0. < end && end <= 1.),
+                [self.lr_means_final_factor, self.lr_final_factor].iter().all(|&end| 0. < end && end <= 1.),
                 "above 0, up to 1",
             ),
             ((0. ..=1.).contains(&self.ssim_weight), "0 to 1"),
@@ -190,7 +171,7 @@ impl RefineConfig {
             ((0. ..1.).contains(&self.prune_opacity), "0 or more, below 1"),
             (is_inner_fraction(&self.grow_until), "above 0 and below 1"),
             (0. < self.initial_gaussians && self.initial_gaussians <= 1., "above 0, up to 1"),
-            ((0. ..=10.).contains(&self.spread), "0 to 10"),
+            ((0. ..=10.).contains(&self.relocation_noise), "0 to 10"),
             ((0. ..=1.).contains(&self.relocate_until), "0 to 1"),
         ];
         rules.into_iter().find(|(is_met, _)| !is_met).map_or(Ok(()), |(_, expected)| Err(expected))
@@ -201,7 +182,7 @@ impl RefineConfig {
         RefineConfig {
             resolution_schedule: Some(vec![]),
             sh_degree: Some(1),
-            opacity: 0.,
+            opacity_reg: 0.,
             ..Default::default()
         }
     }
@@ -217,8 +198,8 @@ impl RefineConfig {
     }
 
     /// Returns the learning rate of poses for photos of `longest_side` pixels.
-    pub(super) fn poses_for(&self, longest_side: u32) -> f64 {
-        self.poses * (POSES_SIDE / f64::from(longest_side)).min(1.)
+    pub(super) fn lr_poses_for(&self, longest_side: u32) -> f64 {
+        self.lr_poses * (POSES_SIDE / f64::from(longest_side)).min(1.)
     }
 
     /// Returns the weight of known depths, which falls to 0 in the first half: later the photos decide.
@@ -271,11 +252,10 @@ mod tests {
             ("sh_every=0", "expected a finite number above 0"),
             ("sh_every=nan", "expected a finite number above 0"),
             ("sh_every=inf", "expected a finite number above 0"),
-            ("means=-1e-3", "expected 0 to 10"),
-            ("means=1e30", "expected 0 to 10"),
-            ("colours=nan", "expected 0 to 10"),
-            ("tokens=0.01", "no longer a model's tokens"),
-            ("means_end=0", "expected above 0, up to 1"),
+            ("lr_means=-1e-3", "expected 0 to 10"),
+            ("lr_means=1e30", "expected 0 to 10"),
+            ("lr_shN_factor=nan", "expected 0 to 10"),
+            ("lr_means_final_factor=0", "expected above 0, up to 1"),
             ("lr_final_factor=inf", "expected above 0, up to 1"),
             ("ssim_weight=1.5", "expected 0 to 1"),
             ("depth_smoothness_weight=-1", "expected 0 to 1000"),
@@ -283,11 +263,11 @@ mod tests {
             ("relocate_until=nan", "expected 0 to 1"),
             ("grow_until=1.0", "expected above 0 and below 1"),
             ("initial_gaussians=0.0", "expected above 0, up to 1"),
-            ("spread=-1", "expected 0 to 10"),
+            ("relocation_noise=-1", "expected 0 to 10"),
             ("relocate_every=-1", "invalid"),
             ("views=", "expected KEY=VALUE"),
             ("", "expected KEY=VALUE"),
-            ("views=1\nmeans=0.1", "expected KEY=VALUE"),
+            ("views=1\nlr_means=0.1", "expected KEY=VALUE"),
             ("view=3", "unknown field"),
         ] {
             let message = with(assignment).expect_err(assignment).to_string();
@@ -306,15 +286,5 @@ mod tests {
         assert_eq!(schedule(256), [0.03, 0.1]);
         assert_eq!(schedule(512), [0.03, 0.4]);
         assert_eq!(schedule(1024), [0.4, 0.7]);
-    }
-
-    #[test]
-    fn former_keys_are_accepted() {
-        let with = |key: &str, value: &str| RefineConfig::with(&[format!("{key}={value}")], false).unwrap();
-        for (former, current) in RENAMED {
-            let value = if former == "sizes" { "[0.5]" } else { "0.25" };
-            assert_eq!(with(former, value), with(current, value));
-            assert_ne!(with(former, value), RefineConfig::default(), "{former}");
-        }
     }
 }

@@ -18,7 +18,7 @@ const FINAL_RATE: f64 = 0.2;
 /// a whole is the same scene.
 #[derive(Debug)]
 pub struct Corrections {
-    /// Pose corrections, [V, 6]: rotation about the camera's centre as a vector along its axis, in radians, and translation of the centre
+    /// Pose corrections, [V, 6]: rotation about the camera's center as a vector along its axis, in radians, and translation of the center
     /// in scene depths, both along the world's axes.
     poses: Option<Tensor>,
     /// Logarithms of the gains of red, green and blue, [V, 3].
@@ -75,7 +75,7 @@ impl Corrections {
                 rate,
             ))
         };
-        let groups = [group("poses", &poses, config.poses), group("exposures", &exposures, config.exposures)];
+        let groups = [group("poses", &poses, config.lr_poses), group("exposures", &exposures, config.lr_exposures)];
         let (groups, rates) = groups.into_iter().flatten().unzip();
         let optimizer = Optimizer::new(groups);
         Corrections { poses, exposures, optimizer, rates, depth }
@@ -115,10 +115,10 @@ impl Corrections {
         let Some(poses) = &self.poses else { return views.w2c.shallow_clone() };
         let numbers = of(poses, which).unsqueeze(0);
         let (twist, shift) = (numbers.narrow(2, 0, 3), numbers.narrow(2, 3, 3) * self.depth);
-        // x_camera = W Tᵀ (x − o − s), with the camera's rotation W and centre o, the correction's rotation T and translation s.
+        // x_camera = W Tᵀ (x − o − s), with the camera's rotation W and center o, the correction's rotation T and translation s.
         let rotation = views.w2c.narrow(2, 0, 3).narrow(3, 0, 3).matmul(&turn(&twist).transpose(2, 3));
-        let centre = views.c2w.narrow(2, 0, 3).narrow(3, 3, 1) + shift.unsqueeze(-1);
-        let rows = Tensor::cat(&[&rotation, &-rotation.matmul(&centre)], 3);
+        let center = views.c2w.narrow(2, 0, 3).narrow(3, 3, 1) + shift.unsqueeze(-1);
+        let rows = Tensor::cat(&[&rotation, &-rotation.matmul(&center)], 3);
         Tensor::cat(&[&rows, &views.w2c.narrow(2, 3, 1)], 2)
     }
 
@@ -155,9 +155,9 @@ impl Corrections {
     pub fn apply(&self, index: usize, view: &View) -> View {
         let numbers = self.numbers(index);
         let mut camera = view.camera;
-        let centre = camera.c2w.w_axis.truncate() + DVec3::from_slice(&numbers[3..6]) * self.depth;
+        let center = camera.c2w.w_axis.truncate() + DVec3::from_slice(&numbers[3..6]) * self.depth;
         camera.c2w = DMat4::from_quat(quaternion(&numbers)) * camera.c2w;
-        camera.c2w.w_axis = centre.extend(1.);
+        camera.c2w.w_axis = center.extend(1.);
         let gain = Tensor::from_slice(&numbers[6..9]).exp().to_kind(Kind::Float).view([3, 1, 1]);
         let mask = view.mask.as_ref().map(Pixels::shallow_clone);
         let image = (view.image.to_float() / gain).into();
@@ -233,7 +233,7 @@ mod tests {
         }
     }
 
-    /// The optimization and the reported corrections use the same cameras and colours.
+    /// The optimization and the reported corrections use the same cameras and colors.
     #[test]
     fn applied_corrections_match_learned_ones() {
         let views = [view(0), view(1), view(2)];

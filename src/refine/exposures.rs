@@ -1,5 +1,6 @@
 //! Exposures of photos relative to each other, measured where photos show the same surface, as panoramas are balanced (Brown and Lowe 2007).
 
+use super::options::ExposureCorrection;
 use crate::scene::Camera;
 use crate::stereo::{DepthMap, SmallPhoto, nearest_to, numbers, projection, truths};
 use glam::DVec3;
@@ -25,23 +26,10 @@ const MIN_DIFFERENCE: f64 = 0.02;
 /// Natural logarithms of the gains of red, green and blue.
 pub(super) type LogGains = [f64; 3];
 
-/// Condition for the correction of exposures.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum ExposureCorrection {
-    /// Never corrects exposures.
-    Off,
-    /// Corrects the exposures of all photos if those of neighbouring photos differ. Where the exposure changes gradually from photo to photo, a
-    /// splat without corrections shows it, too, and is closer to photos in between.
-    #[default]
-    Auto,
-    /// Always corrects exposures.
-    On,
-}
-
 /// Photo that points are compared with.
 struct ExposedPhoto<'a> {
     photo: &'a SmallPhoto,
-    colours: Vec<f32>,
+    colors: Vec<f32>,
     counted: Option<Vec<bool>>,
     /// Depth of each pixel on which the photos agree, infinity for others; `None` if the photo has no depth map.
     depths: Option<Vec<f32>>,
@@ -87,20 +75,18 @@ fn measure_exposures(photos: &[SmallPhoto], depth_maps: &[(usize, DepthMap)]) ->
     gains.iter().map(|gain| [0, 1, 2].map(|c| gain[c] - mean[c])).collect()
 }
 
-impl ExposureCorrection {
-    /// Measures the exposures of `photos` like [`measure_exposures`]; returns `None` if they are not to be corrected.
-    pub(super) fn measure(
-        self,
-        photos: &[SmallPhoto],
-        depth_maps: &[(usize, DepthMap)],
-    ) -> Option<Vec<LogGains>> {
-        if self == ExposureCorrection::Off {
-            return None;
-        }
-        let gains = measure_exposures(photos, depth_maps);
-        let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
-        (self == ExposureCorrection::On || are_uneven(&gains, &cameras)).then_some(gains)
+/// Measures the exposures of `photos` like [`measure_exposures`]; returns `None` if they are not to be corrected on `condition`.
+pub(super) fn correct_exposures(
+    condition: ExposureCorrection,
+    photos: &[SmallPhoto],
+    depth_maps: &[(usize, DepthMap)],
+) -> Option<Vec<LogGains>> {
+    if condition == ExposureCorrection::Off {
+        return None;
     }
+    let gains = measure_exposures(photos, depth_maps);
+    let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
+    (condition == ExposureCorrection::On || are_uneven(&gains, &cameras)).then_some(gains)
 }
 
 /// Returns whether the exposures of nearby photos differ more from each other than from the mean.
@@ -139,42 +125,42 @@ fn balance(ratios: &[Vec<Option<Ratio>>], indices: &[usize]) -> Vec<LogGains> {
 impl<'a> ExposedPhoto<'a> {
     fn new(photo: &'a SmallPhoto) -> Self {
         let counted = photo.counted().as_ref().map(truths);
-        ExposedPhoto { photo, colours: numbers(&photo.image), counted, depths: None }
+        ExposedPhoto { photo, colors: numbers(&photo.image), counted, depths: None }
     }
 
-    /// Returns the colour of a pixel that counts and is neither too dark nor too bright.
-    fn colour(&self, pixel: usize) -> Option<[f32; 3]> {
+    /// Returns the color of a pixel that counts and is neither too dark nor too bright.
+    fn color(&self, pixel: usize) -> Option<[f32; 3]> {
         let [h, w] = self.photo.size().map(|side| side as usize);
-        let colour = [0, 1, 2].map(|c| self.colours[c * h * w + pixel]);
+        let color = [0, 1, 2].map(|c| self.colors[c * h * w + pixel]);
         let is_counted = self.counted.as_ref().is_none_or(|counted| counted[pixel]);
-        (is_counted && colour.iter().all(|value| USABLE.contains(value))).then_some(colour)
+        (is_counted && color.iter().all(|value| USABLE.contains(value))).then_some(color)
     }
 
-    /// Returns points of the surfaces that the photo shows, and their colours. Requires a depth map.
+    /// Returns points of the surfaces that the photo shows, and their colors. Requires a depth map.
     fn points(&self) -> Vec<(DVec3, [f32; 3])> {
         let Camera { intrinsics: k, c2w, width, .. } = self.photo.camera;
         let depths = self.depths.as_ref().expect("depths");
         let point = |(pixel, &depth): (usize, &f32)| {
-            let colour = self.colour(pixel).filter(|_| depth.is_finite())?;
+            let color = self.color(pixel).filter(|_| depth.is_finite())?;
             let [u, v] = [pixel as u32 % width, pixel as u32 / width].map(|side| f64::from(side) + 0.5);
             let seen = DVec3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.) * f64::from(depth);
-            Some((c2w.transform_point3(seen), colour))
+            Some((c2w.transform_point3(seen), color))
         };
         let points: Vec<_> = depths.iter().enumerate().filter_map(point).collect();
         let every = points.len().div_ceil(MAX_POINTS).max(1);
         points.into_iter().step_by(every).collect()
     }
 
-    /// Returns the median ratio of this photo's colours to those of `points`; `None` if it shows too few of them.
+    /// Returns the median ratio of this photo's colors to those of `points`; `None` if it shows too few of them.
     fn ratio_to(&self, points: &[(DVec3, [f32; 3])]) -> Option<Ratio> {
         let project = projection(&self.photo.camera);
         let mut logs: [Vec<f32>; 3] = Default::default();
-        for (point, colour) in points {
+        for (point, color) in points {
             let Some([u, v, z]) = project(*point) else { continue };
             let pixel = v as usize * self.photo.camera.width as usize + u as usize;
             let is_surface = |depths: &Vec<f32>| (z / f64::from(depths[pixel]) - 1.).abs() < SAME_SURFACE;
-            if let Some(shown) = self.colour(pixel).filter(|_| self.depths.as_ref().is_none_or(is_surface)) {
-                (0..3).for_each(|c| logs[c].push((shown[c] / colour[c]).ln()));
+            if let Some(shown) = self.color(pixel).filter(|_| self.depths.as_ref().is_none_or(is_surface)) {
+                (0..3).for_each(|c| logs[c].push((shown[c] / color[c]).ln()));
             }
         }
         let count = logs[0].len();
@@ -201,8 +187,8 @@ fn median(values: &mut [f32]) -> f32 {
 mod tests {
     use super::*;
     use crate::data::View;
-    use crate::refine::begin::small_photo;
-    use crate::refine::{InitialScene, gaussians_from_photos};
+    use crate::refine::init::small_photo;
+    use crate::refine::{PhotoInit, gaussians_from_photos};
     use crate::scene::{Intrinsics, SH_C0};
     use glam::DMat4;
     use tch::{Device, Kind};
@@ -248,16 +234,16 @@ mod tests {
 
     /// Initial Gaussians have the average exposure, whichever photo they come from.
     #[test]
-    fn initial_colours_have_the_average_exposure() {
+    fn initial_colors_have_the_average_exposure() {
         let gains = [0.8, 1.25, 1.];
         let views: Vec<View> = [-0.5, 0., 0.5].into_iter().zip(gains).map(|(x, g)| wall(x, [g; 3])).collect();
         let initial =
             |correction| gaussians_from_photos(&views, &[], 900, 0, correction, |_| true).expect("depths");
         // Brightness of the Gaussians of each photo, relative to all: a third of them come from each.
-        let brightness = |scene: &InitialScene| {
-            let colours = &scene.gaussians.sh * SH_C0 + 0.5;
-            let of = |photo: i64| colours.narrow(1, 300 * photo, 300).mean(Kind::Double).double_value(&[]);
-            [0, 1, 2].map(|photo| of(photo) / colours.mean(Kind::Double).double_value(&[]))
+        let brightness = |scene: &PhotoInit| {
+            let colors = &scene.gaussians.sh * SH_C0 + 0.5;
+            let of = |photo: i64| colors.narrow(1, 300 * photo, 300).mean(Kind::Double).double_value(&[]);
+            [0, 1, 2].map(|photo| of(photo) / colors.mean(Kind::Double).double_value(&[]))
         };
         let (corrected, uncorrected) = (initial(ExposureCorrection::On), initial(ExposureCorrection::Off));
         assert!(uncorrected.log_exposures.is_none() && brightness(&uncorrected)[1] > 1.15);
@@ -268,7 +254,7 @@ mod tests {
         }
     }
 
-    /// Exposures are corrected if neighbours differ, and neither if they change gradually nor if the differences are invisible.
+    /// Exposures are corrected if neighbors differ, and neither if they change gradually nor if the differences are invisible.
     #[test]
     fn uneven_exposures_are_recognized() {
         let cameras: Vec<Camera> = (0..9).map(|x| wall(f64::from(x), [1.; 3]).camera).collect();

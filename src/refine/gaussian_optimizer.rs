@@ -22,7 +22,7 @@ const EPSILON: f64 = 1e-15;
 /// Gaussians that are optimized, with the state of Adam.
 #[derive(Debug)]
 pub struct GaussianOptimizer {
-    leaves: GaussianParams,
+    params: GaussianParams,
     optimizer: Optimizer,
     config: RefineConfig,
     depth: f64,
@@ -40,23 +40,23 @@ impl GaussianOptimizer {
         let first = raw.sh.size()[2].isqrt() - 1;
         let last_count = count.max(raw.means.size()[1]);
         let degrees = [first, first.max(config.sh_degree_for(last_count))];
-        let leaves = GaussianParams::from_raw(raw, degrees[1]);
-        let growth = Growth { first_count: leaves.count(), degrees, degree: first, averaged_steps: 0 };
-        GaussianOptimizer::from_params(leaves, depth, config, growth, count)
+        let params = GaussianParams::from_raw(raw, degrees[1]);
+        let growth = Growth { first_count: params.count(), degrees, degree: first, averaged_steps: 0 };
+        GaussianOptimizer::from_params(params, depth, config, growth, count)
     }
 
-    /// Creates an optimizer of `leaves` without moments and averages.
+    /// Creates an optimizer of `params` without moments and averages.
     fn from_params(
-        leaves: GaussianParams,
+        params: GaussianParams,
         depth: f64,
         config: &RefineConfig,
         growth: Growth,
         count: i64,
     ) -> Self {
-        let optimizer = Optimizer::new(leaves.named_parameters().map(alone).into()).with_epsilon(EPSILON);
-        let last_count = leaves.count().max(count);
+        let optimizer = Optimizer::new(params.named_parameters().map(alone).into()).with_epsilon(EPSILON);
+        let last_count = params.count().max(count);
         let config = config.clone();
-        GaussianOptimizer { leaves, optimizer, config, depth, growth, last_count, average: None }
+        GaussianOptimizer { params, optimizer, config, depth, growth, last_count, average: None }
     }
 
     /// Creates the optimizer that `state` was made of, on `device`. The Gaussians grow to at least `count`.
@@ -70,14 +70,14 @@ impl GaussianOptimizer {
         device: Device,
     ) -> Result<Self> {
         let Record { depth, growth, .. } = state.record;
-        let params = |kind: &str| {
+        let read_params = |kind: &str| {
             GaussianParams::from_named(|name| state.tensor(&format!("{GAUSSIANS}{kind}.{name}")), device)
         };
-        let leaves = params("value")?;
-        let average = if growth.averaged_steps > 0 { Some(params("average")?.copy()) } else { None };
+        let params = read_params("value")?;
+        let average = if growth.averaged_steps > 0 { Some(read_params("average")?.copy()) } else { None };
         let sizes = |params: &GaussianParams| params.named_parameters().map(|(_, t)| t.size());
-        if let Some(found) = average.as_ref().map(sizes).filter(|found| *found != sizes(&leaves)) {
-            let expected = format!("those of the parameters, {:?}", sizes(&leaves));
+        if let Some(found) = average.as_ref().map(sizes).filter(|found| *found != sizes(&params)) {
+            let expected = format!("those of the parameters, {:?}", sizes(&params));
             return Err(Error::input(
                 state.file(),
                 "the sizes of the averages",
@@ -85,7 +85,7 @@ impl GaussianOptimizer {
                 expected,
             ));
         }
-        let mut all = GaussianOptimizer::from_params(leaves, depth, config, growth, count);
+        let mut all = GaussianOptimizer::from_params(params, depth, config, growth, count);
         all.optimizer.load_state(state.file(), &state.tensors_of(GAUSSIANS))?;
         all.average = average;
         Ok(all)
@@ -97,13 +97,13 @@ impl GaussianOptimizer {
             params.named_parameters().map(|(name, t)| (format!("{kind}.{name}"), t.detach()))
         };
         let averages = self.average.iter().flat_map(|average| named("average", average));
-        let all = named("value", &self.leaves).into_iter().chain(self.optimizer.state()).chain(averages);
+        let all = named("value", &self.params).into_iter().chain(self.optimizer.state()).chain(averages);
         tensors.extend(all.map(|(name, t)| (format!("{GAUSSIANS}{name}"), t)));
     }
 
     /// Returns the number of Gaussians.
     pub(super) fn count(&self) -> i64 {
-        self.leaves.count()
+        self.params.count()
     }
 
     /// Returns how the Gaussians have grown.
@@ -113,12 +113,12 @@ impl GaussianOptimizer {
 
     /// Returns the Gaussians, differentiable with respect to the parameters. `progress` goes from 0 to 1.
     pub fn gaussians(&self, progress: f64) -> Gaussians {
-        self.activate(&self.leaves, progress)
+        self.activate(&self.params, progress)
     }
 
     /// Returns the average of the Gaussians over the last steps if there is one, else the current ones; not differentiable.
     pub(super) fn averaged_gaussians(&self) -> Gaussians {
-        let params = self.average.as_ref().unwrap_or(&self.leaves);
+        let params = self.average.as_ref().unwrap_or(&self.params);
         tch::no_grad(|| self.activate(params, 1.)).map(Tensor::copy)
     }
 
@@ -142,7 +142,7 @@ impl GaussianOptimizer {
     pub(super) fn means_learning_rate(&self, progress: f64) -> f64 {
         let relative_count = self.last_count as f64 / MIN_GAUSSIANS as f64;
         let by_count = relative_count.max(1.).powf(-MEANS_POWER);
-        self.config.means * by_count * self.config.means_end.powf(progress)
+        self.config.lr_means * by_count * self.config.lr_means_final_factor.powf(progress)
     }
 
     /// Clears the gradients.
@@ -160,27 +160,27 @@ impl GaussianOptimizer {
         // The order is that of `GaussianParams::named_parameters`.
         self.optimizer.set_learning_rates(&[
             self.means_learning_rate(progress) * self.depth,
-            config.log_scales * others,
-            config.quaternions * others,
-            config.opacity_logits * others,
-            config.colours * others,
-            config.colours * config.harmonics * others,
+            config.lr_scales * others,
+            config.lr_quats * others,
+            config.lr_opacities * others,
+            config.lr_sh0 * others,
+            config.lr_sh0 * config.lr_shN_factor * others,
         ]);
         self.optimizer.step()?;
         self.growth.degree = self.degree_at(progress);
-        let missing = self.count_at(progress) - self.leaves.count();
+        let missing = self.count_at(progress) - self.params.count();
         let is_due = config.relocate_every > 0 && (step + 1).is_multiple_of(config.relocate_every);
         // With few steps, no relocation may be due after the growth has ended.
         let is_late = missing > 0 && progress >= config.grow_until;
         if is_due && progress < config.relocate_until || is_late {
             if missing > 0 {
-                self.leaves = self.leaves.append_dead(missing);
-                self.optimizer.extend(self.leaves.named_parameters(), 1);
+                self.params = self.params.append_dead(missing);
+                self.optimizer.extend(self.params.named_parameters(), 1);
             }
             let squared_gradients = self.optimizer.squared_gradients("means");
             let changed =
-                relocate(&self.leaves, squared_gradients, config.prune_opacity, config.spread, random);
-            let changed = Tensor::from_slice(&changed).to_device(self.leaves.means.device());
+                relocate(&self.params, squared_gradients, config.prune_opacity, config.relocation_noise, random);
+            let changed = Tensor::from_slice(&changed).to_device(self.params.means.device());
             for moment in self.optimizer.moments() {
                 let _ = moment.shallow_clone().index_fill_(1, &changed, 0.);
             }
@@ -196,12 +196,12 @@ impl GaussianOptimizer {
 
     /// Adds the parameters to their average.
     fn update_average(&mut self) {
-        let average = self.average.get_or_insert_with(|| self.leaves.copy());
+        let average = self.average.get_or_insert_with(|| self.params.copy());
         self.growth.averaged_steps += 1;
         let weight = (1. / self.growth.averaged_steps as f64).max(MIN_AVERAGE_WEIGHT);
         tch::no_grad(|| {
             for ((_, average), (_, t)) in
-                average.named_parameters().iter().zip(self.leaves.named_parameters())
+                average.named_parameters().iter().zip(self.params.named_parameters())
             {
                 let _ = average.shallow_clone().lerp_(t, weight);
             }

@@ -59,8 +59,8 @@ impl GaussianParams {
             log_scales: parameter("log_scales")?,
             quaternions: parameter("quaternions")?,
             opacity_logits: parameter("opacity_logits")?,
-            sh0: parameter("colours")?,
-            sh_rest: parameter("harmonics")?,
+            sh0: parameter("sh0")?,
+            sh_rest: parameter("shN")?,
         })
     }
 
@@ -112,8 +112,8 @@ impl GaussianParams {
             ("log_scales", &self.log_scales),
             ("quaternions", &self.quaternions),
             ("opacity_logits", &self.opacity_logits),
-            ("colours", &self.sh0),
-            ("harmonics", &self.sh_rest),
+            ("sh0", &self.sh0),
+            ("shN", &self.sh_rest),
         ]
     }
 

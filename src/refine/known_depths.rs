@@ -18,11 +18,11 @@ pub(super) struct KnownDepths {
 }
 
 impl KnownDepths {
-    /// Returns the depths of `map` on which the photos agree, at the pixels of a photo of `width`×`height` in which the centres of the map's
+    /// Returns the depths of `map` on which the photos agree, at the pixels of a photo of `width`×`height` in which the centers of the map's
     /// pixels are. If the photo has fewer pixels, each gets one of the depths.
     pub fn new(map: &DepthMap, width: i64, height: i64, device: Device) -> Self {
         let size = map.depth.size();
-        // The pixel of the photo, along one side, in which the centre of each of the map's pixels is.
+        // The pixel of the photo, along one side, in which the center of each of the map's pixels is.
         let along = |count: i64, side: i64| -> Vec<i64> {
             (0..count).map(|i| ((i as f64 + 0.5) * side as f64 / count as f64) as i64).collect()
         };
@@ -75,7 +75,7 @@ mod tests {
     #[test]
     fn sure_depths_pull_where_their_pixels_are() {
         let known = KnownDepths::new(&map(), 6, 4, Device::Cpu);
-        // In a photo of 6×4 pixels the centres of the map's pixels are in columns 1 and 4, and in rows 1 and 3.
+        // In a photo of 6×4 pixels the centers of the map's pixels are in columns 1 and 4, and in rows 1 and 3.
         let rendered = Tensor::full([4, 6], 9., (Kind::Float, Device::Cpu));
         let put = |row: i64, column: i64, depth: f64| {
             let _ = rendered.get(row).get(column).fill_(depth);

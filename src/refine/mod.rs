@@ -1,35 +1,32 @@
 //! Refinement of a splat on the photos that it has to match, in seconds. Without a splat, refinement starts from the depths on which the photos agree. [`RefineSession`] does all of it, from a capture to a
 //! splat and its scores.
 
-mod begin;
 mod config;
 mod corrections;
+mod events;
 mod exposures;
 mod gaussian_optimizer;
 mod gaussian_params;
+mod init;
 mod known_depths;
-mod log;
 mod options;
 mod photos;
 mod relocate;
 mod session;
 mod state;
-mod view_sample;
 
-pub use begin::{InitialScene, gaussians_from_photos};
 pub use config::RefineConfig;
 pub use corrections::{Correction, Corrections};
-pub use exposures::ExposureCorrection;
+pub use events::{EvalPoint, RefineEvent, RefineLog, RefineMetrics, SampleScores};
 pub use gaussian_optimizer::GaussianOptimizer;
-pub use log::RefineLog;
-pub use options::{Budget, MaskBackground, RefineOptions};
-pub use photos::{MIN_SIDE, Photos, load_photos};
-pub use session::{EvalPoint, Initial, RefineEvent, RefineMetrics, RefineResult, RefineSession};
-pub use state::{Reached, RefineState};
-pub use view_sample::SampleScores;
+pub use init::{PhotoInit, SceneInit, gaussians_from_photos};
+pub use options::{Budget, ExposureCorrection, MaskBackground, RefineOptions};
+pub use photos::{Photos, load_photos};
+pub use session::{RefineResult, RefineSession};
+pub use state::{RefineState, TrainProgress};
 
 use self::known_depths::KnownDepths;
-use self::photos::Drawn;
+use self::photos::TrainBatch;
 use crate::data::{View, ViewBatch};
 use crate::device::Stopwatch;
 use crate::error::{Error, Result};
@@ -78,7 +75,7 @@ impl RefineStep<'_> {
 
 /// Inputs of an optimization.
 #[derive(Debug)]
-pub struct Task<'a> {
+pub struct OptimizeArgs<'a> {
     /// Photos that have to be matched.
     pub photos: &'a Photos,
     /// Depth of the scene, the unit of lengths: see [`scene_depth`].
@@ -92,7 +89,7 @@ pub struct Task<'a> {
     /// Background of masked pixels; `None` ignores them.
     pub background: Option<MaskBackground>,
     /// Where an earlier optimization has ended that this one continues. The budget includes its steps and its time.
-    pub reached: Reached,
+    pub progress: TrainProgress,
 }
 
 /// Optimizes the Gaussians of `optimizer` and the `corrections` of the photos. `on_step` is called after every step and ends the work if it
@@ -103,51 +100,51 @@ pub struct Task<'a> {
 pub fn refine(
     optimizer: &mut GaussianOptimizer,
     corrections: &mut Corrections,
-    task: &Task,
+    args: &OptimizeArgs,
     on_step: impl FnMut(&RefineStep) -> bool,
-) -> Result<(Gaussians, Reached)> {
-    refine_timed(optimizer, corrections, task, &mut Stopwatch::default(), on_step)
+) -> Result<(Gaussians, TrainProgress)> {
+    refine_timed(optimizer, corrections, args, &mut Stopwatch::default(), on_step)
 }
 
 /// Runs [`refine`] and records the time of each part of a step in `stopwatch`.
 pub(crate) fn refine_timed(
     optimizer: &mut GaussianOptimizer,
     corrections: &mut Corrections,
-    task: &Task,
+    args: &OptimizeArgs,
     stopwatch: &mut Stopwatch,
     mut on_step: impl FnMut(&RefineStep) -> bool,
-) -> Result<(Gaussians, Reached)> {
-    let Task { photos, depth, config, budget, seed, background, reached } = *task;
+) -> Result<(Gaussians, TrainProgress)> {
+    let OptimizeArgs { photos, depth, config, budget, seed, background, progress: earlier } = *args;
     let _threads = KernelThreads::take();
     let mut random = ChaCha8Rng::seed_from_u64(seed);
-    random.set_word_pos(reached.random);
+    random.set_word_pos(earlier.random);
     let (begun, mut elapsed, mut last) = (Instant::now(), Duration::ZERO, Duration::ZERO);
-    let mut step = reached.steps;
+    let mut step = earlier.steps;
     loop {
         let start = Instant::now();
         let (progress, is_over) = match budget {
             Budget::Steps(steps) => (step as f64 / steps as f64, step >= steps),
             Budget::Time(time) => {
-                let gone = reached.time + begun.elapsed();
+                let spent = earlier.time + begun.elapsed();
                 // A step that would not end in time is not started.
-                (gone.as_secs_f64() / time.as_secs_f64(), step > reached.steps && gone + last > time)
+                (spent.as_secs_f64() / time.as_secs_f64(), step > earlier.steps && spent + last > time)
             }
         };
         if is_over {
             break;
         }
-        let Drawn { which, views: batch, depths: known } =
-            stopwatch.time("photos", || photos.draw(progress, config.views, &mut random));
+        let TrainBatch { which, views: batch, depths: known } =
+            stopwatch.time("photos", || photos.sample(progress, config.views, &mut random));
         let gaussians = stopwatch.time("activation", || optimizer.gaussians(progress));
         let cameras = Cameras { w2c: corrections.w2c(&batch, &which), ..batch.cameras() };
-        let mut pictures =
+        let mut rendered =
             stopwatch.time("render", || render(&gaussians, &cameras, default_eps2d(&gaussians)))?;
-        pictures.rgb = corrections.apply_exposures(pictures.rgb, &which);
-        let background = background.map(|background| background.colour(&mut random));
+        rendered.rgb = corrections.apply_exposures(rendered.rgb, &which);
+        let background = background.map(|background| background.color(&mut random));
         let loss = stopwatch.time("loss", || {
-            let loss = loss(&gaussians, &pictures, &batch, background, config, depth);
+            let loss = loss(&gaussians, &rendered, &batch, background, config, depth);
             let weight = config.depth_weight_at(progress);
-            let difference = (weight > 0.).then(|| known_depths_loss(&pictures.depth, &known)).flatten();
+            let difference = (weight > 0.).then(|| known_depths_loss(&rendered.depth, &known)).flatten();
             match difference {
                 Some(difference) => loss + difference * weight,
                 None => loss,
@@ -169,16 +166,16 @@ pub(crate) fn refine_timed(
             break;
         }
     }
-    let reached =
-        Reached { steps: step, time: reached.time + begun.elapsed(), random: random.get_word_pos() };
-    Ok((optimizer.averaged_gaussians(), reached))
+    let progress =
+        TrainProgress { steps: step, time: earlier.time + begun.elapsed(), random: random.get_word_pos() };
+    Ok((optimizer.averaged_gaussians(), progress))
 }
 
 /// Returns the loss: the difference between rendered images and photos, plus the regularization of the Gaussians. Masked pixels of the
-/// photos are left out, or have the colour `background`, over which the splat is seen.
+/// photos are left out, or have the color `background`, over which the splat is seen.
 fn loss(
     gaussians: &Gaussians,
-    pictures: &RenderOutput,
+    rendered: &RenderOutput,
     photos: &ViewBatch,
     background: Option<[f32; 3]>,
     config: &RefineConfig,
@@ -186,35 +183,35 @@ fn loss(
 ) -> Tensor {
     let (l1_weight, ssim_weight) = (1. - config.ssim_weight, -config.ssim_weight);
     let difference = match (&photos.masks, background) {
-        (masks, Some(colour)) => {
-            let colour = Tensor::from_slice(&colour).view([3, 1, 1]).to_device(photos.images.device());
-            let rgb = &pictures.rgb + (1. - pictures.alpha.unsqueeze(2)) * &colour;
+        (masks, Some(color)) => {
+            let color = Tensor::from_slice(&color).view([3, 1, 1]).to_device(photos.images.device());
+            let rgb = &rendered.rgb + (1. - rendered.alpha.unsqueeze(2)) * &color;
             match masks {
                 Some(masks) => {
-                    photometric(&rgb, &fill_masked(&photos.images, &colour, masks), l1_weight, ssim_weight)
+                    photometric(&rgb, &fill_masked(&photos.images, &color, masks), l1_weight, ssim_weight)
                 }
                 None => photometric(&rgb, &photos.images, l1_weight, ssim_weight),
             }
         }
         (Some(masks), None) => {
-            masked_photometric(&pictures.rgb, &photos.images, masks, l1_weight, ssim_weight)
+            masked_photometric(&rendered.rgb, &photos.images, masks, l1_weight, ssim_weight)
         }
-        (None, None) => photometric(&pictures.rgb, &photos.images, l1_weight, ssim_weight),
+        (None, None) => photometric(&rendered.rgb, &photos.images, l1_weight, ssim_weight),
     };
     let mut loss = difference + config.ssim_weight;
-    if config.opacity > 0. {
-        loss += gaussians.opacities.mean(Kind::Float) * config.opacity;
+    if config.opacity_reg > 0. {
+        loss += gaussians.opacities.mean(Kind::Float) * config.opacity_reg;
     }
-    if config.scale > 0. {
-        loss += gaussians.scales.mean(Kind::Float) * (config.scale / depth);
+    if config.scale_reg > 0. {
+        loss += gaussians.scales.mean(Kind::Float) * (config.scale_reg / depth);
     }
     if config.depth_smoothness_weight > 0. {
         let weight = config.depth_smoothness_weight;
         loss += match &photos.masks {
             Some(masks) => {
-                masked_depth_smoothness(&pictures.depth, &photos.images, &masks.squeeze_dim(2), weight)
+                masked_depth_smoothness(&rendered.depth, &photos.images, &masks.squeeze_dim(2), weight)
             }
-            None => depth_smoothness(&pictures.depth, &photos.images, weight),
+            None => depth_smoothness(&rendered.depth, &photos.images, weight),
         };
     }
     loss
@@ -306,16 +303,16 @@ mod tests {
         let mut optimizer = GaussianOptimizer::new(&raw, depth, &config, 0);
         let photos = Photos::new(views, &[], &config, Device::Cpu);
         let budget = Budget::Steps(400);
-        let task = Task {
+        let args = OptimizeArgs {
             photos: &photos,
             depth,
             config: &config,
             budget,
             seed,
             background,
-            reached: Reached::default(),
+            progress: TrainProgress::default(),
         };
-        refine(&mut optimizer, &mut Corrections::none(), &task, |_| true).unwrap().0
+        refine(&mut optimizer, &mut Corrections::none(), &args, |_| true).unwrap().0
     }
 
     /// A bright thing that moves through the photos costs a lot of quality on a view that isn't among them, and most of it is recovered if
@@ -383,17 +380,17 @@ mod tests {
             let config = RefineConfig { relocate_every, ..RefineConfig::default() };
             let photos = Photos::new(&views, &[], &config, Device::Cpu);
             let (budget, mut counts) = (Budget::Steps(20), vec![]);
-            let task = Task {
+            let args = OptimizeArgs {
                 photos: &photos,
                 depth,
                 config: &config,
                 budget,
                 seed: 0,
                 background: None,
-                reached: Reached::default(),
+                progress: TrainProgress::default(),
             };
             let mut optimizer = GaussianOptimizer::new(&raw, depth, &config, 90);
-            let splat = refine(&mut optimizer, &mut Corrections::none(), &task, |step| {
+            let splat = refine(&mut optimizer, &mut Corrections::none(), &args, |step| {
                 counts.push(step.gaussians().count());
                 true
             });
@@ -406,15 +403,15 @@ mod tests {
 
     /// The splat is compared over the background: one that is empty matches a photo that is masked out.
     #[test]
-    fn masked_pixels_have_the_background_s_colour() {
+    fn masked_pixels_have_the_background_s_color() {
         let (gaussians, cameras) = synthetic_gaussians(40, 1, ImageSize { width: 32, height: 24 });
-        let pictures = render(&gaussians, &cameras, DEFAULT_EPS2D).unwrap();
-        let config = RefineConfig { opacity: 0., ..RefineConfig::default() };
+        let rendered = render(&gaussians, &cameras, DEFAULT_EPS2D).unwrap();
+        let config = RefineConfig { opacity_reg: 0., ..RefineConfig::default() };
         let loss_of = |alpha: f64, masked: bool, background: [f32; 3]| {
-            let (rgb, full) = (pictures.rgb.zeros_like(), pictures.alpha.ones_like());
+            let (rgb, full) = (rendered.rgb.zeros_like(), rendered.alpha.ones_like());
             let rendered = RenderOutput { rgb, alpha: &full * alpha, depth: full.zeros_like() };
             let views = ViewBatch {
-                images: pictures.rgb.ones_like() * 0.3,
+                images: rendered.rgb.ones_like() * 0.3,
                 masks: masked.then(|| full.zeros_like().unsqueeze(2)),
                 depths: None,
                 c2w: cameras.w2c.inverse(),
@@ -423,9 +420,9 @@ mod tests {
             };
             loss(&gaussians, &rendered, &views, Some(background), &config, 1.).double_value(&[])
         };
-        for colour in [[0.; 3], [1.; 3], [0.2, 0.9, 0.4]] {
-            let found = loss_of(0., true, colour);
-            assert!(found.abs() < 1e-4, "{colour:?}: {found}");
+        for color in [[0.; 3], [1.; 3], [0.2, 0.9, 0.4]] {
+            let found = loss_of(0., true, color);
+            assert!(found.abs() < 1e-4, "{color:?}: {found}");
         }
         assert!(loss_of(1., true, [1.; 3]) > 0.5 && loss_of(1., true, [0.; 3]).abs() < 1e-4);
         // Photos without a mask are compared over the background, too.
@@ -437,36 +434,36 @@ mod tests {
     #[test]
     fn a_step_makes_only_expected_device_copies() {
         let (gaussians, cameras) = synthetic_gaussians(40, 4, ImageSize { width: 32, height: 24 });
-        let pictures = render(&gaussians, &cameras, DEFAULT_EPS2D).unwrap();
+        let rendered = render(&gaussians, &cameras, DEFAULT_EPS2D).unwrap();
         let c2w = cameras.w2c.inverse();
         let intrinsics = cameras.intrinsics.shallow_clone();
         let views = ViewBatch {
-            images: pictures.rgb,
+            images: rendered.rgb,
             masks: None,
             depths: None,
             c2w,
             w2c: cameras.w2c.shallow_clone(),
             intrinsics,
         };
-        let settings = ["relocate_every=0", "opacity=0.01", "scale=0.01", "depth_smoothness_weight=0.1"]
+        let settings = ["relocate_every=0", "opacity_reg=0.01", "scale_reg=0.01", "depth_smoothness_weight=0.1"]
             .map(String::from);
         let config = RefineConfig::with(&settings, false).unwrap();
         let photos = Photos::from_batch(views);
-        let task_of = |steps| Task {
+        let args_of = |steps| OptimizeArgs {
             photos: &photos,
             depth: 1.,
             config: &config,
             budget: Budget::Steps(steps),
             seed: 0,
             background: None,
-            reached: Reached::default(),
+            progress: TrainProgress::default(),
         };
         let steps = |count| {
             let mut optimizer =
                 GaussianOptimizer::new(&RawGaussians::from_gaussians(&gaussians), 1., &config, 0);
             let mut corrections = Corrections::new(4, true, Some(&[[0.; 3]; 4]), 1., &config, Device::Cpu);
             let _guard = num_threads::change();
-            refine(&mut optimizer, &mut corrections, &task_of(count), |_| true).unwrap();
+            refine(&mut optimizer, &mut corrections, &args_of(count), |_| true).unwrap();
         };
         let count = |ops: &[String], name: &str| ops.iter().filter(|op| *op == name).count();
         let [two, five] = [2, 5].map(|number| record_ops(|| steps(number)).1);

@@ -1,12 +1,12 @@
 //! Options of a refinement session.
 
 use super::config::RefineConfig;
-use super::exposures::ExposureCorrection;
 use crate::data::{Capture, Holdout, PhotoSize};
 use crate::error::{Error, Result};
 use crate::reconstruct::spread_over_path;
 use crate::scene::{Camera, ImageSize};
 use rand::Rng;
+use serde::Deserialize;
 use std::time::{Duration, Instant};
 use tch::Device;
 
@@ -19,39 +19,10 @@ pub enum Budget {
     Time(Duration),
 }
 
-/// Background that a splat is seen over where photos are masked out, so that nothing is left there.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum MaskBackground {
-    /// Black.
-    Black,
-    /// White.
-    White,
-    /// Another colour in every step, which no Gaussian can imitate.
-    Random,
-}
-
-impl Budget {
-    /// Maximum time in seconds: a year.
-    const MAX_SECONDS: f64 = 365. * 24. * 3600.;
-
-    /// Returns a time of that many seconds; `None` unless it is more than 0, up to a year.
-    pub fn from_seconds(seconds: f64) -> Option<Self> {
-        let is_valid = seconds > 0. && seconds <= Self::MAX_SECONDS;
-        is_valid.then(|| Budget::Time(Duration::from_secs_f64(seconds)))
-    }
-}
-
-impl MaskBackground {
-    /// Returns red, green and blue of the background of a step.
-    pub(super) fn colour(self, random: &mut impl Rng) -> [f32; 3] {
-        match self {
-            MaskBackground::Black => [0.; 3],
-            MaskBackground::White => [1.; 3],
-            MaskBackground::Random => random.random(),
-        }
-    }
-}
-
+/// Default of [`RefineOptions::seconds`].
+const DEFAULT_SECONDS: f64 = 60.;
+/// Maximum of [`RefineOptions::seconds`]: a year.
+const MAX_SECONDS: f64 = 365. * 24. * 3600.;
 /// Number of Gaussians that one core can optimize in one second of a time budget.
 const GAUSSIANS_PER_CORE_SECOND: f64 = 400.;
 /// Time in seconds after which more time is for more steps, not for more Gaussians, which match the photos better but not other views.
@@ -76,61 +47,171 @@ const BYTES_PER_PIXEL: u64 = 4;
 /// Minimum number of steps in which the number of Gaussians grows: with fewer, all are there from the start.
 const MIN_STEPS_TO_GROW: u64 = 500;
 
-/// Options of a session.
-#[derive(Debug, Clone)]
+/// Options of a session, which the program reads from its command line and the Python package from its arguments.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+#[cfg_attr(feature = "cli", derive(clap::Args))]
 pub struct RefineOptions {
-    /// Hyperparameters. [`RefineConfig::from_splat`] returns those for a start from a splat.
-    pub config: RefineConfig,
-    /// Number of steps, or time. A time includes reading the photos, the start, the scores, and writing the splat.
-    pub budget: Budget,
-    /// Start of a time budget; if it is `None`, the start of the session.
-    pub started: Option<Instant>,
-    /// Final number of Gaussians if the initial splat doesn't determine it. A session that is ended early may have fewer.
-    pub gaussians: usize,
-    /// Seed of the random numbers.
+    /// Number of Gaussians, not allowed with --splat. auto: 16384 to 1000000, by --seconds, the number of cores and the photos; 16384
+    /// with --steps
+    #[cfg_attr(feature = "cli", arg(long, value_name = "N|auto", default_value = "auto", value_parser = parse_gaussians))]
+    // A plain `Option` would be an option that may be missing.
+    pub gaussians: std::option::Option<usize>,
+    /// Total time in seconds, from the start of the program to its end
+    #[cfg_attr(feature = "cli", arg(long, value_name = "S", default_value_t = DEFAULT_SECONDS, conflicts_with = "steps"))]
+    pub seconds: f64,
+    /// Number of steps, instead of a time: the same steps and seed give the same bytes
+    #[cfg_attr(feature = "cli", arg(long, value_name = "N"))]
+    pub steps: Option<u64>,
+    /// Seed of the random numbers
+    #[cfg_attr(feature = "cli", arg(long, value_name = "S", default_value_t = 0))]
     pub seed: u64,
-    /// Views that are held out and scored, see [`Capture::split`].
+    /// Views to hold out and score: every:N, every:N+K, or none for only the capture's own test split
+    #[cfg_attr(feature = "cli", arg(long, value_name = "WHICH", default_value = "none"))]
     pub holdout: Holdout,
-    /// Maximum number of the other views, spread along the camera path; if it is `None`, as many as fit into about 2 GB of memory.
+    /// Maximum number of the other views, spread along the camera path; by default as many as fit into about 2 GB of memory
+    #[cfg_attr(feature = "cli", arg(long, value_name = "N"))]
     pub views: Option<usize>,
-    /// Learns corrections of the camera poses if `true`.
+    /// Size of the photos: the longer side to which larger ones are downscaled, as in 1600, or WxH, to which all are cropped and
+    /// resized; by default 512, with more than 25,000 Gaussians 1024, and with more than 250,000 1600
+    #[cfg_attr(feature = "cli", arg(long, value_name = "N|WxH"))]
+    pub size: Option<PhotoSize>,
+    /// Also optimize a correction of each camera's pose
+    #[cfg_attr(feature = "cli", arg(long))]
     pub correct_poses: bool,
-    /// Condition for learning a gain of red, green and blue of each photo. It begins with exposures that are measured together with depths;
-    /// without depths, as with [`super::Initial::Splat`], [`ExposureCorrection::Auto`] corrects nothing.
+    /// Also optimize a gain of red, green and blue for each photo. auto: if the exposures of neighboring photos differ, which is
+    /// measured together with depths, never with --splat; without a value: on
+    #[cfg_attr(
+        feature = "cli",
+        arg(
+            long,
+            value_name = "WHEN",
+            default_value = "auto",
+            default_missing_value = "on",
+            num_args = 0..=1,
+            require_equals = true
+        )
+    )]
     pub correct_exposures: ExposureCorrection,
-    /// Background that masked pixels have in the optimization. If it is `None`, the optimization ignores masked pixels.
+    /// Background of masked pixels instead of ignoring them, so that the splat stays empty there
+    #[cfg_attr(feature = "cli", arg(long, value_enum, value_name = "COLOR"))]
     pub mask_background: Option<MaskBackground>,
-    /// Size of the photos.
-    pub size: PhotoSize,
+    /// Optimize the splat for antialiased rendering, which looks right at smaller sizes and from afar, too. The file is marked, and
+    /// viewers have to support it: others show the splat slightly worse
+    #[cfg_attr(feature = "cli", arg(long))]
+    pub antialiased: bool,
+    /// Override a setting of the method, as in views=4; docs/refine.md lists them
+    #[cfg_attr(feature = "cli", arg(long, value_name = "KEY=VALUE"))]
+    pub set: Vec<String>,
+    /// Start of the time budget; if it is `None`, the start of the session.
+    #[serde(skip)]
+    #[cfg_attr(feature = "cli", arg(skip))]
+    pub started: Option<Instant>,
     /// Device of the depth estimation and the optimization.
+    #[serde(skip, default = "cpu")]
+    #[cfg_attr(feature = "cli", arg(skip = Device::Cpu))]
     pub device: Device,
 }
 
+/// Condition for the correction of exposures.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "cli", derive(clap::ValueEnum))]
+pub enum ExposureCorrection {
+    /// Never
+    Off,
+    /// If the exposures of neighboring photos differ
+    // Where the exposure changes gradually from photo to photo, a splat without corrections shows it, too, and is closer to photos in
+    // between.
+    #[default]
+    Auto,
+    /// Always
+    On,
+}
+
+/// Background that a splat is seen over where photos are masked out, so that nothing is left there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[cfg_attr(feature = "cli", derive(clap::ValueEnum))]
+pub enum MaskBackground {
+    /// Black
+    Black,
+    /// White
+    White,
+    /// Another color in every step
+    // No Gaussian can imitate it.
+    Random,
+}
+
+impl MaskBackground {
+    /// Returns red, green and blue of the background of a step.
+    pub(super) fn color(self, random: &mut impl Rng) -> [f32; 3] {
+        match self {
+            MaskBackground::Black => [0.; 3],
+            MaskBackground::White => [1.; 3],
+            MaskBackground::Random => random.random(),
+        }
+    }
+}
+
+fn cpu() -> Device {
+    Device::Cpu
+}
+
+/// Parses a number of Gaussians; `None` stands for `auto`.
+#[cfg(feature = "cli")]
+fn parse_gaussians(text: &str) -> std::result::Result<Option<usize>, String> {
+    const MAX: usize = 10_000_000;
+    match text.parse() {
+        _ if text == "auto" => Ok(None),
+        Ok(count) if (1..=MAX).contains(&count) => Ok(Some(count)),
+        _ => Err(format!("expected 1 to {MAX}, or auto")),
+    }
+}
+
 impl Default for RefineOptions {
-    /// Returns the options for one minute on the CPU, with as many Gaussians as the paper's main model has.
+    /// Returns the options for one minute on the CPU.
     fn default() -> Self {
         RefineOptions {
-            config: RefineConfig::default(),
-            budget: Budget::Time(Duration::from_secs(60)),
-            started: None,
-            gaussians: MIN_GAUSSIANS,
+            gaussians: None,
+            seconds: DEFAULT_SECONDS,
+            steps: None,
             seed: 0,
             holdout: Holdout::None,
             views: None,
+            size: None,
             correct_poses: false,
             correct_exposures: ExposureCorrection::Auto,
             mask_background: None,
-            size: PhotoSize::Within(LONGEST_SIDE),
+            antialiased: false,
+            set: vec![],
+            started: None,
             device: Device::Cpu,
         }
     }
 }
 
 impl RefineOptions {
+    /// Returns the number of steps, or the time, which includes reading the photos, the start, the scores, and writing the splat.
+    pub fn budget(&self) -> Budget {
+        let time = || Budget::Time(Duration::from_secs_f64(self.seconds));
+        self.steps.map_or_else(time, Budget::Steps)
+    }
+
+    /// Returns the hyperparameters. `from_splat` selects the defaults of [`RefineConfig::from_splat`].
+    ///
+    /// # Errors
+    /// Fails like [`RefineConfig::with`].
+    pub fn config(&self, from_splat: bool) -> Result<RefineConfig> {
+        let mut config = RefineConfig::with(&self.set, from_splat)?;
+        config.antialiased |= self.antialiased;
+        Ok(config)
+    }
+
     /// Returns a number of Gaussians that suits the time budget, the number of cores, and the photos of `capture`. Without a time budget it
     /// depends on nothing.
     pub fn gaussians_for(&self, capture: &Capture) -> usize {
-        let Budget::Time(time) = self.budget else { return MIN_GAUSSIANS };
+        let Budget::Time(time) = self.budget() else { return MIN_GAUSSIANS };
         let cores = std::thread::available_parallelism().map_or(1., |cores| cores.get() as f64);
         let by_time = GAUSSIANS_PER_CORE_SECOND * cores * time.as_secs_f64().min(MAX_SECONDS_OF_GROWTH);
         let (cameras, (shown, _)) = (capture.cameras(), capture.split(self.holdout));
@@ -152,36 +233,38 @@ impl RefineOptions {
     }
 
     /// Checks that every option is in its range.
-    pub(super) fn check(&self) -> Result<()> {
-        self.config.check().map_err(|expected| {
-            Error::request(format!("a setting of the refinement is out of range, expected {expected}"))
-        })?;
-        if self.budget == Budget::Time(Duration::ZERO) {
-            return Err(Error::setting("the time of the refinement", "0 s", "more than 0 s"));
+    ///
+    /// # Errors
+    /// Fails if one isn't, or like [`RefineOptions::config`].
+    pub fn check(&self) -> Result<()> {
+        self.config(false)?;
+        // NaN is refused, too.
+        if !(self.seconds > 0. && self.seconds <= MAX_SECONDS) {
+            return Err(Error::setting("seconds", self.seconds, "more than 0, up to a year"));
         }
-        if self.gaussians == 0 {
-            return Err(Error::setting("the number of Gaussians", 0, "1 or more"));
+        if self.gaussians == Some(0) {
+            return Err(Error::setting("gaussians", 0, "1 or more"));
         }
         if let Some(views @ ..2) = self.views {
-            return Err(Error::setting("the number of views", views, "2 or more"));
+            return Err(Error::setting("views", views, "2 or more"));
         }
         Ok(())
     }
 
-    /// Returns the number of Gaussians to create from photos, from which their number grows to [`RefineOptions::gaussians`].
-    pub(super) fn initial_gaussians(&self) -> usize {
-        match self.budget {
-            Budget::Steps(..MIN_STEPS_TO_GROW) => self.gaussians,
-            _ => (self.gaussians as f64 * self.config.initial_gaussians).ceil() as usize,
+    /// Returns the number of Gaussians to create from photos, from which their number grows to `count`.
+    pub(super) fn initial_gaussians(&self, count: usize, config: &RefineConfig) -> usize {
+        match self.steps {
+            Some(..MIN_STEPS_TO_GROW) => count,
+            _ => (count as f64 * config.initial_gaussians).ceil() as usize,
         }
     }
 
-    /// Returns the indices of the photos to match and of the held-out views, and a warning if large captures have more than fit into memory.
-    pub(super) fn select_views(&self, capture: &Capture) -> ([Vec<usize>; 2], Option<String>) {
+    /// Returns the indices of the photos to match, which have `size`, and of the held-out views, and a warning if large captures have more than fit into memory.
+    pub(super) fn select_views(&self, capture: &Capture, size: PhotoSize) -> ([Vec<usize>; 2], Option<String>) {
         let cameras = capture.cameras();
         let (all_shown, all_held_out) = capture.split(self.holdout);
         let bytes = |camera: &Camera| {
-            let ImageSize { height, width } = self.size.of(camera);
+            let ImageSize { height, width } = size.of(camera);
             BYTES_PER_PIXEL * u64::from(height) * u64::from(width)
         };
         let largest = cameras.iter().map(bytes).max().unwrap_or(1);
@@ -201,6 +284,105 @@ impl RefineOptions {
             )
         });
         ([shown, held_out], warning)
+    }
+}
+
+/// Minimum time for the optimization, however long the start took.
+const MIN_TIME: Duration = Duration::from_secs(1);
+/// Maximum fraction of the time for computing depths, beyond the first `FEW_PHOTOS` photos.
+const MAX_START_SHARE: f64 = 0.5;
+/// Number of photos whose depths are computed regardless of the time budget.
+const FEW_PHOTOS: usize = 2;
+/// Maximum fraction of the time for scores during the optimization.
+const MAX_SCORING_SHARE: f64 = 0.03;
+/// Maximum fraction of the time for scoring whole held-out views before the optimization, and again for scoring them after it.
+const MAX_WHOLE_SCORING_SHARE: f64 = 0.05;
+/// Estimated time for writing the splat and ending the program: a constant, and the time per Gaussian.
+const WRITING_TIME: Duration = Duration::from_millis(200);
+const WRITING_TIME_PER_GAUSSIAN: Duration = Duration::from_micros(2);
+
+/// Clock of a session that divides its budget.
+#[derive(Debug)]
+pub(super) struct TimeBudget {
+    budget: Budget,
+    clock: Instant,
+    /// Time for work after the optimization.
+    pub reserve: Duration,
+    /// Time that scores took during the optimization.
+    scoring: Duration,
+    /// Time of the last of these scores; before the first, its expected time.
+    pub last_scoring: Duration,
+}
+
+impl TimeBudget {
+    pub fn new(budget: Budget, clock: Instant) -> Self {
+        let none = Duration::ZERO;
+        TimeBudget { budget, clock, reserve: none, scoring: none, last_scoring: none }
+    }
+
+    /// Returns the time since the clock began.
+    pub fn elapsed(&self) -> Duration {
+        self.clock.elapsed()
+    }
+
+    /// Returns the time since the clock began in seconds.
+    pub fn seconds(&self) -> f64 {
+        self.elapsed().as_secs_f64()
+    }
+
+    /// Reserves the time of writing a splat of `count` Gaussians.
+    pub fn reserve_for_writing(&mut self, count: i64) {
+        self.reserve += WRITING_TIME + WRITING_TIME_PER_GAUSSIAN * count as u32;
+    }
+
+    /// Returns `true` if the depths of `done` photos have to be enough.
+    pub fn is_late_for_depths(&self, done: usize) -> bool {
+        match self.budget {
+            Budget::Steps(_) => false,
+            Budget::Time(time) => done >= FEW_PHOTOS && self.elapsed() > time.mul_f64(MAX_START_SHARE),
+        }
+    }
+
+    /// Returns a warning if reading the photos and the start left little or no time for the optimization.
+    pub fn late_start_warning(&self) -> Option<String> {
+        let Budget::Time(time) = self.budget else { return None };
+        let elapsed = self.elapsed();
+        (elapsed + self.reserve + MIN_TIME.min(time) > time).then(|| {
+            let (time, elapsed) = (time.as_secs_f64(), elapsed.as_secs_f64());
+            format!("{time:.0} s are too short here: reading the photos and the initialization took {elapsed:.1} s; few steps are left")
+        })
+    }
+
+    /// Returns the interval between the held-out views that there is time to score as a whole, if all would take `all`.
+    pub fn affordable_every(&self, all: Duration) -> usize {
+        match self.budget {
+            Budget::Steps(_) => 1,
+            Budget::Time(time) => {
+                all.div_duration_f64(time.mul_f64(MAX_WHOLE_SCORING_SHARE)).ceil().max(1.) as usize
+            }
+        }
+    }
+
+    /// Returns `true` if another scoring keeps the total time of scoring below its maximum fraction of the time since the clock began.
+    pub fn may_score(&self) -> bool {
+        (self.scoring + self.last_scoring).as_secs_f64() <= MAX_SCORING_SHARE * self.seconds()
+    }
+
+    /// Adds the time of a scoring during the optimization.
+    pub fn add_scoring(&mut self, time: Duration) {
+        self.last_scoring = time;
+        self.scoring += time;
+    }
+
+    /// Returns the budget of an optimization that continues one of `optimized`, for which `earlier` was spent in all.
+    pub fn remaining(&self, optimized: Duration, earlier: Duration) -> Budget {
+        match self.budget {
+            Budget::Time(time) => {
+                let used = self.reserve + self.elapsed() + earlier;
+                Budget::Time(optimized + time.saturating_sub(used).max(MIN_TIME.min(time)))
+            }
+            steps => steps,
+        }
     }
 }
 
@@ -241,31 +423,30 @@ mod tests {
         let capture = Capture::from_source("walk".into(), "".into(), &cameras, Arc::new(NoImages)).unwrap();
         let options = RefineOptions {
             holdout: Holdout::Every { every: 8, first: 0 },
-            size: PhotoSize::Within(1024),
             ..Default::default()
         };
-        let ([shown, held_out], warning) = options.select_views(&capture);
+        let ([shown, held_out], warning) = options.select_views(&capture, PhotoSize::Within(1024));
         // 1024×768 pixels of 4 bytes each.
         let each = 4 * 1024 * 768;
         assert_eq!((shown.len(), held_out.len()), ((1280 << 20) / each, (256 << 20) / each));
         let line = warning.unwrap();
         assert!(line.starts_with("walk: 426 of 1750 photos are matched and 85 of 250 scored"), "{line}");
-        let small = RefineOptions { size: PhotoSize::Exactly([96, 128].into()), ..options.clone() };
-        let ([shown, held_out], warning) = small.select_views(&capture);
+        let small = PhotoSize::Exactly([96, 128].into());
+        let ([shown, held_out], warning) = options.select_views(&capture, small);
         assert_eq!((shown.len(), held_out.len(), warning), (1750, 250, None));
-        let asked = RefineOptions { views: Some(500), holdout: Holdout::None, ..options };
-        let ([shown, held_out], warning) = asked.select_views(&capture);
+        let all = RefineOptions { views: Some(500), holdout: Holdout::None, ..options };
+        let ([shown, held_out], warning) = all.select_views(&capture, PhotoSize::Within(1024));
         assert_eq!((shown.len(), held_out.len(), warning), (500, 0, None));
     }
 
     #[test]
     fn the_number_of_gaussians_grows_if_there_is_time() {
-        let of = |budget, gaussians| {
-            RefineOptions { budget, gaussians, ..RefineOptions::default() }.initial_gaussians()
+        let initial = |steps, count| {
+            RefineOptions { steps, ..Default::default() }.initial_gaussians(count, &RefineConfig::default())
         };
-        assert_eq!(of(Budget::Time(Duration::from_secs(1)), 16_384), 3277);
-        assert_eq!(of(Budget::Steps(500), 101), 21);
-        assert_eq!(of(Budget::Steps(499), 101), 101);
+        assert_eq!(initial(None, 16_384), 3277);
+        assert_eq!(initial(Some(500), 101), 21);
+        assert_eq!(initial(Some(499), 101), 101);
     }
 
     #[test]
@@ -280,34 +461,34 @@ mod tests {
             let cameras: Vec<Camera> = (0..count).map(camera).collect();
             Capture::from_source("walk".into(), "".into(), &cameras, Arc::new(NoImages)).unwrap()
         };
-        let of = |budget, capture: &Capture| {
-            RefineOptions { budget, ..RefineOptions::default() }.gaussians_for(capture)
+        let after = |seconds: f64, capture: &Capture| {
+            RefineOptions { seconds, ..RefineOptions::default() }.gaussians_for(capture)
         };
-        let time = |seconds| Budget::Time(Duration::from_secs(seconds));
         let (large, small) = (capture(1000, 50), capture(256, 9));
-        let minute = of(time(60), &large);
+        let minute = after(60., &large);
         assert!((16_384..=1_000_000).contains(&minute));
-        assert!(of(time(120), &large) == (2 * minute).min(1_000_000) || minute == 16_384, "{minute}");
-        assert_eq!(of(time(1), &large), 16_384);
+        assert!(after(120., &large) == (2 * minute).min(1_000_000) || minute == 16_384, "{minute}");
+        assert_eq!(after(1., &large), 16_384);
         // After four minutes more time is for more steps.
-        let most = of(time(240), &large);
+        let most = after(240., &large);
         assert!(most == (4 * minute).min(1_000_000) || minute == 16_384, "{minute} {most}");
-        assert_eq!(of(time(100_000), &large), most);
+        assert_eq!(after(100_000., &large), most);
         // A Gaussian for 24 pixels.
-        assert_eq!(of(time(100_000), &small), 256 * 256 * 9 / 24);
-        assert_eq!(of(Budget::Steps(100_000), &large), 16_384);
+        assert_eq!(after(100_000., &small), 256 * 256 * 9 / 24);
+        let steps = RefineOptions { steps: Some(100_000), ..RefineOptions::default() };
+        assert_eq!(steps.gaussians_for(&large), 16_384);
     }
 
     #[test]
     fn options_out_of_range_are_refused() {
         let default = RefineOptions::default;
         assert!(default().check().is_ok());
-        let config = RefineConfig { views: 0, ..RefineConfig::default() };
         for (options, expected) in [
-            (RefineOptions { config, ..default() }, "expected 1 or more"),
-            (RefineOptions { budget: Budget::Time(Duration::ZERO), ..default() }, "expected more than 0 s"),
-            (RefineOptions { gaussians: 0, ..default() }, "number of Gaussians is 0"),
-            (RefineOptions { views: Some(1), ..default() }, "number of views is 1"),
+            (RefineOptions { set: vec!["views=0".into()], ..default() }, "views=0: expected 1 or more"),
+            (RefineOptions { seconds: 0., ..default() }, "seconds is 0, expected more than 0"),
+            (RefineOptions { seconds: f64::NAN, ..default() }, "seconds is NaN, expected more than 0"),
+            (RefineOptions { gaussians: Some(0), ..default() }, "gaussians is 0, expected 1 or more"),
+            (RefineOptions { views: Some(1), ..default() }, "views is 1, expected 2 or more"),
         ] {
             let error = options.check().unwrap_err();
             assert!(error.is_invalid_request() && error.to_string().contains(expected), "{error}");

@@ -3,7 +3,7 @@
 use super::config::RefineConfig;
 use super::known_depths::KnownDepths;
 use crate::data::{
-    Capture, MIN_SHORTER_SIDE, PhotoSize, Pixels, View, ViewBatch, load_views, select_views, view_matrices,
+    Capture, MIN_SHORTER_SIDE, MIN_SIDE, PhotoSize, Pixels, View, ViewBatch, load_views, select_views, view_matrices,
 };
 use crate::error::{Error, Result};
 use crate::scene::{Camera, ImageSize};
@@ -13,8 +13,6 @@ use rand::seq::index::sample;
 use std::collections::BTreeMap;
 use tch::{Device, Kind, Tensor};
 
-/// Minimum side of a photo in pixels: the side of the SSIM window (spec 9.4).
-pub const MIN_SIDE: u32 = 11;
 /// Number of photos that are read between two calls of `should_continue`.
 const READ_AT_ONCE: usize = 8;
 /// Longer side in pixels of the downscaled images by which near duplicates are found.
@@ -115,7 +113,7 @@ struct Group {
 
 /// Photos of a step.
 #[derive(Debug)]
-pub(super) struct Drawn<'a> {
+pub(super) struct TrainBatch<'a> {
     /// Indices among all photos.
     pub which: Vec<i64>,
     pub views: ViewBatch,
@@ -234,8 +232,8 @@ impl Photos {
         Photos { sizes, schedule }
     }
 
-    /// Draws up to `views` different photos of one size, the size for `progress` from 0 to 1.
-    pub(super) fn draw(&self, progress: f64, views: usize, random: &mut impl Rng) -> Drawn<'_> {
+    /// Samples up to `views` different photos of one size, the size for `progress` from 0 to 1.
+    pub(super) fn sample(&self, progress: f64, views: usize, random: &mut impl Rng) -> TrainBatch<'_> {
         let size = self.schedule.iter().filter(|&&part| progress >= part).count();
         let groups = &self.sizes[size.min(self.sizes.len() - 1)];
         let count = |group: &Group| group.indices.len();
@@ -244,7 +242,7 @@ impl Photos {
         let group = owners.nth(of).expect("a number below the sum");
         let mut chosen = sample(random, count(group), views.min(count(group))).into_vec();
         chosen.sort_unstable();
-        Drawn {
+        TrainBatch {
             which: chosen.iter().map(|&k| group.indices[k] as i64).collect(),
             views: group.select(&chosen),
             depths: chosen.iter().map(|&k| group.depths[k].as_ref()).collect(),

@@ -22,7 +22,7 @@ const SENSITIVITY_POWER: f64 = 0.5;
 /// Gaussians within the original one, by `spread` of its standard deviations, so that they get different gradients. Returns the indices of
 /// the changed Gaussians.
 pub fn relocate(
-    leaves: &GaussianParams,
+    params: &GaussianParams,
     squared_gradients: &Tensor,
     dead: f64,
     spread: f64,
@@ -31,12 +31,12 @@ pub fn relocate(
     let numbers = |t: Tensor| {
         Vec::<f64>::try_from(t.view([-1]).to_kind(Kind::Double)).expect("one number per Gaussian")
     };
-    let opacities = numbers(leaves.opacity_logits.sigmoid());
+    let opacities = numbers(params.opacity_logits.sigmoid());
     let (gone, alive): (Vec<usize>, Vec<usize>) = (0..opacities.len()).partition(|&i| opacities[i] <= dead);
     if gone.is_empty() || alive.is_empty() {
         return vec![];
     }
-    let sizes = leaves.log_scales.mean_dim([2].as_slice(), false, Kind::Double).exp();
+    let sizes = params.log_scales.mean_dim([2].as_slice(), false, Kind::Double).exp();
     let sensitivities =
         numbers(squared_gradients.sum_dim_intlist([2].as_slice(), false, Kind::Double).sqrt() * sizes);
     let weight = |&i: &usize| {
@@ -57,7 +57,7 @@ pub fn relocate(
         let opacity = opacity.clamp(MIN_OPACITY, 1. - 1e-6);
         logits.push((opacity / (1. - opacity)).ln() as f32);
     }
-    let device = leaves.means.device();
+    let device = params.means.device();
     let index = |of: &[usize]| {
         Tensor::from_slice(&of.iter().map(|&i| i as i64).collect::<Vec<_>>()).to_device(device)
     };
@@ -65,18 +65,18 @@ pub fn relocate(
     let (to, from, at) = (index(&gone), index(&sources), index(&changed));
     tch::no_grad(|| {
         let count = changed.len() as i64;
-        let _ = leaves.opacity_logits.shallow_clone().index_copy_(1, &at, &tensor(&logits).view([1, count]));
-        let smaller = leaves.log_scales.index_select(1, &at) + tensor(&shrink).view([1, count, 1]);
-        let _ = leaves.log_scales.shallow_clone().index_copy_(1, &at, &smaller);
-        for (_, tensor) in leaves.named_parameters() {
+        let _ = params.opacity_logits.shallow_clone().index_copy_(1, &at, &tensor(&logits).view([1, count]));
+        let smaller = params.log_scales.index_select(1, &at) + tensor(&shrink).view([1, count, 1]);
+        let _ = params.log_scales.shallow_clone().index_copy_(1, &at, &smaller);
+        for (_, tensor) in params.named_parameters() {
             let _ = tensor.shallow_clone().index_copy_(1, &to, &tensor.index_select(1, &from));
         }
         let offsets: Vec<f32> =
             (0..3 * gone.len()).map(|_| random.random_range(-UNIT_SPREAD..UNIT_SPREAD)).collect();
         let offsets =
-            tensor(&offsets).view([1, -1, 3]) * leaves.log_scales.index_select(1, &to).exp() * spread;
-        let moved = rotate(&leaves.quaternions.index_select(1, &to), &offsets);
-        let _ = leaves.means.shallow_clone().index_add_(1, &to, &moved);
+            tensor(&offsets).view([1, -1, 3]) * params.log_scales.index_select(1, &to).exp() * spread;
+        let moved = rotate(&params.quaternions.index_select(1, &to), &offsets);
+        let _ = params.means.shallow_clone().index_add_(1, &to, &moved);
     });
     changed.extend(gone);
     changed.into_iter().map(|i| i as i64).collect()
@@ -91,7 +91,7 @@ fn rotate(quaternions: &Tensor, vectors: &Tensor) -> Tensor {
     vectors + &twice * w + axis.cross(&twice, 2)
 }
 
-/// Returns the integral of the opacity along a line through the centre of n coincident Gaussians of one opacity, in units of the standard
+/// Returns the integral of the opacity along a line through the center of n coincident Gaussians of one opacity, in units of the standard
 /// deviation times √(2π) (eq. 9 of the paper).
 fn integral(opacity: f64, n: usize) -> f64 {
     let mut sum = 0.;
@@ -154,45 +154,45 @@ mod tests {
 
     #[test]
     fn dead_gaussians_go_where_others_are() {
-        let leaves = ten_gaussians();
-        let still = leaves.means.zeros_like();
-        let mut changed = relocate(&leaves, &still, 0.01, 0., &mut random());
-        let means: Vec<f64> = Vec::try_from(leaves.means.to_kind(Kind::Double).view([-1])).unwrap();
+        let params = ten_gaussians();
+        let still = params.means.zeros_like();
+        let mut changed = relocate(&params, &still, 0.01, 0., &mut random());
+        let means: Vec<f64> = Vec::try_from(params.means.to_kind(Kind::Double).view([-1])).unwrap();
         for dead in 0..4 {
             let at = means[3 * dead];
             assert!(at >= 12., "Gaussian {dead} is still where it was");
             let source = (at / 3.) as usize;
             assert!(changed.contains(&(source as i64)) && changed.contains(&(dead as i64)));
-            let logit = |i: usize| leaves.opacity_logits.double_value(&[0, i as i64]);
+            let logit = |i: usize| params.opacity_logits.double_value(&[0, i as i64]);
             assert!(logit(dead) == logit(source) && logit(source) < 2.);
         }
         changed.sort_unstable();
         let before = changed.len();
         changed.dedup();
         assert_eq!(changed.len(), before);
-        assert!(relocate(&leaves, &still, 0.01, 0., &mut random()).is_empty());
+        assert!(relocate(&params, &still, 0.01, 0., &mut random()).is_empty());
     }
 
     #[test]
     fn gaussians_move_onto_sensitive_ones() {
-        let leaves = ten_gaussians();
+        let params = ten_gaussians();
         // The root of the sensitivity of the last is a million times that of the others.
-        let gradients = leaves.means.ones_like() * 1e-24;
+        let gradients = params.means.ones_like() * 1e-24;
         let _ = gradients.narrow(1, 9, 1).fill_(1.);
         // One whose gradients have overflowed attracts nothing.
         let _ = gradients.narrow(1, 8, 1).fill_(f64::INFINITY);
-        let _ = relocate(&leaves, &gradients, 0.01, 0., &mut random());
+        let _ = relocate(&params, &gradients, 0.01, 0., &mut random());
         for dead in 0..4 {
-            assert!(leaves.means.get(0).get(dead).equal(&leaves.means.get(0).get(9)), "{dead}");
+            assert!(params.means.get(0).get(dead).equal(&params.means.get(0).get(9)), "{dead}");
         }
     }
 
     #[test]
     fn moved_gaussians_are_spread_within_the_original_one() {
         let [together, apart] = [0., 0.5].map(|spread| {
-            let leaves = ten_gaussians();
-            let _ = relocate(&leaves, &leaves.means.zeros_like(), 0.01, spread, &mut random());
-            leaves
+            let params = ten_gaussians();
+            let _ = relocate(&params, &params.means.zeros_like(), 0.01, spread, &mut random());
+            params
         });
         let moved = (&apart.means - &together.means).abs().get(0);
         let scales = together.log_scales.exp().get(0);

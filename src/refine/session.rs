@@ -1,120 +1,35 @@
 //! Refinement session from a capture to Gaussians: reads the photos, creates the initial Gaussians, optimizes them, and scores them on a
 //! few views during the optimization. All of it shares one budget and uses a local frame of the capture (spec 2.5).
 
-use super::begin::{InitialScene, gaussians_from_photos, most_visible};
 use super::config::RefineConfig;
 use super::corrections::{Correction, Corrections};
-use super::exposures::{ExposureCorrection, LogGains};
+use super::events::{EvalPoint, RefineEvent, RefineMetrics, SampleScores, ViewSample, summarize_names};
+use super::exposures::LogGains;
 use super::gaussian_optimizer::GaussianOptimizer;
-use super::options::{Budget, RefineOptions};
+use super::init::{PhotoInit, SceneInit, gaussians_from_photos, most_visible};
+use super::options::{Budget, ExposureCorrection, RefineOptions, TimeBudget};
 use super::photos::{Photos, distinct, load_photos};
 use super::state::{Record, RefineState};
-use super::view_sample::{SampleScores, ViewSample};
-use super::{Task, refine, scene_depth};
-use crate::data::{Capture, Point, View, read_points};
+use super::{OptimizeArgs, refine, scene_depth};
+use crate::data::{Capture, PhotoSize, Point, View, read_points};
 use crate::error::{Error, Result};
 use crate::io::Splat;
 use crate::metrics::{CaptureScores, ContactSheet, Perceptual, score_views};
 use crate::reconstruct::{LoadedModel, Model, reconstruct, spread_over_path};
 use crate::scene::{Camera, Gaussians, LocalFrame, RawGaussians};
 use crate::stereo::DepthMap;
-use serde::Serialize;
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 use tch::Tensor;
 
-/// Minimum time for the optimization, however long the start took.
-const MIN_TIME: Duration = Duration::from_secs(1);
-/// Maximum fraction of the time for computing depths, beyond the first `FEW_PHOTOS` photos.
-const MAX_START_SHARE: f64 = 0.5;
-/// Number of photos whose depths are computed regardless of the time budget.
-const FEW_PHOTOS: usize = 2;
-/// Maximum fraction of the time for scores during the optimization.
-const MAX_SCORING_SHARE: f64 = 0.03;
-/// Maximum fraction of the time for scoring whole held-out views before the optimization, and again for scoring them after it.
-const MAX_WHOLE_SCORING_SHARE: f64 = 0.05;
 /// Divisor of the maximum number of initial Gaussians of a model: 1/`MODEL_SHARE` of all.
 const MODEL_SHARE: usize = 3;
-/// Estimated time for writing the splat and ending the program: a constant, and the time per Gaussian.
-const WRITING_TIME: Duration = Duration::from_millis(200);
-const WRITING_TIME_PER_GAUSSIAN: Duration = Duration::from_micros(2);
 /// Number of steps between metrics.
 const METRICS_EVERY: u64 = 50;
 /// Maximum number of photos that LPIPS compares if no views are held out.
 const LPIPS_PHOTOS: usize = 8;
 /// Fractions of the optimization at which the held-out views are scored.
 const EVAL_FRACTIONS: [f64; 12] = [0., 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
-
-/// Source of the initial Gaussians.
-#[derive(Debug, Clone, Copy)]
-pub enum Initial<'a> {
-    /// Pixels of the photos, at depths on which the photos agree.
-    Photos,
-    /// Splat in the capture's world.
-    Splat(&'a Splat),
-    /// Reconstruction of the photos by a model. It sees [`RefineOptions::views`] of them, or the number in its configuration.
-    Model(&'a LoadedModel),
-    /// State of an earlier refinement of the same capture, which continues. The time and the steps of [`RefineOptions::budget`] include those of
-    /// the earlier refinement.
-    State(&'a RefineState),
-}
-
-/// Progress event of a session.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum RefineEvent<'a> {
-    /// Photos are being read.
-    Loading {
-        /// Number of photos read so far.
-        done: usize,
-        /// Number of photos to read, including those of the held-out views.
-        count: usize,
-    },
-    /// Depths are being computed; the value is the number of photos that are done.
-    Starting(usize),
-    /// A step of the optimization is done.
-    Optimizing {
-        /// Number of steps done.
-        steps: u64,
-        /// Most recent PSNR of a sample of the held-out views, in dB.
-        psnr: Option<f64>,
-    },
-    /// Metrics of a step that was just done, every 50 steps.
-    Measured(&'a RefineMetrics),
-    /// A sample of the held-out views was scored.
-    Scored(&'a EvalPoint),
-    /// Whole views are being scored; the value is the number of views that are done.
-    Scoring(usize),
-    /// Warning to print, a sentence: photos that were left out, exposures that are corrected, missing depth information, or too little time.
-    /// The callback's answer to it is ignored.
-    Warning(&'a str),
-}
-
-/// Metrics of a step.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct RefineMetrics {
-    /// Number of steps done.
-    pub step: u64,
-    /// Time on the session's clock, in seconds.
-    pub seconds: f64,
-    /// Loss of the step's photos.
-    pub loss: f64,
-    /// Number of Gaussians.
-    pub gaussians: i64,
-    /// Learning rate of the means, in units of the scene's depth.
-    pub learning_rate: f64,
-}
-
-/// Scores of the held-out views at one time during the optimization.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct EvalPoint {
-    /// Time on the session's clock, in seconds.
-    pub seconds: f64,
-    /// Number of steps done.
-    pub steps: u64,
-    /// Scores of the sample.
-    #[serde(flatten)]
-    pub scores: SampleScores,
-}
 
 /// Result of a session.
 #[derive(Debug)]
@@ -133,7 +48,7 @@ pub struct RefineResult {
     pub steps: u64,
     /// Start and end of the optimization on the session's clock, in seconds.
     pub seconds: [f64; 2],
-    /// State from which [`Initial::State`] continues; `None` if the final Gaussians are the initial ones.
+    /// State from which [`SceneInit::State`] continues; `None` if the final Gaussians are the initial ones.
     pub state: Option<RefineState>,
     /// Scores of a sample of the photos before and after the optimization.
     pub shown: [SampleScores; 2],
@@ -146,12 +61,13 @@ pub struct RefineResult {
     pub held_out_before: Option<CaptureScores>,
 }
 
-/// Initial state of the optimization.
-enum Start<'a> {
-    Photos(RawGaussians),
-    Splat(&'a Splat, RawGaussians),
-    Model(Gaussians),
-    State(&'a RefineState, Box<GaussianOptimizer>),
+/// Initial Gaussians of a session.
+struct Start {
+    gaussians: Gaussians,
+    /// Median depth of these Gaussians.
+    depth: f64,
+    /// Their optimizer; `None` if it begins with other Gaussians than a model's alone.
+    optimizer: Option<GaussianOptimizer>,
 }
 
 /// Refinement session: the photos and the state computed from them, in the local frame of the capture's cameras. Call
@@ -160,17 +76,13 @@ enum Start<'a> {
 /// ```no_run
 /// use globalsplat::data::{Holdout, open_capture};
 /// use globalsplat::io::write_splat;
-/// use globalsplat::refine::{Budget, Initial, RefineEvent, RefineOptions, RefineSession};
-/// use std::time::Duration;
+/// use globalsplat::refine::{RefineEvent, RefineOptions, RefineSession, SceneInit};
 ///
 /// # fn main() -> globalsplat::Result<()> {
 /// let capture = open_capture("captures/room".as_ref())?;
-/// let options = RefineOptions {
-///     budget: Budget::Time(Duration::from_secs(30)),
-///     holdout: Holdout::Every { every: 8, first: 0 },
-///     ..Default::default()
-/// };
-/// let mut session = RefineSession::load(&capture, &options, |event| {
+/// let holdout = Holdout::Every { every: 8, first: 0 };
+/// let options = RefineOptions { seconds: 30., holdout, ..Default::default() };
+/// let mut session = RefineSession::load(&capture, &options, SceneInit::Photos, |event| {
 ///     match event {
 ///         RefineEvent::Warning(line) => eprintln!("{line}"),
 ///         RefineEvent::Optimizing { steps, .. } => println!("{steps} steps"),
@@ -179,7 +91,7 @@ enum Start<'a> {
 ///     // `false` would end the work early.
 ///     true
 /// })?;
-/// session.start(Initial::Photos)?;
+/// session.start()?;
 /// let result = session.run()?;
 /// write_splat("room.ply".as_ref(), &result.splat)?;
 /// if let Some([before, after]) = session.score_held_out(&result)? {
@@ -191,9 +103,13 @@ enum Start<'a> {
 pub struct RefineSession<'a> {
     capture: &'a Capture,
     options: &'a RefineOptions,
+    init: SceneInit<'a>,
     /// Hyperparameters of the options. `antialiased` is also set for an initial splat or state that is antialiased.
     config: RefineConfig,
-    clock: Instant,
+    /// Final number of Gaussians. A session that is ended early may have fewer.
+    gaussians: usize,
+    size: PhotoSize,
+    time: TimeBudget,
     on_event: Box<dyn FnMut(RefineEvent) -> bool + 'a>,
     is_stopped: bool,
     frame: LocalFrame,
@@ -203,44 +119,47 @@ pub struct RefineSession<'a> {
     held_out_sample: ViewSample,
     /// Held-out views that there is time to score as a whole.
     scored: Vec<View>,
-    start: Option<(Start<'a>, Gaussians, f64)>,
+    start: Option<Start>,
     near_duplicates: usize,
     /// Depths of some photos, if Gaussians were created from them.
     depth_maps: Vec<DepthMap>,
     /// Initial exposures of the photos, if they are corrected.
     log_exposures: Option<Vec<LogGains>>,
-    reserve: Duration,
-    scoring: Duration,
-    last_scoring: Duration,
     steps: u64,
     curve: Vec<EvalPoint>,
 }
 
 impl<'a> RefineSession<'a> {
-    /// Chooses the photos and the held-out views of the capture, and reads them. `on_event` receives progress events and ends the work if
-    /// it returns `false`.
+    /// Chooses the photos and the held-out views of the capture, and reads them. The optimization will begin with `init`. `on_event` receives
+    /// progress events and ends the work if it returns `false`.
     ///
     /// # Errors
     /// Fails if an option is out of range, like [`load_photos`], and if `on_event` ends the work before all photos are read.
     pub fn load(
         capture: &'a Capture,
         options: &'a RefineOptions,
+        init: SceneInit<'a>,
         mut on_event: impl FnMut(RefineEvent) -> bool + 'a,
     ) -> Result<Self> {
         let clock = options.started.unwrap_or_else(Instant::now);
         options.check()?;
-        let ([shown, held_out], warning) = options.select_views(capture);
+        let config = options.config(init.is_splat())?;
+        let (gaussians, size) = init.sizes(capture, options);
+        let ([shown, held_out], warning) = options.select_views(capture, size);
         if let Some(line) = warning {
             let _ = on_event(RefineEvent::Warning(&line));
         }
         let count = shown.len() + held_out.len();
         let mut should_continue = |done: usize| on_event(RefineEvent::Loading { done, count });
-        let mut photos = load_photos(capture, &shown, options.size, &mut should_continue)?;
+        let mut photos = load_photos(capture, &shown, size, &mut should_continue)?;
         let mut held_out =
-            load_photos(capture, &held_out, options.size, |done| should_continue(photos.len() + done))?;
+            load_photos(capture, &held_out, size, |done| should_continue(photos.len() + done))?;
         let frame = LocalFrame::from_cameras(&capture.cameras());
-        let masked_out = leave_out_masked(&mut photos).into_iter().chain(leave_out_masked(&mut held_out));
-        let masked_out: Vec<String> = masked_out.collect();
+        let masked_out = [&mut photos, &mut held_out].map(|views| {
+            let masked_out = views.extract_if(.., |view| view.is_masked_out());
+            masked_out.map(|view| view.name).collect::<Vec<String>>()
+        });
+        let masked_out = masked_out.concat();
         if photos.is_empty() {
             return Err(Error::input(
                 capture.file(),
@@ -251,7 +170,7 @@ impl<'a> RefineSession<'a> {
         }
         if !masked_out.is_empty() {
             let line =
-                format!("{}: masked out as a whole, and left out: {}", capture.name, names(&masked_out));
+                format!("{}: masked out as a whole, and left out: {}", capture.name, summarize_names(&masked_out));
             on_event(RefineEvent::Warning(&line));
         }
         for view in photos.iter_mut().chain(&mut held_out) {
@@ -260,8 +179,11 @@ impl<'a> RefineSession<'a> {
         Ok(RefineSession {
             capture,
             options,
-            config: options.config.clone(),
-            clock,
+            init,
+            config,
+            gaussians,
+            size,
+            time: TimeBudget::new(options.budget(), clock),
             on_event: Box::new(on_event),
             is_stopped: false,
             frame,
@@ -273,12 +195,19 @@ impl<'a> RefineSession<'a> {
             near_duplicates: 0,
             depth_maps: vec![],
             log_exposures: None,
-            reserve: Duration::ZERO,
-            scoring: Duration::ZERO,
-            last_scoring: Duration::ZERO,
             steps: 0,
             curve: vec![],
         })
+    }
+
+    /// Returns the number of Gaussians that the optimization ends with if it isn't ended early.
+    pub fn gaussians(&self) -> usize {
+        self.gaussians
+    }
+
+    /// Returns the size that the photos were loaded at.
+    pub fn size(&self) -> PhotoSize {
+        self.size
     }
 
     /// Returns the photos that the splat has to match, in the session's frame. After [`RefineSession::start`], near duplicates are removed.
@@ -304,7 +233,7 @@ impl<'a> RefineSession<'a> {
     /// Reserves a further part of the time budget for work after the optimization. Writing the splat and scoring the held-out views are
     /// provided for already.
     pub fn reserve(&mut self, time: Duration) {
-        self.reserve += time;
+        self.time.reserve += time;
     }
 
     /// Reserves the time of [`RefineSession::contact_sheet`], estimated by rendering one row of `gaussians`.
@@ -324,43 +253,32 @@ impl<'a> RefineSession<'a> {
     ///
     /// # Errors
     /// Fails if the model or the rasterizer fails, if no camera sees the splat, or if `on_event` ends the work before there are Gaussians.
-    pub fn start(&mut self, initial: Initial<'a>) -> Result<Gaussians> {
+    pub fn start(&mut self) -> Result<Gaussians> {
         let mut warnings = vec![];
-        let start = match initial {
-            Initial::Splat(splat) => {
+        let RefineOptions { correct_exposures, device, .. } = *self.options;
+        let final_count = if self.init.is_splat() { 0 } else { self.gaussians as i64 };
+        // Gaussians of a new optimizer, or the optimizer of a state.
+        let (mut raw, mut optimizer) = (None, None);
+        let gaussians = match self.init {
+            SceneInit::Splat(splat) => {
                 self.config.antialiased |= splat.antialiased;
                 let local = Gaussians::from_splat(splat).to_local(&self.frame, splat.origin);
-                Start::Splat(splat, RawGaussians::from_gaussians(&local.to_device(self.options.device)))
+                let local = raw.insert(RawGaussians::from_gaussians(&local.to_device(device)));
+                Gaussians { antialiased: splat.antialiased, ..local.activate() }
             }
-            Initial::State(state) => {
+            SceneInit::State(state) => {
                 self.config.antialiased |= state.record.antialiased;
                 if state.record.has_depths {
-                    let _ =
-                        self.gaussians_from_photos(self.options.initial_gaussians())?.ok_or_else(stopped)?;
+                    let _ = self.gaussians_from_photos(self.initial_count())?.ok_or_else(stopped)?;
                 }
-                let RefineOptions { gaussians, correct_exposures, device, .. } = self.options;
-                if *correct_exposures == ExposureCorrection::Auto {
+                if correct_exposures == ExposureCorrection::Auto {
                     self.log_exposures = state.has_exposures().then(|| self.equal_exposures());
                 }
-                let optimizer =
-                    GaussianOptimizer::from_state(state, &self.config, *gaussians as i64, *device)?;
-                Start::State(state, optimizer.into())
+                let known = GaussianOptimizer::from_state(state, &self.config, final_count, device)?;
+                optimizer.insert(known).averaged_gaussians()
             }
-            Initial::Model(loaded) => {
-                let data = &loaded.config.data;
-                let all: Vec<usize> = (0..self.photos.len()).collect();
-                let count = self.options.views.unwrap_or(data.context_views);
-                let context = spread_over_path(&self.cameras(), &all, count)
-                    .into_iter()
-                    .map(|index| self.photos[index].fitted(data.image_size))
-                    .collect::<Result<Vec<_>>>()?;
-                // The optimization fits the colours, too.
-                let mut config = loaded.config.clone();
-                config.data.colour_steps = 0;
-                let model = Model { config: &config, ..loaded.into() };
-                Start::Model(reconstruct(model, &context, &[])?.in_world().to_device(self.options.device))
-            }
-            Initial::Photos => {
+            SceneInit::Model(loaded) => self.reconstruct(loaded)?,
+            SceneInit::Photos => {
                 if self.photos.len() < 2 {
                     let why = "one photo gives no depth: expected two or more, or an initial splat";
                     return Err(Error::request(why));
@@ -369,32 +287,48 @@ impl<'a> RefineSession<'a> {
                     let line = "the photos were all taken from one position, so that depth can't be estimated: everything is placed at one distance";
                     warnings.push(format!("{}: {line}", self.capture.name));
                 }
-                let gaussians =
-                    self.gaussians_from_photos(self.options.initial_gaussians())?.ok_or_else(stopped)?;
+                let new = self.gaussians_from_photos(self.initial_count())?.ok_or_else(stopped)?;
                 warnings.extend(self.exposure_warning());
-                Start::Photos(gaussians)
+                Gaussians { antialiased: self.config.antialiased, ..raw.insert(new).activate() }
             }
         };
-        if self.options.correct_exposures == ExposureCorrection::On && self.log_exposures.is_none() {
+        if correct_exposures == ExposureCorrection::On && self.log_exposures.is_none() {
             self.log_exposures = Some(self.equal_exposures());
         }
-        let gaussians = match &start {
-            Start::Photos(raw) => Gaussians { antialiased: self.config.antialiased, ..raw.activate() },
-            Start::Splat(splat, raw) => Gaussians { antialiased: splat.antialiased, ..raw.activate() },
-            Start::Model(gaussians) => gaussians.map(Tensor::shallow_clone),
-            Start::State(_, optimizer) => optimizer.averaged_gaussians(),
-        };
-        let depth = match &start {
-            Start::State(state, _) => state.record.depth,
+        let depth = match self.init {
+            SceneInit::State(state) => state.record.depth,
             _ => scene_depth(&gaussians, &self.photos)?,
         };
         warnings.extend(self.leave_out_near_duplicates(depth));
-        if let Start::State(state, _) = &start {
+        if let SceneInit::State(state) = self.init {
             self.check_state(state)?;
         }
         warnings.iter().for_each(|line| self.warn(line));
-        self.start = Some((start, gaussians.map(Tensor::shallow_clone), depth));
+        let new = || Some(GaussianOptimizer::new(raw.as_ref()?, depth, &self.config, final_count));
+        let optimizer = optimizer.or_else(new);
+        self.start = Some(Start { gaussians: gaussians.map(Tensor::shallow_clone), depth, optimizer });
         Ok(gaussians)
+    }
+
+    /// Returns the reconstruction of the photos by a model.
+    fn reconstruct(&self, loaded: &LoadedModel) -> Result<Gaussians> {
+        let data = &loaded.config.data;
+        let all: Vec<usize> = (0..self.photos.len()).collect();
+        let count = self.options.views.unwrap_or(data.context_views);
+        let context = spread_over_path(&self.cameras(), &all, count)
+            .into_iter()
+            .map(|index| self.photos[index].fitted(data.image_size))
+            .collect::<Result<Vec<_>>>()?;
+        // The optimization fits the colors, too.
+        let mut config = loaded.config.clone();
+        config.data.colour_steps = 0;
+        let model = Model { config: &config, ..loaded.into() };
+        Ok(reconstruct(model, &context, &[])?.in_world().to_device(self.options.device))
+    }
+
+    /// Returns the number of Gaussians to create from photos.
+    fn initial_count(&self) -> usize {
+        self.options.initial_gaussians(self.gaussians, &self.config)
     }
 
     /// Scores the result of [`RefineSession::start`] on the held-out views, optimizes it, and scores a sample of the photos before and
@@ -406,42 +340,41 @@ impl<'a> RefineSession<'a> {
     /// # Panics
     /// Panics if [`RefineSession::start`] was not called before.
     pub fn run(&mut self) -> Result<RefineResult> {
-        let (start, initial, depth) = self.start.take().expect("a start");
+        let Start { gaussians: initial, depth, optimizer } =
+            self.start.take().expect("a session that was started");
         self.scored = self.affordable_views(&initial)?;
         self.held_out_sample = ViewSample::small(&self.scored);
         let scoring = Instant::now();
         let held_out_before = self.score_whole(&initial, &self.scored_views(), None)?;
-        let count = initial.count().max(self.options.gaussians as i64);
-        self.reserve(scoring.elapsed() + WRITING_TIME + WRITING_TIME_PER_GAUSSIAN * count as u32);
+        self.reserve(scoring.elapsed());
+        self.time.reserve_for_writing(initial.count().max(self.gaussians as i64));
         let begun_scoring = Instant::now();
         let sample = ViewSample::large(&self.photos);
-        let state = if let Start::State(state, _) = &start { Some(*state) } else { None };
-        let before = sample.corrected(&self.corrections(state, depth)?).score(&initial)?.expect("photos");
+        let before = sample.corrected(&self.corrections(depth)?).score(&initial)?.expect("photos");
         let time = begun_scoring.elapsed();
         self.reserve(time);
-        self.last_scoring = time.mul_f64(self.held_out_sample.len() as f64 / sample.len() as f64);
-        if let Some(line) = self.late_start_warning() {
+        self.time.last_scoring = time.mul_f64(self.held_out_sample.len() as f64 / sample.len() as f64);
+        if let Some(line) = self.time.late_start_warning() {
             self.warn(&line);
         }
-        if matches!(start, Start::Model(..)) {
+        if matches!(self.init, SceneInit::Model(_)) {
             self.add_eval_point(&initial)?;
         }
-        let initial_splat = if let Start::Splat(splat, _) = start { Some(splat) } else { None };
-        let begun = self.clock.elapsed().as_secs_f64();
+        let begun = self.time.seconds();
         let (gaussians, learned, state) = if self.is_stopped {
             (initial.map(Tensor::shallow_clone), Corrections::none(), None)
         } else {
-            let (gaussians, learned, state) = self.optimize(start, depth)?;
+            let (gaussians, learned, state) = self.optimize(&initial, optimizer, depth)?;
             (gaussians, learned, Some(state))
         };
-        let ended = self.clock.elapsed().as_secs_f64();
+        let ended = self.time.seconds();
         let after = sample.corrected(&learned).score(&gaussians)?.expect("photos");
         let is_initial = after.psnr.is_nan() || after.psnr < before.psnr;
         let corrections =
             if learned.has_any() && !is_initial { learned.report(&self.photos) } else { vec![] };
         let gaussians = if is_initial { initial.map(Tensor::shallow_clone) } else { gaussians };
-        let splat = match initial_splat {
-            Some(splat) if is_initial => Splat { warnings: vec![], ..splat.clone() },
+        let splat = match self.init {
+            SceneInit::Splat(splat) if is_initial => Splat { warnings: vec![], ..splat.clone() },
             _ => gaussians.to_world_units(&self.frame).to_splat(self.frame.origin)?,
         };
         Ok(RefineResult {
@@ -507,14 +440,13 @@ impl<'a> RefineSession<'a> {
         ContactSheet::render(&result.gaussians, self.representative_views())
     }
 
-    /// Returns an evenly spaced subset of the held-out views that can be scored within [`MAX_WHOLE_SCORING_SHARE`] of a time budget.
+    /// Returns an evenly spaced subset of the held-out views that can be scored within a time budget.
     fn affordable_views(&mut self, gaussians: &Gaussians) -> Result<Vec<View>> {
-        let every = match self.options.budget {
-            Budget::Time(time) if !self.held_out.is_empty() => {
+        let every = match self.options.budget() {
+            Budget::Time(_) if !self.held_out.is_empty() => {
                 let begun = Instant::now();
                 self.score_whole(gaussians, &[self.held_out[0].shallow_clone()], None)?;
-                let all = begun.elapsed() * self.held_out.len() as u32;
-                all.div_duration_f64(time.mul_f64(MAX_WHOLE_SCORING_SHARE)).ceil().max(1.) as usize
+                self.time.affordable_every(begun.elapsed() * self.held_out.len() as u32)
             }
             _ => 1,
         };
@@ -541,16 +473,6 @@ impl<'a> RefineSession<'a> {
         let _ = (self.on_event)(RefineEvent::Warning(line));
     }
 
-    /// Returns a warning if reading the photos and the start left little or no time for the optimization.
-    fn late_start_warning(&self) -> Option<String> {
-        let Budget::Time(time) = self.options.budget else { return None };
-        let gone = self.clock.elapsed();
-        (gone + self.reserve + MIN_TIME.min(time) > time).then(|| {
-            let (time, gone) = (time.as_secs_f64(), gone.as_secs_f64());
-            format!("{time:.0} s are too short here: reading the photos and beginning took {gone:.1} s; it ends as soon as it can")
-        })
-    }
-
     fn cameras(&self) -> Vec<Camera> {
         self.photos.iter().map(|photo| photo.camera).collect()
     }
@@ -566,8 +488,8 @@ impl<'a> RefineSession<'a> {
     }
 
     fn are_in_one_place(&self) -> bool {
-        let centre = |view: &View| view.camera.c2w.w_axis;
-        self.photos.iter().all(|view| centre(view) == centre(&self.photos[0]))
+        let center = |view: &View| view.camera.c2w.w_axis;
+        self.photos.iter().all(|view| center(view) == center(&self.photos[0]))
     }
 
     /// Removes near duplicates from the photos. Returns a warning that names them, if there are any.
@@ -590,7 +512,7 @@ impl<'a> RefineSession<'a> {
         Some(format!(
             "{}: {count} of {all} photos are nearly equal to others, and left out: {}",
             self.capture.name,
-            names(&left_out)
+            summarize_names(&left_out)
         ))
     }
 
@@ -598,20 +520,16 @@ impl<'a> RefineSession<'a> {
     fn gaussians_from_photos(&mut self, count: usize) -> Result<Option<RawGaussians>> {
         let to_local = |point: Point| Point { position: self.frame.point_to_local(point.position), ..point };
         let points: Vec<Point> = read_points(self.capture)?.into_iter().map(to_local).collect();
-        let (clock, budget, on_event) = (self.clock, self.options.budget, &mut self.on_event);
+        let (time, on_event) = (&self.time, &mut self.on_event);
         let mut is_stopped = false;
         let should_continue = |done: usize| {
             is_stopped |= !on_event(RefineEvent::Starting(done));
-            let is_late = match budget {
-                Budget::Steps(_) => false,
-                Budget::Time(time) => done >= FEW_PHOTOS && clock.elapsed() > time.mul_f64(MAX_START_SHARE),
-            };
-            !is_stopped && !is_late
+            !is_stopped && !time.is_late_for_depths(done)
         };
         let RefineOptions { seed, correct_exposures: correction, .. } = *self.options;
-        let made = gaussians_from_photos(&self.photos, &points, count, seed, correction, should_continue);
+        let init = gaussians_from_photos(&self.photos, &points, count, seed, correction, should_continue);
         self.is_stopped |= is_stopped;
-        let Some(InitialScene { gaussians, depth_maps, log_exposures }) = made else { return Ok(None) };
+        let Some(PhotoInit { gaussians, depth_maps, log_exposures }) = init else { return Ok(None) };
         self.depth_maps = depth_maps;
         self.log_exposures = log_exposures;
         Ok(Some(gaussians.to_device(self.options.device)))
@@ -624,7 +542,7 @@ impl<'a> RefineSession<'a> {
         let [min, max] = [factors.clone().fold(f64::MAX, f64::min), factors.fold(0., f64::max)];
         (self.options.correct_exposures == ExposureCorrection::Auto).then(|| {
             format!(
-                "{}: the exposures of neighbouring photos differ, and all are corrected: {min:.2} to {max:.2} times the average",
+                "{}: the exposures of neighboring photos differ, and all are corrected: {min:.2} to {max:.2} times the average",
                 self.capture.name
             )
         })
@@ -635,66 +553,65 @@ impl<'a> RefineSession<'a> {
         vec![[0.; 3]; self.photos.len()]
     }
 
-    /// Returns the corrections with which the optimization begins, those of `state` if it continues from one.
-    fn corrections(&self, state: Option<&RefineState>, depth: f64) -> Result<Corrections> {
+    /// Returns the corrections with which the optimization begins, those of a state if it continues from one.
+    fn corrections(&self, depth: f64) -> Result<Corrections> {
         let (RefineOptions { correct_poses, device, .. }, config) = (self.options, &self.config);
         let (count, exposures) = (self.photos.len(), self.log_exposures.as_deref());
         let sides = self.photos.iter().map(|photo| photo.camera.width.max(photo.camera.height));
-        let poses = config.poses_for(sides.max().unwrap_or(0));
-        let config = RefineConfig { poses, ..config.clone() };
+        let lr_poses = config.lr_poses_for(sides.max().unwrap_or(0));
+        let config = RefineConfig { lr_poses, ..config.clone() };
         let mut corrections = Corrections::new(count, *correct_poses, exposures, depth, &config, *device);
-        if let Some(state) = state {
+        if let SceneInit::State(state) = self.init {
             corrections.load_state(state)?;
         }
         Ok(corrections)
     }
 
-    /// Optimizes the Gaussians of `start`, and the corrections of the photos. `depth` is the depth of these Gaussians.
-    fn optimize(&mut self, start: Start, depth: f64) -> Result<(Gaussians, Corrections, RefineState)> {
+    /// Optimizes the Gaussians of `optimizer`, or those of a model and others, and the corrections of the photos. `depth` is the depth of the
+    /// `initial` Gaussians.
+    fn optimize(
+        &mut self,
+        initial: &Gaussians,
+        optimizer: Option<GaussianOptimizer>,
+        mut depth: f64,
+    ) -> Result<(Gaussians, Corrections, RefineState)> {
+        let mut optimizer = match optimizer {
+            Some(optimizer) => optimizer,
+            None => {
+                let raw = self.with_gaussians_from_photos(initial)?;
+                depth = scene_depth(&raw.activate(), &self.photos)?;
+                GaussianOptimizer::new(&raw, depth, &self.config, self.gaussians as i64)
+            }
+        };
         let (RefineOptions { seed, device, .. }, config) = (self.options, self.config.clone());
-        let final_count = if matches!(start, Start::Splat(..)) { 0 } else { self.options.gaussians as i64 };
-        let (mut optimizer, depth, earlier) = match start {
-            Start::Photos(raw) | Start::Splat(_, raw) => {
-                (GaussianOptimizer::new(&raw, depth, &config, final_count), depth, None)
-            }
-            Start::Model(gaussians) => {
-                let raw = self.with_gaussians_from_photos(&gaussians)?;
-                let depth = scene_depth(&raw.activate(), &self.photos)?;
-                (GaussianOptimizer::new(&raw, depth, &config, final_count), depth, None)
-            }
-            Start::State(state, optimizer) => (*optimizer, depth, Some(state)),
+        let mut corrections = self.corrections(depth)?;
+        let (progress, earlier_total) = match self.init {
+            SceneInit::State(state) => (state.record.progress, state.record.total),
+            _ => Default::default(),
         };
-        let mut corrections = self.corrections(earlier, depth)?;
-        let (reached, earlier_total) =
-            earlier.map_or_else(Default::default, |state| (state.record.reached, state.record.total));
         let photos = Photos::new(&self.photos, &self.depth_maps, &config, *device);
-        let budget = match self.options.budget {
-            Budget::Time(time) => {
-                let used = self.reserve + self.clock.elapsed() + earlier_total;
-                Budget::Time(reached.time + time.saturating_sub(used).max(MIN_TIME.min(time)))
-            }
-            steps => steps,
-        };
+        let budget = self.time.remaining(progress.time, earlier_total);
         let background = self.options.mask_background;
-        let task = Task { photos: &photos, depth, config: &config, budget, seed: *seed, background, reached };
-        let mut marks = EVAL_FRACTIONS.iter().peekable();
+        let args =
+            OptimizeArgs { photos: &photos, depth, config: &config, budget, seed: *seed, background, progress };
+        let mut fractions = EVAL_FRACTIONS.iter().peekable();
         let (mut is_due, mut failure) = (false, None);
-        let (gaussians, reached) = refine(&mut optimizer, &mut corrections, &task, |at| {
-            self.steps = at.step;
-            while marks.next_if(|&&mark| at.progress >= mark).is_some() {
+        let (gaussians, progress) = refine(&mut optimizer, &mut corrections, &args, |now| {
+            self.steps = now.step;
+            while fractions.next_if(|&&fraction| now.progress >= fraction).is_some() {
                 is_due = true;
             }
-            if is_due && self.may_score() {
+            if is_due && self.time.may_score() {
                 is_due = false;
-                failure = self.add_eval_point(&at.gaussians()).err();
+                failure = self.add_eval_point(&now.gaussians()).err();
             }
-            if at.step.is_multiple_of(METRICS_EVERY) {
+            if now.step.is_multiple_of(METRICS_EVERY) {
                 let metrics = RefineMetrics {
-                    step: at.step,
-                    seconds: self.clock.elapsed().as_secs_f64(),
-                    loss: at.loss(),
-                    gaussians: at.count(),
-                    learning_rate: at.means_learning_rate(),
+                    step: now.step,
+                    seconds: self.time.seconds(),
+                    loss: now.loss(),
+                    gaussians: now.count(),
+                    learning_rate: now.means_learning_rate(),
                 };
                 self.is_stopped |= !(self.on_event)(RefineEvent::Measured(&metrics));
             }
@@ -711,11 +628,12 @@ impl<'a> RefineSession<'a> {
         let record = Record {
             photos: self.photo_names(),
             frame: self.frame_numbers(),
-            reached,
-            total: earlier_total + self.clock.elapsed(),
+            progress,
+            total: earlier_total + self.time.elapsed(),
             depth,
             has_depths: !self.depth_maps.is_empty(),
             antialiased: config.antialiased,
+            from_splat: self.init.is_splat(),
             growth: optimizer.growth(),
         };
         Ok((gaussians, corrections, RefineState::new(record, tensors)))
@@ -723,16 +641,16 @@ impl<'a> RefineSession<'a> {
 
     /// Returns an error if `state` is that of other photos or cameras, or if the budget has been used up already.
     fn check_state(&self, state: &RefineState) -> Result<()> {
-        let Record { photos, frame, reached, total, .. } = &state.record;
+        let Record { photos, frame, progress, total, .. } = &state.record;
         if *frame != self.frame_numbers() || *photos != self.photo_names() {
             let found = format!("that of another refinement, {} photos", photos.len());
             let expected =
                 format!("that of the {} photos of this one, with the same poses", self.photos.len());
             return Err(Error::input(state.file(), "the list of photos", found, expected));
         }
-        let (used, expected) = match self.options.budget {
-            Budget::Steps(steps) if steps <= reached.steps => {
-                (format!("{} steps", reached.steps), "more steps in all")
+        let (used, expected) = match self.options.budget() {
+            Budget::Steps(steps) if steps <= progress.steps => {
+                (format!("{} steps", progress.steps), "more steps in all")
             }
             Budget::Time(time) if time <= *total => {
                 (format!("{:.0} s", total.as_secs_f64()), "more time in all")
@@ -751,7 +669,7 @@ impl<'a> RefineSession<'a> {
         }
         // Higher spherical harmonics are added later, for all Gaussians at the same time.
         raw.sh = raw.sh.narrow(2, 0, 1);
-        let count = self.options.initial_gaussians();
+        let count = self.initial_count();
         let of_model = count / MODEL_SHARE;
         let Some(new) = self.gaussians_from_photos(count - of_model)? else { return Ok(raw) };
         if let Some(line) = self.exposure_warning() {
@@ -760,40 +678,20 @@ impl<'a> RefineSession<'a> {
         Ok(most_visible(&raw, &self.depth_maps, of_model)?.to_device(self.options.device).concat(&new))
     }
 
-    /// Returns `true` if another scoring keeps the total time of scoring below its maximum fraction of the time since the clock began.
-    fn may_score(&self) -> bool {
-        let scoring = self.scoring + self.last_scoring;
-        scoring.as_secs_f64() <= MAX_SCORING_SHARE * self.clock.elapsed().as_secs_f64()
-    }
-
     /// Scores the sample of the held-out views, if there are any, and appends the scores to the curve.
     fn add_eval_point(&mut self, gaussians: &Gaussians) -> Result<()> {
         let begun = Instant::now();
         if let Some(scores) = self.held_out_sample.score(gaussians)? {
-            let seconds = self.clock.elapsed().as_secs_f64();
-            let point = EvalPoint { seconds, steps: self.steps, scores };
+            let point = EvalPoint { seconds: self.time.seconds(), steps: self.steps, scores };
             self.is_stopped |= !(self.on_event)(RefineEvent::Scored(&point));
             self.curve.push(point);
         }
-        self.last_scoring = begun.elapsed();
-        self.scoring += self.last_scoring;
+        self.time.add_scoring(begun.elapsed());
         Ok(())
     }
-}
-
-/// Removes the views without a pixel that counts, and returns their names.
-fn leave_out_masked(views: &mut Vec<View>) -> Vec<String> {
-    views.extract_if(.., |view| view.is_masked_out()).map(|view| view.name).collect()
 }
 
 /// Returns the error of a session that is ended before there is a result.
 fn stopped() -> Error {
     Error::failed("stopped before there was a splat: nothing is written")
-}
-
-/// Returns the first few names, and the number of the others.
-fn names(all: &[String]) -> String {
-    const FEW: usize = 3;
-    let few = all[..all.len().min(FEW)].join(", ");
-    if all.len() > FEW { format!("{few} and {} more", all.len() - FEW) } else { few }
 }

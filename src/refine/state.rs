@@ -17,7 +17,7 @@ const RECORD: &str = "refinement";
 
 /// How far an optimization has come.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-pub struct Reached {
+pub struct TrainProgress {
     /// Number of steps done.
     pub steps: u64,
     /// Time that the optimization took.
@@ -34,7 +34,7 @@ pub(super) struct Record {
     /// Origin and scale of the local frame that the Gaussians are in.
     pub frame: [f64; 4],
     /// Where the optimization has ended.
-    pub reached: Reached,
+    pub progress: TrainProgress,
     /// Total time, with reading the photos and everything else.
     pub total: Duration,
     /// Depth of the scene, the unit of lengths.
@@ -42,8 +42,9 @@ pub(super) struct Record {
     /// `true` if the plane sweep's depths were used.
     pub has_depths: bool,
     /// `true` if the Gaussians are optimized for antialiased rendering.
-    #[serde(default)]
     pub antialiased: bool,
+    /// `true` if the optimization began with a splat, whose number of Gaussians stays.
+    pub from_splat: bool,
     /// How the Gaussians have grown.
     pub growth: Growth,
 }
@@ -58,7 +59,6 @@ pub(super) struct Growth {
     /// Degree that the last step used.
     pub degree: i64,
     /// Number of steps in the average of the parameters.
-    #[serde(default)]
     pub averaged_steps: u64,
 }
 
@@ -117,7 +117,7 @@ impl RefineState {
 
     /// Returns the number of steps that led to the state.
     pub fn steps(&self) -> u64 {
-        self.record.reached.steps
+        self.record.progress.steps
     }
 
     /// Returns the number of Gaussians.

@@ -250,7 +250,7 @@ fn photos_are_scored_one_at_a_time() {
     let (_rooms, room) = room();
     let (splat, sheet) = (room.join("truth.ply"), folder.path().join("sheet.png"));
     let scene = ["--scene", arg(folder.path()), "--json"];
-    for subject in [&["--splat", arg(&splat), "--sheet", arg(&sheet)][..], &["--renders", arg(&images)]] {
+    for subject in [&["--splat", arg(&splat), "--contact-sheet", arg(&sheet)][..], &["--renders", arg(&images)]] {
         let arguments: Vec<String> =
             ["eval"].iter().chain(subject).chain(&scene).map(|argument| argument.to_string()).collect();
         let (code, out, err) = run(&arguments, folder.path());
@@ -258,7 +258,7 @@ fn photos_are_scored_one_at_a_time() {
         let scores: Value = serde_json::from_str(&out).unwrap();
         assert_eq!(scores["views"].as_array().unwrap().len() as u64, PHOTOS);
         let is_shrunk = err.contains("sheet.png: pictures are shrunk to 1/2");
-        assert_eq!(is_shrunk, subject.contains(&"--sheet"), "{err}");
+        assert_eq!(is_shrunk, subject.contains(&"--contact-sheet"), "{err}");
         let peak = peak_of_children();
         assert!(peak < PHOTOS * 24_000_000, "{subject:?}: {peak} bytes");
     }

@@ -1,8 +1,12 @@
 //! Initial Gaussians from photos, from photos and points, or from known Gaussians that agree with the photos.
 
-use super::exposures::{ExposureCorrection, LogGains};
-use crate::data::{Pixels, Point, View};
+use super::exposures::{LogGains, correct_exposures};
+use super::options::{ExposureCorrection, RefineOptions};
+use super::state::RefineState;
+use crate::data::{Capture, PhotoSize, Pixels, Point, View};
 use crate::error::Result;
+use crate::io::Splat;
+use crate::reconstruct::LoadedModel;
 use crate::render::{contributions, largest_contributions};
 use crate::scene::{Camera, RawGaussians, SH_C0};
 use crate::stereo::{DepthMap, PlaneSweepOutput, SWEEP_SIDE, SmallPhoto, projection, sweep};
@@ -12,7 +16,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tch::{Device, Kind, Tensor};
 
-/// Standard deviation of a Gaussian, in units of the distance between neighbouring Gaussians.
+/// Standard deviation of a Gaussian, in units of the distance between neighboring Gaussians.
 const EXTENT: f64 = 0.5;
 /// Initial logit of the opacity.
 const LOGIT: f32 = -1.;
@@ -26,12 +30,47 @@ const NEAR: f64 = 0.1;
 struct IsotropicGaussian {
     mean: DVec3,
     scale: f64,
-    colour: [f32; 3],
+    color: [f32; 3],
+}
+
+/// Source of the initial Gaussians.
+#[derive(Debug, Clone, Copy)]
+pub enum SceneInit<'a> {
+    /// Pixels of the photos, at depths on which the photos agree.
+    Photos,
+    /// Splat in the capture's world.
+    Splat(&'a Splat),
+    /// Reconstruction of the photos by a model. It sees [`RefineOptions::views`] of them, or the number in its configuration.
+    Model(&'a LoadedModel),
+    /// State of an earlier refinement of the same capture, which continues. The time and the steps of [`RefineOptions`] include those of
+    /// the earlier refinement.
+    State(&'a RefineState),
+}
+
+impl SceneInit<'_> {
+    /// Returns `true` if the Gaussians are those of a splat, whose number stays.
+    pub(super) fn is_splat(&self) -> bool {
+        match self {
+            SceneInit::Splat(_) => true,
+            SceneInit::State(state) => state.record.from_splat,
+            SceneInit::Photos | SceneInit::Model(_) => false,
+        }
+    }
+
+    /// Returns the final number of Gaussians and the size of the photos.
+    pub(super) fn sizes(&self, capture: &Capture, options: &RefineOptions) -> (usize, PhotoSize) {
+        let gaussians = match self {
+            SceneInit::Splat(splat) => splat.len().max(1),
+            SceneInit::State(state) if state.record.from_splat => state.count(),
+            _ => options.gaussians.unwrap_or_else(|| options.gaussians_for(capture)),
+        };
+        (gaussians, options.size.unwrap_or(RefineOptions::size_for(gaussians)))
+    }
 }
 
 /// Initial state of a scene from photos alone.
 #[derive(Debug)]
-pub struct InitialScene {
+pub struct PhotoInit {
     /// Initial Gaussians, on the CPU.
     pub gaussians: RawGaussians,
     /// Depths of some photos.
@@ -51,13 +90,13 @@ pub fn gaussians_from_photos(
     seed: u64,
     exposures: ExposureCorrection,
     should_continue: impl FnMut(usize) -> bool,
-) -> Option<InitialScene> {
+) -> Option<PhotoInit> {
     let photos = views.iter().map(|view| small_photo(view, SWEEP_SIDE)).collect();
     let PlaneSweepOutput { photos, mut depth_maps } = sweep(photos, points, should_continue);
     if depth_maps.is_empty() {
         return None;
     }
-    let log_exposures: Option<Vec<LogGains>> = exposures.measure(&photos, &depth_maps);
+    let log_exposures: Option<Vec<LogGains>> = correct_exposures(exposures, &photos, &depth_maps);
     if let Some(gains) = &log_exposures {
         for (index, map) in &mut depth_maps {
             let gains = Tensor::from_slice(&gains[*index].map(f64::exp)).to_kind(Kind::Float);
@@ -66,7 +105,7 @@ pub fn gaussians_from_photos(
     }
     let depth_maps: Vec<DepthMap> = depth_maps.into_iter().map(|(_, map)| map).collect();
     let gaussians = sample_gaussians(&depth_maps, points, count, seed);
-    Some(InitialScene { gaussians, depth_maps, log_exposures })
+    Some(PhotoInit { gaussians, depth_maps, log_exposures })
 }
 
 /// Downscales a view to at most `longest_side` pixels along its longer side, on the CPU.
@@ -149,18 +188,18 @@ fn sample_gaussians(depth_maps: &[DepthMap], points: &[Point], count: usize, see
     }
     let spacing = (pixels / count.max(1) as f64).sqrt(); // in pixels of the downscaled images
     let chosen = sample(&mut random, points.len(), points.len().min(count - count / DEPTHS_SHARE));
-    let mut balls: Vec<IsotropicGaussian> =
+    let mut gaussians: Vec<IsotropicGaussian> =
         chosen.iter().map(|i| at_point(points[i], depth_maps, spacing)).collect();
-    let left = count - balls.len();
+    let left = count - gaussians.len();
     for (index, of) in depth_maps.iter().enumerate() {
         // Cumulative shares, so that the counts add up to `left`.
         let share = |i: usize| match i == depth_maps.len() {
             true => left,
             false => (left as f64 * shares[i] / shares[depth_maps.len()]) as usize,
         };
-        sample_pixels(of, share(index + 1) - share(index), spacing, &mut random, &mut balls);
+        sample_pixels(of, share(index + 1) - share(index), spacing, &mut random, &mut gaussians);
     }
-    raw(&balls)
+    raw(&gaussians)
 }
 
 /// Creates a Gaussian at a point, with the size that it would have if the nearest camera had seen it.
@@ -168,16 +207,16 @@ fn at_point(point: &Point, depth_maps: &[DepthMap], spacing: f64) -> IsotropicGa
     let size =
         |of: &DepthMap| point.position.distance(of.camera.c2w.w_axis.truncate()) / of.camera.intrinsics.fx;
     let least = depth_maps.iter().map(size).fold(f64::INFINITY, f64::min);
-    IsotropicGaussian { mean: point.position, scale: EXTENT * spacing * least, colour: point.colour }
+    IsotropicGaussian { mean: point.position, scale: EXTENT * spacing * least, color: point.colour }
 }
 
-/// Appends `count` Gaussians at random pixels of `of` that count to `balls`.
+/// Appends `count` Gaussians at random pixels of `of` that count to `gaussians`.
 fn sample_pixels(
     of: &DepthMap,
     count: usize,
     spacing: f64,
     random: &mut impl Rng,
-    balls: &mut Vec<IsotropicGaussian>,
+    gaussians: &mut Vec<IsotropicGaussian>,
 ) {
     let (width, height) = (of.camera.width as usize, of.camera.height as usize);
     let (depth, image, k) = (of.depths(), of.colours(), of.camera.intrinsics);
@@ -195,24 +234,24 @@ fn sample_pixels(
         let pixel = v as usize * width + u as usize;
         let z = f64::from(depth[pixel]);
         let seen = DVec3::new((u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z);
-        balls.push(IsotropicGaussian {
+        gaussians.push(IsotropicGaussian {
             mean: of.camera.c2w.transform_point3(seen),
             scale: EXTENT * spacing * z / k.fx,
-            colour: [0, 1, 2].map(|channel| image[channel * width * height + pixel]),
+            color: [0, 1, 2].map(|channel| image[channel * width * height + pixel]),
         });
     }
 }
 
-fn raw(balls: &[IsotropicGaussian]) -> RawGaussians {
-    let n = balls.len() as i64;
+fn raw(gaussians: &[IsotropicGaussian]) -> RawGaussians {
+    let n = gaussians.len() as i64;
     let of = |values: Vec<f64>, shape: &[i64]| Tensor::from_slice(&values).to_kind(Kind::Float).view(shape);
-    let colours = balls.iter().flat_map(|ball| ball.colour.map(|c| (f64::from(c) - 0.5) / SH_C0));
+    let colors = gaussians.iter().flat_map(|g| g.color.map(|c| (f64::from(c) - 0.5) / SH_C0));
     RawGaussians {
-        means: of(balls.iter().flat_map(|ball| ball.mean.to_array()).collect(), &[1, n, 3]),
-        log_scales: of(balls.iter().flat_map(|ball| [ball.scale.ln(); 3]).collect(), &[1, n, 3]),
-        quaternions: of(balls.iter().flat_map(|_| [1., 0., 0., 0.]).collect(), &[1, n, 4]),
+        means: of(gaussians.iter().flat_map(|g| g.mean.to_array()).collect(), &[1, n, 3]),
+        log_scales: of(gaussians.iter().flat_map(|g| [g.scale.ln(); 3]).collect(), &[1, n, 3]),
+        quaternions: of(gaussians.iter().flat_map(|_| [1., 0., 0., 0.]).collect(), &[1, n, 4]),
         opacity_logits: Tensor::full([1, n], f64::from(LOGIT), (Kind::Float, Device::Cpu)),
-        sh: of(colours.collect(), &[1, n, 1, 3]),
+        sh: of(colors.collect(), &[1, n, 1, 3]),
     }
 }
 

@@ -1,0 +1,344 @@
+//! The command `refine`, which also does the work of `reconstruct --refine`.
+
+use super::capture::SceneSource;
+use super::progress::{self, Progress};
+use super::signals::StopRequest;
+use super::{
+    check_views, device, model, open_masked_capture, print_json, report_downscaling, splat_out, warn,
+};
+use anyhow::Result;
+use clap::Args;
+use globalsplat::data::{Capture, PhotoSize};
+use globalsplat::error::Error;
+use globalsplat::device::process_age;
+use globalsplat::io::{
+    InputFiles, check_writable_dir, check_writable_file, check_writable_png, check_writable_splat,
+    read_splat, splat_files,
+};
+use globalsplat::metrics::CaptureScores;
+use globalsplat::model::Precision;
+use globalsplat::reconstruct::spread_over_path;
+use globalsplat::refine::{
+    Budget, Correction, EvalPoint, RefineEvent, RefineLog, RefineOptions, RefineResult, RefineSession,
+    RefineState, SampleScores, SceneInit,
+};
+use globalsplat::scene::{Camera, LocalFrame};
+use serde_json::json;
+use std::cell::RefCell;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+/// Maximum number of cameras for which a splat's colors are fitted to the range of its file format.
+const FITTED_CAMERAS: usize = 64;
+
+/// Estimated time for writing the state of an optimization, per Gaussian.
+const STATE_TIME_PER_GAUSSIAN: Duration = Duration::from_micros(1);
+
+/// Optimize a splat on the photos of its scene, or create one from the photos alone.
+///
+/// The Gaussians are optimized until their renders match the photos. Without --splat they are initialized where the depths of
+/// several photos agree, and their number grows to --gaussians; neither weights nor a GPU are needed. Ctrl-C ends the
+/// optimization early and writes the current splat.
+#[derive(Args)]
+#[command(after_help = "Examples:\n  globalsplat refine --scene captures/room --out room.ply\n  \
+    globalsplat refine --photos photos/room --out room.ply\n  \
+    globalsplat refine --splat room.ply --scene captures/room --out better.ply --seconds 30\n  \
+    globalsplat refine --scene captures/room --holdout every:8 --contact-sheet views.png --out room.ply\n  \
+    globalsplat refine --scene captures/room --gaussians 100000 --seconds 240 --out room.ply")]
+pub struct Refine {
+    /// Initial splat, in the capture's world coordinates, in any format that `convert` reads
+    #[arg(long, value_name = "FILE", conflicts_with = "gaussians")]
+    pub splat: Option<PathBuf>,
+    /// Initialization without --splat: from the photos alone, or from a model's reconstruction, with new Gaussians up to --gaussians
+    #[arg(long, value_parser = ["photos", "model"], conflicts_with = "splat")]
+    pub init: Option<String>,
+    /// Weights of the initial model, as `globalsplat export` writes them; by default the weights embedded in this program
+    #[arg(long, value_name = "FILE", conflicts_with = "splat")]
+    pub weights: Option<PathBuf>,
+    #[command(flatten)]
+    pub scene: SceneSource,
+    /// Folder of masks named like the photos, as in photo.jpg.png or photo.png: black pixels are ignored; by default the masks and
+    /// transparency of the capture itself
+    #[arg(long, value_name = "DIR")]
+    pub masks: Option<PathBuf>,
+    /// Output splat: .ply, .compressed.ply, .sog, meta.json, .spz, .splat, .glb or .gltf
+    #[arg(long, value_name = "FILE")]
+    pub out: PathBuf,
+    /// Write the state of the optimization beside the splat, as in room.state.safetensors, and continue from it if it is there:
+    /// --seconds and --steps include those of the earlier runs
+    #[arg(long)]
+    pub resume: bool,
+    /// Write coordinates relative to the center of the cameras, which is stored in a file beside the splat: far from the
+    /// world's origin, as in UTM coordinates, float32 loses detail
+    #[arg(long)]
+    pub local_origin: bool,
+    #[command(flatten)]
+    pub options: RefineOptions,
+    #[command(flatten)]
+    pub reports: Reports,
+    /// Device of the optimization: cpu, cuda or cuda:N
+    #[arg(long, value_name = "DEVICE", default_value = "cpu")]
+    pub device: String,
+    /// Print the result as one JSON object
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// What a refinement reports besides its result.
+#[derive(Default, Args)]
+pub struct Reports {
+    /// Also write curves of the loss and the scores to a folder: metrics.jsonl and tensorboard, which TensorBoard
+    /// shows during the optimization
+    #[arg(long, value_name = "DIR")]
+    log: Option<PathBuf>,
+    /// Also write an image: photo, render and depth side by side, a row per held-out view, or else per view
+    #[arg(long, value_name = "FILE.png")]
+    contact_sheet: Option<PathBuf>,
+    /// Also score by LPIPS, before and after, if its weights are found; this takes additional time, after the splat is written
+    #[arg(long)]
+    lpips: bool,
+}
+
+impl Refine {
+    pub fn run(mut self) -> Result<()> {
+        check_views(self.options.views)?;
+        self.options.device = device::parse(&self.device)?;
+        self.options.check()?;
+        if self.init.as_deref() == Some("photos") && self.weights.is_some() {
+            return Err(Error::request("--init photos uses no weights; --init model does").into());
+        }
+        let age = process_age().unwrap_or_default();
+        let now = Instant::now();
+        check_writable_splat(&self.out)?;
+        splat_out::check_origin(&self.out, self.local_origin)?;
+        if let Some(sheet) = &self.reports.contact_sheet {
+            check_writable_png(sheet)?;
+        }
+        let state_file = RefineState::path_for(&self.out);
+        if self.resume {
+            check_writable_file(&state_file)?;
+        }
+        if let Some(log) = &self.reports.log {
+            check_writable_dir(log)?;
+        }
+        let stop = StopRequest::install()?;
+        let path = self.scene.path(self.masks.as_deref(), &self.out, &stop)?;
+        // The time budget begins after the poses of photos are found.
+        let clock = match self.scene.is_unposed() {
+            true => Instant::now(),
+            false => now.checked_sub(age).unwrap_or(now),
+        };
+        self.options.started = Some(clock);
+        let capture = open_masked_capture(&path, self.masks.as_deref())?;
+        self.check_outputs(&capture)?;
+        let (mut splat, mut loaded, mut state) = (None, None, None);
+        let init = match &self.splat {
+            _ if self.resume && state_file.exists() => {
+                let state = state.insert(RefineState::read(&state_file)?);
+                eprintln!("{}: continues after {} steps", state_file.display(), state.steps());
+                SceneInit::State(state)
+            }
+            Some(path) => {
+                let splat = splat.insert(read_splat(path)?);
+                warn(&splat.warnings);
+                SceneInit::Splat(splat)
+            }
+            None if self.weights.is_some() || self.init.as_deref() == Some("model") => {
+                let load = model::load(self.weights.as_deref(), Some(Precision::F32), self.options.device);
+                SceneInit::Model(loaded.insert(load?))
+            }
+            None => SceneInit::Photos,
+        };
+        let bar = Bar::new(self.options.budget(), clock);
+        let steps = if let SceneInit::State(state) = init { state.steps() } else { 0 };
+        let log = self.reports.log.as_ref().map(|folder| RefineLog::create(folder, steps)).transpose()?;
+        let log = RefCell::new(log);
+        let on_event = |event: RefineEvent| {
+            bar.update(event);
+            write_event(&mut log.borrow_mut(), event);
+            !stop.is_requested()
+        };
+        let mut session = RefineSession::load(&capture, &self.options, init, on_event)?;
+        if let (None, SceneInit::Photos, PhotoSize::Within(side)) =
+            (self.options.gaussians, init, session.size())
+        {
+            let count = session.gaussians();
+            let line =
+                format!("{count} Gaussians, photos of at most {side} pixels; --gaussians and --size set others");
+            bar.bar.suspend(|| eprintln!("{line}"));
+        }
+        // Depths of a subset of the photos are enough for an initial splat, too.
+        stop.set_ends_at_once(matches!(init, SceneInit::Model(_)));
+        let gaussians = session.start()?;
+        stop.set_ends_at_once(false);
+        if self.resume {
+            let count = gaussians.count().max(session.gaussians() as i64);
+            session.reserve(STATE_TIME_PER_GAUSSIAN * count as u32);
+        }
+        if self.reports.contact_sheet.is_some() {
+            session.reserve_for_contact_sheet(&gaussians)?;
+        }
+        let result = session.run()?;
+        bar.bar.finish_and_clear();
+        if result.is_initial && result.steps > 0 {
+            eprintln!("the initial splat reproduces the photos better: it is kept");
+        }
+        let cameras = capture.cameras();
+        let spread = spread_over_path(&cameras, &(0..cameras.len()).collect::<Vec<_>>(), FITTED_CAMERAS);
+        let spread: Vec<Camera> = spread.into_iter().map(|index| cameras[index]).collect();
+        let origin = self.local_origin.then(|| LocalFrame::from_cameras(&cameras).origin);
+        splat_out::write_for(&self.out, &result.splat, &spread, origin)?;
+        if let (true, Some(state)) = (self.resume, &result.state) {
+            state.write(&state_file)?;
+        }
+        let held_out = session.score_held_out(&result)?;
+        if let Some(sheet) = &self.reports.contact_sheet {
+            if stop.is_requested() {
+                eprintln!("{}: stopped before it was written", sheet.display());
+            } else {
+                report_downscaling(sheet, session.contact_sheet(&result)?.write(sheet)?);
+            }
+        }
+        let lpips = if self.reports.lpips { session.score_lpips(&result)? } else { None };
+        self.print_result(&session, &result, held_out.as_ref(), lpips.as_ref());
+        Ok(())
+    }
+
+    /// Prints the result. Scores are those before and after the optimization.
+    fn print_result(
+        &self,
+        session: &RefineSession,
+        result: &RefineResult,
+        held_out: Option<&[CaptureScores; 2]>,
+        lpips: Option<&[CaptureScores; 2]>,
+    ) {
+        let RefineResult { steps, seconds: [begun, ended], shown: [before, after], corrections, .. } = result;
+        let (count, photos) = (result.gaussians.count(), session.photos().len());
+        // Scores are of the held-out views if there are any, else of the photos.
+        let distances = lpips.map_or([None; 2], |scores| scores.each_ref().map(|scores| scores.mean.lpips_vgg));
+        let (of_photos, of_held_out) =
+            if session.held_out().is_empty() { (distances, [None; 2]) } else { ([None; 2], distances) };
+        let scores =
+            |psnr: f64, ssim: f64, lpips: Option<f64>| json!({ "psnr": psnr, "ssim": ssim, "lpips_vgg": lpips });
+        if self.json {
+            let of = |scores_of: &SampleScores, lpips| scores(scores_of.psnr, scores_of.ssim, lpips);
+            let mut object = json!({
+                "splat": self.out.to_string_lossy(), "gaussians": count, "photos": photos, "near_duplicates": session.near_duplicates(),
+                "steps": steps, "seconds": ended, "begin_seconds": begun, "corrections": corrections,
+                "shown": { "before": of(before, of_photos[0]), "after": of(after, of_photos[1]) },
+            });
+            if let Some([before, after]) = held_out {
+                let of = |of: &CaptureScores, lpips| scores(of.mean.psnr, of.mean.ssim, lpips);
+                let scores = session.sample_scores(after);
+                let last = EvalPoint { seconds: *ended, steps: *steps, scores };
+                let curve: Vec<&EvalPoint> = result.curve.iter().chain([&last]).collect();
+                object["held_out"] = json!({
+                    "views": after.views.len(), "before": of(before, of_held_out[0]),
+                    "after": of(after, of_held_out[1]), "curve": curve,
+                });
+            }
+            print_json(&object);
+            return;
+        }
+        println!("{}: {count} Gaussians, {steps} steps, {ended:.0} s", self.out.display());
+        println!("{:<24} {:>14} {:>8} {:>8}", "", "PSNR before", "after", "SSIM");
+        let row = |name: String, [before, after]: [f64; 2], ssim: f64| {
+            println!("{name:<24} {before:>14.2} {after:>8.2} {ssim:>8.4}");
+        };
+        let sampled = result.shown_photos;
+        let of_photos = if sampled < photos { format!("{sampled} of ") } else { String::new() };
+        row(format!("{of_photos}{photos} photos"), [before.psnr, after.psnr], after.ssim);
+        if let Some([before, after]) = held_out {
+            let (scored, all) = (after.views.len(), session.held_out().len());
+            let of_all = if scored < all { format!(" of {all}") } else { String::new() };
+            let psnr = [before.mean.psnr, after.mean.psnr];
+            row(format!("{scored}{of_all} views held out"), psnr, after.mean.ssim);
+        }
+        if let [Some(before), Some(after)] = distances {
+            println!("LPIPS (VGG) {before:.4} before, {after:.4} after");
+        }
+        if let Some(line) = describe_corrections(corrections) {
+            println!("{line}");
+        }
+    }
+
+    /// Returns an error if an output would replace an input, except the initial splat.
+    fn check_outputs(&self, capture: &Capture) -> Result<()> {
+        let mut inputs = InputFiles::default();
+        capture.add_input_files(&mut inputs);
+        self.weights.iter().for_each(|weights| inputs.add(weights));
+        inputs.check_file(&self.out)?;
+        self.splat.iter().for_each(|splat| inputs.add_all(splat_files(splat)));
+        inputs.add_all(splat_files(&self.out));
+        Ok(self.reports.contact_sheet.iter().try_for_each(|sheet| inputs.check_file(sheet))?)
+    }
+}
+
+/// Writes metrics and scores to the log, if there is one. If that fails, says so and ends the log.
+fn write_event(log: &mut Option<RefineLog>, event: RefineEvent) {
+    let Some(open) = log else { return };
+    let written = match event {
+        RefineEvent::Measured(metrics) => open.log_step(metrics),
+        RefineEvent::Scored(point) => open.log_scores(point),
+        _ => return,
+    };
+    if let Err(error) = written {
+        eprintln!("{error}; the log ends here");
+        *log = None;
+    }
+}
+
+/// Progress bar of a session.
+struct Bar {
+    bar: Progress,
+    budget: Budget,
+    clock: Instant,
+}
+
+impl Bar {
+    fn new(budget: Budget, clock: Instant) -> Self {
+        let bar = match budget {
+            Budget::Steps(steps) => progress::bar(steps, "steps"),
+            Budget::Time(time) => progress::time_bar(time),
+        };
+        Bar { bar, budget, clock }
+    }
+
+    fn update(&self, event: RefineEvent) {
+        let message = match event {
+            RefineEvent::Loading { done, count } => format!("{done} of {count} photos read"),
+            RefineEvent::Starting(done) => format!("depths found in {done} photos"),
+            RefineEvent::Optimizing { steps, psnr } => match psnr {
+                Some(psnr) => format!("{steps} steps, held out {psnr:.2} dB"),
+                None => format!("{steps} steps"),
+            },
+            RefineEvent::Scoring(_) | RefineEvent::Measured(_) | RefineEvent::Scored(_) => return,
+            RefineEvent::Warning(line) => return self.bar.suspend(|| eprintln!("{line}")),
+        };
+        self.bar.set_message(message);
+        match (event, self.budget) {
+            (RefineEvent::Optimizing { steps, .. }, Budget::Steps(_)) => {
+                // The time of the initialization says nothing about the rate of the steps.
+                if self.bar.position() == 0 {
+                    self.bar.reset_eta();
+                }
+                self.bar.set_position(steps);
+            }
+            (_, Budget::Time(_)) => self.bar.set_position(self.clock.elapsed().as_secs()),
+            _ => {}
+        }
+    }
+}
+
+/// Describes the largest learned corrections in one line, or returns `None` if there are none.
+fn describe_corrections(corrected: &[Correction]) -> Option<String> {
+    let largest = |number: fn(&Correction) -> f64| corrected.iter().map(number).reduce(f64::max);
+    let factor = |of: &Correction| of.exposure.map(|gain| gain.max(1. / gain)).into_iter().fold(1., f64::max);
+    let (degrees, depths, factor) = (largest(|of| of.degrees)?, largest(|of| of.depths)?, largest(factor)?);
+    let cameras = format!("{degrees:.2}° and {depths:.4} of the scene's depth (cameras)");
+    let exposures = format!("a factor of {factor:.3} (exposures)");
+    let kinds = [(degrees > 0. || depths > 0., cameras), (factor > 1., exposures)];
+    let changed: Vec<String> =
+        kinds.into_iter().filter(|(is_any, _)| *is_any).map(|(_, line)| line).collect();
+    (!changed.is_empty()).then(|| format!("corrected at most by: {}", changed.join(", ")))
+}
