@@ -5,7 +5,7 @@ use crate::data::ViewBatch;
 use crate::device::Stopwatch;
 use crate::error::Result;
 use crate::refine::{
-    Budget, Corrections, GaussianOptimizer, Photos, TrainProgress, RefineConfig, OptimizeArgs, refine_timed,
+    Budget, Corrections, GaussianOptimizer, OptimizeArgs, Photos, RefineConfig, TrainProgress, refine_timed,
 };
 use crate::render::cpu::stage_times;
 use crate::render::{DEFAULT_EPS2D, render};

@@ -9,8 +9,8 @@ use super::{
 use anyhow::Result;
 use clap::Args;
 use globalsplat::data::{Capture, PhotoSize};
-use globalsplat::error::Error;
 use globalsplat::device::process_age;
+use globalsplat::error::Error;
 use globalsplat::io::{
     InputFiles, check_writable_dir, check_writable_file, check_writable_png, check_writable_splat,
     read_splat, splat_files,
@@ -163,8 +163,9 @@ impl Refine {
             (self.options.gaussians, init, session.size())
         {
             let count = session.gaussians();
-            let line =
-                format!("{count} Gaussians, photos of at most {side} pixels; --gaussians and --size set others");
+            let line = format!(
+                "{count} Gaussians, photos of at most {side} pixels; --gaussians and --size set others"
+            );
             bar.bar.suspend(|| eprintln!("{line}"));
         }
         // Depths of a subset of the photos are enough for an initial splat, too.
@@ -215,11 +216,11 @@ impl Refine {
         let RefineResult { steps, seconds: [begun, ended], shown: [before, after], corrections, .. } = result;
         let (count, photos) = (result.gaussians.count(), session.photos().len());
         // Scores are of the held-out views if there are any, else of the photos.
-        let distances = lpips.map_or([None; 2], |scores| scores.each_ref().map(|scores| scores.mean.lpips_vgg));
+        let distances =
+            lpips.map_or([None; 2], |scores| scores.each_ref().map(|scores| scores.mean.lpips_vgg));
         let (of_photos, of_held_out) =
             if session.held_out().is_empty() { (distances, [None; 2]) } else { ([None; 2], distances) };
-        let scores =
-            |psnr: f64, ssim: f64, lpips: Option<f64>| json!({ "psnr": psnr, "ssim": ssim, "lpips_vgg": lpips });
+        let scores = |psnr: f64, ssim: f64, lpips: Option<f64>| json!({ "psnr": psnr, "ssim": ssim, "lpips_vgg": lpips });
         if self.json {
             let of = |scores_of: &SampleScores, lpips| scores(scores_of.psnr, scores_of.ssim, lpips);
             let mut object = json!({

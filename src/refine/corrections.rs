@@ -75,7 +75,8 @@ impl Corrections {
                 rate,
             ))
         };
-        let groups = [group("poses", &poses, config.lr_poses), group("exposures", &exposures, config.lr_exposures)];
+        let groups =
+            [group("poses", &poses, config.lr_poses), group("exposures", &exposures, config.lr_exposures)];
         let (groups, rates) = groups.into_iter().flatten().unzip();
         let optimizer = Optimizer::new(groups);
         Corrections { poses, exposures, optimizer, rates, depth }

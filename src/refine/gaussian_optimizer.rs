@@ -178,8 +178,13 @@ impl GaussianOptimizer {
                 self.optimizer.extend(self.params.named_parameters(), 1);
             }
             let squared_gradients = self.optimizer.squared_gradients("means");
-            let changed =
-                relocate(&self.params, squared_gradients, config.prune_opacity, config.relocation_noise, random);
+            let changed = relocate(
+                &self.params,
+                squared_gradients,
+                config.prune_opacity,
+                config.relocation_noise,
+                random,
+            );
             let changed = Tensor::from_slice(&changed).to_device(self.params.means.device());
             for moment in self.optimizer.moments() {
                 let _ = moment.shallow_clone().index_fill_(1, &changed, 0.);

@@ -445,8 +445,9 @@ mod tests {
             w2c: cameras.w2c.shallow_clone(),
             intrinsics,
         };
-        let settings = ["relocate_every=0", "opacity_reg=0.01", "scale_reg=0.01", "depth_smoothness_weight=0.1"]
-            .map(String::from);
+        let settings =
+            ["relocate_every=0", "opacity_reg=0.01", "scale_reg=0.01", "depth_smoothness_weight=0.1"]
+                .map(String::from);
         let config = RefineConfig::with(&settings, false).unwrap();
         let photos = Photos::from_batch(views);
         let args_of = |steps| OptimizeArgs {

@@ -260,7 +260,11 @@ impl RefineOptions {
     }
 
     /// Returns the indices of the photos to match, which have `size`, and of the held-out views, and a warning if large captures have more than fit into memory.
-    pub(super) fn select_views(&self, capture: &Capture, size: PhotoSize) -> ([Vec<usize>; 2], Option<String>) {
+    pub(super) fn select_views(
+        &self,
+        capture: &Capture,
+        size: PhotoSize,
+    ) -> ([Vec<usize>; 2], Option<String>) {
         let cameras = capture.cameras();
         let (all_shown, all_held_out) = capture.split(self.holdout);
         let bytes = |camera: &Camera| {
@@ -421,10 +425,7 @@ mod tests {
         };
         let cameras: Vec<Camera> = (0..2000).map(camera).collect();
         let capture = Capture::from_source("walk".into(), "".into(), &cameras, Arc::new(NoImages)).unwrap();
-        let options = RefineOptions {
-            holdout: Holdout::Every { every: 8, first: 0 },
-            ..Default::default()
-        };
+        let options = RefineOptions { holdout: Holdout::Every { every: 8, first: 0 }, ..Default::default() };
         let ([shown, held_out], warning) = options.select_views(&capture, PhotoSize::Within(1024));
         // 1024×768 pixels of 4 bytes each.
         let each = 4 * 1024 * 768;

@@ -3,7 +3,8 @@
 use super::config::RefineConfig;
 use super::known_depths::KnownDepths;
 use crate::data::{
-    Capture, MIN_SHORTER_SIDE, MIN_SIDE, PhotoSize, Pixels, View, ViewBatch, load_views, select_views, view_matrices,
+    Capture, MIN_SHORTER_SIDE, MIN_SIDE, PhotoSize, Pixels, View, ViewBatch, load_views, select_views,
+    view_matrices,
 };
 use crate::error::{Error, Result};
 use crate::scene::{Camera, ImageSize};

@@ -169,8 +169,11 @@ impl<'a> RefineSession<'a> {
             ));
         }
         if !masked_out.is_empty() {
-            let line =
-                format!("{}: masked out as a whole, and left out: {}", capture.name, summarize_names(&masked_out));
+            let line = format!(
+                "{}: masked out as a whole, and left out: {}",
+                capture.name,
+                summarize_names(&masked_out)
+            );
             on_event(RefineEvent::Warning(&line));
         }
         for view in photos.iter_mut().chain(&mut held_out) {
@@ -592,8 +595,15 @@ impl<'a> RefineSession<'a> {
         let photos = Photos::new(&self.photos, &self.depth_maps, &config, *device);
         let budget = self.time.remaining(progress.time, earlier_total);
         let background = self.options.mask_background;
-        let args =
-            OptimizeArgs { photos: &photos, depth, config: &config, budget, seed: *seed, background, progress };
+        let args = OptimizeArgs {
+            photos: &photos,
+            depth,
+            config: &config,
+            budget,
+            seed: *seed,
+            background,
+            progress,
+        };
         let mut fractions = EVAL_FRACTIONS.iter().peekable();
         let (mut is_due, mut failure) = (false, None);
         let (gaussians, progress) = refine(&mut optimizer, &mut corrections, &args, |now| {

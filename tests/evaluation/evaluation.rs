@@ -250,7 +250,9 @@ fn photos_are_scored_one_at_a_time() {
     let (_rooms, room) = room();
     let (splat, sheet) = (room.join("truth.ply"), folder.path().join("sheet.png"));
     let scene = ["--scene", arg(folder.path()), "--json"];
-    for subject in [&["--splat", arg(&splat), "--contact-sheet", arg(&sheet)][..], &["--renders", arg(&images)]] {
+    for subject in
+        [&["--splat", arg(&splat), "--contact-sheet", arg(&sheet)][..], &["--renders", arg(&images)]]
+    {
         let arguments: Vec<String> =
             ["eval"].iter().chain(subject).chain(&scene).map(|argument| argument.to_string()).collect();
         let (code, out, err) = run(&arguments, folder.path());

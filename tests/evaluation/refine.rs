@@ -128,9 +128,7 @@ fn threads_do_not_change_the_bytes() {
     let folder = tempfile::tempdir().unwrap();
     let scene = world(folder.path(), "48");
     // Enough steps to improve on the initial splat, which would be kept otherwise.
-    for options in
-        [&["--gaussians", "500"][..], &["--init", "model", "--gaussians", "6000"]]
-    {
+    for options in [&["--gaussians", "500"][..], &["--init", "model", "--gaussians", "6000"]] {
         let bytes = |name: &str, threads: &str, seed: &str| {
             let out = folder.path().join(name);
             let mut arguments =
@@ -232,11 +230,11 @@ fn photos_from_one_place_are_shown_at_one_distance() {
 fn an_interrupted_refinement_returns_its_gaussians() {
     let (_folder, room) = room();
     let capture = open_capture(&room).unwrap();
-    let options =
-        RefineOptions { steps: Some(1_000_000), gaussians: Some(300), ..RefineOptions::default() };
+    let options = RefineOptions { steps: Some(1_000_000), gaussians: Some(300), ..RefineOptions::default() };
     // Returns the number of steps done if the work stops at the first event of a kind.
     let steps = |ends: fn(&RefineEvent) -> bool| {
-        let mut session = RefineSession::load(&capture, &options, SceneInit::Photos, move |event| !ends(&event))?;
+        let mut session =
+            RefineSession::load(&capture, &options, SceneInit::Photos, move |event| !ends(&event))?;
         session.start()?;
         let result = session.run()?;
         // Their number has hardly begun to grow from a fifth.
@@ -604,7 +602,9 @@ fn invalid_refinements_are_refused_with_one_sentence() {
     assert!(with(&["--set", "view=3"]).contains("--set view=3: unknown field"));
     assert!(with(&["--set", "views=\"a\""]).contains("--set views"));
     assert!(with(&["--set", "views"]).contains("expected KEY=VALUE"));
-    for value in ["views=0", "sh_every=0", "resolution_schedule=[0.1,0.1]", "lr_means=nan", "prune_opacity=-1"] {
+    for value in
+        ["views=0", "sh_every=0", "resolution_schedule=[0.1,0.1]", "lr_means=nan", "prune_opacity=-1"]
+    {
         assert!(with(&["--set", value]).contains(&format!("--set {value}: expected ")));
     }
     assert!(with(&["--seconds", "0"]).contains("seconds is 0, expected more than 0"));
@@ -612,7 +612,9 @@ fn invalid_refinements_are_refused_with_one_sentence() {
     for size in ["64x8", "10x10", "2000x1", "8", "64x", "-3"] {
         let expected =
             "expected the longer side, as in 1600, or WxH, as in 640x480, with sides of 11 to 16384";
-        assert!(with(&[&format!("--size={size}")]).contains(expected), "{size}");
+        let output = command(&[&base[..], &[&format!("--size={size}")]].concat()).output().unwrap();
+        let message = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.code() == Some(2) && message.contains(expected), "{size}: {message}");
     }
     assert!(with(&["--init", "photos", "--weights", "a.safetensors"]).contains("uses no weights"));
     assert!(with(&["--views", "1"]).contains("--views is 1, expected 2 or more"));

@@ -218,8 +218,16 @@ fn bench_model_reports_the_parts_of_a_pass() {
 fn a_splat_is_scored_by_its_capture() {
     let (_folder, room) = room();
     let (splat, sheet) = (room.join("truth.ply"), room.join("sheet.png"));
-    let scores =
-        json(&["eval", "--splat", arg(&splat), "--scene", arg(&room), "--contact-sheet", arg(&sheet), "--json"]);
+    let scores = json(&[
+        "eval",
+        "--splat",
+        arg(&splat),
+        "--scene",
+        arg(&room),
+        "--contact-sheet",
+        arg(&sheet),
+        "--json",
+    ]);
     // The photos were rendered from this splat: the only difference is 8-bit rounding.
     assert!(scores["psnr"].as_f64().unwrap() > 50.);
     assert!(scores["ssim"].as_f64().unwrap() > 0.999);
