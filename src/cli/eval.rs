@@ -1,6 +1,6 @@
 use super::{
-    check_views, device, distributed, model, open_masked_capture, parse_holdout, parse_photo_size,
-    print_json, progress, report_downscaling, stop_flag, warn, warn_of_many,
+    check_views, device, distributed, model, open_masked_capture, parse_holdout, print_json, progress,
+    report_downscaling, stop_flag, warn, warn_of_many,
 };
 use anyhow::Result;
 use clap::{ArgGroup, Args};
@@ -36,7 +36,7 @@ use tch::Device;
 #[command(group(ArgGroup::new("subject").required(true)))]
 #[command(group(ArgGroup::new("photos").required(true)))]
 #[command(after_help = "Examples:\n  globalsplat eval --splat scene.ply --scene captures/room --json\n  \
-    globalsplat eval --weights model.safetensors --scene captures/room --holdout every:8 --sheet views.png\n  \
+    globalsplat eval --weights model.safetensors --scene captures/room --holdout every:8 --contact-sheet views.png\n  \
     globalsplat eval --weights model.safetensors --data re10k --index re10k_24v.json --out results/re10k")]
 pub struct Eval {
     /// Weights: a file that `export` or `import` wrote, or a checkpoint (.ckpt)
@@ -88,7 +88,7 @@ pub struct Eval {
     size: Option<String>,
     /// Also write an image: photo, render and depth side by side, a row per view; downscaled if it would have more than 64
     /// million pixels
-    #[arg(long, value_name = "FILE.png", conflicts_with_all = ["renders", "data"])]
+    #[arg(long = "contact-sheet", value_name = "FILE.png", conflicts_with_all = ["renders", "data"])]
     sheet: Option<PathBuf>,
     /// Precision: f32, bf16 for the model's matrix products, or auto: bf16 for wide models if the device has instructions for
     /// it
@@ -185,7 +185,9 @@ impl Eval {
         let Some(model) = model else {
             let holdout = self.holdout.as_deref().map(parse_holdout).transpose()?;
             let size = match &self.size {
-                Some(size) => parse_photo_size(size)?,
+                Some(size) => size
+                    .parse::<PhotoSize>()
+                    .map_err(|expected| Error::request(format!("--size {size}: {expected}")))?,
                 None => self.render_height.map_or(PhotoSize::Own, |_| PhotoSize::Exactly(target_size)),
             };
             return Ok(EvalScene::without_context(capture, holdout, size)?);

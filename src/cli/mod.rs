@@ -214,14 +214,6 @@ fn check_views(views: Option<usize>) -> Result<(), Error> {
     }
 }
 
-/// Returns an error if a former option has another value than the one that is left, with the reason `why`.
-fn check_former_option(name: &str, value: Option<&str>, left: &str, why: &str) -> Result<(), Error> {
-    match value.filter(|&value| value != left) {
-        Some(value) => Err(Error::request(format!("{name} {value}: expected {left}; {why}"))),
-        None => Ok(()),
-    }
-}
-
 /// Opens a capture and prints warnings about what is ignored or changed in it.
 fn open_capture(path: &Path) -> globalsplat::Result<Capture> {
     open_masked_capture(path, None)

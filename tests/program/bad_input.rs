@@ -269,7 +269,7 @@ fn options_that_do_not_apply() {
     let data = ["eval", "--weights", "w", "--data", "d", "--index", "i.json", "--out", "o"];
     let model_options = [["--views", "4"], ["--views", "3"], ["--precision", "bf16"]];
     let dataset_options = [["--index", "i.json"], ["--size", "64"], ["--name", "n"]];
-    let scene_options = [["--holdout", "every:3"], ["--views", "3"], ["--sheet", "s.png"]];
+    let scene_options = [["--holdout", "every:3"], ["--views", "3"], ["--contact-sheet", "s.png"]];
     let commands: [(&[&str], [[&str; 2]; 3]); 4] = [
         (&["eval", "--splat", "s.ply", "--scene", "c"], model_options),
         (&["eval", "--renders", "r", "--scene", "c"], model_options),
@@ -363,12 +363,13 @@ fn unwritable_outputs_are_refused_before_the_work() {
         assert_says(&refuse(arguments), &["cameras.json/below.ply can't be written"]);
     }
     let picture = blocked.with_extension("png");
-    let error = refuse(&["eval", "--splat", arg(&splat), "--scene", arg(&room), "--sheet", arg(&picture)]);
+    let error =
+        refuse(&["eval", "--splat", arg(&splat), "--scene", arg(&room), "--contact-sheet", arg(&picture)]);
     assert_says(&error, &["cameras.json/below.png can't be written"]);
     assert_eq!(std::fs::read(room.join("cameras.json")).unwrap(), before);
     let photo = folder.path().join("sheet.jpg");
     for command in [
-        &["eval", "--splat", arg(&splat), "--scene", arg(&room), "--sheet", arg(&photo)][..],
+        &["eval", "--splat", arg(&splat), "--scene", arg(&room), "--contact-sheet", arg(&photo)][..],
         &["synth", "--out", arg(&folder.path().join("worlds")), "--contact-sheet", arg(&photo)],
     ] {
         assert_says(&refuse(command), &["sheet.jpg", "the image's file extension is another, expected .png"]);

@@ -103,7 +103,7 @@ fn names_that_are_not_utf_8() {
     let model = ["reconstruct", "--weights", "@tiny.safetensors", "--out", "@made.ply"];
     folder.json(&[&model[..], &room].concat(), &["/splat", "/weights"]);
     let splat = ["--splat", "@rooms/room_000/truth.ply"];
-    let refine = ["refine", "--steps", "1", "--sheet", "@sheet.png", "--out", "@refined.spz"];
+    let refine = ["refine", "--steps", "1", "--contact-sheet", "@sheet.png", "--out", "@refined.spz"];
     folder.json(&[&refine[..], &splat, &room].concat(), &["/splat"]);
     folder.json(&["convert", "@refined.spz", "@refined.splat"], &["/from/splat", "/to/splat"]);
     for (out, orbit) in [("@views", false), ("@orbit.png", true), ("@orbit.gif", true)] {
@@ -112,7 +112,7 @@ fn names_that_are_not_utf_8() {
     }
     folder.json(&[&["bench", "raster", "--repeats", "1"], &splat[..], &room].concat(), &[]);
 
-    folder.json(&[&["eval", "--sheet", "@scores.png"], &splat[..], &room].concat(), &[]);
+    folder.json(&[&["eval", "--contact-sheet", "@scores.png"], &splat[..], &room].concat(), &[]);
     write("index.json", &json!({"room_001": {"context": [0, 2], "target": [1, 3]}}).to_string());
     std::fs::create_dir(folder.0.join("splats")).expect("a folder");
     std::fs::copy(folder.0.join("rooms/room_001/truth.ply"), folder.0.join("splats/room_001.ply"))
