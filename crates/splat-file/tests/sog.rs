@@ -124,7 +124,7 @@ fn bad_metas() {
         ("", "count", json!(u64::MAX), "expected 18446744073709551615"),
         ("", "scales", json!({}), "codebook"),
         ("scales", "codebook", json!([1.]), "an index in scales.webp"),
-        ("quats", "files", json!(["../quats.webp"]), "a file name without a folder"),
+        ("quats", "files", json!(["../quats.webp"]), "expected a name without a folder"),
         ("shN", "bands", json!(4), "shN.bands is 4, expected 1 to 3"),
         ("shN", "bands", json!(2), "the width of shN_centroids.webp is 192, expected 512"),
         ("shN", "count", json!(2), "an index in shN_labels.webp is 2, expected less than 2"),
