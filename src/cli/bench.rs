@@ -1,4 +1,4 @@
-use super::{device, distributed, model, open_capture, parse_size, print_json, warn};
+use super::{device, distributed, keep_freed_memory, model, open_capture, parse_size, print_json, warn};
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use globalsplat::bench::{bench_model, bench_raster, bench_refine, bench_train, synthetic_gaussians};
@@ -35,9 +35,15 @@ enum Part {
 impl Bench {
     pub fn run(self) -> Result<()> {
         match self.part {
-            Part::Raster(raster) => raster.run(),
+            Part::Raster(raster) => {
+                keep_freed_memory();
+                raster.run()
+            }
             Part::Model(model) => model.run(),
-            Part::Refine(refine) => refine.run(),
+            Part::Refine(refine) => {
+                keep_freed_memory();
+                refine.run()
+            }
             Part::Train(train) => train.run(),
         }
     }
@@ -265,6 +271,9 @@ impl Train {
         let mut config = self.config.read()?;
         if let Some(set) = self.config.set.iter().find(|set| set.trim_start().starts_with("train.batch")) {
             return Err(Error::request(format!("--set {set}: expected --batch N")).into());
+        }
+        if !config.train.checkpoint_rounds {
+            keep_freed_memory();
         }
         let report = match self.batch {
             Batch::Scenes(scenes) => {

@@ -250,6 +250,18 @@ fn warn_of_many<'a>(lines: impl Iterator<Item = &'a String>) {
     }
 }
 
+/// Makes the process keep freed memory, for commands that allocate the same sizes again and again: the system zeroes every page that it
+/// hands out, and by default glibc returns the memory of large tensors to it. A million Gaussians at 1920×1080 take a fifth longer
+/// without this (`globalsplat bench raster`), and a training step of the main model a sixth (docs/speed.md).
+fn keep_freed_memory() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    // SAFETY: the calls set parameters of the allocator.
+    unsafe {
+        libc::mallopt(libc::M_MMAP_MAX, 0);
+        libc::mallopt(libc::M_TRIM_THRESHOLD, -1);
+    }
+}
+
 /// Prints a result as one JSON object.
 fn print_json(value: &serde_json::Value) {
     println!("{value}");

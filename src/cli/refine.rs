@@ -4,7 +4,8 @@ use super::capture::SceneSource;
 use super::progress::{self, Progress};
 use super::signals::StopRequest;
 use super::{
-    check_views, device, model, open_masked_capture, print_json, report_downscaling, splat_out, warn,
+    check_views, device, keep_freed_memory, model, open_masked_capture, print_json, report_downscaling,
+    splat_out, warn,
 };
 use anyhow::Result;
 use clap::Args;
@@ -179,6 +180,7 @@ impl Refine {
         if self.reports.contact_sheet.is_some() {
             session.reserve_for_contact_sheet(&gaussians)?;
         }
+        keep_freed_memory();
         let result = session.run()?;
         bar.bar.finish_and_clear();
         if result.is_initial && result.steps > 0 {

@@ -1,4 +1,4 @@
-use super::{distributed, print_json, progress, stop_flag, warn_of_many};
+use super::{distributed, keep_freed_memory, print_json, progress, stop_flag, warn_of_many};
 use anyhow::Result;
 use clap::Args;
 use globalsplat::config::Config;
@@ -64,6 +64,10 @@ impl Train {
         let (group, device) = distributed::join(&self.device)?;
         let (is_main_process, count) = (group.is_main_process(), group.world_size());
         let config = Config::read(&self.config, &self.set)?;
+        // Recomputed rounds save memory, of which kept pages would take a third more.
+        if !config.train.checkpoint_rounds {
+            keep_freed_memory();
+        }
         let resume = match self.resume.to_str() {
             Some("auto") => Resume::Auto,
             Some("never") => Resume::Never,

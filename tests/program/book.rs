@@ -78,7 +78,7 @@ fn configuration_page_matches_source() {
         (&["model"][..], "src/model/config.rs", "ModelConfig"),
         (&["data"], "src/data/config.rs", "DataConfig"),
         (&["data", "jitter"], "src/data/config.rs", "JitterConfig"),
-        (&["curriculum"], "src/config/curriculum.rs", "CurriculumConfig"),
+        (&["curriculum"], "src/config/train.rs", "CurriculumConfig"),
         (&["loss"], "src/loss/config.rs", "LossConfig"),
         (&["train"], "src/config/train.rs", "TrainConfig"),
     ] {
