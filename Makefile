@@ -90,6 +90,11 @@ parity: build
 	.venv/bin/python -m parity --self-test $(SELF_TEST)
 	.venv/bin/python -m parity --only '[pr][ra]*_float32,photometric,ssim,depth_smoothness' --cuda-on-cpu 1 --self-test $(SELF_TEST)
 
+# Tests the op of the Python package with the native module at hand.
+.PHONY: check-op
+check-op: build
+	scripts/check_op.sh
+
 # Everything: `make test`, and what takes longer than it finds. CONTRIBUTING.md says which change needs which part.
 SLOW_CHECKS := check-ignored check-docs check-features check-packages check-licenses check-robustness check-machines check-demos check-dist check-wheel
 .PHONY: test-all slow-checks $(SLOW_CHECKS)
