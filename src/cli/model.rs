@@ -1,10 +1,9 @@
-//! Shared code for `--weights`, `--precision auto|f32|bf16` and `--views-at`.
+//! Shared code for `--weights` and `--precision auto|f32|bf16`.
 
 use super::distributed;
 use globalsplat::config::Config;
 use globalsplat::model::{Precision, Stage};
-use globalsplat::reconstruct::{BUNDLED_MODEL, Input, LoadedModel, ModelFile};
-use globalsplat::scene::ImageSize;
+use globalsplat::reconstruct::{BUNDLED_MODEL, LoadedModel, ModelFile};
 use globalsplat::{Error, Result};
 use std::path::Path;
 use tch::Device;
@@ -57,17 +56,6 @@ pub fn name(weights: Option<&Path>) -> &Path {
 
 /// Warning for photos that are smaller than the size they are resized to.
 pub const ENLARGED: &str = "smaller photos are enlarged, which shows no more of the scene";
-
-/// Describes the size to which photos are resized for a model that was trained with images of `trained`.
-pub fn describe_input(input: Input, trained: ImageSize) -> String {
-    let pixels = |size: ImageSize| format!("{}×{} pixels", size.width, size.height);
-    let (photo, trained, views) =
-        (pixels(input.photo_size(trained)), pixels(trained), input.views_of_photo());
-    match input.is_plain() {
-        true => format!("the {trained} that the model sees"),
-        false => format!("{photo}, {views} views of the {trained} that the model sees"),
-    }
-}
 
 /// Returns a warning about weights whose training was stopped before the final stage.
 pub fn early_stage(stage: Stage, config: &Config) -> Option<String> {

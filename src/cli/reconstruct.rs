@@ -7,7 +7,7 @@ use clap::Args;
 use globalsplat::data::Capture;
 use globalsplat::device::{Stopwatch, peak_memory_bytes, process_age};
 use globalsplat::io::{InputFiles, check_writable_splat};
-use globalsplat::reconstruct::{Input, Model, load_context, reconstruct};
+use globalsplat::reconstruct::{load_context, reconstruct};
 use globalsplat::refine::RefineOptions;
 use globalsplat::scene::{ImageSize, LocalFrame};
 use serde_json::{Map, Value, json};
@@ -20,7 +20,7 @@ use std::path::PathBuf;
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat reconstruct --scene captures/room --out room.ply\n  \
     globalsplat reconstruct --photos photos/room --out room.ply\n  \
-    globalsplat reconstruct --weights model.safetensors --scene captures/room --views-at 512 --out room.ply")]
+    globalsplat reconstruct --weights model.safetensors --scene captures/room --out room.ply")]
 pub struct Reconstruct {
     /// Weights: a file that `export` or `import` wrote, or a checkpoint (.ckpt); by default the weights embedded in this
     /// program
@@ -39,15 +39,11 @@ pub struct Reconstruct {
     /// for the weights embedded in this program
     #[arg(long, value_name = "N")]
     views: Option<usize>,
-    /// Height of the input photos in pixels, a multiple of the height the model was trained with: at N times that height a
-    /// photo becomes N² views that share its pixels; time and memory grow with the number of views, N²-fold at most
-    #[arg(long, value_name = "PIXELS")]
-    views_at: Option<u32>,
     /// Held-out views: every:N, every:N+K, or none for only the capture's own test split
     #[arg(long, value_name = "WHICH", default_value = "none")]
     holdout: String,
     /// Also refine the splat on all input photos for this time, as `refine --init model` does; as in 60s or 2m
-    #[arg(long, value_name = "TIME", value_parser = parse_seconds, conflicts_with_all = ["precision", "views_at"])]
+    #[arg(long, value_name = "TIME", value_parser = parse_seconds, conflicts_with = "precision")]
     refine: Option<f64>,
     /// Write coordinates relative to the centre of the cameras, which is stored in a file beside the splat: far from the
     /// world's origin, as in UTM coordinates, float32 loses detail
@@ -113,18 +109,13 @@ impl Reconstruct {
         self.weights.iter().for_each(|path| inputs.add(path));
         inputs.check_file(&self.out)?;
         let data = &loaded.config.data;
-        let input = match self.views_at {
-            Some(height) => Input::with_height(height, data.image_size)?,
-            None => Input::PLAIN,
-        };
         let count = self.views.unwrap_or(data.context_views);
-        let size = input.photo_size(data.image_size);
-        let photos = stopwatch.time("photos", || load_context(&capture, holdout, Some(count), size))?;
-        if let Some(line) = fitting(&capture, photos.len(), input, data.image_size) {
+        let photos =
+            stopwatch.time("photos", || load_context(&capture, holdout, Some(count), data.image_size))?;
+        if let Some(line) = fitting(&capture, photos.len(), data.image_size) {
             eprintln!("{line}");
         }
-        let model = Model { input, ..Model::from(&loaded) };
-        let reconstruction = stopwatch.time("network", || reconstruct(model, &photos, &[]))?;
+        let reconstruction = stopwatch.time("network", || reconstruct(&loaded, &photos, &[]))?;
         stopwatch.time("splat", || {
             let (splat, cameras) = (reconstruction.to_splat()?, capture.cameras());
             let origin = self.local_origin.then(|| LocalFrame::from_cameras(&cameras).origin);
@@ -139,15 +130,13 @@ impl Reconstruct {
         let from_start = process_age().map(|age| age.as_secs_f64());
 
         let bytes = std::fs::metadata(&self.out)?.len();
-        let views = photos.len() * input.views_of_photo();
         let (count, seconds) = (reconstruction.gaussians.count(), reconstruction.forward_time.as_secs_f64());
         if self.json {
             print_json(&json!({
                 "splat": self.out.to_string_lossy(),
                 "weights": model::name(self.weights.as_deref()).to_string_lossy(),
                 "photos": photos.len(),
-                "image_size": input.photo_size(data.image_size),
-                "views": views,
+                "image_size": data.image_size,
                 "gaussians": count,
                 "precision": loaded.model.precision(),
                 "load_seconds": parts["weights"],
@@ -164,8 +153,9 @@ impl Reconstruct {
                 _ => "forward pass and fit of colours",
             };
             println!(
-                "{}: {count} Gaussians from {views} views, {megabytes:.2} MB; {pass} {seconds:.2} s, peak memory {:.2} GB",
+                "{}: {count} Gaussians from {} photos, {megabytes:.2} MB; {pass} {seconds:.2} s, peak memory {:.2} GB",
                 self.out.display(),
+                photos.len(),
                 peak_memory_bytes() as f64 / 1e9
             );
         }
@@ -185,19 +175,16 @@ fn parse_seconds(text: &str) -> Result<f64, String> {
 
 /// Describes how the capture's photos are selected and resized before a model that was trained with images of `trained` gets
 /// `shown` of them; `None` if they are used unchanged.
-fn fitting(capture: &Capture, shown: usize, input: Input, trained: ImageSize) -> Option<String> {
-    let size = input.photo_size(trained);
+fn fitting(capture: &Capture, shown: usize, trained: ImageSize) -> Option<String> {
     let sizes: BTreeSet<(u32, u32)> = capture.cameras().iter().map(|c| (c.width, c.height)).collect();
     let chosen = (shown < capture.len())
         .then(|| format!("{shown} of {} photos are shown, spread over the camera's path", capture.len()));
-    let model = model::describe_input(input, trained);
+    let model = format!("the {}×{} pixels that the model sees", trained.width, trained.height);
     let fitted = match sizes.first() {
-        Some((width, height)) if sizes.len() == 1 => ((*width, *height) != (size.width, size.height))
+        Some((width, height)) if sizes.len() == 1 => ((*width, *height) != (trained.width, trained.height))
             .then(|| format!("{width}×{height} pixels are cut and resized to {model}")),
         _ => Some(format!("photos of {} sizes are cut and resized to {model}", sizes.len())),
     };
-    let fitted = fitted.or_else(|| (!input.is_plain()).then(|| format!("photos are shown as {model}")));
-    let enlarged = (!input.is_plain() && capture.has_smaller(size)).then(|| model::ENLARGED.to_string());
-    let parts: Vec<String> = chosen.into_iter().chain(fitted).chain(enlarged).collect();
+    let parts: Vec<String> = chosen.into_iter().chain(fitted).collect();
     (!parts.is_empty()).then(|| format!("{}: {}", capture.name, parts.join("; ")))
 }

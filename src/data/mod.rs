@@ -10,7 +10,6 @@ mod jitter;
 mod loading;
 mod photo_size;
 mod pixels;
-mod polyphase;
 mod view;
 
 pub use batch::{ViewBatch, view_batch};
@@ -30,7 +29,6 @@ pub use loading::{
 pub(crate) use photo_size::MIN_SHORTER_SIDE;
 pub use photo_size::{MIN_SIDE, PhotoSize};
 pub use pixels::Pixels;
-pub use polyphase::polyphase;
 pub use view::{View, load_all_views, load_views, tensor_from_planes};
 
 // Exchanged between processes.

@@ -66,13 +66,6 @@ impl Pixels {
     pub(crate) fn to_device(&self, device: Device) -> Self {
         Pixels(self.0.to_device(device))
     }
-
-    /// Returns the pixels after `change`, which doesn't change their values, such as taking a part of them.
-    pub(crate) fn map(&self, change: impl FnOnce(&Tensor) -> Tensor) -> Self {
-        let changed = change(&self.0);
-        assert_eq!(changed.kind(), self.0.kind(), "values would change their meaning");
-        Pixels(changed)
-    }
 }
 
 #[cfg(test)]

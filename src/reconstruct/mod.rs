@@ -3,12 +3,10 @@
 
 mod colour_fit;
 mod context;
-mod input;
 mod model_file;
 mod published;
 
 pub use context::{context_views, load_context, spread_over_path};
-pub use input::Input;
 pub use model_file::{
     BUNDLED_MODEL, CONFIG_KEY, LoadedModel, ModelDtype, ModelFile, STAGE_KEY, bundled_model, load_model,
     model_weights, save_checkpoint, save_model,
@@ -40,14 +38,12 @@ pub struct Model<'a> {
     pub stage: Stage,
     /// Device of the weights.
     pub device: Device,
-    /// Conversion of photos to the views that the model sees.
-    pub input: Input,
 }
 
 impl<'a> From<&'a LoadedModel> for Model<'a> {
     fn from(loaded: &'a LoadedModel) -> Self {
         let LoadedModel { model: network, config, stage, vs, .. } = loaded;
-        Model { network, config, stage: *stage, device: vs.device(), input: Input::PLAIN }
+        Model { network, config, stage: *stage, device: vs.device() }
     }
 }
 
@@ -88,10 +84,9 @@ impl Reconstruction {
     }
 }
 
-/// Runs the model once over `photos`, all of one size, which are converted to the views that it sees ([`Input`]). If its configuration has
-/// `data.depths`, the model gets the photos' depths, too; `data.colour_steps` steps fit the colours to the photos afterwards. `targets` are
-/// poses (camera-to-world, in the capture's world) of target views: they take part in the normalization, as in the paper's protocol. Each
-/// photo takes part once, however many views it becomes.
+/// Runs the model once over `photos`, all of one size. If its configuration has `data.depths`, the model gets the photos' depths, too;
+/// `data.colour_steps` steps fit the colours to the photos afterwards. `targets` are poses (camera-to-world, in the capture's world) of
+/// target views: they take part in the normalization, as in the paper's protocol.
 ///
 /// # Errors
 /// Fails with fewer than two photos, with images whose sides aren't multiples of the model's patch size, or if rendering to the photos'
@@ -128,12 +123,11 @@ pub fn reconstruct<'a>(
     let poses: Vec<DMat4> =
         photos.iter().map(|photo| photo.camera.c2w).chain(targets.iter().copied()).collect();
     let normalization = normalize(&poses)?;
-    let views = photos.iter().map(|photo| model.input.views(photo)).collect::<Result<Vec<_>>>()?;
     let data = &model.config.data;
     let start = Instant::now();
     let (poses, target_poses) = normalization.c2w.split_at(photos.len());
     let depths = data.depths.then(|| depths_of(photos, poses, data.image_size));
-    let mut gaussians = run_model(model, &views, poses, depths.as_ref())?;
+    let mut gaussians = run_model(model, photos, poses, depths.as_ref())?;
     if data.colour_steps > 0 {
         let batch = view_batch(photos, poses, model.device);
         gaussians = fit_colours(&gaussians, &batch, data.colour_steps)?;
@@ -157,24 +151,12 @@ fn depths_of(photos: &[View], poses: &[DMat4], size: ImageSize) -> Tensor {
     if depths.size()[2..] == size { depths } else { depths.upsample_bilinear2d(size, false, None, None) }
 }
 
-/// Runs the model on its device over `views`, the views of each photo, with the photos' `poses` in a normalized world. `depths` of the
-/// photos [V, 2, H, W] are those of [`pixel_depths`], in units of the normalized world.
-fn run_model(
-    model: Model,
-    views: &[Vec<View>],
-    poses: &[DMat4],
-    depths: Option<&Tensor>,
-) -> Result<Gaussians> {
-    let Model { network, config, stage, device, .. } = model;
-    let posed =
-        views.iter().zip(poses).flat_map(|(of_photo, &pose)| of_photo.iter().map(move |view| (view, pose)));
-    let (views, poses): (Vec<&View>, Vec<DMat4>) = posed.unzip();
-    // All views of a photo have its depths.
-    let repeated = |depths: &Tensor| {
-        let of_photo = views.len() as i64 / depths.size()[0];
-        depths.repeat_interleave_self_int(of_photo, 0, None).unsqueeze(0).to_device(device)
-    };
-    let batch = ViewBatch { depths: depths.map(repeated), ..view_batch(&views, &poses, device) };
+/// Runs the model on its device over `photos` with `poses` in a normalized world. `depths` [V, 2, H, W] are those of [`pixel_depths`], in
+/// units of the normalized world.
+fn run_model(model: Model, photos: &[View], poses: &[DMat4], depths: Option<&Tensor>) -> Result<Gaussians> {
+    let Model { network, config, stage, device } = model;
+    let depths = depths.map(|depths| depths.unsqueeze(0).to_device(device));
+    let batch = ViewBatch { depths, ..view_batch(photos, poses, device) };
     let input = batch.model_input();
     config.model.check_image(input.images.size()[3], input.images.size()[4])?;
     Ok(tch::no_grad(|| network.forward(&input, stage)).gaussians)

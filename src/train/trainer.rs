@@ -14,7 +14,7 @@ use crate::error::{Error, Result};
 use crate::loss::{Losses, PerceptualLoss, StepFraction};
 use crate::model::{GlobalSplat, Growth, Precision, Stage};
 use crate::optim::Optimizer;
-use crate::reconstruct::{Input, Model, ModelFile};
+use crate::reconstruct::{Model, ModelFile};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -468,6 +468,6 @@ impl Trainer {
     pub fn as_model(&self) -> Model<'_> {
         let stage = self.stage();
         let (network, config, device) = (&self.model, &self.config, self.vs.device());
-        Model { network, config, stage, device, input: Input::PLAIN }
+        Model { network, config, stage, device }
     }
 }

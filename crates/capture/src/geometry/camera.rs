@@ -33,15 +33,6 @@ impl Intrinsics {
         Intrinsics { cx: self.cx - left, cy: self.cy - top, ..*self }
     }
 
-    /// Returns the intrinsics of the image made of every `step`-th column and row, starting at `column` and `row`. Its pixels keep
-    /// their rays.
-    pub fn strided(&self, step: f64, column: f64, row: f64) -> Self {
-        // A pixel centre at column + step·j + ½ moves to j + ½.
-        let moved = |point: f64, first: f64| (point - first - 0.5) / step + 0.5;
-        let (cx, cy) = (moved(self.cx, column), moved(self.cy, row));
-        Intrinsics { fx: self.fx / step, fy: self.fy / step, cx, cy }
-    }
-
     /// Returns the 3×3 matrix, row by row.
     pub fn to_rows(&self) -> [f64; 9] {
         [self.fx, 0., self.cx, 0., self.fy, self.cy, 0., 0., 1.]
