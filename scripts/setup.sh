@@ -79,7 +79,7 @@ if ! cmp -s requirements.txt .venv/requirements.txt; then
     echo "setup: installing what requirements.txt pins into .venv (libtorch is most of it)" >&2
     if [ ! -e .venv/libtorch ]; then
         # Meanwhile, cargo compiles the crates that don't need libtorch, at low priority. The others fail, and are built later.
-        nice "${CARGO:-cargo}" build --release --locked --keep-going >/dev/null 2>&1 &
+        nice "${CARGO:-cargo}" build --release --locked --workspace --keep-going >/dev/null 2>&1 &
         early=$!
         trap 'kill "$early" 2>/dev/null || true' EXIT
     fi
