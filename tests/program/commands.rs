@@ -460,7 +460,7 @@ fn a_run_goes_from_photos_to_a_splat() {
             "--json",
         ]);
         assert_eq!(report["gaussians"], 16 * 4);
-        assert_eq!(report["views"], 3, "as many as in training");
+        assert_eq!(report["photos"], 3, "as many as in training");
         assert!(
             report["seconds"].as_f64().unwrap() > 0.
                 && report["peak_memory_bytes"].as_u64().unwrap() > 1 << 20
@@ -475,7 +475,7 @@ fn a_run_goes_from_photos_to_a_splat() {
     let output =
         globalsplat(&["reconstruct", "--scene", arg(&room), "--views", "5", "--out", arg(&splat), "--json"]);
     let report: Value = serde_json::from_slice(&output.stdout).expect("JSON");
-    assert_eq!((&report["weights"], &report["views"]), (&json!("models/tiny.safetensors"), &json!(5)));
+    assert_eq!((&report["weights"], &report["photos"]), (&json!("models/tiny.safetensors"), &json!(5)));
     assert_eq!(report["precision"], "f32", "they are narrow");
     let message = String::from_utf8_lossy(&output.stderr);
     let expected = "room_000: 5 of 9 photos are shown, spread over the camera's path; 40×40 pixels are cut and resized to ";
