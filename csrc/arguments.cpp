@@ -33,7 +33,7 @@ void Arguments::check() const {
   TORCH_CHECK(count < kMaxCount, "there are ", count, " Gaussians, expected fewer than ", kMaxCount);
   TORCH_CHECK(projection.eps2d >= 0, "eps2d is ", projection.eps2d, ", expected 0 or more");
   TORCH_CHECK(projection.near_plane >= 0, "near_plane is ", projection.near_plane, ", expected 0 or more");
-  TORCH_CHECK(!projection.direct_colours || bases == 1, "colours have shape ", sh.sizes(), ", expected [B, N, 1, 3]");
+  TORCH_CHECK(!projection.direct_colors || bases == 1, "colors have shape ", sh.sizes(), ", expected [B, N, 1, 3]");
 }
 
 Inputs Arguments::to_inputs(at::Device device) const {

@@ -49,7 +49,7 @@ struct RenderOutput {
 // Outputs of project(), or their gradients, except that `visible`, `opacity` and `variance` have none; shapes as in splat.h.
 // `opacity`, [B, C, N], is that of the splat, which antialiasing reduces, and `variance`, [B, C, N, 2], the diagonal of its covariance.
 struct Projected {
-  Tensor visible, mean2d, conic, depth, colour, opacity, variance;
+  Tensor visible, mean2d, conic, depth, color, opacity, variance;
 };
 
 // State other than tensors that a backend's splat() passes to its splat_backward().

@@ -102,7 +102,7 @@ struct ProjectFunction : torch::autograd::Function<ProjectFunction> {
     const Projected projected = backend_of(means).project(in);
     save(ctx, in, nullptr);
     ctx->mark_non_differentiable({projected.visible});
-    return {projected.visible, projected.mean2d, projected.conic, projected.depth, projected.colour};
+    return {projected.visible, projected.mean2d, projected.conic, projected.depth, projected.color};
   }
 
   static tensor_list backward(AutogradContext* ctx, tensor_list g) {

@@ -18,7 +18,7 @@ void splat(const SplatArguments& of, rust::Slice<size_t> out);
 
 // Projects Gaussians: the rasterizer's first step as a separate op, so that it can be tested by itself. `out` receives five new tensors:
 // visible [B, C, N] (int64, 1 if a Gaussian isn't dropped), mean2d [B, C, N, 2], conic [B, C, N, 3] (xx, xy, yy of the inverse 2D
-// covariance), depth [B, C, N] and colour [B, C, N, 3]; zeros for Gaussians that aren't visible. Differentiable with respect to means,
+// covariance), depth [B, C, N] and color [B, C, N, 3]; zeros for Gaussians that aren't visible. Differentiable with respect to means,
 // scales, quaternions, sh and w2c.
 void project(const SplatArguments& of, rust::Slice<size_t> out);
 

@@ -31,7 +31,7 @@ SETTINGS = [
     "model.latents=256",
     "data.image_size=[64, 64]",
     "data.depths=false",
-    "data.colour_steps=0",
+    "data.color_steps=0",
     "data.context_views=8",
     "data.min_context_views=0",
     "data.window=[8, 12]",
@@ -61,8 +61,8 @@ VARIANTS = {
     "single stream": ["model.streams=single", "model.width=192"],
     "full capacity": ["curriculum.full_capacity=true"],
     "depths": ["data.depths=true"],
-    "fitted colours": ["data.colour_steps=20"],
-    "depths, fitted colours": ["data.depths=true", "data.colour_steps=20"],
+    "fitted colors": ["data.color_steps=20"],
+    "depths, fitted colors": ["data.depths=true", "data.color_steps=20"],
     "full model, bf16": ["train.precision=bf16"],
 }
 # Number of equal parts of a run over which its curve is averaged.

@@ -110,7 +110,7 @@ class Render {
 
   void expect_bits_of(Render& other) {
     for (size_t k = 0; k < pictures_.size(); ++k) {
-      expect(same(pictures_[k].rgb, other.pictures_[k].rgb), "colours differ from one thread's");
+      expect(same(pictures_[k].rgb, other.pictures_[k].rgb), "colors differ from one thread's");
       expect(same(pictures_[k].alpha, other.pictures_[k].alpha), "opacities differ from one thread's");
       expect(same(pictures_[k].depth, other.pictures_[k].depth), "depths differ from one thread's");
     }

@@ -89,7 +89,7 @@ inline Scene<double> random_scene(Random& random, std::string name, int width, i
   return scene;
 }
 
-// Creates a scene of the given Gaussians, with random rotations and colours. The first camera is at the origin, without rotation; others
+// Creates a scene of the given Gaussians, with random rotations and colors. The first camera is at the origin, without rotation; others
 // are translated.
 inline Scene<double> make_scene(Random& random, std::string name, int bases, std::vector<double> means,
                                 std::vector<double> scales, std::vector<double> opacities, int cameras = 1, int width = 48,
@@ -216,8 +216,8 @@ inline std::vector<Scene<double>> all_scenes(int bases) {
 
   // Every scene is antialiased with two of the four numbers of bases.
   for (size_t i = 0; i < scenes.size(); ++i) scenes[i].projection.antialiased = (i + size_t(bases)) % 2 == 1;
-  // A third of those with a single basis function have colours instead.
-  for (size_t i = 0; bases == 1 && i < scenes.size(); i += 3) scenes[i].projection.direct_colours = true;
+  // A third of those with a single basis function have colors instead.
+  for (size_t i = 0; bases == 1 && i < scenes.size(); i += 3) scenes[i].projection.direct_colors = true;
   return scenes;
 }
 

@@ -144,7 +144,7 @@ double max_abs_difference(const Numbers& a, const Numbers& b) {
 }  // namespace
 
 std::string schedules_differ(const Scene<float>& scene, const std::vector<uint64_t>& seeds) {
-  const char* const names[] = {"colours", "opacities", "depths", "means", "scales", "quaternions", "opacities' gradients",
+  const char* const names[] = {"colors", "opacities", "depths", "means", "scales", "quaternions", "opacities' gradients",
                                "spherical harmonics", "cameras"};
   RenderResult cpu = render_on_cpu(scene), first = render_emulated(scene, seeds[0]);
   // Infinite values and NaN spread to other pixels: of a block on the CPU, of two blocks in the kernels. These scenes aren't compared.

@@ -63,7 +63,7 @@ Projected project_as(const Inputs& in) {
     put(out.mean2d, at, {s.u, s.v});
     put(out.conic, at, {two_ln2 * s.a * s.a, two_ln2 * s.a * s.b, two_ln2 * (s.b * s.b + s.c * s.c)});
     put(out.depth, at, {s.z});
-    put(out.colour, at, {s.red, s.green, s.blue});
+    put(out.color, at, {s.red, s.green, s.blue});
     put(out.opacity, at, {std::exp2(s.log2_opacity)});
     // From the factor, since the inverse of a needle's conic loses all digits.
     const T slope = s.b / s.c;
@@ -81,7 +81,7 @@ Gradients project_backward_as(const Inputs& in, const Projected& gradients, Grad
   std::vector<std::vector<uint32_t>> first(views, std::vector<uint32_t>(count + 1, 0));
   projected.for_each_visible([&](size_t view, int64_t at, const raster::Splat<T>& s) {
     const T *d_mean = gradients.mean2d.data_ptr<T>() + 2 * at, *d_conic = gradients.conic.data_ptr<T>() + 3 * at;
-    const T* d_colour = gradients.colour.data_ptr<T>() + 3 * at;
+    const T* d_color = gradients.color.data_ptr<T>() + 3 * at;
     // With Σ2D⁻¹ = 2 ln 2·UᵀU: ∂L/∂(u, v) = 2 ln 2·UᵀM, and W = 2UNUᵀ for N = ∂L/∂(Σ2D⁻¹), where the single value xy stands for two
     // entries.
     const T two_ln2 = T(2 / raster::kLog2E);
@@ -91,9 +91,9 @@ Gradients project_backward_as(const Inputs& in, const Projected& gradients, Grad
     d.power_pp = 2 * (s.a * s.a * d_conic[0] + s.a * s.b * d_conic[1] + s.b * s.b * d_conic[2]);
     d.power_pr = s.a * s.c * d_conic[1] + 2 * s.b * s.c * d_conic[2];
     d.power_rr = 2 * s.c * s.c * d_conic[2];
-    d.red = d_colour[0];
-    d.green = d_colour[1];
-    d.blue = d_colour[2];
+    d.red = d_color[0];
+    d.green = d_color[1];
+    d.blue = d_color[2];
     d.z = gradients.depth.data_ptr<T>()[at];
     records[view].push_back(d);
     first[view][size_t(at) % count + 1] = 1;

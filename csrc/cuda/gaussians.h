@@ -121,7 +121,7 @@ __global__ void __launch_bounds__(kGaussianThreads, 4)
         const ProjectionParams<float>& of_view = params[view + k];
         float d_r[3];
         const Splat<float>& splat = splats[place];
-        const auto is_unclamped = [&](float colour) { return of_view.direct_colours || colour > 0; };
+        const auto is_unclamped = [&](float color) { return of_view.direct_colors || color > 0; };
         for (int n = 0; n < 3; ++n) group.mean[n] = scene.means[3 * i + n];
         raster::lane::compute_directions(group, scene.bases, of_view, true, shading);
         raster::lane::shade_group_backward<float>(

@@ -106,11 +106,11 @@ Gradients project_backward(const Inputs& in, const Projected& gradients, Gradien
   const std::vector<Tensor> s = numbers_of(projected, in);
   const Tensor &a = s[kA], &b = s[kB], &c = s[kC];
   const std::vector<Tensor> d_mean = gradients.mean2d.unbind(-1), d_conic = gradients.conic.unbind(-1);
-  const std::vector<Tensor> d_colour = gradients.colour.unbind(-1);
+  const std::vector<Tensor> d_color = gradients.color.unbind(-1);
   const Tensor p = d_mean[0] / (kTwoLn2 * a), r = (d_mean[1] - kTwoLn2 * b * p) / (kTwoLn2 * c);
   const Tensor all = at::stack({at::zeros_like(p), p, r, 2 * (a * a * d_conic[0] + a * b * d_conic[1] + b * b * d_conic[2]),
-                                a * c * d_conic[1] + 2 * b * c * d_conic[2], 2 * c * c * d_conic[2], d_colour[0], d_colour[1],
-                                d_colour[2], gradients.depth},
+                                a * c * d_conic[1] + 2 * b * c * d_conic[2], 2 * c * c * d_conic[2], d_color[0], d_color[1],
+                                d_color[2], gradients.depth},
                                -1);
   const Tensor visible = (s[kZ] > 0).flatten();
   const Tensor records = all.flatten(0, 2).index_select(0, visible.nonzero().squeeze(1)).contiguous();

@@ -153,9 +153,9 @@ __global__ void __launch_bounds__(kTileThreads, kBackwardBlocks)
     const RenderOutput<const float> outputs = pictures_of(pictures, call.grid, blockIdx.y);
     const RenderOutput<const float> output_gradients = pictures_of(gradients, call.grid, blockIdx.y);
     const int64_t at = pixel.place;
-    const float colour[3] = {outputs.rgb[at], outputs.rgb[at + plane], outputs.rgb[at + 2 * plane]};
-    const float g_colour[3] = {output_gradients.rgb[at], output_gradients.rgb[at + plane], output_gradients.rgb[at + 2 * plane]};
-    state = raster::lane::pixel_gradients<float>(1, colour, outputs.alpha[at], outputs.depth[at], g_colour, output_gradients.alpha[at],
+    const float color[3] = {outputs.rgb[at], outputs.rgb[at + plane], outputs.rgb[at + 2 * plane]};
+    const float g_color[3] = {output_gradients.rgb[at], output_gradients.rgb[at + plane], output_gradients.rgb[at + 2 * plane]};
+    state = raster::lane::pixel_gradients<float>(1, color, outputs.alpha[at], outputs.depth[at], g_color, output_gradients.alpha[at],
                                                  output_gradients.depth[at]);
   }
 

@@ -185,19 +185,19 @@ template <class T>
 GS_INLINE void load_gradients(const BlockPlace& at, int64_t plane, const RenderOutput<const T>& pictures,
                               const RenderOutput<const T>& gradients, PixelGradients<T>* out) {
   using V = Vector<T>;
-  V transmittance[kVectors<T>], colour[3][kVectors<T>], g_colour[3][kVectors<T>];
+  V transmittance[kVectors<T>], color[3][kVectors<T>], g_color[3][kVectors<T>];
   V alpha[kVectors<T>], g_alpha[kVectors<T>], depth[kVectors<T>], g_depth[kVectors<T>];
   begin_block<T>(at, transmittance);
   for (int channel = 0; channel < 3; ++channel) {
-    load_block(pictures.rgb + channel * plane, at, colour[channel]);
-    load_block(gradients.rgb + channel * plane, at, g_colour[channel]);
+    load_block(pictures.rgb + channel * plane, at, color[channel]);
+    load_block(gradients.rgb + channel * plane, at, g_color[channel]);
   }
   load_block(pictures.alpha, at, alpha);
   load_block(gradients.alpha, at, g_alpha);
   load_block(pictures.depth, at, depth);
   load_block(gradients.depth, at, g_depth);
   for (int k = 0; k < kVectors<T>; ++k) {
-    const V c[3] = {colour[0][k], colour[1][k], colour[2][k]}, g[3] = {g_colour[0][k], g_colour[1][k], g_colour[2][k]};
+    const V c[3] = {color[0][k], color[1][k], color[2][k]}, g[3] = {g_color[0][k], g_color[1][k], g_color[2][k]};
     out[k] = pixel_gradients<T>(transmittance[k], c, alpha[k], depth[k], g, g_alpha[k], g_depth[k]);
   }
 }

@@ -119,12 +119,12 @@ struct PixelGradients {
 
 // Returns the state before the first splat, from the outputs of the forward pass and the gradients with respect to them.
 template <class T>
-GS_INLINE PixelGradients<T> pixel_gradients(Vector<T> transmittance, const Vector<T> colour[3], Vector<T> alpha, Vector<T> depth,
-                                            const Vector<T> g_colour[3], Vector<T> g_alpha, Vector<T> g_depth) {
+GS_INLINE PixelGradients<T> pixel_gradients(Vector<T> transmittance, const Vector<T> color[3], Vector<T> alpha, Vector<T> depth,
+                                            const Vector<T> g_color[3], Vector<T> g_alpha, Vector<T> g_depth) {
   const Vector<T> per_z = select(less(broadcast<T>(T(kMinDepthAlpha)), alpha), g_depth / alpha, Vector<T>{});
   Vector<T> total = g_alpha * alpha;
-  for (int channel = 0; channel < 3; ++channel) total = add_product(g_colour[channel], colour[channel], total);
-  return {transmittance, total, g_colour[0], g_colour[1], g_colour[2], per_z, g_alpha - per_z * depth};
+  for (int channel = 0; channel < 3; ++channel) total = add_product(g_color[channel], color[channel], total);
+  return {transmittance, total, g_color[0], g_color[1], g_color[2], per_z, g_alpha - per_z * depth};
 }
 
 // Processes a splat: updates the state, and adds the splat's gradient to `sums`, in SplatGradient's order.

@@ -4,7 +4,7 @@
 //     (u, v) = (f_x t_x/z + c_x, f_y t_y/z + c_y)
 //     J = [[f_x/z, 0, −f_x a/z], [0, f_y/z, −f_y b/z]],   a = clamp(t_x/z), b = clamp(t_y/z)
 //     Σ2D = H Hᵀ + eps2d·I with H = J W R S;  det ≤ 0 is dropped
-//     colour = max(0, ½ + Σ_b Y_b(d) sh_b),  d = (μ − o)/‖μ − o‖,  o = −Wᵀ p;  with `direct_colours` colour = sh_0.
+//     color = max(0, ½ + Σ_b Y_b(d) sh_b),  d = (μ − o)/‖μ − o‖,  o = −Wᵀ p;  with `direct_colors` color = sh_0.
 //
 // If `antialiased` is set, opacities are multiplied by ρ = √(det(H Hᵀ) / det Σ2D), so that eps2d widens a Gaussian without adding to its
 // integral (Mip-Splatting, Yu et al. 2024, eq. 8).
@@ -48,11 +48,11 @@ struct Projection {
   Vector<T> factor_a, factor_b, factor_c;  // Splat's a, b, c
 };
 
-// Colours of a group in one camera.
+// Colors of a group in one camera.
 template <class T>
 struct Shading {
   Vector<T> direction[3], inverse_distance, basis[kMaxBases];
-  Vector<T> colour[3];  // without the clamp at 0
+  Vector<T> color[3];  // without the clamp at 0
 };
 
 // True if transpose4() can convert rows to lanes and back, for multiples of four elements and as many rows as lanes.
@@ -196,7 +196,7 @@ GS_INLINE void make_splats(const ProjectionParams<T>& params, const Projection<T
                            Vector<T> out[16]) {
   using V = Vector<T>;
   const V zero{}, a = p.factor_a, b = p.factor_b, c = p.factor_c;
-  const auto clamped = [&](V colour) { return params.direct_colours ? colour : larger(colour, zero); };
+  const auto clamped = [&](V color) { return params.direct_colors ? color : larger(color, zero); };
   // α ≥ 1/255 ⟺ s ≤ log₂(255·opacity). The margin covers the rounding of s, whose terms may exceed s itself: at the rim of a splat by 1 +
   // |b|/c.
   const V exact = p.log2_opacity + T(kLog2Of255), skew = magnitude(b) / c;
@@ -209,9 +209,9 @@ GS_INLINE void make_splats(const ProjectionParams<T>& params, const Projection<T
                          b,
                          c,
                          p.log2_opacity,
-                         clamped(s.colour[0]),
-                         clamped(s.colour[1]),
-                         clamped(s.colour[2]),
+                         clamped(s.color[0]),
+                         clamped(s.color[1]),
+                         clamped(s.color[2]),
                          select(p.visible, p.t[2], zero),
                          reach,
                          radius * sqrt(bb_cc) / (a * c) * T(1 + 1e-5) + T(1e-3),
@@ -222,7 +222,7 @@ GS_INLINE void make_splats(const ProjectionParams<T>& params, const Projection<T
   for (int k = 0; k < 16; ++k) out[k] = numbers[k];
 }
 
-// Computes directions and basis functions, without colours. Lanes in which `visible` is false get a direction of zero.
+// Computes directions and basis functions, without colors. Lanes in which `visible` is false get a direction of zero.
 template <class T>
 GS_INLINE void compute_directions(const Group<T>& g, int bases, const ProjectionParams<T>& params, Mask<T> visible, Shading<T>& s) {
   using V = Vector<T>;
@@ -234,15 +234,15 @@ GS_INLINE void compute_directions(const Group<T>& g, int bases, const Projection
   s.inverse_distance = select(visible, T(1) / sqrt(distance2), V{});
   for (int k = 0; k < 3; ++k) s.direction[k] *= s.inverse_distance;
   sh_basis<T>(bases, s.direction, s.basis);
-  if (params.direct_colours) s.basis[0] = broadcast<T>(T(1));
+  if (params.direct_colors) s.basis[0] = broadcast<T>(T(1));
 }
 
 template <class T>
 GS_INLINE void shade_group(const Group<T>& g, int bases, const ProjectionParams<T>& params, Mask<T> visible, Shading<T>& s) {
   compute_directions(g, bases, params, visible, s);
   for (int channel = 0; channel < 3; ++channel) {
-    s.colour[channel] = broadcast<T>(T(params.direct_colours ? 0 : 0.5));
-    for (int k = 0; k < bases; ++k) s.colour[channel] = fma(s.basis[k], g.sh[3 * k + channel], s.colour[channel]);
+    s.color[channel] = broadcast<T>(T(params.direct_colors ? 0 : 0.5));
+    for (int k = 0; k < bases; ++k) s.color[channel] = fma(s.basis[k], g.sh[3 * k + channel], s.color[channel]);
   }
 }
 
@@ -284,15 +284,15 @@ GS_INLINE void shade_group_backward(int bases, const Shading<T>& s, const Mask<T
   using V = Vector<T>;
   const V zero{};
   // Gradient of the mean through the direction: d = r/‖r‖, ∂d/∂r = (I − d dᵀ)/‖r‖.
-  V d_colour[3], d_basis[kMaxBases], d_direction[3];
-  for (int channel = 0; channel < 3; ++channel) d_colour[channel] = select(is_lit[channel], d[6 + channel], zero);
+  V d_color[3], d_basis[kMaxBases], d_direction[3];
+  for (int channel = 0; channel < 3; ++channel) d_color[channel] = select(is_lit[channel], d[6 + channel], zero);
   for (int k = 0; k < bases; ++k) {
     d_basis[k] = zero;
     for (int channel = 0; channel < 3; ++channel)
-      d_basis[k] = add_product(coefficient(3 * k + channel), d_colour[channel], d_basis[k]);
+      d_basis[k] = add_product(coefficient(3 * k + channel), d_color[channel], d_basis[k]);
   }
   for (int k = 0; k < bases; ++k)
-    for (int channel = 0; channel < 3; ++channel) add_product_to(3 * k + channel, s.basis[k], d_colour[channel]);
+    for (int channel = 0; channel < 3; ++channel) add_product_to(3 * k + channel, s.basis[k], d_color[channel]);
   sh_basis_backward<T>(bases, s.direction, d_basis, d_direction);
   const V along = d_direction[0] * s.direction[0] + d_direction[1] * s.direction[1] + d_direction[2] * s.direction[2];
   for (int k = 0; k < 3; ++k) d_r[k] = (d_direction[k] - along * s.direction[k]) * s.inverse_distance;
@@ -449,8 +449,8 @@ GS_INLINE void project_backward_group(const Gaussians<T>& g, int64_t i, int64_t 
       project_group(group, params[view], projection);
       if (any(projection.visible)) {  // all Gaussians with records are visible
         shade_group(group, g.bases, params[view], touched, shading);
-        const auto is_unclamped = [&](V colour) { return params[view].direct_colours ? touched : less(V{}, colour); };
-        const Mask<T> is_lit[3] = {is_unclamped(shading.colour[0]), is_unclamped(shading.colour[1]), is_unclamped(shading.colour[2])};
+        const auto is_unclamped = [&](V color) { return params[view].direct_colors ? touched : less(V{}, color); };
+        const Mask<T> is_lit[3] = {is_unclamped(shading.color[0]), is_unclamped(shading.color[1]), is_unclamped(shading.color[2])};
         V d_r[3];
         shade_group_backward<T>(
             g.bases, shading, is_lit, d, [&](int n) { return group.sh[n]; },

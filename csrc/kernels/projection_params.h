@@ -15,7 +15,7 @@ inline Camera<T> camera_of(const T* w2c, const T* intrinsics) {
 template <class T>
 inline ProjectionParams<T> make_projection_params(const Camera<T>& camera, int width, int height, const ProjectionSettings& settings) {
   ProjectionParams<T> params{camera, width, height, T(settings.eps2d), T(settings.near_plane), T(settings.far_plane),
-                             settings.antialiased, settings.direct_colours, {}, 0, 0, 0, 0};
+                             settings.antialiased, settings.direct_colors, {}, 0, 0, 0, 0};
   const T *r = camera.rotation, *t = camera.translation;
   for (int k = 0; k < 3; ++k) params.centre[k] = -(r[k] * t[0] + r[3 + k] * t[1] + r[6 + k] * t[2]);
   const T margin_x = T(kJacobianMargin) * width / camera.fx, margin_y = T(kJacobianMargin) * height / camera.fy;

@@ -59,7 +59,7 @@ struct CameraGradient {
 struct ProjectionSettings {
   double eps2d = 0;           // added to the diagonal of every 2D covariance, pixels²
   bool antialiased = false;   // whether opacities are reduced by what eps2d adds to the splats' areas
-  bool direct_colours = false;  // whether `sh` holds colours [N, 1, 3] that are used as they are, instead of harmonics
+  bool direct_colors = false;  // whether `sh` holds colors [N, 1, 3] that are used as they are, instead of harmonics
   double near_plane = 0.01;   // Gaussians whose camera-space z is not between near_plane and far_plane are dropped
   double far_plane = 1e10;
 };
@@ -78,7 +78,7 @@ struct ProjectionParams {
   Camera<T> camera;
   int width, height;
   T eps2d, near_plane, far_plane;  // as in ProjectionSettings
-  bool antialiased, direct_colours;
+  bool antialiased, direct_colors;
   T centre[3];                     // world
   T x_low, x_high, y_low, y_high;  // clamp range of x/z and y/z for the Jacobian
 };

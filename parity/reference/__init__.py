@@ -1,7 +1,7 @@
 """GlobalSplat in plain PyTorch: the system's mathematics, one module per part, checked against golden tensors."""
 
 from . import (
-    colour_fit,
+    color_fit,
     decoder,
     depth_search,
     encoder,
@@ -23,7 +23,7 @@ from . import (
 )
 
 __all__ = [
-    "colour_fit",
+    "color_fit",
     "decoder",
     "depth_search",
     "encoder",

@@ -1,4 +1,4 @@
-"""Colour jitter as torchvision's functional transforms define it on floating-point images [3, H, W] in [0, 1]."""
+"""Color jitter as torchvision's functional transforms define it on floating-point images [3, H, W] in [0, 1]."""
 
 import torch
 
@@ -46,8 +46,8 @@ def hsv_to_rgb(hue, saturation, value):
     q = (value * (1.0 - saturation * f)).clamp(0.0, 1.0)
     t = (value * (1.0 - saturation * (1.0 - f))).clamp(0.0, 1.0)
     sector = sector.long() % 6
-    colours = [(value, t, p), (q, value, p), (p, value, t), (p, q, value), (t, p, value), (value, p, q)]
-    choices = torch.stack([torch.stack(colour) for colour in colours])  # [6, 3, H, W]
+    colors = [(value, t, p), (q, value, p), (p, value, t), (p, q, value), (t, p, value), (value, p, q)]
+    choices = torch.stack([torch.stack(color) for color in colors])  # [6, 3, H, W]
     return choices.gather(0, sector[None, None].expand(1, 3, *sector.shape))[0]
 
 

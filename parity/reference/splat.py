@@ -99,17 +99,17 @@ def sh_basis(direction, coefficients):
     return torch.stack(basis, dim=-1)
 
 
-def sh_colour(means, sh, w2c):
-    """Returns colours [N, 3] of Gaussians (means [N, 3], sh [N, C, 3]) seen by w2c [4, 4].
+def sh_color(means, sh, w2c):
+    """Returns colors [N, 3] of Gaussians (means [N, 3], sh [N, C, 3]) seen by w2c [4, 4].
 
-    The colour is max(0, 0.5 + sum of basis(direction) sh).
+    The color is max(0, 0.5 + sum of basis(direction) sh).
     """
     centre = -w2c[:3, :3].T @ w2c[:3, 3]
     direction = means - centre
     # A Gaussian at the camera centre is not drawn, but the gradient of this branch must be finite, too.
     direction = direction / direction.norm(dim=-1, keepdim=True).clamp(min=1e-30)
-    colour = 0.5 + (sh_basis(direction, sh.shape[1])[..., None] * sh).sum(1)
-    return torch.where(colour > 0, colour, 0.0)
+    color = 0.5 + (sh_basis(direction, sh.shape[1])[..., None] * sh).sum(1)
+    return torch.where(color > 0, color, 0.0)
 
 
 def pixel_centres(width, height, dtype=torch.float32, device=None):
@@ -120,8 +120,8 @@ def pixel_centres(width, height, dtype=torch.float32, device=None):
     return torch.stack([j + 0.5, i + 0.5], dim=-1).reshape(-1, 2)
 
 
-def composite(projected, opacities, colours, pixels):
-    """Composites Gaussians at pixels [Q, 2]. projected is the dict of project(); opacities [N], colours [N, 3].
+def composite(projected, opacities, colors, pixels):
+    """Composites Gaussians at pixels [Q, 2]. projected is the dict of project(); opacities [N], colors [N, 3].
 
     Returns RGB [Q, 3], accumulated opacity [Q], expected depth [Q]. In order of depth (ties: lower index first), for
     the Gaussians that contribute to a pixel:
@@ -131,7 +131,7 @@ def composite(projected, opacities, colours, pixels):
     order = torch.argsort(projected["depth"], stable=True)
     order = order[projected["visible"][order]]
     mean2d, conic, depth = projected["mean2d"][order], projected["conic"][order], projected["depth"][order]
-    opacities, colours = opacities[order], colours[order]
+    opacities, colors = opacities[order], colors[order]
 
     delta = mean2d[:, None] - pixels[None]  # [N, Q, 2]
     dx, dy = delta.unbind(-1)
@@ -151,7 +151,7 @@ def composite(projected, opacities, colours, pixels):
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]], dim=0)
     weight = before * alpha  # [N, Q]
 
-    rgb = weight.T @ colours
+    rgb = weight.T @ colors
     accumulated = weight.sum(0)
     covered = accumulated > SMALLEST_ACCUMULATION
     expected = torch.where(covered, (weight.T @ depth) / torch.where(covered, accumulated, 1.0), 0.0)
@@ -164,7 +164,7 @@ def render(means, scales, quaternions, opacities, sh, w2c, intrinsic, width, hei
     Returns RGB [H, W, 3], accumulated opacity [H, W], expected depth [H, W].
     """
     projected = project(means, scales, quaternions, w2c, intrinsic, width, height, eps2d, antialiased)
-    colours = sh_colour(means, sh, w2c)
+    colors = sh_color(means, sh, w2c)
     pixels = pixel_centres(width, height, means.dtype, means.device)
-    rgb, accumulated, depth = composite(projected, opacities * projected["compensation"], colours, pixels)
+    rgb, accumulated, depth = composite(projected, opacities * projected["compensation"], colors, pixels)
     return rgb.reshape(height, width, 3), accumulated.reshape(height, width), depth.reshape(height, width)

@@ -1,4 +1,4 @@
-"""Tests of the reference's resizing against Pillow, and of simple properties of its colour jitter."""
+"""Tests of the reference's resizing against Pillow, and of simple properties of its color jitter."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def test_resampling_is_pillow_s(draw, shape, region, size):
     assert difference.max() <= 1.0 and (difference > 0).mean() < 1e-2
 
 
-def test_a_third_of_the_circle_swaps_the_colours():
+def test_a_third_of_the_circle_swaps_the_colors():
     image = torch.rand(3, 5, 7, dtype=torch.float64)
     assert torch.allclose(jitter.hue(image, 1.0 / 3.0), image[[2, 0, 1]], atol=1e-12)
 

@@ -479,15 +479,15 @@ def scalar_render(means, scales, quaternions, opacities, sh, w2c, intrinsic, wid
         d = [means[g][t] - centre[t] for t in range(3)]
         length = math.sqrt(sum(t * t for t in d))
         values = basis(*(t / length for t in d))
-        colour = [max(0.0, 0.5 + sum(values[t] * sh[g][t][ch] for t in range(len(sh[g])))) for ch in range(3)]
-        drawn.append((z, g, fx * x / z + cx, fy * y / z + cy, (c / det, -b / det, a / det), opacity, colour))
+        color = [max(0.0, 0.5 + sum(values[t] * sh[g][t][ch] for t in range(len(sh[g])))) for ch in range(3)]
+        drawn.append((z, g, fx * x / z + cx, fy * y / z + cy, (c / det, -b / det, a / det), opacity, color))
     drawn.sort(key=lambda item: item[:2])
 
     images = torch.zeros(height, width, 5, dtype=torch.float64)
     for i in range(height):
         for column in range(width):
             remaining, rgb, depth = 1.0, [0.0, 0.0, 0.0], 0.0
-            for z, _, u, v, (ca, cb, cc), opacity, colour in drawn:
+            for z, _, u, v, (ca, cb, cc), opacity, color in drawn:
                 dx, dy = u - (column + 0.5), v - (i + 0.5)
                 alpha = min(0.999, opacity * math.exp(-0.5 * (ca * dx * dx + 2 * cb * dx * dy + cc * dy * dy)))
                 if alpha < 1 / 255:
@@ -495,7 +495,7 @@ def scalar_render(means, scales, quaternions, opacities, sh, w2c, intrinsic, wid
                 if remaining * (1 - alpha) <= 1e-4:
                     break
                 for ch in range(3):
-                    rgb[ch] += remaining * alpha * colour[ch]
+                    rgb[ch] += remaining * alpha * color[ch]
                 depth += remaining * alpha * z
                 remaining *= 1 - alpha
             accumulated = 1 - remaining
@@ -508,7 +508,7 @@ def crowded_scene(w2c, seed):
     """Returns a scene to which every rule of the rasterizer applies.
 
     It has Gaussians behind the camera and in front of the near plane, equal depths, opaque Gaussians in front of
-    others, thin ones below a pixel, colours below zero, and positions far outside of the image.
+    others, thin ones below a pixel, colors below zero, and positions far outside of the image.
     """
     generator = torch.Generator().manual_seed(seed)
     n = 60
@@ -541,17 +541,17 @@ def test_splat_against_scalar_loops(seed, antialiased):
     assert close.double().mean() > 0.95
 
 
-def test_colour_below_zero_is_black_without_gradient():
+def test_color_below_zero_is_black_without_gradient():
     w2c, _ = camera()
     sh = torch.tensor([[[-9.0, 0.3, 9.0]]], dtype=torch.float64, requires_grad=True)
     means = torch.tensor([[0.3, 0.2, 2.0]], dtype=torch.float64)
-    colour = splat.sh_colour(means, sh, w2c)
-    assert colour[0, 0].item() == 0.0 and colour[0, 2].item() == pytest.approx(0.5 + 9 * 0.28209479177387814)
-    colour.sum().backward()
+    color = splat.sh_color(means, sh, w2c)
+    assert color[0, 0].item() == 0.0 and color[0, 2].item() == pytest.approx(0.5 + 9 * 0.28209479177387814)
+    color.sum().backward()
     assert sh.grad[0, 0].tolist() == pytest.approx([0.0, 0.28209479177387814, 0.28209479177387814])
 
 
-def test_capped_alphas_and_negative_colours_have_no_gradient():
+def test_capped_alphas_and_negative_colors_have_no_gradient():
     opacity = torch.tensor([1.0], dtype=torch.float64, requires_grad=True)
     centre = torch.full((1, 2), 0.5, dtype=torch.float64)
     projected = {"mean2d": centre, "conic": torch.tensor([[1.0, 0.0, 1.0]], dtype=torch.float64)}
@@ -560,7 +560,7 @@ def test_capped_alphas_and_negative_colours_have_no_gradient():
     weight.sum().backward()
     assert weight.tolist() == [[0.999] * 3] and opacity.grad.tolist() == [0.0]
     sh = torch.tensor([[[-9.0, 0.3, 9.0]]], dtype=torch.float64, requires_grad=True)
-    colour = splat.sh_colour(torch.tensor([[0.3, 0.2, 2.0]], dtype=torch.float64), sh, camera()[0])
-    assert colour[0, 0].item() == 0.0 and colour[0, 2].item() == pytest.approx(0.5 + 9 * 0.28209479177387814)
-    colour.sum().backward()
+    color = splat.sh_color(torch.tensor([[0.3, 0.2, 2.0]], dtype=torch.float64), sh, camera()[0])
+    assert color[0, 0].item() == 0.0 and color[0, 2].item() == pytest.approx(0.5 + 9 * 0.28209479177387814)
+    color.sum().backward()
     assert sh.grad[0, 0].tolist() == pytest.approx([0.0, 0.28209479177387814, 0.28209479177387814])

@@ -18,7 +18,7 @@ PROGRAM = REPOSITORY / "target/release/globalsplat"
 NPM = REPOSITORY / "parity/npm"
 COUNT = 300  # more than a chunk of a compressed PLY
 C0 = 0.28209479177387814
-# Half of each format's quantization step: positions, logarithms of scales, rotations, opacities, colours, coefficients.
+# Half of each format's quantization step: positions, logarithms of scales, rotations, opacities, colors, coefficients.
 STEPS = {
     "ply": (1e-6, 1e-5, 1e-5, 1e-5, 1e-6, 1e-6),
     "compressed.ply": (4.1 / 1023, 1.1 / 1023, 0.003, 0.51 / 255, 1 / 255, 0.51 / 32),
@@ -28,14 +28,14 @@ STEPS = {
     "their spz": (0.51 / 4096, 0.51 / 16, 0.003, 0.51 / 255, 0.51 / 255 / 0.15, 8.51 / 128),
     "spz of version 2": (0.51 / 4096, 0.51 / 16, 0.12, 0.51 / 255, 0.51 / 255 / 0.15, 8.51 / 128),
     "splat": (1e-6, 1e-5, 0.02, 0.51 / 255, 0.51 / 255 / C0, 0),
-    # Positions have 16 bits of ±ln(4.6), with steps in proportion to |x| + 1. Scales, colours and coefficients have 256
+    # Positions have 16 bits of ±ln(4.6), with steps in proportion to |x| + 1. Scales, colors and coefficients have 256
     # values at unequal steps: a whole one of equal steps. Rotations have 8 bits of ±1/√2 for three components, whose
     # errors add up in the fourth one.
     "sog": (1.02 / 65535 * 4.6 * np.log(4.6), 1.8 / 255, 3 * 0.51 * 2**0.5 / 255, 0.51 / 255, 1.8 / 255, 1.8 / 255),
     "glb": (1e-6, 1e-5, 1e-5, 1e-5, 1e-6, 1e-6),
     # Babylon.js keeps bytes of all but positions and scales.
     "glb in babylon": (1e-6, 1e-5, 1.02 / 127.5, 0.51 / 255, 0.51 / 255 / C0, 0.51 / 128),
-    # 16 bits of a bucket's size for positions, half precision, and bytes for colours and opacities. Level 2 has bytes for
+    # 16 bits of a bucket's size for positions, half precision, and bytes for colors and opacities. Level 2 has bytes for
     # coefficients, too.
     "ksplat of level 0": (1e-6, 1e-5, 1e-6, 0.51 / 255, 0.51 / 255 / C0, 1e-6),
     "ksplat of level 1": (1.02 / 32767, 2**-11, 2**-11, 0.51 / 255, 0.51 / 255 / C0, 2**-12),
@@ -98,7 +98,7 @@ def assert_same(splat, other, steps):
     nearest = ((places[:, None] - others) ** 2).sum(-1).argmin(1)
     assert len(others) == COUNT and len(set(nearest)) == COUNT
     other = {name: values[nearest] for name, values in other.items()}
-    scales, colours = [[f"{name}_{k}" for k in range(3)] for name in ("scale", "f_dc")]
+    scales, colors = [[f"{name}_{k}" for k in range(3)] for name in ("scale", "f_dc")]
     turns = [columns(one, *(f"rot_{k}" for k in range(4))) for one in (splat, other)]
     turns = [turn / np.linalg.norm(turn, axis=1, keepdims=True) for turn in turns]
     turns[1] *= np.sign((turns[0] * turns[1]).sum(1, keepdims=True))  # q and −q are the same rotation
@@ -108,7 +108,7 @@ def assert_same(splat, other, steps):
         ("scales", columns(splat, *scales), columns(other, *scales), steps[1]),
         ("rotations", *turns, steps[2]),
         ("opacities", *opacities, steps[3]),
-        ("colours", columns(splat, *colours), columns(other, *colours), steps[4]),
+        ("colors", columns(splat, *colors), columns(other, *colors), steps[4]),
         ("coefficients", rest(splat), rest(other), steps[5]),
     ]:
         np.testing.assert_allclose(b, a, rtol=0, atol=step, err_msg=what)
@@ -286,7 +286,7 @@ def ksplat(splat, level):
     steps = np.round(steps / (size / 2) * middle) + middle
     turns = columns(splat, *(f"rot_{k}" for k in range(4)))
     numbers = np.hstack([np.exp(columns(splat, *(f"scale_{k}" for k in range(3)))), turns])[order]
-    colours = columns(splat, *(f"f_dc_{k}" for k in range(3))) * C0 + 0.5
+    colors = columns(splat, *(f"f_dc_{k}" for k in range(3))) * C0 + 0.5
     opacities = 1 / (1 + np.exp(-columns(splat, "opacity")))
     channels = rest(splat)[order].reshape(COUNT, 3, -1)
     degree = [0, 3, 8, 15].index(channels.shape[2])
@@ -296,7 +296,7 @@ def ksplat(splat, level):
     rows = [
         places[order].astype("<f4") if level == 0 else steps.astype("<u2"),
         numbers.astype("<f2" if level else "<f4"),
-        np.round(np.hstack([colours, opacities])[order] * 255).astype("u1"),
+        np.round(np.hstack([colors, opacities])[order] * 255).astype("u1"),
         sh.astype(["<f4", "<f2", "u1"][level]),
     ]
     rows = np.hstack([np.ascontiguousarray(part).view("u1") for part in rows if part.size])

@@ -33,7 +33,7 @@ class Capture:
     def Ks(self) -> Doubles:
         """Intrinsic matrices in pixels. :math:`(V, 3, 3)`"""
     def points(self) -> tuple[Doubles, Floats]:
-        """Returns the points of a COLMAP reconstruction and their colours in [0, 1], :math:`(P, 3)` each; none if there aren't any."""
+        """Returns the points of a COLMAP reconstruction and their colors in [0, 1], :math:`(P, 3)` each; none if there aren't any."""
     def image(self, index: int) -> npt.NDArray[np.uint8]:
         """Reads a photo without its lens distortion. :math:`(H, W, 3)`"""
     def __len__(self) -> int: ...

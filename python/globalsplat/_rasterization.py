@@ -62,7 +62,7 @@ def rasterization(
     bit-identical for any number of threads. float64 tensors are rendered in float64, on the CPU; all others in float32.
 
     .. note::
-        More than three channels take a pass for every three. Colours of each camera, :math:`(*, C, N, \ldots)`, take a projection for
+        More than three channels take a pass for every three. Colors of each camera, :math:`(*, C, N, \ldots)`, take a projection for
         each camera.
 
     Args:
@@ -70,7 +70,7 @@ def rasterization(
         quats (Tensor): rotations as quaternions (w, x, y, z) of any length. :math:`(*, N, 4)`
         scales (Tensor): standard deviations along the Gaussians' axes. :math:`(*, N, 3)`
         opacities (Tensor): opacities in [0, 1]. :math:`(*, N)`
-        colors (Tensor): colours or features, :math:`(*, [C,] N, D)`, or with :attr:`sh_degree` coefficients of spherical harmonics,
+        colors (Tensor): colors or features, :math:`(*, [C,] N, D)`, or with :attr:`sh_degree` coefficients of spherical harmonics,
             :math:`(*, [C,] N, K, 3)`.
         viewmats (Tensor): world-to-camera matrices, with x right, y down and z forward. :math:`(*, C, 4, 4)`
         Ks (Tensor): intrinsic matrices in pixels. Gets no gradient. :math:`(*, C, 3, 3)`
@@ -80,9 +80,9 @@ def rasterization(
         far_plane (float): Gaussians whose depth isn't below it are left out.
         eps2d (float): added to the diagonal of projected covariances, in pixels². Splats of GlobalSplat are made for 0.05.
         sh_degree (int, optional): degree of the spherical harmonics to use, 0 to 3. If ``None``, :attr:`colors` are used as they are.
-        backgrounds (Tensor, optional): colours of the backgrounds. :math:`(*, C, D)`
-        render_mode (str): what to render: ``"RGB"`` the colours, ``"D"`` accumulated depths :math:`\sum_i w_i z_i`, ``"ED"`` expected
-            depths :math:`\sum_i w_i z_i / \sum_i w_i`, or colours and depths, ``"RGB+D"`` and ``"RGB+ED"``.
+        backgrounds (Tensor, optional): colors of the backgrounds. :math:`(*, C, D)`
+        render_mode (str): what to render: ``"RGB"`` the colors, ``"D"`` accumulated depths :math:`\sum_i w_i z_i`, ``"ED"`` expected
+            depths :math:`\sum_i w_i z_i / \sum_i w_i`, or colors and depths, ``"RGB+D"`` and ``"RGB+ED"``.
         rasterize_mode (str): ``"antialiased"`` reduces opacities by what :attr:`eps2d` adds to the areas of the projected Gaussians.
         packed, tile_size, channel_chunk, segmented: accepted and without effect.
         radius_clip, sparse_grad, absgrad, distributed, camera_model, covars, with_ut, with_eval3d, radial_coeffs, tangential_coeffs,

@@ -99,10 +99,10 @@ def save_splat(
         path (str or PathLike): the file.
         splat (dict or nn.ParameterDict): arrays or tensors of N Gaussians with the keys of :class:`Splat`, of which
             ``sh_degree``, ``eps2d`` and ``rasterize_mode`` may be absent, or those of :class:`Parameters` if
-            :attr:`activated` is ``False``. Spherical harmonics :math:`(N, K, 3)` are needed, not colours.
+            :attr:`activated` is ``False``. Spherical harmonics :math:`(N, K, 3)` are needed, not colors.
         activated (bool): as in :func:`load_splat`.
         capture (Capture, optional): the photos' cameras. A format with fewer spherical harmonics than the splat, such as .splat, gets
-            the colours that these cameras see.
+            the colors that these cameras see.
 
     Raises:
         ValueError: if shapes don't fit, a value isn't finite, or the extension is unknown.

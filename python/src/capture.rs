@@ -14,7 +14,7 @@ use pyo3::prelude::*;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-/// Positions and colours of points.
+/// Positions and colors of points.
 type Points<'py> = (Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<f32>>);
 
 /// Photos with known cameras. Photos are read when they are needed.
@@ -105,13 +105,13 @@ impl Capture {
         PyArray::from_vec(py, numbers).reshape([self.0.len(), 3, 3])
     }
 
-    /// Points of a COLMAP reconstruction and their colours in [0, 1], two arrays [P, 3]; empty if the capture has none.
+    /// Points of a COLMAP reconstruction and their colors in [0, 1], two arrays [P, 3]; empty if the capture has none.
     fn points<'py>(&self, py: Python<'py>) -> PyResult<Points<'py>> {
         let points = run(py, || Ok(read_points(&self.0)?))?;
         let positions: Vec<f64> = points.iter().flat_map(|point| point.position.to_array()).collect();
-        let colours: Vec<f32> = points.iter().flat_map(|point| point.colour).collect();
+        let colors: Vec<f32> = points.iter().flat_map(|point| point.color).collect();
         let shape = [points.len(), 3];
-        Ok((PyArray::from_vec(py, positions).reshape(shape)?, PyArray::from_vec(py, colours).reshape(shape)?))
+        Ok((PyArray::from_vec(py, positions).reshape(shape)?, PyArray::from_vec(py, colors).reshape(shape)?))
     }
 
     /// Reads a photo, without its lens distortion, at the size of its camera: [H, W, 3].

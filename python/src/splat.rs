@@ -19,7 +19,7 @@ pub fn read_splat(py: Python<'_>, path: PathBuf) -> PyResult<(Bound<'_, PyDict>,
     Ok((to_dict(py, splat)?, warnings))
 }
 
-/// Writes a splat file in the format that the file's extension names. If the format has fewer spherical harmonics, colours are fitted to
+/// Writes a splat file in the format that the file's extension names. If the format has fewer spherical harmonics, colors are fitted to
 /// what the cameras of `capture` see.
 #[pyfunction]
 pub fn write_splat(

@@ -14,7 +14,7 @@ import pytest
 import torch
 from globalsplat import _torch
 from globalsplat.reference.normalize import normalize_scene
-from globalsplat.reference.splat import sh_colour
+from globalsplat.reference.splat import sh_color
 
 # Formats, and the PSNR in dB that a render may lose in each. A .splat has one color of each Gaussian, and is compared with the mean colors.
 FORMATS = {"ply": 0.01, "compressed.ply": 0.3, "sog": 0.3, "spz": 0.3, "splat": 0.3, "glb": 0.01}
@@ -52,7 +52,7 @@ def psnr(image, photo):
 def with_mean_colors(splat, capture):
     """Returns the splat with the mean of each Gaussian's colors toward the cameras of the capture, from 0 to 1."""
     viewmats = torch.from_numpy(capture.viewmats).float()
-    colors = torch.stack([sh_colour(splat["means"], splat["colors"], viewmat) for viewmat in viewmats]).mean(0)
+    colors = torch.stack([sh_color(splat["means"], splat["colors"], viewmat) for viewmat in viewmats]).mean(0)
     return {**splat, "colors": (colors.clamp(max=1.0) - 0.5)[:, None] * math.sqrt(4 * math.pi), "sh_degree": 0}
 
 

@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 ///
 /// COLMAP is the newer of the colmap on the PATH and pycolmap, which `make poses` or `pip install pycolmap` installs;
 /// GLOBALSPLAT_COLMAP names a colmap, or a Python that has pycolmap. It runs on all cores, without a GPU and offline. Ctrl-C
-/// stops it, and the same command continues. Photos that are damaged, of a single colour or identical to another are left
+/// stops it, and the same command continues. Photos that are damaged, of a single color or identical to another are left
 /// out. Of a video, which ffmpeg reads, the sharpest frames are taken, as far apart as the picture has moved.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat capture photos/room --out captures/room\n  \

@@ -28,7 +28,7 @@ const MIN_CUT: f32 = 0.01;
 /// PSNR between both, over eight views around the splat or over the capture's cameras.
 ///
 /// SPZ stores coefficients within ±1, a SOG a few sets of coefficients for all Gaussians, and a .splat only one coefficient per
-/// colour channel; viewers for browsers keep no more of a PLY's coefficients, either (--clamp-sh). With a capture, the
+/// color channel; viewers for browsers keep no more of a PLY's coefficients, either (--clamp-sh). With a capture, the
 /// coefficients are fitted to look the same from its cameras; otherwise values out of range are clamped, which may cost much
 /// quality.
 ///
@@ -52,7 +52,7 @@ pub struct Convert {
     /// Remove spherical harmonics of higher degrees, or add some that are 0
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(i64).range(0..=3))]
     sh_degree: Option<i64>,
-    /// Keep within what viewers for browsers show, whatever the format holds: a Gaussian's own colour in [0, 1], other
+    /// Keep within what viewers for browsers show, whatever the format holds: a Gaussian's own color in [0, 1], other
     /// coefficients within ±1
     #[arg(long)]
     clamp_sh: bool,
@@ -211,7 +211,7 @@ impl Convert {
             let share = if share < 0.05 { "less than 0.1".into() } else { format!("{share:.1}") };
             let who = if self.clamp_sh { "viewers hold" } else { "the format holds" };
             eprintln!(
-                "{}: {share} % of the colours' coefficients are beyond what {who} and cut off; --scene, with the cameras that \
+                "{}: {share} % of the colors' coefficients are beyond what {who} and cut off; --scene, with the cameras that \
                  matter, loses less",
                 self.to.display()
             );

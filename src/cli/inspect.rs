@@ -102,12 +102,12 @@ fn quantiles(values: impl Iterator<Item = f32>) -> Value {
     json!({ "p01": at(1), "p05": at(5), "p25": at(25), "p50": at(50), "p75": at(75), "p95": at(95), "p99": at(99) })
 }
 
-/// Returns the mean square over all directions of the colours' part of each SH degree, a mean over Gaussians and channels.
+/// Returns the mean square over all directions of the colors' part of each SH degree, a mean over Gaussians and channels.
 fn sh_energy(splat: &Splat) -> Vec<f64> {
     let mut energies = vec![0.; splat.sh_degree + 1];
     for index in 0..splat.len() {
-        for (basis, colour) in splat.sh_of(index).iter().enumerate() {
-            energies[basis.isqrt()] += colour.iter().map(|&channel| f64::from(channel).powi(2)).sum::<f64>();
+        for (basis, color) in splat.sh_of(index).iter().enumerate() {
+            energies[basis.isqrt()] += color.iter().map(|&channel| f64::from(channel).powi(2)).sum::<f64>();
         }
     }
     // The integral of a squared spherical harmonic over the sphere, whose area is 4π, is 1.

@@ -148,9 +148,9 @@ impl Reconstruct {
             }));
         } else {
             let megabytes = bytes as f64 / 1e6;
-            let pass = match data.colour_steps {
+            let pass = match data.color_steps {
                 0 => "forward pass",
-                _ => "forward pass and fit of colours",
+                _ => "forward pass and fit of colors",
             };
             println!(
                 "{}: {count} Gaussians from {} photos, {megabytes:.2} MB; {pass} {seconds:.2} s, peak memory {:.2} GB",

@@ -1,4 +1,4 @@
-//! Geometric and colour augmentation in training, identical for all views of a sample (spec 8.3 and 8.4).
+//! Geometric and color augmentation in training, identical for all views of a sample (spec 8.3 and 8.4).
 
 use super::config::DataConfig;
 use super::jitter::Jitter;
@@ -21,7 +21,7 @@ pub struct Augmentation {
     pub shift: [f64; 2],
     /// `true` to swap left and right.
     pub flip: bool,
-    /// Colour jitter.
+    /// Color jitter.
     pub jitter: Jitter,
 }
 
@@ -71,7 +71,7 @@ impl Augmentation {
         Ok((region, if self.flip { mirrored(&shown) } else { shown }))
     }
 
-    /// Writes `region` of `photo` into `planes`, `[3, H, W]` at `size`, with all augmentation except colour jitter.
+    /// Writes `region` of `photo` into `planes`, `[3, H, W]` at `size`, with all augmentation except color jitter.
     pub fn crop_and_flip(
         &self,
         resampler: &mut Resampler,

@@ -17,11 +17,11 @@ pub enum Sampling {
     Farthest,
 }
 
-/// Ranges of the colour jitter. The paper applies jitter but gives no values. A value of 0 disables an adjustment.
+/// Ranges of the color jitter. The paper applies jitter but gives no values. A value of 0 disables an adjustment.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct JitterConfig {
-    /// Maximum brightness change x: colours are multiplied by a factor from 1 − x to 1 + x.
+    /// Maximum brightness change x: colors are multiplied by a factor from 1 − x to 1 + x.
     pub brightness: f64,
     /// Maximum contrast change x: distances from the image's mean grey are multiplied by a factor from 1 − x to 1 + x.
     pub contrast: f64,
@@ -38,7 +38,7 @@ impl Default for JitterConfig {
 }
 
 impl JitterConfig {
-    /// Settings that leave colours unchanged.
+    /// Settings that leave colors unchanged.
     pub const OFF: Self = JitterConfig { brightness: 0., contrast: 0., saturation: 0., hue: 0. };
 }
 
@@ -54,9 +54,9 @@ pub struct DataConfig {
     /// If `true`, a plane sweep estimates a depth for every pixel of the context views, and the model sees the scene with distances
     /// made about equal (spec 3.5).
     pub depths: bool,
-    /// Number of least-squares steps by which the colours of a reconstruction are fitted to its photos (spec 9.9), in
-    /// validation, too. 0 leaves the network's colours as they are.
-    pub colour_steps: usize,
+    /// Number of least-squares steps by which the colors of a reconstruction are fitted to its photos (spec 9.9), in
+    /// validation, too. 0 leaves the network's colors as they are.
+    pub color_steps: usize,
     /// Maximum number of context views per scene in a training step.
     pub context_views: usize,
     /// Minimum number of context views. If it isn't 0, every step draws the number of context views from this to `context_views`.
@@ -73,7 +73,7 @@ pub struct DataConfig {
     pub extra_crop: f64,
     /// If `true`, training samples are mirrored with probability ½.
     pub flip: bool,
-    /// Ranges of the colour jitter in training.
+    /// Ranges of the color jitter in training.
     pub jitter: JitterConfig,
     /// Views that are never used in training: the targets of validation.
     pub holdout: Holdout,
@@ -97,7 +97,7 @@ impl Default for DataConfig {
             captures: vec![],
             image_size: [256, 256].into(),
             depths: false,
-            colour_steps: 0,
+            color_steps: 0,
             context_views: 24,
             min_context_views: 0,
             target_views: 12,
@@ -130,8 +130,8 @@ impl DataConfig {
     pub(crate) fn validation_settings(&self) -> String {
         let scenes = (&self.captures, &self.holdout, &self.validation, self.validation_scenes);
         let views = (self.image_size, self.context_views, self.target_views, self.window);
-        // Omitting the default value keeps the string of runs that began before `colour_steps` existed.
-        let settings = match self.colour_steps {
+        // Omitting the default value keeps the string of runs that began before `color_steps` existed.
+        let settings = match self.color_steps {
             0 => serde_json::to_string(&(scenes, views)),
             steps => serde_json::to_string(&(scenes, views, steps)),
         };

@@ -1,4 +1,4 @@
-//! Colour jitter with the semantics of torchvision's `ColorJitter` on floating-point images: up to four adjustments in random order,
+//! Color jitter with the semantics of torchvision's `ColorJitter` on floating-point images: up to four adjustments in random order,
 //! each with its own factor. Every loop runs over whole planes without branches, so that the compiler vectorizes it (spec 8.4).
 
 use super::config::JitterConfig;
@@ -7,14 +7,14 @@ use rand::Rng;
 use rand::seq::SliceRandom;
 use serde::{Deserialize, Serialize};
 
-/// Weights of the colour channels in the grey value, as in torchvision.
+/// Weights of the color channels in the grey value, as in torchvision.
 const GREY: [f32; CHANNELS] = [0.2989, 0.587, 0.114];
 
-/// A colour adjustment.
+/// A color adjustment.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Adjustment {
-    /// Factor on all colour values.
+    /// Factor on all color values.
     Brightness(f32),
     /// Factor on the distance from the image's mean grey.
     Contrast(f32),
@@ -24,7 +24,7 @@ pub enum Adjustment {
     Hue(f32),
 }
 
-/// A sequence of colour adjustments.
+/// A sequence of color adjustments.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Jitter {
     /// Adjustments in the order of application.
@@ -209,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn no_saturation_is_grey_and_no_contrast_is_one_colour() {
+    fn no_saturation_is_grey_and_no_contrast_is_one_color() {
         let grey = adjusted(&[Adjustment::Saturation(0.)]);
         assert!(farthest(&grey[..40 * 33], &grey[2 * 40 * 33..]) < 1e-6);
         let flat = adjusted(&[Adjustment::Contrast(0.)]);

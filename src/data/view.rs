@@ -13,7 +13,7 @@ use tch::{Device, Kind, Tensor};
 pub struct View {
     /// Name of the image in the capture.
     pub name: String,
-    /// Colours, `[3, H, W]`.
+    /// Colors, `[3, H, W]`.
     pub image: Pixels,
     /// Weight of each pixel, `[1, H, W]`: 1 where the pixel counts, 0 where it is masked out. `None` if every pixel counts.
     pub mask: Option<Pixels>,

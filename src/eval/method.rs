@@ -59,7 +59,7 @@ enum EvalImageSource {
 /// An image of a target view.
 #[derive(Debug)]
 pub struct EvalImage {
-    /// Colours, `[3, H, W]`.
+    /// Colors, `[3, H, W]`.
     pub rgb: Tensor,
     /// Render with depth, if the image was rendered from a splat here.
     pub rendered: Option<RenderedView>,

@@ -1,7 +1,7 @@
 //! Splats fitted to the format of a file, and the precision of their positions in it.
 
 use crate::error::Result;
-use crate::render::{compensate_mean_colour, fit_harmonics, shrink_harmonics};
+use crate::render::{compensate_mean_color, fit_harmonics, shrink_harmonics};
 use crate::scene::{Camera, Gaussians, RawGaussians, splat_frame};
 use glam::DVec3;
 use globalsplat_splat_file::{ShLimits, Splat, has_sh_palette, limits_of, round_sh};
@@ -12,7 +12,7 @@ use tch::Tensor;
 const MAX_SPACING_RATIO: f64 = 1e-4;
 
 /// Returns `splat` with spherical harmonics within `limits` and those of the format of `path`, which look the same from `cameras`. For a
-/// format with a palette of coefficients they are made small first, rounded as the file's will be, and the mean colours are corrected.
+/// format with a palette of coefficients they are made small first, rounded as the file's will be, and the mean colors are corrected.
 ///
 /// # Errors
 /// Returns an error for an unknown extension.
@@ -46,7 +46,7 @@ pub fn fit_splat(path: &Path, splat: &Splat, limits: &ShLimits, cameras: &[Camer
         sh: Gaussians::from_splat(&round_sh(path, &within_limits)?).sh,
         ..fitted.map(Tensor::shallow_clone)
     };
-    let compensated = compensate_mean_colour(&fitted, &rounded, &cameras);
+    let compensated = compensate_mean_color(&fitted, &rounded, &cameras);
     with_sh(&fit_harmonics(&compensated, &[], &limits))
 }
 

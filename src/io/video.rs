@@ -206,8 +206,8 @@ impl Mp4 {
     fn begin(path: &Path, place: &Path, size: ImageSize, frames_per_second: u32) -> Result<Self> {
         /// Constant rate factor with almost no visible loss; ffmpeg's default is 23.
         const QUALITY: &str = "18";
-        /// Declaration of sRGB colours. Without it, players assume BT.601 for small videos and BT.709 for large ones, and colours shift.
-        const COLOURS: [&str; 8] = [
+        /// Declaration of sRGB colors. Without it, players assume BT.601 for small videos and BT.709 for large ones, and colors shift.
+        const COLORS: [&str; 8] = [
             "-colorspace",
             "bt709",
             "-color_primaries",
@@ -239,7 +239,7 @@ impl Mp4 {
             ])
             .args(["-r", &frames_per_second.to_string(), "-i", "-", "-vf", &format!("{even},{to_yuv}")])
             .args(["-c:v", ENCODER, "-crf", QUALITY, "-pix_fmt", "yuv420p"])
-            .args(COLOURS)
+            .args(COLORS)
             // Puts the index that a player needs at the start, so that a page shows the video while it still loads.
             .args(["-movflags", "+faststart", "-f", "mp4"])
             .arg(place)

@@ -21,7 +21,7 @@ pub enum PerceptualKind {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LossConfig {
-    /// Weight of the mean squared error of the rendered colours.
+    /// Weight of the mean squared error of the rendered colors.
     pub mse: f64,
     /// Network of the perceptual loss: `none`, `vgg19`, `lpips_vgg` or `lpips_alex`.
     pub perceptual: PerceptualKind,

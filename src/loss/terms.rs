@@ -28,7 +28,7 @@ macro_rules! terms {
 }
 
 terms! {
-    /// Mean squared error of the rendered colours.
+    /// Mean squared error of the rendered colors.
     Mse "mse"
     /// Perceptual loss, L_perc; 0 if it is left out.
     Perceptual "perceptual"

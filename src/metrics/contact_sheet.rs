@@ -3,7 +3,7 @@
 use crate::data::View;
 use crate::error::Result;
 use crate::io::{Mosaic, enlarge, shrink, shrink_factor, subsample, tile_horizontally};
-use crate::render::{RenderedView, colourize_depth, render_views};
+use crate::render::{RenderedView, colorize_depth, render_views};
 use crate::scene::Gaussians;
 use std::path::Path;
 use tch::{Kind, Tensor};
@@ -48,7 +48,7 @@ impl ContactSheet {
         let [depth, alpha] = [&rendered.depth, &rendered.alpha].map(|numbers| subsample(numbers, factor));
         let [ground_truth, rgb] =
             [ground_truth, &rendered.rgb.clamp(0., 1.)].map(|image| shrink(image, factor));
-        let images = [ground_truth, rgb, colourize_depth(&depth, &alpha)];
+        let images = [ground_truth, rgb, colorize_depth(&depth, &alpha)];
         self.0.add_shrunk(&images.map(|image| enlarge(&image, HEIGHT)))
     }
 
@@ -75,7 +75,7 @@ pub fn comparison_image(ground_truth: &Tensor, image: &Tensor, rendered: Option<
     let mut images = vec![ground_truth, image, heat];
     if let Some(rendered) = rendered {
         let [depth, alpha] = [&rendered.depth, &rendered.alpha].map(|numbers| subsample(numbers, factor));
-        images.push(colourize_depth(&depth, &alpha));
+        images.push(colorize_depth(&depth, &alpha));
     }
     tile_horizontally(&images)
 }

@@ -67,7 +67,7 @@ impl Default for ModelConfig {
 }
 
 impl ModelConfig {
-    /// Returns the number of spherical harmonics per colour channel.
+    /// Returns the number of spherical harmonics per color channel.
     pub fn sh_bases(&self) -> i64 {
         (self.sh_degree + 1).pow(2)
     }

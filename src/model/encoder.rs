@@ -276,7 +276,7 @@ impl Mixer {
 pub struct EncodedTokens {
     /// Tokens from which positions, scales, rotations, opacities and the gate are decoded.
     pub geometry: Tensor,
-    /// Tokens from which colours are decoded.
+    /// Tokens from which colors are decoded.
     pub appearance: Tensor,
 }
 

@@ -8,7 +8,7 @@ use crate::io::Weights;
 use crate::loss;
 use crate::model::{self, EncodedTokens, GlobalSplat, ModelConfig, ModelInput, Precision, RawOutputs, Stage};
 use crate::optim::Optimizer;
-use crate::reconstruct::fit_colours;
+use crate::reconstruct::fit_colors;
 use crate::render::{self, Cameras};
 use crate::scene::{self, Gaussians, RadialWarp};
 use crate::stereo::depth_search::{ComparedPhoto, Search, match_semi_globally, search_depths};
@@ -42,7 +42,7 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
         }
         "quaternion" => outputs([("quaternion", model::quaternion_from_6d(request.input("rotations")?))]),
         "scene_normalization" => scene_normalization(request),
-        "colour_fit" => colour_fit(request),
+        "color_fit" => color_fit(request),
         "projection" => projection(request),
         "rasterizer" => rasterizer(request),
         "mse" => loss_of(loss::mse(request.input("rendered")?, request.input("truth")?)),
@@ -417,7 +417,7 @@ fn rasterizer(request: &Request) -> Result<Answer> {
     outputs([("rgb", rendered.rgb), ("alpha", rendered.alpha), ("depth", rendered.depth)])
 }
 
-fn colour_fit(request: &Request) -> Result<Answer> {
+fn color_fit(request: &Request) -> Result<Answer> {
     let (gaussians, cameras) = gaussians_and_cameras(request)?;
     let views = ViewBatch {
         images: request.input("images")?.shallow_clone(),
@@ -427,7 +427,7 @@ fn colour_fit(request: &Request) -> Result<Answer> {
         w2c: cameras.w2c,
         intrinsics: cameras.intrinsics,
     };
-    let fitted = fit_colours(&gaussians, &views, request.number("steps")?)?;
+    let fitted = fit_colors(&gaussians, &views, request.number("steps")?)?;
     outputs([
         ("contributions", render::image_contributions(&gaussians, &views.cameras())?),
         ("sh", fitted.sh),
@@ -442,7 +442,7 @@ fn projection(request: &Request) -> Result<Answer> {
         ("mean2d", seen.mean2d),
         ("conic", seen.conic),
         ("depth", seen.depth),
-        ("colour", seen.colour),
+        ("color", seen.color),
     ])
 }
 

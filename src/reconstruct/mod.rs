@@ -1,7 +1,7 @@
 //! Reconstruction of a splat from posed photos: loads a model from its file, selects and fits the views, runs a forward pass, and
 //! transforms the result to the capture's world.
 
-mod colour_fit;
+mod color_fit;
 mod context;
 mod model_file;
 mod published;
@@ -13,7 +13,7 @@ pub use model_file::{
 };
 
 // Used by the parity checks, too.
-pub(crate) use colour_fit::fit_colours;
+pub(crate) use color_fit::fit_colors;
 
 use crate::config::Config;
 use crate::data::{View, ViewBatch, cameras_at, view_batch};
@@ -56,7 +56,7 @@ pub struct Reconstruction {
     pub world_from_normalized: Similarity,
     /// Poses of the target cameras in the normalized world, camera-to-world.
     pub target_poses: Vec<DMat4>,
-    /// Time from views in memory to Gaussians: depths, the forward pass and the fit of colours.
+    /// Time from views in memory to Gaussians: depths, the forward pass and the fit of colors.
     pub forward_time: Duration,
 }
 
@@ -85,7 +85,7 @@ impl Reconstruction {
 }
 
 /// Runs the model once over `photos`, all of one size. If its configuration has `data.depths`, the model gets the photos' depths, too;
-/// `data.colour_steps` steps fit the colours to the photos afterwards. `targets` are poses (camera-to-world, in the capture's world) of
+/// `data.color_steps` steps fit the colors to the photos afterwards. `targets` are poses (camera-to-world, in the capture's world) of
 /// target views: they take part in the normalization, as in the paper's protocol.
 ///
 /// # Errors
@@ -128,9 +128,9 @@ pub fn reconstruct<'a>(
     let (poses, target_poses) = normalization.c2w.split_at(photos.len());
     let depths = data.depths.then(|| depths_of(photos, poses, data.image_size));
     let mut gaussians = run_model(model, photos, poses, depths.as_ref())?;
-    if data.colour_steps > 0 {
+    if data.color_steps > 0 {
         let batch = view_batch(photos, poses, model.device);
-        gaussians = fit_colours(&gaussians, &batch, data.colour_steps)?;
+        gaussians = fit_colors(&gaussians, &batch, data.color_steps)?;
     }
     // The results are written to files later. This copy waits for a GPU.
     let gaussians = gaussians.to_device(Device::Cpu);

@@ -207,7 +207,7 @@ fn at_point(point: &Point, depth_maps: &[DepthMap], spacing: f64) -> IsotropicGa
     let size =
         |of: &DepthMap| point.position.distance(of.camera.c2w.w_axis.truncate()) / of.camera.intrinsics.fx;
     let least = depth_maps.iter().map(size).fold(f64::INFINITY, f64::min);
-    IsotropicGaussian { mean: point.position, scale: EXTENT * spacing * least, color: point.colour }
+    IsotropicGaussian { mean: point.position, scale: EXTENT * spacing * least, color: point.color }
 }
 
 /// Appends `count` Gaussians at random pixels of `of` that count to `gaussians`.
@@ -219,7 +219,7 @@ fn sample_pixels(
     gaussians: &mut Vec<IsotropicGaussian>,
 ) {
     let (width, height) = (of.camera.width as usize, of.camera.height as usize);
-    let (depth, image, k) = (of.depths(), of.colours(), of.camera.intrinsics);
+    let (depth, image, k) = (of.depths(), of.colors(), of.camera.intrinsics);
     let counted =
         of.counted_pixels().map(|counted| (0..counted.len()).filter(|&i| counted[i]).collect::<Vec<_>>());
     for _ in 0..count {
@@ -299,7 +299,7 @@ mod tests {
         let options = (Kind::Float, Device::Cpu);
         let map = |counted: Option<Tensor>| DepthMap { counted, ..DepthMap::flat(16, 16, 4.) };
         let right = Tensor::arange(16, options).ge(8.).expand([16, 16], false).contiguous();
-        let point = |x: f64| Point { position: DVec3::new(x, 0., 4.), colour: [0.5; 3] };
+        let point = |x: f64| Point { position: DVec3::new(x, 0., 4.), color: [0.5; 3] };
         let points = [point(-1.), point(1.), point(-9.)];
         let xs = |maps: &[DepthMap]| -> Vec<f64> {
             let raw = sample_gaussians(maps, &points, 200, 0);

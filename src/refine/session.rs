@@ -324,7 +324,7 @@ impl<'a> RefineSession<'a> {
             .collect::<Result<Vec<_>>>()?;
         // The optimization fits the colors, too.
         let mut config = loaded.config.clone();
-        config.data.colour_steps = 0;
+        config.data.color_steps = 0;
         let model = Model { config: &config, ..loaded.into() };
         Ok(reconstruct(model, &context, &[])?.in_world().to_device(self.options.device))
     }

@@ -8,7 +8,7 @@ use tch::{Tensor, with_grad};
 /// Returns the contribution of each Gaussian to the images of `cameras`, in pixels: the sum over all pixels of its weight α·T, its opacity
 /// there times the transmittance in front of it. `gaussians` are of one scene, in the cameras' local frame (spec 2.5).
 ///
-/// The weight of a Gaussian in a pixel is the derivative of the pixel's colour with respect to the Gaussian's colour.
+/// The weight of a Gaussian in a pixel is the derivative of the pixel's color with respect to the Gaussian's color.
 ///
 /// # Errors
 /// Fails like [`render`].
@@ -34,14 +34,14 @@ pub(crate) fn largest_contributions(contributions: &[f32], count: usize) -> Vec<
 /// Fails like [`render`].
 pub(crate) fn image_contributions(gaussians: &Gaussians, cameras: &Cameras) -> Result<Tensor> {
     let (b, n) = gaussians.opacities.size2()?;
-    let colours = Tensor::zeros([b, n, 1, 3], (gaussians.means.kind(), gaussians.means.device()));
-    let colours = colours.set_requires_grad(true);
-    let grey = Gaussians { sh: colours.shallow_clone(), ..gaussians.map(Tensor::detach) };
+    let colors = Tensor::zeros([b, n, 1, 3], (gaussians.means.kind(), gaussians.means.device()));
+    let colors = colors.set_requires_grad(true);
+    let grey = Gaussians { sh: colors.shallow_clone(), ..gaussians.map(Tensor::detach) };
     let red = with_grad(|| -> Result<Tensor> {
         let image = render(&grey, cameras, default_eps2d(gaussians))?;
         Ok(image.rgb.select(2, 0).sum(None))
     })?;
-    Ok(Tensor::run_backward(&[red], &[colours], false, false)[0].select(3, 0).select(2, 0) / SH_C0)
+    Ok(Tensor::run_backward(&[red], &[colors], false, false)[0].select(3, 0).select(2, 0) / SH_C0)
 }
 
 #[cfg(test)]

@@ -1,10 +1,10 @@
-//! Fits spherical harmonics to limits on their values or degree, so that a capture's cameras see the same colours as before (spec 10.15).
+//! Fits spherical harmonics to limits on their values or degree, so that a capture's cameras see the same colors as before (spec 10.15).
 //!
-//! File formats that store a coefficient in one byte can't hold values beyond a bound. Clamping the values changes colours in every
-//! direction. But cameras see a Gaussian from few directions, and other coefficients within the bound show the same colours in those
+//! File formats that store a coefficient in one byte can't hold values beyond a bound. Clamping the values changes colors in every
+//! direction. But cameras see a Gaussian from few directions, and other coefficients within the bound show the same colors in those
 //! directions.
 //!
-//! A format that stores a palette of coefficients holds small coefficients best. What a palette changes in the mean colour that the cameras
+//! A format that stores a palette of coefficients holds small coefficients best. What a palette changes in the mean color that the cameras
 //! see is compensated by the coefficient of degree 0.
 
 use crate::scene::{Camera, Gaussians, SH_C0};
@@ -14,7 +14,7 @@ use globalsplat_splat_file::ShLimits;
 use rayon::prelude::*;
 use tch::Tensor;
 
-/// Number of spherical harmonics of a colour channel, up to degree 3.
+/// Number of spherical harmonics of a color channel, up to degree 3.
 const BASES: usize = 16;
 /// Weight of a change in all directions, relative to the cameras' total weight of 1.
 const OTHER_DIRECTIONS_WEIGHT: f64 = 1e-5;
@@ -33,20 +33,20 @@ const NEAR: f64 = 0.01;
 
 /// Returns the Gaussians with coefficients within `limits`. `gaussians` are [1, N, ..], float32 on the host, in the cameras' local frame
 /// (spec 2.5). Coefficients within the limits stay. Others are clamped, or, if any of `cameras` sees the Gaussian, fitted so that the
-/// cameras see its colours as closely as possible. The opacity of a Gaussian that would be too dark is raised.
+/// cameras see its colors as closely as possible. The opacity of a Gaussian that would be too dark is raised.
 pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &ShLimits) -> Gaussians {
-    let colours = Colours::new(gaussians, cameras);
-    let fitted: Vec<_> = (0..colours.opacities.len())
+    let colors = Colors::new(gaussians, cameras);
+    let fitted: Vec<_> = (0..colors.opacities.len())
         .into_par_iter()
         .map(|index| {
-            let (coefficients, opacity) = (colours.coefficients(index), f64::from(colours.opacities[index]));
+            let (coefficients, opacity) = (colors.coefficients(index), f64::from(colors.opacities[index]));
             match clamp(&coefficients, limits) == coefficients {
                 true => (coefficients, opacity),
-                false => Fit::new(coefficients, colours.seen(index), limits).best(opacity),
+                false => Fit::new(coefficients, colors.seen(index), limits).best(opacity),
             }
         })
         .collect();
-    let kept = colours.bases.min((limits.degree + 1).pow(2));
+    let kept = colors.bases.min((limits.degree + 1).pow(2));
     let sh: Vec<f32> = fitted
         .iter()
         .flat_map(|(coefficients, _)| coefficients[..kept].as_flattened().iter().map(|&c| c as f32))
@@ -59,26 +59,26 @@ pub fn fit_harmonics(gaussians: &Gaussians, cameras: &[Camera], limits: &ShLimit
     }
 }
 
-/// Returns the Gaussians with the smallest coefficients above degree 0 that show the same colours to `cameras`, for formats that hold small coefficients
+/// Returns the Gaussians with the smallest coefficients above degree 0 that show the same colors to `cameras`, for formats that hold small coefficients
 /// best. `gaussians` are as in [`fit_harmonics`]. Gaussians that no camera sees stay.
 pub fn shrink_harmonics(gaussians: &Gaussians, cameras: &[Camera]) -> Gaussians {
-    let colours = Colours::new(gaussians, cameras);
+    let colors = Colors::new(gaussians, cameras);
     let limits = ShLimits::up_to(gaussians.sh.size()[2].isqrt() as usize - 1);
-    let shrunk = (0..colours.opacities.len()).into_par_iter().flat_map_iter(|index| {
-        let (coefficients, seen) = (colours.coefficients(index), colours.seen(index));
+    let shrunk = (0..colors.opacities.len()).into_par_iter().flat_map_iter(|index| {
+        let (coefficients, seen) = (colors.coefficients(index), colors.seen(index));
         let shrunk = match seen.is_empty() {
             true => coefficients,
             false => Fit::new(coefficients, seen, &limits).solve_smallest(),
         };
-        shrunk.into_iter().take(colours.bases).flatten().map(|coefficient| coefficient as f32)
+        shrunk.into_iter().take(colors.bases).flatten().map(|coefficient| coefficient as f32)
     });
     with_sh(gaussians, &shrunk.collect::<Vec<_>>())
 }
 
 /// Returns `rounded`, whose coefficients above degree 0 differ from those of `gaussians`, with coefficients of degree 0 for which `cameras`
-/// see the same mean colour as of `gaussians`.
-pub fn compensate_mean_colour(gaussians: &Gaussians, rounded: &Gaussians, cameras: &[Camera]) -> Gaussians {
-    let (before, after) = (Colours::new(gaussians, cameras), Colours::new(rounded, &[]));
+/// see the same mean color as of `gaussians`.
+pub fn compensate_mean_color(gaussians: &Gaussians, rounded: &Gaussians, cameras: &[Camera]) -> Gaussians {
+    let (before, after) = (Colors::new(gaussians, cameras), Colors::new(rounded, &[]));
     let compensated = (0..before.opacities.len()).into_par_iter().flat_map_iter(|index| {
         let (original, mut rounded) = (before.coefficients(index), after.coefficients(index));
         let seen = before.seen(index);
@@ -105,7 +105,7 @@ type Coefficients = [[f64; 3]; BASES];
 type Seen = Vec<([f64; BASES], f64)>;
 
 /// Numbers of Gaussians, and the cameras that see them.
-struct Colours {
+struct Colors {
     means: Vec<f32>,
     scales: Vec<f32>,
     opacities: Vec<f32>,
@@ -115,11 +115,11 @@ struct Colours {
     cameras: Vec<(Camera, DMat4)>,
 }
 
-impl Colours {
+impl Colors {
     fn new(gaussians: &Gaussians, cameras: &[Camera]) -> Self {
         let numbers =
             |tensor: &Tensor| Vec::<f32>::try_from(tensor.flatten(0, -1)).expect("float32 on the host");
-        Colours {
+        Colors {
             means: numbers(&gaussians.means),
             scales: numbers(&gaussians.scales),
             opacities: numbers(&gaussians.opacities),
@@ -133,8 +133,8 @@ impl Colours {
     fn coefficients(&self, index: usize) -> Coefficients {
         let mut coefficients = [[0.; 3]; BASES];
         let own = &self.sh[3 * self.bases * index..][..3 * self.bases];
-        for (coefficient, colour) in coefficients.iter_mut().zip(own.as_chunks().0) {
-            *coefficient = colour.map(f64::from);
+        for (coefficient, color) in coefficients.iter_mut().zip(own.as_chunks().0) {
+            *coefficient = color.map(f64::from);
         }
         coefficients
     }
@@ -195,7 +195,7 @@ impl<'a> Fit<'a> {
         if dark <= MAX_DARKENING || opacity >= MAX_OPACITY {
             return (fitted, opacity);
         }
-        // The product of colour and opacity stays the same. The colour includes the offset of ½.
+        // The product of color and opacity stays the same. The color includes the offset of ½.
         let raised = (opacity * dark).min(MAX_OPACITY);
         let factor = opacity / raised;
         self.original.iter_mut().flatten().for_each(|coefficient| *coefficient *= factor);
@@ -203,7 +203,7 @@ impl<'a> Fit<'a> {
         (self.solve(), raised)
     }
 
-    /// Returns the coefficients that minimize the squared error of the seen colours, plus a small multiple ε of the squares of all
+    /// Returns the coefficients that minimize the squared error of the seen colors, plus a small multiple ε of the squares of all
     /// coefficients above degree 0.
     ///
     /// With A = Σ weight·Y·Yᵀ, they are c = (A + ε·diag(0, 1, 1, …))⁻¹ A c₀. The matrix is positive definite, so Gauss–Jordan elimination
@@ -255,16 +255,16 @@ impl<'a> Fit<'a> {
         }
     }
 
-    /// Returns the factor that brings the colours of `fitted` nearest to those of the original coefficients, in the least-squares sense.
+    /// Returns the factor that brings the colors of `fitted` nearest to those of the original coefficients, in the least-squares sense.
     fn darkness(&self, fitted: &Coefficients) -> f64 {
-        let colour = |coefficients: &Coefficients, basis: &[f64; BASES], channel: usize| {
+        let color = |coefficients: &Coefficients, basis: &[f64; BASES], channel: usize| {
             let sum: f64 = basis.iter().zip(coefficients).map(|(y, of_basis)| y * of_basis[channel]).sum();
             (sum + 0.5).max(0.)
         };
         let (mut product, mut square) = (0., 0.);
         for (basis, weight) in &self.seen {
             for channel in 0..3 {
-                let (was, is) = (colour(&self.original, basis, channel), colour(fitted, basis, channel));
+                let (was, is) = (color(&self.original, basis, channel), color(fitted, basis, channel));
                 product += weight * was * is;
                 square += weight * is * is;
             }
@@ -345,14 +345,14 @@ mod tests {
         assert!(fitted.sh.narrow(1, 2, 1).equal(&original.sh.narrow(1, 2, 1)), "within the limits");
     }
 
-    /// The smallest coefficients look the same from the cameras, and rounded ones have the same mean colour.
+    /// The smallest coefficients look the same from the cameras, and rounded ones have the same mean color.
     #[test]
     fn coefficients_shrink_and_rounding_is_compensated() {
         let (original, cameras) = (gaussians(3.), cameras(5));
         let shrunk = shrink_harmonics(&original, &cameras);
         let largest = |g: &Gaussians, index: i64| g.sh.narrow(1, index, 1).abs().max().double_value(&[]);
         assert!(largest(&shrunk, 0) < 2.5 && largest(&shrunk, 1) == 3., "{}", largest(&shrunk, 0));
-        // Colours that don't depend on the direction stay as they are.
+        // Colors that don't depend on the direction stay as they are.
         let mut constant = original.map(Tensor::shallow_clone);
         constant.sh = original.sh.copy();
         let _ = constant.sh.narrow(2, 1, 15).fill_(0.);
@@ -368,14 +368,14 @@ mod tests {
         let mut rounded = shrunk.map(Tensor::shallow_clone);
         rounded.sh = &shrunk.sh + 0.2;
         rounded.sh.narrow(2, 0, 1).copy_(&shrunk.sh.narrow(2, 0, 1));
-        let compensated = compensate_mean_colour(&original, &rounded, &cameras);
+        let compensated = compensate_mean_color(&original, &rounded, &cameras);
         let (before, after) = (loss(&original, &rounded, &cameras), loss(&original, &compensated, &cameras));
         assert!(after < 0.15 * before, "{before} rounded, {after} compensated");
         assert!(compensated.sh.narrow(2, 1, 15).equal(&rounded.sh.narrow(2, 1, 15)));
     }
 
     #[test]
-    fn opacity_rises_if_limits_darken_the_colour() {
+    fn opacity_rises_if_limits_darken_the_color() {
         let limits = ShLimits { degree: 0, dc: -1.77..=1.77, rest: 0. ..=0. };
         let mut original = gaussians(0.);
         original.sh = Tensor::zeros_like(&original.sh);

@@ -3,7 +3,7 @@
 mod contribution;
 pub mod cpu;
 pub mod cuda;
-mod depth_colours;
+mod depth_colors;
 mod edit;
 mod harmonics;
 mod orbit;
@@ -13,9 +13,9 @@ mod views;
 use crate::ffi::take_outputs;
 pub use contribution::contributions;
 pub(crate) use contribution::{image_contributions, largest_contributions};
-pub use depth_colours::{DepthScale, colourize_depth, depth_colours};
+pub use depth_colors::{DepthScale, colorize_depth, depth_colors};
 pub use edit::{EditedSplat, SplatEdit, edit_splat, move_cameras};
-pub use harmonics::{compensate_mean_colour, fit_harmonics, shrink_harmonics};
+pub use harmonics::{compensate_mean_color, fit_harmonics, shrink_harmonics};
 pub use orbit::{orbit_around_gaussians, orbit_around_splat};
 pub use transform::transform;
 pub use views::{RenderedView, SplatRenderer, render_views};
@@ -72,7 +72,7 @@ impl Cameras {
 /// Rendered images of all cameras.
 #[derive(Debug)]
 pub struct RenderOutput {
-    /// Colour over a black background, [B, C, 3, H, W]; not clamped above.
+    /// Color over a black background, [B, C, 3, H, W]; not clamped above.
     pub rgb: Tensor,
     /// Accumulated opacity in [0, 1], [B, C, H, W].
     pub alpha: Tensor,
@@ -105,8 +105,8 @@ pub struct Projected {
     pub conic: Tensor,
     /// Depth along the camera's z axis, [B, C, N].
     pub depth: Tensor,
-    /// RGB colour as seen from the camera, [B, C, N, 3].
-    pub colour: Tensor,
+    /// RGB color as seen from the camera, [B, C, N, 3].
+    pub color: Tensor,
 }
 
 /// Projects every Gaussian as [`render()`] does. Differentiable with respect to means, scales, quaternions, SH and `w2c`.
@@ -114,8 +114,8 @@ pub struct Projected {
 /// # Errors
 /// Fails like [`render()`].
 pub fn project(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<Projected> {
-    let [visible, mean2d, conic, depth, colour] = call(ffi::project, gaussians, cameras, eps2d)?;
-    Ok(Projected { visible, mean2d, conic, depth, colour })
+    let [visible, mean2d, conic, depth, color] = call(ffi::project, gaussians, cameras, eps2d)?;
+    Ok(Projected { visible, mean2d, conic, depth, color })
 }
 
 /// Op of the C++ side. It writes the addresses of new tensors to the slice.

@@ -1,4 +1,4 @@
-//! Transforms a splat from one world to another, colours included (spec 2.4).
+//! Transforms a splat from one world to another, colors included (spec 2.4).
 
 use crate::scene::{Gaussians, Similarity};
 use glam::{DMat3, DQuat};

@@ -10,7 +10,7 @@ use tch::{Device, Tensor};
 /// Rendered image of one camera.
 #[derive(Debug)]
 pub struct RenderedView {
-    /// Colour, [3, H, W].
+    /// Color, [3, H, W].
     pub rgb: Tensor,
     /// Accumulated opacity, [H, W].
     pub alpha: Tensor,

@@ -33,7 +33,7 @@ impl DepthMap {
     }
 
     /// Returns the photo's values, channel by channel.
-    pub fn colours(&self) -> Vec<f32> {
+    pub fn colors(&self) -> Vec<f32> {
         numbers(&self.image)
     }
 

@@ -10,9 +10,9 @@ use tch::{Kind, Tensor};
 pub(crate) struct SmallPhoto {
     pub name: String,
     pub camera: Camera,
-    /// Colours, [3, h, w].
+    /// Colors, [3, h, w].
     pub image: Tensor,
-    /// Mean over the colour channels, [h, w].
+    /// Mean over the color channels, [h, w].
     pub grey: Tensor,
     /// Weight of each pixel, [h, w]; `None` if every pixel counts.
     pub weight: Option<Tensor>,
@@ -83,7 +83,7 @@ impl SmallPhoto {
     }
 }
 
-/// Downscales images [.., 3, H, W] and their masks [.., 1, H, W] by `pool`. Colours are means over the pixels that count.
+/// Downscales images [.., 3, H, W] and their masks [.., 1, H, W] by `pool`. Colors are means over the pixels that count.
 pub(crate) fn pool_masked(
     images: &Tensor,
     masks: Option<&Tensor>,

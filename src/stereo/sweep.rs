@@ -332,7 +332,7 @@ mod tests {
             assert!(sureness.median().double_value(&[]) > 0.8);
         }
         // Points show that the scene begins at depth 3, so planes are closer together.
-        let point = |i: i32| Point { position: DVec3::new(0.01 * f64::from(i), 0., 3.), colour: [0.; 3] };
+        let point = |i: i32| Point { position: DVec3::new(0.01 * f64::from(i), 0., 3.), color: [0.; 3] };
         let points: Vec<Point> = (0..40).map(point).collect();
         let photos: Vec<SmallPhoto> = photos(false);
         assert!((EstimatedDepth::of(1, &photos, &points).nearest.unwrap() - 1.3 / 3.).abs() < 1e-9);

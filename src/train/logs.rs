@@ -9,7 +9,7 @@ use crate::error::{Error, Result};
 use crate::io::{AppendFile, EventFile, tile_horizontally, write_atomically};
 use crate::loss::Term;
 use crate::model::{GlobalSplat, Stage};
-use crate::render::{DEFAULT_EPS2D, colourize_depth, render};
+use crate::render::{DEFAULT_EPS2D, colorize_depth, render};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::Path;
@@ -218,7 +218,7 @@ pub(super) fn preview(model: &GlobalSplat, batch: &Batch, stage: Stage) -> Resul
     let (photo, ground_truth, rgb) = (first(&shown.images), first(&target.images), first(&pictures.rgb));
     let (depth, alpha) = (first(&pictures.depth), first(&pictures.alpha));
     let grey = alpha.unsqueeze(0).expand([3, -1, -1], false);
-    Ok(tile_horizontally(&[photo, ground_truth, rgb.clamp(0., 1.), colourize_depth(&depth, &alpha), grey]))
+    Ok(tile_horizontally(&[photo, ground_truth, rgb.clamp(0., 1.), colorize_depth(&depth, &alpha), grey]))
 }
 
 #[cfg(test)]

@@ -63,23 +63,23 @@ fn walk(random: &mut impl Rng, frames: usize, size: ImageSize) -> Vec<Camera> {
         .collect()
 }
 
-/// A patch of the room's surface during construction: a flat, opaque, coloured Gaussian.
+/// A patch of the room's surface during construction: a flat, opaque, colored Gaussian.
 struct Patch {
     mean: DVec3,
     normal: DVec3,
-    colour: DVec3,
+    color: DVec3,
 }
 
 fn surfaces(random: &mut impl Rng) -> Gaussians {
     let mut patches = vec![];
-    let mut colour = || {
+    let mut color = || {
         DVec3::new(
             random.random_range(0.2..0.9),
             random.random_range(0.2..0.9),
             random.random_range(0.2..0.9),
         )
     };
-    // The back wall, floor, ceiling and two side walls, each a checkerboard of two colours.
+    // The back wall, floor, ceiling and two side walls, each a checkerboard of two colors.
     let walls = [
         (DVec3::new(-2., -1.2, 4.), DVec3::X * 4., DVec3::Y * 2.4),
         (DVec3::new(-2., 1.2, 1.), DVec3::X * 4., DVec3::Z * 3.),
@@ -88,27 +88,27 @@ fn surfaces(random: &mut impl Rng) -> Gaussians {
         (DVec3::new(2., -1.2, 1.), DVec3::Y * 2.4, DVec3::Z * 3.),
     ];
     for (corner, along, across) in walls {
-        let colours = [colour(), colour()];
-        checkerboard(&mut patches, corner, along, across, colours);
+        let colors = [color(), color()];
+        checkerboard(&mut patches, corner, along, across, colors);
     }
     let spheres: Vec<(DVec3, f64, [DVec3; 2])> = (0..4)
         .map(|i| {
-            let colours = [colour(), colour()];
+            let colors = [color(), color()];
             let x = -1.2 + 0.8 * i as f64;
             (
                 DVec3::new(x, 0.2 + 0.25 * (i as f64 * 1.7).sin(), 2.4 + 0.5 * (i as f64 * 2.3).cos()),
                 0.35,
-                colours,
+                colors,
             )
         })
         .collect();
-    for (centre, radius, colours) in spheres {
-        striped_sphere(&mut patches, centre, radius, colours);
+    for (centre, radius, colors) in spheres {
+        striped_sphere(&mut patches, centre, radius, colors);
     }
     gaussians_of(&patches)
 }
 
-fn checkerboard(patches: &mut Vec<Patch>, corner: DVec3, along: DVec3, across: DVec3, colours: [DVec3; 2]) {
+fn checkerboard(patches: &mut Vec<Patch>, corner: DVec3, along: DVec3, across: DVec3, colors: [DVec3; 2]) {
     const SQUARE: f64 = 0.4;
     let (columns, rows) = ((along.length() / SPACING) as usize, (across.length() / SPACING) as usize);
     for row in 0..rows {
@@ -118,13 +118,13 @@ fn checkerboard(patches: &mut Vec<Patch>, corner: DVec3, along: DVec3, across: D
             patches.push(Patch {
                 mean: corner + along.normalize() * s + across.normalize() * t,
                 normal: along.cross(across).normalize(),
-                colour: colours[square % 2],
+                color: colors[square % 2],
             });
         }
     }
 }
 
-fn striped_sphere(patches: &mut Vec<Patch>, centre: DVec3, radius: f64, colours: [DVec3; 2]) {
+fn striped_sphere(patches: &mut Vec<Patch>, centre: DVec3, radius: f64, colors: [DVec3; 2]) {
     let rings = (std::f64::consts::PI * radius / SPACING) as usize;
     for ring in 0..rings {
         let polar = std::f64::consts::PI * (ring as f64 + 0.5) / rings as f64;
@@ -132,7 +132,7 @@ fn striped_sphere(patches: &mut Vec<Patch>, centre: DVec3, radius: f64, colours:
         for k in 0..around {
             let azimuth = std::f64::consts::TAU * k as f64 / around as f64;
             let normal = DVec3::new(polar.sin() * azimuth.cos(), polar.cos(), polar.sin() * azimuth.sin());
-            patches.push(Patch { mean: centre + radius * normal, normal, colour: colours[ring / 3 % 2] });
+            patches.push(Patch { mean: centre + radius * normal, normal, color: colors[ring / 3 % 2] });
         }
     }
 }
@@ -157,7 +157,7 @@ fn gaussians_of(patches: &[Patch]) -> Gaussians {
         scales: tensor(scale.repeat(patches.len()), 3),
         quaternions: tensor(quaternions, 4),
         opacities: tensor(vec![0.95; patches.len()], 1).squeeze_dim(-1),
-        sh: tensor(flatten(|p| (p.colour - 0.5) / SH_C0), 3).unsqueeze(2),
+        sh: tensor(flatten(|p| (p.color - 0.5) / SH_C0), 3).unsqueeze(2),
         antialiased: false,
     }
 }

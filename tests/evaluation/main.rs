@@ -3,7 +3,7 @@
 #[path = "../common/mod.rs"]
 mod common;
 
-mod colour_fit;
+mod color_fit;
 mod evaluation;
 mod refine;
 mod report;

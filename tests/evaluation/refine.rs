@@ -117,8 +117,8 @@ fn masks_in_a_folder_are_left_out() {
     assert!(bytes(&[&reconstruct[..], &["--masks", masks]].concat()) != bytes(&reconstruct));
     let refine = ["refine", "--steps", "3", "--gaussians", "200", "--masks", masks];
     let ignored = bytes(&refine);
-    for colour in ["black", "white", "random"] {
-        assert!(bytes(&[&refine[..], &["--mask-background", colour]].concat()) != ignored, "{colour}");
+    for color in ["black", "white", "random"] {
+        assert!(bytes(&[&refine[..], &["--mask-background", color]].concat()) != ignored, "{color}");
     }
 }
 
@@ -507,7 +507,7 @@ fn colmap_points_initialize_gaussians() {
         assert_eq!(points.len() * 3, means.len());
         for (point, expected) in points.iter().zip(means.chunks(3)) {
             assert_eq!(point.position.to_array(), expected);
-            assert_eq!(point.colour, [1., 0., 0.2]);
+            assert_eq!(point.color, [1., 0., 0.2]);
         }
         // Nine tenths of the Gaussians are at points, the others on pixels.
         let views = load_all_views(&capture, None).unwrap();

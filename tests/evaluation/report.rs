@@ -79,8 +79,8 @@ fn made_up(folder: &Path) -> Vec<(PathBuf, Evaluation)> {
     for (folder, evaluation) in &evaluations {
         std::fs::create_dir_all(folder.join("scenes")).unwrap();
         for scene in evaluation.scenes.iter().filter(|scene| scene.scores.scene != "b") {
-            let colour = image::Rgb([90, 120, (scene.scores.mean.psnr * 5.) as u8]);
-            image::RgbImage::from_pixel(1036, 256, colour)
+            let color = image::Rgb([90, 120, (scene.scores.mean.psnr * 5.) as u8]);
+            image::RgbImage::from_pixel(1036, 256, color)
                 .save(comparison_path(folder, &scene.scores.scene))
                 .unwrap();
         }
@@ -184,17 +184,17 @@ fn the_command_writes_the_page_and_refuses_in_a_sentence() {
 
 /// Script that finds texts with a contrast to their background below 4.5, the threshold of WCAG's level AA.
 const FAINT: &str = r#"(() => {
-    const channels = (colour) => colour.match(/[\d.]+/g).map(Number);
-    const luminance = (colour) => {
+    const channels = (color) => color.match(/[\d.]+/g).map(Number);
+    const luminance = (color) => {
         const linear = (v) => (v /= 255) <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4;
-        const [r, g, b] = colour.map(linear);
+        const [r, g, b] = color.map(linear);
         return 0.2126 * r + 0.7152 * g + 0.0722 * b;
     };
     const behind = (element) => {
         for (; element; element = element.parentElement) {
-            const colour = channels(getComputedStyle(element).backgroundColor);
-            if (colour.length < 4) return colour;
-            if (colour[3] > 0) throw new Error("a translucent ground");
+            const color = channels(getComputedStyle(element).backgroundColor);
+            if (color.length < 4) return color;
+            if (color[3] > 0) throw new Error("a translucent ground");
         }
         throw new Error("no ground");
     };
@@ -205,9 +205,9 @@ const FAINT: &str = r#"(() => {
         if (!text || ["title", "SCRIPT"].includes(element.tagName) || !element.checkVisibility()) continue;
         texts += 1;
         const style = getComputedStyle(element);
-        const colour = channels(element.ownerSVGElement ? style.fill : style.color);
-        if (colour.length > 3) faint.push(`${text}: translucent`);
-        const [a, b] = [colour.slice(0, 3), behind(element)].map(luminance);
+        const color = channels(element.ownerSVGElement ? style.fill : style.color);
+        if (color.length > 3) faint.push(`${text}: translucent`);
+        const [a, b] = [color.slice(0, 3), behind(element)].map(luminance);
         const contrast = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
         if (contrast < 4.5) faint.push(`${text}: ${contrast}`);
     }

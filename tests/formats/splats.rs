@@ -223,9 +223,9 @@ fn moved_splats_look_the_same() {
     };
     let psnr = globalsplat::metrics::psnr(&seen(&splat, camera()), &seen(&moved, along));
     assert!(psnr > 70., "{psnr} dB");
-    let without_colours = Splat { sh: splat.sh.clone(), ..moved };
-    let psnr = globalsplat::metrics::psnr(&seen(&splat, camera()), &seen(&without_colours, along));
-    assert!(psnr < 40., "colours matter: {psnr} dB");
+    let without_colors = Splat { sh: splat.sh.clone(), ..moved };
+    let psnr = globalsplat::metrics::psnr(&seen(&splat, camera()), &seen(&without_colors, along));
+    assert!(psnr < 40., "colors matter: {psnr} dB");
 }
 
 /// Coefficients beyond SPZ's range are clamped without a capture; with a capture the others are fitted to its cameras.
@@ -236,7 +236,7 @@ fn convert_preserves_the_views_of_a_capture() {
     let mut splat = read_splat(&room.join("truth.ply")).unwrap().with_sh_degree(3);
     let mut random = Random::new(3);
     for of_one in splat.sh.chunks_exact_mut(16) {
-        of_one[1..].iter_mut().for_each(|colour| *colour = random.symmetric().map(|number: f32| 3. * number));
+        of_one[1..].iter_mut().for_each(|color| *color = random.symmetric().map(|number: f32| 3. * number));
     }
     write_splat(&strong, &splat).unwrap();
     let cameras = globalsplat::data::open_capture(&room).unwrap().cameras();

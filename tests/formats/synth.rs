@@ -246,7 +246,7 @@ fn names_of_synthetic_videos_are_checked() {
         ("synth:scenes=some", r#"scenes is "some", expected"#),
         ("synth:scenes", r#"scenes is "", expected"#),
         ("synth:scenes=1,scenes=2", "scenes is repeated"),
-        ("synth:scenes=1,colour=red", r#"a field is "colour", expected"#),
+        ("synth:scenes=1,color=red", r#"a field is "color", expected"#),
         ("synth:scenes=1,size=8", "size is 8, expected 16 to 8192"),
         ("synth:scenes=1,frames=2", "frames is 2, expected 3 to 10000"),
         ("synth:scenes=1,pictures=nowhere", "nowhere can't be read"),

@@ -275,10 +275,10 @@ fn brute_force(g: &Gaussians, c: &Cameras) -> RenderOutput {
                     rows[1].dot(rows[1]) + DEFAULT_EPS2D,
                 ];
                 let det = cov[0] * cov[2] - cov[1] * cov[1];
-                let colour: Vec<f64> =
+                let color: Vec<f64> =
                     (0..3).map(|ch| (0.28209479177387814 * sh[3 * i + ch] + 0.5).max(0.)).collect();
                 let mean = [fx * t[0] / t[2] + cx, fy * t[1] / t[2] + cy];
-                seen.push((t[2], mean, [cov[2] / det, -cov[1] / det, cov[0] / det], opacities[i], colour));
+                seen.push((t[2], mean, [cov[2] / det, -cov[1] / det, cov[0] / det], opacities[i], color));
             }
             seen.sort_by(|a, b| a.0.total_cmp(&b.0));
             let mut planes = vec![vec![0f64; w * h]; 3];
@@ -286,7 +286,7 @@ fn brute_force(g: &Gaussians, c: &Cameras) -> RenderOutput {
             for pixel in 0..w * h {
                 let (x, y) = ((pixel % w) as f64 + 0.5, (pixel / w) as f64 + 0.5);
                 let (mut transmittance, mut z_sum) = (1f64, 0f64);
-                for (z, mean, conic, opacity, colour) in &seen {
+                for (z, mean, conic, opacity, color) in &seen {
                     let (dx, dy) = (mean[0] - x, mean[1] - y);
                     let sigma = 0.5 * (conic[0] * dx * dx + conic[2] * dy * dy) + conic[1] * dx * dy;
                     let a = (opacity * (-sigma).exp()).min(0.999);
@@ -298,7 +298,7 @@ fn brute_force(g: &Gaussians, c: &Cameras) -> RenderOutput {
                     }
                     let weight = transmittance * a;
                     for channel in 0..3 {
-                        planes[channel][pixel] += weight * colour[channel];
+                        planes[channel][pixel] += weight * color[channel];
                     }
                     z_sum += weight * z;
                     transmittance *= 1. - a;

@@ -389,7 +389,7 @@ fn inspect_describes_splats_captures_and_weights() {
         let at = |name: &str| splat[part][name].as_f64().unwrap();
         assert!(at("p01") <= at("p50") && at("p50") <= at("p99") && at("p99") > 0., "{splat}");
     }
-    // A colour of degree 0 is the same in all directions.
+    // A color of degree 0 is the same in all directions.
     assert_eq!(splat["sh_energy"].as_array().unwrap().len(), 1);
     let preview = folder.path().join("preview.png");
     succeed(&["inspect", arg(&room.join("truth.ply")), "--preview", arg(&preview)]);

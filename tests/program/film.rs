@@ -77,7 +77,7 @@ fn an_mp4_shows_what_the_pictures_show() {
     ] {
         assert_eq!(found[key], expected, "{key}: {found}");
     }
-    // Colour and depth side by side, with a gap.
+    // Color and depth side by side, with a gap.
     assert_eq!((found["width"].as_i64(), found["height"].as_i64()), (Some(2 * 384 + 4), Some(256)));
     let bytes = fs::read(&film).unwrap();
     let at = |name: &[u8]| bytes.windows(4).position(|four| four == name).unwrap();
@@ -342,7 +342,7 @@ fn all_pictures_have_one_scale_of_depth() {
     let middle = image::imageops::resize(&middle, 320, 320, image::imageops::FilterType::Triangle);
     let likeness = psnr(&middle, &long);
     println!("{likeness:.1} dB");
-    assert!(likeness > 30., "colours of the same depths are {likeness} dB alike");
+    assert!(likeness > 30., "colors of the same depths are {likeness} dB alike");
 }
 
 fn assert_same(path: &Path, expected: &[Camera], tolerance: f64) {

@@ -40,7 +40,7 @@ fn bundled_weights_match_the_configuration_tiny() {
     let tiny = read("tiny");
     assert_eq!(shipped.config.model, tiny.model);
     assert_eq!(shipped.config.data.image_size, tiny.data.image_size);
-    let additions = |config: &Config| (config.data.depths, config.data.colour_steps);
+    let additions = |config: &Config| (config.data.depths, config.data.color_steps);
     assert_eq!(additions(&shipped.config), additions(&tiny));
     assert_eq!(shipped.config.data.context_views, 24, "as reconstruct --help says");
     assert_eq!(shipped.stage, tiny.curriculum.final_stage());

@@ -9,7 +9,7 @@ use base64::engine::general_purpose::STANDARD;
 use globalsplat::data::{load_views, open_capture};
 use globalsplat::io::{Splat, read_image, read_splat, tensor_from_rgb, write_splat};
 use globalsplat::metrics::psnr;
-use globalsplat::render::{depth_colours, render_views};
+use globalsplat::render::{depth_colors, render_views};
 use globalsplat::scene::{Gaussians, ImageSize};
 use serde_json::{Value, json};
 use std::os::unix::fs::PermissionsExt;
@@ -137,10 +137,10 @@ fn expected(capture: &Path, splat: &Path, index: usize) -> (Tensor, Tensor) {
     (own.rgb.clamp(0., 1.), view.image.to_float())
 }
 
-/// Returns the mean distance of an image's pixels from the nearest depth colour.
-fn from_depth_colours(picture: &Tensor) -> f64 {
+/// Returns the mean distance of an image's pixels from the nearest depth color.
+fn from_depth_colors(picture: &Tensor) -> f64 {
     let pixels = picture.flatten(1, 2).transpose(0, 1).contiguous();
-    let distances = Tensor::cdist(&pixels, &Tensor::from_slice2(&depth_colours()), 2., None::<i64>);
+    let distances = Tensor::cdist(&pixels, &Tensor::from_slice2(&depth_colors()), 2., None::<i64>);
     distances.amin([1i64].as_slice(), false).mean(Kind::Double).double_value(&[])
 }
 
@@ -214,18 +214,18 @@ fn a_page_shows_the_scene_and_can_be_walked_in() {
     shown.key_for("Home", Duration::from_millis(500));
     shown.wait_for("page.walk.at === 0");
 
-    // Depth is shown in the depth colours, centres as points.
+    // Depth is shown in the depth colors, centres as points.
     shown.key("Digit2");
     let depth = shown.picture();
     assert_eq!(shown.value("document.querySelector('[aria-pressed=true]').id"), "depth");
-    let [of_depth, of_photo] = [&depth, &picture].map(from_depth_colours);
-    println!("{of_depth:.3} from the colours of depth, in colour {of_photo:.3}");
+    let [of_depth, of_photo] = [&depth, &picture].map(from_depth_colors);
+    println!("{of_depth:.3} from the colors of depth, in color {of_photo:.3}");
     assert!(of_depth < 0.05 && of_photo > 0.15, "{of_depth} {of_photo}");
     shown.click("#centres");
     let centres = shown.picture();
     let black = centres.lt(0.05).to_kind(Kind::Float).mean(Kind::Float).double_value(&[]);
     assert!((0.5..0.99).contains(&black), "{black} of the points' picture is black");
-    shown.click("#colour");
+    shown.click("#color");
     shown.key("Home");
     shown.wait_for("page.walk.at === 0");
 

@@ -98,7 +98,7 @@ fn public_viewers_show_our_splats_as_we_do() {
     let Some(mut browser) = Browser::start() else { return };
     let of = |name: &str| folder.path().join(name);
     let published = capture.join("reference.ply");
-    // The embedded model's reconstruction, unchanged; and the published splat, whose colours are far beyond the range of a
+    // The embedded model's reconstruction, unchanged; and the published splat, whose colors are far beyond the range of a
     // byte, converted by `convert --clamp-sh`. Spark reads SPZ up to version 3, and no glTF.
     succeed(&["reconstruct", "--scene", arg(&capture), "--out", arg(&of("made.ply"))]);
     for name in ["made.spz", "made.sog", "made.glb"] {
@@ -123,7 +123,7 @@ fn public_viewers_show_our_splats_as_we_do() {
         ("published, version 4", published.clone(), of("published-4.spz"), LEAST, babylon),
         ("published", published.clone(), of("published.sog"), LEAST, both),
         ("published", published.clone(), of("published.glb"), LEAST, babylon),
-        // The viewers clamp its colours, each in its own way, so its PSNR is only printed.
+        // The viewers clamp its colors, each in its own way, so its PSNR is only printed.
         ("as it is", published.clone(), published, 0., both),
     ];
     for (name, original, file, least, readers) in files {

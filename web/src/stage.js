@@ -27,7 +27,7 @@ export class Stage {
     });
     this.all = new Scene();
     this.all.add(this.world, this.spark);
-    this.mode = "colour";
+    this.mode = "color";
     this.place = new Vector3();
     this.lookedFrom = new Matrix4();
     this.touch();
@@ -51,15 +51,15 @@ export class Stage {
   }
 
   addCentres() {
-    const [places, colours] = [[], []];
-    this.splat.splats.forEachSplat((_, centre, _scales, _quaternion, _opacity, colour) => {
+    const [places, colors] = [[], []];
+    this.splat.splats.forEachSplat((_, centre, _scales, _quaternion, _opacity, color) => {
       places.push(centre.x, centre.y, centre.z);
-      colours.push(colour.r, colour.g, colour.b);
+      colors.push(color.r, color.g, color.b);
     });
     const geometry = new BufferGeometry();
     geometry.setAttribute("position", new BufferAttribute(new Float32Array(places), 3));
-    geometry.setAttribute("color", new BufferAttribute(new Float32Array(colours), 3));
-    // A splat's colours are display (sRGB) values already, so skip the shader's colour space conversion.
+    geometry.setAttribute("color", new BufferAttribute(new Float32Array(colors), 3));
+    // A splat's colors are display (sRGB) values already, so skip the shader's color space conversion.
     const material = new PointsMaterial({ size: 2 * this.renderer.getPixelRatio(), sizeAttenuation: false, vertexColors: true });
     material.onBeforeCompile = (shader) => {
       shader.fragmentShader = shader.fragmentShader.replace("#include <colorspace_fragment>", "");
@@ -72,7 +72,7 @@ export class Stage {
 
   /**
    * Prepares the depth view: each Gaussian is grey by its centre's depth, linear in 1/depth, near ones bright. The page's filter maps
-   * greys to colours.
+   * greys to colors.
    */
   addDepth() {
     this.eye = dyno.dynoVec3(new Vector3());
@@ -131,7 +131,7 @@ export class Stage {
     this.world.add(this.frustums);
   }
 
-  /** Sets what is shown: `colour`, `depth` or `centres`. */
+  /** Sets what is shown: `color`, `depth` or `centres`. */
   show(mode) {
     this.mode = mode;
     this.splat.visible = mode !== "centres";

@@ -105,7 +105,7 @@ fn rays_of_pixels_come_back_to_the_pixels() {
 const WIDTH: u32 = 320;
 const HEIGHT: u32 = 160;
 
-/// Returns the colour of the sky in a direction of the world.
+/// Returns the color of the sky in a direction of the world.
 fn sky(direction: DVec3) -> [f64; 3] {
     let wave = |axis: DVec3| 127.5 + 100. * (1.5 * direction.normalize().dot(axis)).sin();
     [wave(DVec3::new(1., 0.3, 0.)), wave(DVec3::new(0., 1., -0.4)), wave(DVec3::new(-0.2, 0., 1.))]
@@ -129,8 +129,8 @@ fn write_photos(folder: &Path, lens: &Lens) {
     let rays: Vec<DVec3> = (0..width * height).map(|i| ray(pixel(i))).collect();
     for (name, camera) in names().iter().zip(cameras()) {
         let photo = RgbImage::from_fn(width, height, |x, y| {
-            let colour = sky(camera.c2w.transform_vector3(rays[(y * width + x) as usize]));
-            Rgb(colour.map(|level| level.round() as u8))
+            let color = sky(camera.c2w.transform_vector3(rays[(y * width + x) as usize]));
+            Rgb(color.map(|level| level.round() as u8))
         });
         photo.save(folder.join(name)).unwrap();
     }
@@ -147,9 +147,9 @@ fn capture_of(model: &str, size: [u32; 2]) -> TempDir {
     folder
 }
 
-/// Checks that every pixel of `photo` that counts has the colour of the sky along its ray, and that the others are black. Returns the
+/// Checks that every pixel of `photo` that counts has the color of the sky along its ray, and that the others are black. Returns the
 /// fraction of pixels that count.
-fn check_colours(photo: &Photo, tolerance: f64) -> f64 {
+fn check_colors(photo: &Photo, tolerance: f64) -> f64 {
     let Photo { camera, mask, .. } = photo;
     let Intrinsics { fx, fy, cx, cy } = camera.intrinsics;
     let mut counted = 0;
@@ -177,7 +177,7 @@ fn check_colours(photo: &Photo, tolerance: f64) -> f64 {
 const THIN_PRISM: &str = "THIN_PRISM_FISHEYE 125 124 89 61 -0.03 0.01 0.001 -0.002 0.001 0 0.002 -0.001";
 
 #[test]
-fn views_show_the_colours_of_the_rays_of_the_photo() {
+fn views_show_the_colors_of_the_rays_of_the_photo() {
     // Fractions of the pixels of a photo's views that count, at least and at most. Faces of a photo of all directions count in full.
     for (model, size, names, share) in [
         ("EQUIRECTANGULAR 160 80", [80, 160], 6, [1., 1.]),
@@ -195,7 +195,7 @@ fn views_show_the_colours_of_the_rays_of_the_photo() {
         assert_eq!((capture.photo_count(), capture.len()), (5, 5 * names), "{model}");
         let photos = capture.load_all(None).unwrap();
         let tolerance = if model.contains("-0.2 0") { 20. } else { 3. };
-        let shares: Vec<f64> = photos.iter().map(|photo| check_colours(photo, tolerance)).collect();
+        let shares: Vec<f64> = photos.iter().map(|photo| check_colors(photo, tolerance)).collect();
         let mean = shares.iter().sum::<f64>() / shares.len() as f64;
         assert!(share[0] <= mean && mean <= share[1], "{model}: {shares:?}");
         assert_eq!(photos.iter().any(|photo| photo.mask.is_some()), names != 6, "{model}");
@@ -376,7 +376,7 @@ fn photos_of_other_sizes_and_poses_of_paths_keep_the_field_of_view() {
     assert_eq!(found[0].camera.intrinsics.fx, 20.);
     let [(found_height, _), (height, _)] = [&found[0], &expected[0]].map(|photo| photo.image.size());
     assert!(found_height.abs_diff(height / 2) <= 1, "{found_height} {height}");
-    check_colours(&found[0], 6.);
+    check_colors(&found[0], 6.);
     // A path has one camera for each pose.
     let path = read_camera_path(folder.path(), None).unwrap();
     assert_eq!(path.cameras.len(), 5);

@@ -19,7 +19,7 @@ fn save(image: impl Into<DynamicImage>, path: &Path) {
     image.into().save(path).unwrap();
 }
 
-/// Writes five photos to `images`, all of them [`levels`] in colours.
+/// Writes five photos to `images`, all of them [`levels`] in colors.
 fn folder_of_photos(names: &[String]) -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     let photo = DynamicImage::from(levels()).into_rgb8();
@@ -140,7 +140,7 @@ fn opacity_is_a_mask_and_multiplies_another() {
     assert!([1, 3, 4].iter().all(|&view| mask_of(&capture, view).is_none()));
     // Two alpha channels with and without effect, an alpha channel with a mask, and a mask.
     assert_eq!(capture.mask_count(), 4);
-    // The colour of transparent pixels is composited over black.
+    // The color of transparent pixels is composited over black.
     let photo = capture.load(&[0], None).unwrap().remove(0).image.to_rgb();
     assert_eq!((photo.get_pixel(3, 3), photo.get_pixel(20, 3)), (&Rgb([0, 0, 0]), &Rgb([200, 100, 50])));
 }

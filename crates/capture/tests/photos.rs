@@ -43,7 +43,7 @@ fn largest_difference(a: &RgbImage, b: &RgbImage) -> u8 {
     a.as_raw().iter().zip(b.as_raw()).map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0)
 }
 
-/// Returns the colour that the ray (x, y, 1) sees, three levels from 7.5 to 247.5.
+/// Returns the color that the ray (x, y, 1) sees, three levels from 7.5 to 247.5.
 fn scene(x: f64, y: f64) -> [f64; 3] {
     let wave = |t: f64| 127.5 + 120. * t.sin();
     [wave(6. * x + 2. * y), wave(7. * y - x), wave(4. * x - 5. * y)]
@@ -250,18 +250,16 @@ fn jpegs() -> Vec<(String, Vec<u8>)> {
     use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
     let pixels = noise(45, 37).into_raw();
     let mut jpegs = vec![];
-    for (progressive, colours) in
-        [false, true].into_iter().flat_map(|p| [1, 3, 4].map(|colours| (p, colours)))
-    {
+    for (progressive, colors) in [false, true].into_iter().flat_map(|p| [1, 3, 4].map(|colors| (p, colors))) {
         for sampling in
             [SamplingFactor::F_1_1, SamplingFactor::F_2_1, SamplingFactor::F_2_2, SamplingFactor::F_4_1]
         {
             // The decoder doesn't support subsampling with four components.
-            if colours == 4 && !matches!(sampling, SamplingFactor::F_1_1) {
+            if colors == 4 && !matches!(sampling, SamplingFactor::F_1_1) {
                 continue;
             }
             for restart in [0, 3] {
-                let (kind, bytes): (ColorType, Vec<u8>) = match colours {
+                let (kind, bytes): (ColorType, Vec<u8>) = match colors {
                     1 => (ColorType::Luma, pixels.iter().step_by(3).copied().collect()),
                     3 => (ColorType::Rgb, pixels.clone()),
                     _ => (ColorType::Cmyk, pixels.chunks(3).flat_map(|p| [p[0], p[1], p[2], 40]).collect()),
@@ -275,7 +273,7 @@ fn jpegs() -> Vec<(String, Vec<u8>)> {
                 }
                 encoder.set_optimized_huffman_tables(restart == 0);
                 encoder.encode(&bytes, 45, 37, kind).unwrap();
-                jpegs.push((format!("{colours} {sampling:?} {restart} progressive {progressive}"), jpeg));
+                jpegs.push((format!("{colors} {sampling:?} {restart} progressive {progressive}"), jpeg));
             }
         }
     }
@@ -348,7 +346,7 @@ fn photos_of_other_formats_cut_short_are_refused_by_name() {
     }
 }
 
-/// PNG with 24×16 pixels of 16 colours in a palette, as hexadecimal.
+/// PNG with 24×16 pixels of 16 colors in a palette, as hexadecimal.
 const PALETTE_PNG: &str = "89504e470d0a1a0a0000000d4948445200000018000000100403000000fe0aa2a600000030504c5445b4d20078d2003cd200\
     b48c00788c003c8c0000d200008c00b446007846003c4600004600b400007800003c0000000000c5d2909e0000002349444154789c63fccfc0f01e8698\
     1890006e0ecb1ef2f4dc2355cf7b0686b324ea010020e70e8d4441c80f0000000049454e44ae426082";
@@ -363,7 +361,7 @@ fn bytes_of_hex(digits: &str) -> Vec<u8> {
 }
 
 #[test]
-fn only_photos_of_plain_colours_are_as_stored() {
+fn only_photos_of_plain_colors_are_as_stored() {
     let palette = bytes_of_hex(PALETTE_PNG);
     let as_stored = |bytes: &[u8], size| decode_photo(bytes, "photo".as_ref(), size).unwrap().as_stored;
     assert!(!as_stored(&palette, (WIDTH, HEIGHT)));
@@ -386,12 +384,12 @@ fn only_photos_of_plain_colours_are_as_stored() {
 }
 
 #[test]
-fn lossy_webp_has_colours_and_opacity() {
+fn lossy_webp_has_colors_and_opacity() {
     let webp = bytes_of_hex(LOSSY_WEBP);
     let photo = decode_photo(&webp, "lossy.webp".as_ref(), (24, 16)).unwrap();
     let alpha = photo.alpha.unwrap();
     assert!(alpha.enumerate_pixels().all(|(x, _, alpha)| alpha[0] == if x < 12 { 0 } else { 255 }));
-    // By another decoder, up to rounding: the colour where the photo is opaque, black where it isn't.
+    // By another decoder, up to rounding: the color where the photo is opaque, black where it isn't.
     for (x, expected) in [(0, [0; 3]), (13, [135, 121, 96]), (23, [228, 124, 93])] {
         let found = photo.pixels.get_pixel(x, 8).0;
         assert!(found.iter().zip(expected).all(|(a, b)| a.abs_diff(b) < 6), "{x}: {found:?}");

@@ -88,7 +88,7 @@ pub struct PoseProgress {
 /// continues where it was stopped. `capture.json` records how far the estimate is. A call with other settings repeats what depends on
 /// them.
 ///
-/// Photos that are damaged, of a single colour or identical to another are left out and reported.
+/// Photos that are damaged, of a single color or identical to another are left out and reported.
 ///
 /// # Errors
 /// Returns an error if there are fewer than two different photos; if `out` contains something else, or the capture of other photos; if

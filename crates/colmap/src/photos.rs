@@ -218,7 +218,7 @@ fn inspect(path: &Path, mask: Option<&Path>) -> Result<Inspected, String> {
     let (darkest, brightest) =
         pixels.iter().fold((u8::MAX, u8::MIN), |(low, high), &value| (low.min(value), high.max(value)));
     if brightest - darkest <= BLANK {
-        return Err("of a single colour".into());
+        return Err("of a single color".into());
     }
     // COLMAP goes by the extension.
     let has_extension = |known: &[&str]| {
@@ -310,7 +310,7 @@ mod tests {
         assert_eq!(fs::read(images.join("_a_1.png")).unwrap(), fs::read(source.join("a_1.png")).unwrap());
         let skipped: Vec<_> =
             skipped.iter().map(|photo| (photo.name.as_str(), photo.reason.as_str())).collect();
-        assert_eq!(skipped[..2], [("b/3.png", "identical to b/2.png"), ("black.png", "of a single colour")]);
+        assert_eq!(skipped[..2], [("b/3.png", "identical to b/2.png"), ("black.png", "of a single color")]);
         assert_eq!((skipped.len(), skipped[2].0), (3, "cut.png"));
         assert!(skipped[2].1.starts_with("undecodable ("), "{}", skipped[2].1);
     }

@@ -74,7 +74,7 @@ fn bad_requests_are_refused_in_one_sentence() {
     };
     assert_eq!(
         capture_refusal("black"),
-        "black: the number of photos is 2, of which 2 can't be used (40.png is of a single colour, 50.png is of a single colour), expected \
+        "black: the number of photos is 2, of which 2 can't be used (40.png is of a single color, 50.png is of a single color), expected \
          2 or more different ones"
     );
     std::fs::remove_dir_all(at("new")).unwrap();

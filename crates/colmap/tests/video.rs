@@ -298,22 +298,22 @@ fn frames_are_upright() {
 }
 
 #[test]
-fn pixels_become_square_and_colours_stay() {
+fn pixels_become_square_and_colors_stay() {
     if !has_ffmpeg() {
         return;
     }
     let root = tempfile::tempdir().unwrap();
     let at = |name: &str| root.path().join(name);
     let (video, folder) = (at("video.mkv"), at("frames"));
-    let colours = [[200, 40, 60], [30, 180, 70], [40, 60, 190]];
-    // A large video whose colours are undeclared is BT.709, a small one is BT.601; a declaration goes first.
+    let colors = [[200, 40, 60], [30, 180, 70], [40, 60, 190]];
+    // A large video whose colors are undeclared is BT.709, a small one is BT.601; a declaration goes first.
     for (width, height, matrix, declared) in [
         (1280, 720, "bt709", None),
         (320, 180, "bt601", None),
         (320, 180, "bt709", Some("bt709")),
         (1280, 720, "bt601", Some("smpte170m")),
     ] {
-        let image = RgbImage::from_fn(width, height, |x, _| image::Rgb(colours[(x * 3 / width) as usize]));
+        let image = RgbImage::from_fn(width, height, |x, _| image::Rgb(colors[(x * 3 / width) as usize]));
         let size = format!("{width}x{height}");
         let filter =
             format!("loop=4:1,scale=out_color_matrix={matrix}:flags=accurate_rnd,format=yuv420p,setsar=3/2");
@@ -326,11 +326,11 @@ fn pixels_become_square_and_colours_stay() {
         assert_eq!(frames.size, (width * 3 / 2, height));
         let shown = image::open(&frames.files[0]).unwrap().into_rgb8();
         assert_eq!(shown.dimensions(), frames.size);
-        for (i, colour) in colours.into_iter().enumerate() {
+        for (i, color) in colors.into_iter().enumerate() {
             let found = shown[(frames.size.0 * (2 * i as u32 + 1) / 6, height / 2)].0;
             assert!(
-                found.iter().zip(colour).all(|(a, b)| a.abs_diff(b) <= 4),
-                "{found:?} {colour:?} {matrix} {declared:?}"
+                found.iter().zip(color).all(|(a, b)| a.abs_diff(b) <= 4),
+                "{found:?} {color:?} {matrix} {declared:?}"
             );
         }
     }
@@ -345,8 +345,8 @@ fn hdr_is_converted() {
     let (video, folder) = (root.path().join("video.mkv"), root.path().join("frames"));
     // White of 100 cd/m², the diffuse white of SDR, is 51 % in PQ, a medium grey if it is taken for SDR.
     let input = ["-f", "lavfi", "-i", "color=c=0x828282:s=320x180:d=0.2:r=25", "-pix_fmt", "yuv420p10le"];
-    let colours = ["-vf", "setparams=color_primaries=bt2020:color_trc=smpte2084:colorspace=bt2020nc"];
-    let arguments = [&input[..], &colours, &["-c:v", "ffv1", text(&video)]].concat();
+    let colors = ["-vf", "setparams=color_primaries=bt2020:color_trc=smpte2084:colorspace=bt2020nc"];
+    let arguments = [&input[..], &colors, &["-c:v", "ffv1", text(&video)]].concat();
     assert!(run_ffmpeg(root.path(), &arguments, &[]));
     let frames = extract(&video, &folder, Some(1)).unwrap();
     if let [warning] = &frames.warnings[..] {

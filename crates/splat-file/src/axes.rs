@@ -67,8 +67,8 @@ impl Axes {
         let (bases, signs) = (splat.bases(), self.harmonics());
         splat.means.iter_mut().for_each(|mean| *mean = self.position(*mean));
         for of_one in splat.sh.chunks_exact_mut(bases) {
-            for (colour, sign) in of_one[1..].iter_mut().zip(signs) {
-                *colour = colour.map(|channel| sign * channel);
+            for (color, sign) in of_one[1..].iter_mut().zip(signs) {
+                *color = color.map(|channel| sign * channel);
             }
         }
     }

@@ -1,5 +1,5 @@
 //! PlayCanvas' compressed PLY (spec 10.12). Each Gaussian has four words of 32 bits, and a byte for each SH coefficient above degree 0.
-//! Positions, scales and colours are quantized between the bounds of a chunk of 256 Gaussians.
+//! Positions, scales and colors are quantized between the bounds of a chunk of 256 Gaussians.
 
 use crate::codec::{Codec, Contents, WriteOptions, Writer};
 use crate::invalid::InvalidGaussians;
@@ -18,7 +18,7 @@ pub(crate) const CODEC: Option<Codec> = Some(Codec { read, writer: Some(Writer::
 
 /// Number of Gaussians in a chunk, which share their bounds.
 const CHUNK: usize = 256;
-/// Names of the values that are quantized between bounds: position, logarithm of the scale, colour.
+/// Names of the values that are quantized between bounds: position, logarithm of the scale, color.
 const BOUNDED: [[&str; 3]; 3] = [["x", "y", "z"], ["scale_x", "scale_y", "scale_z"], ["r", "g", "b"]];
 /// Names of a Gaussian's four words.
 const WORDS: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
@@ -27,7 +27,7 @@ const POSITION_BITS: [u32; 3] = [11, 10, 11];
 /// Numbers of bits of the three smaller components of a quaternion.
 const ROTATION_BITS: [u32; 3] = [10, 10, 10];
 /// Numbers of bits of red, green, blue and opacity.
-const COLOUR_BITS: [u32; 4] = [8, 8, 8, 8];
+const COLOR_BITS: [u32; 4] = [8, 8, 8, 8];
 /// Largest magnitude of a log scale. Larger ones are clamped: they have no visible effect, but would widen the bounds of their chunk.
 const MAX_LOG_SCALE: f32 = 20.;
 /// Width of the range of SH coefficients, which is centred on 0.
@@ -39,7 +39,7 @@ pub(crate) fn recognizes(bytes: &[u8]) -> bool {
     header.is_some_and(|header| header.element("vertex").is_some_and(|vertex| vertex.has(WORDS[0])))
 }
 
-/// Reads a compressed PLY of any SH degree. In older files, which have no bounds of colours, the bounds are 0 and 1.
+/// Reads a compressed PLY of any SH degree. In older files, which have no bounds of colors, the bounds are 0 and 1.
 ///
 /// # Errors
 /// Returns an error if an element or property is missing or has another type, or if the file is truncated.
@@ -50,8 +50,8 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let words = columns(path, bytes, &header, "vertex", &owned(&WORDS), |number| number as u32)?;
     let (words, _) = words.as_chunks::<{ WORDS.len() }>();
 
-    let has_colour_bounds = header.element("chunk").is_some_and(|chunk| chunk.has("min_r"));
-    let bounded = if has_colour_bounds { &BOUNDED[..] } else { &BOUNDED[..2] };
+    let has_color_bounds = header.element("chunk").is_some_and(|chunk| chunk.has("min_r"));
+    let bounded = if has_color_bounds { &BOUNDED[..] } else { &BOUNDED[..2] };
     let names = bounded.iter().flat_map(bound_names).collect::<Vec<_>>();
     let bounds = columns(path, bytes, &header, "chunk", &names, |number| number as f32)?;
     let mut invalid = InvalidGaussians::default();
@@ -72,7 +72,7 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let (rest, sh_degree) = read_rest(path, bytes, &header, words.len())?;
     let mut splat = Splat { sh_degree, antialiased: header.antialiased, ..Splat::default() };
     let bases = splat.bases();
-    for (index, &[position, rotation, scale, colour]) in words.iter().enumerate() {
+    for (index, &[position, rotation, scale, color]) in words.iter().enumerate() {
         let bounds = chunks[index / CHUNK];
         let between = |bounds: &[f32], fractions: [f64; 3]| -> [f32; 3] {
             std::array::from_fn(|axis| {
@@ -83,13 +83,13 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         splat.means.push(between(&bounds[..6], unpack(position, POSITION_BITS)));
         splat.log_scales.push(between(&bounds[6..12], unpack(scale, POSITION_BITS)));
         splat.quaternions.push(unpack_rotation(rotation));
-        let [red, green, blue, opacity] = unpack(colour, COLOUR_BITS);
-        let colour = match bounds.get(12..) {
+        let [red, green, blue, opacity] = unpack(color, COLOR_BITS);
+        let color = match bounds.get(12..) {
             Some(bounds @ [_, ..]) => between(bounds, [red, green, blue]),
             _ => [red, green, blue].map(|channel| channel as f32),
         };
         splat.opacity_logits.push(logit_of_opacity(opacity));
-        splat.sh.push(colour.map(|channel| ((f64::from(channel) - 0.5) / SH_C0) as f32));
+        splat.sh.push(color.map(|channel| ((f64::from(channel) - 0.5) / SH_C0) as f32));
         let rest = &rest[index * 3 * (bases - 1)..];
         let of_channel = |channel: usize, basis: usize| unpack_sh(rest[channel * (bases - 1) + basis]);
         splat.sh.extend((0..bases - 1).map(|basis| [0, 1, 2].map(|channel| of_channel(channel, basis))));
@@ -129,7 +129,7 @@ fn bound_names(names: &[&str; 3]) -> Vec<String> {
     ["min", "max"].iter().flat_map(|end| names.map(|name| format!("{end}_{name}"))).collect()
 }
 
-/// Returns the range of SH coefficients that the format can store. Degree 0 is unlimited, because each chunk has its own bounds of colours.
+/// Returns the range of SH coefficients that the format can store. Degree 0 is unlimited, because each chunk has its own bounds of colors.
 fn limits() -> ShLimits {
     ShLimits { rest: -SH_RANGE / 2. ..=SH_RANGE / 2., ..ShLimits::up_to(3) }
 }
@@ -149,20 +149,20 @@ fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
         let log_scales = Bounded::of(of_chunk(&|index| {
             splat.log_scales[index].map(|log_scale| log_scale.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE))
         }));
-        let colours = Bounded::of(of_chunk(&|index| {
+        let colors = Bounded::of(of_chunk(&|index| {
             splat.sh_of(index)[0].map(|dc| (f64::from(dc) * SH_C0 + 0.5) as f32)
         }));
-        for bounded in [&means, &log_scales, &colours] {
+        for bounded in [&means, &log_scales, &colors] {
             bounds.extend(bounded.low.iter().chain(&bounded.high).flat_map(|bound| bound.to_le_bytes()));
         }
         for (row, &index) in chunk.iter().enumerate() {
-            let [red, green, blue] = colours.fractions(row);
-            let colour = [red, green, blue, f64::from(splat.opacity(index))];
+            let [red, green, blue] = colors.fractions(row);
+            let color = [red, green, blue, f64::from(splat.opacity(index))];
             let packed = [
                 pack(means.fractions(row), POSITION_BITS),
                 pack_rotation(splat.unit_quaternion(index)),
                 pack(log_scales.fractions(row), POSITION_BITS),
-                pack(colour, COLOUR_BITS),
+                pack(color, COLOR_BITS),
             ];
             words.extend(packed.iter().flat_map(|word| word.to_le_bytes()));
         }

@@ -11,14 +11,14 @@ use std::path::Path;
 /// Functions of the format.
 pub(crate) const CODEC: Option<Codec> = Some(Codec { read, writer: Some(Writer::new(write, limits)) });
 
-/// Number of bytes of a Gaussian: position and scale, float32 each, then colour, opacity and rotation, a byte each.
+/// Number of bytes of a Gaussian: position and scale, float32 each, then color, opacity and rotation, a byte each.
 const BYTES: usize = 32;
 
 /// Functions that recognize the other formats by their first bytes.
 const MAGICS: [fn(&[u8]) -> bool; 4] =
     [ply::recognizes, sog::recognizes, spz::recognizes, gltf::recognizes_glb];
 
-/// Reads a `.splat`, whose colours don't depend on the view direction.
+/// Reads a `.splat`, whose colors don't depend on the view direction.
 ///
 /// # Errors
 /// Returns an error if the file doesn't consist of whole Gaussians.
@@ -34,7 +34,7 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
             f32::from_le_bytes([a, b, c, d])
         })
     };
-    let colour = |byte: u8| ((f64::from(byte) / 255. - 0.5) / SH_C0) as f32;
+    let color = |byte: u8| ((f64::from(byte) / 255. - 0.5) / SH_C0) as f32;
     let scales: Vec<_> = gaussians.iter().map(|gaussian| three(&gaussian[12..24])).collect();
     let splat = Splat {
         means: gaussians.iter().map(|gaussian| three(&gaussian[..12])).collect(),
@@ -48,7 +48,7 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
             .iter()
             .map(|gaussian| logit_of_opacity(f64::from(gaussian[27]) / 255.))
             .collect(),
-        sh: gaussians.iter().map(|gaussian| [24, 25, 26].map(|at| colour(gaussian[at]))).collect(),
+        sh: gaussians.iter().map(|gaussian| [24, 25, 26].map(|at| color(gaussian[at]))).collect(),
         ..Splat::default()
     };
     let mut invalid = InvalidGaussians::default();
@@ -56,7 +56,7 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     Ok(Contents { splat, invalid })
 }
 
-/// Returns the limits of coefficients: colours that a screen shows, independent of the view direction.
+/// Returns the limits of coefficients: colors that a screen shows, independent of the view direction.
 fn limits() -> ShLimits {
     ShLimits { degree: 0, dc: -0.5 / SH_C0..=0.5 / SH_C0, rest: 0. ..=0. }
 }
@@ -85,8 +85,8 @@ fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
             for number in splat.means[index].iter().chain(&splat.scale(index)) {
                 gaussian.extend(number.to_le_bytes());
             }
-            let colour = splat.sh_of(index)[0].map(|dc| f64::from(dc) * SH_C0 + 0.5);
-            gaussian.extend(colour.map(|channel| (channel * 255.).round() as u8));
+            let color = splat.sh_of(index)[0].map(|dc| f64::from(dc) * SH_C0 + 0.5);
+            gaussian.extend(color.map(|channel| (channel * 255.).round() as u8));
             gaussian.push((splat.opacity(index) * 255.).round() as u8);
             gaussian.extend(splat.unit_quaternion(index).map(|part| (part * 128. + 128.).round() as u8));
             // If the first bytes are the magic number of another format, the lowest bit of the position is flipped, so that readers don't

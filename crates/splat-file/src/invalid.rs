@@ -49,7 +49,7 @@ impl InvalidGaussians {
             check("position", &splat.means[row], f32::MIN);
             check("scale", &splat.scale(row), 0.);
             check("rotation", &splat.quaternions[row], f32::MIN);
-            check("colour", splat.sh_of(row).as_flattened(), f32::MIN);
+            check("color", splat.sh_of(row).as_flattened(), f32::MIN);
         }
     }
 

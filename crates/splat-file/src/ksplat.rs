@@ -64,7 +64,7 @@ impl Encoding {
         [4, 2, 1][usize::from(self.level)]
     }
 
-    /// Returns the number of bytes of a Gaussian: position, scale, quaternion, then colour and opacity, then spherical harmonics.
+    /// Returns the number of bytes of a Gaussian: position, scale, quaternion, then color and opacity, then spherical harmonics.
     fn gaussian_bytes(&self, bases: usize) -> usize {
         10 * self.number_bytes() + 4 + 3 * (bases - 1) * self.sh_bytes()
     }
@@ -232,9 +232,9 @@ impl Section<'_> {
         splat.log_scales.push(scale.map(log_of_scale));
         splat.linear_scales.get_or_insert_default().push(scale);
         splat.quaternions.push([6, 7, 8, 9].map(|index| self.encoding.number(gaussian, index)));
-        let (colour, harmonics) = gaussian[10 * self.encoding.number_bytes()..].split_at(4);
-        splat.sh.push([0, 1, 2].map(|channel| ((f64::from(colour[channel]) / 255. - 0.5) / SH_C0) as f32));
-        splat.opacity_logits.push(logit_of_opacity(f64::from(colour[3]) / 255.));
+        let (color, harmonics) = gaussian[10 * self.encoding.number_bytes()..].split_at(4);
+        splat.sh.push([0, 1, 2].map(|channel| ((f64::from(color[channel]) / 255. - 0.5) / SH_C0) as f32));
+        splat.opacity_logits.push(logit_of_opacity(f64::from(color[3]) / 255.));
         // Degree by degree, and within a degree channel by channel.
         for degree in 1..bases.isqrt() {
             let (begin, count) = (3 * (degree * degree - 1), 2 * degree + 1);

@@ -20,7 +20,7 @@ impl ShLimits {
         ShLimits { degree, dc: f64::MIN..=f64::MAX, rest: f64::MIN..=f64::MAX }
     }
 
-    /// Returns the limits of browser viewers, which apply to any file format: Spark and Babylon.js store the view-independent colour of a
+    /// Returns the limits of browser viewers, which apply to any file format: Spark and Babylon.js store the view-independent color of a
     /// Gaussian in [0, 1] and the other coefficients within ±1, one byte each.
     pub fn of_viewers(degree: usize) -> Self {
         let dc = 0.5 / SH_C0;

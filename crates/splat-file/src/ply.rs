@@ -17,8 +17,8 @@ pub(crate) const CODEC: Option<Codec> = Some(Codec { read, writer: Some(Writer::
 /// Maximum logarithm of a scale: larger scales exceed float32.
 const MAX_LOG_SCALE: f32 = 88.;
 
-/// Names of colour channels in point clouds.
-const COLOURS: [[&str; 3]; 3] =
+/// Names of color channels in point clouds.
+const COLORS: [[&str; 3]; 3] =
     [["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"]];
 
 /// Returns `true` if `bytes` begin like a PLY.
@@ -28,7 +28,7 @@ pub(crate) fn recognizes(bytes: &[u8]) -> bool {
 
 /// Reads a 3DGS splat of any SH degree, in text or binary of either byte order. Properties are found by name, so their order doesn't
 /// matter, and others may be present. Without `scale_2`, as in 2DGS, Gaussians are flat in their third direction; without `f_dc_*` their
-/// colours are those of `red`, `green` and `blue`.
+/// colors are those of `red`, `green` and `blue`.
 ///
 /// # Errors
 /// Returns an error if a property is missing, or if the file is a point cloud or truncated.
@@ -45,11 +45,11 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let mut splat = Splat { sh_degree, antialiased: header.antialiased, ..Splat::default() };
     let bases = splat.bases();
     let mut names: Vec<String> = [owned(["x", "y", "z"]), sh_names(bases), shape_names()].concat();
-    let colours = COLOURS.into_iter().find(|names| names.iter().all(|name| has(name)));
-    let colours = colours.filter(|_| !["f_dc_0", "f_dc_1", "f_dc_2"].into_iter().any(has));
-    if let Some(colours) = colours {
-        names[3..6].clone_from_slice(&owned(colours));
-        let said = format!("colours are those of {}, because f_dc_* is missing", colours.join(", "));
+    let colors = COLORS.into_iter().find(|names| names.iter().all(|name| has(name)));
+    let colors = colors.filter(|_| !["f_dc_0", "f_dc_1", "f_dc_2"].into_iter().any(has));
+    if let Some(colors) = colors {
+        names[3..6].clone_from_slice(&owned(colors));
+        let said = format!("colors are those of {}, because f_dc_* is missing", colors.join(", "));
         splat.warnings.push(format!("{}: {said}", path.display()));
     }
     let is_flat = !has("scale_2") && has("scale_1");
@@ -59,8 +59,8 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         splat.warnings.push(format!("{}: {said}", path.display()));
     }
     let mut values = columns(path, bytes, &header, "vertex", &names, |number| number as f32)?;
-    if let Some((colours, vertex)) = colours.zip(vertex) {
-        harmonics_from_colours(vertex.scalar(colours[0]), names.len(), &mut values);
+    if let Some((colors, vertex)) = colors.zip(vertex) {
+        harmonics_from_colors(vertex.scalar(colors[0]), names.len(), &mut values);
     }
     let invalid = find_invalid(&names, &values);
 
@@ -84,19 +84,19 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     Ok(Contents { splat, invalid })
 }
 
-/// Converts the colours in columns 3 to 5 of a table, which are numbers of type `scalar` in the file, to spherical harmonics of degree 0.
+/// Converts the colors in columns 3 to 5 of a table, which are numbers of type `scalar` in the file, to spherical harmonics of degree 0.
 /// White is 255 for bytes and 65,535 for unsigned 16-bit numbers; for other numbers it is 1, or 255 if any is above 1.
-fn harmonics_from_colours(scalar: Option<Scalar>, width: usize, values: &mut [f32]) {
-    let colours = values.chunks_exact(width).flat_map(|vertex| &vertex[3..6]);
-    let brightest = colours.filter(|colour| colour.is_finite()).fold(0f32, |a, &b| a.max(b));
+fn harmonics_from_colors(scalar: Option<Scalar>, width: usize, values: &mut [f32]) {
+    let colors = values.chunks_exact(width).flat_map(|vertex| &vertex[3..6]);
+    let brightest = colors.filter(|color| color.is_finite()).fold(0f32, |a, &b| a.max(b));
     let white = match scalar {
         Some(Scalar::U8) => 255.,
         Some(Scalar::U16) => 65535.,
         _ if brightest > 1. => 255.,
         _ => 1.,
     };
-    for colour in values.chunks_exact_mut(width).flat_map(|vertex| &mut vertex[3..6]) {
-        *colour = ((f64::from(*colour) / white - 0.5) / SH_C0) as f32;
+    for color in values.chunks_exact_mut(width).flat_map(|vertex| &mut vertex[3..6]) {
+        *color = ((f64::from(*color) / white - 0.5) / SH_C0) as f32;
     }
 }
 

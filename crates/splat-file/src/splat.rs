@@ -8,7 +8,7 @@ use std::borrow::Cow;
 use std::fmt::Display;
 use std::path::Path;
 
-/// Spherical harmonic Y_0, which converts between a colour and an SH coefficient: colour = ½ + `SH_C0` · coefficient.
+/// Spherical harmonic Y_0, which converts between a color and an SH coefficient: color = ½ + `SH_C0` · coefficient.
 pub const SH_C0: f64 = 0.28209479177387814;
 /// Minimum scale that a PLY is written with, so that logarithms are finite.
 pub const MIN_SCALE: f64 = 1e-30;
@@ -86,7 +86,7 @@ impl Splat {
         self.means.is_empty()
     }
 
-    /// Returns the number of spherical harmonics per colour channel, 1 to 16.
+    /// Returns the number of spherical harmonics per color channel, 1 to 16.
     pub fn bases(&self) -> usize {
         (self.sh_degree + 1).pow(2)
     }

@@ -58,7 +58,7 @@ impl Similarity {
 }
 
 impl Splat {
-    /// Returns the splat with every point x moved to `matrix` · x. The colours of the moved splat, seen from a camera that is moved along,
+    /// Returns the splat with every point x moved to `matrix` · x. The colors of the moved splat, seen from a camera that is moved along,
     /// are the same. The origin is moved, too, unless it is zero.
     ///
     /// ```

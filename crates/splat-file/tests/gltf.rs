@@ -174,8 +174,8 @@ fn the_numbers_of_a_glb_are_turned() {
         let own = splat.sh_of(1)[basis].map(|channel| if is_odd { -channel } else { channel });
         assert_eq!(glb.floats(&name)[3..6], own, "{name}");
     }
-    let colour = glb.accessor("COLOR_0").clone();
-    assert_eq!((&colour["componentType"], &colour["normalized"]), (&json!(5121), &json!(true)));
+    let color = glb.accessor("COLOR_0").clone();
+    assert_eq!((&color["componentType"], &color["normalized"]), (&json!(5121), &json!(true)));
     let offset = glb.json["bufferViews"][1]["byteOffset"].as_u64().unwrap() as usize;
     let expected = |channel: usize| {
         let value = (f64::from(splat.sh_of(0)[0][channel]) * SH_C0 + 0.5) * 255.;
@@ -349,9 +349,9 @@ fn quantized_and_interleaved_attributes_are_read() {
     assert_says(&stride, &["the stride of accessor", "(POSITION) is 4, expected 6 bytes or more"]);
 }
 
-/// Colours and opacities come from COLOR_0 if the attributes of the extension are absent, as in files of its drafts.
+/// Colors and opacities come from COLOR_0 if the attributes of the extension are absent, as in files of its drafts.
 #[test]
-fn colours_are_a_fallback() {
+fn colors_are_a_fallback() {
     let splat = random_splat(50, 0, 4);
     let mut glb = Glb::written(&splat);
     glb.primitive()["attributes"].as_object_mut().unwrap().remove(DC);
@@ -373,7 +373,7 @@ fn colours_are_a_fallback() {
     );
     let opacity = json!({"componentType": 5121, "normalized": true, "count": 50, "type": "SCALAR"});
     three_channels.set(OPACITY, &[255; 50], opacity);
-    let dc = [0., 0.2, 1.].map(|colour| ((colour - 0.5) / SH_C0) as f32);
+    let dc = [0., 0.2, 1.].map(|color| ((color - 0.5) / SH_C0) as f32);
     assert_eq!(three_channels.read().sh[9], dc);
     glb.primitive()["attributes"].as_object_mut().unwrap().remove("COLOR_0");
     let message = format!("the attribute {DC} of primitive 0 of mesh 0 is missing");
@@ -647,7 +647,7 @@ fn invalid_values_are_refused_or_left_out() {
         (OPACITY, f32::NAN, "the opacity of Gaussian 1 is NaN", "0 to 1"),
         (OPACITY, 1.5, "the opacity of Gaussian 1 is 1.5", "0 to 1"),
         (OPACITY, -0.1, "the opacity of Gaussian 1 is -0.1", "0 to 1"),
-        (DC, f32::INFINITY, "the colour of Gaussian 1 is inf", "finite numbers"),
+        (DC, f32::INFINITY, "the color of Gaussian 1 is inf", "finite numbers"),
     ] {
         let mut glb = Glb::written(&random_splat(3, 0, 1));
         let view = glb.accessor(attribute)["bufferView"].as_u64().unwrap() as usize;

@@ -74,12 +74,12 @@ fn assert_within(what: &str, original: &Splat, copy: &Splat, max_errors: [f64; 7
 fn max_errors(ending: &str) -> [f64; 7] {
     match ending {
         "ply" => [0.; 7],
-        // Steps are fractions of the Gaussians' bounds, which are 6 wide in positions, 2 in logarithms, 1.8·C0 and more in colours.
+        // Steps are fractions of the Gaussians' bounds, which are 6 wide in positions, 2 in logarithms, 1.8·C0 and more in colors.
         "compressed.ply" => {
             [3.1 / 1023., 1.01 / 1023., 0.0028, 0.51 / 255., 0.91 / 255., 0.5 / 32. + 1e-6, 0.5 / 32. + 1e-6]
         }
         // Positions are at most 9, in 65,535 steps of 4.5 in their logarithms; rotations have eight bits of ±1/√2; the codebooks
-        // have 256 values for 6 in the most dense part, and about as many for all colours and coefficients.
+        // have 256 values for 6 in the most dense part, and about as many for all colors and coefficients.
         "sog" => [4.5 * 10. / 65_535., 0.02, 0.006, 0.51 / 255., 0.02, 0.02, 0.02],
         // The largest position, 9, is below 2^23 / 2^19; rotations have nine bits of 1/√2.
         "spz" => [
@@ -91,7 +91,7 @@ fn max_errors(ending: &str) -> [f64; 7] {
             0.5 / 128. + 1e-6,
             0.5 / 64. + 1e-6,
         ],
-        // Scales and opacities are linear, colours unlimited, all in float32.
+        // Scales and opacities are linear, colors unlimited, all in float32.
         "glb" | "gltf" => [0., 1e-6, 1e-6, 1e-7, 0., 0., 0.],
         _ => [0., 1e-6, 0.012, 0.51 / 255., 0.51 / 255. / SH_C0, 0., 0.],
     }
@@ -331,7 +331,7 @@ fn degrees_are_changed() {
     let higher = splat.with_sh_degree(3);
     assert_eq!((higher.sh.len(), higher.sh_degree), (4 * 16, 3));
     assert_eq!(higher.sh_of(3)[..4], *splat.sh_of(3));
-    assert!(higher.sh_of(3)[4..].iter().all(|colour| *colour == [0.; 3]));
+    assert!(higher.sh_of(3)[4..].iter().all(|color| *color == [0.; 3]));
     assert_eq!(higher.with_sh_degree(1), splat);
     assert_eq!(splat.with_sh_degree(0).sh_of(2), &splat.sh_of(2)[..1]);
 }
@@ -359,9 +359,9 @@ fn coefficients_within_the_limits_are_kept() {
         let path = folder.path().join(format!("a.{ending}"));
         let limits = limits_of(&path).unwrap();
         let mut splat = random_splat(1, limits.degree, 1);
-        for (basis, colour) in splat.sh.iter_mut().enumerate() {
+        for (basis, color) in splat.sh.iter_mut().enumerate() {
             let (low, high) = limits.range_of(basis);
-            *colour = [low.max(-5.) as f32, high.min(5.) as f32, 0.];
+            *color = [low.max(-5.) as f32, high.min(5.) as f32, 0.];
         }
         write_splat(&path, &splat).unwrap();
         let copy = read_splat(&path).unwrap();

@@ -67,16 +67,16 @@ fn a_sog_is_as_documented() {
     assert_eq!(quats[pixel_of[1]], [byte(-0.1), byte(-0.2), byte(-0.3), 253], "the sign of x is positive");
     assert_eq!(quats[pixel_of[2]], [a, b, c, 255]);
     let codebook = |entry: &Value| -> Vec<f32> { serde_json::from_value(entry["codebook"].clone()).unwrap() };
-    let (scales, colours, rest) = (codebook(&meta["scales"]), codebook(&meta["sh0"]), codebook(&meta["shN"]));
-    assert_eq!([scales.len(), colours.len(), rest.len()], [256; 3]);
-    let (scale_pixels, colour_pixels) = (image("scales.webp").1, image("sh0.webp").1);
+    let (scales, colors, rest) = (codebook(&meta["scales"]), codebook(&meta["sh0"]), codebook(&meta["shN"]));
+    assert_eq!([scales.len(), colors.len(), rest.len()], [256; 3]);
+    let (scale_pixels, color_pixels) = (image("scales.webp").1, image("sh0.webp").1);
     let (labels, centroids) = (image("shN_labels.webp").1, image("shN_centroids.webp"));
     assert_eq!(centroids.0, 64 * 3);
     for (index, &pixel) in pixel_of.iter().enumerate() {
         let values = |codebook: &[f32], pixel: [u8; 4]| [0, 1, 2].map(|k| codebook[usize::from(pixel[k])]);
         assert_eq!(values(&scales, scale_pixels[pixel]), splat.log_scales[index]);
-        assert_eq!(values(&colours, colour_pixels[pixel]), splat.sh_of(index)[0]);
-        assert_eq!(colour_pixels[pixel][3], [128, 225, 0][index], "opacity");
+        assert_eq!(values(&colors, color_pixels[pixel]), splat.sh_of(index)[0]);
+        assert_eq!(color_pixels[pixel][3], [128, 225, 0][index], "opacity");
         let label = usize::from(u16::from_le_bytes([labels[pixel][0], labels[pixel][1]]));
         for k in 0..3 {
             assert_eq!(values(&rest, centroids.1[label * 3 + k]), splat.sh_of(index)[1 + k]);

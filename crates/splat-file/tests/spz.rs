@@ -158,7 +158,7 @@ fn the_axes_of_an_spz_are_applied() {
     assert_eq!(rdf.means[0], [x, -y, -z]);
     // The order of degree 1 is y, z, x.
     let signs = [1f32, -1., -1., 1.];
-    let turned = rub.sh.iter().zip(signs).map(|(colour, sign)| colour.map(|channel| sign * channel));
+    let turned = rub.sh.iter().zip(signs).map(|(color, sign)| color.map(|channel| sign * channel));
     assert_eq!(rdf.sh, turned.collect::<Vec<_>>());
     let [w, x, y, z] = rub.quaternions[0];
     assert_eq!(rdf.quaternions[0], [w, x, -y, -z]);

@@ -114,7 +114,7 @@ fn scales_and_opacities_are_rounded_once() {
     assert_eq!(bytes[12..16], splat.scale(first)[0].to_le_bytes());
 }
 
-/// Bytes are the colours themselves in older files, without bounds of colours.
+/// Bytes are the colors themselves in older files, without bounds of colors.
 #[test]
 fn older_compressed_plys_are_read() {
     let folder = tempfile::tempdir().unwrap();
@@ -122,9 +122,9 @@ fn older_compressed_plys_are_read() {
     let bytes = std::fs::read(&path).unwrap();
     let body = body_of_ply(&bytes);
     let header = String::from_utf8(bytes[..body].to_vec()).unwrap();
-    let colours = ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"];
+    let colors = ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"];
     let header =
-        colours.iter().fold(header, |header, name| header.replace(&format!("property float {name}\n"), ""));
+        colors.iter().fold(header, |header, name| header.replace(&format!("property float {name}\n"), ""));
     let vertices = &bytes[body + 18 * 4..];
     std::fs::write(&path, [header.as_bytes(), &bytes[body..][..12 * 4], vertices].concat()).unwrap();
     let read = read_splat(&path).unwrap();
@@ -143,11 +143,11 @@ fn surfels_are_flat() {
     assert!(splat.scale(0)[2] > 0.);
 }
 
-/// Colours instead of spherical harmonics are read, whatever their type and their names.
+/// Colors instead of spherical harmonics are read, whatever their type and their names.
 #[test]
-fn colours_are_harmonics_of_degree_0() {
+fn colors_are_harmonics_of_degree_0() {
     let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("colours.ply");
+    let path = folder.path().join("colors.ply");
     let bytes = [[0., 255., 10.], [128., 3., 20.], [255., 77., 30.]];
     for names in [["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"]]
     {
@@ -167,7 +167,7 @@ fn colours_are_harmonics_of_degree_0() {
             let step = if of == "ushort" { 1e-4 } else { 1e-6 };
             let error = largest_error(splat.sh.as_flattened(), &expected);
             assert!(error < step, "{of} {names:?} of {whole}: {error}");
-            // If there are coefficients as well, another program derived the colours from them, and they are ignored.
+            // If there are coefficients as well, another program derived the colors from them, and they are ignored.
             columns.extend(small_gaussians().into_iter().filter(|(name, _)| name.starts_with("f_dc")));
             write_ply(&path, &columns, &names.map(|name| (name, of)));
             let splat = read_splat(&path).unwrap();

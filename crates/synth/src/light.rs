@@ -6,14 +6,14 @@ use glam::{Vec2, Vec3};
 /// A light source. Light is linear RGB, where 1 is the light reflected by a well-lit white wall.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Light {
-    /// The sun, infinitely far away in the direction `towards` (unit), with an angular width of `spread` radians. `colour` is the
+    /// The sun, infinitely far away in the direction `towards` (unit), with an angular width of `spread` radians. `color` is the
     /// irradiance perpendicular to it.
-    Sun { towards: Vec3, spread: f32, colour: Vec3 },
-    /// A ball at `at`, which may be visible and never blocks its own light. `colour` is the irradiance at a distance of one metre.
-    Ball { at: Vec3, radius: f32, colour: Vec3 },
-    /// A parallelogram with half sides `right` and `up` around `at`, facing `facing` (unit). `colour` is the irradiance at a
+    Sun { towards: Vec3, spread: f32, color: Vec3 },
+    /// A ball at `at`, which may be visible and never blocks its own light. `color` is the irradiance at a distance of one metre.
+    Ball { at: Vec3, radius: f32, color: Vec3 },
+    /// A parallelogram with half sides `right` and `up` around `at`, facing `facing` (unit). `color` is the irradiance at a
     /// distance of one metre from its centre.
-    Panel { at: Vec3, right: Vec3, up: Vec3, facing: Vec3, colour: Vec3 },
+    Panel { at: Vec3, right: Vec3, up: Vec3, facing: Vec3, color: Vec3 },
 }
 
 /// Light that arrives at a point.
@@ -23,17 +23,17 @@ pub(super) struct IncidentLight {
     /// Distance to the point where the light left its source, in metres.
     pub distance: f32,
     /// Irradiance perpendicular to the ray, if nothing blocks it.
-    pub colour: Vec3,
+    pub color: Vec3,
 }
 
 impl Light {
     /// Returns the light source with its light multiplied by `factor`.
     pub fn dimmed(self, factor: f32) -> Light {
         match self {
-            Light::Sun { towards, spread, colour } => Light::Sun { towards, spread, colour: factor * colour },
-            Light::Ball { at, radius, colour } => Light::Ball { at, radius, colour: factor * colour },
-            Light::Panel { at, right, up, facing, colour } => {
-                Light::Panel { at, right, up, facing, colour: factor * colour }
+            Light::Sun { towards, spread, color } => Light::Sun { towards, spread, color: factor * color },
+            Light::Ball { at, radius, color } => Light::Ball { at, radius, color: factor * color },
+            Light::Panel { at, right, up, facing, color } => {
+                Light::Panel { at, right, up, facing, color: factor * color }
             }
         }
     }
@@ -41,28 +41,28 @@ impl Light {
     /// Returns the light that reaches `point` from the position on the light source given by `at` in [0, 1)².
     pub fn incident_at(&self, point: Vec3, at: Vec2) -> IncidentLight {
         match *self {
-            Light::Sun { towards, spread, colour } => {
+            Light::Sun { towards, spread, color } => {
                 let (right, up) = towards.any_orthonormal_pair();
                 let offset = spread * (at - 0.5);
                 let towards = (towards + offset.x * right + offset.y * up).normalize();
-                IncidentLight { towards, distance: f32::INFINITY, colour }
+                IncidentLight { towards, distance: f32::INFINITY, color }
             }
-            Light::Ball { at: centre, radius, colour } => {
+            Light::Ball { at: centre, radius, color } => {
                 let (right, up) = (centre - point).normalize_or(Vec3::Y).any_orthonormal_pair();
                 let offset = radius * (at - 0.5);
                 let way = centre + offset.x * right + offset.y * up - point;
                 let distance = way.length().max(1e-3);
                 // Limit the irradiance to that at about a quarter of a metre, to avoid overexposure.
-                let colour = colour / (distance * distance).max(0.06);
-                IncidentLight { towards: way / distance, distance: (distance - 1.1 * radius).max(0.), colour }
+                let color = color / (distance * distance).max(0.06);
+                IncidentLight { towards: way / distance, distance: (distance - 1.1 * radius).max(0.), color }
             }
-            Light::Panel { at: centre, right, up, facing, colour } => {
+            Light::Panel { at: centre, right, up, facing, color } => {
                 let offset = 2. * at - 1.;
                 let way = centre + offset.x * right + offset.y * up - point;
                 let distance = way.length().max(1e-3);
                 let towards = way / distance;
-                let colour = colour * (-towards.dot(facing)).max(0.) / (distance * distance).max(0.25);
-                IncidentLight { towards, distance, colour }
+                let color = color * (-towards.dot(facing)).max(0.) / (distance * distance).max(0.25);
+                IncidentLight { towards, distance, color }
             }
         }
     }

@@ -10,7 +10,7 @@ pub(super) struct Material {
     pub texture: Arc<Texture>,
     /// Transform from metres along a surface to repeats of the texture.
     pub repeats: Affine2,
-    /// Colour factor on the texture.
+    /// Color factor on the texture.
     pub tint: Vec3,
     /// Emitted light, as a factor on the texture.
     pub emission: f32,

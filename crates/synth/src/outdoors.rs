@@ -132,7 +132,7 @@ fn sun(builder: &mut SceneBuilder, sky: &Sky) {
     let (turn, height) = (builder.angle(), builder.within(0.15..2.));
     let towards = vec3(turn.cos(), height, turn.sin()).normalize();
     let warm = vec3(1., 0.95, 0.88).lerp(vec3(1., 0.7, 0.45), (1. - towards.y).powi(3));
-    let colour = builder.within(1. ..4.5) * (1.1 - cover) * warm;
+    let color = builder.within(1. ..4.5) * (1.1 - cover) * warm;
     let spread = if cover > 0.5 { 0.3 } else { 0.02 };
-    builder.contents.lights.push(Light::Sun { towards, spread, colour });
+    builder.contents.lights.push(Light::Sun { towards, spread, color });
 }

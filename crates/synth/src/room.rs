@@ -277,7 +277,7 @@ fn furnish(builder: &mut SceneBuilder, size: Vec3, walls: &[Wall]) {
     objects::clutter(builder, 0.9 * vec2(size.x, size.z), floor, 8);
 }
 
-/// Adds ceiling and hanging lamps of one colour tone, and the sun if it can shine in.
+/// Adds ceiling and hanging lamps of one color tone, and the sun if it can shine in.
 fn light(builder: &mut SceneBuilder, size: Vec3, sky: &mut Sky, has_openings: bool) {
     let warmth = builder.within(0. ..1.);
     let tone = vec3(1., 1. - 0.25 * warmth, 1. - 0.55 * warmth);
@@ -289,13 +289,13 @@ fn light(builder: &mut SceneBuilder, size: Vec3, sky: &mut Sky, has_openings: bo
         if builder.chance(0.5) {
             let half = vec2(builder.within(0.1..0.6), builder.within(0.1..0.4));
             let (right, up) = (half.x * Vec3::X, half.y * Vec3::Z);
-            let colour = strength * tone;
+            let color = strength * tone;
             builder.contents.lights.push(Light::Panel {
                 at: at - 0.05 * Vec3::Y,
                 right,
                 up,
                 facing: Vec3::NEG_Y,
-                colour,
+                color,
             });
             let mut glass = builder.material(Purpose::Ceiling);
             glass.emission = 3.;
@@ -314,13 +314,13 @@ fn light(builder: &mut SceneBuilder, size: Vec3, sky: &mut Sky, has_openings: bo
                 &cord,
                 Affine3A::from_translation(at + radius * Vec3::Y),
             );
-            builder.contents.lights.push(Light::Ball { at, radius, colour: 0.8 * strength * tone });
+            builder.contents.lights.push(Light::Ball { at, radius, color: 0.8 * strength * tone });
         }
     }
     if has_openings && builder.chance(0.7) {
         let (turn, height) = (builder.angle(), builder.within(0.2..1.));
         let towards = vec3(turn.cos(), height, turn.sin()).normalize();
-        builder.contents.lights.push(Light::Sun { towards, spread: 0.02, colour: 8. * vec3(1., 0.93, 0.82) });
+        builder.contents.lights.push(Light::Sun { towards, spread: 0.02, color: 8. * vec3(1., 0.93, 0.82) });
     }
     if has_openings {
         // The outdoors is brighter than rooms in daytime.

@@ -90,7 +90,7 @@ impl SceneBuilder {
         let larger = Affine2::from_scale(Vec2::splat(scale / material.texture.repeat_metres));
         material.repeats = Affine2::from_angle_translation(angle, offset) * larger;
         if purpose == Purpose::Thing && self.chance(0.5) {
-            // Half of the things have the texture in another colour.
+            // Half of the things have the texture in another color.
             material.tint = Vec3::new(self.within(0.4..1.), self.within(0.4..1.), self.within(0.4..1.));
         }
         let glossy = match purpose {

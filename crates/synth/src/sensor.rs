@@ -29,7 +29,7 @@ impl Sensor {
     pub fn draw(builder: &mut SceneBuilder, mean: Vec3) -> Sensor {
         let brightness = mean.element_sum() / 3.;
         let target = 0.2 * builder.log_uniform(0.6, 2.);
-        // Automatic white balance removes most of the light's colour.
+        // Automatic white balance removes most of the light's color.
         let neutral = brightness / mean.max(Vec3::splat(0.2 * brightness)).max(Vec3::splat(1e-6));
         let white = Vec3::ONE.lerp(neutral, builder.within(0.2..0.8));
         let tint = vec3(builder.within(0.94..1.06), 1., builder.within(0.94..1.06));
@@ -148,7 +148,7 @@ mod tests {
         let corners = Sensor { vignette: 0.3, ..PLAIN };
         assert_eq!(grey(corners, MIDDLE / 0.7, 1., Vec2::ONE), 128, "vignetting in a corner");
         let red = Sensor { saturation: 0., ..PLAIN }.bytes(Vec3::X, 1., Vec2::ZERO, 0, 0);
-        assert!(red[0] == red[1] && red[1] == red[2], "{red:?} has a colour");
+        assert!(red[0] == red[1] && red[1] == red[2], "{red:?} has a color");
     }
 
     #[test]

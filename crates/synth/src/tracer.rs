@@ -161,24 +161,24 @@ impl Tracer {
         let light = source.incident_at(surface.point, choice.on_light);
         let facing = light.towards.dot(surface.normal);
         let is_behind = facing <= 0. || light.towards.dot(surface.geometric_normal) <= 0.;
-        if is_behind || light.colour.max_element() < 1e-4 {
+        if is_behind || light.color.max_element() < 1e-4 {
             return (Vec3::ZERO, Vec3::ZERO);
         }
         let start = surface.point + RAY_OFFSET * surface.geometric_normal;
         if self.bvh.is_occluded(start, light.towards, light.distance - 2. * RAY_OFFSET) {
             return (Vec3::ZERO, Vec3::ZERO);
         }
-        let colour = self.lights.len() as f32 * light.colour;
+        let color = self.lights.len() as f32 * light.color;
         let Material { specular, shininess, .. } = *surface.material;
         let highlight = if specular > 0. {
             // Normalized Blinn–Phong lobe.
             let half = (light.towards - direction).normalize_or(surface.normal);
             let lobe = (shininess + 8.) / (8. * PI) * half.dot(surface.normal).max(0.).powf(shininess);
-            specular * lobe * facing * colour
+            specular * lobe * facing * color
         } else {
             Vec3::ZERO
         };
-        (colour * facing / PI, highlight)
+        (color * facing / PI, highlight)
     }
 
     fn surface(&self, origin: Vec3, direction: Vec3, hit: Hit, spread: f32) -> SurfaceHit<'_> {
@@ -306,7 +306,7 @@ mod tests {
             let tracer = floor_scene(186, |contents, _| {
                 for i in 0..lights {
                     let towards = Vec3::new(0.1 * i as f32, 1., 0.).normalize();
-                    contents.lights.push(Light::Sun { towards, spread: 0., colour: Vec3::splat(2.) });
+                    contents.lights.push(Light::Sun { towards, spread: 0., color: Vec3::splat(2.) });
                 }
             });
             let cosines: f32 = (0..lights).map(|i| Vec3::new(0.1 * i as f32, 1., 0.).normalize().y).sum();
@@ -319,7 +319,7 @@ mod tests {
     #[test]
     fn light_of_a_ball_falls_with_the_square_of_the_distance() {
         let tracer = floor_scene(255, |contents, _| {
-            contents.lights.push(Light::Ball { at: Vec3::new(0., 2., 0.), radius: 0., colour: Vec3::ONE });
+            contents.lights.push(Light::Ball { at: Vec3::new(0., 2., 0.), radius: 0., color: Vec3::ONE });
         });
         let (below, aside) =
             (radiance_at(&tracer, Vec3::new(0.02, 0., 0.01)), radiance_at(&tracer, Vec3::new(2., 0., 0.01)));
@@ -336,7 +336,7 @@ mod tests {
                 right: Vec3::ZERO,
                 up: Vec3::ZERO,
                 facing,
-                colour: Vec3::ONE,
+                color: Vec3::ONE,
             });
         });
         let (below, aside) =
@@ -359,7 +359,7 @@ mod tests {
     #[test]
     fn mirrors_reflect_the_scene() {
         let tracer = floor_scene(186, |contents, material| {
-            contents.lights.push(Light::Sun { towards: Vec3::Y, spread: 0., colour: Vec3::splat(2.) });
+            contents.lights.push(Light::Sun { towards: Vec3::Y, spread: 0., color: Vec3::splat(2.) });
             let mirror = Mesh::rectangle(Vec3::new(2., 0., -1.), 2. * Vec3::Z, 2. * Vec3::Y, 1.);
             contents
                 .meshes
@@ -379,7 +379,7 @@ mod tests {
         let towards = Vec3::new(1., 1., 0.).normalize();
         let trace = |specular: f32, eye: Vec3| {
             let tracer = floor_scene(0, |contents, material| {
-                contents.lights.push(Light::Sun { towards, spread: 0., colour: Vec3::splat(2.) });
+                contents.lights.push(Light::Sun { towards, spread: 0., color: Vec3::splat(2.) });
                 let sheet = Mesh::rectangle(Vec3::new(-1., 0.5, 1.), 2. * Vec3::X, -2. * Vec3::Z, 1.);
                 contents.meshes.push((sheet, Material { specular, shininess: 30., ..material.clone() }));
             });
@@ -396,7 +396,7 @@ mod tests {
 
     #[test]
     fn objects_cast_shadows_and_receive_bounced_light() {
-        let sun = Light::Sun { towards: Vec3::Y, spread: 0., colour: Vec3::splat(3.) };
+        let sun = Light::Sun { towards: Vec3::Y, spread: 0., color: Vec3::splat(3.) };
         let tracer = floor_scene(186, |contents, material| {
             contents.lights.push(sun);
             let ball = superellipsoid(Vec3::ONE, [1., 1.], 16).warped(|p| p + 1.5 * Vec3::Y);

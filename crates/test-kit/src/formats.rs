@@ -158,7 +158,7 @@ pub fn rewrite(folder: &Path, format: Format) {
     std::fs::remove_file(folder.join("cameras.json")).unwrap();
 }
 
-/// Adds points to a COLMAP model: `positions` has x, y and z of each; all have the colour (255, 0, 51).
+/// Adds points to a COLMAP model: `positions` has x, y and z of each; all have the color (255, 0, 51).
 pub fn write_points(model: &Path, format: Format, positions: &[f64]) {
     if let Format::ColmapText = format {
         let lines = positions.chunks(3).enumerate().map(|(i, p)| {

@@ -84,13 +84,13 @@ def projection_reference(config, params, inputs):
     def project(means, scales, quaternions, opacities, sh, w2c, intrinsics):
         seen = reference.splat.project(means, scales, quaternions, w2c, intrinsics, *settings)
         visible = seen["visible"] & (opacities * seen["compensation"] >= reference.splat.SMALLEST_ALPHA)
-        colour = reference.splat.sh_colour(means, sh, w2c)
+        color = reference.splat.sh_color(means, sh, w2c)
         return {
             "visible": visible.long(),
             "mean2d": torch.where(visible[:, None], seen["mean2d"], 0.0),
             "conic": torch.where(visible[:, None], seen["conic"], 0.0),
             "depth": torch.where(visible, seen["depth"], 0.0),
-            "colour": torch.where(visible[:, None], colour, 0.0),
+            "color": torch.where(visible[:, None], color, 0.0),
         }
 
     return map_cameras(inputs, project)
@@ -147,7 +147,7 @@ def rasterizer_reference(config, params, inputs):
 
 
 @case
-def colour_fit(rng):
+def color_fit(rng):
     """Spherical harmonics of all degrees, fitted to images of which some pixels count half or not at all."""
     shapes = [((24, 20), 2, 30, 16), ((16, 16), 3, 20, 4), ((9, 30), 1, 12, 1)]
     family = dict(scenes.random_scene(size, 1, *counts) for size, *counts in shapes)
@@ -160,9 +160,9 @@ def colour_fit(rng):
         yield Draw(scene.label, scene.inputs | images, scene.config | {"steps": 6}, tolerance=FLOAT64)
 
 
-@reference_for("colour_fit")
-def colour_fit_reference(config, params, inputs):
+@reference_for("color_fit")
+def color_fit_reference(config, params, inputs):
     names = ("means", "scales", "quaternions", "opacities", "sh", "w2c", "intrinsics", "images", "masks")
     *gaussians, w2cs, intrinsics, images, masks = (inputs[name][0] for name in names)
-    contributions, sh = reference.colour_fit.fit_colours(gaussians, w2cs, intrinsics, images, masks, config["steps"])
+    contributions, sh = reference.color_fit.fit_colors(gaussians, w2cs, intrinsics, images, masks, config["steps"])
     return {"contributions": contributions[None], "sh": sh[None]}

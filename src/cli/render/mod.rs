@@ -27,7 +27,7 @@ const ALPHA: &str = "_alpha";
 
 /// Render a splat, or a model's reconstruction of a capture, from the capture's cameras, along a path, or on an orbit.
 ///
-/// Colour is always rendered; --depth and --alpha add those, side by side in a video and as files of their own in a folder.
+/// Color is always rendered; --depth and --alpha add those, side by side in a video and as files of their own in a folder.
 #[derive(Args)]
 #[command(group(ArgGroup::new("source").required(true)))]
 #[command(group(ArgGroup::new("cameras").required(true).multiple(true)))]
@@ -191,11 +191,11 @@ impl Render {
         [""].into_iter().chain(depth).chain(self.alpha.then_some(ALPHA)).collect()
     }
 
-    /// Returns colour and the other requested images, [3, H, W] each, in the order of the suffixes.
+    /// Returns color and the other requested images, [3, H, W] each, in the order of the suffixes.
     fn parts(&self, rendered: &RenderedView, scale: Option<DepthScale>) -> Vec<Tensor> {
         let mut parts = vec![rendered.rgb.clamp(0., 1.)];
         if let Some(scale) = scale {
-            parts.push(scale.colourize(&rendered.depth, &rendered.alpha));
+            parts.push(scale.colorize(&rendered.depth, &rendered.alpha));
         }
         if self.alpha {
             parts.push(rendered.alpha.unsqueeze(0).expand([3, -1, -1], false));

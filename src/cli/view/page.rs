@@ -70,7 +70,7 @@ pub fn write_page(
     Ok(write_atomically(path, |writer| writer.write_all(text.as_bytes()).map_err(Error::write(path)))?)
 }
 
-/// Encodes the splat compactly as SPZ, with colours within the range that viewers can show.
+/// Encodes the splat compactly as SPZ, with colors within the range that viewers can show.
 fn spz(splat: &Splat, cameras: &[Camera]) -> Result<Vec<u8>> {
     let folder = tempfile::tempdir()?;
     let file = folder.path().join("scene.spz");
@@ -100,7 +100,7 @@ fn page(contents: &Contents, spz: &[u8]) -> Result<Markup> {
                 style { (PreEscaped(STYLE)) }
             }
             body data-state="loading" {
-                (depth_colours())
+                (depth_colors())
                 canvas #canvas tabindex="0" aria-label="The scene. Arrow keys and W, A, S, D walk." {}
                 div #compare hidden {
                     img #photo alt="The photo from here" draggable="false";
@@ -112,7 +112,7 @@ fn page(contents: &Contents, spz: &[u8]) -> Result<Markup> {
                     h1 { (contents.name) }
                     nav aria-label="View" {
                         div role="group" aria-label="Shown" {
-                            button #colour type="button" aria-pressed="true" title="1" { "Colour" }
+                            button #color type="button" aria-pressed="true" title="1" { "Color" }
                             button #depth type="button" aria-pressed="false" title="2" { "Depth" }
                             button #centres type="button" aria-pressed="false" title="3" { "Centres" }
                         }
@@ -142,7 +142,7 @@ fn help() -> Markup {
         ("Drag, wheel", "look around, go forward and back; right button or two fingers: aside"),
         (", and .", "jump to the photo before or after"),
         ("Space", "play along the cameras' path"),
-        ("1, 2, 3", "colour, depth, the Gaussians' centres"),
+        ("1, 2, 3", "color, depth, the Gaussians' centres"),
         ("C", "cameras with their photos"),
         ("H", "hide the controls"),
         ("?", "this help"),
@@ -156,16 +156,16 @@ fn help() -> Markup {
     }
 }
 
-/// Returns an SVG filter that maps greyscale depth to the colours of `render --depth`, and keeps empty pixels black.
-fn depth_colours() -> Markup {
-    let colours = globalsplat::render::depth_colours();
+/// Returns an SVG filter that maps greyscale depth to the colors of `render --depth`, and keeps empty pixels black.
+fn depth_colors() -> Markup {
+    let colors = globalsplat::render::depth_colors();
     let table = |channel: usize| -> String {
-        let values = colours[1..].iter().map(|colour| format!(" {:.3}", colour[channel]));
+        let values = colors[1..].iter().map(|color| format!(" {:.3}", color[channel]));
         std::iter::once("0".into()).chain(values).collect()
     };
     html! {
         svg width="0" height="0" aria-hidden="true" {
-            filter #depth-colours color-interpolation-filters="sRGB" {
+            filter #depth-colors color-interpolation-filters="sRGB" {
                 feComponentTransfer {
                     feFuncR type="table" tableValues=(table(0)) {}
                     feFuncG type="table" tableValues=(table(1)) {}

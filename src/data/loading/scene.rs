@@ -13,7 +13,7 @@ pub struct LoadTimes {
     pub decode: f64,
     /// Time for cropping, resizing and mirroring.
     pub resize: f64,
-    /// Time for colour jitter.
+    /// Time for color jitter.
     pub augment: f64,
     /// Time for the search of depths.
     pub depths: f64,

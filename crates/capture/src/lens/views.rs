@@ -280,7 +280,7 @@ mod tests {
                 let mut seen = seen.peekable();
                 assert!(seen.peek().is_some(), "{pixel} of {lens:?} in {views:?}");
                 for (view, point) in seen {
-                    // The view takes the colour of its point from the pixel.
+                    // The view takes the color of its point from the pixel.
                     let Intrinsics { fx, fy, cx, cy } = view.intrinsics;
                     let ray = DVec3::new((point.x - cx) / fx, (point.y - cy) / fy, 1.);
                     let part = PhotoPart { lens, rotation: view.rotation };

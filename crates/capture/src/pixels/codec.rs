@@ -124,7 +124,7 @@ pub fn read_image_size(path: &Path) -> Result<(u32, u32)> {
     reader.into_dimensions().map_err(undecodable(path))
 }
 
-/// Returns `true` if the image's header declares an alpha channel, or a transparent colour.
+/// Returns `true` if the image's header declares an alpha channel, or a transparent color.
 ///
 /// # Errors
 /// Returns an error if the file is missing or is no image.
@@ -157,9 +157,9 @@ struct Decoded {
     is_rgb: bool,
 }
 
-/// Offset of the colour type in the header of a PNG.
-const PNG_COLOUR_TYPE: usize = 25;
-/// Colour type of red, green and blue, without a palette.
+/// Offset of the color type in the header of a PNG.
+const PNG_COLOR_TYPE: usize = 25;
+/// Color type of red, green and blue, without a palette.
 const PNG_RGB: u8 = 2;
 
 fn decode(encoded: &[u8], file: &Path) -> Result<Decoded> {
@@ -180,7 +180,7 @@ fn decode(encoded: &[u8], file: &Path) -> Result<Decoded> {
     if matches!(decoder.color_type(), ColorType::Rgb32F | ColorType::Rgba32F) {
         // Their range and brightness are up to the program that wrote them.
         let found = "with floating-point pixels";
-        return Err(Error::input(file, "the image", found, "8 or 16 bits for each of its colours"));
+        return Err(Error::input(file, "the image", found, "8 or 16 bits for each of its colors"));
     }
     decoder.set_limits(limits).map_err(undecodable(file))?;
     // Unreadable EXIF data isn't an error, because the pixels may still be usable.
@@ -190,7 +190,7 @@ fn decode(encoded: &[u8], file: &Path) -> Result<Decoded> {
     let image = panic::catch_unwind(AssertUnwindSafe(|| match format {
         Some(ImageFormat::Jpeg) => decode_jpeg(encoded).map_err(refuse),
         _ => {
-            let components = if encoded.get(PNG_COLOUR_TYPE) == Some(&PNG_RGB) { 3 } else { 4 };
+            let components = if encoded.get(PNG_COLOR_TYPE) == Some(&PNG_RGB) { 3 } else { 4 };
             DynamicImage::from_decoder(decoder).map(|image| (image, components)).map_err(undecodable(file))
         }
     }));

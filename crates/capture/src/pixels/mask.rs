@@ -9,7 +9,7 @@ use globalsplat_files::{Error, Result};
 use image::{GrayImage, Rgb, RgbImage};
 use std::path::Path;
 
-/// Reads the mask `file` at `size` = (width, height), resized if it has another size. The level of its grey is the weight; a colour
+/// Reads the mask `file` at `size` = (width, height), resized if it has another size. The level of its grey is the weight; a color
 /// counts by its luminance, and what is transparent is black. A mask without a level above 1 has levels 0 and 1.
 ///
 /// # Errors

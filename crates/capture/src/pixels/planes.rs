@@ -1,8 +1,8 @@
-//! Images in the layout of the model: one plane per colour channel.
+//! Images in the layout of the model: one plane per color channel.
 
 use image::{Rgb, RgbImage};
 
-/// Number of colour channels of an image.
+/// Number of color channels of an image.
 pub const CHANNELS: usize = 3;
 
 /// An 8-bit image, `[3, H, W]`.

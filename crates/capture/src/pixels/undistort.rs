@@ -17,7 +17,7 @@ pub(crate) struct ViewPixels {
 
 /// Returns the photo as `camera`, a pinhole camera, would have taken it, or `None` if the photo is just that.
 ///
-/// Pixel (i, j) has the ray x = (j + ½ − cx)/fx, y = (i + ½ − cy)/fy, and takes its colour from the position in the photo to which
+/// Pixel (i, j) has the ray x = (j + ½ − cx)/fx, y = (i + ½ − cy)/fy, and takes its color from the position in the photo to which
 /// `projection` maps the ray, interpolated linearly between the four surrounding pixel centres. Beyond the photo its border is
 /// repeated, or, if the view is a part of the photo, pixels are black and masked out. Pixels outside `window`'s columns and rows, if
 /// it is given, are unspecified.
@@ -85,7 +85,7 @@ impl LookupTable {
     }
 }
 
-/// Position in a photo to take a colour from: the pixel to the upper left, and the fractional distances to the next ones, 0 to 1.
+/// Position in a photo to take a color from: the pixel to the upper left, and the fractional distances to the next ones, 0 to 1.
 /// Outside the photo, `to_right` is NaN.
 #[derive(Debug, Clone, Copy, Default)]
 struct SamplePosition {
@@ -199,18 +199,18 @@ impl<'a> Undistortion<'a> {
         let Undistortion { width, height, photo, size, undistorted, mask } = self;
         let start = i * size[0] as usize + first;
         // Read four bytes instead of three, to fill a vector.
-        let colour = |bytes: &[u8]| {
+        let color = |bytes: &[u8]| {
             let bytes: [u8; 4] = bytes.try_into().expect("four numbers");
             Vec4::from_array(bytes.map(f32::from))
         };
         let mix = |a: Vec4, b: Vec4, share: f32| a + share * (b - a);
         // Interpolate between the pixel that begins at `byte` and the one to its right, which is unused in the last column.
         let along = |byte: usize, share: f32| match photo.get(byte..byte + 7) {
-            Some(pair) => mix(colour(&pair[..4]), colour(&pair[3..]), share),
+            Some(pair) => mix(color(&pair[..4]), color(&pair[3..]), share),
             None => {
                 let mut pair = [0; 7];
                 pair[..photo.len() - byte].copy_from_slice(&photo[byte..]);
-                mix(colour(&pair[..4]), colour(&pair[3..]), share)
+                mix(color(&pair[..4]), color(&pair[3..]), share)
             }
         };
         let undistorted = &mut undistorted[3 * start..];
@@ -269,9 +269,9 @@ mod tests {
         assert_eq!(undistorted, Some(ViewPixels { image: photo, mask: None }));
     }
 
-    /// Colours agree with the formulas of [`undistort`] in float64.
+    /// Colors agree with the formulas of [`undistort`] in float64.
     #[test]
-    fn colours_are_between_their_neighbours() {
+    fn colors_are_between_their_neighbours() {
         let photo = RgbImage::from_fn(64, 48, |x, y| {
             let level = |k: u32| ((x * 7919 + y * 104_729 + k * 31).wrapping_mul(2_654_435_761) >> 24) as u8;
             Rgb([level(1), level(2), level(3)])

@@ -58,7 +58,7 @@ fn read_model(folder: &Path) -> Result<ModelSummary> {
         let count = bytes.number()?;
         let mut sum = 0.;
         for _ in 0..count {
-            // Number, position, colour.
+            // Number, position, color.
             bytes.skip(8 + 3 * 8 + 3)?;
             sum += f64::from_le_bytes(bytes.skip(8)?.try_into().ok()?);
             let length = bytes.number()?;

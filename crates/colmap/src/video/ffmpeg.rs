@@ -24,7 +24,7 @@ pub(super) struct Probe {
     /// `true` if the transfer function is that of HDR: PQ or HLG.
     is_hdr: bool,
     is_interlaced: bool,
-    /// `true` if the matrix of the colours isn't declared. Players then take HD for BT.709.
+    /// `true` if the matrix of the colors isn't declared. Players then take HD for BT.709.
     is_undeclared_hd: bool,
 }
 
@@ -131,10 +131,10 @@ impl<'a> Converter<'a> {
             } else {
                 let lacks =
                     "the video is HDR, and the ffmpeg on the PATH lacks the filters zscale and tonemap";
-                warnings.push(format!("{lacks}: colours are pale"));
+                warnings.push(format!("{lacks}: colors are pale"));
             }
         }
-        // JPEG has the colour matrix of BT.601, and the full range.
+        // JPEG has the color matrix of BT.601, and the full range.
         let from = if probe.is_undeclared_hd && tonemap.is_empty() { ":in_color_matrix=bt709" } else { "" };
         let scale = format!("scale=w=round(iw*sar):h=ih{from}:out_color_matrix=bt601:out_range=pc");
         Ok(Converter {

@@ -55,7 +55,7 @@ pub struct VideoFrames {
     pub fps: f64,
     /// Width and height of the frames in pixels.
     pub size: (u32, u32),
-    /// What the user should know of the video, a sentence each: that nothing moves, that colours or frames are lost.
+    /// What the user should know of the video, a sentence each: that nothing moves, that colors or frames are lost.
     pub warnings: Vec<String>,
 }
 

@@ -26,8 +26,8 @@ const EXTENSION: &str = "KHR_gaussian_splatting";
 const SPZ_EXTENSION: &str = "KHR_gaussian_splatting_compression_spz_2";
 /// Value of `kernel`, for Gaussians as 3DGS projects them.
 const KERNEL: &str = "ellipse";
-/// Value of `colorSpace`, for the colours that 3DGS is trained with.
-const COLOUR_SPACE: &str = "srgb_rec709_display";
+/// Value of `colorSpace`, for the colors that 3DGS is trained with.
+const COLOR_SPACE: &str = "srgb_rec709_display";
 /// Value of `mode` of primitives of points.
 const POINTS: u32 = 0;
 /// First bytes of a `.glb`.

@@ -4,7 +4,7 @@ use super::accessors::Components;
 use super::container::{Document, quoted};
 use super::json::{Primitive, Splatting};
 use super::scene::MeshNode;
-use super::{COLOUR_SPACE, EXTENSION, KERNEL, POINTS, SPZ_EXTENSION, sh_attribute, turn_rotation_back};
+use super::{COLOR_SPACE, EXTENSION, KERNEL, POINTS, SPZ_EXTENSION, sh_attribute, turn_rotation_back};
 use crate::axes::Axes;
 use crate::codec::Contents;
 use crate::invalid::InvalidGaussians;
@@ -45,7 +45,7 @@ pub fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
             let reader = PrimitiveReader { document: &document, primitive, splatting, name };
             let part = reader.read(&mut memory, &mut opacities)?;
             warn(reader.unknown("kernel", splatting.kernel.as_deref(), KERNEL));
-            warn(reader.unknown("colorSpace", splatting.color_space.as_deref(), COLOUR_SPACE));
+            warn(reader.unknown("colorSpace", splatting.color_space.as_deref(), COLOR_SPACE));
             parts.push(moved(path, part, &place)?);
         }
     }
@@ -126,7 +126,7 @@ impl PrimitiveReader<'_> {
         self.add_size(memory, count, (sh_degree + 1).pow(2))?;
         let rotations: Vec<[f32; 4]> = self.extension("ROTATION", count, Components::NormalizedSigned)?;
         let scales: Vec<[f32; 3]> = self.extension("SCALE", count, Components::Any)?;
-        let (dc, own_opacities) = self.colours(count)?;
+        let (dc, own_opacities) = self.colors(count)?;
         let first = opacities.len();
         opacities.extend(own_opacities);
         let mut rest: Vec<Vec<[f32; 3]>> = vec![];
@@ -138,8 +138,8 @@ impl PrimitiveReader<'_> {
             }
         }
         let mut sh = Vec::with_capacity(count * (rest.len() + 1));
-        for (index, colour) in dc.into_iter().enumerate() {
-            sh.push(colour);
+        for (index, color) in dc.into_iter().enumerate() {
+            sh.push(color);
             sh.extend(rest.iter().map(|of_basis| of_basis[index]));
         }
         Ok(Splat {
@@ -158,20 +158,20 @@ impl PrimitiveReader<'_> {
     }
 
     /// Returns the spherical harmonics of degree 0 and the opacities. Either may come from COLOR_0, for files as of the extension's drafts.
-    fn colours(&self, count: usize) -> Result<(Vec<[f32; 3]>, Vec<f32>)> {
+    fn colors(&self, count: usize) -> Result<(Vec<[f32; 3]>, Vec<f32>)> {
         let (dc, opacity) = (sh_attribute(0, 0), format!("{EXTENSION}:OPACITY"));
         let fallback = |missing: &str| -> Result<Vec<[f32; 4]>> {
             let Some(&accessor) = self.primitive.attributes.get("COLOR_0") else {
                 return Err(self.missing(missing));
             };
             if self.document.accessor(accessor, "COLOR_0")?.shape == "VEC3" && missing != opacity {
-                let colours: Vec<[f32; 3]> =
+                let colors: Vec<[f32; 3]> =
                     self.document.numbers(accessor, "COLOR_0", count, Components::NormalizedUnsigned)?;
-                return Ok(colours.into_iter().map(|[red, green, blue]| [red, green, blue, 1.]).collect());
+                return Ok(colors.into_iter().map(|[red, green, blue]| [red, green, blue, 1.]).collect());
             }
             self.document.numbers(accessor, "COLOR_0", count, Components::NormalizedUnsigned)
         };
-        let to_dc = |colour: f32| ((f64::from(colour) - 0.5) / SH_C0) as f32;
+        let to_dc = |color: f32| ((f64::from(color) - 0.5) / SH_C0) as f32;
         let harmonics = match self.primitive.attributes.get(&dc) {
             Some(&accessor) => self.document.numbers(accessor, &dc, count, Components::Normalized)?,
             None => fallback(&dc)?.into_iter().map(|[r, g, b, _]| [r, g, b].map(to_dc)).collect(),

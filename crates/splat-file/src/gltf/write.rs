@@ -1,7 +1,7 @@
-//! Writes splats as glTF: one primitive with float32 attributes, and colours of bytes for programs that show points only.
+//! Writes splats as glTF: one primitive with float32 attributes, and colors of bytes for programs that show points only.
 
 use super::container::encode_percent;
-use super::{COLOUR_SPACE, EXTENSION, KERNEL, MAGIC, POINTS, sh_attribute, turn_rotation};
+use super::{COLOR_SPACE, EXTENSION, KERNEL, MAGIC, POINTS, sh_attribute, turn_rotation};
 use crate::axes::Axes;
 use crate::codec::WriteOptions;
 use crate::{Error, Result, SH_C0, Splat};
@@ -79,7 +79,7 @@ struct Attribute {
 #[derive(Clone, Copy, PartialEq)]
 enum Values {
     Position,
-    Colour,
+    Color,
     Rotation,
     Scale,
     Opacity,
@@ -91,7 +91,7 @@ impl Values {
     /// Returns the type, the component type and the size in bytes.
     fn layout(self) -> (&'static str, u32, usize) {
         match self {
-            Values::Colour => ("VEC4", UNSIGNED_BYTE, 4),
+            Values::Color => ("VEC4", UNSIGNED_BYTE, 4),
             Values::Rotation => ("VEC4", FLOAT, 16),
             Values::Opacity => ("SCALAR", FLOAT, 4),
             Values::Position | Values::Scale | Values::Harmonic(..) => ("VEC3", FLOAT, 12),
@@ -111,10 +111,10 @@ impl Values {
             Values::Scale => append(&splat.scale(index)),
             Values::Opacity => append(&[splat.opacity(index)]),
             Values::Harmonic(basis, sign) => append(&splat.sh_of(index)[basis].map(|channel| sign * channel)),
-            Values::Colour => {
-                let colour = splat.sh_of(index)[0].map(|dc| f64::from(dc) * SH_C0 + 0.5);
+            Values::Color => {
+                let color = splat.sh_of(index)[0].map(|dc| f64::from(dc) * SH_C0 + 0.5);
                 let byte = |number: f64| (number * 255.).round() as u8; // clamps to 0 and 255
-                bytes.extend(colour.map(byte));
+                bytes.extend(color.map(byte));
                 bytes.push(byte(splat.opacity(index).into()));
             }
         }
@@ -140,7 +140,7 @@ fn attributes(path: &Path, splat: &Splat) -> Result<Vec<Attribute>> {
     let own = |name: &str| format!("{EXTENSION}:{name}");
     let mut attributes = vec![
         Attribute { name: "POSITION".into(), values: Values::Position },
-        Attribute { name: "COLOR_0".into(), values: Values::Colour },
+        Attribute { name: "COLOR_0".into(), values: Values::Color },
         Attribute { name: own("ROTATION"), values: Values::Rotation },
         Attribute { name: own("SCALE"), values: Values::Scale },
         Attribute { name: own("OPACITY"), values: Values::Opacity },
@@ -175,7 +175,7 @@ fn document(attributes: &[Attribute], splat: &Splat, buffer: Option<&str>) -> Va
                 accessor["min"] = json!(min);
                 accessor["max"] = json!(max);
             }
-            Values::Colour => accessor["normalized"] = json!(true),
+            Values::Color => accessor["normalized"] = json!(true),
             _ => {}
         }
         accessors.push(accessor);
@@ -188,7 +188,7 @@ fn document(attributes: &[Attribute], splat: &Splat, buffer: Option<&str>) -> Va
     }
     let splatting = json!({
         "kernel": KERNEL,
-        "colorSpace": COLOUR_SPACE,
+        "colorSpace": COLOR_SPACE,
         "sortingMethod": "cameraDistance",
         "projection": "perspective",
     });

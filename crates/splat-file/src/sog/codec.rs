@@ -157,7 +157,7 @@ fn read(path: &Path, mut reader: Reader, meta: &[u8]) -> Result<Contents> {
         Ok(image)
     };
     let [lower, upper] = [image(lower_name)?, image(upper_name)?];
-    let [scales, rotations, colours] =
+    let [scales, rotations, colors] =
         [image(&meta.scales.files[0])?, image(&meta.quats.files[0])?, image(&meta.sh0.files[0])?];
     let labels = meta.sh_rest.as_ref().map(|rest| image(&rest.files[1])).transpose()?;
 
@@ -191,9 +191,9 @@ fn read(path: &Path, mut reader: Reader, meta: &[u8]) -> Result<Contents> {
         };
         let fractions = [a, b, c].map(|byte| f64::from(byte) / 255.);
         splat.quaternions.push(from_smallest_three(largest.into(), fractions));
-        let [red, green, blue, opacity] = colours.pixels[index];
-        let colour = |index: u8| look_up(&meta.sh0.codebook, &meta.sh0.files[0], index);
-        splat.sh.push([colour(red)?, colour(green)?, colour(blue)?]);
+        let [red, green, blue, opacity] = colors.pixels[index];
+        let color = |index: u8| look_up(&meta.sh0.codebook, &meta.sh0.files[0], index);
+        splat.sh.push([color(red)?, color(green)?, color(blue)?]);
         splat.opacity_logits.push(logit_of_opacity(f64::from(opacity) / 255.));
     }
     if let (Some(rest), Some(labels)) = (&meta.sh_rest, labels) {
@@ -216,13 +216,13 @@ fn read(path: &Path, mut reader: Reader, meta: &[u8]) -> Result<Contents> {
             return refuse(name, found, &format!("{coefficients} for each of {} centroids", rest.count));
         }
         let mut sh = Vec::with_capacity(meta.count * (coefficients + 1));
-        for (colour, label) in splat.sh.iter().zip(&labels.pixels) {
+        for (color, label) in splat.sh.iter().zip(&labels.pixels) {
             let label = usize::from(u16::from_le_bytes([label[0], label[1]]));
             if label >= rest.count {
                 let expected = format!("less than {}, the number of centroids", rest.count);
                 return refuse(&format!("an index in {}", rest.files[1]), label.to_string(), &expected);
             }
-            sh.push(*colour);
+            sh.push(*color);
             for pixel in &centroids.pixels[label * coefficients..][..coefficients] {
                 let value = |channel: usize| look_up(&rest.codebook, name, pixel[channel]);
                 sh.push([value(0)?, value(1)?, value(2)?]);
@@ -286,7 +286,7 @@ fn round_sh(splat: &Splat) -> Splat {
             .as_chunks()
             .0
             .iter()
-            .map(|colour: &[f32; 3]| colour.map(|value| codebook.values[usize::from(codebook.index(value))]))
+            .map(|color: &[f32; 3]| color.map(|value| codebook.values[usize::from(codebook.index(value))]))
             .collect();
         for (&index, label) in order.iter().zip(palette.labels) {
             rounded.sh[index * splat.bases() + 1..][..coefficients]
@@ -326,7 +326,7 @@ fn encode(splat: &Splat) -> (Vec<u8>, Vec<(&'static str, Image)>) {
     };
     let log_scale = |value: f32| value.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE);
     let scales = Codebook::build(splat.log_scales.iter().flatten().map(|&value| log_scale(value)));
-    let colours = Codebook::build((0..splat.len()).flat_map(|index| splat.sh_of(index)[0]));
+    let colors = Codebook::build((0..splat.len()).flat_map(|index| splat.sh_of(index)[0]));
     let opacity = |index: usize| (splat.opacity(index) * 255.).round() as u8;
     let mut images = vec![
         ("means_l.webp", image(&|index| bytes_of_position(index, 0))),
@@ -342,7 +342,7 @@ fn encode(splat: &Splat) -> (Vec<u8>, Vec<(&'static str, Image)>) {
         (
             "sh0.webp",
             image(&|index| {
-                let [red, green, blue] = splat.sh_of(index)[0].map(|value| colours.index(value));
+                let [red, green, blue] = splat.sh_of(index)[0].map(|value| colors.index(value));
                 [red, green, blue, opacity(index)]
             }),
         ),
@@ -355,8 +355,8 @@ fn encode(splat: &Splat) -> (Vec<u8>, Vec<(&'static str, Image)>) {
             .as_chunks()
             .0
             .iter()
-            .map(|colour: &[f32; 3]| {
-                let [red, green, blue] = colour.map(|value| codebook.index(value));
+            .map(|color: &[f32; 3]| {
+                let [red, green, blue] = color.map(|value| codebook.index(value));
                 [red, green, blue, 255]
             })
             .collect();
@@ -383,7 +383,7 @@ fn encode(splat: &Splat) -> (Vec<u8>, Vec<(&'static str, Image)>) {
         means: Means { mins, maxs, files: ["means_l.webp", "means_u.webp"].map(String::from) },
         scales: Indexed { codebook: scales.values, files: name("scales.webp") },
         quats: Files { files: name("quats.webp") },
-        sh0: Indexed { codebook: colours.values, files: name("sh0.webp") },
+        sh0: Indexed { codebook: colors.values, files: name("sh0.webp") },
         sh_rest,
     };
     (serde_json::to_vec(&meta).expect("numbers and strings"), images)

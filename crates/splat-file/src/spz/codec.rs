@@ -18,7 +18,7 @@ pub(crate) const CODEC: Option<Codec> = Some(Codec { read, writer: Some(Writer::
 /// Versions that are written. Version 1 has positions in float16.
 const WRITTEN_VERSIONS: RangeInclusive<u32> = 2..=4;
 /// Factor of an SH coefficient of degree 0, to which ½ is added.
-const COLOUR_SCALE: f64 = 0.15;
+const COLOR_SCALE: f64 = 0.15;
 /// Steps per unit of a scale's logarithm, counted from `LOG_SCALE_BEGIN`.
 const LOG_SCALE_STEPS: f64 = 16.;
 const LOG_SCALE_BEGIN: f64 = -10.;
@@ -29,7 +29,7 @@ const MAX_FRACTIONAL_BITS: u32 = 24;
 /// Largest value in nine bits, which hold the magnitude of a rotation's component other than the largest one.
 const MAX_PART: u32 = (1 << 9) - 1;
 /// Number of bits that are kept of the eight of an SH coefficient, for degree 1 and for higher degrees. Niantic's library keeps 5 and 4,
-/// which costs splats with strongly view-dependent colours 10 dB and more between renders, and saves a third of the file (docs/splats.md).
+/// which costs splats with strongly view-dependent colors 10 dB and more between renders, and saves a third of the file (docs/splats.md).
 const SH_BITS: [u32; 2] = [8, 7];
 
 /// Reads an SPZ.
@@ -52,12 +52,12 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let threes = |bytes: &[u8], number: &dyn Fn(u8) -> f64| -> Vec<[f32; 3]> {
         bytes.as_chunks().0.iter().map(|of_one: &[u8; 3]| of_one.map(|byte| number(byte) as f32)).collect()
     };
-    let colours = threes(&streams.colours, &|byte| (f64::from(byte) / 255. - 0.5) / COLOUR_SCALE);
+    let colors = threes(&streams.colors, &|byte| (f64::from(byte) / 255. - 0.5) / COLOR_SCALE);
     let harmonics = threes(&streams.harmonics, &|byte| (f64::from(byte) - 128.) / 128.);
     let bases = (description.sh_degree + 1).pow(2);
-    let mut sh = Vec::with_capacity(colours.len() * bases);
-    for (index, colour) in colours.into_iter().enumerate() {
-        sh.push(colour);
+    let mut sh = Vec::with_capacity(colors.len() * bases);
+    for (index, color) in colors.into_iter().enumerate() {
+        sh.push(color);
         let of_one = &harmonics[index * (bases - 1)..][..bases - 1];
         sh.extend(of_one);
     }
@@ -90,7 +90,7 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
 /// Returns the limits of coefficients that a byte can represent.
 fn limits() -> ShLimits {
     let largest = f64::from(pack_sh(f32::MAX, SH_BITS[1]));
-    let (dc, rest) = (0.5 / COLOUR_SCALE, (largest - 128.) / 128.);
+    let (dc, rest) = (0.5 / COLOR_SCALE, (largest - 128.) / 128.);
     ShLimits { degree: 3, dc: -dc..=dc, rest: -1. ..=rest }
 }
 
@@ -133,7 +133,7 @@ fn pack_smallest_three([w, x, y, z]: [f32; 4]) -> [u8; 4] {
     word.to_le_bytes()
 }
 
-/// Writes an SPZ. Scales, colours and spherical harmonics outside of the range of a byte are clamped to it.
+/// Writes an SPZ. Scales, colors and spherical harmonics outside of the range of a byte are clamped to it.
 ///
 /// # Errors
 /// Returns an error if a position is too far away for 24 bits, or the file can't be written.
@@ -162,18 +162,18 @@ fn write(path: &Path, splat: &Splat, options: &WriteOptions) -> Result<()> {
     }
     let signs = axes.harmonics();
     for index in 0..splat.len() {
-        for (basis, (colour, sign)) in splat.sh_of(index)[1..].iter().zip(signs).enumerate() {
+        for (basis, (color, sign)) in splat.sh_of(index)[1..].iter().zip(signs).enumerate() {
             let bits = SH_BITS[usize::from(basis >= 3)];
-            harmonics.extend(colour.map(|channel| pack_sh(sign * channel, bits)));
+            harmonics.extend(color.map(|channel| pack_sh(sign * channel, bits)));
         }
     }
-    let colours = (0..splat.len()).flat_map(|index| splat.sh_of(index)[0]);
+    let colors = (0..splat.len()).flat_map(|index| splat.sh_of(index)[0]);
     let scales = splat.log_scales.as_flattened().iter();
     let rotations = || (0..splat.len()).map(|index| axes.rotation(splat.unit_quaternion(index)));
     let streams = Streams {
         positions,
         opacities: (0..splat.len()).map(|index| byte(f64::from(splat.opacity(index)) * 255.)).collect(),
-        colours: colours.map(|dc| byte((f64::from(dc) * COLOUR_SCALE + 0.5) * 255.)).collect(),
+        colors: colors.map(|dc| byte((f64::from(dc) * COLOR_SCALE + 0.5) * 255.)).collect(),
         scales: scales.map(|&log| byte((f64::from(log) - LOG_SCALE_BEGIN) * LOG_SCALE_STEPS)).collect(),
         rotations: match version {
             2 => rotations().flat_map(pack_first_three).collect(),

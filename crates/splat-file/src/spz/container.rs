@@ -32,7 +32,7 @@ pub struct Streams {
     /// Three coordinates per Gaussian, float16 in version 1, 24 bits each since version 2.
     pub positions: Vec<u8>,
     pub opacities: Vec<u8>,
-    pub colours: Vec<u8>,
+    pub colors: Vec<u8>,
     pub scales: Vec<u8>,
     /// Three bytes per Gaussian up to version 2, four since version 3.
     pub rotations: Vec<u8>,
@@ -116,7 +116,7 @@ pub fn read(path: &Path, bytes: &[u8]) -> Result<(Description, Streams)> {
     let streams = Streams {
         positions: next(),
         opacities: next(),
-        colours: next(),
+        colors: next(),
         scales: next(),
         rotations: next(),
         harmonics: next(),
@@ -243,8 +243,8 @@ fn axes_of(path: &Path, mut extensions: &[u8]) -> Result<Axes> {
 /// # Errors
 /// Returns an error if the file can't be written.
 pub fn write(path: &Path, description: &Description, streams: Streams) -> Result<()> {
-    let Streams { positions, opacities, colours, scales, rotations, harmonics } = streams;
-    let mut streams = vec![positions, opacities, colours, scales, rotations, harmonics];
+    let Streams { positions, opacities, colors, scales, rotations, harmonics } = streams;
+    let mut streams = vec![positions, opacities, colors, scales, rotations, harmonics];
     // Since version 4 a splat of degree 0 has no sixth stream.
     streams.retain(|stream| !stream.is_empty());
     let is_plain = description.version >= 4;

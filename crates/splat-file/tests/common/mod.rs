@@ -35,7 +35,7 @@ impl Random {
     }
 }
 
-/// Returns a splat whose values are within the range of every format: coefficients within ±0.9, displayable colours.
+/// Returns a splat whose values are within the range of every format: coefficients within ±0.9, displayable colors.
 pub fn random_splat(count: usize, degree: usize, seed: u64) -> Splat {
     let mut random = Random::new(seed);
     let (mut means, mut log_scales, mut quaternions) = (vec![], vec![], vec![]);

@@ -17,34 +17,34 @@ pub(super) struct Canvas {
 
 impl Canvas {
     /// Creates a canvas from a function of each pixel's centre, in repeats.
-    pub fn from_fn(size: usize, mut colour: impl FnMut(Vec2) -> Vec3) -> Canvas {
+    pub fn from_fn(size: usize, mut color: impl FnMut(Vec2) -> Vec3) -> Canvas {
         let mut canvas = Canvas::filled(size, Vec3::ZERO);
-        canvas.change(|uv, _| colour(uv));
+        canvas.change(|uv, _| color(uv));
         canvas
     }
 
     /// Creates a canvas from a field, value by value.
-    pub fn of_field(field: &Field, colour: impl FnMut(f32) -> Vec3) -> Canvas {
-        let pixels = field.values.iter().copied().map(colour).collect();
+    pub fn of_field(field: &Field, color: impl FnMut(f32) -> Vec3) -> Canvas {
+        let pixels = field.values.iter().copied().map(color).collect();
         Canvas { size: field.size, pixels, repeats: true }
     }
 
-    /// Creates a canvas of one colour.
-    pub fn filled(size: usize, colour: Vec3) -> Canvas {
-        Canvas { size, pixels: vec![colour; size * size], repeats: true }
+    /// Creates a canvas of one color.
+    pub fn filled(size: usize, color: Vec3) -> Canvas {
+        Canvas { size, pixels: vec![color; size * size], repeats: true }
     }
 
-    /// Creates a canvas of one colour whose edges clip shapes.
-    pub fn bounded(size: usize, colour: Vec3) -> Canvas {
-        Canvas { repeats: false, ..Canvas::filled(size, colour) }
+    /// Creates a canvas of one color whose edges clip shapes.
+    pub fn bounded(size: usize, color: Vec3) -> Canvas {
+        Canvas { repeats: false, ..Canvas::filled(size, color) }
     }
 
-    /// Changes every pixel by a function of its centre and its previous colour.
-    pub fn change(&mut self, mut colour: impl FnMut(Vec2, Vec3) -> Vec3) {
+    /// Changes every pixel by a function of its centre and its previous color.
+    pub fn change(&mut self, mut color: impl FnMut(Vec2, Vec3) -> Vec3) {
         let scale = 1. / self.size as f32;
         for (y, row) in self.pixels.chunks_exact_mut(self.size).enumerate() {
             for (x, pixel) in row.iter_mut().enumerate() {
-                *pixel = colour((Vec2::new(x as f32, y as f32) + 0.5) * scale, *pixel);
+                *pixel = color((Vec2::new(x as f32, y as f32) + 0.5) * scale, *pixel);
             }
         }
     }
@@ -56,7 +56,7 @@ impl Canvas {
         }
     }
 
-    /// Paints over the pixels within `reach` of `centre`. `paint` returns the colour and its coverage for the offset from `centre`
+    /// Paints over the pixels within `reach` of `centre`. `paint` returns the color and its coverage for the offset from `centre`
     /// in repeats.
     pub fn stamp(&mut self, centre: Vec2, reach: Vec2, paint: impl Fn(Vec2) -> (Vec3, f32)) {
         let scale = self.size as f32;
@@ -70,19 +70,19 @@ impl Canvas {
         for y in low.y..=high.y {
             for x in low.x..=high.x {
                 let offset = (Vec2::new(x as f32, y as f32) + 0.5) / scale - centre;
-                let (colour, share) = paint(offset);
+                let (color, share) = paint(offset);
                 if share > 0. {
                     let pixel = &mut self.pixels[((y & mask) * (mask + 1) + (x & mask)) as usize];
-                    *pixel = pixel.lerp(colour, share.min(1.));
+                    *pixel = pixel.lerp(color, share.min(1.));
                 }
             }
         }
     }
 
     /// Fills a shape given by its signed distance in repeats, with an edge that is one pixel soft.
-    pub fn fill(&mut self, centre: Vec2, reach: Vec2, colour: Vec3, distance: impl Fn(Vec2) -> f32) {
+    pub fn fill(&mut self, centre: Vec2, reach: Vec2, color: Vec3, distance: impl Fn(Vec2) -> f32) {
         let scale = self.size as f32;
-        self.stamp(centre, reach, |offset| (colour, (0.5 - distance(offset) * scale).clamp(0., 1.)));
+        self.stamp(centre, reach, |offset| (color, (0.5 - distance(offset) * scale).clamp(0., 1.)));
     }
 
     /// Returns the bilinear interpolation of four pixels at `uv` in repeats.

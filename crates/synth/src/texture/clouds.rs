@@ -1,4 +1,4 @@
-//! Noise textures coloured by a palette ramp.
+//! Noise textures colored by a palette ramp.
 
 use rand_chacha::ChaCha8Rng;
 

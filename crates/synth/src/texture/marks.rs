@@ -52,7 +52,7 @@ impl Script {
         start: Vec2,
         length: f32,
         height: f32,
-        colour: Vec3,
+        color: Vec3,
     ) {
         let advance = (self.aspect + 0.3) * height;
         let weight = (self.weight * height).max(0.35 / canvas.size as f32);
@@ -76,7 +76,7 @@ impl Script {
                 let (from, to) = (place(from), place(to));
                 let middle = 0.5 * (from + to);
                 let reach = (to - from).abs() * 0.5 + weight + 1. / canvas.size as f32;
-                canvas.fill(start + middle, reach, colour, |offset| {
+                canvas.fill(start + middle, reach, color, |offset| {
                     shape::stroke(offset, from - middle, to - middle, weight)
                 });
             }
@@ -93,7 +93,7 @@ impl Script {
         corner: Vec2,
         extent: Vec2,
         height: f32,
-        colour: Vec3,
+        color: Vec3,
     ) {
         let line_spacing = height * random.between(1.5, 2.2);
         let lines = (extent.y / line_spacing) as usize;
@@ -107,25 +107,25 @@ impl Script {
                 corner + Vec2::new(0., (line as f32 + 0.5) * line_spacing),
                 length,
                 height,
-                colour,
+                color,
             );
         }
     }
 }
 
-/// Returns a colour that is legible on `paper`.
+/// Returns a color that is legible on `paper`.
 pub(super) fn ink_for(random: &mut ChaCha8Rng, paper: Vec3) -> Vec3 {
     let theme = random.weighted(&[(palette::GREYS, 4.), (palette::VIVID, 1.), (palette::ACCENTS, 1.)]);
-    let ink = palette::colour_of(random, theme);
+    let ink = palette::color_of(random, theme);
     if luminance(paper) > 0.3 { ink * 0.35 } else { Vec3::splat(0.75).lerp(ink, 0.3) }
 }
 
 /// Draws a texture of columns of writing, like newspapers, labels and notices.
 pub(super) fn writing(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let paper = if random.happens(0.6) {
-        palette::colour_of(random, palette::WHITES)
+        palette::color_of(random, palette::WHITES)
     } else {
-        Palette::draw(random, purpose, 1).colour(0)
+        Palette::draw(random, purpose, 1).color(0)
     };
     let mut canvas = Canvas::filled(SIZE, paper);
     let ink = ink_for(random, paper);
@@ -141,7 +141,7 @@ pub(super) fn writing(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
             match random.count(0, 5) {
                 0 => script.write(random, &mut canvas, corner + Vec2::new(0., 0.05), extent.x, 0.05, ink),
                 1 => {
-                    let block = Palette::draw(random, Purpose::Poster, 1).colour(0);
+                    let block = Palette::draw(random, Purpose::Poster, 1).color(0);
                     let half = Vec2::new(0.5 * extent.x, 0.45 * extent.y);
                     let middle = corner + half;
                     canvas.fill(middle, half, block, |offset| shape::rectangle(offset, half, 0.));
@@ -158,9 +158,9 @@ pub(super) fn writing(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 pub(super) fn scribbles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(2, 5);
     let palette = Palette::draw(random, purpose, count);
-    let mut canvas = Canvas::filled(SIZE, palette.colour(0));
+    let mut canvas = Canvas::filled(SIZE, palette.color(0));
     for _ in 0..random.count(1, 12) {
-        let colour = palette.any(random);
+        let color = palette.any(random);
         let width = random.leaning_low(0.8, 5.) / SIZE as f32;
         let mut at = random.spot();
         let (mut angle, mut curl) = (random.between(0., 6.), 0.);
@@ -169,7 +169,7 @@ pub(super) fn scribbles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
             curl = 0.8 * curl + 0.3 * random.bell();
             angle += curl;
             let step = Vec2::from_angle(angle) * step_length;
-            canvas.fill(at + 0.5 * step, 0.5 * step.abs() + width + 1. / SIZE as f32, colour, |offset| {
+            canvas.fill(at + 0.5 * step, 0.5 * step.abs() + width + 1. / SIZE as f32, color, |offset| {
                 shape::stroke(offset, -0.5 * step, 0.5 * step, width)
             });
             at += step;

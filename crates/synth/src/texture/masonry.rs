@@ -14,9 +14,9 @@ use super::{Canvas, Purpose, SIZE, Surface};
 
 /// Appearance of pieces and of the joints between them; lengths in repeats.
 struct Finish {
-    /// Colours of the pieces.
+    /// Colors of the pieces.
     palette: Palette,
-    /// Colour of the joints.
+    /// Color of the joints.
     joint: glam::Vec3,
     /// Half the width of a joint.
     joint_width: f32,
@@ -52,18 +52,18 @@ fn lay(random: &mut ChaCha8Rng, layout: &Layout, finish: &Finish) -> Canvas {
         let lightness = 1. + finish.spread * (unit_of(seed ^ 1, piece.id) - 0.5);
         let texture = 1. + finish.roughness * (rough + 0.6 * stain);
         let middle = 1. - finish.bulge * (1. - raised);
-        let colour = finish.palette.ramp(tone) * (lightness * texture * middle).max(0.15);
+        let color = finish.palette.ramp(tone) * (lightness * texture * middle).max(0.15);
         let joint = finish.joint * (1. + 0.25 * rough).max(0.3);
-        joint.lerp(colour, on_piece)
+        joint.lerp(color, on_piece)
     });
     canvas.shade(&height.slope(light), random.between(0., 0.6));
     canvas
 }
 
-fn joint_colour(random: &mut ChaCha8Rng, theme: palette::Theme) -> glam::Vec3 {
+fn joint_color(random: &mut ChaCha8Rng, theme: palette::Theme) -> glam::Vec3 {
     let other =
         random.weighted(&[(palette::STONES, 4.), (palette::GREYS, 2.), (palette::WHITES, 2.), (theme, 1.)]);
-    palette::colour_of(random, other) * random.between(0.5, 1.)
+    palette::color_of(random, other) * random.between(0.5, 1.)
 }
 
 /// Draws a texture of courses of bricks.
@@ -87,7 +87,7 @@ pub(super) fn bricks(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let count = random.count(1, 4);
     let finish = Finish {
         palette: Palette::from_theme(random, theme, count),
-        joint: joint_colour(random, theme),
+        joint: joint_color(random, theme),
         joint_width: high * random.between(0.03, 0.11),
         rounding: high * random.between(0.05, 0.2),
         bulge: random.between(0., 0.25),
@@ -125,7 +125,7 @@ pub(super) fn tiles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.one_of(&[1, 1, 1, 2, 3, 4]);
     let finish = Finish {
         palette: Palette::from_theme(random, theme, count),
-        joint: joint_colour(random, theme),
+        joint: joint_color(random, theme),
         joint_width: (wide * random.leaning_low(0.004, 0.03)).max(0.3 / SIZE as f32),
         rounding: wide * random.between(0.01, 0.08),
         bulge: random.between(0., 0.1),
@@ -162,9 +162,9 @@ pub(super) fn stones(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     };
     let wide = 1. / across as f32;
     let joint = if random.happens(0.25) {
-        palette::colour_of(random, palette::GREENS) * 0.7
+        palette::color_of(random, palette::GREENS) * 0.7
     } else {
-        joint_colour(random, palette::EARTHS) * random.between(0.3, 1.)
+        joint_color(random, palette::EARTHS) * random.between(0.3, 1.)
     };
     let count = random.count(1, 4);
     let finish = Finish {
@@ -226,14 +226,14 @@ pub(super) fn shingles(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     Surface { canvas, repeat_metres: rows as f32 * random.between(0.1, 0.3) }
 }
 
-/// Draws a mosaic of small stones in many colours.
+/// Draws a mosaic of small stones in many colors.
 pub(super) fn mosaic(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let across = random.count(16, 40);
     let count = random.count(2, 5);
     let palette = Palette::draw(random, purpose, count);
     let drift = smooth(random, SIZE, [4; 2]);
     let seed = random.seed();
-    let joint = joint_colour(random, palette::GREYS);
+    let joint = joint_color(random, palette::GREYS);
     let follows = random.between(0., 1.);
     let layout = if random.happens(0.5) {
         Layout::courses(across, across, 0., false)

@@ -286,7 +286,7 @@ impl Texture {
             canvas.pixels.iter().map(|pixel| pixel.clamp(Vec3::splat(low), Vec3::splat(high))).collect();
         let mut levels = Vec::new();
         loop {
-            levels.push(texels.iter().map(|&colour| texel_of(colour)).collect());
+            levels.push(texels.iter().map(|&color| texel_of(color)).collect());
             if size == 1 {
                 return Texture { levels, repeat_metres };
             }
@@ -301,9 +301,9 @@ impl Texture {
     }
 }
 
-/// Encodes a colour as square roots, because eyes and cameras resolve dark colours more finely.
-fn texel_of(colour: Vec3) -> [u8; 4] {
-    let root = (colour.map(f32::sqrt) * 255. + 0.5).as_u8vec3();
+/// Encodes a color as square roots, because eyes and cameras resolve dark colors more finely.
+fn texel_of(color: Vec3) -> [u8; 4] {
+    let root = (color.map(f32::sqrt) * 255. + 0.5).as_u8vec3();
     [root.x, root.y, root.z, 0]
 }
 

@@ -1,4 +1,4 @@
-//! Realistic colours, and palettes of a few that go together.
+//! Realistic colors, and palettes of a few that go together.
 
 use glam::Vec3;
 use rand_chacha::ChaCha8Rng;
@@ -6,57 +6,57 @@ use rand_chacha::ChaCha8Rng;
 use super::Purpose;
 use super::rng::RandomValues;
 
-/// Colours of one kind in sRGB, as 0xrrggbb.
+/// Colors of one kind in sRGB, as 0xrrggbb.
 pub(super) type Theme = &'static [u32];
 
-/// Colours of painted walls, ceilings and paper.
+/// Colors of painted walls, ceilings and paper.
 pub(super) const WHITES: Theme =
     &[0xe6e3dc, 0xdcd8ce, 0xebe9e4, 0xd3d1cc, 0xe0d9cb, 0xd2d6d7, 0xf0eee8, 0xd9d3c4];
-/// Colours between white and brown.
+/// Colors between white and brown.
 pub(super) const BEIGES: Theme = &[0xd9c8ac, 0xcbb994, 0xe2d3b7, 0xc4ae8b, 0xb9a58a, 0xd8cbb8, 0xc9b7a0];
-/// Colours from nearly white to nearly black.
+/// Colors from nearly white to nearly black.
 pub(super) const GREYS: Theme =
     &[0xb8b6b2, 0x9a9a98, 0x7d7d7b, 0x5f6062, 0xcac9c5, 0x434547, 0x8d9296, 0x2b2c2e, 0xa8a49c];
-/// Colours of leather, dark wood and old fabric.
+/// Colors of leather, dark wood and old fabric.
 pub(super) const BROWNS: Theme = &[0x6b4a32, 0x86613f, 0x4d3524, 0x9c7a55, 0x3b2a1f, 0x7a5a48, 0xa98763];
-/// Colours of wood from birch to wenge, varnished or weathered.
+/// Colors of wood from birch to wenge, varnished or weathered.
 pub(super) const WOODS: Theme = &[
     0xb98a56, 0xa06d3c, 0xd3ac77, 0x7b4e2b, 0x5a3a22, 0xc79d6b, 0xe0c295, 0x8c5a34, 0x9b8a75, 0x3a281c,
     0xb0794a, 0xcfb48c, 0x84807a,
 ];
-/// Colours of grass and leaves.
+/// Colors of grass and leaves.
 pub(super) const GREENS: Theme =
     &[0x5d7a35, 0x47632b, 0x7f9447, 0x3a5127, 0x8a9a5b, 0x647f4d, 0xa3a860, 0x2f3f22, 0x4f7040, 0x6e8b3d];
-/// Colours of dry grass and fallen leaves.
+/// Colors of dry grass and fallen leaves.
 pub(super) const AUTUMN: Theme =
     &[0xb0803a, 0x8f5a2b, 0xc7a24f, 0x7a4526, 0xa8432a, 0xbfa56c, 0x6b5a33, 0xd4b878];
-/// Colours of soil and sand.
+/// Colors of soil and sand.
 pub(super) const EARTHS: Theme =
     &[0x8a6f4e, 0x6e573d, 0xa58a64, 0x55442f, 0xb99f78, 0x9a6b48, 0xc2a67c, 0x7b6a58];
-/// Colours of stone, concrete and gravel.
+/// Colors of stone, concrete and gravel.
 pub(super) const STONES: Theme =
     &[0xa7a29a, 0x8b867d, 0xc1bab0, 0x6d6a66, 0xb3a58f, 0x94897b, 0xd2ccc2, 0x7c8083, 0x55534f];
-/// Colours of fired clay and other bricks.
+/// Colors of fired clay and other bricks.
 pub(super) const BRICKS: Theme =
     &[0x9a4b35, 0xa85c42, 0x7f3d2e, 0xb5714f, 0xc08a66, 0x6b4038, 0xb8a48c, 0x8c8680, 0xd8cfc2, 0xa3705a];
-/// Moderately saturated colours of fabric and paint.
+/// Moderately saturated colors of fabric and paint.
 pub(super) const ACCENTS: Theme = &[
     0x2f4560, 0x5c7a8c, 0x8aa0a3, 0x7d8f6e, 0xa4b494, 0xc59a3f, 0xa8523c, 0x7a2e3a, 0xc7a0a0, 0x6a5a78,
     0x35605a, 0xd7b98e, 0x94b0c2, 0x3f5d45, 0xb57f6a, 0xdcc7c0, 0x4b6a8f,
 ];
-/// Saturated colours of print, plastic and toys.
+/// Saturated colors of print, plastic and toys.
 pub(super) const VIVID: Theme = &[
     0xd22f27, 0x1f5fbf, 0xf2b90c, 0x1f9d55, 0xe8671b, 0x8e2fa8, 0x12a3b8, 0xe84a8a, 0x161616, 0xfafafa,
     0x7ac143, 0x0b3c7d,
 ];
 
-/// A few colours in linear RGB.
+/// A few colors in linear RGB.
 pub(super) struct Palette {
-    colours: Vec<Vec3>,
+    colors: Vec<Vec3>,
 }
 
 impl Palette {
-    /// Draws `count` colours that are likely for `purpose`.
+    /// Draws `count` colors that are likely for `purpose`.
     pub fn draw(random: &mut ChaCha8Rng, purpose: Purpose, count: usize) -> Palette {
         let themes: &[(Theme, f32)] = match purpose {
             Purpose::Floor => &[
@@ -102,83 +102,83 @@ impl Palette {
         Palette::from_theme(random, theme, count)
     }
 
-    /// Draws `count` colours of one theme: shades of one colour, several colours, one with accents, or rarely arbitrary colours.
+    /// Draws `count` colors of one theme: shades of one color, several colors, one with accents, or rarely arbitrary colors.
     pub fn from_theme(random: &mut ChaCha8Rng, theme: Theme, count: usize) -> Palette {
-        let base = colour_of(random, theme);
+        let base = color_of(random, theme);
         let kind = random.unit();
-        let mut colours = vec![base];
-        while colours.len() < count {
-            colours.push(if kind < 0.4 {
+        let mut colors = vec![base];
+        while colors.len() < count {
+            colors.push(if kind < 0.4 {
                 shade(random, base, 0.35)
             } else if kind < 0.68 {
-                colour_of(random, theme)
+                color_of(random, theme)
             } else if kind < 0.94 {
                 let other =
                     random.weighted(&[(theme, 3.), (ACCENTS, 2.), (GREYS, 1.), (WHITES, 1.), (VIVID, 0.5)]);
-                colour_of(random, other)
+                color_of(random, other)
             } else {
-                random_colour(random)
+                random_color(random)
             });
         }
         if kind > 0.97 {
-            colours[0] = random_colour(random);
+            colors[0] = random_color(random);
         }
-        Palette { colours }
+        Palette { colors }
     }
 
-    /// Returns a random colour of the palette.
+    /// Returns a random color of the palette.
     pub fn any(&self, random: &mut ChaCha8Rng) -> Vec3 {
-        random.one_of(&self.colours)
+        random.one_of(&self.colors)
     }
 
-    /// Returns the colour at `index`, wrapping around after the last one.
-    pub fn colour(&self, index: usize) -> Vec3 {
-        self.colours[index % self.colours.len()]
+    /// Returns the color at `index`, wrapping around after the last one.
+    pub fn color(&self, index: usize) -> Vec3 {
+        self.colors[index % self.colors.len()]
     }
 
-    /// Returns the colour at `t` in [0, 1], from the first to the last. Interpolates square roots, so that midpoints look halfway
+    /// Returns the color at `t` in [0, 1], from the first to the last. Interpolates square roots, so that midpoints look halfway
     /// between in brightness.
     pub fn ramp(&self, t: f32) -> Vec3 {
-        let last = self.colours.len() - 1;
+        let last = self.colors.len() - 1;
         if last == 0 {
-            return self.colours[0];
+            return self.colors[0];
         }
         let at = t.clamp(0., 1.) * last as f32;
         let first = (at as usize).min(last - 1);
-        let root = |index: usize| self.colours[index].map(f32::sqrt);
+        let root = |index: usize| self.colors[index].map(f32::sqrt);
         let mixed = root(first).lerp(root(first + 1), at - first as f32);
         mixed * mixed
     }
 }
 
-/// Returns a random colour of a theme, slightly varied.
-pub(super) fn colour_of(random: &mut ChaCha8Rng, theme: Theme) -> Vec3 {
-    let colour = linear_of(random.one_of(theme));
-    shade(random, colour, 0.12)
+/// Returns a random color of a theme, slightly varied.
+pub(super) fn color_of(random: &mut ChaCha8Rng, theme: Theme) -> Vec3 {
+    let color = linear_of(random.one_of(theme));
+    shade(random, color, 0.12)
 }
 
-/// Returns `colour` made brighter or darker by about `spread`, with small random changes of saturation and hue.
-pub(super) fn shade(random: &mut ChaCha8Rng, colour: Vec3, spread: f32) -> Vec3 {
-    let grey = Vec3::splat(luminance(colour));
+/// Returns `color` made brighter or darker by about `spread`, with small random changes of saturation and hue.
+pub(super) fn shade(random: &mut ChaCha8Rng, color: Vec3, spread: f32) -> Vec3 {
+    let grey = Vec3::splat(luminance(color));
     let saturation = random.between(0.65, 1.2);
     let hue = Vec3::new(random.bell(), random.bell(), random.bell()) * 0.05 + 1.;
     let light = random.bell() * 1.8 * spread;
     // Darken and brighten by the same ratio, and never beyond white.
     let factor = if light < 0. { 1. / (1. - light) } else { 1. + light };
-    let shaded = (grey + (colour - grey) * saturation) * hue * factor;
+    let shaded = (grey + (color - grey) * saturation) * hue * factor;
     shaded.clamp(Vec3::splat(0.01), Vec3::splat(0.92))
 }
 
-/// Returns a colour of random hue, brightness and saturation.
-pub(super) fn random_colour(random: &mut ChaCha8Rng) -> Vec3 {
-    let colour = Vec3::new(random.unit(), random.unit(), random.unit());
-    let grey = Vec3::splat(luminance(colour));
-    (grey + (colour - grey) * random.between(0.3, 1.3)).clamp(Vec3::splat(0.01), Vec3::splat(0.92))
+/// Returns a color of random hue, brightness and saturation.
+pub(super) fn random_color(random: &mut ChaCha8Rng) -> Vec3 {
+    let color = Vec3::new(random.unit(), random.unit(), random.unit());
+    let grey = Vec3::splat(luminance(color));
+    (grey + (color - grey) * random.between(0.3, 1.3)).clamp(Vec3::splat(0.01), Vec3::splat(0.92))
 }
 
-/// Returns the luminance of a linear colour, with Rec. 709's weights.
-pub(super) fn luminance(colour: Vec3) -> f32 {
-    colour.dot(Vec3::new(0.2126, 0.7152, 0.0722))
+/// Returns the luminance of a linear color, with Rec. 709's weights.
+pub(super) fn luminance(color: Vec3) -> f32 {
+    color.dot(Vec3::new(0.2126, 0.7152, 0.0722))
 }
 
 /// Converts sRGB 0xrrggbb to linear RGB.

@@ -12,14 +12,14 @@ use super::{Canvas, Purpose, SIZE, Surface};
 
 /// Paints a raised rectangle. Along its edges, over a width of `bevel` repeats, `relief` brightens the left and upper sides and darkens the
 /// right and lower sides. A rectangle with a negative `relief` is sunk.
-fn paint_panel(canvas: &mut Canvas, middle: Vec2, half: Vec2, colour: Vec3, bevel: f32, relief: f32) {
+fn paint_panel(canvas: &mut Canvas, middle: Vec2, half: Vec2, color: Vec3, bevel: f32, relief: f32) {
     let pixels = canvas.size as f32;
     canvas.stamp(middle, half, |offset| {
         let inside = half - offset.abs();
         let edge_distance = inside.min_element();
         let side = if inside.x < inside.y { offset.x.signum() } else { offset.y.signum() };
         let edge = smoothstep(bevel, 0.3 * bevel, edge_distance);
-        (colour * (1. - relief * side * edge), (0.5 + edge_distance * pixels).clamp(0., 1.))
+        (color * (1. - relief * side * edge), (0.5 + edge_distance * pixels).clamp(0., 1.))
     });
 }
 
@@ -36,7 +36,7 @@ pub(super) fn windows(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         (palette::BROWNS, 2.),
         (palette::ACCENTS, 1.),
     ]);
-    let frame = palette::colour_of(random, theme);
+    let frame = palette::color_of(random, theme);
     let (panes_x, panes_y) = (random.count(1, 3), random.count(1, 4));
     let border = random.between(0.02, 0.07) * cell.min_element();
     let sill = random.happens(0.5);
@@ -51,7 +51,7 @@ pub(super) fn windows(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
             let below = middle + Vec2::new(0., half.y);
             paint_panel(&mut canvas, below, Vec2::new(1.1 * half.x, border), frame * 0.8, border, 0.4);
         }
-        let curtain = random.happens(curtains).then(|| palette::colour_of(random, palette::BEIGES) * 0.6);
+        let curtain = random.happens(curtains).then(|| palette::color_of(random, palette::BEIGES) * 0.6);
         let slant = random.between(-1., 1.);
         let level = random.between(-0.8, 0.8);
         let drawn = random.between(0.2, 1.);
@@ -64,14 +64,14 @@ pub(super) fn windows(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
             canvas.stamp(middle + at, half_pane, |offset| {
                 let position = (at + offset) / inner;
                 let mirrored = smoothstep(-0.3, 0.3, level - position.y + slant * position.x);
-                let mut colour = dark.lerp(sky, mirrored * 0.8);
+                let mut color = dark.lerp(sky, mirrored * 0.8);
                 if let Some(curtain) = curtain
                     && position.x.abs() > 1. - drawn
                 {
-                    colour = colour.lerp(curtain * (0.8 + 0.2 * (position.x * 40.).sin()), 0.7);
+                    color = color.lerp(curtain * (0.8 + 0.2 * (position.x * 40.).sin()), 0.7);
                 }
                 let edge_distance = (half_pane - offset.abs()).min_element();
-                (colour, (0.5 + edge_distance * SIZE as f32).clamp(0., 1.))
+                (color, (0.5 + edge_distance * SIZE as f32).clamp(0., 1.))
             });
         }
     }
@@ -81,7 +81,7 @@ pub(super) fn windows(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 /// Draws a texture of shelves with upright books, folders or boxes.
 pub(super) fn shelves(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let theme = random.weighted(&[(palette::WOODS, 4.), (palette::WHITES, 2.), (palette::GREYS, 1.)]);
-    let wood = palette::colour_of(random, theme);
+    let wood = palette::color_of(random, theme);
     let mut canvas = Canvas::filled(SIZE, wood * random.between(0.15, 0.5));
     let rows = random.count(2, 6);
     let row_height = 1. / rows as f32;
@@ -99,18 +99,18 @@ pub(super) fn shelves(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
             if random.happens(fill_probability) {
                 let height = (row_height - board) * random.between(0.6, 0.96);
                 let theme = random.weighted(&weights);
-                let colour = palette::colour_of(random, theme);
+                let color = palette::color_of(random, theme);
                 let middle = Vec2::new(x + 0.5 * width, floor - 0.5 * height);
                 let half = 0.5 * Vec2::new(width, height);
                 let roundness = random.between(0.2, 0.6);
                 canvas.stamp(middle, half, |offset| {
                     let across = offset.x / half.x;
                     (
-                        colour * (1. - roundness * across * across),
+                        color * (1. - roundness * across * across),
                         ((half - offset.abs()).min_element() * SIZE as f32 + 0.5).clamp(0., 1.),
                     )
                 });
-                let label = ink_for(random, colour);
+                let label = ink_for(random, color);
                 for _ in 0..random.count(0, 3) {
                     let band = random.between(0.3, 2.) / SIZE as f32;
                     let place = middle + Vec2::new(0., half.y * random.between(-0.85, 0.85));
@@ -145,21 +145,21 @@ pub(super) fn cupboards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         (palette::GREYS, 2.),
         (palette::ACCENTS, 2.),
     ]);
-    let colour = palette::colour_of(random, theme);
-    let mut canvas = Canvas::filled(SIZE, colour * random.between(0.15, 0.6));
+    let color = palette::color_of(random, theme);
+    let mut canvas = Canvas::filled(SIZE, color * random.between(0.15, 0.6));
     let (columns, rows) = (random.count(1, 4), random.count(1, 5));
     let cell = Vec2::new(1. / columns as f32, 1. / rows as f32);
     let gap = random.between(0.004, 0.012);
     let bevel = random.between(0.006, 0.02);
     let relief = random.between(0.1, 0.5);
     let insets = random.count(0, 2);
-    let metal = palette::colour_of(random, palette::GREYS);
+    let metal = palette::color_of(random, palette::GREYS);
     let handle = random.count(0, 3);
     let handle_length = random.between(0.1, 0.4);
     for index in 0..rows * columns {
         let middle = (Vec2::new((index % columns) as f32, (index / columns) as f32) + 0.5) * cell;
         let mut half = 0.5 * cell - gap;
-        let tone = colour * random.between(0.95, 1.05);
+        let tone = color * random.between(0.95, 1.05);
         paint_panel(&mut canvas, middle, half, tone, bevel, relief);
         for inset in 0..insets {
             half -= random.between(0.1, 0.25) * cell.min_element();
@@ -182,7 +182,7 @@ pub(super) fn cupboards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
             _ => continue,
         };
         let at = middle + place * cell;
-        canvas.fill(at + 0.006, knob + 0.01, colour * 0.35, |offset| {
+        canvas.fill(at + 0.006, knob + 0.01, color * 0.35, |offset| {
             shape::rectangle(offset, knob, knob.min_element())
         });
         canvas.fill(at, knob + 0.01, metal, |offset| shape::rectangle(offset, knob, knob.min_element()));
@@ -196,7 +196,7 @@ pub(super) fn cupboards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 
 /// Draws a texture of keys, switches, buttons or vents: small rounded boxes in rows, some of them labelled.
 pub(super) fn keys(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let ground = Palette::draw(random, purpose, 1).colour(0);
+    let ground = Palette::draw(random, purpose, 1).color(0);
     let count = random.count(1, 3);
     let palette = Palette::draw(random, Purpose::Thing, count);
     let mut canvas = Canvas::filled(SIZE, ground * random.between(0.3, 1.));
@@ -212,10 +212,10 @@ pub(super) fn keys(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
             let span = if random.happens(0.12) { 2.min(columns - column) } else { 1 };
             let middle = Vec2::new(column as f32 + 0.5 * span as f32, row as f32 + 0.5) * cell;
             let half = 0.5 * (Vec2::new(span as f32, 1.) * cell - (1. - share) * cell.min_element());
-            let colour = palette.any(random);
-            paint_panel(&mut canvas, middle, half, colour, 0.3 * half.min_element(), relief);
+            let color = palette.any(random);
+            paint_panel(&mut canvas, middle, half, color, 0.3 * half.min_element(), relief);
             if random.happens(label_probability) {
-                let ink = ink_for(random, colour);
+                let ink = ink_for(random, color);
                 let height = 0.8 * half.y;
                 let start = middle - Vec2::new(0.6 * half.x, 0.);
                 script.write(random, &mut canvas, start, 1.2 * half.x, height, ink);
@@ -228,7 +228,7 @@ pub(super) fn keys(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 
 /// Draws a texture of parallel strips with the same profile: blinds, shutters, siding, radiators, corrugated sheets.
 pub(super) fn slats(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let colour = Palette::draw(random, purpose, 1).colour(0);
+    let color = Palette::draw(random, purpose, 1).color(0);
     let count = random.leaning_low(4., 40.).floor();
     let upright = random.happens(0.5);
     let profile = random.count(0, 2);
@@ -246,14 +246,14 @@ pub(super) fn slats(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let soft = 1.5 * count / SIZE as f32;
         let joint = 1. - seam * smoothstep(0.5 * gap + soft, 0.5 * gap, part.min(1. - part));
         index += 1;
-        colour * light * joint * (1. + 0.06 * uneven.values[index - 1])
+        color * light * joint * (1. + 0.06 * uneven.values[index - 1])
     });
     Surface { canvas, repeat_metres: count * random.leaning_low(0.02, 0.15) }
 }
 
 /// Draws a texture of a suspended ceiling: a grid of boards, which may have specks, with some lamps.
 pub(super) fn ceiling_boards(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
-    let board = palette::colour_of(random, palette::WHITES);
+    let board = palette::color_of(random, palette::WHITES);
     let rail = board * random.between(0.7, 1.1);
     let mut canvas = Canvas::filled(SIZE, rail);
     let (columns, rows) = random.one_of(&[(2, 2), (3, 3), (4, 4), (2, 4), (1, 2)]);
@@ -283,7 +283,7 @@ pub(super) fn grids(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let palette = Palette::draw(random, purpose, count);
     let behind = fractal(random, SIZE, [3; 2], 4, 0.6);
     let dark = random.between(0.1, 0.8);
-    let bar = palette.colour(1);
+    let bar = palette.color(1);
     let bars = Vec2::new(random.count(2, 20) as f32, random.count(2, 20) as f32);
     let bars = if random.happens(0.6) { Vec2::splat(bars.x) } else { bars };
     let oblique = random.happens(0.4);
@@ -298,7 +298,7 @@ pub(super) fn grids(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let along =
             if has_crossbars { smoothstep(1. - width - soft.y, 1. - width + soft.y, part.y) } else { 0. };
         let nearness = if across > along { part.x } else { part.y };
-        let ground = palette.colour(0) * dark * (1. + 0.3 * behind.values[index]);
+        let ground = palette.color(0) * dark * (1. + 0.3 * behind.values[index]);
         index += 1;
         ground.lerp(bar * (0.6 + 0.4 * smoothstep(1. - width, 1., nearness)), across.max(along))
     });

@@ -1,4 +1,4 @@
-//! Textures of wallpaper, fabric and print: repeated figures in flat colours.
+//! Textures of wallpaper, fabric and print: repeated figures in flat colors.
 
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
@@ -51,7 +51,7 @@ pub(super) fn plaid(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.leaning_low(0.2, 1.5) }
 }
 
-/// A sequence of stripes: the end of each in [0, 1], and its colour.
+/// A sequence of stripes: the end of each in [0, 1], and its color.
 type Bands = Vec<(f32, Vec3)>;
 
 fn bands(random: &mut ChaCha8Rng, palette: &Palette) -> Bands {
@@ -60,12 +60,12 @@ fn bands(random: &mut ChaCha8Rng, palette: &Palette) -> Bands {
     let mut end = 0.;
     let band = |(index, width): (usize, &f32)| {
         end += width / sum;
-        (end, palette.colour(index))
+        (end, palette.color(index))
     };
     widths.iter().enumerate().map(band).collect()
 }
 
-/// Returns the colour at position `at`, blended over one pixel at edges. A repeat contains the bands `times` times.
+/// Returns the color at position `at`, blended over one pixel at edges. A repeat contains the bands `times` times.
 fn band_at(bands: &Bands, at: f32, times: f32) -> Vec3 {
     let at = at.rem_euclid(1.);
     let index = bands.partition_point(|(end, _)| *end <= at).min(bands.len() - 1);
@@ -102,7 +102,7 @@ pub(super) fn pieces(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         if checks {
             number = ((piece.id / 64 + piece.id % 64) % 2) as usize;
         }
-        // A second colour for half of a piece turns squares into triangles.
+        // A second color for half of a piece turns squares into triangles.
         if halved && piece.at.x * piece.extent.y > piece.at.y * piece.extent.x {
             number += 1;
         }
@@ -110,7 +110,7 @@ pub(super) fn pieces(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
             number += 1;
         }
         let on_line = if line > 0. { ((line - piece.edge) * SIZE as f32 + 0.5).clamp(0., 1.) } else { 0. };
-        palette.colour(number).lerp(ink, on_line)
+        palette.color(number).lerp(ink, on_line)
     });
     Surface { canvas, repeat_metres: random.leaning_low(0.3, 3.) }
 }
@@ -119,7 +119,7 @@ pub(super) fn pieces(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 pub(super) fn motifs(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(2, 5);
     let palette = Palette::draw(random, purpose, count);
-    let mut canvas = Canvas::filled(SIZE, palette.colour(0));
+    let mut canvas = Canvas::filled(SIZE, palette.color(0));
     let rows = 2 * random.leaning_low(1., 8.) as usize;
     let cell = 1. / rows as f32;
     let staggered = random.happens(0.6);
@@ -164,7 +164,7 @@ impl Motif {
                 3 => Figure::Leaf(random.between(0.2, 0.8)),
                 _ => Figure::Box(random.between(0.3, 1.)),
             };
-            layers.push((figure, radius, palette.colour(index + 1)));
+            layers.push((figure, radius, palette.color(index + 1)));
             radius *= random.between(0.4, 0.85);
         }
         Motif { layers }
@@ -172,10 +172,10 @@ impl Motif {
 
     /// Paints the motif into a cell of width `cell`, rotated by `turn`.
     pub fn paint(&self, canvas: &mut Canvas, centre: Vec2, cell: f32, turn: Vec2) {
-        for &(figure, share, colour) in &self.layers {
+        for &(figure, share, color) in &self.layers {
             let radius = share * cell;
             // A triangle's corners are at twice its inner radius.
-            canvas.fill(centre, Vec2::splat(2. * radius), colour, |offset| {
+            canvas.fill(centre, Vec2::splat(2. * radius), color, |offset| {
                 let offset = turn.rotate(offset);
                 match figure {
                     Figure::Disk => shape::disk(offset, radius),
@@ -193,7 +193,7 @@ impl Motif {
 pub(super) fn ornament(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(2, 4);
     let palette = Palette::draw(random, purpose, count);
-    let mut canvas = Canvas::filled(SIZE, palette.colour(0));
+    let mut canvas = Canvas::filled(SIZE, palette.color(0));
     let columns = random.one_of(&[1usize, 2, 2, 3, 4]);
     let cell = 1. / columns as f32;
     let flower = Motif::draw(random, &palette);
@@ -222,14 +222,14 @@ pub(super) fn ornament(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
                 let (from, to) = (from * mirror * cell, to * mirror * cell);
                 let middle = 0.5 * (from + to);
                 let reach = (to - from).abs() * 0.5 + width;
-                canvas.fill(centre + middle, reach, palette.colour(1), |offset| {
+                canvas.fill(centre + middle, reach, palette.color(1), |offset| {
                     shape::stroke(offset, from - middle, to - middle, width)
                 });
                 if step % every == 1 {
                     let length = leaf.x * cell;
                     let turn = Vec2::from_angle(-angle - 0.8) * mirror;
                     let tip = centre + to + Vec2::new(turn.x, -turn.y) * 0.5 * length;
-                    canvas.fill(tip, Vec2::splat(length), palette.colour(2), |offset| {
+                    canvas.fill(tip, Vec2::splat(length), palette.color(2), |offset| {
                         let offset = Vec2::from_angle(-angle - 0.8).rotate(offset * mirror);
                         shape::leaf(offset, length, length * leaf.y)
                     });

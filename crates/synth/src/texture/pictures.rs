@@ -43,7 +43,7 @@ fn landscape(random: &mut ChaCha8Rng) -> Canvas {
         [0x22304a, 0x6d87a0],
     ];
     let [zenith, haze] =
-        random.one_of(&skies).map(palette::linear_of).map(|colour| palette::shade(random, colour, 0.2));
+        random.one_of(&skies).map(palette::linear_of).map(|color| palette::shade(random, color, 0.2));
     let clouds = fractal(random, SIZE, [2, 5], 7, 0.6);
     let (level, cover) = (random.between(-0.5, 1.), random.between(0., 0.9));
     let horizon = random.between(0.35, 0.75);
@@ -72,7 +72,7 @@ fn landscape(random: &mut ChaCha8Rng) -> Canvas {
         let near = (range + 1) as f32 / ranges as f32;
         let (hills, jagged) = (random.count(1, 4), random.between(0.3, 0.65));
         let profile = fractal(random, SIZE, [hills, 1], 6, jagged);
-        let ground = palette::colour_of(random, theme).lerp(haze, 0.75 * (1. - near));
+        let ground = palette::color_of(random, theme).lerp(haze, 0.75 * (1. - near));
         let water = random.happens(0.12);
         let texture = fractal(random, SIZE, [4, 16], 5, 0.8);
         let base = horizon + (1. - horizon) * (near - 0.5 / ranges as f32) * 0.8;
@@ -82,22 +82,22 @@ fn landscape(random: &mut ChaCha8Rng) -> Canvas {
             let top = base - height * (1. + profile.values[(uv.x * SIZE as f32) as usize]);
             let value = texture.values[index];
             index += 1;
-            let colour = if water {
+            let color = if water {
                 zenith.lerp(haze, 0.5 + 0.3 * value)
             } else {
                 ground * (1. + 0.35 * near * value)
             };
-            below.lerp(colour, (0.5 + (uv.y - top) * SIZE as f32).clamp(0., 1.))
+            below.lerp(color, (0.5 + (uv.y - top) * SIZE as f32).clamp(0., 1.))
         });
         if !water && random.happens(0.5) {
             for _ in 0..random.count(2, 40) {
                 let x = random.unit();
                 let size = near * random.between(0.01, 0.07);
                 let top = base - height * (1. + profile.values[((x * SIZE as f32) as usize).min(SIZE - 1)]);
-                let colour = ground * random.between(0.3, 0.9);
+                let color = ground * random.between(0.3, 0.9);
                 let slim = random.between(0.4, 1.);
                 let lobes = random.count(3, 9);
-                canvas.fill(Vec2::new(x, top - 0.3 * size), Vec2::splat(1.2 * size), colour, |offset| {
+                canvas.fill(Vec2::new(x, top - 0.3 * size), Vec2::splat(1.2 * size), color, |offset| {
                     shape::flower(offset / Vec2::new(slim, 1.), size, lobes, 0.25)
                 });
             }
@@ -118,18 +118,18 @@ fn portrait(random: &mut ChaCha8Rng) -> Canvas {
     });
     let skin = palette::linear_of(random.one_of(&[0xe6b998, 0xc98f6b, 0x8d5a3c, 0x5c3a28, 0xf0d0b8]));
     let skin = palette::shade(random, skin, 0.1);
-    let hair = palette::colour_of(random, palette::BROWNS) * random.between(0.2, 1.);
+    let hair = palette::color_of(random, palette::BROWNS) * random.between(0.2, 1.);
     let theme = random.weighted(&[(palette::ACCENTS, 3.), (palette::GREYS, 2.), (palette::VIVID, 1.)]);
-    let cloth = palette::colour_of(random, theme);
+    let cloth = palette::color_of(random, theme);
     for _ in 0..random.one_of(&[1, 1, 1, 2, 3]) {
         let head = Vec2::new(random.between(0.3, 0.7), random.between(0.3, 0.5));
         let size = random.between(0.1, 0.24);
         let light = Vec2::new(random.between(-1., 1.), -0.4);
-        let mut blob = |place: Vec2, radii: Vec2, colour: Vec3, shading: f32| {
+        let mut blob = |place: Vec2, radii: Vec2, color: Vec3, shading: f32| {
             let (place, radii) = (place * size, radii * size);
             canvas.stamp(head + place, radii + 0.004, |offset| {
                 let lit = 1. + shading * (offset / radii).dot(light);
-                (colour * lit.max(0.2), (0.5 - shape::ellipse(offset, radii) * SIZE as f32).clamp(0., 1.))
+                (color * lit.max(0.2), (0.5 - shape::ellipse(offset, radii) * SIZE as f32).clamp(0., 1.))
             });
         };
         let long = random.between(0., 1.);
@@ -153,7 +153,7 @@ fn portrait(random: &mut ChaCha8Rng) -> Canvas {
 fn shapes(random: &mut ChaCha8Rng) -> Canvas {
     let count = random.count(3, 5);
     let palette = Palette::draw(random, Purpose::Poster, count);
-    let mut canvas = Canvas::bounded(SIZE, palette.colour(0));
+    let mut canvas = Canvas::bounded(SIZE, palette.color(0));
     let straight = random.happens(0.4);
     let line = if random.happens(0.4) { random.between(0.003, 0.015) } else { 0. };
     for _ in 0..random.count(3, 40) {
@@ -184,9 +184,9 @@ fn shapes(random: &mut ChaCha8Rng) -> Canvas {
 /// Draws a poster or a sign: a heading, a picture, paragraphs.
 fn print(random: &mut ChaCha8Rng) -> Canvas {
     let paper = if random.happens(0.5) {
-        palette::colour_of(random, palette::WHITES)
+        palette::color_of(random, palette::WHITES)
     } else {
-        Palette::draw(random, Purpose::Poster, 1).colour(0)
+        Palette::draw(random, Purpose::Poster, 1).color(0)
     };
     let mut canvas = Canvas::bounded(SIZE, paper);
     let ink = ink_for(random, paper);
@@ -234,9 +234,9 @@ fn print(random: &mut ChaCha8Rng) -> Canvas {
             }
             _ => {
                 let height = random.between(0.03, 0.2).min(left);
-                let colour = Palette::draw(random, Purpose::Poster, 1).colour(0);
+                let color = Palette::draw(random, Purpose::Poster, 1).color(0);
                 let half = Vec2::new(random.one_of(&[0.5, 0.43, 0.2]), 0.5 * height);
-                canvas.fill(Vec2::new(0.5, top + half.y), half + 0.01, colour, |offset| {
+                canvas.fill(Vec2::new(0.5, top + half.y), half + 0.01, color, |offset| {
                     shape::rectangle(offset, half, 0.)
                 });
                 top += height + 0.02;
@@ -246,7 +246,7 @@ fn print(random: &mut ChaCha8Rng) -> Canvas {
     canvas
 }
 
-/// Draws brush strokes that follow a field, in the colours of an underlying picture.
+/// Draws brush strokes that follow a field, in the colors of an underlying picture.
 fn painting(random: &mut ChaCha8Rng) -> Canvas {
     let model = random.one_of(&[landscape, portrait, dead_leaves, flowers, shapes])(random);
     let flow = smooth(random, SIZE, [3; 2]);
@@ -260,8 +260,8 @@ fn painting(random: &mut ChaCha8Rng) -> Canvas {
     for _ in 0..count.min(3000) {
         let spot = random.spot();
         let along = Vec2::from_angle(turns * flow.sample(spot)) * 0.5 * length;
-        let colour = model.sample(spot) * (1. + spread * random.bell()).max(0.2);
-        canvas.fill(spot, along.abs() + width, colour, |offset| {
+        let color = model.sample(spot) * (1. + spread * random.bell()).max(0.2);
+        canvas.fill(spot, along.abs() + width, color, |offset| {
             shape::stroke(offset, -along, along, 0.5 * width)
         });
     }
@@ -273,14 +273,14 @@ fn dead_leaves(random: &mut ChaCha8Rng) -> Canvas {
     let count = random.count(3, 5);
     let palette = Palette::draw(random, Purpose::Thing, count);
     let other = Palette::draw(random, Purpose::Poster, 3);
-    let mut canvas = Canvas::bounded(SIZE, palette.colour(0));
+    let mut canvas = Canvas::bounded(SIZE, palette.color(0));
     let light = random.direction();
     let decline = random.leaning_low(0.02, 0.3);
     for step in 0..random.count(40, 250) {
         // Large shapes first, so that they don't hide everything.
         let size = 0.4 / (1. + decline * step as f32) * random.between(0.6, 1.5);
         let own = if random.happens(0.8) { palette.ramp(random.unit()) } else { other.any(random) };
-        let colour = own * random.between(0.5, 1.3);
+        let color = own * random.between(0.5, 1.3);
         let (turn, kind) = (random.direction(), random.count(0, 2));
         let half = Vec2::new(1., random.between(0.3, 1.)) * size;
         let shading = random.between(0., 0.5);
@@ -292,7 +292,7 @@ fn dead_leaves(random: &mut ChaCha8Rng) -> Canvas {
                 _ => shape::polygon(local, 0.7 * size, 3),
             };
             let lit = 1. + shading * offset.dot(light) / size;
-            (colour * lit.max(0.1), (0.5 - distance * SIZE as f32).clamp(0., 1.))
+            (color * lit.max(0.1), (0.5 - distance * SIZE as f32).clamp(0., 1.))
         });
     }
     canvas
@@ -300,7 +300,7 @@ fn dead_leaves(random: &mut ChaCha8Rng) -> Canvas {
 
 /// Draws flowers with stems and leaves in front of a plain background.
 fn flowers(random: &mut ChaCha8Rng) -> Canvas {
-    let ground = Palette::draw(random, Purpose::Wall, 1).colour(0);
+    let ground = Palette::draw(random, Purpose::Wall, 1).color(0);
     let mut canvas = Canvas::bounded(SIZE, ground);
     let foot = Vec2::new(random.between(0.4, 0.6), random.between(0.8, 1.1));
     let green = Palette::from_theme(random, palette::GREENS, 3);
@@ -317,18 +317,18 @@ fn flowers(random: &mut ChaCha8Rng) -> Canvas {
             });
         }
         let theme = random.weighted(&[(palette::VIVID, 2.), (palette::ACCENTS, 3.), (palette::WHITES, 1.)]);
-        let petals = palette::colour_of(random, theme);
+        let petals = palette::color_of(random, theme);
         let (count, depth) = (random.count(4, 14), random.between(0.2, 0.7));
         let mut radius = random.between(0.04, 0.14);
         for layer in 0..random.count(2, 4) {
-            let colour = petals * (1. - 0.2 * layer as f32);
+            let color = petals * (1. - 0.2 * layer as f32);
             let turn = random.direction();
-            canvas.fill(head, Vec2::splat(radius + 0.01), colour, |offset| {
+            canvas.fill(head, Vec2::splat(radius + 0.01), color, |offset| {
                 shape::flower(turn.rotate(offset), radius, count, depth)
             });
             radius *= 0.65;
         }
-        let heart = palette::colour_of(random, palette::AUTUMN);
+        let heart = palette::color_of(random, palette::AUTUMN);
         canvas.fill(head, Vec2::splat(radius), heart, |offset| shape::disk(offset, 0.6 * radius));
     }
     canvas
@@ -344,11 +344,11 @@ fn window(random: &mut ChaCha8Rng) -> Canvas {
     let light = random.between(1., 1.8);
     canvas.pixels.iter_mut().for_each(|pixel| *pixel = (*pixel * light).min(Vec3::ONE));
     let theme = random.weighted(&[(palette::WHITES, 5.), (palette::WOODS, 2.), (palette::GREYS, 2.)]);
-    let frame = palette::colour_of(random, theme);
+    let frame = palette::color_of(random, theme);
     let panes = Vec2::new(random.count(1, 4) as f32, random.count(1, 4) as f32);
     let (bar, edge) = (random.between(0.005, 0.02), random.between(0.02, 0.06));
     let [left, right] = [(); 2].map(|()| if random.happens(0.3) { random.between(0.1, 0.35) } else { 0. });
-    let cloth = palette::colour_of(random, palette::WHITES);
+    let cloth = palette::color_of(random, palette::WHITES);
     let folds = random.between(60., 160.);
     canvas.change(|uv, outside| {
         let part = (uv * panes - (uv * panes).round()).abs() / panes;
@@ -380,7 +380,7 @@ fn screen(random: &mut ChaCha8Rng) -> Canvas {
         let half = Vec2::new(random.between(0.12, 0.45), random.between(0.12, 0.45));
         let middle = Vec2::new(random.between(0.2, 0.8), random.between(0.2, 0.8));
         canvas.fill(middle, half, paper, |offset| shape::rectangle(offset, half, 0.01));
-        let bar = Palette::draw(random, Purpose::Poster, 1).colour(0);
+        let bar = Palette::draw(random, Purpose::Poster, 1).color(0);
         let half_bar = Vec2::new(half.x, 0.02);
         canvas.fill(middle - Vec2::new(0., half.y - 0.02), half_bar, bar, |offset| {
             shape::rectangle(offset, half_bar, 0.)
@@ -400,9 +400,9 @@ fn frame(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
         (palette::WHITES, 2.),
         (palette::AUTUMN, 1.),
     ]);
-    let wood = palette::colour_of(random, wood) * random.between(0.3, 1.);
+    let wood = palette::color_of(random, wood) * random.between(0.3, 1.);
     let mat = random.weighted(&[(palette::WHITES, 4.), (palette::ACCENTS, 1.)]);
-    let mat = palette::colour_of(random, mat);
+    let mat = palette::color_of(random, mat);
     let bar = random.between(0.015, 0.07);
     let margin = if random.happens(0.6) { random.between(0.03, 0.2) } else { 0. };
     let relief = random.between(0.1, 0.5);

@@ -1,4 +1,4 @@
-//! Textures of paint, plastic and metal: one colour with small variations.
+//! Textures of paint, plastic and metal: one color with small variations.
 
 use glam::Vec3;
 use rand_chacha::ChaCha8Rng;
@@ -8,10 +8,10 @@ use super::palette::{self, Palette};
 use super::rng::RandomValues;
 use super::{Canvas, Purpose, SIZE, Surface};
 
-/// Draws an even colour with a slightly uneven coat of paint.
+/// Draws an even color with a slightly uneven coat of paint.
 pub(super) fn paint(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let colour = Palette::draw(random, purpose, 1).colour(0);
-    let mut canvas = Canvas::filled(SIZE, colour);
+    let color = Palette::draw(random, purpose, 1).color(0);
+    let mut canvas = Canvas::filled(SIZE, color);
     let cells = random.count(1, 4);
     canvas.shade(&fractal(random, SIZE, [cells; 2], 4, 0.5), random.leaning_low(0.005, 0.12));
     if random.happens(0.6) {
@@ -22,7 +22,7 @@ pub(super) fn paint(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.between(2., 4.) }
 }
 
-/// Draws a soft gradient from one colour to others and back.
+/// Draws a soft gradient from one color to others and back.
 pub(super) fn gradient(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(2, 4);
     let palette = Palette::draw(random, purpose, count);
@@ -40,8 +40,8 @@ pub(super) fn gradient(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 /// Draws metal brushed in one direction.
 pub(super) fn brushed(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let theme = random.weighted(&[(palette::GREYS, 4.), (palette::BEIGES, 1.), (palette::ACCENTS, 0.5)]);
-    let colour = palette::colour_of(random, theme);
-    let mut canvas = Canvas::filled(SIZE, colour);
+    let color = palette::color_of(random, theme);
+    let mut canvas = Canvas::filled(SIZE, color);
     let cells = random.one_of(&[[2, 128], [128, 2], [4, 64], [64, 4], [1, 256]]);
     canvas.shade(&fractal(random, SIZE, cells, 2, 0.7), random.between(0.04, 0.2));
     canvas.shade(&smooth(random, SIZE, cells.map(|count| count.div_ceil(24))), random.between(0., 0.25));
@@ -59,7 +59,7 @@ pub(super) fn brushed(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 
 /// Draws bright and dull spots as on polished or wet surfaces.
 pub(super) fn glossy(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let colour = Palette::draw(random, purpose, 1).colour(0);
+    let color = Palette::draw(random, purpose, 1).color(0);
     let cells = [random.count(1, 3), random.count(1, 3)];
     let lights = fractal(random, SIZE, cells, 2, 0.4);
     let level = random.between(0.1, 0.6);
@@ -67,7 +67,7 @@ pub(super) fn glossy(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let share = random.between(0.15, 0.5);
     let canvas = Canvas::of_field(&lights, |value| {
         let bright = super::shape::smoothstep(level, level + 0.5, value);
-        (colour * (1. + 0.15 * value)).lerp(light, share * bright)
+        (color * (1. + 0.15 * value)).lerp(light, share * bright)
     });
     Surface { canvas, repeat_metres: random.between(0.6, 2.) }
 }

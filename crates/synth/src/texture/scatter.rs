@@ -44,7 +44,7 @@ pub(super) fn leaves(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let height = index as f32 / count as f32;
         let light =
             if fallen { random.between(0.7, 1.2) } else { 1.15 - lit * (1. - height) + 0.2 * random.bell() };
-        let colour = palette.ramp(random.unit()) * light.max(0.1);
+        let color = palette.ramp(random.unit()) * light.max(0.1);
         let turn = random.direction();
         let size = length * random.between(0.6, 1.3);
         let width = size * slim * random.between(0.6, 1.1);
@@ -55,7 +55,7 @@ pub(super) fn leaves(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
             let cover = (0.5 - shape::leaf(local, size, width) * pixels).clamp(0., 1.);
             let vein = 1. + veined * (1. - local.y.abs() * pixels).max(0.);
             let side = 1. + tilt * local.y.signum() * (local.y.abs() * pixels).min(1.) + 0.3 * local.x / size;
-            (colour * vein * side, cover)
+            (color * vein * side, cover)
         });
     }
     Surface { canvas, repeat_metres: random.between(0.06, 0.15) / length * 0.6 }
@@ -73,7 +73,7 @@ pub(super) fn grass(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let width = random.between(0.4, 1.2) / SIZE as f32;
     let upright = random.between(0., 0.9);
     let count = (random.between(50., 110.) / length) as usize;
-    let dry = palette::colour_of(random, palette::AUTUMN);
+    let dry = palette::color_of(random, palette::AUTUMN);
     let dryness = random.leaning_low(0., 0.4);
     for _ in 0..count {
         let root = random.spot();
@@ -90,13 +90,12 @@ pub(super) fn grass(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         });
     }
     if random.happens(0.2) {
-        let petals = [palette::VIVID, palette::WHITES, palette::ACCENTS]
-            .map(|theme| palette::colour_of(random, theme));
+        let petals =
+            [palette::VIVID, palette::WHITES, palette::ACCENTS].map(|theme| palette::color_of(random, theme));
         for _ in 0..random.count(10, 150) {
             let radius = random.between(1., 3.) / SIZE as f32;
-            let colour = random.one_of(&petals);
-            canvas
-                .fill(random.spot(), Vec2::splat(2. * radius), colour, |offset| shape::disk(offset, radius));
+            let color = random.one_of(&petals);
+            canvas.fill(random.spot(), Vec2::splat(2. * radius), color, |offset| shape::disk(offset, radius));
         }
     }
     Surface { canvas, repeat_metres: random.between(0.8, 3.) }
@@ -166,18 +165,18 @@ pub(super) fn earth(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.between(1., 4.) }
 }
 
-/// Draws confetti, splashes or brush strokes: bits of any shape in several colours.
+/// Draws confetti, splashes or brush strokes: bits of any shape in several colors.
 pub(super) fn confetti(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(3, 5);
     let palette = Palette::draw(random, purpose, count);
-    let mut canvas = Canvas::filled(SIZE, palette.colour(0));
+    let mut canvas = Canvas::filled(SIZE, palette.color(0));
     let length = random.leaning_low(0.02, 0.3);
     let bits = (random.between(0.2, 2.) / (length * length)).min(800.) as usize;
     let kind = random.count(0, 3);
     let slim = random.between(0.05, 0.6);
     let clear = random.between(0.4, 1.);
     for _ in 0..bits {
-        let colour = palette.any(random);
+        let color = palette.any(random);
         let turn = random.direction();
         let size = length * random.between(0.3, 1.2);
         let pixels = SIZE as f32;
@@ -189,7 +188,7 @@ pub(super) fn confetti(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
                 2 => shape::polygon(local, 0.3 * size, 3),
                 _ => shape::flower(local, 0.5 * size, 5, slim),
             };
-            (colour, clear * (0.5 - distance * pixels).clamp(0., 1.))
+            (color, clear * (0.5 - distance * pixels).clamp(0., 1.))
         });
     }
     Surface { canvas, repeat_metres: random.leaning_low(0.4, 3.) }

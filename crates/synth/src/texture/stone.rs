@@ -22,10 +22,10 @@ pub(super) fn marble(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     ]);
     let palette = Palette::from_theme(random, theme, 2);
     let vein = if random.happens(0.7) {
-        palette::colour_of(random, palette::GREYS) * random.between(0.3, 1.)
+        palette::color_of(random, palette::GREYS) * random.between(0.3, 1.)
     } else {
         let theme = random.one_of(&[palette::WHITES, palette::BROWNS, palette::AUTUMN]);
-        palette::colour_of(random, theme)
+        palette::color_of(random, theme)
     };
     let cells = random.count(2, 4);
     let clouds = fractal(random, SIZE, [cells; 2], 6, 0.6);
@@ -53,7 +53,7 @@ pub(super) fn marble(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 
 /// Draws terrazzo: chips of stone in cement.
 pub(super) fn terrazzo(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let ground = Palette::draw(random, purpose, 1).colour(0);
+    let ground = Palette::draw(random, purpose, 1).color(0);
     let count = random.count(2, 5);
     let theme = random.weighted(&[
         (palette::STONES, 3.),
@@ -79,7 +79,7 @@ pub(super) fn terrazzo(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: across as f32 * random.between(0.01, 0.04) }
 }
 
-/// Draws granite, sandstone or worktops: grains of a few colours.
+/// Draws granite, sandstone or worktops: grains of a few colors.
 pub(super) fn speckle(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let theme = random.weighted(&[
         (palette::STONES, 4.),
@@ -88,9 +88,9 @@ pub(super) fn speckle(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         (palette::BROWNS, 1.),
     ]);
     let base = if random.happens(0.7) {
-        palette::colour_of(random, theme)
+        palette::color_of(random, theme)
     } else {
-        Palette::draw(random, purpose, 1).colour(0)
+        Palette::draw(random, purpose, 1).color(0)
     };
     let mut canvas = Canvas::filled(SIZE, base);
     for _ in 0..random.count(2, 4) {
@@ -109,7 +109,7 @@ pub(super) fn speckle(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 /// Draws concrete with stains, pores and the joints of its formwork.
 pub(super) fn concrete(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let theme = random.weighted(&[(palette::GREYS, 3.), (palette::STONES, 4.), (palette::BEIGES, 1.)]);
-    let base = palette::colour_of(random, theme);
+    let base = palette::color_of(random, theme);
     let mut canvas = Canvas::filled(SIZE, base);
     canvas.shade(&fractal(random, SIZE, [3; 2], 7, 0.7), random.between(0.05, 0.3));
     let streaks = fractal(random, SIZE, [16, 2], 4, 0.6);
@@ -124,15 +124,15 @@ pub(super) fn concrete(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         let layout = Layout::courses(random.count(1, 3), random.count(1, 2), 0., false);
         let width = random.between(0.5, 2.) / SIZE as f32;
         let dark = random.between(0.3, 0.8);
-        canvas.change(|uv, colour| colour * (1. - dark * smoothstep(2. * width, 0., layout.piece(uv).edge)));
+        canvas.change(|uv, color| color * (1. - dark * smoothstep(2. * width, 0., layout.piece(uv).edge)));
     }
     Surface { canvas, repeat_metres: random.between(1., 4.) }
 }
 
 /// Draws plaster or stucco: relief lit from the side.
 pub(super) fn plaster(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let colour = Palette::draw(random, purpose, 1).colour(0);
-    let mut canvas = Canvas::filled(SIZE, colour);
+    let color = Palette::draw(random, purpose, 1).color(0);
+    let mut canvas = Canvas::filled(SIZE, color);
     let cells = random.leaning_low(2., 48.) as usize;
     let gain = random.between(0.5, 0.9);
     let relief = match random.count(0, 3) {
@@ -164,19 +164,19 @@ pub(super) fn asphalt(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         let [right, down] = [(); 2].map(|()| fractal(random, SIZE, [6; 2], 5, 0.65));
         let width = random.between(0.001, 0.006);
         let dark = random.between(0.3, 0.9);
-        canvas.change(|uv, colour| {
+        canvas.change(|uv, color| {
             let push = Vec2::new(right.sample(uv), down.sample(uv)) * 0.04;
-            colour * (1. - dark * smoothstep(width, 0.2 * width, voronoi.cell(uv + push).edge))
+            color * (1. - dark * smoothstep(width, 0.2 * width, voronoi.cell(uv + push).edge))
         });
     }
     if random.happens(0.2) {
         let paint = palette::linear_of(random.one_of(&[0xe8e6e0, 0xd8b23a]));
         let (from, half) = (random.unit(), random.between(0.02, 0.05));
         let worn = fractal(random, SIZE, [8; 2], 5, 0.8);
-        canvas.change(|uv, colour| {
+        canvas.change(|uv, color| {
             let off = uv.x - from;
             let inside = smoothstep(half, half - 0.006, (off - off.round()).abs());
-            colour.lerp(paint, inside * (0.8 + worn.sample(uv)).clamp(0., 0.95))
+            color.lerp(paint, inside * (0.8 + worn.sample(uv)).clamp(0., 0.95))
         });
     }
     Surface { canvas, repeat_metres: random.between(1.5, 4.) }

@@ -90,7 +90,7 @@ pub(super) fn folds(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 
 /// Draws padded leather or cloth, buttoned in diamonds or stitched in channels.
 pub(super) fn quilted(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let colour = Palette::draw(random, purpose, 1).colour(0);
+    let color = Palette::draw(random, purpose, 1).color(0);
     let across = random.count(2, 8) as f32;
     let kind = random.count(0, 2);
     let (deep, light) = (random.between(0.3, 0.8), random.direction());
@@ -103,7 +103,7 @@ pub(super) fn quilted(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let part = (at - at.floor() - 0.5) * 2.;
         ((1. - part.x.powi(4)) * (1. - part.y.powi(4))).sqrt()
     });
-    let mut canvas = Canvas::of_field(&height, |value| colour * (1. - deep + deep * value));
+    let mut canvas = Canvas::of_field(&height, |value| color * (1. - deep + deep * value));
     canvas.shade(&height.slope(light), random.between(1., 5.));
     canvas.shade(&fractal(random, SIZE, [24; 2], 4, 0.8), random.between(0.01, 0.12));
     Surface { canvas, repeat_metres: across * random.between(0.06, 0.2) }
@@ -120,7 +120,7 @@ pub(super) fn carpet(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         (super::palette::VIVID, 0.5),
     ]);
     let palette = Palette::from_theme(random, theme, count);
-    let mut canvas = Canvas::filled(SIZE, palette.colour(0));
+    let mut canvas = Canvas::filled(SIZE, palette.color(0));
     let middle = Vec2::splat(0.5);
     // Paint the middle first, so that the borders cover what extends too far.
     let cells = random.count(4, 14);
@@ -137,8 +137,8 @@ pub(super) fn carpet(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         let (mut radius, depth) = (random.between(0.15, 0.38), random.between(0., 0.6));
         let squeeze = Vec2::new(1., random.between(0.7, 1.4));
         for layer in 0..random.count(2, 7) {
-            let colour = palette.colour(layer + 1);
-            canvas.fill(middle, Vec2::splat(0.5), colour, |offset| {
+            let color = palette.color(layer + 1);
+            canvas.fill(middle, Vec2::splat(0.5), color, |offset| {
                 shape::flower(offset * squeeze, radius, petals, depth)
             });
             radius *= random.between(0.6, 0.9);
@@ -148,7 +148,7 @@ pub(super) fn carpet(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let mut inset = 0.;
     for border in 0..random.count(1, 6) {
         let width = random.leaning_low(0.005, 0.07);
-        let (colour, other) = (palette.colour(border + 1), palette.colour(border + 2));
+        let (color, other) = (palette.color(border + 1), palette.color(border + 2));
         let teeth = random.one_of(&[0., 0., 12., 20., 32., 48.]);
         canvas.change(|uv, below| {
             let from_edge = uv.min(1. - uv).min_element();
@@ -157,7 +157,7 @@ pub(super) fn carpet(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
             let along = if uv.x.min(1. - uv.x) < uv.y.min(1. - uv.y) { uv.y } else { uv.x };
             let tooth = (along * teeth).fract() * 2. - 1.;
             let toothed = teeth > 0. && (from_edge - inset) / width > tooth.abs();
-            below.lerp(if toothed { other } else { colour }, share * (1. - outside))
+            below.lerp(if toothed { other } else { color }, share * (1. - outside))
         });
         inset += width;
     }

@@ -47,13 +47,13 @@ pub(super) fn weather(random: &mut ChaCha8Rng, canvas: &mut Canvas, purpose: Pur
 /// Adds patches of dust, moss or soot.
 fn dirt(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
     let theme = random.weighted(&[(palette::EARTHS, 4.), (palette::GREYS, 2.), (palette::GREENS, 1.)]);
-    let colour = palette::colour_of(random, theme) * random.between(0.2, 1.);
+    let color = palette::color_of(random, theme) * random.between(0.2, 1.);
     let cells = random.one_of(&[[2, 2], [3, 3], [5, 5], [8, 2]]);
     let gain = random.between(0.5, 0.85);
     let patches = fractal(random, SIZE, cells, 6, gain);
     let (level, most) = (random.between(-0.3, 0.9), random.between(0.1, 0.6));
     for (pixel, value) in canvas.pixels.iter_mut().zip(&patches.values) {
-        *pixel = pixel.lerp(colour, most * smoothstep(level, level + 0.9, *value));
+        *pixel = pixel.lerp(color, most * smoothstep(level, level + 0.9, *value));
     }
 }
 
@@ -70,7 +70,7 @@ fn scratches(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
     }
 }
 
-/// Scales the distances from the mean colour by a factor.
+/// Scales the distances from the mean color by a factor.
 fn contrast(canvas: &mut Canvas, factor: f32) {
     let mean = canvas.pixels.iter().sum::<Vec3>() / canvas.pixels.len() as f32;
     canvas.pixels.iter_mut().for_each(|pixel| *pixel = mean + (*pixel - mean) * factor);

@@ -47,7 +47,7 @@ fn grain(random: &mut ChaCha8Rng) -> Field {
     field.map(|value| value * scale)
 }
 
-/// Returns two colours of one wood: earlywood and latewood.
+/// Returns two colors of one wood: earlywood and latewood.
 fn tones(random: &mut ChaCha8Rng) -> (Vec3, Vec3) {
     let theme = random.weighted(&[
         (palette::WOODS, 10.),
@@ -55,7 +55,7 @@ fn tones(random: &mut ChaCha8Rng) -> (Vec3, Vec3) {
         (palette::WHITES, 1.),
         (palette::ACCENTS, 0.7),
     ]);
-    let light = palette::colour_of(random, theme);
+    let light = palette::color_of(random, theme);
     let red = Vec3::new(1., random.between(0.82, 1.), random.between(0.65, 1.));
     (light, light * red * random.between(0.35, 0.85))
 }
@@ -87,7 +87,7 @@ pub(super) fn boards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let joint = wide * random.leaning_low(0.005, 0.06);
     let depth = random.between(0.3, 0.9);
     let bevel = random.between(0., 0.3);
-    let other = palette::colour_of(random, palette::WOODS);
+    let other = palette::color_of(random, palette::WOODS);
     let mixed = if random.happens(0.25) { random.between(0.2, 1.) } else { 0. };
     // With fewer boards, the grain appears larger.
     let scale = random.between(0.6, 1.6);

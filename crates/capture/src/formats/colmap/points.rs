@@ -11,8 +11,8 @@ use std::path::Path;
 pub struct Point {
     /// Position in the capture's world coordinates.
     pub position: DVec3,
-    /// RGB colour, values in [0, 1].
-    pub colour: [f32; 3],
+    /// RGB color, values in [0, 1].
+    pub color: [f32; 3],
 }
 
 /// Returns the points of the COLMAP model that `capture` was read from. Returns none if the capture has another format or the model
@@ -43,16 +43,16 @@ fn read_points_text(file: &Path) -> Result<Vec<Point>> {
         for (value, name) in position.iter_mut().zip(["X", "Y", "Z"]) {
             *value = words.parse(name, "a number")?;
         }
-        let mut colour = [0u8; 3];
-        for (value, name) in colour.iter_mut().zip(["R", "G", "B"]) {
+        let mut color = [0u8; 3];
+        for (value, name) in color.iter_mut().zip(["R", "G", "B"]) {
             *value = words.parse(name, "a whole number from 0 to 255")?;
         }
-        points.push(point(file, id, position, colour)?);
+        points.push(point(file, id, position, color)?);
     }
     Ok(points)
 }
 
-/// Reads the number of points (u64), then for each point: id (u64), position (f64), colour (u8), error (f64), and the number of
+/// Reads the number of points (u64), then for each point: id (u64), position (f64), color (u8), error (f64), and the number of
 /// views that see it (u64), each two ids (u32).
 fn read_points_binary(file: &Path) -> Result<Vec<Point>> {
     const VIEW: usize = 8;
@@ -66,21 +66,21 @@ fn read_points_binary(file: &Path) -> Result<Vec<Point>> {
         for value in &mut position {
             *value = bytes.number(|| format!("the position of point {id}"))?;
         }
-        let colour = bytes.take(|| format!("the colour of point {id}"))?;
+        let color = bytes.take(|| format!("the color of point {id}"))?;
         bytes.number(|| format!("the error of point {id}"))?;
         let views = bytes.count(&format!("the number of views of point {id}"), VIEW)?;
         bytes.at += views * VIEW;
-        points.push(point(file, id, position, colour)?);
+        points.push(point(file, id, position, color)?);
     }
     bytes.end()?;
     Ok(points)
 }
 
-fn point(file: &Path, id: u64, position: [f64; 3], colour: [u8; 3]) -> Result<Point> {
+fn point(file: &Path, id: u64, position: [f64; 3], color: [u8; 3]) -> Result<Point> {
     let position = DVec3::from_array(position);
     if !position.is_finite() {
         let found = position.to_string();
         return Err(Error::input(file, format!("the position of point {id}"), found, "finite numbers"));
     }
-    Ok(Point { position, colour: colour.map(|value| f32::from(value) / 255.) })
+    Ok(Point { position, color: color.map(|value| f32::from(value) / 255.) })
 }

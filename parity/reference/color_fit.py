@@ -11,14 +11,14 @@ UNSEEN = 1e-3  # pixels that are added to the contribution of every Gaussian
 
 def weights(means, scales, quaternions, opacities, w2c, intrinsic, width, height):
     """Returns the weights of the Gaussians in the pixels of a camera, [H W, N]: each channel of a render is its product
-    with their colours."""
+    with their colors."""
     projected = splat.project(means, scales, quaternions, w2c, intrinsic, width, height)
     pixels = splat.pixel_centres(width, height, means.dtype, means.device)
     one_hot = torch.eye(len(means), dtype=means.dtype)
     return splat.composite(projected, opacities * projected["compensation"], one_hot, pixels)[0]
 
 
-def fit_colours(gaussians, w2cs, intrinsics, images, masks, steps):
+def fit_colors(gaussians, w2cs, intrinsics, images, masks, steps):
     """Returns the contributions [N] of Gaussians (means, scales, quaternions, opacities, sh) of one scene in pixels, and
     their SH [N, bases, 3] after some steps of accelerated gradient descent on half the sum of squared errors."""
     means, scales, quaternions, opacities, sh = gaussians
@@ -34,11 +34,11 @@ def fit_colours(gaussians, w2cs, intrinsics, images, masks, steps):
     def gradient(sh):
         total = torch.zeros_like(sh)
         for (w2c, _), factor, image, mask in zip(cameras, factors, images, masks, strict=True):
-            colours = splat.sh_colour(means, sh, w2c)
-            error = (factor @ colours - image.flatten(1).T) * mask.flatten()[:, None]
+            colors = splat.sh_color(means, sh, w2c)
+            error = (factor @ colors - image.flatten(1).T) * mask.flatten()[:, None]
             centre = -w2c[:3, :3].T @ w2c[:3, 3]
             direction = torch.nn.functional.normalize(means - centre, dim=-1)
-            towards = (factor.T @ error) * (colours > 0)  # a colour that is cut off at 0 doesn't change
+            towards = (factor.T @ error) * (colors > 0)  # a color that is cut off at 0 doesn't change
             total = total + splat.sh_basis(direction, bases)[..., None] * towards[:, None]
         return total
 

@@ -1,4 +1,4 @@
-//! The colours of a reconstruction are fitted to its photos (spec 9.9).
+//! The colors of a reconstruction are fitted to its photos (spec 9.9).
 
 use crate::common::program::{arg, succeed};
 use crate::common::room::write_room;
@@ -20,20 +20,20 @@ fn psnr(reconstruction: &Reconstruction, views: &[View]) -> f64 {
     psnr_of_mse(errors.sum::<f64>() / views.len() as f64)
 }
 
-/// Photos and held-out views are reproduced better, and only the colours change.
+/// Photos and held-out views are reproduced better, and only the colors change.
 #[test]
-fn fitted_colours_show_held_out_views_better() {
+fn fitted_colors_show_held_out_views_better() {
     let folder = tempfile::tempdir().unwrap();
     write_room(folder.path(), 3, 8, [96, 96].into()).unwrap();
     let capture = open_capture(folder.path()).unwrap();
     let mut model = bundled_model(Device::Cpu).unwrap();
-    assert!(model.config.data.colour_steps > 0);
+    assert!(model.config.data.color_steps > 0);
     let mut views = load_context(&capture, Holdout::None, None, model.config.data.image_size).unwrap();
     let held_out = [views.remove(5), views.remove(2)];
     let targets = held_out.each_ref().map(|view| view.camera.c2w);
 
     let fitted = reconstruct(&model, &views, &targets).unwrap();
-    model.config.data.colour_steps = 0;
+    model.config.data.color_steps = 0;
     let plain = reconstruct(&model, &views, &targets).unwrap();
     for views in [&views[..], &held_out] {
         let (fitted, plain) = (psnr(&fitted, views), psnr(&plain, views));
@@ -50,10 +50,10 @@ fn fitted_colours_show_held_out_views_better() {
 }
 
 #[test]
-fn reconstruct_says_that_colours_are_fitted() {
+fn reconstruct_says_that_colors_are_fitted() {
     let folder = tempfile::tempdir().unwrap();
     let (room, out) = (folder.path().join("room"), folder.path().join("room.ply"));
     write_room(&room, 3, 6, [96, 96].into()).unwrap();
     let report = succeed(&["reconstruct", "--scene", arg(&room), "--out", arg(&out)]);
-    assert!(report.contains("forward pass and fit of colours "), "{report}");
+    assert!(report.contains("forward pass and fit of colors "), "{report}");
 }

@@ -1,4 +1,4 @@
-//! Fit of a reconstruction's colours to its photos (spec 9.9). Renders are linear in the spherical harmonics, so that the best ones for
+//! Fit of a reconstruction's colors to its photos (spec 9.9). Renders are linear in the spherical harmonics, so that the best ones for
 //! given shapes and opacities solve a least-squares problem.
 
 use crate::data::ViewBatch;
@@ -8,7 +8,7 @@ use crate::scene::Gaussians;
 use std::f64::consts::PI;
 use tch::{Kind, Tensor, with_grad};
 
-/// Contribution in pixels that is added to that of every Gaussian, so that colours which the photos don't show hardly change.
+/// Contribution in pixels that is added to that of every Gaussian, so that colors which the photos don't show hardly change.
 const UNSEEN: f64 = 1e-3;
 
 /// Returns `gaussians`, one scene in the normalized world, with spherical harmonics fitted to the images of `views`: reduces the sum of
@@ -17,13 +17,13 @@ const UNSEEN: f64 = 1e-3;
 ///
 /// # Errors
 /// Fails if rendering fails.
-pub(crate) fn fit_colours(gaussians: &Gaussians, views: &ViewBatch, steps: usize) -> Result<Gaussians> {
+pub(crate) fn fit_colors(gaussians: &Gaussians, views: &ViewBatch, steps: usize) -> Result<Gaussians> {
     let cameras = views.cameras();
     let gradient = |sh: &Tensor| -> Result<Tensor> {
         let sh = sh.detach().set_requires_grad(true);
-        let coloured = Gaussians { sh: sh.shallow_clone(), ..gaussians.map(Tensor::detach) };
+        let colored = Gaussians { sh: sh.shallow_clone(), ..gaussians.map(Tensor::detach) };
         let half_sum = with_grad(|| -> Result<Tensor> {
-            let rendered = render(&coloured, &cameras, default_eps2d(gaussians))?.rgb;
+            let rendered = render(&colored, &cameras, default_eps2d(gaussians))?.rgb;
             let errors = (rendered - &views.images).square();
             let errors = views.masks.as_ref().map_or(errors.shallow_clone(), |masks| &errors * masks);
             Ok(errors.sum(None::<Kind>) * 0.5)
@@ -105,11 +105,11 @@ mod tests {
     }
 
     #[test]
-    fn colours_are_recovered_from_renders() {
+    fn colors_are_recovered_from_renders() {
         let truth = gaussians();
         let views = views(&truth);
         let grey = Gaussians { sh: truth.sh.zeros_like(), ..truth.map(Tensor::shallow_clone) };
-        let fitted = |steps| tch::no_grad(|| fit_colours(&grey, &views, steps)).unwrap();
+        let fitted = |steps| tch::no_grad(|| fit_colors(&grey, &views, steps)).unwrap();
         let errors = [0, 5, 20, 100].map(|steps| error(&fitted(steps), &views));
         assert_eq!(errors[0], error(&grey, &views));
         for (error, bound) in errors[1..].iter().zip([0.1, 0.01, 0.001]) {
@@ -128,11 +128,11 @@ mod tests {
         let masks = Tensor::ones([1, 3, 1, 24, 24], (Kind::Float, Device::Cpu));
         let _ = masks.narrow(4, 0, 10).fill_(0.);
         views.masks = Some(masks);
-        let fitted = fit_colours(&truth, &views, 3).unwrap();
+        let fitted = fit_colors(&truth, &views, 3).unwrap();
         assert!(fitted.sh.allclose(&truth.sh, 1e-4, 1e-4, false), "the renders are the images");
         let _ = views.images.narrow(4, 0, 10).fill_(0.7);
-        assert!(fit_colours(&truth, &views, 3).unwrap().sh.equal(&fitted.sh));
+        assert!(fit_colors(&truth, &views, 3).unwrap().sh.equal(&fitted.sh));
         views.masks = None;
-        assert!(!fit_colours(&truth, &views, 3).unwrap().sh.allclose(&truth.sh, 0.02, 0.02, false));
+        assert!(!fit_colors(&truth, &views, 3).unwrap().sh.allclose(&truth.sh, 0.02, 0.02, false));
     }
 }

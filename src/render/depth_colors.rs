@@ -1,4 +1,4 @@
-//! Colours for depth that people can compare: equal steps look equally large.
+//! Colors for depth that people can compare: equal steps look equally large.
 
 use super::SplatRenderer;
 use crate::error::Result;
@@ -8,22 +8,22 @@ use tch::{Kind, Tensor};
 /// Minimum opacity at which depth is valid.
 const MIN_ALPHA: f64 = 0.05;
 
-/// Smallest divisor, which replaces depths and ranges of 0. It is so small that colours don't depend on the unit.
+/// Smallest divisor, which replaces depths and ranges of 0. It is so small that colors don't depend on the unit.
 const SMALLEST: f64 = f32::MIN_POSITIVE as f64;
 
-/// Colour map from far to near, matplotlib's viridis: dark violet, blue, green, yellow. Its lightness grows in the most even steps among
-/// the well-known colour maps, so it reads the same in grey and for the colour-blind. Far depths aren't black, which is the colour of empty
+/// Color map from far to near, matplotlib's viridis: dark violet, blue, green, yellow. Its lightness grows in the most even steps among
+/// the well-known color maps, so it reads the same in grey and for the color-blind. Far depths aren't black, which is the color of empty
 /// pixels.
-const COLOURS: colorous::Gradient = colorous::VIRIDIS;
-/// Number of colours: as many as the gradient has, and as an 8-bit image distinguishes.
+const COLORS: colorous::Gradient = colorous::VIRIDIS;
+/// Number of colors: as many as the gradient has, and as an 8-bit image distinguishes.
 const STEPS: usize = 256;
 
-/// Range of depths that the colours cover. One scale for all frames of a video prevents flicker.
+/// Range of depths that the colors cover. One scale for all frames of a video prevents flicker.
 #[derive(Debug, Clone, Copy)]
 pub struct DepthScale {
-    /// Inverse depth, 1/depth, of the darkest colour.
+    /// Inverse depth, 1/depth, of the darkest color.
     far: f64,
-    /// Inverse depth, 1/depth, of the brightest colour.
+    /// Inverse depth, 1/depth, of the brightest color.
     near: f64,
 }
 
@@ -61,21 +61,21 @@ impl DepthScale {
         Ok(DepthScale::from_depths(&rendered.iter().map(|r| (&r.depth, &r.alpha)).collect::<Vec<_>>()))
     }
 
-    /// Converts depth [H, W] to colours [3, H, W]: near is bright, far is dark, linear in inverse depth. Where little is visible (`alpha`),
-    /// the colour fades to black.
-    pub fn colourize(&self, depth: &Tensor, alpha: &Tensor) -> Tensor {
+    /// Converts depth [H, W] to colors [3, H, W]: near is bright, far is dark, linear in inverse depth. Where little is visible (`alpha`),
+    /// the color fades to black.
+    pub fn colorize(&self, depth: &Tensor, alpha: &Tensor) -> Tensor {
         let share = (inverse(depth) - self.far) / (self.near - self.far).max(SMALLEST);
         let step = (share.clamp(0., 1.) * (STEPS - 1) as f64).round().to_kind(Kind::Int64);
-        let colours = Tensor::from_slice2(&depth_colours()).to_device(depth.device());
+        let colors = Tensor::from_slice2(&depth_colors()).to_device(depth.device());
         let (height, width) = (depth.size()[0], depth.size()[1]);
-        let image = colours.index_select(0, &step.flatten(0, -1)).view([height, width, 3]).permute([2, 0, 1]);
+        let image = colors.index_select(0, &step.flatten(0, -1)).view([height, width, 3]).permute([2, 0, 1]);
         image * visible_mask(depth, alpha).to_kind(Kind::Float) * alpha.clamp(0., 1.)
     }
 }
 
-/// Converts depth to colours like [`DepthScale::colourize`], on the scale of this image.
-pub fn colourize_depth(depth: &Tensor, alpha: &Tensor) -> Tensor {
-    DepthScale::from_depths(&[(depth, alpha)]).colourize(depth, alpha)
+/// Converts depth to colors like [`DepthScale::colorize`], on the scale of this image.
+pub fn colorize_depth(depth: &Tensor, alpha: &Tensor) -> Tensor {
+    DepthScale::from_depths(&[(depth, alpha)]).colorize(depth, alpha)
 }
 
 fn inverse(depth: &Tensor) -> Tensor {
@@ -86,10 +86,10 @@ fn visible_mask(depth: &Tensor, alpha: &Tensor) -> Tensor {
     alpha.ge(MIN_ALPHA).logical_and(&depth.gt(0.))
 }
 
-/// Returns the colour map as RGB in [0, 1], from far to near.
-pub fn depth_colours() -> [[f32; 3]; STEPS] {
+/// Returns the color map as RGB in [0, 1], from far to near.
+pub fn depth_colors() -> [[f32; 3]; STEPS] {
     std::array::from_fn(|step| {
-        let colorous::Color { r, g, b } = COLOURS.eval_rational(step, STEPS);
+        let colorous::Color { r, g, b } = COLORS.eval_rational(step, STEPS);
         [r, g, b].map(|value| f32::from(value) / 255.)
     })
 }
@@ -98,9 +98,9 @@ pub fn depth_colours() -> [[f32; 3]; STEPS] {
 mod tests {
     use super::*;
 
-    /// Returns CIELAB's L*, from 0 to 100, of an sRGB colour (IEC 61966-2-1, CIE 15).
-    fn lightness(colour: [f32; 3]) -> f64 {
-        let linear = colour.map(|value| match f64::from(value) {
+    /// Returns CIELAB's L*, from 0 to 100, of an sRGB color (IEC 61966-2-1, CIE 15).
+    fn lightness(color: [f32; 3]) -> f64 {
+        let linear = color.map(|value| match f64::from(value) {
             value if value <= 0.04045 => value / 12.92,
             value => ((value + 0.055) / 1.055).powf(2.4),
         });
@@ -113,14 +113,14 @@ mod tests {
 
     #[test]
     fn lightness_grows_in_even_steps() {
-        // Every 15th colour: the rounding to 8 bits is larger than single steps.
-        let levels: Vec<f64> = depth_colours().iter().step_by(15).map(|&colour| lightness(colour)).collect();
+        // Every 15th color: the rounding to 8 bits is larger than single steps.
+        let levels: Vec<f64> = depth_colors().iter().step_by(15).map(|&color| lightness(color)).collect();
         let steps: Vec<f64> = levels.windows(2).map(|pair| pair[1] - pair[0]).collect();
         let mean = steps.iter().sum::<f64>() / steps.len() as f64;
         println!("L* from {:.1} to {:.1}, steps {steps:.2?}", levels[0], levels[levels.len() - 1]);
         assert!(levels[levels.len() - 1] - levels[0] > 70., "{levels:?}");
         assert!(steps.iter().all(|step| (step / mean - 1.).abs() < 0.2), "{steps:?} about {mean}");
-        let all: Vec<f64> = depth_colours().iter().map(|&colour| lightness(colour)).collect();
+        let all: Vec<f64> = depth_colors().iter().map(|&color| lightness(color)).collect();
         assert!(all.windows(2).all(|pair| pair[1] > pair[0] - 0.1), "darker again: {all:?}");
     }
 
@@ -128,30 +128,30 @@ mod tests {
     fn near_pixels_are_bright_and_transparent_ones_black() {
         let depth = Tensor::from_slice(&[1f32, 2., 4., 0., 1.]).view([1, 5]);
         let alpha = Tensor::from_slice(&[1f32, 1., 1., 1., 0.01]).view([1, 5]);
-        let image = colourize_depth(&depth, &alpha);
+        let image = colorize_depth(&depth, &alpha);
         assert_eq!(image.size(), [3, 1, 5]);
         let at =
             |x: i64| <[f32; 3]>::try_from(Vec::try_from(image.select(2, x).flatten(0, -1)).unwrap()).unwrap();
-        let all = depth_colours();
+        let all = depth_colors();
         assert_eq!((at(0), at(2)), (all[STEPS - 1], all[0]));
         assert!(lightness(at(0)) > lightness(at(1)) && lightness(at(1)) > lightness(at(2)));
         assert_eq!((at(3), at(4)), ([0.; 3], [0.; 3]));
     }
 
     #[test]
-    fn one_scale_gives_one_depth_one_colour() {
+    fn one_scale_gives_one_depth_one_color() {
         let opaque = Tensor::ones([1, 2], (Kind::Float, tch::Device::Cpu));
         let [first, second] = [[1f32, 2.], [2., 8.]].map(|depths| Tensor::from_slice(&depths).view([1, 2]));
         let scale = DepthScale::from_depths(&[(&first, &opaque), (&second, &opaque)]);
-        let two = |image: &Tensor, x: i64| scale.colourize(image, &opaque).select(2, x);
+        let two = |image: &Tensor, x: i64| scale.colorize(image, &opaque).select(2, x);
         assert_eq!(two(&first, 1), two(&second, 0));
         // On scales of their own, a depth of 2 is the farthest in one image and the nearest in the other.
         assert_ne!(
-            colourize_depth(&first, &opaque).select(2, 1),
-            colourize_depth(&second, &opaque).select(2, 0)
+            colorize_depth(&first, &opaque).select(2, 1),
+            colorize_depth(&second, &opaque).select(2, 0)
         );
         // If nothing is visible, the image is black.
         let nothing = opaque.zeros_like();
-        assert_eq!(colourize_depth(&first, &nothing).sum(Kind::Float).double_value(&[]), 0.);
+        assert_eq!(colorize_depth(&first, &nothing).sum(Kind::Float).double_value(&[]), 0.);
     }
 }
