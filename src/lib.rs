@@ -20,10 +20,10 @@
 //! op alone.
 //!
 //! Modules, from the highest level to the lowest; each uses only those after it in this list, and [`scene`]:
-//! [`refine`] optimizes a splat per scene, [`eval`] evaluates methods, [`train`] trains, [`reconstruct`] turns photos into
-//! splats, [`metrics`] compares images, [`config`] defines the configuration of a run, [`optim`] and [`loss`] hold the optimizer and the losses, [`data`]
-//! reads captures, [`synth`] generates synthetic scenes, [`io`] reads and writes files, [`ranks`] connects the processes of
-//! distributed training, [`render`] is the differentiable splat op, [`model`] the network, [`scene`] the camera maths.
+//! [`refine`] optimizes a splat per scene, [`eval`] evaluates methods, [`train`] trains, [`reconstruct`] turns photos into splats,
+//! [`metrics`] compares images, [`config`] defines the configuration of a run, [`optim`] and [`loss`] hold the optimizer and the
+//! losses, [`data`] reads captures, [`stereo`] estimates depths, [`synth`] generates synthetic scenes, [`io`] reads and writes files,
+//! [`distributed`] connects the processes of distributed training, [`render`] is the differentiable splat op, [`model`] the network.
 
 #[doc(hidden)]
 pub mod bench;
