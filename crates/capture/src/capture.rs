@@ -1,20 +1,20 @@
 //! The in-memory representation of a capture, common to all file formats.
 
-use crate::formats::find_masks_in;
 use crate::geometry::{Camera, ImageSize, check_pose, nearest_rigid_of_scaled};
 use crate::holdout::Holdout;
 use crate::image_source::ImageSource;
 use crate::lens::{Distortion, Lens, LensModel, PhotoPart, PinholeView, Projection, split_into_views};
+use crate::photos::{find_masks_in, format_names};
 use crate::pixels::{
-    DecodedPhoto, LookupTable, Planes, ViewPixels, decode_photo, encode_photo, grey_to_rgb,
-    has_alpha_channel, multiply, read_image_size, read_mask, resize_and_crop, source_ranges, undistort,
+    DecodedPhoto, Planes, Undistorter, ViewPixels, decode_photo, encode_photo, grey_to_rgb,
+    has_alpha_channel, multiply, read_image_size, read_mask, resize_and_crop, source_ranges,
 };
-use glam::{DMat4, DVec4};
+use glam::DMat4;
 use globalsplat_files::{Error, InputFiles, Result, parent_of, split_keyed_path};
 use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 use std::borrow::Cow;
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 use std::path::{Component, Path, PathBuf};
 use std::sync::Arc;
@@ -35,16 +35,9 @@ pub(crate) struct Frame {
 }
 
 impl Frame {
-    /// Returns the weights of the photo's pixels as its lens took them, in equal channels: the mask's, multiplied by the photo's
-    /// opacity `alpha`. Returns `None` if there is neither.
-    fn read_mask(&self, alpha: Option<GrayImage>) -> Result<Option<RgbImage>> {
-        let alpha = alpha.map(|alpha| grey_to_rgb(&alpha));
-        let Some(file) = &self.mask else { return Ok(alpha) };
-        let mut mask = read_mask(file, (self.camera.width, self.camera.height))?;
-        if let Some(alpha) = alpha {
-            multiply(&mut mask, &alpha);
-        }
-        Ok(Some(mask))
+    /// Creates the frame of a photo without a mask that a pinhole camera took.
+    pub fn pinhole(image: ImageLocation, name: String, camera: Camera) -> Self {
+        Frame { image, mask: None, name, camera, lens: LensModel::default() }
     }
 }
 
@@ -57,6 +50,14 @@ struct View {
     name: String,
     camera: Camera,
     projection: Projection,
+}
+
+impl View {
+    /// Returns the map from the view to its photo, at least in the part that fitting to `size` reads.
+    fn undistorter(&self, size: Option<ImageSize>) -> Undistorter {
+        let window = size.map(|size| source_ranges(&self.camera, size));
+        Undistorter::new(self.projection.clone(), self.camera, window)
+    }
 }
 
 /// Location of a photo's image.
@@ -142,6 +143,22 @@ impl Changes {
         }
     }
 
+    /// Returns the file of photo `name`: the one that was `found`, or, if `purpose` needs no photos, the one that is `declared`. Returns
+    /// `None` and counts the photo as missing otherwise.
+    pub fn photo(
+        &mut self,
+        name: &str,
+        found: Option<PathBuf>,
+        purpose: Purpose,
+        declared: PathBuf,
+    ) -> Option<PathBuf> {
+        let is_needed = matches!(purpose, Purpose::Photos);
+        if found.is_none() && is_needed {
+            self.missing.push(name.to_string());
+        }
+        found.or((!is_needed).then_some(declared))
+    }
+
     /// Removes the scale from `c2w`, the pose of photo `name`, if its rotation is scaled. Returns any other pose unchanged.
     pub fn remove_scale(&mut self, name: &str, c2w: DMat4) -> DMat4 {
         match nearest_rigid_of_scaled(&c2w) {
@@ -159,11 +176,11 @@ impl Changes {
         let mut lines = vec![];
         if !self.missing.is_empty() {
             let (count, all) = (self.missing.len(), present + self.missing.len());
-            let names = format_names(self.missing.iter().map(String::as_str));
+            let names = format_names(&self.missing);
             lines.push(format!("{file}: {count} of {all} photos are missing and left out: {names}"));
         }
         if let Some((_, factor)) = self.scaled.first() {
-            let names = format_names(self.scaled.iter().map(|(name, _)| name.as_str()));
+            let names = format_names(&self.scaled.iter().map(|(name, _)| name).collect::<Vec<_>>());
             lines.push(format!(
                 "{file}: {} of {present} rotations are scaled, the first by {factor:.6}, which is taken out: {names}",
                 self.scaled.len()
@@ -176,14 +193,6 @@ impl Changes {
 
 /// Minimum number of views that a scene can be reconstructed from.
 const MIN_VIEWS: usize = 2;
-
-/// Formats the first few of `names` and the number of the remaining ones.
-pub(crate) fn format_names<'a>(names: impl ExactSizeIterator<Item = &'a str>) -> String {
-    const SHOWN: usize = 3;
-    let more = names.len().saturating_sub(SHOWN);
-    let shown = names.take(SHOWN).collect::<Vec<_>>().join(", ");
-    if more == 0 { shown } else { format!("{shown} and {more} more") }
-}
 
 /// A photo and its camera.
 #[derive(Debug, Clone)]
@@ -269,12 +278,9 @@ impl Capture {
         cameras: &[Camera],
         source: Arc<dyn ImageSource>,
     ) -> Result<Self> {
-        let frame = |(index, &camera): (usize, &Camera)| Frame {
-            image: ImageLocation::Source { source: source.clone(), index },
-            mask: None,
-            name: format!("{index:06}"),
-            camera,
-            lens: LensModel::default(),
+        let frame = |(index, &camera): (usize, &Camera)| {
+            let image = ImageLocation::Source { source: source.clone(), index };
+            Frame::pinhole(image, format!("{index:06}"), camera)
         };
         let frames = cameras.iter().enumerate().map(frame).collect();
         Capture::new(name, file, frames, Changes::default(), Purpose::Photos)
@@ -309,11 +315,10 @@ impl Capture {
         let without: Vec<&str> =
             names.iter().zip(&masks).filter(|(_, mask)| mask.is_none()).map(|(name, _)| *name).collect();
         let line = (!without.is_empty()).then(|| {
-            let (count, names) = (without.len(), format_names(without.iter().copied()));
+            let (folder, count, all) = (folder.display(), without.len(), names.len());
             format!(
-                "{}: {count} of {} photos have no mask and count whole: {names}",
-                folder.display(),
-                self.frames.len()
+                "{folder}: {count} of {all} photos have no mask and count whole: {}",
+                format_names(&without)
             )
         });
         for (frame, mask) in self.frames.iter_mut().zip(masks) {
@@ -454,20 +459,16 @@ impl Capture {
     /// # Errors
     /// Fails if an image or a mask is missing or can't be decoded, if an image has another size than the capture declares.
     pub fn load(&self, indices: &[usize], size: Option<ImageSize>) -> Result<Vec<Photo>> {
-        // Positions in `indices` of the views of each photo, in the order in which the photos come first.
-        let mut photos: Vec<Vec<usize>> = vec![];
-        let mut photo_of_frame = HashMap::new();
+        // Positions in `indices` of the views of each photo.
+        let mut photos: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
         for (position, &index) in indices.iter().enumerate() {
-            let photo = *photo_of_frame.entry(self.views[index].frame).or_insert(photos.len());
-            photos.resize_with(photos.len().max(photo + 1), Vec::new);
-            photos[photo].push(position);
+            photos.entry(self.views[index].frame).or_default().push(position);
         }
-        let views =
-            |positions: &[usize]| positions.iter().map(|&at| &self.views[indices[at]]).collect::<Vec<_>>();
-        let tables = match photos.as_slice() {
-            [first, _, ..] => lookup_tables(&views(first), size),
-            _ => vec![],
+        let photos: Vec<Vec<usize>> = photos.into_values().collect();
+        let views = |positions: &[usize]| -> Vec<&View> {
+            positions.iter().map(|&position| &self.views[indices[position]]).collect()
         };
+        let tables = if photos.len() > 1 { precompute(&views(&photos[0]), size) } else { vec![] };
         let pixels = |positions: &Vec<usize>| {
             let views = views(positions);
             let area = |camera: &Camera| u64::from(camera.width) * u64::from(camera.height);
@@ -476,20 +477,17 @@ impl Capture {
         };
         let largest = photos.iter().map(pixels).max().unwrap_or(0).max(1);
         let at_once = (DECODED_BYTES / (DECODED_BYTES_PER_PIXEL * largest)).max(1) as usize;
-        let mut loaded: Vec<Option<Photo>> = indices.iter().map(|_| None).collect();
+        let mut loaded: Vec<(usize, Photo)> = vec![];
         for photos in photos.chunks(at_once) {
             let load = |positions: &Vec<usize>| self.load_views(&views(positions), size, &tables);
             let all: Vec<_> = photos.par_iter().map(load).collect();
             // If several images can't be read, the error is that of the first one.
             for (positions, views) in photos.iter().zip(all) {
-                for (&position, view) in positions.iter().zip(views?) {
-                    loaded[position] = Some(view);
-                }
+                loaded.extend(positions.iter().copied().zip(views?));
             }
         }
-        let views: Vec<Photo> =
-            loaded.into_iter().map(|photo| photo.expect("every view is one of a photo")).collect();
-        Ok(views)
+        loaded.sort_by_key(|(position, _)| *position);
+        Ok(loaded.into_iter().map(|(_, photo)| photo).collect())
     }
 
     /// Reads every view like [`Capture::load`].
@@ -530,7 +528,7 @@ impl Capture {
         &self,
         views: &[&View],
         size: Option<ImageSize>,
-        tables: &[LookupTable],
+        tables: &[Undistorter],
     ) -> Result<Vec<Photo>> {
         let (photo, mask) = self.read_photo(&self.frames[views[0].frame])?;
         let load = |view: &&View| {
@@ -580,13 +578,20 @@ impl Capture {
         Ok((image, view_mask(mask.as_ref(), shown, view, None, &[])))
     }
 
-    /// Returns the pixels of a photo as its lens took them, and their weights in equal channels if it has a mask.
+    /// Returns the pixels of a photo as its lens took them, and their weights in equal channels: the mask's, multiplied by the photo's
+    /// opacity.
     fn read_photo(&self, frame: &Frame) -> Result<(RgbImage, Option<RgbImage>)> {
         if let ImageLocation::Source { source, index } = &frame.image {
             return Ok((source.image(*index), None));
         }
-        let photo = self.decode(frame, &frame.image.read()?)?;
-        Ok((photo.pixels, frame.read_mask(photo.alpha)?))
+        let DecodedPhoto { pixels, alpha, .. } = self.decode(frame, &frame.image.read()?)?;
+        let alpha = alpha.map(|alpha| grey_to_rgb(&alpha));
+        let Some(file) = &frame.mask else { return Ok((pixels, alpha)) };
+        let mut mask = read_mask(file, pixels.dimensions())?;
+        if let Some(alpha) = alpha {
+            multiply(&mut mask, &alpha);
+        }
+        Ok((pixels, Some(mask)))
     }
 
     fn decode(&self, frame: &Frame, encoded: &[u8]) -> Result<DecodedPhoto> {
@@ -618,17 +623,16 @@ impl Capture {
     }
 }
 
-/// Returns lookup tables for `views` of a photo, which those of most other photos usually share. Returns none if a view is the photo,
-/// and for the largest photos: a table takes 16 bytes per pixel, and the size that the capture declares isn't verified yet.
-fn lookup_tables(views: &[&View], size: Option<ImageSize>) -> Vec<LookupTable> {
+/// Returns undistorters with precomputed positions for `views` of a photo, which those of most other photos usually share. Returns none
+/// if a view is the photo, and for the largest photos: a position takes 16 bytes per pixel, and the size that the capture declares isn't
+/// verified yet.
+fn precompute(views: &[&View], size: Option<ImageSize>) -> Vec<Undistorter> {
     const MAX_PIXELS: u64 = 1 << 23;
     let pixels = views.iter().map(|view| u64::from(view.camera.width) * u64::from(view.camera.height));
     if views.iter().any(|view| view.projection.is_identity()) || pixels.sum::<u64>() > MAX_PIXELS {
         return vec![];
     }
-    let window = |camera: &Camera| size.map(|size| source_ranges(camera, size));
-    let table = |view: &&View| LookupTable::new(view.projection.clone(), view.camera, window(&view.camera));
-    views.iter().map(table).collect()
+    views.iter().map(|view| view.undistorter(size).precompute()).collect()
 }
 
 /// Returns the pixels of `view`, at least in the part that fitting to `size` reads, or `None` if they are those of `photo`. Uses one
@@ -637,12 +641,14 @@ fn view_pixels(
     photo: &RgbImage,
     view: &View,
     size: Option<ImageSize>,
-    tables: &[LookupTable],
+    tables: &[Undistorter],
 ) -> Option<ViewPixels> {
-    let View { projection, camera, .. } = view;
-    match tables.iter().find(|table| table.matches_camera(projection, camera)) {
-        Some(table) => Some(table.undistort(photo)),
-        None => undistort(photo, projection, camera, size.map(|size| source_ranges(camera, size))),
+    if view.projection.is_identity() {
+        return None;
+    }
+    match tables.iter().find(|table| table.matches_camera(&view.projection, &view.camera)) {
+        Some(table) => Some(table.apply(photo)),
+        None => Some(view.undistorter(size).apply(photo)),
     }
 }
 
@@ -653,7 +659,7 @@ fn view_mask(
     shown: Option<Vec<u8>>,
     view: &View,
     size: Option<ImageSize>,
-    tables: &[LookupTable],
+    tables: &[Undistorter],
 ) -> Option<RgbImage> {
     let Camera { width, height, .. } = view.camera;
     let shown =
@@ -668,39 +674,38 @@ fn view_mask(
 
 /// Returns the pinhole views of `frames`, which `file` describes, and a line for each kind of lens whose photos change.
 fn views_of_frames(file: &Path, frames: &[Frame], purpose: Purpose) -> Result<(Vec<View>, Vec<String>)> {
-    // Photos of one camera have the same lens.
-    let mut lenses: Vec<Lens> = vec![];
-    let lens_of_frame: Vec<Option<usize>> = frames
-        .iter()
-        .map(|frame| {
-            let is_split =
-                matches!(purpose, Purpose::Photos) && !matches!(frame.lens, LensModel::Perspective(_));
-            let lens = is_split.then(|| Lens::new(&frame.camera, frame.lens))?;
-            let known = lenses.iter().rposition(|known| *known == lens);
-            Some(known.unwrap_or_else(|| {
-                lenses.push(lens);
-                lenses.len() - 1
-            }))
-        })
-        .collect();
-    let part =
-        |lens: &Lens, view: PinholeView| (view, Arc::new(PhotoPart { lens: *lens, rotation: view.rotation }));
-    let parts = |lens: &Lens| split_into_views(lens).into_iter().map(|view| part(lens, view)).collect();
-    let parts: Vec<Vec<(PinholeView, Arc<PhotoPart>)>> = lenses.par_iter().map(parts).collect();
+    let is_path = matches!(purpose, Purpose::Cameras(_));
+    let lens = |frame: &Frame| {
+        let is_split = !is_path && !matches!(frame.lens, LensModel::Perspective(_));
+        is_split.then(|| Lens::new(&frame.camera, frame.lens))
+    };
+    // Photos of one camera have the same lens, and mostly follow each other.
+    let groups: Vec<&[Frame]> = frames.chunk_by(|a, b| lens(a) == lens(b)).collect();
+    let parts = |frames: &&[Frame]| -> Option<Vec<(PinholeView, Projection)>> {
+        let lens = lens(&frames[0])?;
+        let part = |view: PinholeView| PhotoPart { lens, rotation: view.rotation };
+        Some(
+            split_into_views(&lens)
+                .into_iter()
+                .map(|view| (view, Projection::Part(Arc::new(part(view)))))
+                .collect(),
+        )
+    };
+    let parts: Vec<_> = groups.par_iter().map(parts).collect();
     let mut views = vec![];
-    for (index, (frame, lens)) in frames.iter().zip(&lens_of_frame).enumerate() {
+    // Numbers of photos and of their views, by kind.
+    let mut counts = [(0, 0); 3];
+    let parts =
+        groups.iter().zip(&parts).flat_map(|(frames, parts)| std::iter::repeat_n(parts, frames.len()));
+    for (index, (frame, parts)) in frames.iter().zip(parts).enumerate() {
         let Frame { name, camera, lens: model, .. } = frame;
-        let Some(lens) = *lens else {
+        let Some(parts) = parts else {
             let distortion = match model {
                 LensModel::Perspective(distortion) => *distortion,
                 LensModel::Equirectangular => {
+                    let (field, found) = (format!("the camera of {name}"), "EQUIRECTANGULAR");
                     let expected = "a camera with a field of view below 180 degrees";
-                    return Err(Error::input(
-                        file,
-                        format!("the camera of {name}"),
-                        "EQUIRECTANGULAR",
-                        expected,
-                    ));
+                    return Err(Error::input(file, field, found, expected));
                 }
                 _ => Distortion::default(),
             };
@@ -708,39 +713,31 @@ fn views_of_frames(file: &Path, frames: &[Frame], purpose: Purpose) -> Result<(V
             views.push(View { frame: index, name: name.clone(), camera: *camera, projection });
             continue;
         };
-        views.extend(parts[lens].iter().map(|(view, part)| {
+        let kind = match model {
+            LensModel::Equirectangular => 0,
+            _ if parts.len() > 1 => 1,
+            _ => 2,
+        };
+        counts[kind].0 += 1;
+        counts[kind].1 += parts.len();
+        views.extend(parts.iter().map(|(view, projection)| {
             let PinholeView { suffix, rotation, intrinsics, size: ImageSize { height, width } } = *view;
-            let [x, y, z] = [rotation.x_axis, rotation.y_axis, rotation.z_axis].map(|axis| axis.extend(0.));
-            let c2w = camera.c2w * DMat4::from_cols(x, y, z, DVec4::W);
+            let c2w = camera.c2w * DMat4::from_mat3(rotation);
             let camera = Camera { intrinsics, c2w, width, height };
-            View {
-                frame: index,
-                name: part_name(name, suffix),
-                camera,
-                projection: Projection::Part(part.clone()),
-            }
+            View { frame: index, name: part_name(name, suffix), camera, projection: projection.clone() }
         }));
     }
-    let line = |kind: &str, is_kind: &dyn Fn(usize) -> bool| {
-        let counts =
-            lens_of_frame.iter().flatten().filter(|&&lens| is_kind(lens)).map(|&lens| parts[lens].len());
-        let (photos, views) = counts.fold((0, 0), |(photos, views), count| (photos + 1, views + count));
-        let outcome = match views > photos {
-            true => format!("are split into {views} pinhole views"),
-            false => "are turned into pinhole views".into(),
-        };
-        let all = frames.len();
-        (photos > 0).then(|| format!("{}: {photos} of {all} photos {kind} and {outcome}", file.display()))
-    };
-    let shows_all = |lens: usize| lenses[lens].model == LensModel::Equirectangular;
-    let is_wide = |lens: usize| !shows_all(lens) && parts[lens].len() > 1;
-    let is_other = |lens: usize| !shows_all(lens) && parts[lens].len() == 1;
-    let lines = [
-        line("show 360 degrees", &shows_all),
-        line("have a wide field of view", &is_wide),
-        line("have a fisheye lens or the like", &is_other),
-    ];
-    Ok((views, lines.into_iter().flatten().collect()))
+    let kinds = ["show 360 degrees", "have a wide field of view", "have a fisheye lens or the like"];
+    let lines =
+        kinds.iter().zip(counts).filter(|(_, (photos, _))| *photos > 0).map(|(kind, (photos, views))| {
+            let outcome = match views > photos {
+                true => format!("are split into {views} pinhole views"),
+                false => "are turned into pinhole views".into(),
+            };
+            format!("{}: {photos} of {} photos {kind} and {outcome}", file.display(), frames.len())
+        });
+    let lines = lines.collect();
+    Ok((views, lines))
 }
 
 /// Returns the name of the part `suffix` of photo `name`, with `suffix` before the name's extension.
@@ -802,7 +799,7 @@ fn fit_cameras_to_photos(file: &Path, frames: &mut [Frame]) -> Option<String> {
         found.height,
         said.width,
         said.height,
-        format_names(names.into_iter())
+        format_names(&names)
     ))
 }
 
@@ -853,7 +850,7 @@ fn check_masks(file: &Path, frames: &[Frame]) -> Result<Option<String>> {
     }
     Ok((!names.is_empty()).then(|| {
         let (file, count, all) = (file.display(), names.len(), frames.len());
-        let names = format_names(names.into_iter());
+        let names = format_names(&names);
         format!("{file}: the masks of {count} of {all} photos have another size and are resized: {names}")
     }))
 }

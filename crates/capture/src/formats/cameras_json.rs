@@ -1,14 +1,12 @@
 //! Reader and writer of `cameras.json` folders: {"image_shape": [H, W], "views": [{"image", "intrinsic" 3×3 in pixels, "c2w" 4×4}]}
 //! (spec 10.2). `c2w` is the camera-to-world matrix, row by row, of a camera with OpenCV axes: x right, y down, z forward.
 
-use super::json::replace_nan_with_null;
-use super::photos::{find_photos, portable};
-use super::{CaptureOpener, file_in, folder_name};
+use super::{CaptureOpener, file_in, folder_name, read_json};
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
 use crate::geometry::{Camera, Intrinsics, pose_to_rows};
-use crate::lens::LensModel;
+use crate::photos::{find_photos, portable};
 use glam::DMat4;
-use globalsplat_files::{Error, Result, parent_of, read_text, write_json};
+use globalsplat_files::{Error, Result, parent_of, write_json};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -41,7 +39,7 @@ struct ViewEntry {
 type NullableNumber = Option<f64>;
 
 /// Recognizes a folder that contains a `cameras.json`, or that file itself.
-pub(super) fn find(path: &Path) -> Option<CaptureOpener> {
+pub(crate) fn find(path: &Path) -> Option<CaptureOpener> {
     let is_cameras_file = path.is_file() && path.file_name().is_some_and(|name| name == FILE_NAME);
     let file = if is_cameras_file { path.to_owned() } else { file_in(path, FILE_NAME)? };
     Some(Box::new(move |purpose| read(&file, purpose)))
@@ -49,31 +47,18 @@ pub(super) fn find(path: &Path) -> Option<CaptureOpener> {
 
 /// Reads the capture that `file` describes. Views keep the order of the file. For [`Purpose::Photos`], views whose photo is missing
 /// are left out and reported as a warning; for [`Purpose::Cameras`], photos need not exist.
-pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
-    let parsed = parse(file)?;
+pub(crate) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
+    let expected = "{\"image_shape\": [H, W], \"views\": [{\"image\", \"intrinsic\", \"c2w\"}]}";
+    let parsed: CamerasFile = read_json(file, "not a description of cameras", expected)?;
     let root = parent_of(file);
     let cameras = to_cameras(file, &parsed)?;
     let names: Vec<&str> = parsed.views.iter().map(|view| view.image.as_str()).collect();
     let photos = find_photos(&[root.to_owned()], &names);
     let (mut frames, mut changes) = (vec![], Changes::default());
     for ((name, photo), camera) in names.into_iter().zip(photos).zip(cameras) {
-        let photo = match (photo, purpose) {
-            (Some(photo), _) => photo,
-            (None, Purpose::Cameras(_)) => root.join(name),
-            (None, Purpose::Photos) => {
-                changes.missing.push(name.to_string());
-                continue;
-            }
-        };
+        let Some(photo) = changes.photo(name, photo, purpose, root.join(name)) else { continue };
         let camera = Camera { c2w: changes.remove_scale(name, camera.c2w), ..camera };
-        let name = portable(name);
-        frames.push(Frame {
-            image: ImageLocation::File(photo),
-            name,
-            camera,
-            mask: None,
-            lens: LensModel::default(),
-        });
+        frames.push(Frame::pinhole(ImageLocation::File(photo), portable(name), camera));
     }
     Capture::new(folder_name(root), file.to_owned(), frames, changes, purpose)
 }
@@ -103,14 +88,6 @@ pub fn write_cameras_json(file: &Path, images: &[String], cameras: &[Camera]) ->
 
 fn rows(values: &[f64], width: usize) -> Vec<Vec<NullableNumber>> {
     values.chunks(width).map(|row| row.iter().copied().map(Some).collect()).collect()
-}
-
-fn parse(file: &Path) -> Result<CamerasFile> {
-    let text = read_text(file)?;
-    serde_json::from_str(&replace_nan_with_null(&text)).map_err(|e| {
-        let expected = "{\"image_shape\": [H, W], \"views\": [{\"image\", \"intrinsic\", \"c2w\"}]}";
-        Error::input(file, "the file", format!("not a description of cameras ({e})"), expected)
-    })
 }
 
 fn to_cameras(file: &Path, parsed: &CamerasFile) -> Result<Vec<Camera>> {

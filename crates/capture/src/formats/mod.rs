@@ -1,121 +1,22 @@
-//! Formats of captures on disk. Each has a module, and an entry in [`FORMATS`] that recognizes its captures.
+//! Formats of captures on disk. Each has a module, whose `find` recognizes its captures.
 
-mod camera_path;
-mod cameras_json;
+pub mod cameras_json;
 #[cfg(feature = "chunks")]
-mod chunk;
-mod colmap;
-mod json;
-mod natural;
-mod photo_folder;
-mod photos;
-mod transforms_json;
-
-pub use camera_path::{CameraPath, read_camera_path};
-pub use cameras_json::write_cameras_json;
-#[cfg(feature = "chunks")]
-pub use chunk::{CHUNK_EXTENSION, CHUNK_INDEX_FILE, Chunk, camera_numbers};
-pub use colmap::{Point, read_points};
-pub use photo_folder::{PhotoList, list_photos};
-pub use photos::{find_masks, find_masks_in};
-pub use transforms_json::write_transforms_json;
+pub mod chunk;
+pub mod colmap;
+pub mod transforms_json;
 
 use crate::capture::{Capture, Purpose};
-use globalsplat_files::{Error, Result};
-use natural::natural_order;
+use globalsplat_files::{Error, Result, read_text};
+use serde::de::DeserializeOwned;
 use std::path::{Path, PathBuf};
 
-/// Function that looks for a capture of one format at a path: a folder, or the file that describes the capture.
-type Format = fn(&Path) -> Option<CaptureOpener>;
-
 /// Function that reads a capture that was found.
-type CaptureOpener = Box<dyn FnOnce(Purpose) -> Result<Capture>>;
-
-/// All formats in order of preference. If several match a folder, the first that can be read is used.
-const FORMATS: &[Format] = &[
-    #[cfg(feature = "chunks")]
-    chunk::find,
-    cameras_json::find,
-    transforms_json::find,
-    colmap::find,
-];
-
-/// Name of the folder of masks, beside or in the folder of photos.
-pub const MASKS_FOLDER: &str = "masks";
-
-/// Description of the supported formats for error messages.
-const SUPPORTED_FORMATS: &str = "a cameras.json, a transforms.json or a transforms_train.json in it, a COLMAP model (cameras and images, both \
-                     .bin or both .txt) in it or in its sparse, sparse/0, colmap/sparse/0, dense/sparse or dense/0/sparse, or a \
-                     CHUNK.torch#KEY";
-
-/// Returns `true` if a capture is at `path`, judging by file names alone.
-pub fn is_capture(path: &Path) -> bool {
-    FORMATS.iter().any(|find| find(path).is_some())
-}
+pub(crate) type CaptureOpener = Box<dyn FnOnce(Purpose) -> Result<Capture>>;
 
 /// Returns the file `name` that describes a capture, if it exists in the capture's folder `path`.
 fn file_in(path: &Path, name: &str) -> Option<PathBuf> {
     Some(path.join(name)).filter(|file| file.is_file())
-}
-
-/// Opens the capture at `path`. The format is recognized by the files on disk, in this order:
-///
-/// 1. `CHUNK.torch#KEY`, a scene of a RealEstate10K-style chunk, or `CHUNK.torch` if it holds a single scene;
-/// 2. a folder with a `cameras.json`, or that file;
-/// 3. a folder with a nerfstudio or instant-ngp `transforms.json`, or that file, which may also be named `transforms_train.json` or
-///    similar; or a folder with NeRF's `transforms_train.json` and `transforms_test.json`, whose views [`Capture::split`] holds
-///    out;
-/// 4. a folder with a COLMAP model, binary or text, in `sparse/0`, `sparse`, `colmap/sparse/0`, `dense/0/sparse`, `dense/sparse` or
-///    the folder itself, and the photos in `images` next to it, or in the folder itself. If there are several models, the one with
-///    the most photos.
-///
-/// If several formats match, the first that can be read is used. Missing photos are left out, and cameras are scaled to photos
-/// whose size differs from the declared one. [`Capture::warnings`] lists everything that is left out or changed.
-///
-/// Lens distortion is removed when the images are loaded, so every camera is a pinhole camera with OpenCV axes. A photo of a fisheye
-/// or of 360 degrees may become several views.
-///
-/// ```no_run
-/// use globalsplat_capture::open_capture;
-/// use std::path::Path;
-///
-/// # fn main() -> globalsplat_capture::Result<()> {
-/// let capture = open_capture(Path::new("captures/room"))?;
-/// for (name, camera) in capture.names().zip(capture.cameras()) {
-///     println!("{name}: {}×{} pixels at {}", camera.width, camera.height, camera.c2w.w_axis);
-/// }
-/// # Ok(())
-/// # }
-/// ```
-///
-/// # Errors
-/// Fails if nothing of a known format is at `path`, or if a capture violates its format.
-pub fn open_capture(path: &Path) -> Result<Capture> {
-    open_for(path, Purpose::Photos)
-}
-
-fn open_for(path: &Path, purpose: Purpose) -> Result<Capture> {
-    let mut refusals = vec![];
-    for read in FORMATS.iter().filter_map(|find| find(path)) {
-        match read(purpose) {
-            Ok(capture) => {
-                let taken = capture.file().display().to_string();
-                let lines = refusals.iter().map(|why| format!("{why}; {taken} is read instead"));
-                return Ok(capture.with_warnings(lines.collect()));
-            }
-            Err(why) if why.is_invalid_request() => refusals.push(why),
-            Err(why) => return Err(why),
-        }
-    }
-    match refusals.len() {
-        0 if !path.exists() => Err(Error::request(format!("{}: no such capture", path.display()))),
-        0 => Err(Error::input(path, "the capture", "of no known format", SUPPORTED_FORMATS)),
-        1 => Err(refusals.remove(0)),
-        _ => {
-            let reasons = refusals.iter().map(Error::to_string).collect::<Vec<_>>().join("; ");
-            Err(Error::request(format!("{}: none of its formats can be read: {reasons}", path.display())))
-        }
-    }
 }
 
 /// Returns the name of the last folder in `path`. An empty path stands for the working directory.
@@ -125,68 +26,46 @@ pub fn folder_name(path: &Path) -> String {
     folder.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
 }
 
-/// Maximum depth of folders that are searched for captures.
-const DEPTH: usize = 2;
-
-/// Captures found below a folder.
-#[derive(Debug)]
-pub struct FoundCaptures {
-    /// Captures ordered by path, with numbers in paths compared by value.
-    pub captures: Vec<Capture>,
-    /// Warnings about folders that couldn't be read, one line each.
-    pub warnings: Vec<String>,
-}
-
-/// Opens every capture in `path`: `path` itself, or those in folders up to two levels below it. Skips hidden folders, such as those
-/// left by interrupted work, and folders that can't be read.
+/// Reads the JSON in `file`. NaN, Infinity and -Infinity, which Python writes and JSON lacks, are read as null.
 ///
 /// # Errors
-/// Fails if `path` can't be read or holds no capture, or if a capture violates its format.
-pub fn find_captures(path: &Path) -> Result<FoundCaptures> {
-    let CaptureFolders { folders, warnings } = capture_folders(path)?;
-    let captures = folders.iter().map(|folder| open_capture(folder)).collect::<Result<_>>()?;
-    Ok(FoundCaptures { captures, warnings })
+/// Fails if the file can't be read, and if it isn't a `T`: the file is then said to be `found`.
+pub(crate) fn read_json<T: DeserializeOwned>(file: &Path, found: &str, expected: &str) -> Result<T> {
+    serde_json::from_str(&replace_nan_with_null(&read_text(file)?))
+        .map_err(|e| Error::input(file, "the file", format!("{found} ({e})"), expected))
 }
 
-/// Folders of the captures that [`find_captures`] opens.
-#[derive(Debug, Default)]
-pub struct CaptureFolders {
-    /// Paths of the captures, with numbers in paths compared by value.
-    pub folders: Vec<PathBuf>,
-    /// Warnings as in [`FoundCaptures::warnings`].
-    pub warnings: Vec<String>,
-}
-
-/// Finds the folders for [`find_captures`].
-pub fn capture_folders(path: &Path) -> Result<CaptureFolders> {
-    let mut found = CaptureFolders::default();
-    found.collect(path, DEPTH)?;
-    if found.folders.is_empty() {
-        let unread = found.warnings.first().map_or(String::new(), |line| format!(" ({line})"));
-        let expected = format!("{SUPPORTED_FORMATS}; or folders with such, up to {DEPTH} levels below it");
-        return Err(Error::input(path, "the folder", format!("without captures{unread}"), expected));
-    }
-    found.folders.sort_by(natural_order);
-    Ok(found)
-}
-
-impl CaptureFolders {
-    fn collect(&mut self, path: &Path, depth: usize) -> Result<()> {
-        if is_capture(path) {
-            self.folders.push(path.to_owned());
-            return Ok(());
-        }
-        if depth == 0 {
-            return Ok(());
-        }
-        for entry in std::fs::read_dir(path).map_err(Error::read(path))? {
-            let entry = entry.map_err(Error::read(path))?;
-            let is_hidden = entry.file_name().as_encoded_bytes().starts_with(b".");
-            if !is_hidden && entry.path().is_dir() {
-                let below = self.collect(&entry.path(), depth - 1);
-                self.warnings.extend(below.err().map(|why| format!("{why}, and is left out")));
+/// Replaces NaN, Infinity and -Infinity outside of strings by null.
+fn replace_nan_with_null(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    let mut rest = text;
+    let (mut in_string, mut escaped) = (false, false);
+    while let Some(c) = rest.chars().next() {
+        let token =
+            ["NaN", "Infinity", "-Infinity"].iter().find(|token| !in_string && rest.starts_with(**token));
+        match token {
+            Some(token) => {
+                out.push_str("null");
+                rest = &rest[token.len()..];
+            }
+            None => {
+                in_string ^= c == '"' && !escaped;
+                escaped = in_string && c == '\\' && !escaped;
+                out.push(c);
+                rest = &rest[c.len_utf8()..];
             }
         }
-        Ok(())
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::replace_nan_with_null;
+
+    #[test]
+    fn only_numbers_are_replaced() {
+        let text = r#"{"NaN \" NaN": [NaN, -Infinity, 1.5], "b": Infinity}"#;
+        assert_eq!(replace_nan_with_null(text), r#"{"NaN \" NaN": [null, null, 1.5], "b": null}"#);
     }
 }

@@ -3,16 +3,14 @@
 //! `camera_angle_y` in radians, the `camera_model`, and the distortion `k1` to `k6`, `p1`, `p2` (spec 10.3). NeRF's synthetic scenes
 //! have a file of this kind for each split.
 
-use super::json::replace_nan_with_null;
-use super::natural::natural_order;
-use super::photos::{find_photos, portable};
-use super::{CaptureOpener, file_in, folder_name};
+use super::{CaptureOpener, file_in, folder_name, read_json};
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
 use crate::geometry::{Camera, ImageSize, Intrinsics, nearest_rigid_of_scaled, pose_to_rows};
-use crate::lens::{COLMAP_MODELS, Distortion, Lens, LensModel, equirectangular_intrinsics};
+use crate::lens::{COLMAP_MODELS, Distortion, Lens, LensModel};
+use crate::photos::{find_photos, natural_order, portable};
 use crate::pixels::read_image_size;
 use glam::{DMat4, DVec4};
-use globalsplat_files::{Error, Result, parent_of, read_text, write_json};
+use globalsplat_files::{Error, Result, parent_of, write_json};
 use serde_json::{Value, json};
 use std::collections::HashSet;
 use std::f64::consts::PI;
@@ -29,25 +27,16 @@ const TEST_FILES: [&str; 2] = ["transforms_test.json", "transforms_val.json"];
 const TRAIN_LIST: &str = "train_filenames";
 const TEST_LISTS: [&str; 2] = ["test_filenames", "val_filenames"];
 
-/// Names of the perspective lenses whose coefficients have keys of their own.
-const PERSPECTIVE_MODELS: [&str; 5] = ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL"];
-
 /// Signs of the axes of OpenGL cameras in those of OpenCV.
 const OPENGL_AXES: DVec4 = DVec4::new(1., -1., -1., 1.);
 
-/// Name of the lens model whose k4 to k6 form a denominator.
-const FULL_OPENCV: &str = "FULL_OPENCV";
-
-/// Names of the fisheyes whose coefficients are k1 to k4, p1 and p2.
-const FISHEYE_MODELS: [&str; 5] =
-    [OPENCV_FISHEYE, "FISHEYE", "SIMPLE_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE"];
-
+/// Names of lens models that are treated in a way of their own.
+const OPENCV: &str = "OPENCV";
 const OPENCV_FISHEYE: &str = "OPENCV_FISHEYE";
-
-/// nerfstudio's name of COLMAP's RAD_TAN_THIN_PRISM_FISHEYE.
-const FISHEYE624: (&str, &str) = ("FISHEYE624", "RAD_TAN_THIN_PRISM_FISHEYE");
-
+const FULL_OPENCV: &str = "FULL_OPENCV";
 const EQUIRECTANGULAR: &str = "EQUIRECTANGULAR";
+/// nerfstudio's name of COLMAP's RAD_TAN_THIN_PRISM_FISHEYE.
+const FISHEYE624: &str = "FISHEYE624";
 
 /// Key of a list of coefficients.
 const COEFFICIENTS: &str = "distortion_params";
@@ -64,7 +53,7 @@ const FAMILIES: [&[&str]; 2] = [
 
 /// Recognizes a folder with a `transforms.json`, or with a `transforms_train.json` and optional test files, or a file
 /// `transforms….json`.
-pub(super) fn find(path: &Path) -> Option<CaptureOpener> {
+pub(crate) fn find(path: &Path) -> Option<CaptureOpener> {
     let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
     let is_transforms_file = path.is_file() && name.starts_with("transforms") && name.ends_with(".json");
     let file = if is_transforms_file { Some(path.to_owned()) } else { file_in(path, FILE_NAME) };
@@ -72,28 +61,22 @@ pub(super) fn find(path: &Path) -> Option<CaptureOpener> {
         return Some(Box::new(move |purpose| read(&file, purpose)));
     }
     let train = file_in(path, TRAIN_FILE)?;
-    let mut others: Vec<PathBuf> = TEST_FILES.iter().filter_map(|name| file_in(path, name)).collect();
+    let others: Vec<PathBuf> = TEST_FILES.iter().filter_map(|name| file_in(path, name)).collect();
     Some(Box::new(move |purpose| {
-        let mut capture = read(&train, purpose)?;
-        if !others.is_empty() {
-            let test = others.remove(0);
-            let (frames, changes, _) = read_frames(&test, purpose)?;
-            capture = capture.with_test(&test, frames, changes, purpose)?;
-        }
-        let unread = others.iter().map(|file| {
+        let capture = read(&train, purpose)?;
+        let [test, unread @ ..] = others.as_slice() else { return Ok(capture) };
+        let (frames, changes, _) = read_frames(test, purpose)?;
+        let unread = unread.iter().map(|file| {
             let views = read_frames(file, purpose).map_or(0, |(frames, ..)| frames.len());
-            format!(
-                "{}: its {views} views are left out, as {} has those to hold out",
-                file.display(),
-                TEST_FILES[0]
-            )
+            let (file, taken) = (file.display(), TEST_FILES[0]);
+            format!("{file}: its {views} views are left out, as {taken} has those to hold out")
         });
-        Ok(capture.with_warnings(unread.collect()))
+        Ok(capture.with_test(test, frames, changes, purpose)?.with_warnings(unread.collect()))
     }))
 }
 
 /// Reads the capture that `file` describes.
-pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
+pub(crate) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
     let (frames, changes, lists) = read_frames(file, purpose)?;
     let new = |frames| Capture::new(folder_name(parent_of(file)), file.to_owned(), frames, changes, purpose);
     let Lists { train, test, unread } = lists;
@@ -103,11 +86,11 @@ pub(super) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
     }
     let (held_out, mut rest): (Vec<_>, Vec<_>) =
         frames.into_iter().partition(|frame| test.contains(&normalize_name(&frame.name)));
-    let others = rest.extract_if(.., |frame| {
+    let is_other = |frame: &mut Frame| {
         let name = normalize_name(&frame.name);
         unread.contains(&name) || train.as_ref().is_some_and(|train| !train.contains(&name))
-    });
-    let others = others.count();
+    };
+    let others = rest.extract_if(.., is_other).count();
     let warnings = (others > 0).then(|| {
         let file = file.display();
         format!("{file}: {others} frames are left out, as they are neither to learn from nor held out by its lists of filenames")
@@ -153,19 +136,14 @@ impl Lists {
 /// Reads the frames that `file` describes, ordered by name, with numbers in names compared by value. Frames with a missing image
 /// are left out, as nerfstudio and instant-ngp do: users delete photos after the poses were computed.
 fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Lists)> {
-    let text = read_text(file)?;
     let expected = "{\"frames\": [{\"file_path\", \"transform_matrix\"}], …}";
-    let json: Value = serde_json::from_str(&replace_nan_with_null(&text))
-        .map_err(|e| Error::input(file, "the file", format!("no JSON ({e})"), expected))?;
+    let json: Value = read_json(file, "no JSON", expected)?;
     let entries = match json.get("frames") {
         Some(Value::Array(entries)) => entries,
         other => return Err(Error::input(file, "frames", describe_value(other), "a list of frames")),
     };
-    let fields: Vec<Fields> = entries
-        .iter()
-        .enumerate()
-        .map(|(index, frame)| Fields { file, index, frame, shared: &json, purpose })
-        .collect();
+    let frame = |(index, frame)| Fields { file, index, frame, shared: &json, purpose };
+    let fields: Vec<Fields> = entries.iter().enumerate().map(frame).collect();
     let names = fields.iter().map(Fields::file_path).collect::<Result<Vec<_>>>()?;
     let mut bases = vec![parent_of(file).to_owned()];
     bases.extend(parent_of(file).canonicalize().ok().and_then(|root| Some(root.parent()?.to_owned())));
@@ -176,14 +154,9 @@ fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Li
     };
     let (mut frames, mut changes) = (vec![], Changes::default());
     for (((fields, name), photo), mask) in fields.iter().zip(names).zip(photos).zip(masks) {
-        match (photo, purpose) {
-            (Some(photo), _) => {
-                frames.push(Frame { mask, ..fields.frame(photo, name, &mut changes)? });
-            }
-            (None, Purpose::Cameras(_)) => {
-                frames.push(fields.frame(parent_of(file).join(name), name, &mut changes)?)
-            }
-            (None, Purpose::Photos) => changes.missing.push(name.to_string()),
+        let declared = parent_of(file).join(name);
+        if let Some(photo) = changes.photo(name, photo, purpose, declared) {
+            frames.push(Frame { mask, ..fields.frame(photo, name, &mut changes)? });
         }
     }
     frames.sort_by(|a, b| natural_order(&a.name, &b.name));
@@ -203,8 +176,8 @@ fn find_named_masks(
     if names.iter().all(Option::is_none) {
         return Ok(vec![None; fields.len()]);
     }
-    let mut masks =
-        find_photos(bases, &names.iter().map(|name| name.unwrap_or_default()).collect::<Vec<_>>());
+    let paths: Vec<&str> = names.iter().map(|name| name.unwrap_or_default()).collect();
+    let mut masks = find_photos(bases, &paths);
     for (((fields, name), photo), mask) in fields.iter().zip(names).zip(photos).zip(&mut masks) {
         // Without its folder, the name of a missing mask may be that of the photo.
         *mask = mask.take().filter(|mask| photo.as_ref().is_some_and(|photo| photo != mask));
@@ -218,7 +191,7 @@ fn find_named_masks(
 }
 
 /// Describes a value of the file for an error message.
-pub(super) fn describe_value(value: Option<&Value>) -> String {
+pub(crate) fn describe_value(value: Option<&Value>) -> String {
     match value {
         None => "missing".into(),
         Some(Value::Null) => "null or NaN".into(),
@@ -251,7 +224,7 @@ pub fn write_transforms_json(file: &Path, names: &[String], cameras: &[Camera]) 
 
 /// Returns the pose of 16 numbers, row by row, converted to OpenCV axes. OpenGL's y axis points up and its z axis backward, so
 /// those two columns change sign.
-pub(super) fn from_opengl(entries: &[f64; 16]) -> DMat4 {
+pub(crate) fn from_opengl(entries: &[f64; 16]) -> DMat4 {
     let opengl = DMat4::from_cols_array(entries).transpose();
     opengl * DMat4::from_diagonal(OPENGL_AXES)
 }
@@ -281,32 +254,34 @@ impl<'a> Fields<'a> {
         format!("{key} of frame {}", self.index)
     }
 
-    fn number(&self, key: &str) -> Result<Option<f64>> {
+    /// Returns the value of `key` as `convert` reads it, or `None` if there is none.
+    fn get<T>(
+        &self,
+        key: &str,
+        expected: &str,
+        convert: impl Fn(&'a Value) -> Option<T>,
+    ) -> Result<Option<T>> {
         let Some((value, name)) = self.find(key) else { return Ok(None) };
-        match value.as_f64() {
-            Some(number) => Ok(Some(number)),
-            None => Err(Error::input(self.file, name, describe_value(Some(value)), "a number")),
-        }
+        let refused = || Error::input(self.file, name, describe_value(Some(value)), expected);
+        convert(value).ok_or_else(refused).map(Some)
+    }
+
+    fn number(&self, key: &str) -> Result<Option<f64>> {
+        self.get(key, "a number", Value::as_f64)
     }
 
     /// Reads a number of pixels.
     fn size(&self, key: &str) -> Result<Option<u32>> {
-        match self.number(key)? {
-            None => Ok(None),
-            Some(size) if size >= 1. && size <= f64::from(u32::MAX) && size.fract() == 0. => {
-                Ok(Some(size as u32))
-            }
-            Some(size) => Err(self.refuse(key, size, "a number of pixels")),
-        }
+        let is_size = |size: &f64| *size >= 1. && *size <= f64::from(u32::MAX) && size.fract() == 0.;
+        let size = self.get(key, "a number of pixels", |value| value.as_f64().filter(is_size))?;
+        Ok(size.map(|size| size as u32))
     }
 
     /// Computes the focal length in pixels from an angle of view over `size` pixels: size / (2 tan(angle/2)).
     fn focal_from_angle(&self, key: &str, size: u32) -> Result<Option<f64>> {
-        match self.number(key)? {
-            None => Ok(None),
-            Some(angle) if angle > 0. && angle < PI => Ok(Some(f64::from(size) / (2. * (angle / 2.).tan()))),
-            Some(angle) => Err(self.refuse(key, angle, "an angle between 0 and π")),
-        }
+        let is_angle = |angle: &f64| *angle > 0. && *angle < PI;
+        let angle = self.get(key, "an angle between 0 and π", |value| value.as_f64().filter(is_angle))?;
+        Ok(angle.map(|angle| f64::from(size) / (2. * (angle / 2.).tan())))
     }
 
     /// Returns an error that reports the existing value `found` of `key`.
@@ -316,26 +291,25 @@ impl<'a> Fields<'a> {
     }
 
     fn file_path(&self) -> Result<&'a str> {
-        match self.frame.get("file_path") {
-            Some(Value::String(path)) if !path.is_empty() => Ok(path),
-            other => Err(Error::input(
-                self.file,
-                self.name("file_path"),
-                describe_value(other),
-                "the path of an image",
-            )),
-        }
+        self.path("file_path")?.ok_or_else(|| self.refuse_path("file_path"))
     }
 
     fn mask_path(&self) -> Result<Option<&'a str>> {
-        match self.frame.get("mask_path") {
+        self.path("mask_path")
+    }
+
+    /// Returns the frame's own path `key`, or `None` if it is empty or missing.
+    fn path(&self, key: &str) -> Result<Option<&'a str>> {
+        match self.frame.get(key) {
             None | Some(Value::Null) => Ok(None),
             Some(Value::String(path)) => Ok(Some(path.as_str()).filter(|path| !path.is_empty())),
-            other => {
-                let expected = "the path of an image";
-                Err(Error::input(self.file, self.name("mask_path"), describe_value(other), expected))
-            }
+            Some(_) => Err(self.refuse_path(key)),
         }
+    }
+
+    fn refuse_path(&self, key: &str) -> Error {
+        let found = describe_value(self.frame.get(key));
+        Error::input(self.file, self.name(key), found, "the path of an image")
     }
 
     fn frame(&self, image: PathBuf, name: &str, changes: &mut Changes) -> Result<Frame> {
@@ -350,13 +324,8 @@ impl<'a> Fields<'a> {
         }
         let lens = self.lens(&model, ImageSize { height, width })?;
         let camera = Camera { intrinsics: lens.intrinsics, c2w, width, height };
-        Ok(Frame {
-            image: ImageLocation::File(image),
-            name: portable(name),
-            camera,
-            lens: lens.model,
-            mask: None,
-        })
+        let frame = Frame::pinhole(ImageLocation::File(image), portable(name), camera);
+        Ok(Frame { lens: lens.model, ..frame })
     }
 
     /// Returns the intrinsics. A missing focal length is computed from the angle of view if possible, otherwise it equals that of
@@ -382,34 +351,29 @@ impl<'a> Fields<'a> {
         let refuse = |(name, found, expected): (String, String, String)| {
             Error::input(self.file, self.name(&name), found, expected)
         };
-        let intrinsics = match model {
+        if model == EQUIRECTANGULAR {
             // nerfstudio writes focal lengths of other meanings, or none.
-            EQUIRECTANGULAR => {
-                let [fx, fy, cx, cy] = equirectangular_intrinsics(f64::from(width), f64::from(height));
-                Intrinsics { fx, fy, cx, cy }
-            }
-            _ => self.intrinsics(width, height)?,
-        };
-        let camera = Camera { intrinsics, c2w: DMat4::IDENTITY, width, height };
+            return Lens::from_colmap(model, &[width.into(), height.into()], size).map_err(refuse);
+        }
+        let intrinsics = self.intrinsics(width, height)?;
         let model = match model {
-            EQUIRECTANGULAR => LensModel::Equirectangular,
-            _ if FISHEYE_MODELS.contains(&model) => {
+            "OPENCV_FISHEYE" | "FISHEYE" | "SIMPLE_FISHEYE" | "RADIAL_FISHEYE" | "SIMPLE_RADIAL_FISHEYE" => {
                 let ([k1, k2, k3, k4, ..], tangential) = self.coefficients(model)?;
                 LensModel::fisheye([k1, k2, k3, k4], tangential)
             }
-            _ if model == FULL_OPENCV || PERSPECTIVE_MODELS.contains(&model) => {
+            "OPENCV" | "FULL_OPENCV" | "PINHOLE" | "SIMPLE_PINHOLE" | "RADIAL" | "SIMPLE_RADIAL" => {
                 let ([k1, k2, k3, k4, k5, k6], tangential) = self.coefficients(model)?;
                 let (k4, denominator) = if model == FULL_OPENCV { (0., [k4, k5, k6]) } else { (k4, [0.; 3]) };
                 LensModel::Perspective(Distortion { radial: [k1, k2, k3, k4], denominator, tangential })
             }
             model => {
                 let Intrinsics { fx, fy, cx, cy } = intrinsics;
-                let name = if model == FISHEYE624.0 { FISHEYE624.1 } else { model };
+                let name = if model == FISHEYE624 { "RAD_TAN_THIN_PRISM_FISHEYE" } else { model };
                 let parameters = [vec![fx, fy, cx, cy], self.list()?.unwrap_or_default()].concat();
                 return Lens::from_colmap(name, &parameters, size).map_err(refuse);
             }
         };
-        let lens = Lens::new(&camera, model);
+        let lens = Lens::new(&Camera { intrinsics, c2w: DMat4::IDENTITY, width, height }, model);
         lens.check().map(|()| lens).map_err(refuse)
     }
 
@@ -439,55 +403,35 @@ impl<'a> Fields<'a> {
 
     /// Returns the numbers of `distortion_params`, if there are any.
     fn list(&self) -> Result<Option<Vec<f64>>> {
-        let Some((value, name)) = self.find(COEFFICIENTS) else { return Ok(None) };
-        let numbers = value.as_array().and_then(|list| list.iter().map(Value::as_f64).collect());
-        let refused = || Error::input(self.file, name, describe_value(Some(value)), "a list of numbers");
-        numbers.ok_or_else(refused).map(Some)
+        self.get(COEFFICIENTS, "a list of numbers", |value| {
+            value.as_array()?.iter().map(Value::as_f64).collect()
+        })
     }
 
     /// Returns the name of the lens model. instant-ngp says in `is_fisheye` that it is OpenCV's fisheye.
     fn camera_model(&self) -> Result<String> {
-        let is_fisheye = match self.find("is_fisheye") {
-            None => false,
-            Some((Value::Bool(is_fisheye), _)) => *is_fisheye,
-            Some((value, name)) => {
-                return Err(Error::input(self.file, name, describe_value(Some(value)), "true or false"));
-            }
-        };
-        let Some((value, name)) = self.find("camera_model") else {
-            return Ok(if is_fisheye { OPENCV_FISHEYE } else { PERSPECTIVE_MODELS[0] }.into());
-        };
-        let known = COLMAP_MODELS.iter().map(|(known, _)| *known).chain([FISHEYE624.0]);
-        let model = value.as_str().unwrap_or_default().to_ascii_uppercase();
-        match known.clone().any(|known| known == model) {
-            true if is_fisheye && model == PERSPECTIVE_MODELS[0] => Ok(OPENCV_FISHEYE.into()),
-            true => Ok(model),
-            false => {
-                let expected = format!("one of {}", known.collect::<Vec<_>>().join(", "));
-                Err(Error::input(self.file, name, describe_value(Some(value)), expected))
-            }
-        }
+        let is_fisheye = self.get("is_fisheye", "true or false", Value::as_bool)?.unwrap_or(false);
+        let known = || COLMAP_MODELS.iter().map(|(known, _)| *known).chain([FISHEYE624]);
+        let expected = format!("one of {}", known().collect::<Vec<_>>().join(", "));
+        let model = self.get("camera_model", &expected, |value| {
+            let model = value.as_str()?.to_ascii_uppercase();
+            known().any(|known| known == model).then_some(model)
+        })?;
+        let model = model.unwrap_or_else(|| OPENCV.into());
+        Ok(if is_fisheye && model == OPENCV { OPENCV_FISHEYE.into() } else { model })
     }
 
     /// Returns `transform_matrix` with OpenCV axes, and the scale factor that was removed from its rotation.
     fn c2w(&self) -> Result<(DMat4, f64)> {
         let name = self.name("transform_matrix");
         let value = self.frame.get("transform_matrix");
-        let rows: Vec<&[Value]> = value
-            .and_then(Value::as_array)
-            .into_iter()
-            .flatten()
-            .filter_map(Value::as_array)
-            .map(Vec::as_slice)
-            .collect();
-        if value.and_then(Value::as_array).is_none_or(|all| all.len() != 4)
-            || rows.len() != 4
-            || rows.iter().any(|row| row.len() != 4)
-        {
+        let four = |value: &'a Value| value.as_array().filter(|list| list.len() == 4);
+        let rows: Option<Vec<_>> = value.and_then(four).and_then(|rows| rows.iter().map(four).collect());
+        let Some(rows) = rows else {
             return Err(Error::input(self.file, name, describe_value(value), "a 4×4 matrix"));
-        }
+        };
         let mut entries = [0.; 16];
-        for (i, value) in rows.iter().copied().flatten().enumerate() {
+        for (i, value) in rows.into_iter().flatten().enumerate() {
             entries[i] = match value {
                 Value::Null => f64::NAN,
                 value => value.as_f64().ok_or_else(|| {

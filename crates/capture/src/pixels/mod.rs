@@ -21,4 +21,4 @@ pub use resize_and_crop::{resize_and_crop, source_ranges};
 
 pub(crate) use mask::multiply;
 pub use mask::{grey_to_rgb, read_mask};
-pub(crate) use undistort::{LookupTable, ViewPixels, undistort};
+pub(crate) use undistort::{Undistorter, ViewPixels};

@@ -15,73 +15,59 @@ pub(crate) struct ViewPixels {
     pub mask: Option<Vec<u8>>,
 }
 
-/// Returns the photo as `camera`, a pinhole camera, would have taken it, or `None` if the photo is just that.
+/// Takes the pixels of a pinhole view from its photo.
 ///
 /// Pixel (i, j) has the ray x = (j + ½ − cx)/fx, y = (i + ½ − cy)/fy, and takes its color from the position in the photo to which
-/// `projection` maps the ray, interpolated linearly between the four surrounding pixel centres. Beyond the photo its border is
-/// repeated, or, if the view is a part of the photo, pixels are black and masked out. Pixels outside `window`'s columns and rows, if
-/// it is given, are unspecified.
-pub(crate) fn undistort(
-    photo: &RgbImage,
-    projection: &Projection,
-    camera: &Camera,
-    window: Option<[Range<usize>; 2]>,
-) -> Option<ViewPixels> {
-    if projection.is_identity() {
-        return None;
-    }
-    let [columns, rows] = window.unwrap_or_else(|| whole(camera));
-    let mut looks = RowLookup::new(projection, camera, &columns);
-    let mut row = vec![SamplePosition::default(); columns.len()];
-    let mut picture = Undistortion::new(photo, projection, camera);
-    for i in rows {
-        looks.fill(i, &mut row);
-        picture.fill(i, columns.start, &row);
-    }
-    Some(picture.finish())
-}
-
-/// Returns all columns and rows of `camera`'s image.
-fn whole(camera: &Camera) -> [Range<usize>; 2] {
-    [camera.width, camera.height].map(|count| 0..count as usize)
-}
-
-/// Precomputed lookup positions that all views of one projection share.
+/// the projection maps the ray, interpolated linearly between the four surrounding pixel centres. Beyond the photo its border is
+/// repeated, or, if the view is a part of the photo, pixels are black and masked out.
 #[derive(Debug)]
-pub(crate) struct LookupTable {
+pub(crate) struct Undistorter {
     projection: Projection,
     camera: Camera,
     columns: Range<usize>,
     rows: Range<usize>,
-    /// Lookup positions, row by row.
-    places: Vec<SamplePosition>,
+    /// Positions of the pixels of `columns` and `rows`, row by row, or nothing to compute them for each photo anew.
+    positions: Vec<SamplePosition>,
 }
 
-impl LookupTable {
-    /// Computes the positions for `window`'s columns and rows, or for the whole image.
+impl Undistorter {
+    /// Creates the undistorter of the view with the projection and the camera. Pixels outside `window`'s columns and rows, if it is
+    /// given, are unspecified.
     pub fn new(projection: Projection, camera: Camera, window: Option<[Range<usize>; 2]>) -> Self {
-        let [columns, rows] = window.unwrap_or_else(|| whole(&camera));
-        let mut places = vec![SamplePosition::default(); columns.len() * rows.len()];
-        places.par_chunks_mut(columns.len()).zip(rows.clone()).for_each_init(
-            || RowLookup::new(&projection, &camera, &columns),
-            |looks, (row, i)| looks.fill(i, row),
-        );
-        LookupTable { projection, camera, columns, rows, places }
+        let [columns, rows] = window.unwrap_or([camera.width, camera.height].map(|count| 0..count as usize));
+        Undistorter { projection, camera, columns, rows, positions: vec![] }
     }
 
-    /// Returns `true` if the table is that of `projection` and `camera`, whatever the camera's pose.
+    /// Computes the positions in the photo, which several photos then share.
+    pub fn precompute(mut self) -> Self {
+        let mut positions = vec![SamplePosition::default(); self.columns.len() * self.rows.len()];
+        let rows = positions.par_chunks_mut(self.columns.len()).zip(self.rows.clone());
+        rows.for_each_init(|| RowLookup::new(&self), |lookup, (row, i)| lookup.fill(i, row));
+        self.positions = positions;
+        self
+    }
+
+    /// Returns `true` if the undistorter is that of `projection` and `camera`, whatever the camera's pose.
     pub fn matches_camera(&self, projection: &Projection, camera: &Camera) -> bool {
         let known = |camera: &Camera| (camera.intrinsics, camera.width, camera.height);
         self.projection == *projection && known(&self.camera) == known(camera)
     }
 
-    /// Returns the view of `photo` like the function [`undistort`].
-    pub fn undistort(&self, photo: &RgbImage) -> ViewPixels {
-        let mut picture = Undistortion::new(photo, &self.projection, &self.camera);
-        for (i, row) in self.rows.clone().zip(self.places.chunks(self.columns.len())) {
-            picture.fill(i, self.columns.start, row);
+    /// Returns the pixels of the view of `photo`.
+    pub fn apply(&self, photo: &RgbImage) -> ViewPixels {
+        let mut undistortion = Undistortion::new(photo, &self.projection, &self.camera);
+        let mut lookup = RowLookup::new(self);
+        let mut row = vec![SamplePosition::default(); self.columns.len()];
+        for (n, i) in self.rows.clone().enumerate() {
+            match self.positions.get(n * row.len()..(n + 1) * row.len()) {
+                Some(known) => undistortion.fill(i, self.columns.start, known),
+                None => {
+                    lookup.fill(i, &mut row);
+                    undistortion.fill(i, self.columns.start, &row);
+                }
+            }
         }
-        picture.finish()
+        undistortion.finish()
     }
 }
 
@@ -106,7 +92,7 @@ struct RowLookup<'a> {
 }
 
 impl<'a> RowLookup<'a> {
-    fn new(projection: &'a Projection, camera: &'a Camera, columns: &Range<usize>) -> Self {
+    fn new(Undistorter { projection, camera, columns, .. }: &'a Undistorter) -> Self {
         let Intrinsics { fx, cx, .. } = camera.intrinsics;
         let across: Vec<f64> = columns.clone().map(|j| (j as f64 + 0.5 - cx) / fx).collect();
         let seen = vec![(0., 0.); across.len()];
@@ -259,78 +245,68 @@ mod tests {
     const INTRINSICS: Intrinsics = Intrinsics { fx: 50., fy: 48., cx: 33., cy: 23. };
     const CAMERA: Camera = Camera { intrinsics: INTRINSICS, c2w: DMat4::IDENTITY, width: 64, height: 48 };
 
-    #[test]
-    fn no_distortion_changes_no_pixel() {
-        let photo = RgbImage::from_fn(64, 48, |x, y| Rgb([x as u8 * 4, y as u8 * 5, (x * y % 251) as u8]));
-        assert_eq!(undistort(&photo, &Projection::default(), &CAMERA, None), None);
-        // This distortion is small enough to pass through the interpolation without visible change.
-        let tiny = Distortion { radial: [1e-12, 0., 0., 0.], ..Distortion::default() };
-        let undistorted = undistort(&photo, &Projection::Distortion(tiny), &CAMERA, None);
-        assert_eq!(undistorted, Some(ViewPixels { image: photo, mask: None }));
-    }
-
-    /// Colors agree with the formulas of [`undistort`] in float64.
-    #[test]
-    fn colors_are_between_their_neighbours() {
-        let photo = RgbImage::from_fn(64, 48, |x, y| {
+    fn noise(width: u32, height: u32) -> RgbImage {
+        RgbImage::from_fn(width, height, |x, y| {
             let level = |k: u32| ((x * 7919 + y * 104_729 + k * 31).wrapping_mul(2_654_435_761) >> 24) as u8;
             Rgb([level(1), level(2), level(3)])
-        });
-        let removed = undistort(&photo, &LENS, &CAMERA, None).unwrap().image;
-        let level = |x: f64, y: f64, k: usize| f64::from(photo.get_pixel(x as u32, y as u32)[k]);
-        for (j, i, found) in removed.enumerate_pixels() {
-            let (x, y) = (f64::from(j) + 0.5 - INTRINSICS.cx, f64::from(i) + 0.5 - INTRINSICS.cy);
-            let (x, y) = DISTORTION.apply(x / INTRINSICS.fx, y / INTRINSICS.fy);
-            let u = (INTRINSICS.fx * x + INTRINSICS.cx - 0.5).clamp(0., 63.);
-            let v = (INTRINSICS.fy * y + INTRINSICS.cy - 0.5).clamp(0., 47.);
-            let (s, t, right, below) = (u.fract(), v.fract(), (u + 1.).min(63.), (v + 1.).min(47.));
-            for k in 0..3 {
-                let top = level(u, v, k) * (1. - s) + level(right, v, k) * s;
-                let bottom = level(u, below, k) * (1. - s) + level(right, below, k) * s;
-                let exact = top * (1. - t) + bottom * t;
-                // The nearest level, up to the rounding of float32.
-                assert!((f64::from(found[k]) - exact).abs() < 0.5001, "{found:?} for {exact} at ({j}, {i})");
+        })
+    }
+
+    /// Colors agree with the formulas of [`Undistorter`] in float64.
+    #[test]
+    fn colors_are_between_their_neighbours() {
+        for (width, height) in [(64, 48), (1, 1), (1, 5), (5, 1), (2, 2)] {
+            let (photo, camera) = (noise(width, height), Camera { width, height, ..CAMERA });
+            let removed = Undistorter::new(LENS, camera, None).apply(&photo).image;
+            let level = |x: f64, y: f64, k: usize| f64::from(photo.get_pixel(x as u32, y as u32)[k]);
+            let [last_x, last_y] = [width, height].map(|count| f64::from(count - 1));
+            for (j, i, found) in removed.enumerate_pixels() {
+                let (x, y) = (f64::from(j) + 0.5 - INTRINSICS.cx, f64::from(i) + 0.5 - INTRINSICS.cy);
+                let (x, y) = DISTORTION.apply(x / INTRINSICS.fx, y / INTRINSICS.fy);
+                let u = (INTRINSICS.fx * x + INTRINSICS.cx - 0.5).clamp(0., last_x);
+                let v = (INTRINSICS.fy * y + INTRINSICS.cy - 0.5).clamp(0., last_y);
+                let (s, t, right, below) = (u.fract(), v.fract(), (u + 1.).min(last_x), (v + 1.).min(last_y));
+                for k in 0..3 {
+                    let top = level(u, v, k) * (1. - s) + level(right, v, k) * s;
+                    let bottom = level(u, below, k) * (1. - s) + level(right, below, k) * s;
+                    let exact = top * (1. - t) + bottom * t;
+                    // The nearest level, up to the rounding of float32.
+                    assert!(
+                        (f64::from(found[k]) - exact).abs() < 0.5001,
+                        "{found:?} for {exact} at ({j}, {i})"
+                    );
+                }
             }
         }
     }
 
     #[test]
-    fn a_window_has_the_same_pixels_as_the_full_image() {
-        let photo = RgbImage::from_fn(64, 48, |x, y| Rgb([x as u8 * 4, y as u8 * 5, (x * y % 251) as u8]));
-        let view = |window| undistort(&photo, &LENS, &CAMERA, window).unwrap().image;
-        let window = Some([7..40, 0..29]);
-        let (whole, part) = (view(None), view(window.clone()));
+    fn a_window_and_precomputed_positions_give_the_same_pixels() {
+        let photo = noise(64, 48);
+        let whole = Undistorter::new(LENS, CAMERA, None).apply(&photo);
+        let part = || Undistorter::new(LENS, CAMERA, Some([7..40, 0..29]));
+        let expected = part().apply(&photo);
         for (x, y) in (7..40).flat_map(|x| (0..29).map(move |y| (x, y))) {
-            assert_eq!(part.get_pixel(x, y), whole.get_pixel(x, y), "({x}, {y})");
+            assert_eq!(expected.image.get_pixel(x, y), whole.image.get_pixel(x, y), "({x}, {y})");
         }
-        assert_ne!(part, whole);
-        // A lookup table gives the same pixels.
-        let table = |window| LookupTable::new(LENS, CAMERA, window).undistort(&photo).image;
-        assert_eq!(table(None), whole);
-        assert_eq!(table(window), part);
+        assert_ne!(expected, whole);
+        assert_eq!(part().precompute().apply(&photo), expected);
+        assert_eq!(Undistorter::new(LENS, CAMERA, None).precompute().apply(&photo), whole);
     }
 
     #[test]
-    fn matches_camera_compares_projection_intrinsics_and_size() {
-        let table = LookupTable::new(LENS, CAMERA, None);
+    fn an_undistorter_fits_its_projection_intrinsics_and_size() {
+        let table = Undistorter::new(LENS, CAMERA, None);
         let elsewhere = Camera { c2w: DMat4::from_translation(DVec3::ONE), ..CAMERA };
-        assert!(table.matches_camera(&LENS, &CAMERA) && table.matches_camera(&LENS, &elsewhere));
-        assert!(!table.matches_camera(&Projection::default(), &CAMERA));
         let longer = Camera { intrinsics: Intrinsics { fx: 51., ..INTRINSICS }, ..CAMERA };
-        assert!(
-            !table.matches_camera(&LENS, &longer)
-                && !table.matches_camera(&LENS, &Camera { width: 65, ..CAMERA })
-        );
-    }
-
-    #[test]
-    fn the_narrowest_images_have_edges_alone() {
-        for (width, height) in [(1, 1), (1, 5), (5, 1), (2, 2)] {
-            let photo = RgbImage::from_fn(width, height, |x, y| Rgb([40 * x as u8, 50 * y as u8, 7]));
-            let camera = Camera { width, height, ..CAMERA };
-            let removed = undistort(&photo, &LENS, &camera, None).unwrap().image;
-            assert_eq!(removed.dimensions(), (width, height));
-            assert!(removed.pixels().all(|pixel| pixel[2] == 7), "{width}×{height}: {removed:?}");
+        for (projection, camera, fits) in [
+            (LENS, CAMERA, true),
+            (LENS, elsewhere, true),
+            (Projection::default(), CAMERA, false),
+            (LENS, longer, false),
+            (LENS, Camera { width: 65, ..CAMERA }, false),
+        ] {
+            assert_eq!(table.matches_camera(&projection, &camera), fits, "{projection:?} {camera:?}");
         }
     }
 }

@@ -7,12 +7,12 @@
 //! - `render_height` and `render_width`, in pixels;
 //! - optionally `camera_type`, which must be `"perspective"`, and `fps` or `seconds`.
 
-use super::json::replace_nan_with_null;
-use super::transforms_json::{describe_value, from_opengl};
-use super::{cameras_json, is_capture, open_for, transforms_json};
 use crate::capture::{Purpose, check_cameras};
+use crate::formats::transforms_json::{describe_value, from_opengl};
+use crate::formats::{cameras_json, read_json, transforms_json};
 use crate::geometry::{Camera, ImageSize, Intrinsics, nearest_rigid_of_scaled};
-use globalsplat_files::{Error, InputFiles, Result, read_text};
+use crate::open::{is_capture, open_for};
+use globalsplat_files::{Error, InputFiles, Result};
 use serde_json::Value;
 use std::path::Path;
 
@@ -29,25 +29,20 @@ pub struct CameraPath {
     pub inputs: InputFiles,
 }
 
-/// Reads the cameras of a capture of any format that [`open_capture`](super::open_capture) supports, or of a JSON file with any name.
+/// Reads the cameras of a capture of any format that [`open_capture`](crate::open_capture) supports, or of a JSON file with any name.
 ///
 /// The keys of a JSON file determine its format: with `camera_path` it is a path of nerfstudio's viewer, with `frames` a
 /// `transforms.json`, and otherwise a `cameras.json`. Photos may be missing. `size` is the size of a missing photo if the capture doesn't
 /// specify it.
 ///
 /// # Errors
-/// Fails like [`open_capture`](super::open_capture).
+/// Fails like [`open_capture`](crate::open_capture).
 pub fn read_camera_path(path: &Path, size: Option<ImageSize>) -> Result<CameraPath> {
     let purpose = Purpose::Cameras(size);
-    let json =
-        match path.is_file() && path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("json")) {
-            false => None,
-            true => {
-                let text = read_text(path)?;
-                // Invalid JSON is reported later, by the reader of the format.
-                Some(serde_json::from_str(&replace_nan_with_null(&text)).unwrap_or(Value::Null))
-            }
-        };
+    let is_json =
+        path.is_file() && path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("json"));
+    // Invalid JSON is reported later, by the reader of the format.
+    let json: Option<Value> = is_json.then(|| read_json(path, "", "").unwrap_or(Value::Null));
     let has_key = |key: &str| json.as_ref().is_some_and(|json| json.get(key).is_some());
     let capture = match (&json, is_capture(path)) {
         (Some(json), _) if has_key("camera_path") => return read_nerfstudio_path(path, json),
@@ -76,13 +71,9 @@ fn read_nerfstudio_path(file: &Path, json: &Value) -> Result<CameraPath> {
         return Err(invalid("camera_type", Some(kind), "\"perspective\""));
     }
     let side = |key: &str| {
-        let expected = "a number of pixels, 1 to 16384";
-        let side = number(json, key, key, expected, 0., 16385.)?;
-        if side < 1. || side.fract() != 0. {
-            Err(invalid(key, json.get(key), expected))
-        } else {
-            Ok(side as u32)
-        }
+        let side = json.get(key).and_then(Value::as_f64).filter(|side| side.fract() == 0. && *side >= 1.);
+        let side = side.filter(|side| *side <= 16384.).map(|side| side as u32);
+        side.ok_or_else(|| invalid(key, json.get(key), "a number of pixels, 1 to 16384"))
     };
     let (height, width) = (side("render_height")?, side("render_width")?);
     let entries = json.get("camera_path").and_then(Value::as_array).filter(|entries| !entries.is_empty());

@@ -6,12 +6,11 @@ mod points;
 
 pub use points::{Point, read_points};
 
-use super::natural::natural_order;
-use super::photos::{find_masks, find_photos, portable};
-use super::{CaptureOpener, MASKS_FOLDER, folder_name};
-use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose, format_names};
+use super::{CaptureOpener, folder_name};
+use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
 use crate::geometry::{Camera, ImageSize};
 use crate::lens::{COLMAP_MODELS, Lens, LensModel};
+use crate::photos::{MASKS_FOLDER, find_masks, find_photos, format_names, natural_order, portable};
 use fields::{ByteReader, WordReader, is_comment};
 use glam::{DMat4, DQuat, DVec3};
 use globalsplat_files::{Error, Result, read_text};
@@ -114,7 +113,7 @@ struct ImageEntry {
 }
 
 /// Recognizes a folder that contains a model.
-pub(super) fn find(folder: &Path) -> Option<CaptureOpener> {
+pub(crate) fn find(folder: &Path) -> Option<CaptureOpener> {
     let (folder, models) = (folder.to_owned(), Model::find_all(folder));
     (!models.is_empty())
         .then(|| -> CaptureOpener { Box::new(move |purpose| read_largest(&folder, models, purpose)) })
@@ -148,7 +147,7 @@ fn read_largest(folder: &Path, mut models: Vec<Model>, purpose: Purpose) -> Resu
         "the largest of {} models is taken, with {} photos; left out: {}",
         sizes.len(),
         images.len(),
-        format_names(smaller.iter().map(String::as_str))
+        format_names(&smaller)
     );
     read(folder, &model, images, if smaller.is_empty() { vec![] } else { vec![line] }, purpose)
 }
@@ -178,7 +177,7 @@ fn read(
         false => format!("{PHOTOS}/{name}"),
     };
     let paths: Vec<String> = images.iter().map(|image| path(&image.name)).collect();
-    let photos = find_photos(&model.bases, &paths.iter().map(String::as_str).collect::<Vec<_>>());
+    let photos = find_photos(&model.bases, &paths);
     let masks = match purpose {
         Purpose::Photos => {
             let folders: Vec<_> = model.bases.iter().map(|base| base.join(MASKS_FOLDER)).collect();
@@ -189,14 +188,9 @@ fn read(
     let mut lenses = BTreeMap::new();
     let (mut frames, mut changes) = (vec![], Changes { lines, ..Changes::default() });
     for ((image, photo), mask) in images.into_iter().zip(photos).zip(masks) {
-        let photo = match (photo.filter(|_| !image.name.is_empty()), purpose) {
-            (Some(photo), _) => photo,
-            (None, Purpose::Cameras(_)) => model.bases[0].join(PHOTOS).join(&image.name),
-            (None, Purpose::Photos) => {
-                changes.missing.push(image.name);
-                continue;
-            }
-        };
+        let (photo, declared) =
+            (photo.filter(|_| !image.name.is_empty()), model.bases[0].join(PHOTOS).join(&image.name));
+        let Some(photo) = changes.photo(&image.name, photo, purpose, declared) else { continue };
         let refuse = |field: &str, found: String, expected: String| {
             let field = format!("{field} of image {} ({})", image.id, image.name);
             Err(Error::input(&model.images, field, found, expected))

@@ -1,11 +1,10 @@
 //! Masks of photos: where they are found, and what becomes of them.
 
+use crate::{assert_refused, assert_warns, open_transforms};
 use globalsplat_capture::{Capture, Photo, open_capture};
-use globalsplat_test_kit::formats::{
-    HEIGHT, WIDTH, cameras, in_images, names, pinhole, transforms, write_colmap_text,
-};
+use globalsplat_test_kit::formats::{HEIGHT, WIDTH, cameras, names, pinhole, write_colmap_text};
 use image::{DynamicImage, GrayImage, Luma, Rgb, RgbImage, Rgba, RgbaImage};
-use serde_json::{Value, json};
+use serde_json::json;
 use std::path::Path;
 use tempfile::TempDir;
 
@@ -27,19 +26,8 @@ fn folder_of_photos(names: &[String]) -> TempDir {
     folder
 }
 
-/// Writes a `transforms.json` of the photos after `change` of its contents.
-fn write_transforms(folder: &Path, change: impl FnOnce(&mut Value)) {
-    let mut contents = transforms(&in_images(&names()), &cameras());
-    change(&mut contents);
-    std::fs::write(folder.join("transforms.json"), contents.to_string()).unwrap();
-}
-
 fn mask_of(capture: &Capture, view: usize) -> Option<Vec<u8>> {
     capture.load(&[view], None).unwrap().remove(0).mask
-}
-
-fn error_of<T>(result: globalsplat_capture::Result<T>) -> String {
-    result.err().expect("an error").to_string()
 }
 
 #[test]
@@ -47,9 +35,7 @@ fn masks_are_found_where_tools_put_them() {
     // nerfstudio names them, for any of its frames.
     let nerfstudio = folder_of_photos(&names());
     save(levels(), &nerfstudio.path().join("masks/some.png"));
-    write_transforms(nerfstudio.path(), |contents| {
-        contents["frames"][1]["mask_path"] = json!("masks/some.png")
-    });
+    let named = open_transforms(nerfstudio.path(), |t| t["frames"][1]["mask_path"] = json!("masks/some.png"));
     // COLMAP adds an extension to the name of the photo, or the name has the same one.
     let names = ["left/0.jpg", "left/1.png", "right/0.jpg", "right/1.png", "2.png"].map(String::from);
     let colmap = folder_of_photos(&names);
@@ -57,8 +43,8 @@ fn masks_are_found_where_tools_put_them() {
     for mask in ["left/0.jpg.png", "left/1.png.png", "right/0.png", "right/1.png"] {
         save(levels(), &colmap.path().join("masks").join(mask));
     }
-    for (folder, expected) in [(nerfstudio, [1].as_slice()), (colmap, &[1, 2, 3, 4])] {
-        let capture = open_capture(folder.path()).unwrap();
+    for (capture, expected) in [(named, [1].as_slice()), (open_capture(colmap.path()), &[1, 2, 3, 4])] {
+        let capture = capture.unwrap();
         let masked: Vec<usize> = (0..5).filter(|&view| mask_of(&capture, view).is_some()).collect();
         assert_eq!((masked.as_slice(), capture.mask_count()), (expected, expected.len()));
         assert_eq!(mask_of(&capture, masked[0]).unwrap(), levels().into_raw());
@@ -69,26 +55,22 @@ fn masks_are_found_where_tools_put_them() {
 #[test]
 fn a_folder_of_masks_replaces_those_of_the_capture() {
     let folder = folder_of_photos(&names());
-    let [own, given] = ["own", "given"].map(|name| folder.path().join(name));
-    save(GrayImage::from_pixel(WIDTH, HEIGHT, Luma([9])), &own.join("000.png"));
-    write_transforms(folder.path(), |contents| contents["frames"][0]["mask_path"] = json!("own/000.png"));
-    let capture = || open_capture(folder.path()).unwrap();
-    assert_eq!(mask_of(&capture(), 0).unwrap()[0], 9);
-    assert!(error_of(capture().with_masks(&given)).contains("given"));
+    let given = folder.path().join("given");
+    save(GrayImage::from_pixel(WIDTH, HEIGHT, Luma([9])), &folder.path().join("own/000.png"));
+    let own = open_transforms(folder.path(), |t| t["frames"][0]["mask_path"] = json!("own/000.png")).unwrap();
+    assert_eq!(mask_of(&own, 0).unwrap()[0], 9);
+    assert_refused(own.clone().with_masks(&given), &["given can't be read"]);
     std::fs::create_dir(&given).unwrap();
-    let error = error_of(capture().with_masks(&given));
-    assert!(
-        error.contains("the folder is without a mask for any photo, expected images/000.png.png"),
-        "{error}"
-    );
+    let found = "given: the folder is without a mask for any photo, expected images/000.png.png";
+    assert_refused(own.clone().with_masks(&given), &[found]);
     // With or without the folders of the photos' names.
     for names in [["images/001.png.png", "images/002.tif"], ["001.png", "002.png.bmp"]] {
         names.iter().for_each(|name| save(levels(), &given.join(name)));
-        let capture = capture().with_masks(&given).unwrap();
+        let capture = own.clone().with_masks(&given).unwrap();
         let masked = [0, 1, 2, 3, 4].map(|view| mask_of(&capture, view).is_some());
         assert_eq!(masked, [false, true, true, false, false], "{names:?}");
-        let line = "given: 3 of 5 photos have no mask and count whole: images/000.png, images/003.png, images/004.png";
-        assert!(capture.warnings().iter().any(|warning| warning.ends_with(line)), "{:?}", capture.warnings());
+        let count = "given: 3 of 5 photos have no mask and count whole: ";
+        assert_warns(&capture, &[count, "images/000.png, images/003.png, images/004.png"]);
         std::fs::remove_dir_all(&given).unwrap();
     }
 }
@@ -125,11 +107,11 @@ fn opacity_is_a_mask_and_multiplies_another() {
     save(photo(|x| x as u8 * 10), &images.join("002.png"));
     save(levels(), &folder.path().join("masks/2.png"));
     save(GrayImage::from_pixel(WIDTH, HEIGHT, Luma([255])), &folder.path().join("masks/3.png"));
-    write_transforms(folder.path(), |contents| {
-        contents["frames"][2]["mask_path"] = json!("masks/2.png");
-        contents["frames"][3]["mask_path"] = json!("masks/3.png");
+    let capture = open_transforms(folder.path(), |t| {
+        t["frames"][2]["mask_path"] = json!("masks/2.png");
+        t["frames"][3]["mask_path"] = json!("masks/3.png");
     });
-    let capture = open_capture(folder.path()).unwrap();
+    let capture = capture.unwrap();
     let half: Vec<u8> = (0..WIDTH * HEIGHT).map(|i| if i % WIDTH < 12 { 0 } else { 255 }).collect();
     assert_eq!(mask_of(&capture, 0).unwrap(), half);
     let product = |(x, _, level): (u32, u32, &Luma<u8>)| {
@@ -149,12 +131,11 @@ fn opacity_is_a_mask_and_multiplies_another() {
 fn masks_of_another_size_are_resized_if_the_aspect_agrees() {
     let folder = folder_of_photos(&names());
     let mask = folder.path().join("masks/1.png");
-    write_transforms(folder.path(), |contents| contents["frames"][1]["mask_path"] = json!("masks/1.png"));
+    let open = || open_transforms(folder.path(), |t| t["frames"][1]["mask_path"] = json!("masks/1.png"));
     // White to the left of column 6 of 12.
     save(GrayImage::from_fn(12, 8, |x, _| Luma([if x < 6 { 255 } else { 0 }])), &mask);
-    let capture = open_capture(folder.path()).unwrap();
-    let line = "the masks of 1 of 5 photos have another size and are resized: images/001.png";
-    assert!(matches!(capture.warnings(), [warning] if warning.ends_with(line)), "{:?}", capture.warnings());
+    let capture = open().unwrap();
+    assert_warns(&capture, &["the masks of 1 of 5 photos have another size and are resized: images/001.png"]);
     let resized = mask_of(&capture, 1).unwrap();
     for x in [0, 8, 15, 23] {
         // The filter overshoots near the edge.
@@ -163,41 +144,34 @@ fn masks_of_another_size_are_resized_if_the_aspect_agrees() {
     }
     for (width, height) in [(16, 24), (24, 20), (12, 16)] {
         save(GrayImage::new(width, height), &mask);
-        let error = error_of(open_capture(folder.path()));
-        let found =
-            format!("1.png: the mask is {width}×{height} pixels, expected 24×16 pixels as images/001.png");
-        assert!(error.contains(&found), "{error}");
+        let found = format!("1.png: the mask is {width}×{height} pixels");
+        assert_refused(open(), &[&found, "expected 24×16 pixels as images/001.png"]);
     }
 }
 
 #[test]
 fn a_missing_or_damaged_mask_is_refused_by_name() {
     let folder = folder_of_photos(&names());
-    let write =
-        |path: Value| write_transforms(folder.path(), |contents| contents["frames"][3]["mask_path"] = path);
-    // The last one is the name of the photo if the folder is left out, as it may be for photos.
-    for path in ["masks/3.png", "masks/images/003.png"] {
-        write(json!(path));
-        let error = error_of(open_capture(folder.path()));
-        assert!(
-            error.contains(&format!("mask_path of frame 3 is {path:?}, which is missing, expected an image")),
-            "{error}"
-        );
+    let [masks, photo] = ["masks", "images/003.png"].map(|name| folder.path().join(name));
+    std::fs::create_dir(&masks).unwrap();
+    std::fs::write(masks.join("damaged.png"), "no image").unwrap();
+    let open = |path| open_transforms(folder.path(), |t| t["frames"][3]["mask_path"] = path);
+    for (path, found) in [
+        (
+            json!("masks/3.png"),
+            "mask_path of frame 3 is \"masks/3.png\", which is missing, expected an image",
+        ),
+        // The name of the photo if the folder is left out, as it may be for photos.
+        (json!("masks/images/003.png"), "is \"masks/images/003.png\", which is missing"),
+        (json!(7), "mask_path of frame 3 is 7, expected the path of an image"),
+        (json!("masks/damaged.png"), "masks/damaged.png: the image is undecodable"),
+    ] {
+        assert_refused(open(path), &[found]);
     }
-    write(json!(7));
-    assert!(
-        error_of(open_capture(folder.path()))
-            .contains("mask_path of frame 3 is 7, expected the path of an image")
-    );
-    write(json!("masks/3.png"));
-    std::fs::create_dir(folder.path().join("masks")).unwrap();
-    std::fs::write(folder.path().join("masks/3.png"), "no image").unwrap();
-    assert!(error_of(open_capture(folder.path())).contains("masks/3.png: the image is undecodable"));
+    assert_eq!(open(json!(null)).unwrap().mask_count(), 0);
     // A photo that is missing, too, is left out.
-    std::fs::remove_file(folder.path().join("images/003.png")).unwrap();
-    assert_eq!(open_capture(folder.path()).unwrap().len(), 4);
-    write(json!(null));
-    assert_eq!(open_capture(folder.path()).unwrap().mask_count(), 0);
+    std::fs::remove_file(photo).unwrap();
+    assert_eq!(open(json!("masks/3.png")).unwrap().len(), 4);
 }
 
 #[test]
@@ -218,8 +192,8 @@ fn masks_are_read_however_they_are_written() {
     for (mask, name) in masks.into_iter().zip(names()) {
         save(mask, &folder.path().join("masks").join(name));
     }
-    write_transforms(folder.path(), |_| {});
-    let capture = open_capture(folder.path()).unwrap().with_masks(&folder.path().join("masks")).unwrap();
+    let capture = open_transforms(folder.path(), |_| ()).unwrap();
+    let capture = capture.with_masks(&folder.path().join("masks")).unwrap();
     let expected: Vec<u8> = (0..WIDTH * HEIGHT).map(|i| level(i % WIDTH, 255)).collect();
     for view in 0..5 {
         assert!(mask_of(&capture, view) == Some(expected.clone()), "{view}");
@@ -227,28 +201,18 @@ fn masks_are_read_however_they_are_written() {
 }
 
 #[test]
-fn photos_may_be_masked_out_as_a_whole() {
+fn masked_out_photos_are_known_and_masks_are_part_of_the_checksum() {
     let folder = folder_of_photos(&names());
     let masks = folder.path().join("masks");
-    write_transforms(folder.path(), |_| {});
-    names()[..4].iter().for_each(|name| save(GrayImage::new(WIDTH, HEIGHT), &masks.join(name)));
-    let capture = open_capture(folder.path()).unwrap().with_masks(&masks).unwrap();
-    let photos = capture.load_all(None).unwrap();
-    assert_eq!(photos.iter().filter(|photo| photo.is_masked_out()).count(), 4);
-}
-
-#[test]
-fn masks_are_part_of_the_checksum() {
-    let folder = folder_of_photos(&names());
-    let masks = folder.path().join("masks");
-    write_transforms(folder.path(), |_| {});
-    let checksum = |capture: &Capture| capture.checksum(0..5).unwrap();
-    let plain = open_capture(folder.path()).unwrap();
-    let mut checksums = vec![checksum(&plain)];
-    for level in [10, 20] {
+    let plain = open_transforms(folder.path(), |_| ()).unwrap();
+    let mut checksums = vec![];
+    for (level, count) in [(0, 1), (10, 0), (20, 0)] {
         save(GrayImage::from_pixel(WIDTH, HEIGHT, Luma([level])), &masks.join("002.png"));
-        checksums.push(checksum(&plain.clone().with_masks(&masks).unwrap()));
+        let masked = plain.clone().with_masks(&masks).unwrap();
+        let photos = masked.load_all(None).unwrap();
+        assert_eq!(photos.iter().filter(|photo| photo.is_masked_out()).count(), count);
+        checksums.extend([&plain, &masked].map(|capture| capture.checksum(0..5).unwrap()));
     }
-    assert_eq!(checksums[0], checksum(&plain));
-    assert!(checksums[0] != checksums[1] && checksums[1] != checksums[2] && checksums[0] != checksums[2]);
+    let [a, b, c, d, e, f] = checksums[..] else { unreachable!() };
+    assert!(a == c && c == e && a != b && b != d && d != f && b != f, "{checksums:?}");
 }

@@ -1,0 +1,272 @@
+//! Chunks of RealEstate10K, ACID and DL3DV: `*.torch`, a torch.save file with a list of posed videos, each a dict {"key", "url",
+//! "timestamps", "cameras" [n, 18], "images": n encoded images} (spec 10.7).
+
+use super::CaptureOpener;
+use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
+use crate::geometry::{Camera, Intrinsics};
+use crate::pixels::{SUPPORTED_IMAGES, encoded_image_size};
+use glam::{DMat4, DVec4};
+use globalsplat_files::{Error, Result, split_keyed_path};
+use globalsplat_torch_file::{Archive, Array, Dtype, Id, UnknownGlobals, Value, Values, unpickle};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// File extension of a chunk.
+pub const CHUNK_EXTENSION: &str = "torch";
+/// Name of the index file that identifies a folder of chunks: {key: chunk's file name}.
+pub const CHUNK_INDEX_FILE: &str = "index.json";
+/// Number of values of a camera: f_x, f_y, c_x, c_y as fractions of the image's width and height, 0, 0, and the first three rows of
+/// w2c.
+const CAMERA_NUMBERS: usize = 18;
+
+/// Number of views that is always allowed. A chunk may refer to one image repeatedly, in a byte or two each time.
+const ALWAYS_ALLOWED_VIEWS: usize = 100_000;
+/// Minimum number of bytes of the file per view beyond [`ALWAYS_ALLOWED_VIEWS`]. An image with its description takes more.
+const MIN_BYTES_PER_VIEW: usize = 50;
+
+/// A posed video.
+#[derive(Debug, Clone)]
+struct Scene {
+    /// Key of the scene in an index.
+    key: String,
+    /// Camera values, [views, [`CAMERA_NUMBERS`]].
+    cameras: Array,
+    /// Byte range of each view's encoded image in the file.
+    images: Vec<Range<usize>>,
+}
+
+/// A chunk in memory, with images still encoded.
+#[derive(Debug, Clone)]
+pub struct Chunk {
+    file: PathBuf,
+    bytes: Arc<Vec<u8>>,
+    scenes: Vec<Scene>,
+}
+
+/// Recognizes `CHUNK.torch#KEY`, or `CHUNK.torch` with a single scene.
+pub(crate) fn find(path: &Path) -> Option<CaptureOpener> {
+    if let Some((file, key)) = split_keyed_path(path).find(|(file, _)| is_chunk(file)) {
+        return Some(Box::new(move |purpose| Chunk::read(&file)?.capture_for(&key, purpose)));
+    }
+    let file = is_chunk(path).then(|| path.to_owned())?;
+    Some(Box::new(move |purpose| Chunk::read(&file)?.only_capture(purpose)))
+}
+
+/// Returns `true` if `path` is a file with the extension of a chunk.
+fn is_chunk(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension == CHUNK_EXTENSION) && path.is_file()
+}
+
+impl Chunk {
+    /// Reads a chunk. Executes nothing that it contains and trusts none of the sizes that it declares.
+    ///
+    /// # Errors
+    /// Fails if the file can't be read, is damaged, or holds anything other than scenes.
+    pub fn read(file: &Path) -> Result<Self> {
+        Self::parse(file, std::fs::read(file).map_err(Error::read(file))?)
+    }
+
+    /// Parses `bytes`, the contents of the chunk `file`.
+    ///
+    /// # Errors
+    /// Fails like [`Chunk::read`], except for errors of reading the file.
+    pub fn parse(file: &Path, bytes: Vec<u8>) -> Result<Self> {
+        let archive = Archive::parse(file, &bytes)?;
+        let expected = "a list of scenes, of tensors, lists, dicts, strings and numbers alone";
+        let scenes =
+            read_scenes(&bytes, &archive).map_err(|found| Error::input(file, "data.pkl", found, expected))?;
+        Ok(Chunk { file: file.to_owned(), bytes: Arc::new(bytes), scenes })
+    }
+
+    /// Returns the names of the scenes, in order.
+    pub fn keys(&self) -> impl Iterator<Item = &str> {
+        self.scenes.iter().map(|scene| scene.key.as_str())
+    }
+
+    /// Returns the scene `key`.
+    ///
+    /// # Errors
+    /// Fails if there is no such scene, or if it violates the requirements on captures.
+    pub fn capture(&self, key: &str) -> Result<Capture> {
+        self.capture_for(key, Purpose::Photos)
+    }
+
+    fn capture_for(&self, key: &str, purpose: Purpose) -> Result<Capture> {
+        match self.scenes.iter().find(|scene| scene.key == key) {
+            Some(scene) => self.capture_of(scene, purpose),
+            None => {
+                let found = format!("{key:?}, which is missing");
+                Err(Error::input(&self.file, "the scene", found, self.choice()))
+            }
+        }
+    }
+
+    /// Returns the scene of a chunk that has a single scene.
+    ///
+    /// # Errors
+    /// Fails if there are more scenes or none; otherwise like [`Chunk::capture`].
+    fn only_capture(&self, purpose: Purpose) -> Result<Capture> {
+        match self.scenes.as_slice() {
+            [scene] => self.capture_of(scene, purpose),
+            scenes => {
+                let (file, count, choice) = (self.file.display(), scenes.len(), self.choice());
+                Err(Error::request(format!(
+                    "{file}: it holds {count} scenes, expected {file}#KEY with {choice}"
+                )))
+            }
+        }
+    }
+
+    /// Lists the available scenes for an error message.
+    fn choice(&self) -> String {
+        const SHOWN: usize = 8;
+        let keys: Vec<&str> = self.keys().take(SHOWN).collect();
+        let more = if self.scenes.len() > SHOWN { ", …" } else { "" };
+        format!("one of its {}: {}{more}", self.scenes.len(), keys.join(", "))
+    }
+
+    fn capture_of(&self, scene: &Scene, purpose: Purpose) -> Result<Capture> {
+        let named = PathBuf::from(format!("{}#{}", self.file.display(), scene.key));
+        // A damaged frame is detected when it is loaded. Until then, assume the size of the other frames.
+        let sizes: Vec<_> =
+            scene.images.iter().map(|image| encoded_image_size(&self.bytes[image.clone()])).collect();
+        let undecodable = || Error::input(&named, "every image", "undecodable", SUPPORTED_IMAGES);
+        let size = sizes.iter().flatten().next().copied().ok_or_else(undecodable);
+        let usual = purpose.size(&named, "the images", size)?;
+        let cameras =
+            scene.cameras.to_f32(&self.bytes).expect("floats inside the file, as the parser checked");
+        let views = scene.images.iter().zip(cameras.chunks_exact(CAMERA_NUMBERS)).zip(&sizes).enumerate();
+        let frames = views.map(|(index, ((bytes, numbers), size))| {
+            let name = format!("{index:06}");
+            let (file, bytes) = (self.bytes.clone(), bytes.clone());
+            let image = ImageLocation::Bytes { file, bytes, name: named.join(&name) };
+            Frame::pinhole(image, name, camera(numbers, size.unwrap_or(usual)))
+        });
+        Capture::new(scene.key.clone(), named.clone(), frames.collect(), Changes::default(), purpose)
+    }
+}
+
+/// Builds a camera from a chunk's values and the image's (width, height).
+fn camera(numbers: &[f32], (width, height): (u32, u32)) -> Camera {
+    let at = |i: usize| f64::from(numbers[i]);
+    let (w, h) = (f64::from(width), f64::from(height));
+    let row = |i: usize| DVec4::new(at(i), at(i + 1), at(i + 2), at(i + 3));
+    let w2c = DMat4::from_cols(row(6), row(10), row(14), DVec4::W).transpose();
+    let intrinsics = Intrinsics { fx: at(0) * w, fy: at(1) * h, cx: at(2) * w, cy: at(3) * h };
+    Camera { intrinsics, c2w: w2c.inverse(), width, height }
+}
+
+/// Returns a camera's 18 values in a chunk: f_x, f_y, c_x, c_y as fractions of the image's width and height, 0, 0, and the first three
+/// rows of the world-to-camera matrix.
+pub fn camera_numbers(camera: &Camera) -> [f32; CAMERA_NUMBERS] {
+    let (w, h) = (f64::from(camera.width), f64::from(camera.height));
+    let k = camera.intrinsics;
+    let mut numbers = [0f32; CAMERA_NUMBERS];
+    for (number, value) in numbers.iter_mut().zip([k.fx / w, k.fy / h, k.cx / w, k.cy / h]) {
+        *number = value as f32;
+    }
+    let rows = crate::geometry::pose_to_rows(&camera.c2w.inverse());
+    for (number, value) in numbers[6..].iter_mut().zip(rows) {
+        *number = value as f32;
+    }
+    numbers
+}
+
+/// Returns the scenes in `archive`, whose file contents are `bytes`.
+///
+/// # Errors
+/// Fails if the pickle uses anything that isn't allowed, or is not a list of scenes.
+fn read_scenes(bytes: &[u8], archive: &Archive) -> Result<Vec<Scene>, String> {
+    let values = unpickle(&mut &bytes[archive.pickle.clone()], UnknownGlobals::Refuse)?;
+    let max_views = ALWAYS_ALLOWED_VIEWS + bytes.len() / MIN_BYTES_PER_VIEW;
+    list_scenes(&values, archive, max_views).map_err(|why| format!("unusable ({why})"))
+}
+
+fn list_scenes(values: &Values, archive: &Archive, max_views: usize) -> Result<Vec<Scene>, String> {
+    let Value::List(list) = values.get(values.root) else {
+        return Err(format!("{}, expected a list of scenes", values.get(values.root).type_name()));
+    };
+    let (mut scenes, mut views) = (vec![], 0);
+    for (index, &scene) in list.iter().enumerate() {
+        let dict = match values.get(scene) {
+            Value::Dict(items) => items,
+            other => return Err(format!("scene {index} is {}, expected a dict", other.type_name())),
+        };
+        let fields = Fields { values, archive, dict, index };
+        let images = fields.images()?;
+        views += images.len();
+        if views > max_views {
+            return Err(format!("{views} views or more, for which the file has no room"));
+        }
+        scenes.push(fields.scene(images)?);
+    }
+    Ok(scenes)
+}
+
+/// Entries of a scene. Every error message names the scene and the field.
+struct Fields<'v, 'a> {
+    values: &'v Values<'a>,
+    archive: &'v Archive,
+    dict: &'v [(Id, Id)],
+    index: usize,
+}
+
+impl<'v, 'a> Fields<'v, 'a> {
+    fn name(&self, field: &str) -> String {
+        format!("{field} of scene {}", self.index)
+    }
+
+    fn get(&self, field: &str) -> Result<&'v Value<'a>, String> {
+        self.values.find(self.dict, field).ok_or_else(|| format!("scene {} has no {field}", self.index))
+    }
+
+    fn images(&self) -> Result<&'v [Id], String> {
+        match self.get("images")? {
+            Value::List(items) => Ok(items),
+            other => {
+                Err(format!("{} is {}, expected a list of tensors", self.name("images"), other.type_name()))
+            }
+        }
+    }
+
+    /// Returns `value`, which is in `field`, as an array of one or two dimensions.
+    fn array(&self, field: &str, value: &Value) -> Result<Array, String> {
+        let array = Array::locate(self.values, &self.archive.storages, value)
+            .map_err(|why| format!("{} {why}", self.name(field)))?;
+        match array.shape.len() <= 2 {
+            true => Ok(array),
+            false => Err(format!("{} is no plain tensor", self.name(field))),
+        }
+    }
+
+    fn scene(&self, images: &[Id]) -> Result<Scene, String> {
+        let views = images.len();
+        let cameras = self.array("cameras", self.get("cameras")?)?;
+        if !cameras.dtype.is_float() || cameras.shape != [views, CAMERA_NUMBERS] {
+            let (found, field) = (format!("{} {:?}", cameras.dtype, cameras.shape), self.name("cameras"));
+            let expected = format!("F32 [{views}, {CAMERA_NUMBERS}] for as many images");
+            return Err(format!("{field} is {found}, expected {expected}"));
+        }
+        let timestamps = self.values.find(self.dict, "timestamps");
+        let timestamps = timestamps.map(|value| self.array("timestamps", value)).transpose()?;
+        if let Some(Array { shape, .. }) = timestamps.filter(|timestamps| timestamps.shape != [views]) {
+            let field = self.name("timestamps");
+            return Err(format!("{field} has shape {shape:?}, expected [{views}] for as many images"));
+        }
+        let key = match self.get("key")? {
+            Value::Str(key) => key.to_string(),
+            other => return Err(format!("{} is {}, expected a string", self.name("key"), other.type_name())),
+        };
+        let image = |&id: &Id| match self.array("images", self.values.get(id))? {
+            array if !array.is_contiguous() => Err(format!("{} is no plain tensor", self.name("images"))),
+            Array { dtype: Dtype::U8, shape, bytes, .. } if shape.len() == 1 => Ok(bytes),
+            Array { dtype, shape, .. } => {
+                let (field, found) = (self.name("images"), format!("{dtype} {shape:?}"));
+                Err(format!("an image of {field} is {found}, expected the bytes of a JPEG"))
+            }
+        };
+        let images = images.iter().map(image).collect::<Result<_, String>>()?;
+        Ok(Scene { key, cameras, images })
+    }
+}

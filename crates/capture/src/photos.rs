@@ -1,0 +1,311 @@
+//! Files of photos and masks: the search for those that a capture names, folders of photos without poses, and the order of names.
+
+use crate::pixels::{PHOTO_EXTENSIONS, SUPPORTED_IMAGES, read_image_size};
+use globalsplat_files::{Error, Result};
+use rayon::prelude::*;
+use std::cmp::Ordering;
+use std::collections::BTreeSet;
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
+
+/// Name of the folder of masks, beside or in the folder of photos.
+pub const MASKS_FOLDER: &str = "masks";
+
+/// Reduction factors of the folders of smaller photos that tools create next to `images`: `images_2` and so on.
+const REDUCTIONS: [Option<u32>; 4] = [None, Some(2), Some(4), Some(8)];
+
+/// Maximum number of leading folders of a name that may be skipped.
+const MAX_SKIPPED_FOLDERS: usize = 16;
+
+/// Minimum number of photos of a capture.
+const MIN_PHOTOS: usize = 2;
+
+/// Rule for turning names into paths: below `base`, without the first `skipped` folders, in a folder of smaller photos if
+/// `reduced`.
+#[derive(Clone, Copy)]
+struct Rule<'a> {
+    base: &'a Path,
+    skipped: usize,
+    reduced: Option<u32>,
+}
+
+/// Looks for the photos `names` below `bases` and returns the path of each photo that exists.
+///
+/// A name may come from another machine: with backslashes, without its extension or with one in different case, below a folder that
+/// doesn't exist here, or in `images` when only `images_2`, `images_4` or `images_8` exists. One rule applies to all names: the
+/// first that finds two photos without mapping different names to the same photo.
+pub(crate) fn find_photos(bases: &[PathBuf], names: &[impl AsRef<str>]) -> Vec<Option<PathBuf>> {
+    let deepest = names.iter().map(|name| parts(name.as_ref()).count()).max().unwrap_or(0);
+    let rules = bases.iter().flat_map(|base| {
+        (0..deepest.clamp(1, MAX_SKIPPED_FOLDERS))
+            .flat_map(move |skipped| REDUCTIONS.map(|reduced| Rule { base, skipped, reduced }))
+    });
+    let mut best = (0, vec![None; names.len()]);
+    for rule in rules {
+        let found: Vec<_> = names.iter().map(|name| rule.find(name.as_ref())).collect();
+        let pairs =
+            names.iter().zip(&found).filter_map(|(name, photo)| Some((name.as_ref(), photo.as_ref()?)));
+        let (named, photos): (BTreeSet<&str>, BTreeSet<&PathBuf>) = pairs.unzip();
+        let (count, is_ambiguous) = (photos.len(), photos.len() < named.len());
+        if count > best.0 && !(is_ambiguous && rule.skipped > 0) {
+            best = (count, found);
+            if count >= MIN_PHOTOS {
+                break;
+            }
+        }
+    }
+    best.1
+}
+
+/// Looks for the masks of the photos `names` in `folders`: files with the name of the photo, with the extension of an image added or
+/// in place of its own. Photos of the same name but for the extension share a mask. Returns one path, or `None`, for each photo.
+pub fn find_masks(folders: &[PathBuf], names: &[impl AsRef<str>]) -> Vec<Option<PathBuf>> {
+    if !folders.iter().any(|folder| folder.is_dir()) {
+        return vec![None; names.len()];
+    }
+    let names: Vec<String> = names.iter().map(|name| portable(name.as_ref())).collect();
+    let stem = |name: &String| Path::new(name).with_extension("").to_string_lossy().into_owned();
+    let stems: Vec<String> = names.iter().map(stem).collect();
+    let by_stem = find_photos(folders, &stems);
+    find_photos(folders, &names).into_iter().zip(by_stem).map(|(mask, by_stem)| mask.or(by_stem)).collect()
+}
+
+/// Looks for masks like [`find_masks`] in a folder that has to have some.
+///
+/// # Errors
+/// Fails if the folder can't be read or has no mask for any photo.
+pub fn find_masks_in(folder: &Path, names: &[impl AsRef<str>]) -> Result<Vec<Option<PathBuf>>> {
+    std::fs::read_dir(folder).map_err(Error::read(folder))?;
+    let masks = find_masks(&[folder.to_owned()], names);
+    if masks.iter().all(Option::is_none) {
+        let expected = format!("{}.png", names.first().map_or("photo.jpg", AsRef::as_ref));
+        return Err(Error::input(folder, "the folder", "without a mask for any photo", expected));
+    }
+    Ok(masks)
+}
+
+/// Returns the name with `/` as the separator.
+pub(crate) fn portable(name: &str) -> String {
+    name.replace('\\', "/")
+}
+
+fn parts(name: &str) -> impl Iterator<Item = &str> {
+    name.split(['/', '\\']).filter(|part| !part.is_empty() && *part != ".")
+}
+
+impl Rule<'_> {
+    fn find(&self, name: &str) -> Option<PathBuf> {
+        let as_written = match (self.skipped, self.reduced) {
+            (0, None) if !name.is_empty() => file_at(self.base.join(name)),
+            _ => None,
+        };
+        as_written.or_else(|| {
+            let mut parts = parts(name).skip(self.skipped).peekable();
+            let first = parts.next()?;
+            let mut path = self.base.to_owned();
+            match self.reduced {
+                None => path.push(first),
+                Some(factor) if parts.peek().is_some() => path.push(format!("{first}_{factor}")),
+                Some(_) => return None,
+            }
+            path.extend(parts);
+            file_at(path)
+        })
+    }
+}
+
+/// Returns the file at `path`, or the photo whose name differs only in the case of its extension or has an additional extension.
+fn file_at(path: PathBuf) -> Option<PathBuf> {
+    if path.is_file() {
+        return Some(path);
+    }
+    let extension = path.extension().unwrap_or_default();
+    let recased = [extension.to_ascii_lowercase(), extension.to_ascii_uppercase()];
+    let recased = recased.map(|extension| path.with_extension(extension));
+    let complete = |extension: &str| {
+        let mut path = path.clone().into_os_string();
+        path.push(format!(".{extension}"));
+        PathBuf::from(path)
+    };
+    let extensions = PHOTO_EXTENSIONS.iter();
+    let complete = extensions.flat_map(|known| [complete(known), complete(&known.to_ascii_uppercase())]);
+    recased.into_iter().chain(complete).find(|path| path.is_file())
+}
+
+/// Names of files that systems leave in folders, beside hidden ones.
+const SYSTEM_FILES: [&str; 2] = ["Thumbs.db", "desktop.ini"];
+
+/// The photos in a folder and its subfolders.
+#[derive(Debug)]
+pub struct PhotoList {
+    /// Paths of the photos, with numbers in paths compared by value.
+    pub photos: Vec<PathBuf>,
+    /// Paths of the other files, in the same order.
+    pub others: Vec<PathBuf>,
+    folder: PathBuf,
+}
+
+impl PhotoList {
+    /// Returns a line about the files that are no photos, if there are any.
+    pub fn warning(&self) -> Option<String> {
+        let name = |path: &PathBuf| path.strip_prefix(&self.folder).unwrap_or(path).display().to_string();
+        let names: Vec<String> = self.others.iter().map(name).collect();
+        (!names.is_empty()).then(|| {
+            let (count, all) = (names.len(), names.len() + self.photos.len());
+            format!(
+                "{}: {count} of {all} files are no photos and left out: {}",
+                self.folder.display(),
+                format_names(&names)
+            )
+        })
+    }
+}
+
+/// Lists the photos in `folder` and its subfolders, as COLMAP does.
+///
+/// A photo is a file whose contents begin as those of an image, whatever format its extension names, and whose extension is that of a
+/// photo in any case, or missing. So a text file named `.jpg` is none, and neither is a camera's raw file, whose contents begin as those
+/// of a TIFF. Hidden files and folders, files of the system, and folders named `masks` are ignored.
+///
+/// # Errors
+/// Fails if a folder can't be read, or if there is no photo.
+pub fn list_photos(folder: &Path) -> Result<PhotoList> {
+    let mut files = vec![];
+    collect_files(folder, &mut files)?;
+    files.sort_by(natural_order);
+    let are_photos: Vec<bool> = files.par_iter().map(|file| is_photo(file)).collect();
+    let (mut photos, mut others) = (vec![], vec![]);
+    for (file, is_photo) in files.into_iter().zip(are_photos) {
+        if is_photo { photos.push(file) } else { others.push(file) }
+    }
+    if photos.is_empty() {
+        let found = format!("without photos, of {} files", others.len());
+        return Err(Error::input(folder, "the folder", found, format!("photos, each {SUPPORTED_IMAGES}")));
+    }
+    Ok(PhotoList { photos, others, folder: folder.to_owned() })
+}
+
+/// Adds the files below `folder`. Links to folders count as files, so that no folder is visited twice.
+fn collect_files(folder: &Path, files: &mut Vec<PathBuf>) -> Result<()> {
+    for entry in std::fs::read_dir(folder).map_err(Error::read(folder))? {
+        let entry = entry.map_err(Error::read(folder))?;
+        let name = entry.file_name();
+        if name.as_encoded_bytes().starts_with(b".") || SYSTEM_FILES.iter().any(|system| name == *system) {
+            continue;
+        }
+        match entry.file_type().map_err(Error::read(entry.path()))?.is_dir() {
+            false => files.push(entry.path()),
+            true if name == MASKS_FOLDER => {}
+            true => collect_files(&entry.path(), files)?,
+        }
+    }
+    Ok(())
+}
+
+fn is_photo(file: &Path) -> bool {
+    let is_known =
+        |extension: &str| PHOTO_EXTENSIONS.iter().any(|known| known.eq_ignore_ascii_case(extension));
+    let extension = file.extension().map(|extension| extension.to_string_lossy());
+    // Opening anything but a file, such as a pipe, may block.
+    extension.is_none_or(|extension| is_known(&extension)) && file.is_file() && read_image_size(file).is_ok()
+}
+
+/// Compares names or paths folder by folder. Within a folder's name, runs of digits are compared by their numeric value, however
+/// long, and everything else byte by byte. Leading zeros break ties.
+pub(crate) fn natural_order<Name: AsRef<OsStr> + ?Sized>(a: &Name, b: &Name) -> Ordering {
+    let [mut folders_of_a, mut folders_of_b] =
+        [a, b].map(|name| name.as_ref().as_encoded_bytes().split(|&byte| byte == b'/'));
+    loop {
+        // Compare a folder completely, including zeros, before its contents, so that the contents of different folders never
+        // interleave.
+        match (folders_of_a.next(), folders_of_b.next()) {
+            (Some(a), Some(b)) if a == b => {}
+            (Some(a), Some(b)) => return tokens(a).cmp(tokens(b)).then_with(|| a.cmp(b)),
+            (a, b) => return a.is_some().cmp(&b.is_some()),
+        }
+    }
+}
+
+/// Splits a name into tokens to compare: bytes, and numbers. A number has the byte `0`, its number of digits, and its digits, the
+/// latter two without leading zeros.
+fn tokens(mut rest: &[u8]) -> impl Iterator<Item = (u8, usize, &[u8])> {
+    std::iter::from_fn(move || {
+        let digits = rest.iter().take_while(|byte| byte.is_ascii_digit()).count();
+        let (token, after) = rest.split_at_checked(digits.max(1))?;
+        rest = after;
+        if digits == 0 {
+            return Some((token[0], 0, &token[..0]));
+        }
+        let zeros = token.iter().take_while(|&&digit| digit == b'0').count();
+        Some((b'0', digits - zeros, &token[zeros..]))
+    })
+}
+
+/// Formats the first few of `names` and the number of the remaining ones.
+pub(crate) fn format_names(names: &[impl AsRef<str>]) -> String {
+    const SHOWN: usize = 3;
+    let shown = names.iter().take(SHOWN).map(AsRef::as_ref).collect::<Vec<_>>().join(", ");
+    match names.len().saturating_sub(SHOWN) {
+        0 => shown,
+        more => format!("{shown} and {more} more"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn photos_are_found_however_their_paths_are_written() {
+        let files = ["images/a b (1).png", "images/c.JPG"];
+        let reduced = ["images_8/1/a.png", "images_8/1/b.png", "images_4/1/a.png", "images_4/1/b.png"];
+        let thinned = ["images/a.png", "images/b.png", "images_2/a.png", "images_2/b.png", "images_2/c.png"];
+        type Names<'a> = &'a [&'a str];
+        let cases: [(Names, Names, &[Option<usize>]); 10] = [
+            (&files, &files, &[Some(0), Some(1)]),
+            (&files, &["./images/a b (1)", "images\\c.jpg"], &[Some(0), Some(1)]),
+            (&files, &["C:\\room\\images\\a b (1).png", "C:\\room\\images\\c.JPG"], &[Some(0), Some(1)]),
+            (&files, &["/home/room/images/a b (1).png", "/home/room/images/c.JPG"], &[Some(0), Some(1)]),
+            (&files, &["room/images/a b (1).PNG", "room/images/c"], &[Some(0), Some(1)]),
+            (&["a.png", "b.png"], &["images/a.png", "images/b.png"], &[Some(0), Some(1)]),
+            (&["a.png"], &["", "images"], &[None, None]),
+            (&reduced, &["images/1/a.png", "images/1/b.png"], &[Some(2), Some(3)]),
+            // A photo that was removed from one folder isn't taken from another.
+            (&thinned, &["images/a.png", "images/b.png", "images/c.png"], &[Some(0), Some(1), None]),
+            // One photo isn't that of two names.
+            (&["0.png", "1.png"], &["left/0.png", "right/0.png", "left/1.png"], &[None, None, None]),
+        ];
+        for (files, names, expected) in cases {
+            let folder = tempfile::tempdir().unwrap();
+            let paths: Vec<PathBuf> = files.iter().map(|file| folder.path().join(file)).collect();
+            for path in &paths {
+                std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+                std::fs::write(path, b"").unwrap();
+            }
+            let found = find_photos(&[folder.path().to_owned()], names);
+            let expected: Vec<_> =
+                expected.iter().map(|index| index.map(|index| paths[index].clone())).collect();
+            assert_eq!(found, expected, "{names:?}");
+        }
+    }
+
+    #[test]
+    fn numbers_count_and_folders_stay_together() {
+        let (nines, googol) = ("9".repeat(100), "1".to_string() + &"0".repeat(100));
+        let names = [
+            "", "-", "0", "00", "01", "1", "2.png", "10.png", "0099", &nines, &googol, "a", "a/r_2",
+            "a/r_10", "a/r_10/b", "a 9", "a 10", "a-b/r_1", "a01/d", "a1/c", "a1/d", "a2", "é2", "é10",
+            "写真2", "写真10",
+        ];
+        for (i, &a) in names.iter().enumerate() {
+            assert!(natural_order(a, a).is_eq(), "{a}");
+            for &b in &names[i + 1..] {
+                assert_eq!(
+                    (natural_order(a, b), natural_order(b, a)),
+                    (Ordering::Less, Ordering::Greater),
+                    "{a} {b}"
+                );
+            }
+        }
+    }
+}

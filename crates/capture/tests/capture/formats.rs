@@ -1,0 +1,528 @@
+//! Capture formats: each gives the same cameras and pixels.
+
+use crate::{assert_refused, assert_warns, open_transforms, photos_alone, write_photos};
+use glam::{DMat3, DMat4, DQuat, DVec3};
+use globalsplat_capture::{
+    Camera, Holdout, Intrinsics, find_captures, open_capture, read_image, write_cameras_json,
+};
+use globalsplat_test_kit::formats::{
+    Format, assert_same_cameras, cameras, in_images, names, pinhole, rewrite, transforms,
+    write_colmap_binary, write_colmap_text,
+};
+use globalsplat_test_kit::fox;
+use image::{Rgb, RgbImage};
+use serde_json::{Value, json};
+use std::path::Path;
+use tempfile::TempDir;
+
+/// All formats; `None` is `cameras.json`.
+const FORMATS: [Option<Format>; 4] =
+    [None, Some(Format::Transforms), Some(Format::ColmapText), Some(Format::ColmapBinary)];
+
+/// Writes a capture of [`cameras`] to `folder`.
+fn write_capture(folder: &Path, format: Option<Format>) {
+    write_photos(&folder.join("images"), &names());
+    write_cameras_json(&folder.join("cameras.json"), &in_images(&names()), &cameras()).unwrap();
+    format.into_iter().for_each(|format| rewrite(folder, format));
+}
+
+fn capture_in(format: Option<Format>) -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    write_capture(folder.path(), format);
+    folder
+}
+
+/// Writes a COLMAP model of the first `count` of [`cameras`].
+fn write_model(model: &Path, is_binary: bool, count: usize) {
+    match is_binary {
+        true => write_colmap_binary(model, &names()[..count], &cameras()[..count]),
+        false => write_colmap_text(model, &names()[..count], &cameras()[..count], &pinhole(&cameras()[0])),
+    }
+}
+
+fn names_of_captures(folder: &Path) -> Vec<String> {
+    find_captures(folder).unwrap().captures.into_iter().map(|capture| capture.name).collect()
+}
+
+#[test]
+fn every_format_opens_to_the_same_capture() {
+    let expected = open_capture(capture_in(None).path()).unwrap().load_all(None).unwrap();
+    for format in FORMATS {
+        let folder = capture_in(format);
+        // A file that other tools leave there.
+        std::fs::write(folder.path().join("point_cloud.ply"), b"ply").unwrap();
+        let capture = open_capture(folder.path()).unwrap();
+        assert_same_cameras(&capture, &cameras());
+        for (a, b) in capture.load_all(None).unwrap().iter().zip(&expected) {
+            assert!(a.image == b.image, "{format:?}: {}", a.name);
+        }
+        assert_eq!(capture.name, folder.path().file_name().unwrap().to_str().unwrap());
+    }
+}
+
+#[test]
+fn the_first_of_several_formats_is_chosen() {
+    let folder = capture_in(None);
+    let path = folder.path();
+    open_transforms(path, |_| ()).unwrap();
+    write_model(&path.join("sparse/0"), false, 5);
+    write_model(&path.join("sparse/0"), true, 5);
+    for chosen in ["cameras.json", "transforms.json", "sparse/0/images.bin", "sparse/0/images.txt"] {
+        assert_eq!(open_capture(path).unwrap().file(), path.join(chosen));
+        std::fs::remove_file(path.join(chosen)).unwrap();
+    }
+    let known =
+        ["of no known format", "cameras.json", "transforms_train.json", "sparse/0", "CHUNK.torch#KEY"];
+    assert_refused(open_capture(path), &known);
+}
+
+#[test]
+fn the_first_format_that_can_be_read_is_taken() {
+    let folder = photos_alone();
+    let path = folder.path();
+    // File that 3DGS writes beside its splats.
+    let foreign = r#"[{"id": 0, "img_name": "000", "width": 24, "height": 16, "position": [0, 0, 0]}]"#;
+    std::fs::write(path.join("cameras.json"), foreign).unwrap();
+    let refused = "cameras.json: the file is not a description of cameras";
+    assert_refused(open_capture(path), &[refused]);
+    write_model(&path.join("sparse/0"), false, 5);
+    let capture = open_capture(path).unwrap();
+    assert_same_cameras(&capture, &cameras());
+    assert_warns(&capture, &[refused, "sparse/0/images.txt is read instead"]);
+    std::fs::write(path.join("sparse/0/cameras.txt"), "nonsense").unwrap();
+    assert!(open_capture(path).unwrap_err().is_invalid_request());
+    let parts = ["none of its formats can be read", refused, "cameras.txt: CAMERA_ID in line 1"];
+    assert_refused(open_capture(path), &parts);
+}
+
+#[test]
+fn colmap_models_are_found_where_tools_put_them() {
+    for (place, photos, opened) in [
+        ("sparse/0", "images", ""),
+        ("sparse", "images", ""),
+        ("dense/0/sparse", "dense/0/images", ""),
+        ("dense/sparse", "dense/images", ""),
+        ("", "images", ""),
+        ("", "", ""),
+        ("sparse/0", "images", "sparse/0"),
+        ("sparse", "images", "sparse"),
+    ] {
+        for is_binary in [false, true] {
+            let folder = tempfile::tempdir().unwrap();
+            write_photos(&folder.path().join(photos), &names());
+            write_model(&folder.path().join(place), is_binary, 5);
+            let capture = open_capture(&folder.path().join(opened)).unwrap();
+            assert_same_cameras(&capture, &cameras());
+            assert!(capture.warnings().is_empty() && capture.load_all(None).unwrap()[4].name == "004.png");
+        }
+    }
+}
+
+#[test]
+fn of_several_models_the_largest_is_taken() {
+    for (small, large) in [
+        ("sparse/0", "sparse/1"),
+        ("sparse/2", "sparse/10"),
+        ("sparse", "sparse/1"),
+        ("sparse/0", "colmap/sparse/3"),
+    ] {
+        let folder = photos_alone();
+        write_model(&folder.path().join(large), false, 5);
+        write_model(&folder.path().join(small), true, 2);
+        let capture = open_capture(folder.path()).unwrap();
+        assert_same_cameras(&capture, &cameras());
+        let left_out = format!("{small} (2 photos)");
+        assert_warns(&capture, &["the largest of 2 models is taken, with 5 photos", &left_out]);
+    }
+    // The path `sparse` itself opens the same capture.
+    let folder = photos_alone();
+    for (model, count) in [("sparse/0", 2), ("sparse/1", 5), ("sparse/2", 5)] {
+        write_model(&folder.path().join(model), true, count);
+    }
+    let capture = open_capture(&folder.path().join("sparse")).unwrap();
+    assert!(capture.len() == 5 && capture.file().ends_with("sparse/1/images.bin"));
+}
+
+#[test]
+fn captures_are_found_in_numeric_order() {
+    use std::os::unix::fs::PermissionsExt;
+    let above = tempfile::tempdir().unwrap();
+    let place = |name: &str| above.path().join(name);
+    for (name, format) in ["scene_10", "below/1", "scene_9", "below/0"].iter().zip(FORMATS) {
+        write_capture(&place(name), format);
+    }
+    // Left by interrupted work, or hidden.
+    for name in [".scene_9.globalsplat-partial", ".scene_9.globalsplat-old", ".hidden/room"] {
+        write_capture(&place(name), None);
+    }
+    std::fs::create_dir(place("closed")).unwrap();
+    std::fs::set_permissions(place("closed"), std::fs::Permissions::from_mode(0o0)).unwrap();
+    assert_eq!(names_of_captures(above.path()), ["0", "1", "scene_9", "scene_10"]);
+    // A user who may read everything, such as root, gets no warning.
+    let warnings = find_captures(above.path()).unwrap().warnings;
+    match std::fs::read_dir(place("closed")) {
+        Ok(_) => assert!(warnings.is_empty()),
+        Err(_) => assert!(warnings.len() == 1 && warnings[0].contains("closed can't be read")),
+    }
+    // Numbered models with their photos are captures, not models of one capture.
+    let numbered = tempfile::tempdir().unwrap();
+    for name in ["0", "1"] {
+        write_photos(&numbered.path().join(name), &names());
+        write_model(&numbered.path().join(name), true, 5);
+    }
+    assert_eq!(names_of_captures(numbered.path()), ["0", "1"]);
+}
+
+#[test]
+fn views_are_in_numeric_order() {
+    let names: Vec<String> = (1..=12).map(|i| format!("r_{i}.png")).collect();
+    let shuffled = in_images(&[6, 1, 9, 0, 11, 4, 2, 10, 8, 3, 7, 5].map(|i: usize| names[i].clone()));
+    let poses: Vec<_> = cameras().into_iter().cycle().take(names.len()).collect();
+    for format in FORMATS {
+        let folder = tempfile::tempdir().unwrap();
+        write_photos(&folder.path().join("images"), &names);
+        write_cameras_json(&folder.path().join("cameras.json"), &shuffled, &poses).unwrap();
+        format.into_iter().for_each(|format| rewrite(folder.path(), format));
+        let capture = open_capture(folder.path()).unwrap();
+        let found: Vec<String> = capture.names().map(|name| name.replace("images/", "")).collect();
+        // That of the file, for `cameras.json`.
+        let expected = if format.is_none() {
+            shuffled.iter().map(|name| name[7..].to_string()).collect()
+        } else {
+            names.clone()
+        };
+        assert_eq!(found, expected, "{format:?}");
+    }
+}
+
+fn remove(value: &mut Value, keys: &[&str]) {
+    for key in keys {
+        value.as_object_mut().unwrap().remove(*key).expect("a key that was there");
+    }
+}
+
+/// Returns the angle of view of `size` pixels with a focal length.
+fn angle(size: f64, focal: f64) -> Value {
+    json!(2. * (size / 2. / focal).atan())
+}
+
+#[test]
+fn transforms_specify_intrinsics_in_several_ways() {
+    let original = cameras()[0].intrinsics;
+    let Intrinsics { cx, cy, .. } = original;
+    let with_focal = |fx: f64, fy: f64| Intrinsics { fx, fy, cx, cy };
+    type Change = fn(&mut Value);
+    let angles: Change = |t| {
+        remove(t, &["fl_x", "fl_y"]);
+        (t["camera_angle_x"], t["camera_angle_y"]) = (angle(24., 21.5), angle(16., 20.25));
+    };
+    // One angle of view, no principal point or size, and the names of NeRF's synthetic scenes.
+    let synthetic: Change = |t| {
+        remove(t, &["fl_x", "fl_y", "cx", "cy", "w", "h"]);
+        t["camera_angle_x"] = angle(24., 30.);
+        for (i, frame) in t["frames"].as_array_mut().unwrap().iter_mut().enumerate() {
+            frame["file_path"] = json!(format!("./images/{i:03}"));
+        }
+    };
+    // A frame's own fields override the shared ones, focal lengths override angles.
+    let own: Change = |t| {
+        t["camera_angle_x"] = json!(1.);
+        remove(t, &["fl_y"]);
+        (t["frames"][2]["fl_x"], t["frames"][2]["cx"]) = (json!(33.), json!(10.));
+    };
+    // An angle of a frame overrides a focal length of all frames.
+    let own_angles: Change = |t| {
+        for frame in t["frames"].as_array_mut().unwrap() {
+            frame["camera_angle_x"] = angle(24., 30.);
+        }
+        t["frames"][3]["camera_angle_y"] = angle(16., 25.);
+        t["frames"][4]["fl_x"] = json!(40.);
+    };
+    let keys_of_other_tools: Change = |t| {
+        t["applied_transform"] = json!([[0., 1., 0., 3.], [1., 0., 0., 0.], [0., 0., -1., 0.]]);
+        t["ply_file_path"] = json!("sparse_pc.ply");
+        (t["camera_model"], t["is_fisheye"]) = (json!("OpenCV"), json!(false));
+        (t["frames"][0]["colmap_im_id"], t["frames"][0]["sharpness"]) = (json!(1), json!(30.5));
+    };
+    let (equal, wide) = (with_focal(21.5, 21.5), with_focal(30., 30.));
+    for (change, expected) in [
+        (angles, [original; 5]),
+        (synthetic, [Intrinsics { fx: 30., fy: 30., cx: 12., cy: 8. }; 5]),
+        (own, [equal, equal, Intrinsics { cx: 10., ..with_focal(33., 33.) }, equal, equal]),
+        (own_angles, [wide, wide, wide, with_focal(30., 25.), with_focal(40., 40.)]),
+        (keys_of_other_tools, [original; 5]),
+    ] {
+        let cameras = cameras().into_iter().zip(expected);
+        let expected: Vec<_> = cameras.map(|(camera, intrinsics)| Camera { intrinsics, ..camera }).collect();
+        assert_same_cameras(&open_transforms(photos_alone().path(), change).unwrap(), &expected);
+    }
+    // The second frame has its own coefficients, all 0.
+    let folder = photos_alone();
+    let views = |change: Change| open_transforms(folder.path(), change).unwrap().load(&[0, 1], None).unwrap();
+    let undistorted = views(|_| ());
+    let distorted = views(|t| (t["k1"], t["frames"][1]["k2"]) = (json!(-0.2), json!(0.)));
+    assert!(distorted[0].image != undistorted[0].image && distorted[1].image == undistorted[1].image);
+}
+
+#[test]
+fn rounded_poses_become_rigid() {
+    let entries = |matrix: &mut Value, rows: usize, change: &dyn Fn(f64) -> f64| {
+        for row in matrix.as_array_mut().unwrap().iter_mut().take(rows) {
+            let entries = row.as_array_mut().unwrap().iter_mut().take(rows);
+            entries.for_each(|entry| *entry = json!(change(entry.as_f64().unwrap())));
+        }
+    };
+    let folder = photos_alone();
+    let capture = open_transforms(folder.path(), |t| {
+        entries(&mut t["frames"][1]["transform_matrix"], 4, &|entry| (entry * 1e3).round() / 1e3);
+    });
+    let (found, exact) = (capture.unwrap().cameras()[1].c2w, cameras()[1].c2w);
+    assert!(!found.abs_diff_eq(exact, 1e-5) && found.abs_diff_eq(exact, 2e-3));
+    let rotation = DMat3::from_mat4(found);
+    assert!(
+        (rotation.transpose() * rotation).abs_diff_eq(DMat3::IDENTITY, 1e-14) && rotation.determinant() > 0.
+    );
+
+    // A scale is taken out, and a line says so.
+    for factor in [0.5, 1.002, 1e-4, 300.] {
+        let capture = open_transforms(folder.path(), |t| {
+            let frames = t["frames"].as_array_mut().unwrap().iter_mut();
+            frames.for_each(|frame| entries(&mut frame["transform_matrix"], 3, &|entry| entry * factor));
+        });
+        let capture = capture.unwrap();
+        assert_same_cameras(&capture, &cameras());
+        assert_warns(&capture, &["5 of 5 rotations are scaled", "taken out", "images/000.png", "and 2 more"]);
+    }
+    let folder = capture_in(None);
+    let file = folder.path().join("cameras.json");
+    let mut contents: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    entries(&mut contents["views"][1]["c2w"], 3, &|entry| entry * 2.);
+    std::fs::write(&file, contents.to_string()).unwrap();
+    let capture = open_capture(&file).unwrap();
+    assert_same_cameras(&capture, &cameras());
+    assert_warns(&capture, &["1 of 5 rotations are scaled, the first by 2.0", "images/001.png"]);
+}
+
+#[test]
+fn a_real_capture_with_a_lens_opens() {
+    let Some(fox) = fox() else { return };
+    let capture = open_capture(&fox).unwrap();
+    assert_eq!((capture.name.as_str(), capture.len()), ("fox", 50));
+    let cameras = capture.cameras();
+    for camera in &cameras {
+        assert_eq!((camera.width, camera.height), (1080, 1920));
+        assert_eq!(camera.intrinsics, Intrinsics { fx: 1375.52, fy: 1374.49, cx: 554.558, cy: 965.268 });
+    }
+    // All cameras look at the fox: the point nearest to all optical axes, Σ(I − zzᵀ)(p − c) = 0, is in the middle of every
+    // photo.
+    let (mut a, mut b) = (DMat3::ZERO, DVec3::ZERO);
+    for camera in &cameras {
+        let (z, c) = (camera.c2w.z_axis.truncate(), camera.c2w.w_axis.truncate());
+        let across = DMat3::IDENTITY - DMat3::from_cols(z * z.x, z * z.y, z * z.z);
+        (a, b) = (a + across, b + across * c);
+    }
+    let middle = a.inverse() * b;
+    for camera in &cameras {
+        let p = camera.c2w.inverse().transform_point3(middle);
+        assert!(p.z > 1. && (p.x / p.z).abs() < 0.4 && (p.y / p.z).abs() < 0.7, "{p}");
+        // The photos are upright: the world's up, z, is up in the photo.
+        assert!(camera.c2w.y_axis.z < -0.5, "{}", camera.c2w);
+    }
+    let stored = read_image(&fox.join("images/0001.jpg")).unwrap();
+    let view = &capture.load(&[0], None).unwrap()[0];
+    assert_eq!(view.image.size(), (1920, 1080));
+    let levels = view.image.to_rgb().into_raw().into_iter().zip(stored.into_raw());
+    let moved = levels.map(|(a, b)| f64::from(a.abs_diff(b))).sum::<f64>() / (3. * 1920. * 1080. * 255.);
+    assert!(moved > 0.002 && moved < 0.1, "the lens moves pixels a little: {moved}");
+}
+
+#[test]
+fn missing_photos_are_left_out_with_a_warning() {
+    for format in FORMATS {
+        let folder = capture_in(format);
+        assert!(open_capture(folder.path()).unwrap().warnings().is_empty());
+        std::fs::remove_file(folder.path().join("images/002.png")).unwrap();
+        let capture = open_capture(folder.path()).unwrap();
+        let mut expected = cameras();
+        expected.remove(2);
+        assert_same_cameras(&capture, &expected);
+        assert!(!capture.is_complete());
+        assert_warns(&capture, &["1 of 5 photos are missing", "left out", "002.png"]);
+        for name in ["000", "001", "003"] {
+            std::fs::remove_file(folder.path().join(format!("images/{name}.png"))).unwrap();
+        }
+        let parts = ["the number of frames with an image is 1 of 5", "is missing, expected two or more"];
+        assert_refused(open_capture(folder.path()), &parts);
+    }
+}
+
+#[test]
+fn cameras_are_scaled_to_smaller_and_larger_photos() {
+    let save = |width: u32, height: u32, file: &Path| {
+        let photo = RgbImage::from_fn(width, height, |x, y| Rgb([(x * 9) as u8, (y * 12) as u8, 7]));
+        photo.save(file).unwrap();
+    };
+    for format in FORMATS.into_iter().flatten() {
+        for folder_name in ["images", "images_2", "images_4"] {
+            let folder = capture_in(Some(format));
+            std::fs::remove_dir_all(folder.path().join("images")).unwrap();
+            let images = folder.path().join(folder_name);
+            std::fs::create_dir(&images).unwrap();
+            let mut expected = cameras();
+            let sizes = [(24, 16), (12, 8), (48, 32), (6, 4), (12, 8)];
+            for ((name, camera), (width, height)) in names().iter().zip(&mut expected).zip(sizes) {
+                save(width, height, &images.join(name));
+                let factor = f64::from(width) / 24.;
+                let intrinsics = camera.intrinsics.resized(factor, factor);
+                *camera = Camera { width, height, intrinsics, ..*camera };
+            }
+            let capture = open_capture(folder.path()).unwrap();
+            assert_same_cameras(&capture, &expected);
+            assert_warns(&capture, &["4 of 5 photos", "12×8 pixels in place of 24×16", "scaled", "001.png"]);
+            assert_eq!(capture.load(&[3], None).unwrap()[0].image.size(), (4, 6));
+        }
+    }
+    // A photo of another aspect ratio is refused, by its name.
+    let folder = capture_in(Some(Format::ColmapText));
+    save(12, 12, &folder.path().join("images/001.png"));
+    assert_refused(open_capture(folder.path()).unwrap().load_all(None), &["001.png", "12×12 pixels"]);
+}
+
+/// COLMAP's names may have subfolders, spaces, parentheses and backslashes.
+#[test]
+fn names_are_found_however_they_are_written() {
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["left/0 (1).png", "a plan (2)/b.png"] {
+        let all: Vec<String> = (0..5).map(|i| name.replace('.', &format!(" {i}."))).collect();
+        write_photos(&folder.path().join("images"), &all);
+        for spelled in [all.clone(), all.iter().map(|name| name.replace('/', "\\")).collect()] {
+            write_colmap_text(&folder.path().join("sparse/0"), &spelled, &cameras(), &pinhole(&cameras()[0]));
+            let capture = open_capture(folder.path()).unwrap();
+            assert_same_cameras(&capture, &cameras());
+            assert!(capture.names().eq(&all) && capture.warnings().is_empty());
+        }
+    }
+}
+
+#[test]
+fn the_synthetic_layout_has_views_to_learn_from_and_views_to_hold_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    for (part, count) in [("train", 3), ("test", 2)] {
+        write_photos(&path.join(part), &names());
+        let images: Vec<String> = (0..count).map(|i| format!("./{part}/{i:03}")).collect();
+        let mut contents = transforms(&images, &cameras());
+        remove(&mut contents, &["fl_x", "fl_y", "cx", "cy", "w", "h"]);
+        contents["camera_angle_x"] = angle(24., 30.);
+        std::fs::write(path.join(format!("transforms_{part}.json")), contents.to_string()).unwrap();
+    }
+    let capture = open_capture(path).unwrap();
+    assert_eq!((capture.len(), capture.has_test_part()), (5, true));
+    assert!(capture.warnings().is_empty(), "{:?}", capture.warnings());
+    assert_eq!(capture.split(Holdout::None), (vec![0, 1, 2], vec![3, 4]));
+    assert_eq!(capture.split("every:3+1".parse().unwrap()), (vec![0, 2], vec![1]));
+    assert_eq!(capture.scored_views(), [3, 4]);
+    assert_eq!(capture.names().nth(3), Some("./test/000"));
+    // Each file alone is a capture without splits.
+    let alone = open_capture(&path.join("transforms_train.json")).unwrap();
+    assert_eq!((alone.len(), alone.has_test_part()), (3, false));
+    assert_eq!(find_captures(path).unwrap().captures.len(), 1);
+    // Without its photos, the test split is missing.
+    std::fs::remove_dir_all(path.join("test")).unwrap();
+    let capture = open_capture(path).unwrap();
+    assert!(!capture.has_test_part());
+    assert_warns(&capture, &["transforms_test.json", "2 of 2 photos are missing"]);
+}
+
+#[test]
+fn nerfstudios_lists_of_filenames_hold_photos_out() {
+    let folder = photos_alone();
+    let images = in_images(&names());
+    let open = |held_out: Value| {
+        open_transforms(folder.path(), |t| {
+            (t["train_filenames"], t["val_filenames"]) = (json!(images[..2]), held_out);
+        })
+    };
+    let capture = open(json!([format!("./{}", images[3])])).unwrap();
+    assert_eq!(capture.split(Holdout::None), (vec![0, 1], vec![2]));
+    assert_eq!(capture.names().collect::<Vec<_>>(), [&images[0], &images[1], &images[3]]);
+    assert_warns(&capture, &["transforms.json", "2 frames are left out"]);
+    assert_refused(open(json!([1])), &["val_filenames", "a list of file_paths"]);
+}
+
+#[test]
+fn cameras_without_images_do_no_harm() {
+    let folder = photos_alone();
+    let model = folder.path().join("sparse/0");
+    let open = || open_capture(folder.path());
+    write_model(&model, false, 5);
+    let cameras_text = std::fs::read_to_string(model.join("cameras.txt")).unwrap();
+    for unused in ["8 OPENCV_FISHEYE 24 16 1 1 1 1 0 0 0 0", "9 A_MODEL_TO_COME 0 0 1"] {
+        std::fs::write(model.join("cameras.txt"), format!("{unused}\n{cameras_text}")).unwrap();
+        assert_same_cameras(&open().unwrap(), &cameras());
+    }
+    write_model(&model, true, 5);
+    let cameras_bytes = std::fs::read(model.join("cameras.bin")).unwrap();
+    // COLMAP's EUCM, which has six parameters.
+    let (model_number, parameters) = (16i32, 8f64.to_le_bytes().repeat(6));
+    let camera = |id: u32| {
+        let head =
+            [&id.to_le_bytes()[..], &model_number.to_le_bytes(), &24u64.to_le_bytes(), &16u64.to_le_bytes()];
+        [head.concat(), parameters.clone()].concat()
+    };
+    let unused = [&2u64.to_le_bytes()[..], &camera(8), &cameras_bytes[8..]].concat();
+    std::fs::write(model.join("cameras.bin"), unused).unwrap();
+    assert_same_cameras(&open().unwrap(), &cameras());
+    std::fs::write(model.join("cameras.bin"), [&1u64.to_le_bytes()[..], &camera(7)].concat()).unwrap();
+    assert_refused(open(), &["of camera 7 is", "alpha from 0 to 1"]);
+}
+
+/// The model has poses of photos, frames of a rig, and the rig's poses of its cameras, as COLMAP has written them since 3.12.
+#[test]
+fn a_model_with_a_rig_has_the_poses_of_its_photos() {
+    let pose = |[w, x, y, z]: [f64; 4], translation: [f64; 3]| {
+        DMat4::from_rotation_translation(DQuat::from_xyzw(x, y, z, w).normalize(), translation.into())
+    };
+    // As in the model, which pycolmap 4.2.1 wrote.
+    let right_from_left = pose([0.9, 0.1, 0.2, -0.3], [0.3, -0.1, 0.2]);
+    let (mut expected, mut photos) = (vec![], vec![]);
+    for (side, focal) in [("left", 21.5), ("right", 23.)] {
+        for number in 0..3 {
+            photos.push(format!("{side}/{number}.png"));
+            let t = f64::from(number);
+            let left_from_world = pose([0.8, 0.3 * t, -0.2, 0.1 * t], [t, 0.5 * t, 1. - t]);
+            let w2c = if side == "left" { left_from_world } else { right_from_left * left_from_world };
+            let intrinsics = Intrinsics { fx: focal, ..cameras()[0].intrinsics };
+            expected.push(Camera { intrinsics, c2w: w2c.inverse(), ..cameras()[0] });
+        }
+    }
+    for form in ["bin", "txt"] {
+        let folder = tempfile::tempdir().unwrap();
+        let model = folder.path().join("sparse/0");
+        std::fs::create_dir_all(&model).unwrap();
+        for name in ["cameras", "images", "frames", "rigs"].map(|name| format!("{name}.{form}")) {
+            let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/rig").join(&name);
+            std::fs::copy(data, model.join(name)).unwrap();
+        }
+        write_photos(&folder.path().join("images"), &photos);
+        assert_same_cameras(&open_capture(folder.path()).unwrap(), &expected);
+    }
+}
+
+/// Files may begin with a byte order mark, and have the line ends of Windows, spaces at line ends and numbers in other forms.
+#[test]
+fn text_is_read_as_every_system_writes_it() {
+    for (format, files) in [
+        (None, &["cameras.json"][..]),
+        (Some(Format::Transforms), &["transforms.json"]),
+        (Some(Format::ColmapText), &["sparse/0/cameras.txt", "sparse/0/images.txt"]),
+    ] {
+        let folder = capture_in(format);
+        for file in files.iter().map(|file| folder.path().join(file)) {
+            let text = std::fs::read_to_string(&file).unwrap().replace("21.5 20.25", "2.15e+001 2025.0e-002");
+            let ending = if file.extension().unwrap() == "txt" { " \t\r\n" } else { "\r\n" };
+            std::fs::write(&file, "\u{feff}".to_string() + text.replace('\n', ending).trim_end()).unwrap();
+        }
+        assert_same_cameras(&open_capture(folder.path()).unwrap(), &cameras());
+    }
+}
