@@ -7,8 +7,8 @@ Prints mean ± standard deviation.
 
 Renders four synthetic scenes, and trains each variant on two thirds of every video's frames; the held-out third scores
 it. The model is that of configs/tiny.toml, with larger patches, fewer scene tokens and the paper's consistency loss.
-Runs are in OUT (by default runs/ablations), as many in parallel as there are cores. Prints two Markdown tables: final
-scores and learning curves. The same command resumes where it was stopped, and does not repeat completed runs. After a
+Runs are in OUT (by default runs/ablations), as many in parallel as there are cores. Prints a Markdown table of the
+scores. The same command resumes where it was stopped, and does not repeat completed runs. After a
 change to configs/tiny.toml, or to the settings, variants or scenes in this file, OUT must be another folder.
 """
 
@@ -21,8 +21,8 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from core_runs import PROGRAM, REPOSITORY, row, train
-
+REPOSITORY = Path(__file__).resolve().parents[1]
+PROGRAM = REPOSITORY / "target/release/globalsplat"
 CONFIG = REPOSITORY / "configs/tiny.toml"
 # Settings of all variants. Small patches, many scene tokens and Muon only suit weights trained with large patches and
 # few tokens first.
@@ -65,8 +65,25 @@ VARIANTS = {
     "depths, fitted colors": ["data.depths=true", "data.color_steps=20"],
     "full model, bf16": ["train.precision=bf16"],
 }
-# Number of equal parts of a run over which its curve is averaged.
-PARTS = 6
+
+
+def train(run, settings, scenes):
+    """Trains a run on one core and returns its JSON result, cached in `result.json`."""
+    result = run / "result.json"
+    if not result.is_file():
+        command = [PROGRAM, "train", "--config", CONFIG, "--out", run, "--json"]
+        command += [argument for setting in settings for argument in ("--set", setting)]
+        environment = dict(os.environ, OMP_NUM_THREADS="1", GLOBALSPLAT_WORLDS=str(scenes))
+        output = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True).stdout
+        partial = result.with_suffix(".partial")
+        partial.write_bytes(output)
+        partial.rename(result)
+    return json.loads(result.read_text())
+
+
+def row(*cells):
+    """Prints a row of a Markdown table."""
+    print("|", " | ".join(cells), "|", flush=True)
 
 
 def run_folder(out, name, seed):
@@ -78,22 +95,6 @@ def format_recipe():
     variants = [f"{name}: {settings}" for name, settings in VARIANTS.items()]
     lines = [*SETTINGS, *variants, f"synth {' '.join(SYNTH_OPTIONS)}"]
     return CONFIG.read_text() + "".join(f"# {line}\n" for line in lines)
-
-
-def read_curve(out, name, seeds):
-    """Returns the number of steps, and the training PSNR in dB of each of PARTS equal parts of the runs.
-
-    The PSNR is averaged over a part's steps and the seeds.
-    """
-    parts = [[] for _ in range(PARTS)]
-    for seed in range(seeds):
-        text = (run_folder(out, name, seed) / "metrics.jsonl").read_text()
-        lines = [json.loads(line) for line in text.splitlines()]
-        lines = [line for line in lines if "validation" not in line and not line["skipped"]]
-        steps = lines[-1]["step"] + 1
-        for line in lines:
-            parts[line["step"] * PARTS // steps].append(line["psnr"])
-    return steps, [statistics.mean(part) for part in parts]
 
 
 def main():
@@ -114,12 +115,11 @@ def main():
     with ThreadPoolExecutor(os.cpu_count()) as pool:
 
         def run(name, seed):
-            settings = [*SETTINGS, *VARIANTS[name], f"train.seed={seed}"]
-            return train(run_folder(out, name, seed), CONFIG, settings, GLOBALSPLAT_WORLDS=str(scenes))
+            return train(run_folder(out, name, seed), [*SETTINGS, *VARIANTS[name], f"train.seed={seed}"], scenes)
 
         results = {name: [pool.submit(run, name, seed) for seed in range(seeds)] for name in arguments.only}
-        row("variant", "held-out PSNR, dB", "SSIM", "CPU seconds")
-        row(*["---"] * 4)
+        row("variant", "held-out PSNR, dB", "SSIM")
+        row(*["---"] * 3)
         for name in arguments.only:
             try:
                 runs = [result.result() for result in results[name]]
@@ -127,21 +127,12 @@ def main():
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
             psnr, ssim = ([run["held_out"][key] for run in runs] for key in ("psnr", "ssim"))
-            seconds = statistics.mean(run["core_seconds"] for run in runs)
             spread = f"{statistics.mean(psnr):.2f} ± {statistics.stdev(psnr):.2f}" if seeds > 1 else f"{psnr[0]:.2f}"
-            row(name, spread, f"{statistics.mean(ssim):.4f}", f"{seconds:.0f}")
+            row(name, spread, f"{statistics.mean(ssim):.4f}")
     # All runs have the same values, because the baseline depends on the photos alone.
     held_out = runs[0]["held_out"]
     psnr, ssim = held_out["nearest_photo_psnr"], held_out["nearest_photo_ssim"]
-    row("nearest context photo (baseline)", f"{psnr:.2f}", f"{ssim:.4f}", "")
-
-    print()
-    for position, name in enumerate(arguments.only):
-        steps, psnr = read_curve(out, name, seeds)
-        if position == 0:
-            row("training PSNR (dB), up to step", *(str(steps * (part + 1) // PARTS) for part in range(PARTS)))
-            row(*["---"] * (PARTS + 1))
-        row(name, *(f"{value:.2f}" for value in psnr))
+    row("nearest context photo (baseline)", f"{psnr:.2f}", f"{ssim:.4f}")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@
 #                                        folder with a space that only its owner may write to, in another language and time zone,
 #                                        without standard input; then the demo at a reduced size
 #   scripts/other_machines.sh small      tests of numerical code, on one core with SSE2
-#   scripts/other_machines.sh ordinary view splat    only view.rs and splat.rs of the `ordinary` tests
+#   scripts/other_machines.sh ordinary view:: splat::    only these modules of the `ordinary` tests, without the demo
 # Fails at the end if a test failed. If run as root, it makes the folders above the repository accessible to other users until it ends.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -23,68 +23,25 @@ end() {
 }
 trap end EXIT
 
-# The tests given by name, or all if none is given: a file tests/*/NAME.rs, or lib and main, the unit tests of the library and the program.
-chosen=("${@:2}")
-for name in "${chosen[@]}"; do
-    [[ " lib main " == *" $name "* ]] || compgen -G "tests/*/$name.rs" >/dev/null || compgen -G "crates/*/tests/$name.rs" >/dev/null || {
-        echo "other_machines: there is no test $name, expected lib, main or the name of a file in a folder of tests/" >&2
-        exit 2
-    }
-done
 built="$("${CARGO:-cargo}" test --release --locked --workspace --no-run 2>&1)" || {
     echo "$built" >&2
     exit 1
 }
-# One line per test binary: its name (lib and main for unit tests, the name of a folder in tests/, or file: and the name of a file in the
-# tests/ of a crate) and its path.
-tests="$(sed -nE \
-    -e 's#^ *Executable unittests src/(lib|main)\.rs \((.*)\)$#\1 \2#p' \
-    -e 's#^ *Executable tests/([a-z]+)/main\.rs \((.*)\)$#\1 \2#p' \
-    -e 's#^ *Executable tests/([a-z_]+)\.rs \((.*)\)$#file:\1 \2#p' <<<"$built")"
-
-# Tests that do not depend on these conditions and are slow: output of compilers and other programs, reductions across processes. They run
-# here only if given by name.
-alike=(cuda distributed viewers)
+# Paths of the test binaries, those with unit tests first.
+unit_tests="$(sed -nE 's#^ *Executable unittests src/[^ ]+ \((.*)\)$#\1#p' <<<"$built")"
+integration_tests="$(sed -nE 's#^ *Executable tests/[^ ]+ \((.*)\)$#\1#p' <<<"$built")"
 
 failed=()
-# Runs the tests $2…, or all tests, with the command $1, limited to the chosen ones. Prints the missing requirements of skipped tests.
+# Runs the test binaries $2 with the command $1 and the arguments $3…, and prints the missing requirements of skipped tests.
 run() {
-    local as=$1 name binary filters ran=false
-    shift
+    local as=$1 binaries=$2 binary
+    shift 2
     : >"$GLOBALSPLAT_SKIPPED"
     chmod a+rw "$GLOBALSPLAT_SKIPPED"
-    while read -r name binary; do
-        filters=()
-        case "$name" in
-        lib | main | file:*)
-            [[ $# -eq 0 || " $* " == *" ${name#file:} "* ]] || continue
-            [[ ${#chosen[@]} -eq 0 || " ${chosen[*]} " == *" ${name#file:} "* ]] || continue
-            ;;
-        *)
-            local file module
-            for file in tests/"$name"/*.rs; do
-                module="$(basename "$file" .rs)"
-                [[ $module != main ]] || continue
-                [[ $# -eq 0 || " $* " == *" $module "* ]] || continue
-                if [ ${#chosen[@]} -gt 0 ]; then
-                    [[ " ${chosen[*]} " == *" $module "* ]] || continue
-                else
-                    [[ " ${alike[*]} " != *" $module "* ]] || continue
-                fi
-                filters+=("$module::")
-            done
-            [ ${#filters[@]} -gt 0 ] || continue
-            ;;
-        esac
-        [ "${binary:0:1}" = / ] || binary="$repository/$binary"
-        echo "$as: $name ${filters[*]}"
-        ran=true
-        "$as" "$binary" --quiet "${filters[@]}" </dev/null || failed+=("$as: $name")
-    done <<<"$tests"
-    $ran || {
-        echo "other_machines: $as has no test named ${chosen[*]}" >&2
-        exit 2
-    }
+    for binary in $binaries; do
+        echo "$as: ${binary##*/} $*"
+        "$as" "$(realpath "$binary")" --quiet "$@" </dev/null || failed+=("$as: ${binary##*/}")
+    done
     [ ! -s "$GLOBALSPLAT_SKIPPED" ] || echo "$as: skipped, missing: $(sort -u "$GLOBALSPLAT_SKIPPED" | paste -sd , | sed 's/,/, /g')"
 }
 
@@ -135,19 +92,23 @@ run_ordinary() {
         echo "as_ordinary: without torchrun, because this user can't run .venv/bin/python"
         local -x TORCHRUN=/nonexistent
     }
-    run as_ordinary
-    [ ${#chosen[@]} -eq 0 ] || return 0
+    if [ $# -gt 0 ]; then
+        run as_ordinary "$unit_tests $integration_tests" "$@"
+        return
+    fi
+    # Slow tests that don't depend on these conditions are left out: output of compilers and other programs, reductions across processes.
+    run as_ordinary "$unit_tests $integration_tests" --skip cuda:: --skip distributed:: --skip viewers::
     echo "as_ordinary: demo"
     OUT="$folder/a folder/tmp/demo" CAPTURES=none as_ordinary scripts/demo.sh --dry-run || failed+=("as_ordinary: demo")
 }
 
 run_small() {
-    run as_small lib splat model refine examples
+    run as_small "$unit_tests"
+    run as_small "$integration_tests" splat:: model:: refine:: examples::
 }
 
 case "${1:-all}" in
-ordinary) run_ordinary ;;
-small) run_small ;;
+ordinary | small) "run_$1" "${@:2}" ;;
 all)
     run_ordinary
     run_small

@@ -17,19 +17,56 @@ import argparse
 import json
 import shlex
 import statistics
+import subprocess
 from pathlib import Path
+from zlib import crc32
 
-from core_runs import refined, row, told, told_once
+PROGRAM = Path(__file__).resolve().parents[1] / "target/release/globalsplat"
 
 # Quantiles of Student's t distribution for 95 % confidence, by the number of samples.
 STUDENT = {2: 12.71, 3: 4.30, 4: 3.18, 5: 2.78, 6: 2.57, 7: 2.45, 8: 2.36}
+
+
+def run(*command):
+    """Runs a command of the program and returns its JSON output."""
+    return json.loads(subprocess.run([PROGRAM, *command, "--json"], stdout=subprocess.PIPE, check=True).stdout)
+
+
+def identity(command):
+    """Returns a command's arguments, and a checksum of the files that they refer to, except the argument of --out."""
+    inputs = [
+        Path(str(argument)) for before, argument in zip(("", *command), command, strict=False) if before != "--out"
+    ]
+    checksum = 0
+    for file in (file for path in inputs for file in sorted([path, *path.rglob("*")]) if file.is_file()):
+        with file.open("rb") as opened:
+            while block := opened.read(1 << 20):
+                checksum = crc32(block, checksum)
+    return [*map(str, command), f"{checksum:08x}"]
+
+
+def run_once(file, *command):
+    """Returns the JSON output of a command, cached in `file` for the same arguments and inputs."""
+    of = identity(command)
+    kept = json.loads(file.read_text()) if file.is_file() else {}
+    if kept.get("of") != of:
+        kept = {"of": of, "told": run(*command)}
+        partial = file.with_suffix(".partial")
+        partial.write_text(json.dumps(kept))
+        partial.rename(file)
+    return kept["told"]
+
+
+def row(*cells):
+    """Prints a row of a Markdown table."""
+    print("|", " | ".join(cells), "|", flush=True)
 
 
 def make_synthetic_captures(out, count):
     """Makes `count` synthetic captures of 48 photos of 512×512, unless they are there, and returns their names."""
     folder = out / f"synthetic_{count}"
     if not (folder / "index.json").is_file():
-        told("synth", "--out", folder, "--scenes", str(count), "--frames", "48", "--size", "512")
+        run("synth", "--out", folder, "--scenes", str(count), "--frames", "48", "--size", "512")
     chunks = json.loads((folder / "index.json").read_text())
     return [f"{folder / chunk}#{key}" for key, chunk in sorted(chunks.items())]
 
@@ -37,24 +74,19 @@ def make_synthetic_captures(out, count):
 def scores(out, splat, folder, holdout, size):
     """Returns the scores of a splat on the held-out views."""
     file = out / f"{splat.stem}.scores.json"
-    return told_once(file, "eval", "--splat", splat, "--scene", folder, "--holdout", holdout, "--size", size)
+    return run_once(file, "eval", "--splat", splat, "--scene", folder, "--holdout", holdout, "--size", size)
 
 
-def values_of(name, results):
-    """Returns the value called `name` of each result, or None where there is none."""
-    return [result.get(name) for result in results]
-
-
-def mean(values, digits):
-    """Formats the mean of `values`, which may lack some."""
-    known = [value for value in values if value is not None]
+def mean(results, name, digits):
+    """Formats the mean of the values called `name`, which results may lack."""
+    known = [result[name] for result in results if result.get(name) is not None]
     return f"{statistics.mean(known):.{digits}f}" if known else ""
 
 
 def with_interval(values):
     """Formats the mean of `values` with its 95 % confidence interval."""
     if len(values) not in STUDENT:
-        return mean(values, 2)
+        return f"{statistics.mean(values):.2f}"
     half = STUDENT[len(values)] * statistics.stdev(values) / len(values) ** 0.5
     return f"{statistics.mean(values):.2f} ± {half:.2f}"
 
@@ -85,8 +117,19 @@ def main():
             for seed in range(arguments.seeds):
                 for name, more in variants:
                     file = arguments.out / f"{name}.{capture_name}.{seconds:g}.{seed}.json"
-                    output = refined(file, folder, holdout, seconds, "--seed", str(seed), *shlex.split(more))
-                    found = scores(arguments.out, file.with_suffix(".ply"), folder, holdout, arguments.size)
+                    splat = file.with_suffix(".ply")
+                    command = [
+                        "refine",
+                        "--scene",
+                        folder,
+                        "--holdout",
+                        holdout,
+                        "--seed",
+                        str(seed),
+                        *shlex.split(more),
+                    ]
+                    output = run_once(file, *command, "--seconds", str(seconds), "--out", splat)
+                    found = scores(arguments.out, splat, folder, holdout, arguments.size)
                     results[name].append({"steps": output["steps"], **found})
                 for name, splats in arguments.peer:
                     splat = Path(splats) / f"{capture_name}.{seconds:g}.{seed}.ply"
@@ -96,17 +139,12 @@ def main():
                         results[name].append(scores(kept, splat, folder, holdout, arguments.size))
             for name, found in results.items():
                 if found:
-                    time, psnr = f"{seconds:g} s", with_interval(values_of("psnr", found))
-                    row(
-                        capture_name,
-                        name,
-                        time,
-                        mean(values_of("steps", found), 0),
-                        mean(values_of("gaussians", found), 0),
-                        psnr,
-                        mean(values_of("ssim", found), 3),
-                        mean(values_of("lpips_vgg", found), 3),
-                    )
+                    psnr = with_interval([result["psnr"] for result in found])
+                    means = [
+                        mean(found, *column)
+                        for column in (("steps", 0), ("gaussians", 0), ("ssim", 3), ("lpips_vgg", 3))
+                    ]
+                    row(capture_name, name, f"{seconds:g} s", *means[:2], psnr, *means[2:])
 
 
 if __name__ == "__main__":

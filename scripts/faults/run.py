@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Injects faults into every writing system call of every command that writes files, and checks the files afterwards.
 
-    .venv/bin/python scripts/faults/run.py [--binary PROGRAM] [--short] [--most N] [--only OPERATION ...] [--self-test]
+    .venv/bin/python scripts/faults/run.py [--binary PROGRAM] [--short] [--most N] [--only OPERATION ...]
 
 Each operation runs without faults first, under inject.c, which records its calls. Then, for every call and every kind
 of fault, it runs again from the same state, in which older files exist where it writes. Afterwards
@@ -9,7 +9,6 @@ of fault, it runs again from the same state, in which older files exist where it
   - every file, and every folder that is a unit, must be the old one or the new one;
   - the same command without faults must end bit-identically to the first run, and leave no other files.
 Prints a Markdown table, and every failure with the options that reproduce it. --short runs a fixed sample, in a minute.
---self-test corrupts correct files instead, one by one, and fails unless every corruption is detected.
 """
 
 import argparse
@@ -153,12 +152,11 @@ class Tree:
         wrong = self.broken + [f"{name} isn't the new one" for name in sorted(names)]
         return wrong + [f"{name} is left" for name in sorted(self.temporary)]
 
-    def mixes(self, trees, unit_of, crashed=False, completed_by=None):
+    def mixes(self, trees, unit_of, crashed):
         """Returns the units that are neither old nor new.
 
         `trees` are the old tree, those between, and the new one. After a crash, an old folder may still have the
-        temporary name that it was renamed to while being replaced. The file `completed_by` may be missing: readers
-        ignore the other files without it.
+        temporary name that it was renamed to while being replaced.
         """
         of = [tree.units(unit_of) for tree in trees]
         wrong = list(self.broken)
@@ -176,7 +174,7 @@ class Tree:
         }
         for unit, files in of[0].items():
             lies_beside = crashed and all(moved.get(name) == value for name, value in files.items())
-            if unit in of[-1] and unit not in units and not lies_beside and unit != completed_by:
+            if unit in of[-1] and unit not in units and not lies_beside:
                 wrong.append(f"{unit} is gone")
         checkpoints = [any("checkpoints/" in unit for unit in tree) for tree in (of[0], units)]
         return wrong + ["all checkpoints are gone"] * (checkpoints == [True, False])
@@ -192,9 +190,9 @@ def whole_checkpoint(name):
 class Operation:
     """A command, the state that it starts from, and the states that it may leave."""
 
-    def __init__(self, bench, name, arguments, unit_of=str, waits=False, into=None, once=False, completed_by=None):
+    def __init__(self, bench, name, arguments, unit_of=str, waits=False, into=None, once=False):
         self.bench, self.name, self.unit_of, self.waits, self.into = bench, name, unit_of, waits, into
-        self.once, self.completed_by = once, completed_by
+        self.once = once
         self.arguments = [str(argument) for argument in arguments]
         self.old = bench.folder / "old" / name.replace(" ", "_").replace(",", "").replace("/", "_")
         self.old.mkdir(parents=True)
@@ -489,7 +487,7 @@ def check(op, fault):
         # If renames fail persistently (all, or those onto this file), a rename can't be undone; the next run repairs
         # it.
         crashed = sticky and group in ("rename", "any")
-        wrong += tree.mixes(op.trees, op.unit_of, crashed, op.completed_by)
+        wrong += tree.mixes(op.trees, op.unit_of, crashed)
     return "right" if done.code == 0 else "refused", wrong, done
 
 
@@ -541,49 +539,6 @@ def inject(operations, most, short, one):
     return failures
 
 
-def spoil(operations):
-    """Corrupts the files of correct runs, one by one. Returns the number of corruptions that were not detected."""
-    spoiled, unnoticed = 0, 0
-    for op in operations:
-        op.reset()
-        op.bench.run(op.arguments, into=op.into)
-        tree = Tree(op.bench.out)
-        assert not tree.differs(op.new) and not tree.mixes(op.trees, op.unit_of), op.name
-        units = tree.units(op.unit_of)
-        for path in [
-            path for path in op.bench.out.rglob("*") if path.is_file() and path.name not in (".lock", "stdout")
-        ]:
-            right = path.read_bytes()
-            middle = len(right) // 2
-            flipped = right[:middle] + bytes([right[middle] ^ 1]) + right[middle + 1 :]
-            ways = {"flipped": flipped, "cut": right[:-1], "gone": None}
-            name = path.relative_to(op.bench.out).as_posix()
-            older = op.old / name
-            if older.is_file() and older.read_bytes() != right:
-                ways["older"] = older.read_bytes()
-            for way, bytes_ in ways.items():
-                # A unit of one file may validly be the old one, or be missing.
-                fits_none = way in ("flipped", "cut") or len(units.get(op.unit_of(name), "")) > 1
-                path.unlink() if bytes_ is None else path.write_bytes(bytes_)
-                try:
-                    tree = Tree(op.bench.out)
-                    noticed = tree.differs(op.new) and (not fits_none or tree.mixes(op.trees, op.unit_of))
-                except (ValueError, AssertionError):
-                    noticed = True
-                spoiled += 1
-                if not noticed:
-                    unnoticed += 1
-                    print(f"{op.name}: {name}, {way}, isn't noticed")
-                path.write_bytes(right)
-        left = op.bench.out / ".left.globalsplat-partial"
-        left.write_text("")
-        spoiled += 1
-        unnoticed += not Tree(op.bench.out).differs(op.new)
-        left.unlink()
-    print(f"{spoiled} spoiled, {spoiled - unnoticed} noticed")
-    return unnoticed
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--binary", type=Path, default=REPOSITORY / "target/release/globalsplat")
@@ -593,14 +548,10 @@ def main():
     parser.add_argument("--only", nargs="+", metavar="OPERATION")
     one = ("CALL", "N", "KIND", "STICKY")
     parser.add_argument("--fault", nargs=4, metavar=one, help="inject only this fault, as printed with a failure")
-    parser.add_argument("--self-test", action="store_true", help="corrupt correct files and check that it is detected")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="faults-") as folder:
         bench = Bench(arguments.binary.resolve(), Path(folder).resolve())
-        chosen = operations(bench, arguments.only)
-        if arguments.self_test:
-            return 1 if spoil(chosen) else 0
-        failures = inject(chosen, arguments.most, arguments.short, arguments.fault)
+        failures = inject(operations(bench, arguments.only), arguments.most, arguments.short, arguments.fault)
         for failure in failures:
             print(told_of(*failure))
         return 1 if failures else 0
