@@ -6,10 +6,7 @@ use anyhow::Result;
 use clap::Args;
 use globalsplat::Error;
 use globalsplat::io::check_writable_dir;
-use globalsplat_colmap::{
-    CaptureOptions, CaptureProgress, CaptureReport, Colmap, Matching, PoseOptions, VideoOptions, VideoPass,
-    make_capture,
-};
+use globalsplat_colmap::{CaptureOptions, CaptureReport, Colmap, Matching, make_capture};
 use std::path::{Path, PathBuf};
 
 /// Make a capture from a folder of photos or a video: find the camera poses, by COLMAP.
@@ -51,15 +48,12 @@ pub struct Capture {
 
 impl Capture {
     pub fn run(self) -> Result<()> {
-        let camera_model = self.camera_model.map(|model| model.to_uppercase());
         let options = CaptureOptions {
-            video: VideoOptions { frames: self.frames },
-            poses: PoseOptions {
-                camera_model,
-                matching: self.matching,
-                masks: self.masks,
-                keeps_finished: false,
-            },
+            frames: self.frames,
+            camera_model: self.camera_model.map(|model| model.to_uppercase()),
+            matching: self.matching,
+            masks: self.masks,
+            keeps_finished: false,
         };
         if self.frames.is_some() && self.source.is_dir() {
             return Err(Error::request("--frames is for videos, and the source is a folder of photos").into());
@@ -73,7 +67,7 @@ impl Capture {
         } else {
             let out = self.out.display();
             let splat = Path::new(self.out.file_name().unwrap_or("scene".as_ref())).with_extension("ply");
-            println!("{out}: {}", report.poses);
+            println!("{out}: {report}");
             println!("next: globalsplat refine --scene {} --out {}", quoted(&self.out), quoted(&splat));
         }
         Ok(())
@@ -100,26 +94,17 @@ fn run_make_capture(
     eprintln!("{colmap}");
     let mut bar: Option<(&'static str, progress::Progress)> = None;
     stop.set_ends_at_once(false);
-    let report = make_capture(source, out, options, &colmap, |progress| {
-        let (unit, done, total) = match progress {
-            CaptureProgress::Video(at) => {
-                let unit = match at.pass {
-                    VideoPass::Measure => "frames measured",
-                    VideoPass::Write => "frames written",
-                };
-                (unit, at.done, at.total.unwrap_or(at.done))
-            }
-            CaptureProgress::Poses(at) => (at.step.unit(), at.done, at.total),
-        };
+    let report = make_capture(source, out, options, &colmap, &mut |at| {
+        let unit = at.step.unit();
         if bar.as_ref().is_none_or(|(current, _)| *current != unit) {
-            let next = progress::bar(total as u64, unit);
+            let next = progress::bar(at.total as u64, unit);
             if let Some((_, finished)) = bar.replace((unit, next)) {
                 finished.finish_and_clear();
             }
         }
         if let Some((_, bar)) = &bar {
-            bar.set_length(total as u64);
-            bar.set_position(done as u64);
+            bar.set_length(at.total as u64);
+            bar.set_position(at.done as u64);
         }
         !stop.is_requested()
     });
@@ -131,8 +116,8 @@ fn run_make_capture(
         anyhow::bail!("stopped; the same command continues in {}", out.display())
     };
     if let Some(video) = &report.video {
-        eprintln!("{}: {}", source.display(), video.summary);
-        video.warnings.iter().for_each(|line| eprintln!("{}: {line}", source.display()));
+        eprintln!("{}: {}", source.display(), video.chosen.summary);
+        video.chosen.warnings.iter().for_each(|line| eprintln!("{}: {line}", source.display()));
     }
     Ok(report)
 }
@@ -164,10 +149,9 @@ impl SceneSource {
         let capture = out.with_file_name(format!("{}_capture", stem.trim_end_matches(".compressed")));
         // A capture that `globalsplat capture` made with other settings is used as it is.
         let masks = masks.map(Path::to_owned);
-        let poses = PoseOptions { keeps_finished: true, masks, ..PoseOptions::default() };
-        let report =
-            run_make_capture(photos, &capture, &CaptureOptions { poses, ..Default::default() }, stop)?;
-        eprintln!("{}: {}", capture.display(), report.poses);
+        let options = CaptureOptions { keeps_finished: true, masks, ..CaptureOptions::default() };
+        let report = run_make_capture(photos, &capture, &options, stop)?;
+        eprintln!("{}: {report}", capture.display());
         Ok(capture)
     }
 }

@@ -1,16 +1,17 @@
 #![doc = include_str!("../README.md")]
 
+mod capture;
 mod colmap;
-mod estimate;
-mod make_capture;
 mod photos;
+mod poses;
+mod progress;
 mod record;
 mod video;
 
-pub use colmap::{CAMERA_MODELS, Colmap, VARIABLE};
-pub use estimate::{PoseOptions, PoseProgress, estimate_poses};
+pub use capture::{CaptureOptions, make_capture};
+pub use colmap::Colmap;
 pub use globalsplat_files::{Error, Result};
-pub use make_capture::{CaptureOptions, CaptureProgress, CaptureReport, VideoRecord, make_capture};
 pub use photos::SkippedPhoto;
-pub use record::{Matching, PoseReport, Step};
-pub use video::{VideoFrames, VideoOptions, VideoPass, VideoProgress, extract_frames};
+pub use progress::{Progress, Step};
+pub use record::{CaptureReport, Matching, VideoRecord};
+pub use video::{VideoFrames, extract_frames};

@@ -1,23 +1,24 @@
-//! The file that records how far an estimate of poses has come, so that the same call continues it, and the settings and results in it.
+//! The file that records how far a capture has come, so that the same call continues it, and the settings and results in it.
 
 use crate::photos::{FoundPhoto, Photo, SkippedPhoto};
+use crate::progress::Step;
+use crate::video::VideoFrames;
 use globalsplat_files::{Error, Result, read_text, write_json};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
+use std::time::UNIX_EPOCH;
 
 /// Name of the file, in the capture's folder.
 pub(crate) const FILE: &str = "capture.json";
-/// Name of the file that records which video the frames are from, in the capture's folder.
-pub(crate) const VIDEO_FILE: &str = "video.json";
 
 /// How pairs of photos to match are chosen.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Matching {
-    /// [`Matching::Exhaustive`] for up to 200 photos, otherwise [`Matching::Sequential`].
+    /// [`Matching::Sequential`] for frames of a video and more than 200 photos, otherwise [`Matching::Exhaustive`].
     #[default]
     Auto,
     /// Every pair.
@@ -40,35 +41,57 @@ impl FromStr for Matching {
     }
 }
 
-/// Steps of an estimate of poses.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Step {
-    /// Photos are checked and linked.
-    Photos,
-    /// Features are detected in photos.
-    Features,
-    /// Features of pairs of photos are matched.
-    Pairs,
-    /// The mapper registers photos.
-    Poses,
+/// Which video the frames of a capture are from, and which frames were chosen.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct VideoRecord {
+    /// Name of the file.
+    name: String,
+    /// Size of the file.
+    bytes: u64,
+    /// Time of its last modification, in seconds since 1970.
+    modified: u64,
+    /// Number of frames that was asked for.
+    frames: Option<usize>,
+    /// The chosen frames.
+    #[serde(flatten)]
+    pub chosen: VideoFrames,
 }
 
-impl Step {
-    /// Returns what the step counts.
-    pub fn unit(self) -> &'static str {
-        match self {
-            Step::Photos => "photos checked",
-            Step::Features => "photos with features",
-            Step::Pairs => "pairs matched",
-            Step::Poses => "photos registered",
-        }
+impl VideoRecord {
+    /// Describes the file at `video`, of which no frames are chosen yet.
+    pub(crate) fn new(video: &Path, frames: Option<usize>) -> Result<Self> {
+        let metadata = std::fs::metadata(video).map_err(Error::read(video))?;
+        let modified = metadata.modified().ok().and_then(|time| time.duration_since(UNIX_EPOCH).ok());
+        Ok(VideoRecord {
+            name: video.file_name().unwrap_or_default().to_string_lossy().into_owned(),
+            bytes: metadata.len(),
+            modified: modified.unwrap_or_default().as_secs(),
+            frames,
+            chosen: VideoFrames::default(),
+        })
+    }
+
+    /// Returns `true` if the frames of `other` are those of this video, and as many as this one asks for or `any_number`.
+    pub(crate) fn matches(&self, other: &Self, any_number: bool) -> bool {
+        (&self.name, self.bytes, self.modified) == (&other.name, other.bytes, other.modified)
+            && (any_number || self.frames == other.frames)
     }
 }
 
-/// Result of an estimate of poses.
+/// Formats which frames were asked for, as `240 frames of walk.mp4 (1234 bytes)`.
+impl fmt::Display for VideoRecord {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        self.frames.iter().try_for_each(|frames| write!(f, "{frames} frames of "))?;
+        write!(f, "{} ({} bytes)", self.name, self.bytes)
+    }
+}
+
+/// Result of [`make_capture`](crate::make_capture).
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct PoseReport {
+pub struct CaptureReport {
+    /// The video that the photos are frames of.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub video: Option<VideoRecord>,
     /// Version of COLMAP, as `pycolmap 4.2.1`.
     pub colmap: String,
     /// Number of photos found.
@@ -94,9 +117,9 @@ pub struct PoseReport {
 }
 
 /// Formats the result in sentences, one per line.
-impl fmt::Display for PoseReport {
+impl fmt::Display for CaptureReport {
     fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        let PoseReport { photos, registered, points, reprojection_error, .. } = self;
+        let CaptureReport { photos, registered, points, reprojection_error, .. } = self;
         write!(
             f,
             "{registered} of {photos} photos registered, {points} points, reprojection error {reprojection_error:.2} pixels"
@@ -124,9 +147,11 @@ pub(crate) fn format_first(items: impl ExactSizeIterator<Item = String>) -> Stri
     if others > 0 { format!("{shown} and {others} more") } else { shown }
 }
 
-/// How far an estimate has come, and for which photos and settings.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+/// How far a capture has come, and for which photos and settings.
+#[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Record {
+    /// The video that the photos are frames of.
+    pub video: Option<VideoRecord>,
     /// Version of COLMAP, as `pycolmap 4.2.1`.
     pub colmap: String,
     /// Camera model, or `None` to choose it by the number of photos.
@@ -135,7 +160,7 @@ pub(crate) struct Record {
     pub matching: Matching,
     /// Folder of masks that the user named.
     pub masks: Option<PathBuf>,
-    /// Photos in the folder of the user.
+    /// Photos in the folder of the user, or frames of the video.
     pub found: Vec<FoundPhoto>,
     /// Photos in the folder of images, once they are all there.
     pub photos: Option<Vec<Photo>>,
@@ -149,8 +174,8 @@ pub(crate) struct Record {
     pub matched_pairs: usize,
     /// Seconds that each step took, in all calls together.
     pub seconds: BTreeMap<Step, f64>,
-    /// The result.
-    pub report: Option<PoseReport>,
+    /// The result, without what isn't kept: the video and the other files.
+    pub report: Option<CaptureReport>,
 }
 
 impl Record {
@@ -173,5 +198,25 @@ impl Record {
     /// Returns an error if the file can't be written.
     pub fn write(&self, out: &Path) -> Result<()> {
         write_json(&out.join(FILE), self)
+    }
+
+    /// Returns this record with the settings of `new`, without what depends on settings that have changed. If `keeps_finished`, a finished
+    /// capture stays as it is.
+    pub fn update(mut self, new: Record, keeps_finished: bool) -> Record {
+        if keeps_finished && self.report.is_some() {
+            return self;
+        }
+        if self.masks != new.masks {
+            return new;
+        }
+        if (&self.colmap, &self.camera_model) != (&new.colmap, &new.camera_model) {
+            self.seconds.retain(|step, _| *step == Step::Photos);
+            return Record { photos: self.photos, skipped: self.skipped, seconds: self.seconds, ..new };
+        }
+        if self.matching != new.matching {
+            self.seconds.remove(&Step::Poses);
+            return Record { matching: new.matching, matched_pairs: 0, report: None, ..self };
+        }
+        self
     }
 }

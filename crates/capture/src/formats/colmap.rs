@@ -14,6 +14,7 @@ use crate::photos::{MASKS_FOLDER, find_masks, find_photos, format_names, natural
 use fields::{ByteReader, WordReader, is_comment};
 use glam::{DMat4, DQuat, DVec3};
 use globalsplat_files::{Error, Result, read_text};
+use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -110,6 +111,42 @@ struct ImageEntry {
     translation: [f64; 3],
     camera: u32,
     name: String,
+}
+
+/// Summary of a COLMAP model.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ColmapModel {
+    /// Folder of the model.
+    pub folder: PathBuf,
+    /// Names of the photos that have a pose.
+    pub photos: Vec<String>,
+    /// Number of points.
+    pub points: usize,
+    /// Mean over the points of the distance between where a point is seen and where the model projects it, in pixels; 0 without points.
+    pub reprojection_error: f64,
+}
+
+/// Reads the binary models in the numbered folders in `sparse`, the one with the most photos first, which [`open_capture`](crate::open_capture)
+/// takes.
+///
+/// # Errors
+/// Returns an error if a file violates the format.
+pub fn read_colmap_models(sparse: &Path) -> Result<Vec<ColmapModel>> {
+    let folders = numbered(sparse).into_iter().filter(|folder| folder.join("images.bin").is_file());
+    let summarize = |folder: PathBuf| {
+        let images = read_images_binary(&folder.join("images.bin"))?;
+        let points = points::read_points_binary(&folder.join("points3D.bin"))?;
+        let errors: f64 = points.iter().map(|(_, error)| error).sum();
+        Ok(ColmapModel {
+            folder,
+            photos: images.into_iter().map(|image| image.name).collect(),
+            points: points.len(),
+            reprojection_error: errors / points.len().max(1) as f64,
+        })
+    };
+    let mut models = folders.map(summarize).collect::<Result<Vec<_>>>()?;
+    models.sort_by_key(|model| Reverse(model.photos.len()));
+    Ok(models)
 }
 
 /// Recognizes a folder that contains a model.

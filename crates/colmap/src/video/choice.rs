@@ -119,21 +119,4 @@ mod tests {
             assert!((1. / 3. ..2.).contains(&spacing), "{spacing}");
         }
     }
-
-    #[test]
-    fn a_cut_is_one_stretch() {
-        // Two scenes, each of which moves by 0.5.
-        let motion = [[0.01].repeat(50), vec![1.], [0.01].repeat(50)].concat();
-        let chosen = choose_frames(&positions(&motion, Some(20)), &[1.].repeat(101));
-        assert_eq!(chosen.len(), 20);
-        let before = chosen.iter().filter(|frame| **frame < 50).count();
-        assert!((9..=11).contains(&before), "{chosen:?}");
-    }
-
-    #[test]
-    fn the_sharpest_frame_of_a_stretch_is_chosen() {
-        let sharpness: Vec<f64> = (0..100).map(|frame| if frame % 10 == 7 { 2. } else { 1. }).collect();
-        let chosen = choose_frames(&positions(&[0.01; 100], Some(10)), &sharpness);
-        assert_eq!(chosen, (0..10).map(|stretch| 10 * stretch + 7).collect::<Vec<_>>());
-    }
 }

@@ -1,131 +1,98 @@
 //! ffmpeg and ffprobe, run as processes.
 
-use super::grey::Grey;
+use super::motion::Grey;
 use globalsplat_files::{Error, Result, is_program_missing};
 use serde_json::Value;
-use std::ffi::OsString;
-use std::io::{BufRead, BufReader};
+use std::fs;
+use std::io::{BufRead, BufReader, Read};
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Command, Output, Stdio};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::thread::JoinHandle;
-use std::time::Duration;
 
-/// What ffprobe tells of a video.
-pub(super) struct Probe {
-    /// Index of the picture stream in the file.
-    stream: u64,
-    /// Number of frames that the container declares.
-    pub(super) declared_frames: Option<usize>,
-    /// Duration in seconds, 0 if it isn't known.
-    duration: f64,
-    /// Average number of frames per second, 0 if it isn't known.
-    pub(super) fps: f64,
-    /// `true` if the transfer function is that of HDR: PQ or HLG.
-    is_hdr: bool,
-    is_interlaced: bool,
-    /// `true` if the matrix of the colors isn't declared. Players then take HD for BT.709.
-    is_undeclared_hd: bool,
-}
+/// BT.2020 in PQ or HLG to BT.709, by linear light in which 1 is 100 cd/m².
+const TONEMAP: &str = "zscale=t=linear:npl=100,format=gbrpf32le,zscale=p=bt709,tonemap=hable:desat=0,\
+                       zscale=t=bt709:m=bt709:r=tv,format=yuv420p,";
 
-impl Probe {
-    /// Returns the number of frames by the file's declaration, or by its duration.
-    pub(super) fn expected_frames(&self) -> Option<usize> {
-        let by_duration = (self.duration * self.fps).round() as usize;
-        self.declared_frames.or((by_duration > 0).then_some(by_duration))
-    }
-}
-
-/// Asks ffprobe about the video at `path`.
-///
-/// # Errors
-/// Returns an error if there is no ffprobe, or one that says why the file isn't a video.
-pub(super) fn probe(path: &Path) -> Result<Probe> {
-    let mut command = command("ffprobe");
-    command.args(["-v", "error", "-of", "json", "-show_streams", "-show_format"]).arg(absolute(path)?);
-    let output = run(path, command)?;
-    let no_video = |found: &str| Err(Error::input(path, "the content", found, "a video"));
-    if !output.status.success() {
-        let said = String::from_utf8_lossy(&output.stderr);
-        let why = said.lines().map(|line| message_of(line, path)).next().unwrap_or_default();
-        return no_video(&format!("not readable by ffmpeg ({why})"));
-    }
-    let found: Value = serde_json::from_slice(&output.stdout)
-        .map_err(Error::failed_with_context(format!("{}: ffprobe failed", path.display())))?;
-    let text = |value: &Value| value.as_str().unwrap_or_default().to_owned();
-    let number = |value: &Value| value.as_str().and_then(|text| text.parse::<f64>().ok()).unwrap_or(0.);
-
-    let format = text(&found["format"]["format_name"]);
-    let brand = text(&found["format"]["tags"]["major_brand"]);
-    // ffmpeg shows text as a video of a terminal.
-    if format == "tty" {
-        return no_video("text");
-    }
-    if format == "image2"
-        || format.ends_with("_pipe")
-        || ["heic", "heix", "mif1", "avif"].contains(&brand.trim())
-    {
-        return no_video("a photo");
-    }
-    let streams = found["streams"].as_array().map(Vec::as_slice).unwrap_or_default();
-    let has_pictures =
-        |stream: &&Value| stream["codec_type"] == "video" && stream["disposition"]["attached_pic"] != 1;
-    let area =
-        |stream: &Value| stream["width"].as_u64().unwrap_or(0) * stream["height"].as_u64().unwrap_or(0);
-    // The first of the largest ones.
-    let Some(stream) = streams.iter().filter(has_pictures).rev().max_by_key(|stream| area(stream)) else {
-        let has_sound = streams.iter().any(|stream| stream["codec_type"] == "audio");
-        return no_video(if has_sound { "sound without pictures" } else { "without pictures" });
-    };
-    let fps = text(&stream["avg_frame_rate"]);
-    let fps = fps.split_once('/').and_then(|(frames, seconds)| {
-        Some(frames.parse::<f64>().ok()? / seconds.parse::<f64>().ok().filter(|seconds| *seconds > 0.)?)
-    });
-    let declared_frames = number(&stream["nb_frames"]) as usize;
-    Ok(Probe {
-        stream: stream["index"].as_u64().unwrap_or(0),
-        declared_frames: (declared_frames > 0).then_some(declared_frames),
-        duration: number(&stream["duration"]).max(number(&found["format"]["duration"])),
-        fps: fps.unwrap_or(0.),
-        is_hdr: ["smpte2084", "arib-std-b67"].contains(&text(&stream["color_transfer"]).as_str()),
-        is_interlaced: ["tt", "bb", "tb", "bt"].contains(&text(&stream["field_order"]).as_str()),
-        is_undeclared_hd: stream["color_space"].as_str().is_none_or(|space| space == "unknown")
-            && area(stream) >= 1280 * 720,
-    })
-}
-
-/// Runs the passes of ffmpeg over a video.
-pub(super) struct Converter<'a> {
-    video: &'a Path,
-    stream: u64,
-    /// Options by which every frame is written once.
-    every_frame: [&'static str; 2],
+/// A video, and how ffmpeg has to read it.
+pub(super) struct Video<'a> {
+    path: &'a Path,
+    /// Index of the picture stream in the file, as an argument of ffmpeg.
+    stream: String,
+    /// Option by which every frame is written once.
+    every_frame: &'static str,
     /// Filter that every frame passes.
     deinterlace: &'static str,
     /// Filters that chosen frames pass.
     to_jpeg: String,
+    /// Number of frames that the container declares.
+    pub(super) declared_frames: Option<usize>,
+    /// Number of frames by the file's declaration, or by its duration; 0 if neither is known.
+    pub(super) expected_frames: usize,
     /// What is wrong with the result, a sentence each.
     pub(super) warnings: Vec<String>,
 }
 
-impl<'a> Converter<'a> {
-    /// Chooses the filters for a video.
+impl<'a> Video<'a> {
+    /// Asks ffprobe about the video at `path`, and chooses the filters for it.
     ///
     /// # Errors
-    /// Returns an error if there is no ffmpeg.
-    pub(super) fn new(video: &'a Path, probe: &Probe) -> Result<Self> {
-        /// BT.2020 in PQ or HLG to BT.709, by linear light in which 1 is 100 cd/m².
-        const TONEMAP: &str = "zscale=t=linear:npl=100,format=gbrpf32le,zscale=p=bt709,tonemap=hable:desat=0,\
-                               zscale=t=bt709:m=bt709:r=tv,format=yuv420p,";
-        let ask = |question: &str| {
-            let mut command = command("ffmpeg");
-            command.args(["-hide_banner", question]);
-            run(video, command).map(|output| String::from_utf8_lossy(&output.stdout).into_owned())
+    /// Returns an error if there is no ffprobe or ffmpeg, or one that says why the file isn't a video.
+    pub(super) fn open(path: &'a Path) -> Result<Self> {
+        if !fs::metadata(path).map_err(Error::read(path))?.is_file() {
+            return Err(Error::input(path, "the path", "no file", "a video"));
+        }
+        let mut probe = command("ffprobe");
+        probe.args(["-v", "error", "-of", "json", "-show_streams", "-show_format"]).arg(absolute(path)?);
+        let output = run(path, probe)?;
+        let no_video = |found: &str| Err(Error::input(path, "the content", found, "a video"));
+        if !output.status.success() {
+            let why = first_message(&*output.stderr, path).unwrap_or_default();
+            return no_video(&format!("not readable by ffmpeg ({why})"));
+        }
+        let found: Value = serde_json::from_slice(&output.stdout)
+            .map_err(Error::failed_with_context(format!("{}: ffprobe failed", path.display())))?;
+        let text = |value: &Value| value.as_str().unwrap_or_default().to_owned();
+        let number = |value: &Value| value.as_str().and_then(|text| text.parse::<f64>().ok()).unwrap_or(0.);
+
+        let format = text(&found["format"]["format_name"]);
+        let brand = text(&found["format"]["tags"]["major_brand"]);
+        // ffmpeg shows text as a video of a terminal.
+        if format == "tty" {
+            return no_video("text");
+        }
+        if format == "image2"
+            || format.ends_with("_pipe")
+            || ["heic", "heix", "mif1", "avif"].contains(&brand.trim())
+        {
+            return no_video("a photo");
+        }
+        let streams = found["streams"].as_array().map(Vec::as_slice).unwrap_or_default();
+        let has_pictures =
+            |stream: &&Value| stream["codec_type"] == "video" && stream["disposition"]["attached_pic"] != 1;
+        let area =
+            |stream: &Value| stream["width"].as_u64().unwrap_or(0) * stream["height"].as_u64().unwrap_or(0);
+        // The first of the largest ones.
+        let Some(stream) = streams.iter().filter(has_pictures).rev().max_by_key(|stream| area(stream)) else {
+            let has_sound = streams.iter().any(|stream| stream["codec_type"] == "audio");
+            return no_video(if has_sound { "sound without pictures" } else { "without pictures" });
         };
-        let mut warnings = vec![];
-        let mut tonemap = "";
-        if probe.is_hdr {
-            let filters = ask("-filters")?;
+        let is_one_of = |field: &str, names: &[&str]| names.contains(&text(&stream[field]).as_str());
+        let declared_frames = Some(number(&stream["nb_frames"]) as usize).filter(|count| *count > 0);
+        let rate = text(&stream["avg_frame_rate"]);
+        let rate = rate.split_once('/').and_then(|(frames, seconds)| {
+            Some(frames.parse::<f64>().ok()? / seconds.parse::<f64>().ok().filter(|seconds| *seconds > 0.)?)
+        });
+        let seconds = number(&stream["duration"]).max(number(&found["format"]["duration"]));
+
+        let ask = |question: &[&str]| {
+            let mut command = command("ffmpeg");
+            command.arg("-hide_banner").args(question);
+            run(path, command).map(|output| String::from_utf8_lossy(&output.stdout).into_owned())
+        };
+        let (mut warnings, mut tonemap) = (vec![], "");
+        if is_one_of("color_transfer", &["smpte2084", "arib-std-b67"]) {
+            let filters = ask(&["-filters"])?;
             if ["zscale", "tonemap"].iter().all(|name| filters.split_whitespace().any(|word| word == *name)) {
                 tonemap = TONEMAP;
             } else {
@@ -134,18 +101,23 @@ impl<'a> Converter<'a> {
                 warnings.push(format!("{lacks}: colors are pale"));
             }
         }
-        // JPEG has the color matrix of BT.601, and the full range.
-        let from = if probe.is_undeclared_hd && tonemap.is_empty() { ":in_color_matrix=bt709" } else { "" };
+        // Players take HD for BT.709 if the matrix of the colors isn't declared. JPEG has that of BT.601, and the full range.
+        let is_declared = !is_one_of("color_space", &["", "unknown"]);
+        let is_bt709 = !is_declared && area(stream) >= 1280 * 720 && tonemap.is_empty();
+        let from = if is_bt709 { ":in_color_matrix=bt709" } else { "" };
         let scale = format!("scale=w=round(iw*sar):h=ih{from}:out_color_matrix=bt601:out_range=pc");
-        Ok(Converter {
-            video,
-            stream: probe.stream,
-            every_frame: match is_before_5_1(&ask("-version")?) {
-                true => ["-vsync", "passthrough"],
-                false => ["-fps_mode", "passthrough"],
+        Ok(Video {
+            path,
+            stream: format!("0:{}", stream["index"]),
+            // ffmpeg has one option before 5.1, and the other since 8.
+            every_frame: if ask(&["-h", "long"])?.contains("-fps_mode") { "-fps_mode" } else { "-vsync" },
+            deinterlace: match is_one_of("field_order", &["tt", "bb", "tb", "bt"]) {
+                true => "yadif=deint=interlaced,",
+                false => "",
             },
-            deinterlace: if probe.is_interlaced { "yadif=deint=interlaced," } else { "" },
             to_jpeg: format!("{tonemap}{scale},format=yuvj420p"),
+            declared_frames,
+            expected_frames: declared_frames.unwrap_or((seconds * rate.unwrap_or(0.)).round() as usize),
             warnings,
         })
     }
@@ -154,110 +126,65 @@ impl<'a> Converter<'a> {
     pub(super) fn decode_small(&self) -> Result<Pass<'_>> {
         let scale = "scale=w='min(640,iw)':h='min(640,ih)':force_original_aspect_ratio=decrease:flags=area";
         let filter = format!("{}{scale},format=gray", self.deinterlace);
-        let output = ["-f", "image2pipe", "-c:v", "pgm", "-"].map(OsString::from);
-        self.start(&filter, &output, None)
+        self.start(&filter, &["-f", "image2pipe", "-c:v", "pgm", "-"], Path::new("."))
     }
 
     /// Starts the second pass: the frames `chosen` as `frame_00001.jpg`, … in `folder`.
     pub(super) fn write(&self, chosen: &[usize], folder: &Path) -> Result<Pass<'_>> {
-        let select = format!("select='{}'", expression_of(chosen));
-        let filter = format!("{}{select},{},showinfo", self.deinterlace, self.to_jpeg);
-        let count = chosen.len().to_string();
-        let output = ["-frames:v", &count, "-c:v", "mjpeg", "-q:v", "2", "-f", "image2", "frame_%05d.jpg"];
+        let filter = format!("{}select='{}',{}", self.deinterlace, expression_of(chosen), self.to_jpeg);
+        let (count, jpeg) = (chosen.len().to_string(), ["-c:v", "mjpeg", "-q:v", "2", "-f", "image2"]);
+        let output = [&["-progress", "pipe:1", "-frames:v", &count], &jpeg[..], &["frame_%05d.jpg"]].concat();
         // The name of the folder may have a %, too.
-        self.start(&filter, &output.map(OsString::from), Some(folder))
+        self.start(&filter, &output, folder)
     }
 
-    fn start(&self, filter: &str, output: &[OsString], folder: Option<&Path>) -> Result<Pass<'_>> {
+    fn start(&self, filter: &str, output: &[&str], folder: &Path) -> Result<Pass<'_>> {
         let mut command = command("ffmpeg");
-        command
-            .args(["-hide_banner", "-nostdin", "-nostats", "-v", "level+info", "-y", "-i"])
-            .arg(absolute(self.video)?);
-        command
-            .args(["-map", &format!("0:{}", self.stream), "-vf", filter])
-            .args(self.every_frame)
-            .args(output);
-        if let Some(folder) = folder {
-            command.current_dir(folder);
-        }
+        command.args(["-hide_banner", "-nostdin", "-nostats", "-v", "error", "-y", "-i"]);
+        command.arg(absolute(self.path)?).args(["-map", &self.stream, "-vf", filter]);
+        command.args([self.every_frame, "passthrough"]).args(output).current_dir(folder);
         let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
-        let mut child = child.map_err(not_started(self.video, "ffmpeg"))?;
+        let mut child = child.map_err(not_started(self.path, "ffmpeg"))?;
         let stdout = BufReader::new(child.stdout.take().expect("a pipe was requested"));
-        let stderr = BufReader::new(child.stderr.take().expect("a pipe was requested"));
-        let (sender, shown) = channel();
-        let video = self.video.to_owned();
-        let error = std::thread::spawn(move || {
-            let mut first_error = None;
-            for line in stderr.split(b'\n').map_while(std::io::Result::ok) {
-                let line = String::from_utf8_lossy(&line);
-                if let Some(frame) = Shown::parse(&line) {
-                    // Nobody listens any more after a stop.
-                    let _ = sender.send(frame);
-                } else if line.contains("[error]") || line.contains("[fatal]") {
-                    first_error.get_or_insert_with(|| message_of(&line, &video));
-                }
-            }
-            first_error
-        });
-        Ok(Pass { converter: self, child, stdout, shown, error: Some(error) })
+        let stderr = child.stderr.take().expect("a pipe was requested");
+        let video = self.path.to_owned();
+        let error = std::thread::spawn(move || first_message(stderr, &video));
+        Ok(Pass { video: self, child, stdout, error: Some(error) })
     }
 
     /// Returns the error that the work on the video failed.
     pub(super) fn failed(&self, why: impl std::fmt::Display) -> Error {
-        Error::failed(format!("{}: {why}", self.video.display()))
-    }
-
-    /// Returns the error that the caller stopped the work.
-    pub(super) fn stopped(&self) -> Error {
-        self.failed("stopped before all frames were written")
-    }
-}
-
-/// What ffmpeg tells of a frame that it writes.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct Shown {
-    /// Seconds from the start of the video; `None` if the file doesn't tell it.
-    pub(super) time: Option<f64>,
-    /// Width and height in pixels.
-    pub(super) size: (u32, u32),
-}
-
-impl Shown {
-    /// Parses a line of the filter showinfo: "… pts_time:1.5 … s:1920x1080 …".
-    fn parse(line: &str) -> Option<Self> {
-        let value = |key: &str| Some(line.split_once(key)?.1.split_whitespace().next().unwrap_or_default());
-        let time = line.contains("showinfo").then(|| value(" pts_time:"))??;
-        let (width, height) = value(" s:")?.split_once('x')?;
-        Some(Shown { time: time.parse().ok(), size: (width.parse().ok()?, height.parse().ok()?) })
+        Error::failed(format!("{}: {why}", self.path.display()))
     }
 }
 
 /// A run of ffmpeg, which is killed on drop.
 pub(super) struct Pass<'a> {
-    converter: &'a Converter<'a>,
+    video: &'a Video<'a>,
     child: Child,
     stdout: BufReader<ChildStdout>,
-    shown: Receiver<Shown>,
     /// First error that ffmpeg reports.
     error: Option<JoinHandle<Option<String>>>,
 }
 
 impl Pass<'_> {
-    /// Returns the next image of [`Converter::decode_small`]; `None` at the end of the video.
+    /// Returns the next image of [`Video::decode_small`]; `None` at the end of the video.
     pub(super) fn next_frame(&mut self) -> Result<Option<Grey>> {
-        Grey::read(&mut self.stdout).map_err(Error::failed_with_context(format!(
-            "{}: no frames from ffmpeg",
-            self.converter.video.display()
-        )))
+        let context = format!("{}: no frames from ffmpeg", self.video.path.display());
+        Grey::read(&mut self.stdout).map_err(Error::failed_with_context(context))
     }
 
-    /// Returns the next frames of [`Converter::write`], which may be none after 0.1 s; `None` at the end.
-    pub(super) fn next_shown(&mut self) -> Option<Option<Shown>> {
-        match self.shown.recv_timeout(Duration::from_millis(100)) {
-            Ok(shown) => Some(Some(shown)),
-            Err(RecvTimeoutError::Timeout) => Some(None),
-            Err(RecvTimeoutError::Disconnected) => None,
+    /// Waits for the next number of frames that [`Video::write`] has written, twice a second; `None` at the end.
+    pub(super) fn next_count(&mut self) -> Result<Option<usize>> {
+        let context = format!("{}: no progress from ffmpeg", self.video.path.display());
+        let mut line = String::new();
+        while self.stdout.read_line(&mut line).map_err(Error::failed_with_context(&context))? > 0 {
+            if let Some(count) = line.strip_prefix("frame=").and_then(|count| count.trim().parse().ok()) {
+                return Ok(Some(count));
+            }
+            line.clear();
         }
+        Ok(None)
     }
 
     /// Waits for the end of ffmpeg.
@@ -270,7 +197,7 @@ impl Pass<'_> {
         match status.success() {
             true => Ok(()),
             false => Err(self
-                .converter
+                .video
                 .failed(format!("ffmpeg failed: {}", error.unwrap_or_else(|| status.to_string())))),
         }
     }
@@ -287,10 +214,8 @@ impl Drop for Pass<'_> {
 /// Returns the command that runs a program of ffmpeg without input.
 fn command(program: &str) -> Command {
     let mut command = Command::new(program);
-    command.stdin(Stdio::null());
     // Ctrl-C must reach only this program, which then ends ffmpeg.
-    #[cfg(unix)]
-    std::os::unix::process::CommandExt::process_group(&mut command, 0);
+    command.stdin(Stdio::null()).process_group(0);
     command
 }
 
@@ -327,43 +252,17 @@ fn absolute(path: &Path) -> Result<PathBuf> {
     std::path::absolute(path).map_err(Error::read(path))
 }
 
-/// Returns a line of ffmpeg without its prefixes: the module, such as "[mov @ 0x55aa]", the level, and the path of the video.
-fn message_of(line: &str, video: &Path) -> String {
-    let mut rest = line.trim();
+/// Reads the errors that ffmpeg reports to their end. Returns the first one without its prefixes: the module, such as "[mov @ 0x55aa]", and the
+/// path of the video.
+fn first_message(errors: impl Read, video: &Path) -> Option<String> {
+    let mut lines = BufReader::new(errors).split(b'\n').map_while(std::io::Result::ok);
+    let first = lines.next()?;
+    lines.for_each(drop);
+    let first = String::from_utf8_lossy(&first);
+    let mut rest = first.trim();
     while let Some((_, after)) = rest.strip_prefix('[').and_then(|prefix| prefix.split_once("] ")) {
         rest = after;
     }
     let video = absolute(video).unwrap_or_default();
-    rest.strip_prefix(&format!("{}: ", video.display())).unwrap_or(rest).into()
-}
-
-/// Returns `true` if ffmpeg introduces itself as a version before 5.1, which has no -fps_mode. Later versions have no -vsync.
-fn is_before_5_1(banner: &str) -> bool {
-    // "ffmpeg version 5.1.9-0+deb12u1 Copyright …", "ffmpeg version n7.1 …"; builds between versions have no such number.
-    let version = banner.split_whitespace().nth(2).unwrap_or_default().trim_start_matches('n');
-    let mut numbers = version.split(|c: char| !c.is_ascii_digit()).map_while(|part| part.parse::<u32>().ok());
-    numbers.next().is_some_and(|major| (major, numbers.next().unwrap_or(0)) < (5, 1))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn versions_are_told_apart() {
-        for (version, is_before) in [
-            ("4.4.2-0ubuntu0.22.04.1", true),
-            ("5.0.1", true),
-            ("n4.4", true),
-            ("5.1.9-0+deb12u1", false),
-            ("n7.1", false),
-            ("8.0", false),
-            ("10", false),
-            ("N-118193-g5f38c82536", false),
-            ("git-2024-01-01", false),
-        ] {
-            let banner = format!("ffmpeg version {version} Copyright (c) 2000-2025 the FFmpeg developers");
-            assert_eq!(is_before_5_1(&banner), is_before, "{version}");
-        }
-    }
+    Some(rest.strip_prefix(&format!("{}: ", video.display())).unwrap_or(rest).into())
 }

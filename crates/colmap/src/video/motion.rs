@@ -1,8 +1,9 @@
-//! Motion of the picture from frame to frame: the median of the displacements of blocks, which are matched from coarse to fine.
+//! Sharpness of small grey images, and motion of the picture from one to the next: the median of the displacements of blocks, which are matched
+//! from coarse to fine.
 //!
 //! Blocks are compared by zero-mean normalized cross-correlation, which doesn't depend on exposure and contrast.
 
-use super::grey::Grey;
+use std::io::{self, BufRead, ErrorKind};
 
 /// Maximum size of the finest level in pixels.
 const FINEST: usize = 160;
@@ -27,6 +28,85 @@ const NEXT_REFERENCE: f64 = 0.02;
 /// Motion of a cut, in units of the longer side.
 const CUT: f64 = 1.;
 
+/// A grey image, rows from the top.
+#[derive(Debug, Clone)]
+pub(super) struct Grey {
+    width: usize,
+    height: usize,
+    /// Values of 0 to 255.
+    pixels: Vec<f32>,
+}
+
+impl Grey {
+    /// Reads a binary PGM as ffmpeg writes it: "P5", the size and the maximum, 255, in a line each. Returns `None` at the end of the data.
+    pub(super) fn read(reader: &mut impl BufRead) -> io::Result<Option<Self>> {
+        if reader.fill_buf()?.is_empty() {
+            return Ok(None);
+        }
+        let mut header = String::new();
+        for _ in 0..3 {
+            reader.read_line(&mut header)?;
+        }
+        let words: Vec<&str> = header.split_whitespace().collect();
+        let ["P5", width, height, "255"] = words[..] else { return Err(ErrorKind::InvalidData.into()) };
+        let parse = |word: &str| word.parse::<usize>().map_err(|_| io::Error::from(ErrorKind::InvalidData));
+        let (width, height) = (parse(width)?, parse(height)?);
+        let mut bytes = vec![0; width * height];
+        reader.read_exact(&mut bytes)?;
+        Ok(Some(Grey { width, height, pixels: bytes.into_iter().map(f32::from).collect() }))
+    }
+
+    /// Returns the sharpness: the mean square of the Laplacian, relative to the variance of the pixels, which makes it independent of
+    /// exposure. 0 for an image of less than 3 pixels a side.
+    pub(super) fn sharpness(&self) -> f64 {
+        /// Variance that matters little in a photo, but makes the noise of a black frame count as blur.
+        const LEAST_VARIANCE: f64 = 25.;
+        if self.width < 3 || self.height < 3 {
+            return 0.;
+        }
+        let (mut squares, mut sum, mut square_sum) = (0f64, 0f64, 0f64);
+        let row = |y: usize| &self.pixels[y * self.width..][..self.width];
+        for y in 1..self.height - 1 {
+            let (above, here, below) = (row(y - 1), row(y), row(y + 1));
+            let (mut row_squares, mut row_sum, mut row_square_sum) = (0f32, 0f32, 0f32);
+            for x in 1..self.width - 1 {
+                let laplacian = above[x] + below[x] + here[x - 1] + here[x + 1] - 4. * here[x];
+                row_squares += laplacian * laplacian;
+                row_sum += here[x];
+                row_square_sum += here[x] * here[x];
+            }
+            squares += f64::from(row_squares);
+            sum += f64::from(row_sum);
+            square_sum += f64::from(row_square_sum);
+        }
+        let count = ((self.width - 2) * (self.height - 2)) as f64;
+        let variance = square_sum / count - (sum / count).powi(2);
+        squares / count / (variance + LEAST_VARIANCE)
+    }
+
+    /// Returns the image reduced by an integer `factor`: means of squares of pixels.
+    fn reduce(&self, factor: usize) -> Self {
+        let (width, height) = ((self.width / factor).max(1), (self.height / factor).max(1));
+        let mut pixels = vec![0.; width * height];
+        for (y, row) in self.pixels.chunks(self.width).take(height * factor).enumerate() {
+            for (x, value) in row.iter().take(width * factor).enumerate() {
+                pixels[y / factor * width + x / factor] += value;
+            }
+        }
+        let scale = 1. / (factor * factor) as f32;
+        pixels.iter_mut().for_each(|value| *value *= scale);
+        Grey { width, height, pixels }
+    }
+
+    /// Returns the image at the sizes at which blocks are matched, from the finest to the coarsest.
+    fn levels(&self) -> [Grey; LEVELS] {
+        let finest = self.reduce(self.width.max(self.height).div_ceil(FINEST));
+        let middle = finest.reduce(2);
+        let coarsest = middle.reduce(2);
+        [finest, middle, coarsest]
+    }
+}
+
 /// Measures how far the picture moves. It compares frames to a reference frame that is up to [`NEXT_REFERENCE`] away.
 #[derive(Default)]
 pub(super) struct MotionTracker {
@@ -39,7 +119,7 @@ impl MotionTracker {
     /// Returns the motion from the last frame to `frame`, in units of the longer side: [`CUT`] if they don't show the same, 0 at the first
     /// frame.
     pub(super) fn add(&mut self, frame: &Grey) -> f64 {
-        let levels = Levels::new(frame);
+        let levels = frame.levels();
         let Some(reference) = &self.reference else {
             self.reference = Some(Reference::new(levels));
             return 0.;
@@ -61,28 +141,16 @@ impl MotionTracker {
     }
 }
 
-/// A frame, from the finest level to the coarsest.
-struct Levels([Grey; LEVELS]);
-
-impl Levels {
-    fn new(frame: &Grey) -> Self {
-        let finest = frame.reduce(frame.width.max(frame.height).div_ceil(FINEST));
-        let middle = finest.reduce(2);
-        let coarsest = middle.reduce(2);
-        Levels([finest, middle, coarsest])
-    }
-}
-
 /// A frame that others are compared to.
 struct Reference {
-    levels: Levels,
+    levels: [Grey; LEVELS],
     /// Centres of the blocks with texture, in pixels of the finest level.
     blocks: Vec<[isize; 2]>,
 }
 
 impl Reference {
-    fn new(levels: Levels) -> Self {
-        let finest = &levels.0[0];
+    fn new(levels: [Grey; LEVELS]) -> Self {
+        let finest = &levels[0];
         let centre = |index: isize, side: usize| (2 * index + 1) * side as isize / (2 * GRID);
         let centres =
             (0..GRID * GRID).map(|i| [centre(i % GRID, finest.width), centre(i / GRID, finest.height)]);
@@ -92,7 +160,7 @@ impl Reference {
 
     /// Returns the median displacement of the blocks from this frame to `frame`, in units of the longer side; `None` if too few blocks are
     /// found again.
-    fn displacement(&self, frame: &Levels) -> Option<f64> {
+    fn displacement(&self, frame: &[Grey; LEVELS]) -> Option<f64> {
         if self.blocks.len() < MIN_BLOCKS {
             return None;
         }
@@ -103,13 +171,13 @@ impl Reference {
             return None;
         }
         lengths.sort_by(f32::total_cmp);
-        let finest = &self.levels.0[0];
+        let finest = &self.levels[0];
         Some(f64::from(lengths[lengths.len() / 2]) / finest.width.max(finest.height) as f64)
     }
 
     /// Returns the displacement of the whole picture, in pixels of the coarsest level.
-    fn whole_displacement(&self, frame: &Levels) -> [isize; 2] {
-        let (from, to) = (&self.levels.0[LEVELS - 1], &frame.0[LEVELS - 1]);
+    fn whole_displacement(&self, frame: &[Grey; LEVELS]) -> [isize; 2] {
+        let (from, to) = (&self.levels[LEVELS - 1], &frame[LEVELS - 1]);
         let range = [from.width, from.height].map(|side| (side as f32 * RANGE) as isize);
         let all = Window { left: 0, top: 0, right: from.width as isize, bottom: from.height as isize };
         best_match([0, 0], range, |shift| all.correlate(from, to, shift, 0.)).0
@@ -117,14 +185,19 @@ impl Reference {
 
     /// Returns the length of the displacement of the block at `centre`, in pixels of the finest level. The search starts at `shift`, the
     /// displacement of the whole picture. Returns `None` if the block isn't found again.
-    fn block_displacement(&self, frame: &Levels, centre: [isize; 2], mut shift: [isize; 2]) -> Option<f32> {
+    fn block_displacement(
+        &self,
+        frame: &[Grey; LEVELS],
+        centre: [isize; 2],
+        mut shift: [isize; 2],
+    ) -> Option<f32> {
         for level in (1..LEVELS).rev() {
             let window = Window::around(centre.map(|value| value >> level));
-            let correlate = |shift| window.correlate(&self.levels.0[level], &frame.0[level], shift, 0.5);
+            let correlate = |shift| window.correlate(&self.levels[level], &frame[level], shift, 0.5);
             shift = best_match(shift, [SEARCH[level]; 2], correlate).0.map(|value| 2 * value);
         }
         let window = Window::around(centre);
-        let correlate = |shift| window.correlate(&self.levels.0[0], &frame.0[0], shift, 0.5);
+        let correlate = |shift| window.correlate(&self.levels[0], &frame[0], shift, 0.5);
         let (shift @ [x, y], correlation) = best_match(shift, [SEARCH[0]; 2], correlate);
         // The maximum of a parabola through the correlations around the best pixel.
         let fraction = |before: f32, after: f32| {

@@ -26,7 +26,9 @@ pub fn read_points(capture: &Capture) -> Result<Vec<Point>> {
         images.file_name().and_then(|name| name.to_str()).and_then(|name| name.strip_prefix("images."));
     let file = images.with_file_name(format!("points3D.{}", form.unwrap_or_default()));
     match form {
-        Some("bin") if file.is_file() => read_points_binary(&file),
+        Some("bin") if file.is_file() => {
+            Ok(read_points_binary(&file)?.into_iter().map(|(point, _)| point).collect())
+        }
         Some("txt") if file.is_file() => read_points_text(&file),
         _ => Ok(vec![]),
     }
@@ -53,8 +55,8 @@ fn read_points_text(file: &Path) -> Result<Vec<Point>> {
 }
 
 /// Reads the number of points (u64), then for each point: id (u64), position (f64), color (u8), error (f64), and the number of
-/// views that see it (u64), each two ids (u32).
-fn read_points_binary(file: &Path) -> Result<Vec<Point>> {
+/// views that see it (u64), each two ids (u32). Returns the points and their errors.
+pub fn read_points_binary(file: &Path) -> Result<Vec<(Point, f64)>> {
     const VIEW: usize = 8;
     const MIN_ENTRY_BYTES: usize = 8 + 3 * 8 + 3 + 8 + 8;
     let contents = std::fs::read(file).map_err(Error::read(file))?;
@@ -67,10 +69,10 @@ fn read_points_binary(file: &Path) -> Result<Vec<Point>> {
             *value = bytes.number(|| format!("the position of point {id}"))?;
         }
         let color = bytes.take(|| format!("the color of point {id}"))?;
-        bytes.number(|| format!("the error of point {id}"))?;
+        let error = bytes.number(|| format!("the error of point {id}"))?;
         let views = bytes.count(&format!("the number of views of point {id}"), VIEW)?;
         bytes.at += views * VIEW;
-        points.push(point(file, id, position, color)?);
+        points.push((point(file, id, position, color)?, error));
     }
     bytes.end()?;
     Ok(points)

@@ -1,0 +1,183 @@
+//! Captures from photos or a video: which folders may be used, what an earlier call has made, and the steps in their order.
+
+use crate::colmap::{CAMERA_MODELS, Colmap};
+use crate::photos::find_photos;
+use crate::poses::Estimate;
+use crate::progress::{Interrupt, Progress, Reporter, Step, unless_stopped};
+use crate::record::{CaptureReport, FILE, Matching, Record, VideoRecord};
+use crate::video::write_sharpest_frames;
+use globalsplat_files::{Error, Result};
+use std::fs::{self, DirEntry};
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+/// Options of [`make_capture`].
+#[derive(Debug, Clone, Default)]
+pub struct CaptureOptions {
+    /// Number of frames to take from a video, 1 to 2,000. `None` stands for one frame per 6 % of the longer side that the picture moves, but 30
+    /// to 300 frames.
+    pub frames: Option<usize>,
+    /// A camera model of COLMAP. By default EQUIRECTANGULAR for panoramas of 360° whose XMP data say so, else OPENCV for 10 or more photos of
+    /// one size and focal length, and SIMPLE_RADIAL for fewer.
+    pub camera_model: Option<String>,
+    /// Choice of pairs.
+    pub matching: Matching,
+    /// Folder of masks, named like the photos; by default the folder `masks` among the photos, if there is one. Black pixels have no
+    /// features.
+    pub masks: Option<PathBuf>,
+    /// `true` to use a finished capture as it is, whatever settings it was made with.
+    pub keeps_finished: bool,
+}
+
+/// Makes a capture in the folder `out` of `source`, a folder of photos or a video: chooses the frames of a video like
+/// [`extract_frames`](crate::extract_frames), estimates poses by `colmap` on all cores, and writes the photos to `images` and COLMAP's models
+/// to `sparse/0`, `sparse/1`, …
+///
+/// `on_progress` is called several times a second. If it returns `false`, the work is stopped and the result is `None`; the same call continues
+/// where it was stopped. `capture.json` records how far the capture is. A call with other settings repeats what depends on them.
+///
+/// Photos that are damaged, of a single color or identical to another are left out and reported.
+///
+/// # Errors
+/// Returns an error if there are fewer than two different photos or frames; if `out` contains something else, or the capture of other
+/// photos; if ffmpeg or COLMAP fails; or if COLMAP registers no photo.
+pub fn make_capture(
+    source: &Path,
+    out: &Path,
+    options: &CaptureOptions,
+    colmap: &Colmap,
+    on_progress: &mut dyn FnMut(Progress) -> bool,
+) -> Result<Option<CaptureReport>> {
+    unless_stopped(run_steps(source, out, options, colmap, &mut Reporter(on_progress)))
+}
+
+fn run_steps(
+    source: &Path,
+    out: &Path,
+    options: &CaptureOptions,
+    colmap: &Colmap,
+    reporter: &mut Reporter,
+) -> Result<CaptureReport, Interrupt> {
+    if let Some(model) = options.camera_model.as_deref().filter(|model| !CAMERA_MODELS.contains(model)) {
+        let expected = format!("one of {}", CAMERA_MODELS.join(", "));
+        return Err(Error::setting("the camera model", model, expected).into());
+    }
+    let (images, is_video) = (out.join("images"), source.is_file());
+    let photos = if is_video { &images } else { source };
+    let old = Record::read(out)?;
+    check_output(photos, out, is_video, old.is_none())?;
+    let video = match is_video {
+        true => Some(frames_of_video(source, out, options, old.as_ref(), reporter)?),
+        false => None,
+    };
+    let (found, other_files) = find_photos(photos)?;
+    if found.len() < 2 {
+        return Err(Error::input(photos, "the number of photos", found.len(), "2 or more").into());
+    }
+    let new = Record {
+        video,
+        colmap: colmap.name_and_version(),
+        camera_model: options.camera_model.clone(),
+        matching: match options.matching {
+            Matching::Auto if is_video => Matching::Sequential,
+            matching => matching,
+        },
+        masks: options.masks.clone(),
+        found,
+        ..Record::default()
+    };
+    let record = match old {
+        Some(old) if old.found != new.found => {
+            let found = format!("that of {} other or changed photos", old.found.len());
+            let expected = format!(
+                "the {} photos of {}, or a folder without a capture",
+                new.found.len(),
+                photos.display()
+            );
+            return Err(Error::input(out.join(FILE), "the list of photos", found, expected).into());
+        }
+        Some(old) => old.update(new, options.keeps_finished),
+        None => new,
+    };
+    fs::create_dir_all(&images).map_err(Error::write(&images))?;
+    record.write(out)?;
+    let mut estimate = Estimate { out, images: &images, colmap, record, reporter };
+    for step in [Step::Photos, Step::Features, Step::Pairs, Step::Poses] {
+        if estimate.record.report.is_some() {
+            break;
+        }
+        let start = Instant::now();
+        let outcome = match step {
+            Step::Photos => estimate.import(photos),
+            Step::Features => estimate.extract_features(),
+            Step::Pairs => estimate.match_pairs(),
+            _ => estimate.run_mapper(),
+        };
+        *estimate.record.seconds.entry(step).or_default() += start.elapsed().as_secs_f64();
+        estimate.record.write(out)?;
+        outcome?;
+    }
+    let report = match estimate.record.report.take() {
+        Some(report) => report,
+        None => estimate.report()?,
+    };
+    estimate.record.report = Some(report.clone());
+    estimate.record.write(out)?;
+    Ok(CaptureReport { video: estimate.record.video, other_files, ..report })
+}
+
+/// Checks that a capture of the photos in the folder `photos` may be written to `out`: the photos may be the capture's own images, but no other
+/// folder of photos may contain the capture, which would then be found among the photos. If `is_new`, the folder `out` may only contain
+/// hidden files and these photos, or what a call left that was killed before it had recorded the frames of a video.
+fn check_output(photos: &Path, out: &Path, is_video: bool, is_new: bool) -> Result<()> {
+    let canonical = photos.canonicalize();
+    if !is_video {
+        let photos_folder = canonical.as_ref().map_err(|why| Error::read(photos)(why.kind().into()))?;
+        let existing = out.ancestors().find_map(|folder| {
+            let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
+            folder.canonicalize().ok()
+        });
+        if existing.is_some_and(|out| out.starts_with(photos_folder)) {
+            let expected = format!("a folder outside of {}", photos.display());
+            return Err(Error::input(out, "the output", "inside the folder of photos", expected));
+        }
+    }
+    let entries = |folder: &Path| fs::read_dir(folder).into_iter().flatten().flatten();
+    let starts_with =
+        |entry: &DirEntry, start: &str| entry.file_name().as_encoded_bytes().starts_with(start.as_bytes());
+    let are_photos = |folder: &Path| {
+        folder.canonicalize().ok() == canonical.as_ref().ok().cloned()
+            && (!is_video || entries(folder).all(|frame| starts_with(&frame, "frame_")))
+    };
+    let other = entries(out).find(|entry| !starts_with(entry, ".") && !are_photos(&entry.path()));
+    match other.filter(|_| is_new) {
+        None => Ok(()),
+        Some(other) => {
+            let found = format!("a folder with {}", other.file_name().display());
+            Err(Error::input(out, "the output", found, "a new folder, or one with such a capture"))
+        }
+    }
+}
+
+/// Writes the frames of `video` to the folder of images in `out`, unless the call that wrote the record `old` has.
+fn frames_of_video(
+    video: &Path,
+    out: &Path,
+    options: &CaptureOptions,
+    old: Option<&Record>,
+    reporter: &mut Reporter,
+) -> Result<VideoRecord, Interrupt> {
+    let mut record = VideoRecord::new(video, options.frames)?;
+    let Some(old) = old else {
+        record.chosen = write_sharpest_frames(video, &out.join("images"), options.frames, reporter)?;
+        return Ok(record);
+    };
+    match &old.video {
+        Some(old) if record.matches(old, options.keeps_finished) => Ok(old.clone()),
+        other => {
+            let found = other.as_ref().map_or("none".to_string(), VideoRecord::to_string);
+            let expected = format!("{record}, or a folder without a capture");
+            Err(Error::input(out.join(FILE), "the video", found, expected).into())
+        }
+    }
+}

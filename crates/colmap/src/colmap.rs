@@ -1,0 +1,342 @@
+//! COLMAP, as a program or as the Python package pycolmap: found, and its commands run.
+
+use crate::progress::Interrupt;
+use globalsplat_files::{Error, Result};
+use serde_json::Value;
+use std::fmt;
+use std::fs::OpenOptions;
+use std::io::{BufRead, BufReader, Write, pipe};
+use std::os::unix::process::ExitStatusExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::sync::mpsc::{RecvTimeoutError, channel};
+use std::time::Duration;
+
+/// Camera models that COLMAP 4 estimates. Versions before 4 lack the last ones.
+pub(crate) const CAMERA_MODELS: [&str; 18] = [
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+    "OPENCV_FISHEYE",
+    "FOV",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "THIN_PRISM_FISHEYE",
+    "RAD_TAN_THIN_PRISM_FISHEYE",
+    "SIMPLE_DIVISION",
+    "DIVISION",
+    "SIMPLE_FISHEYE",
+    "FISHEYE",
+    "EUCM",
+    "EQUIRECTANGULAR",
+];
+
+/// Environment variable that names the COLMAP to use: the path of a `colmap` program, or of a Python that has pycolmap.
+const VARIABLE: &str = "GLOBALSPLAT_COLMAP";
+/// How to get COLMAP.
+const GET: &str = "pip install pycolmap, or apt install colmap";
+/// Oldest versions that are supported.
+const OLDEST_COLMAP: (u32, u32) = (3, 8);
+const OLDEST_PYCOLMAP: (u32, u32) = (4, 0);
+
+/// Prints pycolmap's version. Modules in the working directory are not imported.
+const PRINT_VERSION: &str = "import sys; sys.path = [p for p in sys.path if p]; import pycolmap; print('COLMAP', pycolmap.__version__)";
+/// Program that runs a command by pycolmap.
+const RUN_COMMAND: &str = include_str!("pycolmap_command.py");
+
+/// Sections of options that were named after SIFT before COLMAP 3.13, with their present names.
+const RENAMED: [(&str, &str); 2] =
+    [("FeatureExtraction.", "SiftExtraction."), ("FeatureMatching.", "SiftMatching.")];
+
+/// Maximum time between two calls of the callback.
+const PAUSE: Duration = Duration::from_millis(100);
+
+/// An installed COLMAP.
+#[derive(Debug, Clone)]
+pub struct Colmap {
+    program: PathBuf,
+    /// `true` if `program` is a Python that has pycolmap, `false` if it is COLMAP's own program.
+    pub(crate) is_python: bool,
+    version: String,
+}
+
+impl Colmap {
+    /// Finds COLMAP: the program or the Python that `GLOBALSPLAT_COLMAP` names; else the newest of `colmap` on the PATH and the pycolmap of
+    /// the first Python that has it, and of equal versions pycolmap. Python is looked for in `.venv` of the working directory and of
+    /// the folders above this program, in the active virtual or Conda environment, and as `python3` on the PATH.
+    ///
+    /// # Errors
+    /// Returns an error that says how to install COLMAP if there is none, or what is wrong with the one that `GLOBALSPLAT_COLMAP` names.
+    pub fn find() -> Result<Self> {
+        if let Some(path) = std::env::var_os(VARIABLE).filter(|path| !path.is_empty()) {
+            return Self::at(Path::new(&path));
+        }
+        let program = Self::new("colmap".into(), false);
+        let python = python_programs().into_iter().find_map(|python| Self::new(python, true));
+        let found = [program, python].into_iter().flatten();
+        let newest = found.max_by_key(|colmap| (colmap.check().is_ok(), parse_version(&colmap.version)));
+        let newest = newest.ok_or_else(|| {
+            Error::request(format!("COLMAP, which finds the poses of photos, isn't installed ({GET})"))
+        })?;
+        newest.check().map(|()| newest)
+    }
+
+    /// Returns the COLMAP at `path`, a `colmap` program or a Python that has pycolmap.
+    ///
+    /// # Errors
+    /// Returns an error if it can't be started, or if its version isn't supported.
+    pub fn at(path: &Path) -> Result<Self> {
+        let is_python =
+            path.file_stem().is_some_and(|name| name.to_string_lossy().to_lowercase().starts_with("python"));
+        let found = Self::new(path.to_owned(), is_python);
+        let colmap = found.ok_or_else(|| {
+            let found = if is_python { "a Python without pycolmap" } else { "no COLMAP that starts" };
+            Error::input(
+                path,
+                "the program",
+                found,
+                format!("a colmap program or a Python with pycolmap ({GET})"),
+            )
+        })?;
+        colmap.check().map(|()| colmap)
+    }
+
+    /// Returns the name and the version, as `pycolmap 4.2.1`.
+    pub fn name_and_version(&self) -> String {
+        format!("{} {}", if self.is_python { "pycolmap" } else { "COLMAP" }, self.version)
+    }
+
+    /// Returns `None` if the program can't be started, or has no version.
+    fn new(program: PathBuf, is_python: bool) -> Option<Self> {
+        let mut command = Command::new(&program);
+        match is_python {
+            true => command.args(["-c", PRINT_VERSION]),
+            false => command.arg("help"),
+        };
+        let output = command.stdin(Stdio::null()).output().ok()?;
+        let version = version_in(&String::from_utf8_lossy(&output.stdout))?.to_string();
+        Some(Colmap { program, is_python, version })
+    }
+
+    fn check(&self) -> Result<()> {
+        let oldest = if self.is_python { OLDEST_PYCOLMAP } else { OLDEST_COLMAP };
+        match parse_version(&self.version) >= Some(oldest) {
+            true => Ok(()),
+            false => {
+                let expected = format!("{}.{} or newer ({GET})", oldest.0, oldest.1);
+                Err(Error::input(&self.program, "the version of COLMAP", &self.version, expected))
+            }
+        }
+    }
+
+    /// Runs a command of COLMAP and appends what it prints to the file `log`. `options` have the names that COLMAP 4 gives them. Calls `on_count`
+    /// for every count of photos in the log, and regularly with `None` in between; the command is stopped as soon as it fails.
+    ///
+    /// # Errors
+    /// Returns the error of `on_count`, or one that quotes COLMAP's if the command can't be started or fails.
+    pub(crate) fn run(
+        &self,
+        name: &str,
+        options: &Value,
+        log: &Path,
+        on_count: &mut dyn FnMut(Option<usize>) -> Result<(), Interrupt>,
+    ) -> Result<(), Interrupt> {
+        let failed_start = || Error::failed_with_context(format!("{self} can't be started"));
+        let mut command = Command::new(&self.program);
+        if self.is_python {
+            command.args(["-c", RUN_COMMAND, name, &options.to_string()]);
+        } else {
+            let mut help = Command::new(&self.program);
+            let help = help.args([name, "-h"]).stdin(Stdio::null()).output().map_err(failed_start())?;
+            command.arg(name).args(arguments(options, &String::from_utf8_lossy(&help.stdout)));
+        }
+        let (output, writer) = pipe().map_err(failed_start())?;
+        let errors = writer.try_clone().map_err(failed_start())?;
+        // Python ends when its standard input closes.
+        let child = command.stdin(Stdio::piped()).stdout(writer).stderr(errors).spawn();
+        let mut child = Running(child.map_err(failed_start())?);
+        // It holds the end of the pipe for writing.
+        drop(command);
+        let (sender, lines) = channel();
+        std::thread::spawn(move || {
+            let lines = BufReader::new(output).split(b'\n').map_while(std::io::Result::ok);
+            // Nobody listens any more after a stop.
+            lines.for_each(|line| drop(sender.send(String::from_utf8_lossy(&line).trim_end().to_string())));
+        });
+        let mut log_file =
+            OpenOptions::new().create(true).append(true).open(log).map_err(Error::write(log))?;
+        let mut last_words = "without a message".to_string();
+        loop {
+            match lines.recv_timeout(PAUSE) {
+                Ok(line) => {
+                    writeln!(log_file, "{line}").map_err(Error::write(log))?;
+                    if let Some(message) = message_in(&line) {
+                        last_words = message.to_string();
+                    }
+                    on_count(count_in(&line))?;
+                }
+                Err(RecvTimeoutError::Timeout) => on_count(None)?,
+                Err(RecvTimeoutError::Disconnected) => break,
+            }
+        }
+        let status = child.0.wait().map_err(Error::failed_with_context(self))?;
+        if status.success() {
+            return Ok(());
+        }
+        // Ctrl-C (SIGINT), SIGTERM and SIGHUP reach COLMAP, too, possibly before this process knows of them.
+        if matches!(status.signal(), Some(1 | 2 | 15)) {
+            return Err(Interrupt::Stopped);
+        }
+        on_count(None)?;
+        let log = log.display();
+        Err(Error::failed(format!("COLMAP's {name} failed: {last_words} ({status}); see {log}")).into())
+    }
+}
+
+/// Formats the version and the program, as `pycolmap 4.2.1 (.venv/bin/python)`.
+impl fmt::Display for Colmap {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        write!(f, "{} ({})", self.name_and_version(), self.program.display())
+    }
+}
+
+/// Returns the version in the output of `colmap help`, whose first line begins with `COLMAP 3.8`.
+fn version_in(text: &str) -> Option<&str> {
+    text.lines().find_map(|line| line.strip_prefix("COLMAP ")?.split_whitespace().next())
+}
+
+/// Returns the first two numbers of a version: those of `4.2.0.dev0` are (4, 2).
+fn parse_version(version: &str) -> Option<(u32, u32)> {
+    let mut numbers = version.split(|c: char| !c.is_ascii_digit());
+    Some((numbers.next()?.parse().ok()?, numbers.next()?.parse().ok()?))
+}
+
+/// Returns the Pythons that may have pycolmap.
+fn python_programs() -> Vec<PathBuf> {
+    let program = std::env::current_exe().unwrap_or_default();
+    let folders = [Path::new("")].into_iter().chain(program.ancestors().skip(1));
+    let local = folders.map(|folder| folder.join(".venv"));
+    let active =
+        ["VIRTUAL_ENV", "CONDA_PREFIX"].map(std::env::var_os).into_iter().flatten().map(PathBuf::from);
+    let pythons = local.chain(active).map(|environment| environment.join("bin/python"));
+    pythons.filter(|python| python.is_file()).chain(["python3".into()]).collect()
+}
+
+/// Returns the arguments of COLMAP's program for `options`, in the version whose help for the command is `help`.
+fn arguments(options: &Value, help: &str) -> Vec<String> {
+    let arguments = options.as_object().into_iter().flatten().flat_map(|(name, value)| {
+        let rename = |(section, before)| Some(format!("{before}{}", name.strip_prefix(section)?));
+        let old_name = RENAMED.into_iter().find_map(rename).filter(|_| !help.contains(&format!("--{name}")));
+        let value = match value {
+            Value::Bool(is_on) => u8::from(*is_on).to_string(),
+            Value::String(text) => text.clone(),
+            other => other.to_string(),
+        };
+        [format!("--{}", old_name.as_ref().unwrap_or(name)), value]
+    });
+    arguments.collect()
+}
+
+/// A process that is killed on drop unless it has ended.
+struct Running(Child);
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// Returns the number of photos that a line of COLMAP's log reports: those with features, or those registered so far.
+fn count_in(line: &str) -> Option<usize> {
+    let number = |text: &str| -> Option<usize> {
+        let end = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
+        text[..end].parse().ok()
+    };
+    if let Some((_, rest)) = line.split_once("Processed file [") {
+        return number(rest);
+    }
+    // "Registering image #7 (3)" until COLMAP 3.11, "Registering image #7 (num_reg_frames=3)" since.
+    let (_, rest) = line.split_once("Registering image #")?;
+    let (_, rest) = rest.split_once('(')?;
+    number(rest.strip_prefix("num_reg_frames=").unwrap_or(rest)).map(|others| others + 1)
+}
+
+/// Returns the text of a warning, an error or an exception in COLMAP's log.
+fn message_in(line: &str) -> Option<&str> {
+    if let Some(message) =
+        ["ERROR: ", "WARNING: "].iter().find_map(|start| line.trim_start().strip_prefix(start))
+    {
+        return Some(message);
+    }
+    let is_logged = |level: char| {
+        let rest = line.strip_prefix(level)?;
+        rest.starts_with("20").then_some(())?;
+        Some(rest.split_once("] ")?.1)
+    };
+    let exception =
+        || line.split_once("Error: ").filter(|(class, _)| !class.contains(' ')).map(|(_, text)| text);
+    ['E', 'F'].into_iter().find_map(is_logged).or_else(exception)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn versions_are_read_and_compared() {
+        let help = "COLMAP 3.8 -- Structure-from-Motion and Multi-View Stereo\n(Commit Unknown on Unknown without CUDA)\n";
+        assert_eq!(version_in(help), Some("3.8"));
+        assert_eq!(version_in("COLMAP 4.2.1\n"), Some("4.2.1"));
+        assert_eq!(version_in("Usage: something else"), None);
+        assert_eq!(parse_version("4.2.0.dev0"), Some((4, 2)));
+        assert!(parse_version("3.12.3") > parse_version("3.8"));
+        assert_eq!(parse_version("unknown"), None);
+    }
+
+    #[test]
+    fn options_have_the_names_of_the_version() {
+        let options = json!({
+            "image_path": "my photos",
+            "FeatureExtraction.use_gpu": false,
+            "FeatureExtraction.max_image_size": 1600,
+            "SiftExtraction.max_num_features": 2048,
+        });
+        for section in ["SiftExtraction", "FeatureExtraction"] {
+            let help = format!(
+                "--image_path arg\n --{section}.use_gpu arg (=1)\n --{section}.max_image_size arg (=-1)\n"
+            );
+            let expected = format!(
+                "--{section}.max_image_size 1600 --{section}.use_gpu 0 --SiftExtraction.max_num_features 2048 --image_path my photos"
+            );
+            assert_eq!(arguments(&options, &help).join(" "), expected);
+        }
+    }
+
+    #[test]
+    fn logs_of_all_versions_are_understood() {
+        for (line, count, message) in [
+            ("Processed file [12/50]", Some(12), None),
+            ("I20261127 01:56:37.250 1405 feature_extraction.cc:270] Processed file [2/50]", Some(2), None),
+            ("Registering image #7 (3)", Some(4), None),
+            (
+                "I20261127 02:05:53.566 1396 pipeline.cc:620] Registering image #8 (num_reg_frames=7)",
+                Some(8),
+                None,
+            ),
+            ("  Name:            0001.jpg", None, None),
+            ("  => Image sees 128 / 367 points", None, None),
+            ("Elapsed time: 0.003 [minutes]", None, None),
+            ("I20261127 01:56:37.250 1405 mapper.cc:270] all is well", None, None),
+            ("ERROR: failed to create sparse model", None, Some("failed to create sparse model")),
+            ("E20261127 01:56:37.250 1405 mapper.cc:270] no images", None, Some("no images")),
+            ("ValueError: [sift.cc:12] Check failed", None, Some("[sift.cc:12] Check failed")),
+        ] {
+            assert_eq!((count_in(line), message_in(line)), (count, message), "{line}");
+        }
+    }
+}

@@ -1,0 +1,122 @@
+//! Captures up to the first command of COLMAP: requests that are refused, and videos whose frames are chosen once.
+
+use crate::{has_ffmpeg, make, write_noise};
+use globalsplat_colmap::{CaptureOptions, Colmap, Step, make_capture};
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+/// Returns a COLMAP whose commands all fail.
+fn failing_colmap() -> Colmap {
+    Colmap::at(&Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/colmap")).unwrap()
+}
+
+#[test]
+fn a_program_that_is_named_but_missing_is_an_error() {
+    let error = Colmap::at(Path::new("/no/such/python3")).unwrap_err();
+    assert!(error.is_invalid_request());
+    assert_eq!(
+        error.to_string(),
+        "/no/such/python3: the program is a Python without pycolmap, expected a colmap program or a Python with pycolmap \
+         (pip install pycolmap, or apt install colmap)"
+    );
+}
+
+#[test]
+fn bad_requests_are_refused_in_one_sentence() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    ["empty", "full", "black"].iter().for_each(|name| fs::create_dir(at(name)).unwrap());
+    fs::write(at("full/thesis.tex"), "").unwrap();
+    write_noise(&at("photos"));
+    write_noise(&at("same"));
+    for index in 1..4 {
+        fs::copy(at("same/0.png"), at(&format!("same/{index}.png"))).unwrap();
+    }
+    // Photos taken with the lens cap on.
+    for side in [40, 50] {
+        image::RgbImage::new(side, side).save(at(&format!("black/{side}.png"))).unwrap();
+    }
+    let plain = CaptureOptions::default();
+    let unknown = CaptureOptions { camera_model: Some("FISH".into()), ..plain.clone() };
+    for (source, out, options, expected) in [
+        (
+            "empty",
+            "out",
+            &plain,
+            "empty: the folder is without photos, of 0 files, expected photos, each a JPEG, PNG, WebP, TIFF, BMP, HEIC or AVIF",
+        ),
+        (
+            "same",
+            "same_out",
+            &plain,
+            "same: the number of photos is 4, of which 3 can't be used (1.png is identical to 0.png, 2.png is identical to 0.png, \
+             3.png is identical to 0.png), expected 2 or more different ones",
+        ),
+        (
+            "black",
+            "black_out",
+            &plain,
+            "black: the number of photos is 2, of which 2 can't be used (40.png is of a single color, 50.png is of a single color), \
+             expected 2 or more different ones",
+        ),
+        (
+            "photos",
+            "full",
+            &plain,
+            "full: the output is a folder with thesis.tex, expected a new folder, or one with such a capture",
+        ),
+        (
+            "photos",
+            "photos/out",
+            &plain,
+            "photos/out: the output is inside the folder of photos, expected a folder outside of photos",
+        ),
+        ("photos", "out", &unknown, "the camera model is FISH, expected one of SIMPLE_PINHOLE, "),
+    ] {
+        let error = make(&at(source), &at(out), options, &failing_colmap()).unwrap_err();
+        assert!(error.is_invalid_request(), "{error}");
+        let error = error.to_string().replace(&format!("{}/", folder.path().display()), "");
+        assert!(error.starts_with(expected), "{error}");
+    }
+}
+
+#[test]
+fn frames_of_a_video_are_chosen_once_and_their_poses_estimated() {
+    if !has_ffmpeg() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let (video, out) = (folder.path().join("walk.mp4"), folder.path().join("out"));
+    // 20 frames that pan over a pattern.
+    let source = "testsrc2=size=320x160:rate=10:duration=2,crop=200:120:n*5:10";
+    let ffmpeg =
+        Command::new("ffmpeg").args(["-v", "error", "-f", "lavfi", "-i", source]).arg(&video).status();
+    assert!(ffmpeg.unwrap().success());
+    let run = |frames: usize| {
+        let options = CaptureOptions { frames: Some(frames), ..Default::default() };
+        let mut has_measured = false;
+        let result = make_capture(&video, &out, &options, &failing_colmap(), &mut |progress| {
+            has_measured |= progress.step == Step::Measure;
+            true
+        });
+        (result.unwrap_err().to_string(), has_measured)
+    };
+    let is_estimated = |error: &str| error.contains("COLMAP's feature_extractor failed");
+    let (error, has_measured) = run(6);
+    assert!(is_estimated(&error) && has_measured, "{error}");
+    assert_eq!(fs::read_dir(out.join("images")).unwrap().count(), 6);
+    let (error, has_measured) = run(6);
+    assert!(is_estimated(&error) && !has_measured, "{error}");
+    assert!(run(5).0.contains("the video is 6 frames of walk.mp4"));
+    // A call that was killed leaves the frames without the record.
+    fs::remove_dir_all(&out).unwrap();
+    fs::create_dir_all(out.join("images")).unwrap();
+    fs::write(out.join("images/frame_00001.jpg"), "").unwrap();
+    let (error, has_measured) = run(6);
+    assert!(is_estimated(&error) && has_measured, "{error}");
+    // Photos that the user put there are no frames.
+    fs::remove_file(out.join("capture.json")).unwrap();
+    fs::write(out.join("images/mine.jpg"), "").unwrap();
+    assert!(run(6).0.contains("the output is a folder with "));
+}

@@ -1,0 +1,149 @@
+//! Poses that COLMAP finds for the photos of a synthetic scene, whose poses are known.
+
+use crate::{make, write_noise};
+use glam::DMat4;
+use globalsplat_capture::{Lens, open_capture};
+use globalsplat_colmap::{CaptureOptions, CaptureReport, Colmap, Matching, Step, make_capture};
+use globalsplat_synth::{Video, VideoSettings};
+use globalsplat_test_kit::{pose_errors, skip};
+use image::RgbImage;
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::PathBuf;
+use tempfile::TempDir;
+
+/// A temporary folder with the folders `photos` and `out`, and the installed COLMAP.
+struct Fixture {
+    root: TempDir,
+    photos: PathBuf,
+    out: PathBuf,
+    colmap: Colmap,
+}
+
+impl Fixture {
+    /// Returns `None` and skips the test without COLMAP.
+    fn new() -> Option<Self> {
+        let colmap = Colmap::find().map_err(|why| skip("pycolmap", &why.to_string())).ok()?;
+        let root = tempfile::tempdir().unwrap();
+        let [photos, out] = ["photos", "out"].map(|name| root.path().join(name));
+        fs::create_dir(&photos).unwrap();
+        Some(Fixture { root, photos, out, colmap })
+    }
+
+    /// Writes photos of a synthetic scene, through `lens` or without distortion, and returns the poses of their cameras.
+    fn write_photos(&self, count: usize, lens: Option<&Lens>) -> Vec<DMat4> {
+        let video =
+            Video::new(1, 3, &VideoSettings { frames: count, size: [360, 480].into(), pictures: vec![] });
+        for index in 0..count {
+            let photo = match lens {
+                Some(lens) => video.photo_through(index, lens),
+                None => video.photo(index),
+            };
+            photo.save(self.photos.join(format!("{index:02}.png"))).unwrap();
+        }
+        video.cameras().iter().map(|camera| camera.c2w).collect()
+    }
+
+    fn make(&self, options: &CaptureOptions) -> globalsplat_colmap::Result<CaptureReport> {
+        make(&self.photos, &self.out, options, &self.colmap)
+    }
+
+    /// Makes a capture, and returns the steps that it took.
+    fn make_steps(&self, options: &CaptureOptions) -> (CaptureReport, BTreeSet<Step>) {
+        let mut steps = BTreeSet::new();
+        let report = make_capture(&self.photos, &self.out, options, &self.colmap, &mut |progress| {
+            assert!(progress.done <= progress.total, "{progress:?}");
+            steps.insert(progress.step);
+            true
+        });
+        (report.unwrap().expect("nothing stops it"), steps)
+    }
+}
+
+#[test]
+fn poses_are_those_of_the_scene_and_a_stopped_estimate_continues() {
+    let Some(fixture) = Fixture::new() else { return };
+    let Fixture { photos, out, colmap, .. } = &fixture;
+    let truth = fixture.write_photos(10, None);
+    fs::copy(photos.join("00.png"), photos.join("copy.png")).unwrap();
+    let whole = fs::read(photos.join("00.png")).unwrap();
+    fs::write(photos.join("damaged.png"), &whole[..whole.len() / 2]).unwrap();
+    fs::write(photos.join("text.png"), b"no photo").unwrap();
+    let options = CaptureOptions::default();
+
+    // Stopped among the features, then after them.
+    for (step, done) in [(Step::Features, 4), (Step::Pairs, 0)] {
+        let report = make_capture(photos, out, &options, colmap, &mut |progress| {
+            progress.step < step || progress.step == step && progress.done < done
+        });
+        assert!(report.unwrap().is_none());
+    }
+    let (report, steps) = fixture.make_steps(&options);
+    assert_eq!(steps, [Step::Pairs, Step::Poses].into(), "features are detected once");
+    assert_eq!((report.photos, report.registered, report.unregistered.len()), (12, 10, 0), "{report}");
+    let skipped: Vec<&str> = report.skipped.iter().map(|photo| photo.name.as_str()).collect();
+    assert_eq!(skipped, ["copy.png", "damaged.png"]);
+    assert!(report.other_files.as_ref().is_some_and(|line| line.ends_with("left out: text.png")), "{report}");
+    assert!(report.points > 500 && report.reprojection_error < 1., "{report}");
+
+    let capture = open_capture(out).unwrap();
+    let names: Vec<&str> = capture.names().collect();
+    assert_eq!((names.len(), names[0], names[9]), (10, "00.png", "09.png"));
+    let cameras = capture.cameras();
+    // All photos have one camera, though the first ones were read before the estimate was stopped.
+    assert!(cameras.iter().all(|camera| camera.intrinsics == cameras[0].intrinsics));
+    let found: Vec<DMat4> = cameras.iter().map(|camera| camera.c2w).collect();
+    let errors = pose_errors(&found, &truth);
+    assert!(errors.iter().all(|&(position, angle)| position < 0.005 && angle < 0.3), "{errors:?}");
+
+    // A finished estimate is reported again, and other pairs leave the features.
+    let (again, steps) = fixture.make_steps(&options);
+    assert!(steps.is_empty() && again.points == report.points);
+    let sequential = CaptureOptions { matching: Matching::Sequential, ..options };
+    let (again, steps) = fixture.make_steps(&sequential);
+    assert_eq!((again.registered, steps), (10, [Step::Pairs, Step::Poses].into()));
+
+    // Other photos don't replace a capture.
+    fs::remove_file(photos.join("05.png")).unwrap();
+    let error = fixture.make(&sequential).unwrap_err();
+    assert!(error.is_invalid_request() && error.to_string().contains("other or changed photos"), "{error}");
+}
+
+#[test]
+fn fisheyes_without_a_known_focal_length_are_placed() {
+    let Some(fixture) = Fixture::new() else { return };
+    let lens = Lens::from_colmap("SIMPLE_FISHEYE", &[200., 240., 180.], [360, 480].into()).unwrap();
+    fixture.write_photos(8, Some(&lens));
+    let options = CaptureOptions { camera_model: Some("SIMPLE_FISHEYE".into()), ..Default::default() };
+    let report = fixture.make(&options).unwrap();
+    assert_eq!((report.registered, report.unregistered.len()), (8, 0), "{report}");
+}
+
+#[test]
+fn masked_pixels_have_no_features() {
+    let Some(fixture) = Fixture::new() else { return };
+    fixture.write_photos(10, None);
+    let masks = fixture.root.path().join("masks");
+    fs::create_dir(&masks).unwrap();
+    for index in 0..10 {
+        RgbImage::new(480, 360).save(masks.join(format!("{index:02}.png"))).unwrap();
+    }
+    let options = CaptureOptions { masks: Some(masks), ..Default::default() };
+    let error = fixture.make(&options).unwrap_err().to_string();
+    assert!(error.starts_with("COLMAP registered none of the 10 photos: "), "{error}");
+}
+
+#[test]
+fn photos_that_share_nothing_are_an_error() {
+    let Some(fixture) = Fixture::new() else { return };
+    write_noise(&fixture.photos);
+    for count in [4, 2] {
+        let error = fixture.make(&CaptureOptions::default()).unwrap_err();
+        assert!(!error.is_invalid_request(), "{error}");
+        let error = error.to_string();
+        assert!(error.starts_with(&format!("COLMAP registered none of the {count} photos: ")), "{error}");
+        assert_eq!(error.lines().count(), 1);
+        fs::remove_dir_all(&fixture.out).unwrap();
+        (2..count).for_each(|index| fs::remove_file(fixture.photos.join(format!("{index}.png"))).unwrap());
+    }
+}
