@@ -4,7 +4,6 @@
 #   scripts/on_a_gpu.sh              runs all parts on the first GPU
 #   scripts/on_a_gpu.sh --dry-run    runs the same commands at a reduced size, as a smoke test of a minute or two; DEVICE=cpu without a GPU
 #   scripts/on_a_gpu.sh --only 'model*'     runs the parts whose name matches the shell pattern (* and ?); may be repeated
-#   scripts/on_a_gpu.sh --after raster      runs the parts that come after the named one
 #   DEVICE    cuda or cuda:N (default: cuda)
 #   OUT       output folder; gets report.md, figures.json and logs.tar.gz, nothing else (default: runs/on_a_gpu)
 #   SECONDS_IN_ALL  time limit of all parts together, in seconds (default: 580)
@@ -19,15 +18,14 @@ python="${PYTHON:-.venv/bin/python}"
 globalsplat=target/release/globalsplat
 [ -z "${LIBTORCH:-}" ] || export LD_LIBRARY_PATH="$LIBTORCH/lib${LD_LIBRARY_PATH:+:$LD_LIBRARY_PATH}"
 
-dry=false only=() after=""
+dry=false only=()
 asked="$*"
 while [ $# -gt 0 ]; do
     case "$1" in
     --dry-run) dry=true ;;
     --only) only+=("${2:?--only names parts}") && shift ;;
-    --after) after="${2:?--after names a part}" && shift ;;
     *)
-        echo "on_a_gpu: unknown argument $1, expected --dry-run, --only PART or --after PART" >&2
+        echo "on_a_gpu: unknown argument $1, expected --dry-run or --only PART" >&2
         exit 2
         ;;
     esac
@@ -64,10 +62,6 @@ limit="${SECONDS_IN_ALL:-580}"
 # Succeeds if the options select the part.
 is_asked() { # NAME
     local pattern
-    if [ -n "$after" ]; then
-        [ "$1" != "$after" ] || after=""
-        return 1
-    fi
     [ ${#only[@]} -gt 0 ] || return 0
     for pattern in "${only[@]}"; do
         # shellcheck disable=SC2053 # a pattern

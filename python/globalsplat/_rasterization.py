@@ -155,14 +155,15 @@ def rasterization(
     per_gaussian = (channels,) if sh_degree is None else (colors.shape[-2], 3)
     expect_shape("colors", colors, *batch, *((cameras,) if has_camera_colors else ()), count, *per_gaussian)
     expect("the number of channels of colors", channels, channels >= 1, "1 or more")
-    for name, tensor in {
+    others = {
         "quats": quats,
         "scales": scales,
         "opacities": opacities,
         "colors": colors,
         "viewmats": viewmats,
         "Ks": Ks,
-    }.items():
+    }
+    for name, tensor in others.items():
         expect(f"the device of {name}", tensor.device, tensor.device == means.device, f"{means.device}, that of means")
     if backgrounds is not None:
         expect_shape("backgrounds", backgrounds, *batch, cameras, channels)
@@ -195,8 +196,7 @@ def rasterization(
         passes = [colors.new_zeros(*colors.shape[:-1], 1, CHANNELS)]
 
     settings = (width, height, eps2d, near_plane, far_plane, rasterize_mode == "antialiased", sh_degree is None)
-    means2d, *others = torch.ops.globalsplat.project(*gaussians, passes[0], viewmats, Ks, *settings)
-    conics, depths, projected_opacities, variances, visible = (tensor.detach() for tensor in others)
+    means2d, *projected = torch.ops.globalsplat.project(*gaussians, passes[0], viewmats, Ks, *settings)
     # Gradients reach the tensor in `meta`, so the op gets what is made from it.
     out = (*batch, cameras)
     shape, means2d = means2d.shape, means2d.reshape(*out, count, 2)
@@ -216,7 +216,7 @@ def rasterization(
     meta = {
         # gsplat's indices of packed results.
         **dict.fromkeys(("batch_ids", "camera_ids", "gaussian_ids")),
-        **_describe(means2d, conics, depths, projected_opacities, variances, visible, width, height),
+        **_describe(means2d, [tensor.detach() for tensor in projected], width, height),
         "width": width,
         "height": height,
         "tile_size": tile_size,
@@ -229,17 +229,9 @@ def rasterization(
     return image.reshape(*out, *image.shape[2:]), alpha.reshape(*out, *alpha.shape[2:]), meta
 
 
-def _describe(
-    means2d: Tensor,
-    conics: Tensor,
-    depths: Tensor,
-    opacities: Tensor,
-    variances: Tensor,
-    visible: Tensor,
-    width: int,
-    height: int,
-) -> dict[str, Tensor]:
-    """Returns the entries of `meta` for the projected Gaussians, whose tensors have the shape of means2d."""
+def _describe(means2d: Tensor, projected: list[Tensor], width: int, height: int) -> dict[str, Tensor]:
+    """Returns the entries of `meta` for the Gaussians with these projected means, and what else the op returns of them."""
+    conics, depths, opacities, variances, visible = projected
     # Standard deviations within which alpha is 1/255 or more.
     extents = (2.0 * torch.log(255.0 * opacities)).clamp(min=0.0).sqrt().clamp(max=RADIUS)
     radii = torch.ceil(extents[..., None] * variances.sqrt()).clamp(max=MAX_RADIUS)

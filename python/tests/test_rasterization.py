@@ -1,5 +1,7 @@
 """The splat op against the reference rasterizer, which the parity checks compare the program with, and as an op of PyTorch."""
 
+import itertools
+
 import globalsplat
 import pytest
 import torch
@@ -54,21 +56,9 @@ def leaves(tensors):
 
 
 def reference_rasterization(
-    means,
-    quats,
-    scales,
-    opacities,
-    colors,
-    viewmats,
-    Ks,
-    near_plane=0.01,
-    far_plane=1e10,
-    eps2d=0.3,
-    sh_degree=None,
-    backgrounds=None,
-    render_mode="RGB",
-    rasterize_mode="classic",
-):
+    means, quats, scales, opacities, colors, viewmats, Ks, *, near_plane=0.01, far_plane=1e10, eps2d=0.3, sh_degree=None,
+    backgrounds=None, render_mode="RGB", rasterize_mode="classic",
+):  # fmt: skip
     """Returns images, alphas and projected means, a tensor per camera, of the reference, with the conventions of `rasterization`."""
     images, alphas, means2d = [], [], []
     for camera, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
@@ -108,9 +98,8 @@ def compare(monkeypatch, inputs, Ks, **options):
     is_certain = is_certain[..., None]
     expected, ours = leaves(tensor.double() for tensor in inputs), leaves(inputs)
     theirs = reference_rasterization(*expected, Ks.double(), **options)
-    backgrounds = options.pop("backgrounds", None)
-    if backgrounds is not None:
-        options["backgrounds"] = backgrounds.to(inputs[0].dtype)
+    if "backgrounds" in options:
+        options["backgrounds"] = options["backgrounds"].to(inputs[0].dtype)
     image, alpha, meta = globalsplat.rasterization(*ours, Ks, WIDTH, HEIGHT, **options)
     assert_close("image", image * is_certain, theirs[0] * is_certain)
     assert_close("alpha", alpha * is_certain, theirs[1] * is_certain)
@@ -123,11 +112,8 @@ def compare(monkeypatch, inputs, Ks, **options):
         for image, alpha, tensors in ((image, alpha, [*ours, meta["means2d"]]), (*theirs[:2], [*expected, *theirs[2]]))
     ]
     assert_close("gradient of means2d", gradients[0][6], torch.stack(gradients[1][6:]))
-    for name, our, their in zip(
-        ["means", "quats", "scales", "opacities", "colors", "viewmats"],
-        *(found[:6] for found in gradients),
-        strict=True,
-    ):
+    names = ["means", "quats", "scales", "opacities", "colors", "viewmats"]
+    for name, our, their in zip(names, *(found[:6] for found in gradients), strict=True):
         if name == "viewmats":  # the last rows of matrices are constant
             our, their = our[:, :3], their[:, :3]
         assert_close(f"gradient of {name}", our, their)
@@ -178,14 +164,11 @@ def test_batches_and_colors_of_each_camera_equal_separate_calls():
     image, alpha, meta = globalsplat.rasterization(*batch, Ks.expand(3, -1, -1, -1), WIDTH, HEIGHT, render_mode="RGB+D")
     assert image.shape == (3, 2, HEIGHT, WIDTH, 5) and alpha.shape == (3, 2, HEIGHT, WIDTH, 1)
     assert meta["means2d"].shape == (3, 2, 60, 2) and meta["radii"].shape == (3, 2, 60, 2)
-    for row in range(3):
-        for camera in range(2):
-            means, quats, scales, opacities, colors, matrices = (tensor[row] for tensor in batch)
-            one, _, _ = globalsplat.rasterization(
-                means, quats, scales, opacities, colors[camera], matrices[camera : camera + 1], Ks[:1], WIDTH, HEIGHT,
-                render_mode="RGB+D",
-            )  # fmt: skip
-            torch.testing.assert_close(one[0], image[row, camera], rtol=0, atol=0)
+    for row, camera in itertools.product(range(3), range(2)):
+        *scene, colors, matrices = (tensor[row] for tensor in batch)
+        one_camera = colors[camera], matrices[camera : camera + 1], Ks[:1]
+        one, _, _ = globalsplat.rasterization(*scene, *one_camera, WIDTH, HEIGHT, render_mode="RGB+D")
+        torch.testing.assert_close(one[0], image[row, camera], rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("dtype, bases", [(torch.float32, 4), (torch.float64, 1)])

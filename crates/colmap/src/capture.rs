@@ -58,9 +58,10 @@ fn run_steps(
     colmap: &Colmap,
     reporter: &mut Reporter,
 ) -> Result<CaptureReport, Interrupt> {
-    if let Some(model) = options.camera_model.as_deref().filter(|model| !CAMERA_MODELS.contains(model)) {
-        let expected = format!("one of {}", CAMERA_MODELS.join(", "));
-        return Err(Error::setting("the camera model", model, expected).into());
+    if let Some(model) =
+        options.camera_model.as_ref().filter(|model| CAMERA_MODELS.split(", ").all(|known| known != **model))
+    {
+        return Err(Error::setting("the camera model", model, format!("one of {CAMERA_MODELS}")).into());
     }
     let (images, is_video) = (out.join("images"), source.is_file());
     let photos = if is_video { &images } else { source };
@@ -99,7 +100,7 @@ fn run_steps(
         Some(old) => old.update(new, options.keeps_finished),
         None => new,
     };
-    fs::create_dir_all(&images).map_err(Error::write(&images))?;
+    fs::create_dir_all(out).map_err(Error::write(out))?;
     record.write(out)?;
     let mut estimate = Estimate { out, images: &images, colmap, record, reporter };
     for step in [Step::Photos, Step::Features, Step::Pairs, Step::Poses] {
@@ -146,7 +147,7 @@ fn check_output(photos: &Path, out: &Path, is_video: bool, is_new: bool) -> Resu
     let starts_with =
         |entry: &DirEntry, start: &str| entry.file_name().as_encoded_bytes().starts_with(start.as_bytes());
     let are_photos = |folder: &Path| {
-        folder.canonicalize().ok() == canonical.as_ref().ok().cloned()
+        folder.canonicalize().is_ok_and(|folder| canonical.as_ref().is_ok_and(|photos| *photos == folder))
             && (!is_video || entries(folder).all(|frame| starts_with(&frame, "frame_")))
     };
     let other = entries(out).find(|entry| !starts_with(entry, ".") && !are_photos(&entry.path()));

@@ -391,7 +391,7 @@ mod tests {
             let name = "a.jpg".to_string();
             Photo { name, width: 400, height: 300, focal, is_equirectangular: false }
         };
-        for model in CAMERA_MODELS {
+        for model in CAMERA_MODELS.split(", ") {
             let parameters = fisheye_parameters(model, &photo(None));
             assert_eq!(parameters.is_some(), model.contains("FISHEYE"), "{model}");
             let Some(parameters) = parameters else { continue };

@@ -105,18 +105,4 @@ mod tests {
         assert_eq!(count(100, 0.00001), 1.);
         assert_eq!(count(100, 0.), 1.);
     }
-
-    #[test]
-    fn stretches_have_equal_motion_and_pauses_add_no_frames() {
-        // 40 frames of motion, 500 of rest, and 40 of motion thrice as fast.
-        let motion = [[0.002].repeat(40), [0.].repeat(500), [0.006].repeat(40)].concat();
-        let positions = positions(&motion, Some(8));
-        let chosen = choose_frames(&positions, &numbers(580));
-        assert_eq!(chosen.len(), 8);
-        assert!(chosen.iter().filter(|frame| (39..540).contains(*frame)).count() <= 1, "{chosen:?}");
-        for pair in chosen.windows(2) {
-            let spacing = positions[pair[1]] - positions[pair[0]];
-            assert!((1. / 3. ..2.).contains(&spacing), "{spacing}");
-        }
-    }
 }
