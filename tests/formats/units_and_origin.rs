@@ -12,8 +12,10 @@ use globalsplat::metrics::psnr;
 use globalsplat::render::{SplatRenderer, transform};
 use globalsplat::scene::{Camera, Gaussians, LocalFrame, Similarity};
 use serde_json::{Value, json};
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
+use tch::Tensor;
 
 /// Scales and origins, among them kilometres, UTM and ECEF coordinates.
 const PLACES: [(f64, [f64; 3]); 4] =
@@ -52,58 +54,78 @@ fn run_json(arguments: &[&str]) -> Value {
     serde_json::from_str(&succeed(arguments)).expect("JSON")
 }
 
-/// Returns the PNGs of `folder`, sorted by name.
-fn pictures(folder: &Path) -> Vec<PathBuf> {
-    let mut files: Vec<PathBuf> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
-    files.sort();
-    assert!(!files.is_empty());
-    files
+/// Returns the minimum PSNR of the PNGs of folder `a` compared with those of `b`.
+fn least_psnr(a: &Path, b: &Path) -> f64 {
+    let images = |folder: &Path| -> BTreeMap<PathBuf, Tensor> {
+        let files = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+        files.map(|file| (file.clone(), tensor_from_rgb(&read_image(&file).unwrap()))).collect()
+    };
+    let (a, b) = (images(a), images(b));
+    assert!(!a.is_empty() && a.len() == b.len());
+    a.values().zip(b.values()).map(|(a, b)| psnr(a, b)).fold(f64::INFINITY, f64::min)
 }
 
-/// Returns the minimum PSNR of the images of folder `a` compared with those of `b`.
-fn least_psnr(a: &Path, b: &Path) -> f64 {
-    let image = |path: &Path| tensor_from_rgb(&read_image(path).unwrap());
-    let both = pictures(a).into_iter().zip(pictures(b));
-    both.map(|(a, b)| psnr(&image(&a), &image(&b))).fold(f64::INFINITY, f64::min)
+/// Renders `splat` from the cameras of `scene`, along a smooth path through them and on orbits, to `pictures`. Returns the PSNR of the
+/// splat, and that of a copy with losses, which `convert` tells.
+fn render_and_score(splat: &Path, scene: &Path, pictures: &Path) -> [f64; 2] {
+    let copy = pictures.with_extension("compressed.ply");
+    let (splat, scene) = (arg(splat), arg(scene));
+    succeed(&["render", "--splat", splat, "--scene", scene, "--depth", "--out", arg(pictures)]);
+    for (name, cameras) in
+        [("around", &["--orbit"][..]), ("amid", &["--orbit", "--scene", scene]), ("path", &["--path", scene])]
+    {
+        let out = pictures.join(format!("{name}.png"));
+        let others = ["--splat", splat, "--frames", "3", "--size", "32x24", "--out", arg(&out)];
+        succeed(&[&["render"], cameras, &others].concat());
+    }
+    let scores = run_json(&["eval", "--splat", splat, "--scene", scene, "--json"]);
+    let loss = run_json(&["convert", splat, arg(&copy), "--scene", scene, "--local-origin", "--json"]);
+    [scores, loss].map(|report| report["psnr"].as_f64().unwrap())
+}
+
+/// Returns what the page of `splat` and `scene` contains: it has a local origin, and a unit that suits a browser's precision and the page's
+/// step sizes.
+fn page_contents(splat: &Path, scene: &Path) -> Value {
+    let page = splat.with_extension("html");
+    succeed(&["render", "--splat", arg(splat), "--scene", arg(scene), "--html", arg(&page)]);
+    let text = fs::read_to_string(page).unwrap();
+    let (_, json) = text.split_once("<script id=\"scene\" type=\"application/json\">").unwrap();
+    serde_json::from_str(json.split_once("</script>").unwrap().0).unwrap()
+}
+
+fn assert_same_page(a: &Value, b: &Value) {
+    for field in ["distance", "frustum"] {
+        let ratio = a[field].as_f64().unwrap() / b[field].as_f64().unwrap();
+        assert!((ratio - 1.).abs() < 1e-4, "{field}: {ratio}");
+    }
+    let poses = |page: &Value| -> Vec<Vec<f64>> { serde_json::from_value(page["path"].clone()).unwrap() };
+    for (a, b) in poses(a).concat().into_iter().zip(poses(b).concat()) {
+        assert!((a - b).abs() < 1e-3, "{a} {b}");
+    }
 }
 
 #[test]
 fn a_splat_looks_the_same_in_any_unit_and_place() {
     let (folder, room) = room();
     let ground_truth = room.join("truth.ply");
-    let of = |name: &str| folder.path().join(name);
-    // Renders from the capture's cameras, along a smooth path through them and on orbits, with the scores and the loss of
-    // `convert`.
-    let looked_at = |splat: &Path, scene: &Path, name: &str| -> (PathBuf, f64, f64) {
-        let (pictures, copy) = (of(name), of("copy.compressed.ply"));
-        let (splat, scene) = (arg(splat), arg(scene));
-        succeed(&["render", "--splat", splat, "--scene", scene, "--depth", "--out", arg(&pictures)]);
-        for (name, cameras) in [
-            ("around", &["--orbit"][..]),
-            ("amid", &["--orbit", "--scene", scene]),
-            ("path", &["--path", scene]),
-        ] {
-            let out = pictures.join(format!("{name}.png"));
-            let others = ["--splat", splat, "--frames", "3", "--size", "32x24", "--out", arg(&out)];
-            succeed(&[&["render"], cameras, &others].concat());
-        }
-        let scores = run_json(&["eval", "--splat", splat, "--scene", scene, "--json"]);
-        let loss = run_json(&["convert", splat, arg(&copy), "--scene", scene, "--local-origin", "--json"]);
-        (pictures, scores["psnr"].as_f64().unwrap(), loss["psnr"].as_f64().unwrap())
-    };
-    let (plain, plain_psnr, plain_loss) = looked_at(&ground_truth, &room, "plain");
+    let [scene, splat, plain, pictures] =
+        ["scene", "a.ply", "plain", "pictures"].map(|name| folder.path().join(name));
+    let [plain_psnr, plain_loss] = render_and_score(&ground_truth, &room, &plain);
+    let plain_page = has_viewer().then(|| page_contents(&ground_truth, &room));
     let read = read_splat(&ground_truth).unwrap();
     for place in PLACES {
         let to = to_place(place);
-        let (scene, splat) = (of("scene"), of("a.ply"));
         write_moved(&room, &scene, &to);
         write_local_splat(&splat, &moved_splat(&read, &to)).unwrap();
         assert_eq!(origin_file(&splat).is_file(), to.translation != DVec3::ZERO);
-        let (pictures, psnr, loss) = looked_at(&splat, &scene, "pictures");
+        let [psnr, loss] = render_and_score(&splat, &scene, &pictures);
         let least = least_psnr(&plain, &pictures);
         assert!(least >= 60., "{place:?}: {least:.2} dB");
         assert!((psnr - plain_psnr).abs() < 0.05, "{place:?}: {psnr:.2} instead of {plain_psnr:.2} dB");
         assert!((loss - plain_loss).abs() < 1., "{place:?}: {loss:.2} instead of {plain_loss:.2} dB");
+        if let Some(plain) = &plain_page {
+            assert_same_page(plain, &page_contents(&splat, &scene));
+        }
         fs::remove_dir_all(&scene).unwrap();
         fs::remove_dir_all(&pictures).unwrap();
     }
@@ -141,42 +163,6 @@ fn powers_of_two_change_no_bit() {
         for (a, b) in seen.iter().zip(&scaled) {
             assert!(a.rgb.equal(&b.rgb) && a.alpha.equal(&b.alpha), "2^{exponent}");
             assert!((&a.depth * factor).equal(&b.depth), "2^{exponent}");
-        }
-    }
-}
-
-/// A page has a local origin, and a unit that suits a browser's precision and the page's step sizes.
-#[test]
-fn a_page_is_the_same_in_any_unit_and_place() {
-    if !has_viewer() {
-        return;
-    }
-    let (folder, room) = room();
-    let ground_truth = read_splat(&room.join("truth.ply")).unwrap();
-    let of = |name: &str| folder.path().join(name);
-    let contents = |splat: &Path, scene: &Path| -> Value {
-        let page = of("page.html");
-        succeed(&["render", "--splat", arg(splat), "--scene", arg(scene), "--html", arg(&page)]);
-        let text = fs::read_to_string(page).unwrap();
-        let (_, json) = text.split_once("<script id=\"scene\" type=\"application/json\">").unwrap();
-        serde_json::from_str(json.split_once("</script>").unwrap().0).unwrap()
-    };
-    let plain = contents(&room.join("truth.ply"), &room);
-    for place in PLACES {
-        let to = to_place(place);
-        let (scene, splat) = (of("scene"), of("a.ply"));
-        write_moved(&room, &scene, &to);
-        write_local_splat(&splat, &moved_splat(&ground_truth, &to)).unwrap();
-        let other = contents(&splat, &scene);
-        for (path, least) in [("/distance", 1e-4), ("/frustum", 1e-4)] {
-            let number = |value: &Value| value.pointer(path).unwrap().as_f64().unwrap();
-            assert!((number(&plain) / number(&other) - 1.).abs() < least, "{path}: {place:?}");
-        }
-        for (a, b) in plain["path"].as_array().unwrap().iter().zip(other["path"].as_array().unwrap()) {
-            let numbers = |pose: &Value| -> Vec<f64> { serde_json::from_value(pose.clone()).unwrap() };
-            for (a, b) in numbers(a).iter().zip(numbers(b)) {
-                assert!((a - b).abs() < 1e-3, "{place:?}: {a} {b}");
-            }
         }
     }
 }
@@ -247,25 +233,23 @@ fn a_local_origin_keeps_the_detail() {
 fn origins_that_are_none_are_refused() {
     let (folder, room) = room();
     let splat = room.join("truth.ply");
-    let refused = |bad: &str, command: &[&str]| {
+    let out = folder.path().join("out.ply");
+    let (inspect, convert) = (["inspect", arg(&splat)], ["convert", arg(&splat), arg(&out)]);
+    for (bad, command) in [
+        ("", &inspect[..]),
+        ("[1, 2, 3]", &inspect),
+        ("{}", &inspect),
+        ("{\"origin\": [1, 2]}", &inspect),
+        ("{\"origin\": [1, 2, 1e999]}", &inspect),
+        ("{\"origin\": [1, \"2\", 3]}", &inspect),
+        ("{\"origin\": null}", &convert),
+    ] {
         fs::write(origin_file(&splat), bad).unwrap();
         let said = refuse(command);
         for part in ["truth.ply.origin.json: the JSON is ", "expected {\"origin\": [x, y, z]}"] {
             assert!(said.contains(part), "{bad}: {said}");
         }
-    };
-    for bad in [
-        "",
-        "[1, 2, 3]",
-        "{}",
-        "{\"origin\": [1, 2]}",
-        "{\"origin\": [1, 2, 1e999]}",
-        "{\"origin\": [1, \"2\", 3]}",
-    ] {
-        refused(bad, &["inspect", arg(&splat)]);
     }
-    let out = folder.path().join("out.ply");
-    refused("{\"origin\": null}", &["convert", arg(&splat), arg(&out)]);
 }
 
 /// A real capture gets the same scores in kilometres and in UTM coordinates.

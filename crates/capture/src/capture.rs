@@ -56,7 +56,7 @@ impl View {
     /// Returns the map from the view to its photo, at least in the part that fitting to `size` reads.
     fn undistorter(&self, size: Option<ImageSize>) -> Undistorter {
         let window = size.map(|size| source_ranges(&self.camera, size));
-        Undistorter::new(self.projection.clone(), self.camera, window)
+        Undistorter::new(self.projection, self.camera, window)
     }
 }
 
@@ -129,20 +129,6 @@ pub(crate) struct Changes {
 }
 
 impl Changes {
-    /// Checks that enough photos are left if some are missing. The number of existing photos is `present`.
-    ///
-    /// # Errors
-    /// Fails if fewer than two photos are left and `purpose` needs photos.
-    pub fn check(&self, file: &Path, present: usize, purpose: Purpose) -> Result<()> {
-        match (self.missing.first(), purpose) {
-            (Some(name), Purpose::Photos) if present < MIN_VIEWS => {
-                let found = format!("{present} of {}, {name:?} is missing", present + self.missing.len());
-                Err(Error::input(file, "the number of frames with an image", found, "two or more"))
-            }
-            _ => Ok(()),
-        }
-    }
-
     /// Returns the file of photo `name`: the one that was `found`, or, if `purpose` needs no photos, the one that is `declared`. Returns
     /// `None` and counts the photo as missing otherwise.
     pub fn photo(
@@ -247,7 +233,7 @@ impl Capture {
     pub(crate) fn new(
         name: String,
         file: PathBuf,
-        mut frames: Vec<Frame>,
+        frames: Vec<Frame>,
         changes: Changes,
         purpose: Purpose,
     ) -> Result<Self> {
@@ -255,16 +241,22 @@ impl Capture {
             Purpose::Photos => (MIN_VIEWS, "two or more"),
             Purpose::Cameras(_) => (1, "one or more"),
         };
-        changes.check(&file, frames.len(), purpose)?;
-        if frames.len() < least {
-            return Err(Error::input(&file, "the number of views", frames.len(), expected));
+        let count = frames.len();
+        if count < least {
+            let (field, found) = match changes.missing.as_slice() {
+                [] => ("the number of views", count.to_string()),
+                [name, ..] => {
+                    let found = format!("{count} of {}, {name:?} is missing", count + changes.missing.len());
+                    ("the number of frames with an image", found)
+                }
+            };
+            return Err(Error::input(&file, field, found, expected));
         }
-        let is_complete = changes.missing.is_empty();
-        let mut warnings = check_frames(&file, &mut frames, changes, purpose)?;
-        let (views, lines) = views_of_frames(&file, &frames, purpose)?;
-        warnings.extend(lines);
-        let train = views.len();
-        Ok(Capture { name, file, frames, views, train, is_complete, warnings })
+        let (frames_file, is_complete) = (file.clone(), true);
+        let empty =
+            Capture { name, file, frames: vec![], views: vec![], train: 0, is_complete, warnings: vec![] };
+        let capture = empty.with_test(&frames_file, frames, changes, purpose)?;
+        Ok(Capture { train: capture.views.len(), ..capture })
     }
 
     /// Creates a capture whose images are computed by `source` on request: image i is seen by camera i, and named by its index.
@@ -532,15 +524,14 @@ impl Capture {
     ) -> Result<Vec<Photo>> {
         let (photo, mask) = self.read_photo(&self.frames[views[0].frame])?;
         let load = |view: &&View| {
-            let fit_image = |image: &RgbImage| match size {
+            let fit = |image: &RgbImage| match size {
                 Some(size) => resize_and_crop(image, &view.camera, size),
                 None => (Planes::from_rgb(image), view.camera),
             };
-            let pixels = view_pixels(&photo, view, size, tables);
-            let (image, camera) = fit_image(pixels.as_ref().map_or(&photo, |pixels| &pixels.image));
-            let mask = view_mask(mask.as_ref(), pixels.and_then(|pixels| pixels.mask), view, size, tables)
-                .map(|mask| fit_image(&mask).0.into_first_channel())
-                .filter(|mask| mask.iter().any(|&weight| weight < u8::MAX));
+            let (image, mask) = view_pixels(&photo, mask.as_ref(), view, size, tables);
+            let (image, camera) = fit(&image);
+            let mask = mask.map(|mask| fit(&mask).0.into_first_channel());
+            let mask = mask.filter(|mask| mask.iter().any(|&weight| weight < u8::MAX));
             Photo { name: view.name.clone(), image, mask, camera }
         };
         Ok(views.iter().map(load).collect())
@@ -571,11 +562,11 @@ impl Capture {
     pub fn photo_with_mask(&self, index: usize) -> Result<(RgbImage, Option<RgbImage>)> {
         let view = &self.views[index];
         let (photo, mask) = self.read_photo(&self.frames[view.frame])?;
-        let (image, shown) = match view_pixels(&photo, view, None, &[]) {
-            Some(ViewPixels { image, mask }) => (image, mask),
-            None => (photo, None),
-        };
-        Ok((image, view_mask(mask.as_ref(), shown, view, None, &[])))
+        if view.projection.is_identity() {
+            return Ok((photo, mask));
+        }
+        let (image, mask) = view_pixels(&photo, mask.as_ref(), view, None, &[]);
+        Ok((image.into_owned(), mask.map(Cow::into_owned)))
     }
 
     /// Returns the pixels of a photo as its lens took them, and their weights in equal channels: the mask's, multiplied by the photo's
@@ -615,10 +606,9 @@ impl Capture {
         let frame = &self.frames[view.frame];
         let bytes = frame.image.read()?;
         let photo = self.decode(frame, &bytes)?;
-        match view_pixels(&photo.pixels, view, None, &[]) {
-            Some(view) => encode_photo(&view.image, photo.is_jpeg),
-            None if photo.as_stored => Ok(bytes.into_owned()),
-            None => encode_photo(&photo.pixels, photo.is_jpeg),
+        match view_pixels(&photo.pixels, None, view, None, &[]).0 {
+            Cow::Borrowed(_) if photo.as_stored => Ok(bytes.into_owned()),
+            image => encode_photo(&image, photo.is_jpeg),
         }
     }
 }
@@ -635,41 +625,38 @@ fn precompute(views: &[&View], size: Option<ImageSize>) -> Vec<Undistorter> {
     views.iter().map(|view| view.undistorter(size).precompute()).collect()
 }
 
-/// Returns the pixels of `view`, at least in the part that fitting to `size` reads, or `None` if they are those of `photo`. Uses one
-/// of `tables` if it matches.
-fn view_pixels(
-    photo: &RgbImage,
+/// Returns the pixels of `view` of `photo`, at least in the part that fitting to `size` reads, and their weights in equal channels: those of
+/// the photo's `mask`, and 0 where the photo doesn't show the view. There are no weights if every pixel counts. Uses one of `tables` if it
+/// matches.
+fn view_pixels<'a>(
+    photo: &'a RgbImage,
+    mask: Option<&'a RgbImage>,
     view: &View,
     size: Option<ImageSize>,
     tables: &[Undistorter],
-) -> Option<ViewPixels> {
+) -> (Cow<'a, RgbImage>, Option<Cow<'a, RgbImage>>) {
     if view.projection.is_identity() {
-        return None;
+        return (Cow::Borrowed(photo), mask.map(Cow::Borrowed));
     }
-    match tables.iter().find(|table| table.matches_camera(&view.projection, &view.camera)) {
-        Some(table) => Some(table.apply(photo)),
-        None => Some(view.undistorter(size).apply(photo)),
-    }
-}
-
-/// Returns the weights of the pixels of `view`, in equal channels, at least in the part that fitting to `size` reads: those of the photo's
-/// `mask`, and 0 where the photo doesn't show the view, as `shown` says. Returns `None` if every pixel counts.
-fn view_mask(
-    mask: Option<&RgbImage>,
-    shown: Option<Vec<u8>>,
-    view: &View,
-    size: Option<ImageSize>,
-    tables: &[Undistorter],
-) -> Option<RgbImage> {
-    let Camera { width, height, .. } = view.camera;
-    let shown =
-        shown.and_then(|shown| GrayImage::from_raw(width, height, shown)).map(|shown| grey_to_rgb(&shown));
-    let Some(mask) = mask else { return shown };
-    let mut mask = view_pixels(mask, view, size, tables).map_or_else(|| mask.clone(), |pixels| pixels.image);
-    if let Some(shown) = shown {
-        multiply(&mut mask, &shown);
-    }
-    Some(mask)
+    let own;
+    let undistorter = match tables.iter().find(|table| table.matches_camera(&view.projection, &view.camera)) {
+        Some(table) => table,
+        None => {
+            own = view.undistorter(size);
+            &own
+        }
+    };
+    let ViewPixels { image, mask: shown } = undistorter.apply(photo);
+    let shown = shown.and_then(|shown| GrayImage::from_raw(image.width(), image.height(), shown));
+    let mask = match (mask.map(|mask| undistorter.apply(mask).image), shown.map(|shown| grey_to_rgb(&shown)))
+    {
+        (Some(mut mask), Some(shown)) => {
+            multiply(&mut mask, &shown);
+            Some(mask)
+        }
+        (mask, shown) => mask.or(shown),
+    };
+    (Cow::Owned(image), mask.map(Cow::Owned))
 }
 
 /// Returns the pinhole views of `frames`, which `file` describes, and a line for each kind of lens whose photos change.
@@ -681,25 +668,16 @@ fn views_of_frames(file: &Path, frames: &[Frame], purpose: Purpose) -> Result<(V
     };
     // Photos of one camera have the same lens, and mostly follow each other.
     let groups: Vec<&[Frame]> = frames.chunk_by(|a, b| lens(a) == lens(b)).collect();
-    let parts = |frames: &&[Frame]| -> Option<Vec<(PinholeView, Projection)>> {
-        let lens = lens(&frames[0])?;
-        let part = |view: PinholeView| PhotoPart { lens, rotation: view.rotation };
-        Some(
-            split_into_views(&lens)
-                .into_iter()
-                .map(|view| (view, Projection::Part(Arc::new(part(view)))))
-                .collect(),
-        )
-    };
-    let parts: Vec<_> = groups.par_iter().map(parts).collect();
+    let split = |frames: &&[Frame]| lens(&frames[0]).map(|lens| (lens, split_into_views(&lens)));
+    let splits: Vec<_> = groups.par_iter().map(split).collect();
     let mut views = vec![];
     // Numbers of photos and of their views, by kind.
     let mut counts = [(0, 0); 3];
-    let parts =
-        groups.iter().zip(&parts).flat_map(|(frames, parts)| std::iter::repeat_n(parts, frames.len()));
-    for (index, (frame, parts)) in frames.iter().zip(parts).enumerate() {
+    let splits =
+        groups.iter().zip(&splits).flat_map(|(frames, split)| std::iter::repeat_n(split, frames.len()));
+    for (index, (frame, split)) in frames.iter().zip(splits).enumerate() {
         let Frame { name, camera, lens: model, .. } = frame;
-        let Some(parts) = parts else {
+        let Some((lens, parts)) = split else {
             let distortion = match model {
                 LensModel::Perspective(distortion) => *distortion,
                 LensModel::Equirectangular => {
@@ -720,11 +698,11 @@ fn views_of_frames(file: &Path, frames: &[Frame], purpose: Purpose) -> Result<(V
         };
         counts[kind].0 += 1;
         counts[kind].1 += parts.len();
-        views.extend(parts.iter().map(|(view, projection)| {
-            let PinholeView { suffix, rotation, intrinsics, size: ImageSize { height, width } } = *view;
+        views.extend(parts.iter().map(|&PinholeView { suffix, rotation, intrinsics, size }| {
             let c2w = camera.c2w * DMat4::from_mat3(rotation);
-            let camera = Camera { intrinsics, c2w, width, height };
-            View { frame: index, name: part_name(name, suffix), camera, projection: projection.clone() }
+            let camera = Camera { intrinsics, c2w, width: size.width, height: size.height };
+            let projection = Projection::Part(PhotoPart { lens: *lens, rotation });
+            View { frame: index, name: part_name(name, suffix), camera, projection }
         }));
     }
     let kinds = ["show 360 degrees", "have a wide field of view", "have a fisheye lens or the like"];
@@ -897,21 +875,9 @@ pub(crate) fn check_cameras<'a>(file: &Path, cameras: impl Iterator<Item = &'a C
 
 #[cfg(test)]
 mod tests {
-    use super::{render_names as names_with, scaled_to};
+    use super::{render_names, scaled_to};
     use crate::geometry::{Camera, Intrinsics};
     use glam::DMat4;
-
-    fn render_names(names: &[&str]) -> Vec<String> {
-        names_with(names, &[""])
-    }
-
-    #[test]
-    fn pictures_of_several_kinds_have_names_of_their_own() {
-        let suffixes = ["", "_depth"];
-        assert_eq!(names_with(&["x.png", "y.png"], &suffixes), ["x", "y"]);
-        assert_eq!(names_with(&["x.png", "x_depth.png"], &suffixes), ["x.png", "x_depth.png"]);
-        assert_eq!(names_with(&["x", "x_depth"], &suffixes), ["000000", "000001"]);
-    }
 
     #[test]
     fn cameras_are_scaled_where_the_aspect_agrees_to_a_pixel() {
@@ -932,14 +898,23 @@ mod tests {
 
     #[test]
     fn pictures_are_named_as_photos_and_none_twice() {
-        assert_eq!(render_names(&["images/000.png", "images/001.png"]), ["000", "001"]);
-        assert_eq!(render_names(&["./images/left/0.png", "./images/right/0.png"]), ["left/0", "right/0"]);
-        assert_eq!(render_names(&["left/0.png", "1.png"]), ["left/0", "1"]);
-        assert_eq!(render_names(&["a/0.png", "a/0.jpg"]), ["0.png", "0.jpg"]);
-        assert_eq!(render_names(&["0.v1.png", "0.v2.png"]), ["0.v1", "0.v2"]);
-        assert_eq!(render_names(&["../a/0.png", "b/0.png"]), ["up/a/0", "b/0"]);
-        assert_eq!(render_names(&["0.png", "0.png"]), ["000000", "000001"]);
-        assert_eq!(render_names(&["000000", "000001"]), ["000000", "000001"]);
-        assert!(render_names(&[]).is_empty());
+        let (one, depth): (&[&str], &[&str]) = (&[""], &["", "_depth"]);
+        let cases: [(&[&str], &[&str], &[&str]); 12] = [
+            (&["images/000.png", "images/001.png"], one, &["000", "001"]),
+            (&["./images/left/0.png", "./images/right/0.png"], one, &["left/0", "right/0"]),
+            (&["left/0.png", "1.png"], one, &["left/0", "1"]),
+            (&["a/0.png", "a/0.jpg"], one, &["0.png", "0.jpg"]),
+            (&["0.v1.png", "0.v2.png"], one, &["0.v1", "0.v2"]),
+            (&["../a/0.png", "b/0.png"], one, &["up/a/0", "b/0"]),
+            (&["0.png", "0.png"], one, &["000000", "000001"]),
+            (&["000000", "000001"], one, &["000000", "000001"]),
+            (&[], one, &[]),
+            (&["x.png", "y.png"], depth, &["x", "y"]),
+            (&["x.png", "x_depth.png"], depth, &["x.png", "x_depth.png"]),
+            (&["x", "x_depth"], depth, &["000000", "000001"]),
+        ];
+        for (names, suffixes, expected) in cases {
+            assert_eq!(render_names(names, suffixes), expected, "{names:?}");
+        }
     }
 }

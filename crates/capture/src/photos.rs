@@ -20,15 +20,6 @@ const MAX_SKIPPED_FOLDERS: usize = 16;
 /// Minimum number of photos of a capture.
 const MIN_PHOTOS: usize = 2;
 
-/// Rule for turning names into paths: below `base`, without the first `skipped` folders, in a folder of smaller photos if
-/// `reduced`.
-#[derive(Clone, Copy)]
-struct Rule<'a> {
-    base: &'a Path,
-    skipped: usize,
-    reduced: Option<u32>,
-}
-
 /// Looks for the photos `names` below `bases` and returns the path of each photo that exists.
 ///
 /// A name may come from another machine: with backslashes, without its extension or with one in different case, below a folder that
@@ -38,16 +29,17 @@ pub(crate) fn find_photos(bases: &[PathBuf], names: &[impl AsRef<str>]) -> Vec<O
     let deepest = names.iter().map(|name| parts(name.as_ref()).count()).max().unwrap_or(0);
     let rules = bases.iter().flat_map(|base| {
         (0..deepest.clamp(1, MAX_SKIPPED_FOLDERS))
-            .flat_map(move |skipped| REDUCTIONS.map(|reduced| Rule { base, skipped, reduced }))
+            .flat_map(move |skipped| REDUCTIONS.map(|reduction| (base, skipped, reduction)))
     });
     let mut best = (0, vec![None; names.len()]);
-    for rule in rules {
-        let found: Vec<_> = names.iter().map(|name| rule.find(name.as_ref())).collect();
+    for (base, skipped, reduction) in rules {
+        let find = |name| find_photo(base, name, skipped, reduction);
+        let found: Vec<_> = names.iter().map(|name| find(name.as_ref())).collect();
         let pairs =
             names.iter().zip(&found).filter_map(|(name, photo)| Some((name.as_ref(), photo.as_ref()?)));
         let (named, photos): (BTreeSet<&str>, BTreeSet<&PathBuf>) = pairs.unzip();
         let (count, is_ambiguous) = (photos.len(), photos.len() < named.len());
-        if count > best.0 && !(is_ambiguous && rule.skipped > 0) {
+        if count > best.0 && !(is_ambiguous && skipped > 0) {
             best = (count, found);
             if count >= MIN_PHOTOS {
                 break;
@@ -93,25 +85,23 @@ fn parts(name: &str) -> impl Iterator<Item = &str> {
     name.split(['/', '\\']).filter(|part| !part.is_empty() && *part != ".")
 }
 
-impl Rule<'_> {
-    fn find(&self, name: &str) -> Option<PathBuf> {
-        let as_written = match (self.skipped, self.reduced) {
-            (0, None) if !name.is_empty() => file_at(self.base.join(name)),
-            _ => None,
-        };
-        as_written.or_else(|| {
-            let mut parts = parts(name).skip(self.skipped).peekable();
-            let first = parts.next()?;
-            let mut path = self.base.to_owned();
-            match self.reduced {
-                None => path.push(first),
-                Some(factor) if parts.peek().is_some() => path.push(format!("{first}_{factor}")),
-                Some(_) => return None,
-            }
-            path.extend(parts);
-            file_at(path)
-        })
+/// Looks for the photo `name` below `base`, without its first `skipped` folders, in a folder of smaller photos if there is a `reduction`.
+fn find_photo(base: &Path, name: &str, skipped: usize, reduction: Option<u32>) -> Option<PathBuf> {
+    if (skipped, reduction) == (0, None)
+        && !name.is_empty()
+        && let Some(photo) = file_at(base.join(name))
+    {
+        return Some(photo);
     }
+    let mut parts = parts(name).skip(skipped).peekable();
+    let first = parts.next()?;
+    let folder = match reduction {
+        None => first.to_string(),
+        Some(factor) => parts.peek().map(|_| format!("{first}_{factor}"))?,
+    };
+    let mut path = base.join(folder);
+    path.extend(parts);
+    file_at(path)
 }
 
 /// Returns the file at `path`, or the photo whose name differs only in the case of its extension or has an additional extension.

@@ -67,13 +67,7 @@ pub fn replace_dir<E: From<Error>>(
 ) -> Result<(), E> {
     let target = target_of(path, Metadata::is_dir, "the name of a folder")?;
     fs::create_dir_all(parent_of(&target)).map_err(Error::write(path))?;
-    let make = |place: &Path| {
-        fs::create_dir(place)?;
-        // Another process may have removed the folder before it was locked, and created its own.
-        File::open(place)
-            .map_err(|e| if e.kind() == ErrorKind::NotFound { ErrorKind::AlreadyExists.into() } else { e })
-    };
-    let (temporary, _lock) = claim(&target, make).map_err(Error::write(path))?;
+    let (temporary, _lock) = claim(&target, make_dir).map_err(Error::write(path))?;
     let retired = old_name(&target);
     let swap = || {
         if retired.is_dir() && !target.exists() {
@@ -88,7 +82,8 @@ pub fn replace_dir<E: From<Error>>(
     };
     let filled = fill(&temporary);
     sync_dir(&temporary);
-    let _swapping = lock_parent(&target);
+    // Processes replace folders in one parent one at a time, since a folder is missing for a moment. Not every file system has locks.
+    let _swapping = File::open(parent_of(&target)).and_then(|parent| parent.lock().map(|()| parent));
     let result = filled.and_then(|()| Ok(swap()?));
     if result.is_err() {
         let _ = fs::remove_dir_all(&temporary);
@@ -99,13 +94,6 @@ pub fn replace_dir<E: From<Error>>(
     }
     sync_dir(parent_of(&target));
     Ok(())
-}
-
-/// Locks the parent folder of `path` until the returned file is dropped, so that processes replace folders in it one at a time. Without the
-/// lock, a folder may be missing for a moment. Returns `None` if the file system has no locks.
-fn lock_parent(path: &Path) -> Option<File> {
-    let parent = File::open(parent_of(path)).ok()?;
-    parent.lock().ok().map(|()| parent)
 }
 
 /// Removes the entries `own_entries`, which belong to the program, from the folder `retired`, after moving its other entries to the folder
@@ -138,7 +126,7 @@ pub fn remove_dir(path: &Path, own_entries: &[&str]) -> Result<()> {
             return remove_own_entries(path, own_entries);
         }
     }
-    let temporary = free_names(path).next().expect("names without end");
+    let (temporary, _lock) = claim(path, make_dir).map_err(Error::write(path))?;
     fs::rename(path, &temporary).map_err(Error::write(path))?;
     unless_missing(fs::remove_dir_all(&temporary)).map_err(Error::write(&temporary))
 }
@@ -333,47 +321,43 @@ fn writable_by_owner(mut permissions: fs::Permissions) -> fs::Permissions {
 }
 
 /// Claims a temporary path beside `target` for this process alone. `make` creates a new file or folder there and opens it. It stays locked
-/// until the returned file is closed.
+/// until the returned file is closed. Removes what was abandoned at the temporary paths.
 fn claim(target: &Path, make: impl Fn(&Path) -> io::Result<File>) -> io::Result<(PathBuf, File)> {
-    for place in free_names(target) {
-        let file = match make(&place) {
-            Ok(file) => file,
-            Err(e) if e.kind() == ErrorKind::AlreadyExists => continue,
-            Err(e) => return Err(e),
-        };
-        // On file systems without locks, no process takes it for abandoned, and abandoned files stay.
-        let _ = file.lock();
-        // Another process may have found it before it was locked, and removed it.
-        if is_at(&file, &place) {
-            let later = temporary_names(target).skip_while(|name| *name != place).skip(1);
-            for left in later.take_while(|name| name.symlink_metadata().is_ok()) {
-                let _ = remove_abandoned(&left);
+    let remove_abandoned = |number| remove_abandoned(&temporary_path(target, number)).unwrap_or(false);
+    let mut number = 0;
+    loop {
+        let place = temporary_path(target, number);
+        match make(&place) {
+            Ok(file) => {
+                // On file systems without locks, no process takes it for abandoned, and abandoned files stay.
+                let _ = file.lock();
+                // Another process may have found it before it was locked, and removed it.
+                if is_at(&file, &place) {
+                    (number + 1..).take_while(|later| remove_abandoned(*later)).for_each(drop);
+                    return Ok((place, file));
+                }
             }
-            return Ok((place, file));
+            Err(e) if e.kind() == ErrorKind::AlreadyExists => number += u32::from(!remove_abandoned(number)),
+            Err(e) => return Err(e),
         }
     }
-    unreachable!("names without end")
 }
 
-/// Returns the temporary paths for `target` that are free, after removing what was abandoned there.
-fn free_names(target: &Path) -> impl Iterator<Item = PathBuf> {
-    // If the removal fails, the path counts as taken.
-    let is_free =
-        |name: &PathBuf| name.symlink_metadata().is_err() || remove_abandoned(name).unwrap_or(false);
-    temporary_names(target).filter(is_free)
+/// Creates the folder `place` and opens it.
+fn make_dir(place: &Path) -> io::Result<File> {
+    fs::create_dir(place)?;
+    // Another process may have removed the folder before it was locked, and created its own.
+    File::open(place)
+        .map_err(|e| if e.kind() == ErrorKind::NotFound { ErrorKind::AlreadyExists.into() } else { e })
 }
 
-/// Returns all temporary paths for `target`, as an infinite iterator.
-fn temporary_names(target: &Path) -> impl Iterator<Item = PathBuf> {
+/// Returns a temporary path for `target`, one for each `number`.
+fn temporary_path(target: &Path, number: u32) -> PathBuf {
     let name = target.file_name().unwrap_or_default().to_string_lossy();
-    let ends = name.char_indices().map(|(at, letter)| at + letter.len_utf8());
-    let end = ends.take_while(|end| *end <= NAME_BYTES).last().unwrap_or(0);
-    let stem = format!(".{}.{PARTIAL}", &name[..end]);
-    let target = target.to_owned();
-    (0..).map(move |number| match number {
-        0 => target.with_file_name(&stem),
-        later => target.with_file_name(format!("{stem}-{later}")),
-    })
+    let ends = 0..=name.len().min(NAME_BYTES);
+    let end = ends.rev().find(|&end| name.is_char_boundary(end)).unwrap_or(0);
+    let ending = if number == 0 { String::new() } else { format!("-{number}") };
+    target.with_file_name(format!(".{}.{PARTIAL}{ending}", &name[..end]))
 }
 
 /// Removes the temporary file or folder at `place` unless a process uses it. Returns `true` if it was removed.
@@ -454,40 +438,34 @@ mod tests {
     fn a_folder_goes_as_one_and_foreign_files_stay() {
         let root = tempfile::tempdir().unwrap();
         let folder = root.path().join("step");
-        let make = |names: &[&str]| {
-            fs::create_dir_all(&folder).unwrap();
-            names.iter().for_each(|name| fs::write(folder.join(name), name).unwrap());
-        };
-        make(&["model", "state"]);
         // A partial removal from before must not get in the way.
         fs::create_dir_all(root.path().join(".step.globalsplat-partial/model")).unwrap();
-        remove_dir(&folder, &["model", "state"]).unwrap();
-        assert_eq!(fs::read_dir(root.path()).unwrap().count(), 0);
-
-        make(&["model", "state", "notes"]);
-        remove_dir(&folder, &["model", "state"]).unwrap();
-        assert_eq!(fs::read_dir(&folder).unwrap().count(), 1);
-        assert_eq!(fs::read(folder.join("notes")).unwrap(), b"notes");
+        for (entries, left) in [(&["model", "state"][..], &[][..]), (&["model", "notes", "state"], &["step"])]
+        {
+            fs::create_dir_all(&folder).unwrap();
+            entries.iter().for_each(|name| fs::write(folder.join(name), name).unwrap());
+            remove_dir(&folder, &["model", "state"]).unwrap();
+            assert_eq!(names(root.path()), left);
+        }
+        assert_eq!(names(&folder), ["notes"]);
     }
 
     #[test]
     fn writers_of_one_file_have_names_of_their_own() {
         let root = tempfile::tempdir().unwrap();
         let file = root.path().join("room.ply");
+        let partial = [".room.ply.globalsplat-partial", ".room.ply.globalsplat-partial-1"];
         // Left by processes that were killed.
-        for left in [".room.ply.globalsplat-partial", ".room.ply.globalsplat-partial-1"] {
-            fs::write(root.path().join(left), "left").unwrap();
-        }
+        partial.iter().for_each(|left| fs::write(root.path().join(left), "left").unwrap());
         let first = PartialFile::create(&file).unwrap();
-        assert_eq!(names(root.path()), [".room.ply.globalsplat-partial"]);
+        assert_eq!(names(root.path()), partial[..1]);
         let second = PartialFile::create(&file).unwrap();
-        assert_eq!(names(root.path()), [".room.ply.globalsplat-partial", ".room.ply.globalsplat-partial-1"]);
-        (&first.file).write_all(b"first").unwrap();
-        (&second.file).write_all(b"second").unwrap();
-        second.persist().unwrap();
-        assert_eq!(fs::read(&file).unwrap(), b"second");
-        first.persist().unwrap();
-        assert_eq!(fs::read(&file).unwrap(), b"first");
+        assert_eq!(names(root.path()), partial);
+        for (writer, text) in [(second, b"second".as_slice()), (first, b"first")] {
+            (&writer.file).write_all(text).unwrap();
+            writer.persist().unwrap();
+            assert_eq!(fs::read(&file).unwrap(), text);
+        }
         drop(PartialFile::create(&file).unwrap());
         assert_eq!(names(root.path()), ["room.ply"]);
     }
@@ -496,20 +474,16 @@ mod tests {
     fn folders_are_replaced_by_many_at_once() {
         let root = tempfile::tempdir().unwrap();
         let folder = root.path().join("room");
-        std::thread::scope(|scope| {
-            for writer in 0..8 {
-                let folder = &folder;
-                scope.spawn(move || {
-                    for _ in 0..20 {
-                        let fill = |place: &Path| {
-                            let put = |name| fs::write(place.join(name), format!("{writer}"));
-                            ["a", "b"].into_iter().try_for_each(put).map_err(Error::write(place))
-                        };
-                        replace_dir(folder, &["a", "b"], fill).unwrap();
-                    }
-                });
+        let write_all = |writer: i32| {
+            for _ in 0..20 {
+                let fill = |place: &Path| {
+                    let put = |name| fs::write(place.join(name), format!("{writer}"));
+                    ["a", "b"].into_iter().try_for_each(put).map_err(Error::write(place))
+                };
+                replace_dir(&folder, &["a", "b"], fill).unwrap();
             }
-        });
+        };
+        std::thread::scope(|scope| (0..8).for_each(|writer| drop(scope.spawn(move || write_all(writer)))));
         assert_eq!(names(root.path()), ["room"]);
         assert_eq!(fs::read(folder.join("a")).unwrap(), fs::read(folder.join("b")).unwrap());
     }
@@ -534,9 +508,15 @@ mod tests {
         let at = |name: &str| root.path().join(name);
         fs::create_dir(at("below")).unwrap();
         fs::write(at("below/file"), "old").unwrap();
-        symlink("file", at("below/link")).unwrap();
-        symlink("below/link", at("twice")).unwrap();
-        symlink("below/new", at("dangling")).unwrap();
+        for (target, link) in [
+            ("file", "below/link"),
+            ("below/link", "twice"),
+            ("below/new", "dangling"),
+            ("fifo", "to_fifo"),
+            ("loop", "loop"),
+        ] {
+            symlink(target, at(link)).unwrap();
+        }
         for (link, target) in [("twice", "below/file"), ("dangling", "below/new")] {
             check_writable_file(&at(link)).unwrap();
             write(&at(link), "new").unwrap();
@@ -549,8 +529,6 @@ mod tests {
         let fifo = std::ffi::CString::new(at("fifo").to_str().unwrap()).unwrap();
         assert_eq!(unsafe { libc::mkfifo(fifo.as_ptr(), 0o600) }, 0);
         let _listener = std::os::unix::net::UnixListener::bind(at("socket")).unwrap();
-        symlink("fifo", at("to_fifo")).unwrap();
-        symlink("loop", at("loop")).unwrap();
         for (path, found) in [
             (at("fifo"), "a FIFO"),
             (at("to_fifo"), "a FIFO"),

@@ -2,7 +2,7 @@
 
 use crate::atomic::parent_of;
 use crate::{Error, Result};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 
@@ -10,15 +10,10 @@ use std::path::Path;
 /// links to an input are recognized.
 #[derive(Debug, Clone, Default)]
 pub struct InputFiles {
-    files: BTreeMap<FileId, InputKind>,
+    photos: BTreeSet<FileId>,
     /// Folders that contain photos.
     photo_folders: BTreeSet<FileId>,
-}
-
-#[derive(Debug, Clone, Copy)]
-enum InputKind {
-    Photo,
-    Other,
+    others: BTreeSet<FileId>,
 }
 
 /// Device and inode of a file or folder.
@@ -27,7 +22,7 @@ type FileId = (u64, u64);
 impl InputFiles {
     /// Adds `file`, if it exists.
     pub fn add(&mut self, file: &Path) {
-        self.files.extend(file_id(file).map(|id| (id, InputKind::Other)));
+        self.others.extend(file_id(file));
     }
 
     /// Adds those of `files` that exist.
@@ -54,13 +49,14 @@ impl InputFiles {
 
     /// Adds the photo `file`, if it exists, and its folder as a folder of photos.
     pub fn add_photo(&mut self, file: &Path) {
-        self.files.extend(file_id(file).map(|id| (id, InputKind::Photo)));
+        self.photos.extend(file_id(file));
         self.photo_folders.extend(file_id(parent_of(file)));
     }
 
     /// Adds all files and folders of `others`.
     pub fn extend(&mut self, others: InputFiles) {
-        self.files.extend(others.files);
+        self.photos.extend(others.photos);
+        self.others.extend(others.others);
         self.photo_folders.extend(others.photo_folders);
     }
 
@@ -69,18 +65,13 @@ impl InputFiles {
     /// # Errors
     /// Returns [`Error::Input`] if `path` is one of the inputs.
     pub fn check_file(&self, path: &Path) -> Result<()> {
-        match file_id(path).and_then(|id| self.files.get(&id)) {
-            None => Ok(()),
-            Some(InputKind::Photo) => Err(Error::input(
-                path,
-                "the output",
-                "a photo of the capture",
-                "a path that isn't an input photo",
-            )),
-            Some(InputKind::Other) => {
-                Err(Error::input(path, "the output", "a file that this command reads", "another name"))
-            }
-        }
+        let Some(id) = file_id(path) else { return Ok(()) };
+        let (found, expected) = match (self.photos.contains(&id), self.others.contains(&id)) {
+            (true, _) => ("a photo of the capture", "a path that isn't an input photo"),
+            (false, true) => ("a file that this command reads", "another name"),
+            (false, false) => return Ok(()),
+        };
+        Err(Error::input(path, "the output", found, expected))
     }
 
     /// Checks that the output folder `path` is not a folder of photos.
@@ -88,15 +79,11 @@ impl InputFiles {
     /// # Errors
     /// Returns [`Error::Input`] if `path` is a folder of photos.
     pub fn check_folder(&self, path: &Path) -> Result<()> {
-        match file_id(path).is_some_and(|id| self.photo_folders.contains(&id)) {
-            false => Ok(()),
-            true => Err(Error::input(
-                path,
-                "the output",
-                "a folder with the capture's photos",
-                "a folder without them",
-            )),
+        if file_id(path).is_some_and(|id| self.photo_folders.contains(&id)) {
+            let (found, expected) = ("a folder with the capture's photos", "a folder without them");
+            return Err(Error::input(path, "the output", found, expected));
         }
+        Ok(())
     }
 }
 
@@ -111,46 +98,41 @@ mod tests {
 
     #[test]
     fn files_are_recognized_by_any_path_and_links() {
+        use std::os::unix::fs::symlink;
         let folder = tempfile::tempdir().expect("a temporary folder");
         let at = |name: &str| folder.path().join(name);
-        ["a.ply", "b.ply", "other.ply"].iter().for_each(|name| fs::write(at(name), "").expect("a file"));
-        let mut inputs = InputFiles::default();
-        inputs.add_all([at("a.ply"), at("b.ply"), at("missing.ply")]);
-        let roundabout = folder.path().join(".").join("b.ply");
-        assert!([at("a.ply"), at("b.ply"), roundabout].iter().all(|file| inputs.check_file(file).is_err()));
-        assert!(["other.ply", "missing.ply"].iter().all(|name| inputs.check_file(&at(name)).is_ok()));
-        fs::hard_link(at("a.ply"), at("link.ply")).expect("a link");
-        assert!(inputs.check_file(&at("link.ply")).is_err());
-    }
-
-    #[test]
-    fn the_folder_of_a_photo_without_a_folder_in_its_path_is_the_current_one() {
-        let mut inputs = InputFiles::default();
-        inputs.add_photo(Path::new("photo.png"));
-        let current = std::env::current_dir().expect("a current folder");
-        assert!(
-            [Path::new("."), current.as_path()].iter().all(|folder| inputs.check_folder(folder).is_err())
-        );
-        let other = tempfile::tempdir().expect("a temporary folder");
-        inputs.check_folder(other.path()).expect("no folder of photos");
-    }
-
-    #[test]
-    fn links_to_folders_are_followed_once() {
-        use std::os::unix::fs::symlink;
-        let root = tempfile::tempdir().expect("a temporary folder");
-        let at = |name: &str| root.path().join(name);
         fs::create_dir_all(at("run/below")).expect("folders");
         fs::create_dir(at("elsewhere")).expect("a folder");
-        let files = ["run/a", "run/below/b", "elsewhere/c"];
-        files.iter().for_each(|name| fs::write(at(name), "").expect("a file"));
-        symlink(at("elsewhere"), at("run/link")).expect("a link");
-        // Links back to a folder above, and to nothing.
-        symlink(at("run"), at("elsewhere/loop")).expect("a link");
-        symlink(at("missing"), at("run/dangling")).expect("a link");
+        for name in ["a.ply", "other.ply", "run/a", "run/below/b", "elsewhere/c"] {
+            fs::write(at(name), "").expect("a file");
+        }
+        fs::hard_link(at("a.ply"), at("link.ply")).expect("a link");
+        // Links to a folder, back to a folder above, and to nothing.
+        for (target, link) in
+            [("elsewhere", "run/link"), ("run", "elsewhere/loop"), ("missing", "run/dangling")]
+        {
+            symlink(at(target), at(link)).expect("a link");
+        }
         let mut inputs = InputFiles::default();
+        inputs.add_all([at("a.ply"), at("missing.ply")]);
         inputs.add_folder(&at("run"));
-        assert!(files.iter().all(|file| inputs.check_file(&at(file)).is_err()));
-        inputs.check_file(&at("missing")).expect("no input");
+        inputs.add_photo(Path::new("photo.png"));
+        for (name, is_input) in [
+            ("./a.ply", true),
+            ("link.ply", true),
+            ("run/a", true),
+            ("run/below/b", true),
+            ("elsewhere/c", true),
+            ("other.ply", false),
+            ("missing.ply", false),
+            ("missing", false),
+        ] {
+            assert_eq!(inputs.check_file(&at(name)).is_err(), is_input, "{name}");
+        }
+        // The folder of a photo without a folder in its path is the current one.
+        let current = std::env::current_dir().expect("a current folder");
+        for (folder, has_photos) in [(Path::new("."), true), (&current, true), (folder.path(), false)] {
+            assert_eq!(inputs.check_folder(folder).is_err(), has_photos, "{folder:?}");
+        }
     }
 }

@@ -2,9 +2,6 @@
 //! pixel (0, 0) is at (½, ½), as everywhere in this crate. Points are read separately, on request (spec 10.4).
 
 mod fields;
-mod points;
-
-pub use points::{Point, read_points};
 
 use super::{CaptureOpener, folder_name};
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
@@ -135,7 +132,7 @@ pub fn read_colmap_models(sparse: &Path) -> Result<Vec<ColmapModel>> {
     let folders = numbered(sparse).into_iter().filter(|folder| folder.join("images.bin").is_file());
     let summarize = |folder: PathBuf| {
         let images = read_images_binary(&folder.join("images.bin"))?;
-        let points = points::read_points_binary(&folder.join("points3D.bin"))?;
+        let points = read_points_binary(&folder.join("points3D.bin"))?;
         let errors: f64 = points.iter().map(|(_, error)| error).sum();
         Ok(ColmapModel {
             folder,
@@ -316,14 +313,8 @@ fn read_images_text(file: &Path) -> Result<Vec<ImageEntry>> {
         }
         let mut words = WordReader { file, number, rest: line };
         let id = words.parse("IMAGE_ID", "a whole number")?;
-        let mut quaternion = [0.; 4];
-        for (value, name) in quaternion.iter_mut().zip(["QW", "QX", "QY", "QZ"]) {
-            *value = words.parse(name, "a number")?;
-        }
-        let mut translation = [0.; 3];
-        for (value, name) in translation.iter_mut().zip(["TX", "TY", "TZ"]) {
-            *value = words.parse(name, "a number")?;
-        }
+        let quaternion = words.numbers(["QW", "QX", "QY", "QZ"], "a number")?;
+        let translation = words.numbers(["TX", "TY", "TZ"], "a number")?;
         let camera = words.parse("CAMERA_ID", "a whole number")?;
         // A name may contain spaces.
         images.push(ImageEntry { id, quaternion, translation, camera, name: words.rest.trim().to_string() });
@@ -346,7 +337,7 @@ fn read_cameras_binary(file: &Path) -> Result<Vec<CameraEntry>> {
     let mut bytes = ByteReader { file, contents: &contents, at: 0 };
     let mut cameras = vec![];
     for i in 0..bytes.count("the number of cameras", MIN_ENTRY_BYTES)? {
-        let id = u32::from_le_bytes(bytes.take(|| format!("the id of camera {i}, counted from 0,"))?);
+        let id = bytes.u32(|| format!("the id of camera {i}, counted from 0,"))?;
         let number = i32::from_le_bytes(bytes.take(|| format!("model of camera {id}"))?);
         let model = usize::try_from(number).ok().and_then(|number| COLMAP_MODELS.get(number));
         // The number of parameters of an unknown model is unknown, and so is the start of the next camera.
@@ -354,11 +345,10 @@ fn read_cameras_binary(file: &Path) -> Result<Vec<CameraEntry>> {
             let expected = format!("one of {}", COLMAP_MODELS.map(|(name, _)| name).join(", "));
             Error::input(file, format!("model of camera {id}"), format!("number {number}"), expected)
         })?;
-        let width = u64::from_le_bytes(bytes.take(|| format!("width of camera {id}"))?);
-        let height = u64::from_le_bytes(bytes.take(|| format!("height of camera {id}"))?);
-        let parameters = (0..*parameters)
-            .map(|_| bytes.number(|| format!("the parameters of camera {id}")))
-            .collect::<Result<_>>()?;
+        let width = bytes.u64(|| format!("width of camera {id}"))?;
+        let height = bytes.u64(|| format!("height of camera {id}"))?;
+        let parameter = |_| Ok(bytes.numbers::<1>(|| format!("the parameters of camera {id}"))?[0]);
+        let parameters = (0..*parameters).map(parameter).collect::<Result<_>>()?;
         cameras.push(CameraEntry { id, model: model.to_string(), width, height, parameters });
     }
     bytes.end()?;
@@ -374,18 +364,86 @@ fn read_images_binary(file: &Path) -> Result<Vec<ImageEntry>> {
     let mut bytes = ByteReader { file, contents: &contents, at: 0 };
     let mut images = vec![];
     for i in 0..bytes.count("the number of images", MIN_ENTRY_BYTES)? {
-        let id = u32::from_le_bytes(bytes.take(|| format!("the id of image {i}, counted from 0,"))?);
-        let mut pose = [0.; 7];
-        for value in &mut pose {
-            *value = bytes.number(|| format!("the pose of image {id}"))?;
-        }
-        let [w, x, y, z, translation @ ..] = pose;
-        let camera = u32::from_le_bytes(bytes.take(|| format!("camera id of image {id}"))?);
+        let id = bytes.u32(|| format!("the id of image {i}, counted from 0,"))?;
+        let [w, x, y, z, translation @ ..] = bytes.numbers::<7>(|| format!("the pose of image {id}"))?;
+        let camera = bytes.u32(|| format!("camera id of image {id}"))?;
         let name = bytes.name(|| format!("name of image {id}"))?;
         let points = bytes.count(&format!("the number of points of image {id}"), POINT)?;
-        bytes.at += points * POINT;
+        bytes.skip(points * POINT);
         images.push(ImageEntry { id, quaternion: [w, x, y, z], translation, camera, name });
     }
     bytes.end()?;
     Ok(images)
+}
+
+/// A point on the surface of the scene.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Point {
+    /// Position in the capture's world coordinates.
+    pub position: DVec3,
+    /// RGB color, values in [0, 1].
+    pub color: [f32; 3],
+}
+
+/// Returns the points of the COLMAP model that `capture` was read from. Returns none if the capture has another format or the model
+/// has no file of points.
+///
+/// # Errors
+/// Fails if the file violates the format.
+pub fn read_points(capture: &Capture) -> Result<Vec<Point>> {
+    let images = capture.file();
+    let form =
+        images.file_name().and_then(|name| name.to_str()).and_then(|name| name.strip_prefix("images."));
+    let file = images.with_file_name(format!("points3D.{}", form.unwrap_or_default()));
+    match form {
+        Some("bin") if file.is_file() => {
+            Ok(read_points_binary(&file)?.into_iter().map(|(point, _)| point).collect())
+        }
+        Some("txt") if file.is_file() => read_points_text(&file),
+        _ => Ok(vec![]),
+    }
+}
+
+/// Reads lines of the form POINT3D_ID X Y Z R G B ERROR, followed by the views that see the point.
+fn read_points_text(file: &Path) -> Result<Vec<Point>> {
+    let text = read_text(file)?;
+    let mut points = vec![];
+    for (number, line) in (1..).zip(text.lines()).filter(|(_, line)| !is_comment(line)) {
+        let mut words = WordReader { file, number, rest: line };
+        let id: u64 = words.parse("POINT3D_ID", "a whole number")?;
+        let position = words.numbers(["X", "Y", "Z"], "a number")?;
+        let color = words.numbers(["R", "G", "B"], "a whole number from 0 to 255")?;
+        points.push(point(file, id, position, color)?);
+    }
+    Ok(points)
+}
+
+/// Reads the number of points (u64), then for each point: id (u64), position (f64), color (u8), error (f64), and the number of
+/// views that see it (u64), each two ids (u32). Returns the points and their errors.
+fn read_points_binary(file: &Path) -> Result<Vec<(Point, f64)>> {
+    const VIEW: usize = 8;
+    const MIN_ENTRY_BYTES: usize = 8 + 3 * 8 + 3 + 8 + 8;
+    let contents = std::fs::read(file).map_err(Error::read(file))?;
+    let mut bytes = ByteReader { file, contents: &contents, at: 0 };
+    let mut points = vec![];
+    for i in 0..bytes.count("the number of points", MIN_ENTRY_BYTES)? {
+        let id = bytes.u64(|| format!("the id of point {i}, counted from 0,"))?;
+        let position = bytes.numbers(|| format!("the position of point {id}"))?;
+        let color = bytes.take(|| format!("the color of point {id}"))?;
+        let [error] = bytes.numbers(|| format!("the error of point {id}"))?;
+        let views = bytes.count(&format!("the number of views of point {id}"), VIEW)?;
+        bytes.skip(views * VIEW);
+        points.push((point(file, id, position, color)?, error));
+    }
+    bytes.end()?;
+    Ok(points)
+}
+
+fn point(file: &Path, id: u64, position: [f64; 3], color: [u8; 3]) -> Result<Point> {
+    let position = DVec3::from_array(position);
+    if !position.is_finite() {
+        let found = position.to_string();
+        return Err(Error::input(file, format!("the position of point {id}"), found, "finite numbers"));
+    }
+    Ok(Point { position, color: color.map(|value| f32::from(value) / 255.) })
 }

@@ -105,31 +105,8 @@ mod tests {
     const INTRINSICS: Intrinsics = Intrinsics { fx: 50., fy: 48., cx: 33., cy: 23. };
     const SIZE: ImageSize = ImageSize { height: 48, width: 64 };
 
-    /// Returns the ray that the lens shows at (x', y'), by Newton's method with the Jacobian.
-    fn invert(lens: &Distortion, distorted: (f64, f64)) -> (f64, f64) {
-        let (mut x, mut y) = distorted;
-        for _ in 0..8 {
-            let at = lens.apply(x, y);
-            let (dx, dy) = (distorted.0 - at.0, distorted.1 - at.1);
-            let [xx, xy, yy] = lens.jacobian(x, y);
-            let determinant = xx * yy - xy * xy;
-            x += (yy * dx - xy * dy) / determinant;
-            y += (xx * dy - xy * dx) / determinant;
-        }
-        (x, y)
-    }
-
-    /// Inverting the distortion gives the original ray. Eight iterations of Newton's method reach full precision only if the Jacobian
-    /// matches the equations.
     #[test]
-    fn distorting_and_back_is_the_identity() {
-        for (lens, i, j) in
-            [LENS, RATIONAL].iter().flat_map(|lens| (0..121).map(move |n| (lens, n / 11, n % 11)))
-        {
-            let (x, y) = (f64::from(i) * 0.16 - 0.8, f64::from(j) * 0.12 - 0.6);
-            let (u, v) = invert(lens, lens.apply(x, y));
-            assert!((u - x).abs() < 1e-13 && (v - y).abs() < 1e-13, "({x}, {y}) became ({u}, {v})");
-        }
+    fn distorted_points_follow_the_equations() {
         // Computed by hand: r² = 0.25, L = 1 − 0.03 + 0.003125 − 0.00015625 + 0.0000078125.
         let (x, y) = LENS.apply(0.3, -0.4);
         let l = 0.9729765625;
@@ -159,17 +136,21 @@ mod tests {
 
     #[test]
     fn a_lens_that_folds_is_refused() {
-        LENS.check(&INTRINSICS, SIZE).expect("a good lens");
-        // The map x − x³ turns back at x = 0.577, which lies inside the image.
-        for k1 in [-1., f64::NAN, f64::INFINITY] {
-            let lens = Distortion { radial: [k1, 0., 0., 0.], ..Distortion::default() };
-            let (found, _) = lens.check(&INTRINSICS, SIZE).unwrap_err();
-            assert!(found.contains(&format!("k1 {k1}")) && found.contains("folds"), "{found}");
-        }
-        RATIONAL.check(&INTRINSICS, SIZE).expect("a good lens");
+        let radial = |k1| Distortion { radial: [k1, 0., 0., 0.], ..Distortion::default() };
         // The map 1 / (1 − 3r²) has a pole inside the image, and is steep on either side of it.
         let pole = Distortion { denominator: [-3., 0., 0.], ..Distortion::default() };
-        let (found, _) = pole.check(&INTRINSICS, SIZE).unwrap_err();
-        assert!(found.contains("over [-3.0, 0.0, 0.0]") && found.contains("folds"), "{found}");
+        for (lens, found) in [
+            (LENS, None),
+            (RATIONAL, None),
+            // The map x − x³ turns back at x = 0.577, which lies inside the image.
+            (radial(-1.), Some("k1 -1,")),
+            (radial(f64::NAN), Some("k1 NaN,")),
+            (radial(f64::INFINITY), Some("k1 inf,")),
+            (pole, Some("over [-3.0, 0.0, 0.0]")),
+        ] {
+            let refused = lens.check(&INTRINSICS, SIZE).err().map(|(found, _)| found);
+            assert_eq!(refused.is_some(), found.is_some(), "{lens:?}");
+            assert!(refused.unwrap_or_default().contains(found.unwrap_or_default()), "{lens:?}");
+        }
     }
 }

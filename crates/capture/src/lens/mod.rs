@@ -90,56 +90,49 @@ impl Lens {
             let known = COLMAP_MODELS.map(|(known, _)| known).join(", ");
             return Err(("model".into(), model.into(), format!("one of {known}")));
         };
-        let radial =
-            |radial: [f64; 4]| LensModel::Perspective(Distortion { radial, ..Distortion::default() });
-        let radial_fisheye = |radial: [f64; 4]| LensModel::fisheye(radial, [0.; 2]);
-        let ([fx, fy, cx, cy], model) = match (model, parameters) {
-            ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f, cx, cy], LensModel::default()),
-            ("PINHOLE", &[fx, fy, cx, cy]) => ([fx, fy, cx, cy], LensModel::default()),
-            ("SIMPLE_RADIAL", &[f, cx, cy, k]) => ([f, f, cx, cy], radial([k, 0., 0., 0.])),
-            ("RADIAL", &[f, cx, cy, k1, k2]) => ([f, f, cx, cy], radial([k1, k2, 0., 0.])),
-            ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => {
-                let distortion =
-                    Distortion { radial: [k1, k2, 0., 0.], tangential: [p1, p2], denominator: [0.; 3] };
-                ([fx, fy, cx, cy], LensModel::Perspective(distortion))
-            }
-            ("FULL_OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6]) => {
-                let (radial, denominator) = ([k1, k2, k3, 0.], [k4, k5, k6]);
-                let distortion = Distortion { radial, denominator, tangential: [p1, p2] };
-                ([fx, fy, cx, cy], LensModel::Perspective(distortion))
-            }
-            ("OPENCV_FISHEYE", &[fx, fy, cx, cy, k1, k2, k3, k4]) => {
-                ([fx, fy, cx, cy], radial_fisheye([k1, k2, k3, k4]))
-            }
-            ("SIMPLE_RADIAL_FISHEYE", &[f, cx, cy, k]) => ([f, f, cx, cy], radial_fisheye([k, 0., 0., 0.])),
-            ("RADIAL_FISHEYE", &[f, cx, cy, k1, k2]) => ([f, f, cx, cy], radial_fisheye([k1, k2, 0., 0.])),
-            ("SIMPLE_FISHEYE", &[f, cx, cy]) => ([f, f, cx, cy], radial_fisheye([0.; 4])),
-            ("FISHEYE", &[fx, fy, cx, cy]) => ([fx, fy, cx, cy], radial_fisheye([0.; 4])),
-            ("THIN_PRISM_FISHEYE", &[fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, sx, sy]) => {
-                let fisheye = Fisheye::thin_prism([k1, k2, k3, k4], [p1, p2], [sx, sy]);
-                ([fx, fy, cx, cy], LensModel::Fisheye(fisheye))
-            }
-            (
-                "RAD_TAN_THIN_PRISM_FISHEYE",
-                &[fx, fy, cx, cy, k0, k1, k2, k3, k4, k5, p0, p1, s0, s1, s2, s3],
-            ) => {
-                let fisheye =
-                    Fisheye::radial_tangential([k0, k1, k2, k3, k4, k5], [p0, p1], [s0, s1, s2, s3]);
-                ([fx, fy, cx, cy], LensModel::Fisheye(fisheye))
-            }
-            ("FOV", &[fx, fy, cx, cy, omega]) => ([fx, fy, cx, cy], LensModel::Fov { omega: omega.abs() }),
-            ("SIMPLE_DIVISION", &[f, cx, cy, k]) => ([f, f, cx, cy], LensModel::Division { k }),
-            ("DIVISION", &[fx, fy, cx, cy, k]) => ([fx, fy, cx, cy], LensModel::Division { k }),
-            ("EUCM", &[fx, fy, cx, cy, alpha, beta]) => ([fx, fy, cx, cy], LensModel::Eucm { alpha, beta }),
-            ("EQUIRECTANGULAR", &[width, height]) => {
-                (equirectangular_intrinsics(width, height), LensModel::Equirectangular)
-            }
-            (model, parameters) => {
-                let expected = format!("{count} parameters for {model}");
-                return Err(("the parameters".into(), format!("{parameters:?}"), expected));
-            }
+        let refused = || {
+            ("the parameters".into(), format!("{parameters:?}"), format!("{count} parameters for {model}"))
         };
-        let lens = Lens { intrinsics: Intrinsics { fx, fy, cx, cy }, model, size };
+        let has_one_focal = model.starts_with("SIMPLE_") || model.starts_with("RADIAL");
+        let (intrinsics, coefficients) = match *parameters {
+            [width, height] if model == "EQUIRECTANGULAR" => {
+                (equirectangular_intrinsics(width, height), &[][..])
+            }
+            [f, cx, cy, ref rest @ ..] if has_one_focal => (Intrinsics { fx: f, fy: f, cx, cy }, rest),
+            [fx, fy, cx, cy, ref rest @ ..] => (Intrinsics { fx, fy, cx, cy }, rest),
+            _ => return Err(refused()),
+        };
+        let perspective = |radial: [f64; 4], tangential: [f64; 2]| {
+            LensModel::Perspective(Distortion { radial, tangential, ..Distortion::default() })
+        };
+        let fisheye = |radial: [f64; 4]| LensModel::fisheye(radial, [0.; 2]);
+        let model = match (model, coefficients) {
+            ("SIMPLE_PINHOLE" | "PINHOLE", []) => LensModel::default(),
+            ("SIMPLE_RADIAL", &[k]) => perspective([k, 0., 0., 0.], [0.; 2]),
+            ("RADIAL", &[k1, k2]) => perspective([k1, k2, 0., 0.], [0.; 2]),
+            ("OPENCV", &[k1, k2, p1, p2]) => perspective([k1, k2, 0., 0.], [p1, p2]),
+            ("FULL_OPENCV", &[k1, k2, p1, p2, k3, k4, k5, k6]) => {
+                let (radial, denominator) = ([k1, k2, k3, 0.], [k4, k5, k6]);
+                LensModel::Perspective(Distortion { radial, denominator, tangential: [p1, p2] })
+            }
+            ("SIMPLE_FISHEYE" | "FISHEYE", []) => fisheye([0.; 4]),
+            ("SIMPLE_RADIAL_FISHEYE", &[k]) => fisheye([k, 0., 0., 0.]),
+            ("RADIAL_FISHEYE", &[k1, k2]) => fisheye([k1, k2, 0., 0.]),
+            ("OPENCV_FISHEYE", &[k1, k2, k3, k4]) => fisheye([k1, k2, k3, k4]),
+            ("THIN_PRISM_FISHEYE", &[k1, k2, p1, p2, k3, k4, sx, sy]) => {
+                LensModel::Fisheye(Fisheye::thin_prism([k1, k2, k3, k4], [p1, p2], [sx, sy]))
+            }
+            ("RAD_TAN_THIN_PRISM_FISHEYE", &[k0, k1, k2, k3, k4, k5, p0, p1, s0, s1, s2, s3]) => {
+                let (radial, prism) = ([k0, k1, k2, k3, k4, k5], [s0, s1, s2, s3]);
+                LensModel::Fisheye(Fisheye::radial_tangential(radial, [p0, p1], prism))
+            }
+            ("FOV", &[omega]) => LensModel::Fov { omega: omega.abs() },
+            ("SIMPLE_DIVISION" | "DIVISION", &[k]) => LensModel::Division { k },
+            ("EUCM", &[alpha, beta]) => LensModel::Eucm { alpha, beta },
+            ("EQUIRECTANGULAR", []) if parameters.len() == 2 => LensModel::Equirectangular,
+            _ => return Err(refused()),
+        };
+        let lens = Lens { intrinsics, model, size };
         lens.check().map(|()| lens)
     }
 
@@ -176,16 +169,12 @@ impl Lens {
                 return Err(("the size".into(), format!("{width}×{height} pixels"), expected.into()));
             }
             LensModel::Equirectangular => {
-                let Intrinsics { fx, fy, cx, cy } = self.intrinsics;
                 let whole = equirectangular_intrinsics(f64::from(width), f64::from(height));
-                let is_whole = |(found, whole): (f64, f64)| (found / whole - 1.).abs() < 0.01;
-                return match [fx, fy, cx, cy].into_iter().zip(whole).all(is_whole) {
-                    true => Ok(()),
-                    false => {
-                        let found = format!("[{}, {}]", 2. * cx, 2. * cy);
-                        Err(("the parameters".into(), found, format!("the size, [{width}, {height}]")))
-                    }
-                };
+                let (found, whole) = (self.intrinsics.to_rows(), whole.to_rows());
+                let is_whole = found.iter().zip(whole).all(|(a, b)| a.eq(&b) || (a / b - 1.).abs() < 0.01);
+                let found = format!("[{}, {}]", 2. * self.intrinsics.cx, 2. * self.intrinsics.cy);
+                let refused = || ("the parameters".into(), found, format!("the size, [{width}, {height}]"));
+                return is_whole.then_some(()).ok_or_else(refused);
             }
             LensModel::Fov { omega } if !(0. ..PI).contains(&omega) => {
                 return refuse(format!("omega {omega}"), "an angle below π");
@@ -253,9 +242,9 @@ impl Lens {
     }
 }
 
-/// Returns fx, fy, cx and cy of a photo of all directions.
-pub(crate) fn equirectangular_intrinsics(width: f64, height: f64) -> [f64; 4] {
-    [width / TAU, height / PI, width / 2., height / 2.]
+/// Returns the intrinsics of a photo of all directions.
+fn equirectangular_intrinsics(width: f64, height: f64) -> Intrinsics {
+    Intrinsics { fx: width / TAU, fy: height / PI, cx: width / 2., cy: height / 2. }
 }
 
 impl LensModel {

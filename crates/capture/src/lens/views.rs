@@ -4,7 +4,6 @@ use super::{Distortion, Lens, LensModel, MAX_ANGLE};
 use crate::geometry::{ImageSize, Intrinsics};
 use glam::{DMat3, DVec2, DVec3};
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
-use std::sync::Arc;
 
 /// Largest tangent of the angle between a view's axis and the rays of its left, right, upper and lower edges, unless the view is a
 /// face of a cube: 55 degrees.
@@ -22,12 +21,12 @@ pub(crate) struct PinholeView {
 }
 
 /// Mapping from the rays of a pinhole view to its photo.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Projection {
     /// The view has the intrinsics and the size of the photo, whose lens distorts it.
     Distortion(Distortion),
     /// The view shows a part of the photo.
-    Part(Arc<PhotoPart>),
+    Part(PhotoPart),
 }
 
 impl Default for Projection {

@@ -11,7 +11,7 @@ use image::{
 };
 use std::any::Any;
 use std::fs::File;
-use std::io::{BufReader, Cursor, Read, Seek};
+use std::io::{BufRead, BufReader, Cursor, Read, Seek};
 use std::panic::{self, AssertUnwindSafe};
 use std::path::Path;
 
@@ -28,8 +28,8 @@ pub(crate) const SUPPORTED_IMAGES: &str = "a JPEG, PNG, WebP, TIFF, BMP, HEIC or
 /// # Errors
 /// Returns an error if the file is missing, can't be decoded, or is truncated.
 pub fn read_image(path: &Path) -> Result<RgbImage> {
-    let bytes = std::fs::read(path).map_err(Error::read(path))?;
-    Ok(split_alpha(decode(&bytes, path)?.image).0)
+    // No photo has the size 0×0, for which it would be rotated.
+    Ok(decode_photo(&std::fs::read(path).map_err(Error::read(path))?, path, (0, 0))?.pixels)
 }
 
 /// Pixels of a decoded photo.
@@ -58,7 +58,40 @@ pub struct DecodedPhoto {
 /// # Errors
 /// Returns the errors of [`read_image`].
 pub fn decode_photo(encoded: &[u8], file: &Path, size: (u32, u32)) -> Result<DecodedPhoto> {
-    let Decoded { mut image, orientation, format, is_rgb } = decode(encoded, file)?;
+    if let Some(header) = HeifHeader::parse(encoded) {
+        let (pixels, alpha) = split_alpha(header.decode(encoded, file)?);
+        return Ok(DecodedPhoto { pixels, alpha, as_stored: false, is_jpeg: false, is_png: false });
+    }
+    let reader = ImageReader::new(Cursor::new(encoded)).with_guessed_format().map_err(Error::read(file))?;
+    let format = reader.format();
+    let mut decoder = reader.into_decoder().map_err(undecodable(file))?;
+    // A file of a few bytes can claim any size.
+    let limits = Limits::default();
+    limits.check_dimensions(decoder.dimensions().0, decoder.dimensions().1).map_err(undecodable(file))?;
+    if decoder.total_bytes() > limits.max_alloc.unwrap_or(u64::MAX) {
+        let (width, height) = decoder.dimensions();
+        return Err(Error::input(file, "the image", format!("{width}×{height} pixels"), "a photo's size"));
+    }
+    if matches!(decoder.color_type(), ColorType::Rgb32F | ColorType::Rgba32F) {
+        // Their range and brightness are up to the program that wrote them.
+        let found = "with floating-point pixels";
+        return Err(Error::input(file, "the image", found, "8 or 16 bits for each of its colors"));
+    }
+    decoder.set_limits(limits).map_err(undecodable(file))?;
+    // Unreadable EXIF data isn't an error, because the pixels may still be usable.
+    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    let (is_jpeg, is_png) = (format == Some(ImageFormat::Jpeg), format == Some(ImageFormat::Png));
+    let refuse = |why| Error::input(file, "the image", format!("undecodable ({why})"), SUPPORTED_IMAGES);
+    // The decoders of some rare formats panic.
+    let image = panic::catch_unwind(AssertUnwindSafe(|| match is_jpeg {
+        true => decode_jpeg(encoded).map_err(refuse),
+        false => {
+            let has_rgb = is_png && encoded.get(PNG_COLOR_TYPE) == Some(&PNG_RGB);
+            DynamicImage::from_decoder(decoder).map(|image| (image, has_rgb)).map_err(undecodable(file))
+        }
+    }));
+    let panicked = |why: Box<dyn Any + Send>| refuse(format!("the decoder failed: {}", panic_message(&*why)));
+    let (mut image, has_rgb) = image.map_err(panicked)??;
     let stored = (image.width(), image.height());
     let turned = match orientation {
         Orientation::Rotate90
@@ -71,15 +104,9 @@ pub fn decode_photo(encoded: &[u8], file: &Path, size: (u32, u32)) -> Result<Dec
     if turn {
         image.apply_orientation(orientation);
     }
-    let as_stored = !turn && is_rgb && matches!(image, DynamicImage::ImageRgb8(_));
+    let as_stored = !turn && has_rgb && matches!(image, DynamicImage::ImageRgb8(_));
     let (pixels, alpha) = split_alpha(image);
-    Ok(DecodedPhoto {
-        pixels,
-        alpha,
-        as_stored,
-        is_jpeg: format == Some(ImageFormat::Jpeg),
-        is_png: format == Some(ImageFormat::Png),
-    })
+    Ok(DecodedPhoto { pixels, alpha, as_stored, is_jpeg, is_png })
 }
 
 /// Encodes a photo as a JPEG of high quality, or as a PNG.
@@ -100,10 +127,7 @@ pub fn encode_photo(pixels: &RgbImage, as_jpeg: bool) -> Result<Vec<u8>> {
 /// Returns (width, height) like [`read_image_size`], for an image in memory, or `None` if it isn't an image.
 #[cfg(feature = "chunks")]
 pub fn encoded_image_size(encoded: &[u8]) -> Option<(u32, u32)> {
-    let heif_size = || HeifHeader::parse(encoded).map(|header| header.rotated_size());
-    let dimensions =
-        || ImageReader::new(Cursor::new(encoded)).with_guessed_format().ok()?.into_dimensions().ok();
-    jpeg_size(Cursor::new(encoded)).or_else(heif_size).or_else(dimensions)
+    image_size(Cursor::new(encoded), Path::new("")).ok()
 }
 
 /// Returns (width, height) of the pixels as stored, from the image's header alone.
@@ -111,7 +135,10 @@ pub fn encoded_image_size(encoded: &[u8]) -> Option<(u32, u32)> {
 /// # Errors
 /// Returns an error if the file is missing or isn't an image.
 pub fn read_image_size(path: &Path) -> Result<(u32, u32)> {
-    let mut reader = BufReader::new(File::open(path).map_err(Error::read(path))?);
+    image_size(BufReader::new(File::open(path).map_err(Error::read(path))?), path)
+}
+
+fn image_size(mut reader: impl BufRead + Seek, path: &Path) -> Result<(u32, u32)> {
     // The decoder would read the whole file.
     if let Some(size) = jpeg_size(&mut reader) {
         return Ok(size);
@@ -142,63 +169,17 @@ pub(crate) fn has_alpha_channel(path: &Path) -> Result<bool> {
 }
 
 /// Reads the header of a HEIC or an AVIF, or returns `None` and rewinds `reader` if the file is neither.
-fn heif_header(reader: &mut BufReader<File>, path: &Path) -> Result<Option<HeifHeader>> {
+fn heif_header(reader: &mut (impl BufRead + Seek), path: &Path) -> Result<Option<HeifHeader>> {
     let mut start = vec![];
     reader.take(HEADER_BYTES).read_to_end(&mut start).map_err(Error::read(path))?;
     reader.rewind().map_err(Error::read(path))?;
     Ok(HeifHeader::parse(&start))
 }
 
-struct Decoded {
-    image: DynamicImage,
-    orientation: Orientation,
-    format: Option<ImageFormat>,
-    /// `true` if the file holds three channels, whatever they were decoded to.
-    is_rgb: bool,
-}
-
 /// Offset of the color type in the header of a PNG.
 const PNG_COLOR_TYPE: usize = 25;
 /// Color type of red, green and blue, without a palette.
 const PNG_RGB: u8 = 2;
-
-fn decode(encoded: &[u8], file: &Path) -> Result<Decoded> {
-    if let Some(header) = HeifHeader::parse(encoded) {
-        let (image, orientation) = (header.decode(encoded, file)?, Orientation::NoTransforms);
-        return Ok(Decoded { image, orientation, format: None, is_rgb: false });
-    }
-    let reader = ImageReader::new(Cursor::new(encoded)).with_guessed_format().map_err(Error::read(file))?;
-    let format = reader.format();
-    let mut decoder = reader.into_decoder().map_err(undecodable(file))?;
-    // A file of a few bytes can claim any size.
-    let limits = Limits::default();
-    limits.check_dimensions(decoder.dimensions().0, decoder.dimensions().1).map_err(undecodable(file))?;
-    if decoder.total_bytes() > limits.max_alloc.unwrap_or(u64::MAX) {
-        let (width, height) = decoder.dimensions();
-        return Err(Error::input(file, "the image", format!("{width}×{height} pixels"), "a photo's size"));
-    }
-    if matches!(decoder.color_type(), ColorType::Rgb32F | ColorType::Rgba32F) {
-        // Their range and brightness are up to the program that wrote them.
-        let found = "with floating-point pixels";
-        return Err(Error::input(file, "the image", found, "8 or 16 bits for each of its colors"));
-    }
-    decoder.set_limits(limits).map_err(undecodable(file))?;
-    // Unreadable EXIF data isn't an error, because the pixels may still be usable.
-    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
-    let refuse = |why| Error::input(file, "the image", format!("undecodable ({why})"), SUPPORTED_IMAGES);
-    // The decoders of some rare formats panic.
-    let image = panic::catch_unwind(AssertUnwindSafe(|| match format {
-        Some(ImageFormat::Jpeg) => decode_jpeg(encoded).map_err(refuse),
-        _ => {
-            let components = if encoded.get(PNG_COLOR_TYPE) == Some(&PNG_RGB) { 3 } else { 4 };
-            DynamicImage::from_decoder(decoder).map(|image| (image, components)).map_err(undecodable(file))
-        }
-    }));
-    let panicked = |why: Box<dyn Any + Send>| refuse(format!("the decoder failed: {}", panic_message(&*why)));
-    let (image, components) = image.map_err(panicked)??;
-    let is_rgb = components == 3 && matches!(format, Some(ImageFormat::Jpeg | ImageFormat::Png));
-    Ok(Decoded { image, orientation, format, is_rgb })
-}
 
 fn undecodable(path: &Path) -> impl FnOnce(ImageError) -> Error {
     move |e| Error::input(path, "the image", format!("undecodable ({e})"), SUPPORTED_IMAGES)

@@ -1,9 +1,9 @@
 //! HEIC and AVIF: files of boxes (ISO/IEC 14496-12, 23008-12). The size is read from them; programs on the PATH decode the pixels.
 
 use globalsplat_files::{Error, Result, is_program_missing};
+use image::DynamicImage;
 use image::metadata::Orientation;
-use image::{DynamicImage, ImageFormat};
-use std::io::Write;
+use std::ffi::OsStr;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
@@ -75,107 +75,60 @@ impl HeifHeader {
         if HeifBoxes(encoded).any(|part| !part.is_whole) {
             return Err(undecodable("its data end before the image does".into()));
         }
-        let by_ffmpeg = run_ffmpeg(encoded).and_then(|image| check_size("ffmpeg", image, self.size));
+        let given = |e| undecodable(format!("it can't be given to another program: {e}"));
+        let folder = tempfile::tempdir().map_err(given)?;
+        let [heif, bmp, png] = ["photo.heif", "photo.bmp", "photo.png"].map(|name| folder.path().join(name));
+        std::fs::write(&heif, encoded).map_err(given)?;
+        // The file may refer to no other one.
+        let read =
+            "-v error -xerror -noautorotate -protocol_whitelist file -f mov -i".split(' ').map(OsStr::new);
+        let write = "-frames:v 1 -pix_fmt bgr24".split(' ').map(OsStr::new);
+        let arguments = read.chain([heif.as_os_str()]).chain(write).chain([bmp.as_os_str()]);
+        let by_ffmpeg = run("ffmpeg", arguments, &bmp, self.size);
+        let by_ffmpeg = by_ffmpeg.unwrap_or_else(|| Err("ffmpeg isn't on the PATH".into()));
         let image = by_ffmpeg.map(|mut image| {
             image.apply_orientation(self.rotation);
             image
         });
-        // libheif rotates.
-        let by_libheif =
-            || run_libheif(encoded).map(|image| check_size("libheif", image?, self.rotated_size()));
+        // libheif's program, which has two names, rotates.
+        let by_libheif = || {
+            let run = |program| run(program, [heif.as_os_str(), png.as_os_str()], &png, self.rotated_size());
+            ["heif-dec", "heif-convert"].into_iter().find_map(run)
+        };
         image.or_else(|why| by_libheif().unwrap_or(Err(why))).map_err(undecodable)
     }
 }
 
-/// Returns `image` if it has the given size: a single tile is smaller than the image.
-fn check_size(
+/// Runs `program`, which decodes an image to the file `decoded`. Returns the image, or why it can't be decoded or hasn't the given `size`:
+/// a single tile is smaller than the image. Returns `None` if the program isn't on the PATH.
+fn run<'a>(
     program: &str,
-    image: DynamicImage,
+    arguments: impl IntoIterator<Item = &'a OsStr>,
+    decoded: &Path,
     size: (u32, u32),
-) -> std::result::Result<DynamicImage, String> {
-    let (width, height) = (image.width(), image.height());
-    if (width, height) == size {
-        return Ok(image);
-    }
-    Err(format!("{program} decodes {width}×{height} of its {}×{} pixels", size.0, size.1))
-}
-
-/// Decodes `encoded` by ffmpeg without rotating it, or returns why ffmpeg can't.
-fn run_ffmpeg(encoded: &[u8]) -> std::result::Result<DynamicImage, String> {
-    let mut command = Command::new("ffmpeg");
-    // The cache lets ffmpeg seek in its standard input.
-    command
-        .args(["-v", "error", "-xerror", "-noautorotate", "-protocol_whitelist", "cache,pipe", "-f", "mov"])
-        .args([
-            "-i",
-            "cache:pipe:0",
-            "-frames:v",
-            "1",
-            "-c:v",
-            "bmp",
-            "-pix_fmt",
-            "bgr24",
-            "-f",
-            "image2pipe",
-            "-",
-        ])
-        .stdin(Stdio::piped())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped());
-    let mut ffmpeg = command.spawn().map_err(|e| match is_program_missing(&e) {
-        true => "ffmpeg isn't on the PATH".to_string(),
-        false => format!("the ffmpeg on the PATH can't be started: {e}"),
-    })?;
-    let mut input = ffmpeg.stdin.take().expect("a pipe was asked for");
-    let output = std::thread::scope(|scope| {
-        // If ffmpeg ends early, its own message says why.
-        scope.spawn(move || drop(input.write_all(encoded)));
-        ffmpeg.wait_with_output()
-    });
-    let output = output.map_err(|e| format!("ffmpeg failed: {e}"))?;
-    if output.status.success() && !output.stdout.is_empty() {
-        return image::load_from_memory_with_format(&output.stdout, ImageFormat::Bmp)
-            .map_err(|e| format!("ffmpeg wrote no image: {e}"));
-    }
-    let message = String::from_utf8_lossy(&output.stderr);
-    // The cache reports that it can't seek to the end of a pipe, which is no error. A line may begin with an address: `[mov @ 0x…] `.
-    let lines = message
-        .lines()
-        .map(str::trim)
-        .filter(|line| !line.starts_with("[cache") && !line.starts_with("Last message"))
-        .map(|line| {
-            line.strip_prefix('[').and_then(|line| line.split_once("] ")).map_or(line, |(_, line)| line)
-        });
-    let lines = lines.collect::<Vec<_>>().join("; ");
-    Err(if lines.is_empty() {
-        format!("ffmpeg failed, {}", output.status)
-    } else {
-        format!("ffmpeg: {lines}")
-    })
-}
-
-/// Decodes and rotates `encoded` by libheif's program, which has two names, or returns why it can't. Returns `None` if it isn't on the PATH.
-fn run_libheif(encoded: &[u8]) -> Option<std::result::Result<DynamicImage, String>> {
-    let run = || {
-        let failed = |e| format!("libheif can't be given the image: {e}");
-        let folder = tempfile::tempdir().map_err(failed)?;
-        let [heic, png] = ["photo.heic", "photo.png"].map(|name| folder.path().join(name));
-        std::fs::write(&heic, encoded).map_err(failed)?;
-        for program in ["heif-dec", "heif-convert"] {
-            match Command::new(program).args([&heic, &png]).stdin(Stdio::null()).output() {
-                Err(e) if is_program_missing(&e) => {}
-                Err(e) => return Err(format!("{program} failed: {e}")),
-                Ok(output) => {
-                    let message = String::from_utf8_lossy(&output.stderr);
-                    return image::open(&png)
-                        .map(Some)
-                        .map_err(|_| format!("{program} failed: {}", message.trim()));
-                }
-            }
-        }
-        Ok(None)
+) -> Option<std::result::Result<DynamicImage, String>> {
+    let output = match Command::new(program).args(arguments).stdin(Stdio::null()).output() {
+        Err(e) if is_program_missing(&e) => return None,
+        Err(e) => return Some(Err(format!("the {program} on the PATH can't be started: {e}"))),
+        Ok(output) => output,
     };
-    run().transpose()
+    let image = image::open(decoded).ok().filter(|_| output.status.success());
+    Some(match image {
+        Some(image) if (image.width(), image.height()) == size => Ok(image),
+        Some(image) => {
+            let (width, height) = (image.width(), image.height());
+            Err(format!("{program} decodes {width}×{height} of its {}×{} pixels", size.0, size.1))
+        }
+        None => {
+            let message = String::from_utf8_lossy(&output.stderr);
+            // A line may begin with an address: `[mov @ 0x…] `.
+            let lines = message.lines().map(|line| {
+                let line = line.trim();
+                line.strip_prefix('[').and_then(|line| line.split_once("] ")).map_or(line, |(_, line)| line)
+            });
+            Err(format!("{program}: {}", lines.collect::<Vec<_>>().join("; ")))
+        }
+    })
 }
 
 /// A part of a file.

@@ -49,11 +49,11 @@ pub(super) fn jpeg_size(mut reader: impl BufRead + Seek) -> Option<(u32, u32)> {
     }
 }
 
-/// Decodes a JPEG, grey or as RGB, and returns its number of color components: 1, 3, or 4 of CMYK.
+/// Decodes a JPEG, grey or as RGB. Returns `true` with it if the file holds three components: neither grey nor CMYK.
 ///
 /// # Errors
 /// Returns a description of what is missing or damaged. Without its end marker, a file counts as cut short.
-pub(super) fn decode_jpeg(bytes: &[u8]) -> Result<(DynamicImage, usize), String> {
+pub(super) fn decode_jpeg(bytes: &[u8]) -> Result<(DynamicImage, bool), String> {
     if !has_end_marker(bytes) {
         return Err("its data end before the image does".into());
     }
@@ -72,7 +72,7 @@ pub(super) fn decode_jpeg(bytes: &[u8]) -> Result<(DynamicImage, usize), String>
         true => GrayImage::from_raw(width, height, pixels).map(DynamicImage::from),
         false => RgbImage::from_raw(width, height, pixels).map(DynamicImage::from),
     };
-    Ok((image.expect("a decoder that fills the image"), stored.num_components()))
+    Ok((image.expect("a decoder that fills the image"), stored.num_components() == 3))
 }
 
 /// Returns `true` if the JPEG ends with a marker, whatever follows it. Those of thumbnails lie in segments, which are skipped.

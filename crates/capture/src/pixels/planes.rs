@@ -69,17 +69,3 @@ pub(super) fn split_channels(image: &RgbImage, planes: &mut [u8]) {
         (*red, *green, *blue) = (pixel[0], pixel[1], pixel[2]);
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn planes_round_trip() {
-        let image = RgbImage::from_fn(7, 5, |x, y| Rgb([x as u8 * 30, y as u8 * 40, (x * y) as u8]));
-        let planes = Planes::from_rgb(&image);
-        assert_eq!(planes.to_rgb(), image);
-        assert_eq!(planes.size(), (5, 7));
-        assert_eq!(planes.as_bytes()[7 * 5 + 7 * 2 + 3], image.get_pixel(3, 2).0[1]);
-    }
-}

@@ -104,26 +104,21 @@ mod tests {
     }
 
     #[test]
-    fn a_wide_image_is_cut_to_a_square() {
-        let (image, fitted) = resize_and_crop(&RgbImage::new(640, 360), &camera(640, 360), [256, 256].into());
-        assert_eq!(image.to_rgb().dimensions(), (256, 256));
-        // 640×360 → 456×256 (455.1 rounded to a multiple of 8) → 256×256.
-        let k = fitted.intrinsics;
-        assert!((k.fx - 500. * 456. / 640.).abs() < 1e-9 && (k.fy - 510. * 256. / 360.).abs() < 1e-9);
-        assert!((k.cx - 128.).abs() < 1e-9 && (k.cy - 128.).abs() < 1e-9);
-    }
-
-    #[test]
-    fn a_tall_image_is_cut_too() {
-        let (image, fitted) =
-            resize_and_crop(&RgbImage::new(1080, 1920), &camera(1080, 1920), [128, 192].into());
-        assert_eq!(image.to_rgb().dimensions(), (192, 128));
-        assert!((fitted.intrinsics.cx - 96.).abs() < 1e-9);
-        assert!((fitted.intrinsics.cy - 64.).abs() < 1.); // cut at a whole pixel
-    }
-
-    #[test]
-    fn a_line_is_cut_out_of_a_square() {
+    fn images_are_cut_to_the_aspect_ratio_around_their_centre() {
+        for (width, height, size, [fx, fy]) in [
+            // 640×360 → 456×256 (455.1 rounded to a multiple of 8) → 256×256.
+            (640, 360, [256, 256], [500. * 456. / 640., 510. * 256. / 360.]),
+            // 1080×1920 → 72×128 → 72×48 → 192×128.
+            (1080, 1920, [128, 192], [500. * 192. / 1080., 510. * 128. / 1920. * 128. / 48.]),
+        ] {
+            let k = resize_and_crop(&RgbImage::new(width, height), &camera(width, height), size.into())
+                .1
+                .intrinsics;
+            assert!((k.fx - fx).abs() < 1e-9 && (k.fy - fy).abs() < 1e-9, "{k:?}");
+            let [cy, cx] = size.map(|count| f64::from(count) / 2.);
+            assert!((k.cx - cx).abs() < 1e-9 && (k.cy - cy).abs() < 1e-9, "{k:?}");
+        }
+        // At least a pixel of a row or a column is left.
         for size in [[1, 4000], [4000, 1], [11, 2000]] {
             let (image, fitted) = resize_and_crop(&RgbImage::new(40, 40), &camera(40, 40), size.into());
             let (width, height) = image.to_rgb().dimensions();

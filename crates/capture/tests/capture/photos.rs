@@ -1,42 +1,15 @@
-//! Photos of a capture: undistortion, EXIF orientation, and pixel formats.
+//! Photos of a capture: EXIF orientation, and pixel formats.
 
 use crate::assert_refused;
-use glam::{DMat4, DVec3};
-use globalsplat_capture::{Camera, Intrinsics, Result, decode_photo, open_capture, read_image_size};
-use globalsplat_test_kit::formats::{
-    HEIGHT, WIDTH, assert_same_cameras, cameras, in_images, transforms, write_colmap_text,
-};
+use globalsplat_capture::{Camera, Result, decode_photo, open_capture, read_image_size};
+use globalsplat_test_kit::formats::{HEIGHT, WIDTH, cameras, transforms};
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::PngEncoder;
 use image::codecs::webp::WebPEncoder;
 use image::imageops::{flip_horizontal, rotate90, rotate270};
 use image::{ColorType, DynamicImage, GrayImage, ImageEncoder, ImageFormat, Luma, Rgb, RgbImage};
-use serde_json::json;
 use std::io::Cursor;
 use std::process::Command;
-
-/// Returns the distorted image coordinates of the ray (x, y, 1), by OpenCV's rational model and in the notation of its documentation.
-fn distort([k1, k2, p1, p2, k3, k4, k5, k6]: [f64; 8], x: f64, y: f64) -> (f64, f64) {
-    let r2 = x.powi(2) + y.powi(2);
-    let radial = (1. + k1 * r2 + k2 * r2.powi(2) + k3 * r2.powi(3))
-        / (1. + k4 * r2 + k5 * r2.powi(2) + k6 * r2.powi(3));
-    (
-        x * radial + 2. * p1 * x * y + p2 * (r2 + 2. * x.powi(2)),
-        y * radial + p1 * (r2 + 2. * y.powi(2)) + 2. * p2 * x * y,
-    )
-}
-
-/// Returns the x and y of the ray (x, y, 1) whose distorted image coordinates are (u, v), by fixed-point iteration.
-fn undistort(lens: [f64; 8], u: f64, v: f64) -> (f64, f64) {
-    let (mut x, mut y) = (u, v);
-    for _ in 0..200 {
-        let (du, dv) = distort(lens, x, y);
-        (x, y) = (x + u - du, y + v - dv);
-    }
-    let (du, dv) = distort(lens, x, y);
-    assert!((du - u).abs() < 1e-12 && (dv - v).abs() < 1e-12);
-    (x, y)
-}
 
 /// Returns the largest absolute difference between the bytes of two images of the same size.
 fn largest_difference(a: &RgbImage, b: &RgbImage) -> u8 {
@@ -44,114 +17,18 @@ fn largest_difference(a: &RgbImage, b: &RgbImage) -> u8 {
     a.as_raw().iter().zip(b.as_raw()).map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0)
 }
 
-/// Returns the color that the ray (x, y, 1) sees, three levels from 7.5 to 247.5.
-fn scene(x: f64, y: f64) -> [f64; 3] {
-    let wave = |t: f64| 127.5 + 120. * t.sin();
-    [wave(6. * x + 2. * y), wave(7. * y - x), wave(4. * x - 5. * y)]
-}
-
-#[test]
-fn distortion_is_removed_from_the_photos() {
-    check_lens([-0.15, 0.04, 0.01, -0.02, 0., 0., 0., 0.]);
-    check_lens([0.1, -0.05, 0.01, -0.02, 0.02, 0.3, -0.08, 0.04]);
-}
-
-fn check_lens(lens: [f64; 8]) {
-    let (width, height) = (160, 120);
-    let k = Intrinsics { fx: 110., fy: 115., cx: 83., cy: 58. };
-    let camera = Camera { intrinsics: k, c2w: DMat4::IDENTITY, width, height };
-    let cameras = [camera, Camera { c2w: DMat4::from_translation(DVec3::X), ..camera }];
-    let ray = |x: u32, y: u32| ((f64::from(x) + 0.5 - k.cx) / k.fx, (f64::from(y) + 0.5 - k.cy) / k.fy);
-    let render = |ray_of: &dyn Fn(f64, f64) -> (f64, f64)| {
-        RgbImage::from_fn(width, height, |x, y| {
-            let (x, y) = ray(x, y);
-            let (x, y) = ray_of(x, y);
-            Rgb(scene(x, y).map(|value| value.round() as u8))
-        })
-    };
-    let (distorted, pinhole) = (render(&|x, y| undistort(lens, x, y)), render(&|x, y| (x, y)));
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path();
-    std::fs::create_dir(path.join("images")).unwrap();
-    let names = ["a.png".to_string(), "b.png".to_string()];
-    names.iter().for_each(|name| distorted.save(path.join("images").join(name)).unwrap());
-    let (model, count) = if lens[4..] == [0.; 4] { ("OPENCV", 4) } else { ("FULL_OPENCV", 8) };
-    let coefficients = lens[..count].iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
-    let opencv = format!("{model} {} {} {} {} {coefficients}", k.fx, k.fy, k.cx, k.cy);
-    let mut contents = transforms(&in_images(&names), &cameras);
-    contents["camera_model"] = json!(model);
-    for (key, value) in ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"].iter().zip(lens) {
-        contents[*key] = json!(value);
+/// Returns files of `photo` with an EXIF orientation, each with its extension.
+fn encode_with_orientation(photo: &GrayImage, orientation: u8) -> [(&'static str, Vec<u8>); 3] {
+    fn encode<E: ImageEncoder>(photo: &GrayImage, mut encoder: E, orientation: u8) {
+        let exif = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0";
+        encoder.set_exif_metadata([&exif[..], &[orientation, 0, 0, 0, 0, 0, 0, 0]].concat()).unwrap();
+        photo.write_with_encoder(encoder).unwrap();
     }
-    write_colmap_text(&path.join("colmap/sparse/0"), &names, &cameras, &opencv);
-    std::os::unix::fs::symlink(path.join("images"), path.join("colmap/images")).unwrap();
-    std::fs::write(path.join("transforms.json"), contents.to_string()).unwrap();
-    assert!(largest_difference(&distorted, &pinhole) > 50, "the lens hardly distorts");
-    for capture in [open_capture(path).unwrap(), open_capture(&path.join("colmap")).unwrap()] {
-        assert_same_cameras(&capture, &cameras);
-        let found = capture.load(&[1], None).unwrap()[0].image.to_rgb();
-        // Number of pixels whose ray falls inside the distorted photo. Other pixels aren't compared.
-        let mut checked = 0;
-        for y in 0..height {
-            for x in 0..width {
-                let (u, v) = ray(x, y);
-                let (u, v) = distort(lens, u, v);
-                let (u, v) = (u * k.fx + k.cx, v * k.fy + k.cy);
-                if u < 0.5 || v < 0.5 || u > f64::from(width) - 0.5 || v > f64::from(height) - 0.5 {
-                    continue;
-                }
-                checked += 1;
-                let (a, b) = (found.get_pixel(x, y), pinhole.get_pixel(x, y));
-                // Levels are rounded twice, and interpolated linearly between the photo's pixels.
-                assert!(a.0.iter().zip(b.0).all(|(a, b)| a.abs_diff(b) <= 2), "({x}, {y}): {a:?} {b:?}");
-            }
-        }
-        assert!(checked > 9 * width * height / 10, "{checked} pixels");
-    }
-}
-
-/// Returns files of `photo` in every format that has an EXIF orientation, each with its extension.
-fn encode_with_orientation(photo: &GrayImage, orientation: u8) -> [(&'static str, Vec<u8>); 4] {
-    let mut exif = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".to_vec();
-    exif.extend([orientation, 0, 0, 0, 0, 0, 0, 0]);
     let [mut jpeg, mut png, mut webp] = [vec![], vec![], vec![]];
-    let mut encoder = JpegEncoder::new(&mut jpeg);
-    encoder.set_exif_metadata(exif.clone()).unwrap();
-    photo.write_with_encoder(encoder).unwrap();
-    let mut encoder = PngEncoder::new(&mut png);
-    encoder.set_exif_metadata(exif.clone()).unwrap();
-    photo.write_with_encoder(encoder).unwrap();
-    let mut encoder = WebPEncoder::new_lossless(&mut webp);
-    encoder.set_exif_metadata(exif).unwrap();
-    photo.write_with_encoder(encoder).unwrap();
-    [("jpg", jpeg), ("png", png), ("webp", webp), ("tiff", grey_tiff(photo, orientation))]
-}
-
-/// Returns an uncompressed grey TIFF with `orientation`.
-fn grey_tiff(photo: &GrayImage, orientation: u8) -> Vec<u8> {
-    let (width, height, length) = (photo.width(), photo.height(), photo.len() as u32);
-    let entries: [(u16, u32); 9] = [
-        (256, width),
-        (257, height),
-        (258, 8),                  // bits per sample
-        (262, 1),                  // black is 0
-        (273, 8 + 2 + 9 * 12 + 4), // where the pixels begin
-        (274, u32::from(orientation)),
-        (277, 1), // samples per pixel
-        (278, height),
-        (279, length),
-    ];
-    let mut tiff = b"II*\0\x08\0\0\0".to_vec();
-    tiff.extend((entries.len() as u16).to_le_bytes());
-    for (tag, value) in entries {
-        tiff.extend(tag.to_le_bytes());
-        // One number of 32 bits.
-        tiff.extend([4, 0, 1, 0, 0, 0]);
-        tiff.extend(value.to_le_bytes());
-    }
-    tiff.extend([0; 4]);
-    tiff.extend(photo.as_raw());
-    tiff
+    encode(photo, JpegEncoder::new(&mut jpeg), orientation);
+    encode(photo, PngEncoder::new(&mut png), orientation);
+    encode(photo, WebPEncoder::new_lossless(&mut webp), orientation);
+    [("jpg", jpeg), ("png", png), ("webp", webp)]
 }
 
 /// Loads the first view of a capture whose photos are all `bytes`, declared to be `width` × `height`.

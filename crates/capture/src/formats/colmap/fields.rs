@@ -26,6 +26,19 @@ impl WordReader<'_> {
         let refused = |_| Error::input(self.file, format!("{name} in line {}", self.number), found, expected);
         if word.is_empty() { Err(()) } else { word.parse().map_err(drop) }.map_err(refused)
     }
+
+    /// Reads the numbers `names`.
+    pub fn numbers<T: FromStr + Copy + Default, const N: usize>(
+        &mut self,
+        names: [&str; N],
+        expected: &str,
+    ) -> Result<[T; N]> {
+        let mut numbers = [T::default(); N];
+        for (number, name) in numbers.iter_mut().zip(names) {
+            *number = self.parse(name, expected)?;
+        }
+        Ok(numbers)
+    }
 }
 
 /// A file's contents that are parsed value by value.
@@ -53,13 +66,30 @@ impl ByteReader<'_> {
         }
     }
 
-    pub fn number(&mut self, field: impl FnOnce() -> String) -> Result<f64> {
-        self.take(field).map(f64::from_le_bytes)
+    pub fn u32(&mut self, field: impl FnOnce() -> String) -> Result<u32> {
+        self.take(field).map(u32::from_le_bytes)
+    }
+
+    pub fn u64(&mut self, field: impl FnOnce() -> String) -> Result<u64> {
+        self.take(field).map(u64::from_le_bytes)
+    }
+
+    pub fn numbers<const N: usize>(&mut self, field: impl Fn() -> String) -> Result<[f64; N]> {
+        let mut numbers = [0.; N];
+        for number in &mut numbers {
+            *number = f64::from_le_bytes(self.take(&field)?);
+        }
+        Ok(numbers)
+    }
+
+    /// Skips `count` bytes that are there.
+    pub fn skip(&mut self, count: usize) {
+        self.at += count;
     }
 
     /// Reads a number of entries that take at least `smallest` bytes each, and fails if the file can't hold that many.
     pub fn count(&mut self, field: &str, smallest: usize) -> Result<usize> {
-        let count = u64::from_le_bytes(self.take(|| field.to_string())?);
+        let count = self.u64(|| field.to_string())?;
         let room = self.left() / smallest;
         usize::try_from(count).ok().filter(|&count| count <= room).ok_or_else(|| {
             let expected = format!("{room} at most, for which the file has bytes");

@@ -1,4 +1,6 @@
-//! A smooth camera path through given views.
+//! Camera paths: orbits, and a smooth path through given views.
+//!
+//! # The smooth path
 //!
 //! The parameters of a camera other than its rotation form a point x in seven dimensions, each a length: the position, and Z·ln f
 //! and Z·c/f along both axes of the image, where Z is the distance of the scene. A step from one camera to the next, which turns by
@@ -24,9 +26,11 @@
 //!
 //! Both curves pass through every view with continuous velocity. Frames are equally spaced by the length d.
 
-use super::camera::{Camera, ImageSize, Intrinsics};
+use super::camera::{Camera, ImageSize, Intrinsics, look_at};
+use super::normalize;
 use glam::{DMat4, DQuat, DVec3};
 use globalsplat_files::{Error, Result};
+use std::f64::consts::TAU;
 
 /// Minimum length of a step relative to the whole path. A view at a shorter distance counts as equal to the previous one.
 const SAME: f64 = 1e-9;
@@ -203,6 +207,45 @@ impl Curve {
     }
 }
 
+/// Returns `frames` cameras on an ellipse around the mean of `cameras`, as wide and high as their own spread. All look at the point
+/// at `distance` in front of the mean camera. It suits captures taken by walking, because the path stays close to the photos.
+///
+/// # Errors
+/// Fails if there are no cameras.
+pub fn orbit_around_cameras(cameras: &[Camera], distance: f64, frames: usize) -> Result<Vec<Camera>> {
+    let poses: Vec<DMat4> = cameras.iter().map(|camera| camera.c2w).collect();
+    let normalization = normalize(&poses)?;
+    let to_world = normalization.world_from_normalized;
+    let spread = |axis: usize| {
+        let n = poses.len() as f64;
+        (normalization.c2w.iter().map(|pose| pose.w_axis[axis].powi(2)).sum::<f64>() / n).sqrt()
+            * to_world.scale
+    };
+    // At least a tenth of the distance to the target, so that cameras that only moved forward still give an orbit.
+    let (x, y) = (spread(0).max(0.1 * distance), spread(1).max(0.05 * distance));
+    let [right, down, forward] =
+        [to_world.rotation.x_axis, to_world.rotation.y_axis, to_world.rotation.z_axis];
+    let target = to_world.translation + forward * distance;
+    let reference = cameras.first().ok_or_else(|| Error::request("an orbit needs a camera"))?;
+    let camera = |frame: usize| {
+        let angle = TAU * frame as f64 / frames as f64;
+        let eye = to_world.translation + right * (x * angle.cos()) + down * (y * angle.sin());
+        Camera { c2w: look_at(eye, target, down), ..*reference }
+    };
+    Ok((0..frames).map(camera).collect())
+}
+
+/// Returns `frames` cameras on a circle of `radius` around `target`, slightly above it (y points down). Everything but the pose is
+/// copied from `reference`.
+pub fn orbit_around_point(target: DVec3, radius: f64, reference: &Camera, frames: usize) -> Vec<Camera> {
+    let camera = |frame: usize| {
+        let angle = TAU * frame as f64 / frames as f64;
+        let eye = target + radius * DVec3::new(angle.sin(), -0.3, -angle.cos());
+        Camera { c2w: look_at(eye, target, DVec3::Y), ..*reference }
+    };
+    (0..frames).map(camera).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -344,9 +387,7 @@ mod tests {
         let mut negated = views.clone();
         negated.iter_mut().step_by(2).for_each(|view| view.rotation = -view.rotation);
         let [a, b] = [views, negated].map(|views| Curve::through(views, DISTANCE));
-        for share in [0., 0.1, 0.33, 0.5, 0.87, 1.] {
-            assert!(a.at(share).distance_to(&b.at(share), DISTANCE) < 1e-9);
-        }
+        assert!((0..=8).map(|i| f64::from(i) / 8.).all(|t| a.at(t).distance_to(&b.at(t), DISTANCE) < 1e-9));
     }
 
     #[test]
