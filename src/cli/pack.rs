@@ -1,7 +1,7 @@
 use super::{print_json, progress, warn_of_many};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::{ChunkWriter, FoundCaptures, Holdout, find_captures};
+use globalsplat::data::{ChunkWriter, Holdout, find_captures, open_capture};
 use globalsplat::error::Error;
 use globalsplat::io::{InputFiles, check_writable_dir};
 use serde_json::json;
@@ -35,9 +35,11 @@ impl Pack {
             if !scene.exists() && !scene.to_string_lossy().contains('#') {
                 return Err(Error::request(format!("{}: no such capture", scene.display())).into());
             }
-            let found: FoundCaptures = find_captures(scene)?;
+            let found = find_captures(scene)?;
             lines.extend(found.warnings);
-            captures.extend(found.captures);
+            for path in &found.paths {
+                captures.push(open_capture(path)?);
+            }
         }
         for capture in &captures {
             lines.extend_from_slice(capture.warnings());

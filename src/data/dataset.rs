@@ -3,7 +3,7 @@
 use crate::error::{Error, Result};
 use crate::io::{InputFiles, read_text};
 use globalsplat_capture::{
-    CHUNK_INDEX_FILE, Capture, CaptureFolders, Chunk, capture_folders, folder_name, is_capture, open_capture,
+    CHUNK_INDEX_FILE, Capture, Chunk, FoundCaptures, find_captures, folder_name, is_capture, open_capture,
 };
 use globalsplat_synth::SyntheticDataset;
 use std::collections::BTreeMap;
@@ -230,7 +230,7 @@ fn synthetic_groups(videos: SyntheticDataset) -> Vec<SceneGroup> {
 
 /// Returns the captures in `root` except those in `except`, and warnings about folders that couldn't be read.
 fn capture_groups(root: &Path, except: &Path) -> Result<(Vec<SceneGroup>, Vec<String>)> {
-    let CaptureFolders { mut folders, warnings } = capture_folders(root)?;
+    let FoundCaptures { paths: mut folders, warnings } = find_captures(root)?;
     folders.retain(|folder| !folder.starts_with(except));
     if folders.is_empty() {
         let found = format!("a folder whose captures are all in {}", except.display());

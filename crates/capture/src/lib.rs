@@ -27,7 +27,7 @@ pub use globalsplat_files::{Error, Result};
 pub use holdout::Holdout;
 pub use image_source::ImageSource;
 pub use lens::Lens;
-pub use open::{CaptureFolders, FoundCaptures, capture_folders, find_captures, is_capture, open_capture};
+pub use open::{FoundCaptures, find_captures, is_capture, open_capture};
 pub use photos::{MASKS_FOLDER, PhotoList, find_masks, find_masks_in, list_photos};
 pub use pixels::{
     CHANNELS, DecodedPhoto, PHOTO_EXTENSIONS, Planes, Region, Resampler, decode_photo, encode_photo,

@@ -94,51 +94,35 @@ pub(crate) fn open_for(path: &Path, purpose: Purpose) -> Result<Capture> {
 const DEPTH: usize = 2;
 
 /// Captures found below a folder.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct FoundCaptures {
-    /// Captures ordered by path, with numbers in paths compared by value.
-    pub captures: Vec<Capture>,
+    /// Paths to open, with numbers in paths compared by value.
+    pub paths: Vec<PathBuf>,
     /// Warnings about folders that couldn't be read, one line each.
     pub warnings: Vec<String>,
 }
 
-/// Opens every capture in `path`: `path` itself, or those in folders up to two levels below it. Skips hidden folders, such as those
+/// Finds every capture in `path`: `path` itself, or those in folders up to two levels below it. Skips hidden folders, such as those
 /// left by interrupted work, and folders that can't be read.
 ///
 /// # Errors
-/// Fails if `path` can't be read or holds no capture, or if a capture violates its format.
+/// Fails if `path` can't be read or holds no capture.
 pub fn find_captures(path: &Path) -> Result<FoundCaptures> {
-    let CaptureFolders { folders, warnings } = capture_folders(path)?;
-    let captures = folders.iter().map(|folder| open_capture(folder)).collect::<Result<_>>()?;
-    Ok(FoundCaptures { captures, warnings })
-}
-
-/// Folders of the captures that [`find_captures`] opens.
-#[derive(Debug, Default)]
-pub struct CaptureFolders {
-    /// Paths of the captures, with numbers in paths compared by value.
-    pub folders: Vec<PathBuf>,
-    /// Warnings as in [`FoundCaptures::warnings`].
-    pub warnings: Vec<String>,
-}
-
-/// Finds the folders for [`find_captures`].
-pub fn capture_folders(path: &Path) -> Result<CaptureFolders> {
-    let mut found = CaptureFolders::default();
+    let mut found = FoundCaptures::default();
     found.collect(path, DEPTH)?;
-    if found.folders.is_empty() {
+    if found.paths.is_empty() {
         let unread = found.warnings.first().map_or(String::new(), |line| format!(" ({line})"));
         let expected = format!("{SUPPORTED_FORMATS}; or folders with such, up to {DEPTH} levels below it");
         return Err(Error::input(path, "the folder", format!("without captures{unread}"), expected));
     }
-    found.folders.sort_by(natural_order);
+    found.paths.sort_by(natural_order);
     Ok(found)
 }
 
-impl CaptureFolders {
+impl FoundCaptures {
     fn collect(&mut self, path: &Path, depth: usize) -> Result<()> {
         if is_capture(path) {
-            self.folders.push(path.to_owned());
+            self.paths.push(path.to_owned());
             return Ok(());
         }
         if depth == 0 {

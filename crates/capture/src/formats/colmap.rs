@@ -150,40 +150,32 @@ pub fn read_colmap_models(sparse: &Path) -> Result<Vec<ColmapModel>> {
 pub(crate) fn find(folder: &Path) -> Option<CaptureOpener> {
     let (folder, models) = (folder.to_owned(), Model::find_all(folder));
     (!models.is_empty())
-        .then(|| -> CaptureOpener { Box::new(move |purpose| read_largest(&folder, models, purpose)) })
+        .then(|| -> CaptureOpener { Box::new(move |purpose| read_largest(&folder, &models, purpose)) })
 }
 
 /// Reads the model with the most photos among `models`, the first one in case of a tie.
-fn read_largest(folder: &Path, mut models: Vec<Model>, purpose: Purpose) -> Result<Capture> {
-    if models.len() == 1 {
-        return read(folder, &models[0], models[0].images()?, vec![], purpose);
-    }
-    let name = |model: &Model| {
-        model.images.parent().and_then(|place| place.strip_prefix(folder).ok()?.to_str().map(String::from))
-    };
-    let names: Vec<String> = models.iter().map(|model| name(model).unwrap_or_default()).collect();
+fn read_largest(folder: &Path, models: &[Model], purpose: Purpose) -> Result<Capture> {
+    let mut images: Vec<Result<Vec<ImageEntry>>> = models.iter().map(Model::images).collect();
+    let sizes: Vec<Option<usize>> = images.iter().map(|images| images.as_ref().ok().map(Vec::len)).collect();
     // If no model can be read, the first one reports the error.
-    let sizes: Vec<Option<usize>> =
-        models.iter().map(|model| model.images().ok().map(|images| images.len())).collect();
     let largest = (0..models.len()).rev().max_by_key(|&model| sizes[model]).expect("a model or more");
-    let model = models.swap_remove(largest);
-    let images = model.images()?;
-    let smaller: Vec<String> = names
-        .iter()
-        .zip(&sizes)
-        .filter(|(_, size)| **size < Some(images.len()))
-        .map(|(name, size)| match size {
-            Some(size) => format!("{name} ({size} photos)"),
-            None => format!("{name} (its images can't be read)"),
+    let images = images.swap_remove(largest)?;
+    let smaller = models.iter().zip(&sizes).filter(|(_, size)| **size < Some(images.len()));
+    let smaller: Vec<String> = smaller
+        .map(|(model, size)| {
+            let place = model.images.parent().and_then(|place| place.strip_prefix(folder).ok());
+            let name = place.unwrap_or(folder).display();
+            match size {
+                Some(size) => format!("{name} ({size} photos)"),
+                None => format!("{name} (its images can't be read)"),
+            }
         })
         .collect();
-    let line = format!(
-        "the largest of {} models is taken, with {} photos; left out: {}",
-        sizes.len(),
-        images.len(),
-        format_names(&smaller)
-    );
-    read(folder, &model, images, if smaller.is_empty() { vec![] } else { vec![line] }, purpose)
+    let lines = (!smaller.is_empty()).then(|| {
+        let (count, photos, left_out) = (models.len(), images.len(), format_names(&smaller));
+        format!("the largest of {count} models is taken, with {photos} photos; left out: {left_out}")
+    });
+    read(folder, &models[largest], images, lines.into_iter().collect(), purpose)
 }
 
 /// Reads `images` of `model` as the capture in `folder`. Frames are ordered by name, with numbers in names compared by value.

@@ -77,9 +77,12 @@ pub(crate) fn find(path: &Path) -> Option<CaptureOpener> {
 
 /// Reads the capture that `file` describes.
 pub(crate) fn read(file: &Path, purpose: Purpose) -> Result<Capture> {
-    let (frames, changes, lists) = read_frames(file, purpose)?;
+    let (frames, changes, json) = read_frames(file, purpose)?;
     let new = |frames| Capture::new(folder_name(parent_of(file)), file.to_owned(), frames, changes, purpose);
-    let Lists { train, test, unread } = lists;
+    let train = read_names(file, &json, TRAIN_LIST)?;
+    let [test, validation] = TEST_LISTS.map(|key| read_names(file, &json, key));
+    let mut lists = [test?, validation?].into_iter().flatten();
+    let (test, unread) = (lists.next().unwrap_or_default(), lists.next().unwrap_or_default());
     // A camera path consists of all frames in order.
     if matches!(purpose, Purpose::Cameras(_)) || test.is_empty() {
         return new(frames);
@@ -105,37 +108,22 @@ fn normalize_name(name: &str) -> String {
     portable(name).trim_start_matches("./").to_owned()
 }
 
-/// Names of photos in nerfstudio's lists.
-struct Lists {
-    /// Training photos, if there is such a list.
-    train: Option<HashSet<String>>,
-    /// Test photos.
-    test: HashSet<String>,
-    /// Validation photos, if there are also test photos.
-    unread: HashSet<String>,
-}
-
-impl Lists {
-    fn read(file: &Path, json: &Value) -> Result<Self> {
-        let list = |key: &str| match json.get(key) {
-            None | Some(Value::Null) => Ok(None),
-            Some(Value::Array(names)) => {
-                let name = |name: &Value| name.as_str().map(normalize_name);
-                let names: Option<HashSet<_>> = names.iter().map(name).collect();
-                names.map(Some).ok_or_else(|| Error::input(file, key, "no names", "a list of file_paths"))
-            }
-            other => Err(Error::input(file, key, describe_value(other), "a list of file_paths")),
-        };
-        let [test, validation] = TEST_LISTS.map(list);
-        let mut lists = [test?, validation?].into_iter().flatten();
-        let (test, unread) = (lists.next().unwrap_or_default(), lists.next().unwrap_or_default());
-        Ok(Lists { train: list(TRAIN_LIST)?, test, unread })
+/// Returns the names of photos in nerfstudio's list `key`, or `None` if there is no such list.
+fn read_names(file: &Path, json: &Value, key: &str) -> Result<Option<HashSet<String>>> {
+    let refused = |found: String| Error::input(file, key, found, "a list of file_paths");
+    match json.get(key) {
+        None | Some(Value::Null) => Ok(None),
+        Some(Value::Array(names)) => {
+            let names: Option<_> = names.iter().map(|name| name.as_str().map(normalize_name)).collect();
+            names.map(Some).ok_or_else(|| refused("no names".into()))
+        }
+        other => Err(refused(describe_value(other))),
     }
 }
 
 /// Reads the frames that `file` describes, ordered by name, with numbers in names compared by value. Frames with a missing image
-/// are left out, as nerfstudio and instant-ngp do: users delete photos after the poses were computed.
-fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Lists)> {
+/// are left out, as nerfstudio and instant-ngp do: users delete photos after the poses were computed. Returns the contents of the file, too.
+fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Value)> {
     let expected = "{\"frames\": [{\"file_path\", \"transform_matrix\"}], …}";
     let json: Value = read_json(file, "no JSON", expected)?;
     let entries = match json.get("frames") {
@@ -160,7 +148,7 @@ fn read_frames(file: &Path, purpose: Purpose) -> Result<(Vec<Frame>, Changes, Li
         }
     }
     frames.sort_by(|a, b| natural_order(&a.name, &b.name));
-    Ok((frames, changes, Lists::read(file, &json)?))
+    Ok((frames, changes, json))
 }
 
 /// Looks for the masks that `fields` name below `bases`. Frames whose photo is missing have none.

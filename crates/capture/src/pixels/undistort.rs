@@ -55,19 +55,34 @@ impl Undistorter {
 
     /// Returns the pixels of the view of `photo`.
     pub fn apply(&self, photo: &RgbImage) -> ViewPixels {
-        let mut undistortion = Undistortion::new(photo, &self.projection, &self.camera);
+        let Camera { width, height, .. } = self.camera;
+        let pixels = width as usize * height as usize;
+        // One more byte, so that four bytes can be written at the last pixel.
+        let mut colors = vec![0; 3 * pixels + 1];
+        let mut mask = matches!(self.projection, Projection::Part(_)).then(|| vec![0; pixels]);
         let mut lookup = RowLookup::new(self);
         let mut row = vec![SamplePosition::default(); self.columns.len()];
         for (n, i) in self.rows.clone().enumerate() {
-            match self.positions.get(n * row.len()..(n + 1) * row.len()) {
-                Some(known) => undistortion.fill(i, self.columns.start, known),
-                None => {
-                    lookup.fill(i, &mut row);
-                    undistortion.fill(i, self.columns.start, &row);
+            let known = self.positions.get(n * row.len()..(n + 1) * row.len());
+            if known.is_none() {
+                lookup.fill(i, &mut row);
+            }
+            let row = known.unwrap_or(&row);
+            let start = i * width as usize + self.columns.start;
+            interpolate(photo, row, &mut colors[3 * start..]);
+            let Some(mask) = &mut mask else { continue };
+            let pixels = colors[3 * start..].chunks_exact_mut(3).zip(&mut mask[start..]);
+            for ((color, weight), position) in pixels.zip(row) {
+                match position.to_right.is_nan() {
+                    true => color.fill(0),
+                    false => *weight = u8::MAX,
                 }
             }
         }
-        undistortion.finish()
+        colors.pop();
+        let image = RgbImage::from_raw(width, height, colors).expect("three bytes a pixel");
+        // Most views lie inside the photo.
+        ViewPixels { image, mask: mask.filter(|mask| mask.contains(&0)) }
     }
 }
 
@@ -152,81 +167,35 @@ fn between(position: f64, last: f64) -> (u32, f32) {
     (whole.to_bits() as u32, (position - (whole - WHOLE)) as f32)
 }
 
-/// A photo and its undistorted version.
-struct Undistortion<'a> {
-    /// Size of the photo.
-    width: usize,
-    height: usize,
-    photo: &'a [u8],
-    /// Size of the undistorted version, and its pixels and one more byte, so that four bytes can be written at the last pixel.
-    size: [u32; 2],
-    undistorted: Vec<u8>,
-    mask: Option<Vec<u8>>,
-}
-
-impl<'a> Undistortion<'a> {
-    fn new(photo: &'a RgbImage, projection: &Projection, camera: &Camera) -> Self {
-        let size = [camera.width, camera.height];
-        let pixels = size.iter().map(|&count| count as usize).product();
-        Undistortion {
-            width: photo.width() as usize,
-            height: photo.height() as usize,
-            photo,
-            size,
-            undistorted: vec![0; 3 * pixels + 1],
-            mask: matches!(projection, Projection::Part(_)).then(|| vec![0; pixels]),
+/// Writes the colors at the positions `row` in `photo`, three bytes each, and one more byte.
+fn interpolate(photo: &RgbImage, row: &[SamplePosition], colors: &mut [u8]) {
+    /// Constant 2²³: a float32 this large has no fraction, and added integers below 256 are in its lowest bits.
+    const WHOLE: f32 = 8_388_608.;
+    let [width, height] = [photo.width(), photo.height()].map(|count| count as usize);
+    let photo: &[u8] = photo.as_raw();
+    // Read four bytes instead of three, to fill a vector.
+    let color = |bytes: &[u8]| {
+        let bytes: [u8; 4] = bytes.try_into().expect("four numbers");
+        Vec4::from_array(bytes.map(f32::from))
+    };
+    let mix = |a: Vec4, b: Vec4, share: f32| a + share * (b - a);
+    // Interpolate between the pixel that begins at `byte` and the one to its right, which is unused in the last column.
+    let along = |byte: usize, share: f32| match photo.get(byte..byte + 7) {
+        Some(pair) => mix(color(&pair[..4]), color(&pair[3..]), share),
+        None => {
+            let mut pair = [0; 7];
+            pair[..photo.len() - byte].copy_from_slice(&photo[byte..]);
+            mix(color(&pair[..4]), color(&pair[3..]), share)
         }
-    }
-
-    /// Fills row `i`, starting at column `first`.
-    fn fill(&mut self, i: usize, first: usize, row: &[SamplePosition]) {
-        /// Constant 2²³: a float32 this large has no fraction, and added integers below 256 are in its lowest bits.
-        const WHOLE: f32 = 8_388_608.;
-        let Undistortion { width, height, photo, size, undistorted, mask } = self;
-        let start = i * size[0] as usize + first;
-        // Read four bytes instead of three, to fill a vector.
-        let color = |bytes: &[u8]| {
-            let bytes: [u8; 4] = bytes.try_into().expect("four numbers");
-            Vec4::from_array(bytes.map(f32::from))
-        };
-        let mix = |a: Vec4, b: Vec4, share: f32| a + share * (b - a);
-        // Interpolate between the pixel that begins at `byte` and the one to its right, which is unused in the last column.
-        let along = |byte: usize, share: f32| match photo.get(byte..byte + 7) {
-            Some(pair) => mix(color(&pair[..4]), color(&pair[3..]), share),
-            None => {
-                let mut pair = [0; 7];
-                pair[..photo.len() - byte].copy_from_slice(&photo[byte..]);
-                mix(color(&pair[..4]), color(&pair[3..]), share)
-            }
-        };
-        let undistorted = &mut undistorted[3 * start..];
-        for (j, place) in row.iter().enumerate() {
-            let (left, top) = (place.left as usize, place.top as usize);
-            let bottom = (top + 1).min(*height - 1);
-            let above = along(3 * (top * *width + left), place.to_right);
-            let below = along(3 * (bottom * *width + left), place.to_right);
-            // Round to the nearest of 256 levels. The fourth byte is overwritten by the next pixel.
-            let levels = (mix(above, below, place.to_bottom) + WHOLE).to_array();
-            undistorted[3 * j..][..4].copy_from_slice(&levels.map(|level| level.to_bits() as u8));
-        }
-        let Some(mask) = mask else { return };
-        let pixels = undistorted.chunks_exact_mut(3).zip(&mut mask[start..]);
-        for ((pixel, weight), place) in pixels.zip(row) {
-            // A NaN has no level.
-            let is_shown = !place.to_right.is_nan();
-            *weight = if is_shown { u8::MAX } else { 0 };
-            if !is_shown {
-                pixel.fill(0);
-            }
-        }
-    }
-
-    fn finish(mut self) -> ViewPixels {
-        self.undistorted.pop();
-        let [width, height] = self.size;
-        let image = RgbImage::from_raw(width, height, self.undistorted).expect("three bytes a pixel");
-        // Most views lie inside the photo.
-        ViewPixels { image, mask: self.mask.filter(|mask| mask.contains(&0)) }
+    };
+    for (j, place) in row.iter().enumerate() {
+        let (left, top) = (place.left as usize, place.top as usize);
+        let bottom = (top + 1).min(height - 1);
+        let above = along(3 * (top * width + left), place.to_right);
+        let below = along(3 * (bottom * width + left), place.to_right);
+        // Round to the nearest of 256 levels. The fourth byte is overwritten by the next pixel.
+        let levels = (mix(above, below, place.to_bottom) + WHOLE).to_array();
+        colors[3 * j..][..4].copy_from_slice(&levels.map(|level| level.to_bits() as u8));
     }
 }
 

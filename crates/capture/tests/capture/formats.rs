@@ -2,9 +2,7 @@
 
 use crate::{assert_refused, assert_warns, open_transforms, photos_alone, write_photos};
 use glam::{DMat3, DMat4, DQuat, DVec3};
-use globalsplat_capture::{
-    Camera, Holdout, Intrinsics, find_captures, open_capture, write_cameras_json,
-};
+use globalsplat_capture::{Camera, Holdout, Intrinsics, find_captures, open_capture, write_cameras_json};
 use globalsplat_test_kit::formats::{
     Format, assert_same_cameras, cameras, in_images, names, pinhole, rewrite, transforms,
     write_colmap_binary, write_colmap_text,
@@ -41,7 +39,7 @@ fn write_model(model: &Path, is_binary: bool, count: usize) {
 }
 
 fn names_of_captures(folder: &Path) -> Vec<String> {
-    find_captures(folder).unwrap().captures.into_iter().map(|capture| capture.name).collect()
+    find_captures(folder).unwrap().paths.iter().map(|path| open_capture(path).unwrap().name).collect()
 }
 
 #[test]
@@ -422,7 +420,7 @@ fn the_synthetic_layout_has_views_to_learn_from_and_views_to_hold_out() {
     // Each file alone is a capture without splits.
     let alone = open_capture(&path.join("transforms_train.json")).unwrap();
     assert_eq!((alone.len(), alone.has_test_part()), (3, false));
-    assert_eq!(find_captures(path).unwrap().captures.len(), 1);
+    assert_eq!(find_captures(path).unwrap().paths.len(), 1);
     // Without its photos, the test split is missing.
     std::fs::remove_dir_all(path.join("test")).unwrap();
     let capture = open_capture(path).unwrap();
