@@ -21,8 +21,8 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-REPOSITORY = Path(__file__).resolve().parents[1]
-PROGRAM = REPOSITORY / "target/release/globalsplat"
+from program import PROGRAM, REPOSITORY, row
+
 CONFIG = REPOSITORY / "configs/tiny.toml"
 # Settings of all variants. Small patches, many scene tokens and Muon only suit weights trained with large patches and
 # few tokens first.
@@ -79,11 +79,6 @@ def train(run, settings, scenes):
         partial.write_bytes(output)
         partial.rename(result)
     return json.loads(result.read_text())
-
-
-def row(*cells):
-    """Prints a row of a Markdown table."""
-    print("|", " | ".join(cells), "|", flush=True)
 
 
 def run_folder(out, name, seed):

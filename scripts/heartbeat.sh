@@ -13,24 +13,11 @@ label=$1
 shift
 [ ! -t 2 ] || $always || exec "$@"
 
-# Prints the names of the crates and C++ files that compilers in this process group are compiling.
-list_compiling() {
-    ps -eo pgid=,args= | awk -v group="$(ps -o pgid= $$ | tr -d ' ')" '
-        $1 != group { next }
-        $2 ~ /rustc$/ && match($0, /--crate-name [^ ]+/) { name = substr($0, RSTART + 13, RLENGTH - 13) }
-        $2 ~ /cc1plus$/ && match($0, /[^ \/]+\.(cpp|cc)( |$)/) { name = substr($0, RSTART, RLENGTH); sub(/ $/, "", name) }
-        name != "" && name != "build_script_build" && !seen[name]++ { names = names (names == "" ? "" : ", ") name }
-        { name = "" }
-        END { print names }'
-}
-
 # Prints a line every 30 seconds until the command ends. Standard input is a pipe whose other end the command holds open and never writes
 # to, so that `read` times out while the command runs and fails at once when it ends.
 print_heartbeats() {
-    local compiling
     while read -rt 30; [ $? -gt 128 ] && kill -0 $$ 2>/dev/null; do
-        compiling="$(list_compiling)"
-        echo "$label: $((SECONDS / 60)) min $((SECONDS % 60)) s so far${compiling:+, now $compiling}"
+        echo "$label: $((SECONDS / 60)) min $((SECONDS % 60)) s so far"
     done
 }
 

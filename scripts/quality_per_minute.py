@@ -17,19 +17,13 @@ import argparse
 import json
 import shlex
 import statistics
-import subprocess
 from pathlib import Path
 from zlib import crc32
 
-PROGRAM = Path(__file__).resolve().parents[1] / "target/release/globalsplat"
+from program import row, run
 
 # Quantiles of Student's t distribution for 95 % confidence, by the number of samples.
 STUDENT = {2: 12.71, 3: 4.30, 4: 3.18, 5: 2.78, 6: 2.57, 7: 2.45, 8: 2.36}
-
-
-def run(*command):
-    """Runs a command of the program and returns its JSON output."""
-    return json.loads(subprocess.run([PROGRAM, *command, "--json"], stdout=subprocess.PIPE, check=True).stdout)
 
 
 def identity(command):
@@ -55,11 +49,6 @@ def run_once(file, *command):
         partial.write_text(json.dumps(kept))
         partial.rename(file)
     return kept["told"]
-
-
-def row(*cells):
-    """Prints a row of a Markdown table."""
-    print("|", " | ".join(cells), "|", flush=True)
 
 
 def make_synthetic_captures(out, count):

@@ -10,13 +10,13 @@ and without, and scored against the photos. Prints a Markdown table.
 import argparse
 from pathlib import Path
 
-from core_runs import row, told
+from program import row, run
 
 ENDINGS = ["ply", "glb", "compressed.ply", "spz", "sog", "splat"]
 
 
 def photos_psnr(splat, capture):
-    return told("eval", "--splat", splat, "--scene", capture)["psnr"]
+    return run("eval", "--splat", splat, "--scene", capture)["psnr"]
 
 
 def main():
@@ -26,7 +26,7 @@ def main():
     parser.add_argument("--out", type=Path, default=Path("runs/splat_formats"))
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    row(
+    columns = (
         "splat",
         "format",
         "bytes",
@@ -36,23 +36,16 @@ def main():
         "write, s",
         "read, s",
     )
+    row(*columns)
     row("---", "---", *["---:"] * 6)
     for capture in arguments.captures:
         original = capture / arguments.splat
-        row(
-            capture.name,
-            "published",
-            f"{original.stat().st_size:,}",
-            "",
-            f"{photos_psnr(original, capture):.2f}",
-            "",
-            "",
-            "",
-        )
+        psnr = f"{photos_psnr(original, capture):.2f}"
+        row(capture.name, "published", f"{original.stat().st_size:,}", "", psnr, "", "", "")
         for ending in ENDINGS:
             fitted, plain = (arguments.out / f"{capture.name}.{name}.{ending}" for name in ("fitted", "plain"))
-            loss = told("convert", original, fitted, "--scene", capture)
-            unfitted = told("convert", original, plain)
+            loss = run("convert", original, fitted, "--scene", capture)
+            unfitted = run("convert", original, plain)
             scores = [f"{photos_psnr(splat, capture):.2f}" for splat in (fitted, plain)]
             # Pixels that are all the same have no PSNR.
             between = f"{loss['psnr']:.1f}" if loss["psnr"] else "same"
