@@ -108,12 +108,11 @@ check-ignored:
 	$(CARGO) test $(ALL) --no-fail-fast -- --ignored
 check-docs:
 	RUSTDOCFLAGS="-D warnings" $(CARGO) doc $(ALL) --no-deps
-# The crates of CRATES without libtorch, with checks of overflow; the library without the program's dependencies, and the crates without
-# their optional ones.
+# The crates of CRATES without libtorch, with checks of overflow; the library without the program's dependencies, and `capture` without
+# its optional ones.
 check-features:
 	env -u LIBTORCH $(CARGO) test --locked $(CRATES:%=-p globalsplat-%)
 	$(CARGO) check --release --locked --lib --no-default-features
-	env -u LIBTORCH $(CARGO) test --locked -p globalsplat-splat-file --no-default-features
 	env -u LIBTORCH $(CARGO) check --locked -p globalsplat-capture --no-default-features
 # Packages the crates that need no libtorch as for crates.io, builds each package by itself, and checks that it has a README and the
 # licenses. Needs cargo 1.90 for packages that depend on each other.

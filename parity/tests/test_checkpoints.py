@@ -140,10 +140,10 @@ def lightning(weights, prefix="model."):
     }
 
 
-@pytest.mark.parametrize("legacy, protocol", [(False, 2), (False, 5), (True, 2), (True, 4)])
-def test_checkpoints_of_lightning_are_read(weights, tmp_path, legacy, protocol):
+@pytest.mark.parametrize("protocol", [2, 5])
+def test_checkpoints_of_lightning_are_read(weights, tmp_path, protocol):
     file = tmp_path / "last.ckpt"
-    torch.save(lightning(weights), file, pickle_protocol=protocol, _use_new_zipfile_serialization=not legacy)
+    torch.save(lightning(weights), file, pickle_protocol=protocol)
     read, told = imported(file, tmp_path / "model.safetensors")
     assert same(read, weights)
     # Frozen networks, and another tensor that isn't part of the model.
@@ -178,8 +178,7 @@ def test_other_precisions_become_float32(weights, tmp_path, dtype):
     assert same(read, {name: tensor.to(dtype).float() for name, tensor in weights.items()})
 
 
-@pytest.mark.parametrize("legacy", [False, True])
-def test_shared_storages_and_any_strides_are_read(weights, tmp_path, legacy):
+def test_shared_storages_and_any_strides_are_read(weights, tmp_path):
     flat = torch.cat([tensor.flatten() for tensor in weights.values()])
     state, offset = {}, 0
     for name, tensor in weights.items():
@@ -195,7 +194,7 @@ def test_shared_storages_and_any_strides_are_read(weights, tmp_path, legacy):
     state["slot_encoder.mem_regs"] = weights["slot_encoder.mem_regs"].clone()
     state["slot_encoder.mem_regs"].tag = "a tensor"
     file = tmp_path / "model.pt"
-    torch.save(state, file, _use_new_zipfile_serialization=not legacy)
+    torch.save(state, file)
     read, _ = imported(file, tmp_path / "model.safetensors")
     assert same(read, weights)
 
@@ -286,11 +285,8 @@ class Runs:
         return self.call
 
 
-@pytest.mark.parametrize(
-    "legacy, protocol, place",
-    [(False, 2, "beside"), (True, 4, "inside"), (False, 4, "as a parameter"), (True, 2, "beside")],
-)
-def test_what_would_run_code_is_refused_and_not_run(weights, tmp_path, legacy, protocol, place):
+@pytest.mark.parametrize("protocol, place", [(2, "beside"), (4, "inside"), (4, "as a parameter")])
+def test_what_would_run_code_is_refused_and_not_run(weights, tmp_path, protocol, place):
     trap = tmp_path / "trap"
     calls = {
         "system": Runs(os.system, f"touch {trap}"),
@@ -309,17 +305,16 @@ def test_what_would_run_code_is_refused_and_not_run(weights, tmp_path, legacy, p
         else:
             state["scene_tokens"] = evil
         file = tmp_path / "evil.ckpt"
-        torch.save(checkpoint, file, pickle_protocol=protocol, _use_new_zipfile_serialization=not legacy)
+        torch.save(checkpoint, file, pickle_protocol=protocol)
         error = refuse("import", "--from", file, "--out", tmp_path / "model.safetensors")
         assert f".{name}," in error and "nothing was run" in error, error
     assert "nothing was run" in refuse("reconstruct", "--weights", file, "--scene", "x", "--out", tmp_path / "a.ply")
     assert not trap.exists() and not (tmp_path / "model.safetensors").exists()
 
 
-@pytest.mark.parametrize("legacy", [False, True])
-def test_files_that_are_cut_short_are_refused(weights, tmp_path, legacy):
+def test_files_that_are_cut_short_are_refused(weights, tmp_path):
     whole, cut = tmp_path / "whole.ckpt", tmp_path / "cut.ckpt"
-    torch.save(lightning(weights), whole, _use_new_zipfile_serialization=not legacy)
+    torch.save(lightning(weights), whole)
     contents = whole.read_bytes()
     for length in [0, 1, 3, 4, 20, 1000, *range(5000, len(contents), len(contents) // 12), len(contents) - 1]:
         cut.write_bytes(contents[:length])

@@ -95,7 +95,7 @@ def test_a_chunk_that_runs_something_is_refused_and_runs_nothing(packed, tmp_pat
     made, file = tmp_path / "made", tmp_path / "evil.torch"
     torch.save([*torch.load(packed / "000000.torch"), RunsSomething(made)], file)
     done = run("inspect", file)
-    assert done.returncode == 2 and "data.pkl is a pickle that asks for posix.mkdir" in done.stderr
+    assert done.returncode == 2 and "data.pkl is a pickle that calls posix.mkdir" in done.stderr
     assert not made.exists()
     torch.load(file, weights_only=False)  # confirms that the pickle does create the folder
     assert made.exists()

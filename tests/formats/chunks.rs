@@ -1,6 +1,6 @@
 //! Chunks: writing, reading back, and invalid files.
 
-#[path = "../../crates/torch-file/tests/pickles/mod.rs"]
+#[path = "../../crates/torch-file/tests/torch_files/pickles.rs"]
 mod pickles;
 
 use crate::common::formats::{HEIGHT, WIDTH, assert_same_cameras, cameras, names, transforms};
@@ -220,7 +220,7 @@ fn pickles_of_other_values_are_refused() {
     let absent = [text("storage"), b"ctorch\nFloatStorage\n".to_vec(), text("1"), text("cpu"), int(64)];
     let absent = one_view(&tensor_of(&absent, 0, &[1, 18], &[18, 1]), &tensor("ByteStorage", 0, &[4], &[1]));
     let cases: [(&[u8], &str); 9] = [
-        (&call, "asks for os.system"),
+        (&call, "calls os.system"),
         (&absent, "cameras of scene 0 asks for data/1, which is missing"),
         (&nested, "scene 0 is a list, expected a dict"),
         // A list that contains itself.

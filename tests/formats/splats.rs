@@ -1,7 +1,7 @@
 //! Splats on their way through the program: what `convert` loses, what every command leaves out, and renders before and after. The formats
 //! themselves are tested in crates/splat-file.
 
-#[path = "../../crates/splat-file/tests/common/mod.rs"]
+#[path = "../../crates/splat-file/tests/splats/common.rs"]
 mod splat_files;
 
 use crate::common::program::{arg, refuse, room, succeed};

@@ -1,20 +1,16 @@
 //! PlayCanvas' compressed PLY (spec 10.12). Each Gaussian has four words of 32 bits, and a byte for each SH coefficient above degree 0.
 //! Positions, scales and colors are quantized between the bounds of a chunk of 256 Gaussians.
 
-use crate::codec::{Codec, Contents, WriteOptions, Writer};
-use crate::invalid::InvalidGaussians;
+use crate::invalid::{Contents, InvalidGaussians};
 use crate::morton::morton_order;
+use crate::numbers::Scalar;
 use crate::ply::degree_of_rest;
-use crate::ply_body::columns;
-use crate::ply_header::{Header, Kind, Scalar};
+use crate::ply_table::{Header, Kind};
 use crate::rotations::{from_smallest_three, smallest_three};
-use crate::splat::logit_of_opacity;
-use crate::{Error, Result, SH_C0, ShLimits, Splat};
+use crate::splat::{color_of_dc, dc_of_color, logit_of_opacity};
+use crate::{Error, Result, ShLimits, Splat, WriteOptions};
 use globalsplat_files::write_atomically;
 use std::path::Path;
-
-/// Functions of the format.
-pub(crate) const CODEC: Option<Codec> = Some(Codec { read, writer: Some(Writer::new(write, limits)) });
 
 /// Number of Gaussians in a chunk, which share their bounds.
 const CHUNK: usize = 256;
@@ -24,7 +20,7 @@ const BOUNDED: [[&str; 3]; 3] = [["x", "y", "z"], ["scale_x", "scale_y", "scale_
 const WORDS: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
 /// Numbers of bits of the three components of a position or scale.
 const POSITION_BITS: [u32; 3] = [11, 10, 11];
-/// Numbers of bits of the three smaller components of a quaternion.
+/// Numbers of bits of the three smaller components of a quaternion, after two bits for the index of the largest one.
 const ROTATION_BITS: [u32; 3] = [10, 10, 10];
 /// Numbers of bits of red, green, blue and opacity.
 const COLOR_BITS: [u32; 4] = [8, 8, 8, 8];
@@ -36,24 +32,22 @@ const SH_RANGE: f64 = 8.;
 /// Returns `true` if `bytes` are a compressed PLY.
 pub(crate) fn recognizes(bytes: &[u8]) -> bool {
     let header = Header::begins(bytes).then(|| Header::parse(Path::new(""), bytes).ok()).flatten();
-    header.is_some_and(|header| header.element("vertex").is_some_and(|vertex| vertex.has(WORDS[0])))
+    header
+        .is_some_and(|header| header.element("vertex").and_then(|vertex| vertex.property(WORDS[0])).is_some())
 }
 
 /// Reads a compressed PLY of any SH degree. In older files, which have no bounds of colors, the bounds are 0 and 1.
-///
-/// # Errors
-/// Returns an error if an element or property is missing or has another type, or if the file is truncated.
-fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
+pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let header = Header::parse(path, bytes)?;
-    let owned = |names: &[&str]| names.iter().map(|name| name.to_string()).collect::<Vec<_>>();
-    expect_type(path, &header, "vertex", &owned(&WORDS), Scalar::U32)?;
-    let words = columns(path, bytes, &header, "vertex", &owned(&WORDS), |number| number as u32)?;
+    let words = WORDS.map(String::from);
+    expect_type(path, &header, "vertex", &words, Scalar::U32)?;
+    let words = header.columns(path, bytes, "vertex", &words, |number| number as u32)?;
     let (words, _) = words.as_chunks::<{ WORDS.len() }>();
 
-    let has_color_bounds = header.element("chunk").is_some_and(|chunk| chunk.has("min_r"));
+    let has_color_bounds = header.element("chunk").is_some_and(|chunk| chunk.property("min_r").is_some());
     let bounded = if has_color_bounds { &BOUNDED[..] } else { &BOUNDED[..2] };
     let names = bounded.iter().flat_map(bound_names).collect::<Vec<_>>();
-    let bounds = columns(path, bytes, &header, "chunk", &names, |number| number as f32)?;
+    let bounds = header.columns(path, bytes, "chunk", &names, |number| number as f32)?;
     let mut invalid = InvalidGaussians::default();
     for (chunk, bounds) in bounds.chunks_exact(names.len()).enumerate() {
         for (bad, name) in bounds.iter().zip(&names).filter(|(bound, _)| !bound.is_finite()) {
@@ -82,46 +76,48 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         };
         splat.means.push(between(&bounds[..6], unpack(position, POSITION_BITS)));
         splat.log_scales.push(between(&bounds[6..12], unpack(scale, POSITION_BITS)));
-        splat.quaternions.push(unpack_rotation(rotation));
+        splat
+            .quaternions
+            .push(from_smallest_three((rotation >> 30) as usize, unpack(rotation, ROTATION_BITS)));
         let [red, green, blue, opacity] = unpack(color, COLOR_BITS);
         let color = match bounds.get(12..) {
             Some(bounds @ [_, ..]) => between(bounds, [red, green, blue]),
             _ => [red, green, blue].map(|channel| channel as f32),
         };
         splat.opacity_logits.push(logit_of_opacity(opacity));
-        splat.sh.push(color.map(|channel| ((f64::from(channel) - 0.5) / SH_C0) as f32));
+        splat.sh.push(color.map(|channel| dc_of_color(channel.into())));
         let rest = &rest[index * 3 * (bases - 1)..];
         let of_channel = |channel: usize, basis: usize| unpack_sh(rest[channel * (bases - 1) + basis]);
         splat.sh.extend((0..bases - 1).map(|basis| [0, 1, 2].map(|channel| of_channel(channel, basis))));
     }
-    invalid.add_all(&splat);
-    Ok(Contents { splat, invalid })
+    Ok((splat, invalid))
 }
 
 /// Returns the bytes of the SH coefficients above degree 0, `[count, 3, bases - 1]`, and the degree.
 fn read_rest(path: &Path, bytes: &[u8], header: &Header, count: usize) -> Result<(Vec<u8>, usize)> {
     let Some(element) = header.element("sh") else { return Ok((vec![], 0)) };
     let names: Vec<String> =
-        (0..).map(|k| format!("f_rest_{k}")).take_while(|name| element.has(name)).collect();
+        (0..).map(|k| format!("f_rest_{k}")).take_while(|name| element.property(name).is_some()).collect();
     let degree = degree_of_rest(path, names.len())?;
     if element.count != count {
         let field = "the number of rows of the element sh";
         return Err(Error::input(path, field, element.count, format!("{count}, as many as Gaussians")));
     }
     expect_type(path, header, "sh", &names, Scalar::U8)?;
-    Ok((columns(path, bytes, header, "sh", &names, |number| number as u8)?, degree))
+    Ok((header.columns(path, bytes, "sh", &names, |number| number as u8)?, degree))
 }
 
 /// Checks that the properties `names` of `element` have the type `scalar`, if they exist.
 fn expect_type(path: &Path, header: &Header, element: &str, names: &[String], scalar: Scalar) -> Result<()> {
-    let properties = header.element(element).into_iter().flat_map(|element| &element.properties);
-    for property in properties.filter(|property| names.contains(&property.name)) {
-        if property.kind != Kind::Number(scalar) {
+    let mut properties = header.element(element).into_iter().flat_map(|element| &element.properties);
+    match properties.find(|property| names.contains(&property.name) && property.kind != Kind::Number(scalar))
+    {
+        Some(property) => {
             let expected = if scalar == Scalar::U8 { "uchar" } else { "uint" };
-            return Err(Error::input(path, format!("the type of {}", property.name), "another", expected));
+            Err(Error::input(path, format!("the type of {}", property.name), "another", expected))
         }
+        None => Ok(()),
     }
-    Ok(())
 }
 
 /// Returns the names of the lower bounds of three values, followed by those of the upper bounds.
@@ -130,15 +126,12 @@ fn bound_names(names: &[&str; 3]) -> Vec<String> {
 }
 
 /// Returns the range of SH coefficients that the format can store. Degree 0 is unlimited, because each chunk has its own bounds of colors.
-fn limits() -> ShLimits {
+pub(crate) fn limits() -> ShLimits {
     ShLimits { rest: -SH_RANGE / 2. ..=SH_RANGE / 2., ..ShLimits::up_to(3) }
 }
 
 /// Writes a compressed PLY. The Gaussians are in Morton order, so that those of a chunk are close together and the bounds are narrow.
-///
-/// # Errors
-/// Returns an error if the file can't be written.
-fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
+pub(crate) fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
     let order = morton_order(&splat.means);
     let (mut bounds, mut words) = (vec![], vec![]);
     for chunk in order.chunks(CHUNK) {
@@ -149,18 +142,17 @@ fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
         let log_scales = Bounded::of(of_chunk(&|index| {
             splat.log_scales[index].map(|log_scale| log_scale.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE))
         }));
-        let colors = Bounded::of(of_chunk(&|index| {
-            splat.sh_of(index)[0].map(|dc| (f64::from(dc) * SH_C0 + 0.5) as f32)
-        }));
+        let colors = Bounded::of(of_chunk(&|index| splat.sh_of(index)[0].map(|dc| color_of_dc(dc) as f32)));
         for bounded in [&means, &log_scales, &colors] {
             bounds.extend(bounded.low.iter().chain(&bounded.high).flat_map(|bound| bound.to_le_bytes()));
         }
         for (row, &index) in chunk.iter().enumerate() {
+            let (largest, others) = smallest_three(splat.unit_quaternion(index));
             let [red, green, blue] = colors.fractions(row);
             let color = [red, green, blue, f64::from(splat.opacity(index))];
             let packed = [
                 pack(means.fractions(row), POSITION_BITS),
-                pack_rotation(splat.unit_quaternion(index)),
+                (largest as u32) << 30 | pack(others, ROTATION_BITS),
                 pack(log_scales.fractions(row), POSITION_BITS),
                 pack(color, COLOR_BITS),
             ];
@@ -237,17 +229,6 @@ fn unpack<const N: usize>(mut word: u32, bits: [u32; N]) -> [f64; N] {
         word >>= bits;
     }
     fractions
-}
-
-/// Packs a unit quaternion: the index of the component with the largest magnitude in two bits, then the other three components.
-fn pack_rotation(quaternion: [f32; 4]) -> u32 {
-    let (largest, fractions) = smallest_three(quaternion);
-    (largest as u32) << 30 | pack(fractions, ROTATION_BITS)
-}
-
-/// Unpacks the unit quaternion that [`pack_rotation`] packed.
-fn unpack_rotation(word: u32) -> [f32; 4] {
-    from_smallest_three((word >> 30) as usize, unpack(word, ROTATION_BITS))
 }
 
 /// Quantizes an SH coefficient to a byte. Values out of range are clamped.

@@ -1,15 +1,12 @@
 //! antimatter15's `.splat` format: 32 bytes per Gaussian and nothing else (spec 10.14).
 
-use crate::codec::{Codec, Contents, WriteOptions, Writer};
-use crate::invalid::InvalidGaussians;
+use crate::invalid::{Contents, InvalidGaussians};
+use crate::numbers::f32_at;
 use crate::rotations::normalized;
-use crate::splat::{log_of_scale, logit_of_opacity};
-use crate::{Error, Result, SH_C0, ShLimits, Splat, gltf, ply, sog, spz};
+use crate::splat::{color_of_dc, dc_of_color, logit_of_opacity};
+use crate::{Error, Result, SH_C0, ShLimits, Splat, WriteOptions, gltf, ply, sog, spz};
 use globalsplat_files::write_atomically;
 use std::path::Path;
-
-/// Functions of the format.
-pub(crate) const CODEC: Option<Codec> = Some(Codec { read, writer: Some(Writer::new(write, limits)) });
 
 /// Number of bytes of a Gaussian: position and scale, float32 each, then color, opacity and rotation, a byte each.
 const BYTES: usize = 32;
@@ -19,53 +16,31 @@ const MAGICS: [fn(&[u8]) -> bool; 4] =
     [ply::recognizes, sog::recognizes, spz::recognizes, gltf::recognizes_glb];
 
 /// Reads a `.splat`, whose colors don't depend on the view direction.
-///
-/// # Errors
-/// Returns an error if the file doesn't consist of whole Gaussians.
-fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
+pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let (gaussians, rest) = bytes.as_chunks::<BYTES>();
     if gaussians.is_empty() || !rest.is_empty() {
         let found = format!("{} bytes", bytes.len());
         return Err(Error::input(path, "the length", found, format!("{BYTES} bytes for each Gaussian")));
     }
-    let three = |bytes: &[u8]| -> [f32; 3] {
-        std::array::from_fn(|axis| {
-            let [a, b, c, d] = [0, 1, 2, 3].map(|byte| bytes[4 * axis + byte]);
-            f32::from_le_bytes([a, b, c, d])
-        })
-    };
-    let color = |byte: u8| ((f64::from(byte) / 255. - 0.5) / SH_C0) as f32;
-    let scales: Vec<_> = gaussians.iter().map(|gaussian| three(&gaussian[12..24])).collect();
-    let splat = Splat {
-        means: gaussians.iter().map(|gaussian| three(&gaussian[..12])).collect(),
-        log_scales: scales.iter().map(|scale| scale.map(log_of_scale)).collect(),
-        linear_scales: Some(scales),
-        quaternions: gaussians
-            .iter()
-            .map(|gaussian| normalized([28, 29, 30, 31].map(|at| f32::from(gaussian[at]) - 128.)))
-            .collect(),
-        opacity_logits: gaussians
-            .iter()
-            .map(|gaussian| logit_of_opacity(f64::from(gaussian[27]) / 255.))
-            .collect(),
-        sh: gaussians.iter().map(|gaussian| [24, 25, 26].map(|at| color(gaussian[at]))).collect(),
-        ..Splat::default()
-    };
-    let mut invalid = InvalidGaussians::default();
-    invalid.add_all(&splat);
-    Ok(Contents { splat, invalid })
+    let mut splat = Splat { linear_scales: Some(vec![]), ..Splat::default() };
+    for gaussian in gaussians {
+        let fraction = |at: usize| f64::from(gaussian[at]) / 255.;
+        splat.means.push([0, 4, 8].map(|at| f32_at(gaussian, at)));
+        splat.push_linear_scale([12, 16, 20].map(|at| f32_at(gaussian, at)));
+        splat.sh.push([24, 25, 26].map(|at| dc_of_color(fraction(at))));
+        splat.opacity_logits.push(logit_of_opacity(fraction(27)));
+        splat.quaternions.push(normalized([28, 29, 30, 31].map(|at| f32::from(gaussian[at]) - 128.)));
+    }
+    Ok((splat, InvalidGaussians::default()))
 }
 
 /// Returns the limits of coefficients: colors that a screen shows, independent of the view direction.
-fn limits() -> ShLimits {
+pub(crate) fn limits() -> ShLimits {
     ShLimits { degree: 0, dc: -0.5 / SH_C0..=0.5 / SH_C0, rest: 0. ..=0. }
 }
 
 /// Writes a `.splat`. The Gaussians of the largest volume times opacity come first, for viewers that show a file while it loads.
-///
-/// # Errors
-/// Returns an error if there is no Gaussian, or the file can't be written.
-fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
+pub(crate) fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
     if splat.is_empty() {
         return Err(Error::failed(format!(
             "{}: a .splat holds one Gaussian at least, found 0",
@@ -85,7 +60,7 @@ fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
             for number in splat.means[index].iter().chain(&splat.scale(index)) {
                 gaussian.extend(number.to_le_bytes());
             }
-            let color = splat.sh_of(index)[0].map(|dc| f64::from(dc) * SH_C0 + 0.5);
+            let color = splat.sh_of(index)[0].map(color_of_dc);
             gaussian.extend(color.map(|channel| (channel * 255.).round() as u8));
             gaussian.push((splat.opacity(index) * 255.).round() as u8);
             gaussian.extend(splat.unit_quaternion(index).map(|part| (part * 128. + 128.).round() as u8));

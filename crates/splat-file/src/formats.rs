@@ -1,13 +1,26 @@
 //! File formats of splats: a module for each format, and an entry in [`FORMATS`]. The extension determines the format that is written; a
 //! file that is read is recognized by its contents, where that is possible.
 
-use crate::codec::{Codec, Contents, WriteOptions, Writer};
+use crate::invalid::Contents;
 use crate::origin::{origin_file, read_origin, write_with_origin};
 use crate::rotations::drop_missing_rotations;
 use crate::{Error, Result, ShLimits, Splat, compressed_ply, dot_splat, gltf, ksplat, ply, sog, spz};
 use glam::DVec3;
 use globalsplat_files::check_writable_file;
 use std::path::{Path, PathBuf};
+
+/// Choices within a format.
+#[derive(Debug, Clone)]
+pub struct WriteOptions {
+    /// Version of SPZ, 2 to 4. Programs from before 2026 read versions up to 3.
+    pub spz_version: u32,
+}
+
+impl Default for WriteOptions {
+    fn default() -> Self {
+        WriteOptions { spz_version: 4 }
+    }
+}
 
 /// A splat file format.
 struct Format {
@@ -17,12 +30,33 @@ struct Format {
     recognizes: fn(&[u8]) -> bool,
     /// `true` if a file can say that the splat is antialiased.
     marks_antialiased: bool,
-    /// Functions of the format, or `None` if this build lacks the feature that it needs.
-    codec: Option<Codec>,
+    read: fn(&Path, &[u8]) -> Result<Contents>,
+    /// Functions that write the format, or `None` if it is only read.
+    writer: Option<Writer>,
+}
+
+/// Functions that write a format.
+struct Writer {
+    write: fn(&Path, &Splat, &WriteOptions) -> Result<()>,
+    limits: fn() -> ShLimits,
+    /// Function that rounds SH coefficients above degree 0 as the format does, if it has a palette of them.
+    round_sh: Option<fn(&Splat) -> Splat>,
+}
+
+impl Writer {
+    /// Creates the functions of a format without a palette.
+    const fn new(write: fn(&Path, &Splat, &WriteOptions) -> Result<()>, limits: fn() -> ShLimits) -> Self {
+        Writer { write, limits, round_sh: None }
+    }
 }
 
 /// Name of the file that describes an unbundled SOG.
 const SOG_META: &str = "meta.json";
+
+/// Returns the limits of a format that holds any number.
+fn unlimited() -> ShLimits {
+    ShLimits::up_to(3)
+}
 
 /// All formats. The first one whose suffix matches, or that recognizes a file, is used.
 const FORMATS: [Format; 9] = [
@@ -30,27 +64,71 @@ const FORMATS: [Format; 9] = [
         ending: ".compressed.ply",
         recognizes: compressed_ply::recognizes,
         marks_antialiased: true,
-        codec: compressed_ply::CODEC,
+        read: compressed_ply::read,
+        writer: Some(Writer::new(compressed_ply::write, compressed_ply::limits)),
     },
-    Format { ending: ".ply", recognizes: ply::recognizes, marks_antialiased: true, codec: ply::CODEC },
-    Format { ending: ".sog", recognizes: sog::recognizes, marks_antialiased: true, codec: sog::CODEC },
-    Format { ending: SOG_META, recognizes: |_| false, marks_antialiased: true, codec: sog::FOLDER_CODEC },
-    Format { ending: ".spz", recognizes: spz::recognizes, marks_antialiased: true, codec: spz::CODEC },
-    Format { ending: ".splat", recognizes: |_| false, marks_antialiased: false, codec: dot_splat::CODEC },
+    Format {
+        ending: ".ply",
+        recognizes: ply::recognizes,
+        marks_antialiased: true,
+        read: ply::read,
+        writer: Some(Writer::new(ply::write, unlimited)),
+    },
+    Format {
+        ending: ".sog",
+        recognizes: sog::recognizes,
+        marks_antialiased: true,
+        read: sog::read_bundle,
+        writer: Some(Writer { round_sh: Some(sog::round_sh), ..Writer::new(sog::write_bundle, unlimited) }),
+    },
+    Format {
+        ending: SOG_META,
+        recognizes: |_| false,
+        marks_antialiased: true,
+        read: sog::read_folder,
+        writer: Some(Writer { round_sh: Some(sog::round_sh), ..Writer::new(sog::write_folder, unlimited) }),
+    },
+    Format {
+        ending: ".spz",
+        recognizes: spz::recognizes,
+        marks_antialiased: true,
+        read: spz::read,
+        writer: Some(Writer::new(spz::write, spz::limits)),
+    },
+    Format {
+        ending: ".splat",
+        recognizes: |_| false,
+        marks_antialiased: false,
+        read: dot_splat::read,
+        writer: Some(Writer::new(dot_splat::write, dot_splat::limits)),
+    },
     Format {
         ending: ".glb",
         recognizes: gltf::recognizes_glb,
         marks_antialiased: false,
-        codec: gltf::GLB_CODEC,
+        read: gltf::read,
+        writer: Some(Writer::new(gltf::write_glb, unlimited)),
     },
-    Format { ending: ".gltf", recognizes: |_| false, marks_antialiased: false, codec: gltf::GLTF_CODEC },
-    Format { ending: ".ksplat", recognizes: |_| false, marks_antialiased: false, codec: ksplat::CODEC },
+    Format {
+        ending: ".gltf",
+        recognizes: |_| false,
+        marks_antialiased: false,
+        read: gltf::read,
+        writer: Some(Writer::new(gltf::write_gltf, unlimited)),
+    },
+    Format {
+        ending: ".ksplat",
+        recognizes: |_| false,
+        marks_antialiased: false,
+        read: ksplat::read,
+        writer: None,
+    },
 ];
 
-/// Extensions of all formats, for messages.
-const ENDINGS: &str = ".ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf, .ksplat or meta.json";
 /// Extensions of the formats that are written, for messages.
 const WRITTEN_ENDINGS: &str = ".ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf or meta.json";
+/// Extensions of all formats, for messages.
+const ENDINGS: &str = ".ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf, .ksplat or meta.json";
 
 impl Format {
     /// Returns `true` if a file with this name, in lower case, is in this format.
@@ -66,38 +144,22 @@ impl Format {
             _ => vec![],
         }
     }
-
-    /// Returns the functions of the format, which is that of the file at `path`.
-    ///
-    /// # Errors
-    /// Returns an error if this build lacks the feature that the format needs.
-    fn codec(&self, path: &Path) -> Result<&Codec> {
-        self.codec.as_ref().ok_or_else(|| {
-            let expected = "another format, or a build of globalsplat-splat-file with its feature spz";
-            Error::input(path, "the format", self.ending, expected)
-        })
-    }
-
-    /// Returns the functions that write the format, which is that of the file at `path`.
-    ///
-    /// # Errors
-    /// Returns an error if this build lacks the feature that the format needs, or if the format is only read.
-    fn writer(&self, path: &Path) -> Result<&Writer> {
-        self.codec(path)?.writer.as_ref().ok_or_else(|| {
-            Error::input(path, "the format", format!("{}, which is only read", self.ending), WRITTEN_ENDINGS)
-        })
-    }
 }
 
 /// Returns the format that belongs to the extension of `path`.
-///
-/// # Errors
-/// Returns an error for an unknown extension.
 fn format_of(path: &Path) -> Result<&'static Format> {
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
     FORMATS.iter().find(|format| format.is_named(&name)).ok_or_else(|| {
         let found = path.extension().map_or("missing".into(), |ending| format!(".{}", ending.display()));
         Error::input(path, "the ending", found, ENDINGS)
+    })
+}
+
+/// Returns the functions that write the format that belongs to the extension of `path`.
+fn writer_of(path: &Path) -> Result<&'static Writer> {
+    let Format { ending, writer, .. } = format_of(path)?;
+    writer.as_ref().ok_or_else(|| {
+        Error::input(path, "the format", format!("{ending}, which is only read"), WRITTEN_ENDINGS)
     })
 }
 
@@ -123,12 +185,11 @@ pub fn find_splat(folder: &Path, name: &str) -> PathBuf {
 /// Checks that a splat could be written at `path`. Call it before the work starts.
 ///
 /// # Errors
-/// Returns an error for an unknown extension or a format that this build can't write, a request error that names the path, or an error if a
+/// Returns an error for an unknown extension or a format that is only read, a request error that names the path, or an error if a
 /// new splat would replace a file that belongs to something else, such as the buffer of a `.gltf`.
 pub fn check_writable_splat(path: &Path) -> Result<()> {
-    let format = format_of(path)?;
-    format.writer(path)?;
-    for file in format.other_files(path) {
+    writer_of(path)?;
+    for file in format_of(path)?.other_files(path) {
         check_writable_file(&file)?;
         if file.exists() && !path.exists() {
             let found = format!("{}, which would be replaced", file.display());
@@ -149,17 +210,17 @@ pub fn can_mark_antialiased(path: &Path) -> Result<bool> {
 /// Returns the limits of the spherical harmonics in the format that the extension of `path` selects.
 ///
 /// # Errors
-/// Returns an error for an unknown extension, or a format that this build can't write.
+/// Returns an error for an unknown extension, or a format that is only read.
 pub fn limits_of(path: &Path) -> Result<ShLimits> {
-    Ok((format_of(path)?.writer(path)?.limits)())
+    Ok((writer_of(path)?.limits)())
 }
 
 /// Returns `true` if the format that the extension of `path` selects holds SH coefficients above degree 0 as a palette, as a SOG does.
 ///
 /// # Errors
-/// Returns an error for an unknown extension, or a format that this build can't write.
+/// Returns an error for an unknown extension, or a format that is only read.
 pub fn has_sh_palette(path: &Path) -> Result<bool> {
-    Ok(format_of(path)?.writer(path)?.round_sh.is_some())
+    Ok(writer_of(path)?.round_sh.is_some())
 }
 
 /// Returns the splat with the SH coefficients above degree 0 that a file at `path` would hold, if its format has a palette of them, which
@@ -169,7 +230,7 @@ pub fn has_sh_palette(path: &Path) -> Result<bool> {
 /// Returns the errors of [`has_sh_palette`], or an error if a list of the splat has the wrong length.
 pub fn round_sh(path: &Path, splat: &Splat) -> Result<Splat> {
     splat.check_lengths()?;
-    Ok(format_of(path)?.writer(path)?.round_sh.map_or_else(|| splat.clone(), |round_sh| round_sh(splat)))
+    Ok(writer_of(path)?.round_sh.map_or_else(|| splat.clone(), |round_sh| round_sh(splat)))
 }
 
 /// Reads a splat in the format that is recognized by its contents, or else in the format of its extension. Gaussians whose quaternion has
@@ -191,7 +252,7 @@ pub fn round_sh(path: &Path, splat: &Splat) -> Result<Splat> {
 /// Returns an error for an unknown extension, or if the file can't be read or violates its format, a Gaussian has a value that isn't finite
 /// or is out of range, or no Gaussian can be drawn.
 pub fn read_splat(path: &Path) -> Result<Splat> {
-    let Contents { splat, invalid } = read_contents(path)?;
+    let (splat, invalid) = read_contents(path)?;
     invalid.refuse(path)?;
     drawable(path, splat.len(), splat)
 }
@@ -201,19 +262,17 @@ pub fn read_splat(path: &Path) -> Result<Splat> {
 /// # Errors
 /// Returns the errors of [`read_splat`], except for invalid values.
 pub fn read_splat_without_invalid(path: &Path) -> Result<Splat> {
-    let Contents { splat, invalid } = read_contents(path)?;
+    let (splat, invalid) = read_contents(path)?;
     drawable(path, splat.len(), invalid.leave_out(path, splat))
 }
 
 fn read_contents(path: &Path) -> Result<Contents> {
     let named = format_of(path)?;
     let bytes = std::fs::read(path).map_err(Error::read(path))?;
-    (recognize(&bytes).unwrap_or(named).codec(path)?.read)(path, &bytes)
-}
-
-/// Returns the format whose magic number `bytes` begin with.
-fn recognize(bytes: &[u8]) -> Option<&'static Format> {
-    FORMATS.iter().find(|format| (format.recognizes)(bytes))
+    let format = FORMATS.iter().find(|format| (format.recognizes)(&bytes)).unwrap_or(named);
+    let (splat, mut invalid) = (format.read)(path, &bytes)?;
+    invalid.add_all(&splat);
+    Ok((splat, invalid))
 }
 
 /// Creates the splat from the valid Gaussians of a file that has `all` in total, without those that have no rotation.
@@ -254,7 +313,7 @@ pub fn write_local_splat(path: &Path, splat: &Splat) -> Result<()> {
 /// # Errors
 /// Returns the errors of [`write_splat`], or an error if the format doesn't allow the options.
 pub fn write_local_splat_with(path: &Path, splat: &Splat, options: &WriteOptions) -> Result<()> {
-    let writer = format_of(path)?.writer(path)?;
+    let writer = writer_of(path)?;
     splat.check_lengths()?;
     let (rotated, _) = drop_missing_rotations(splat);
     write_with_origin(path, splat.origin, || {

@@ -7,6 +7,10 @@ use std::path::Path;
 /// Maximum number of properties that a warning names.
 const NAMED: usize = 6;
 
+/// Splat as a file has it, and its Gaussians that are invalid. A reader may leave values that aren't finite to
+/// [`InvalidGaussians::add_all`].
+pub(crate) type Contents = (Splat, InvalidGaussians);
+
 /// Gaussians of a file that have an invalid value, one that isn't finite or is out of its range.
 #[derive(Debug, Default)]
 pub(crate) struct InvalidGaussians {
@@ -53,10 +57,7 @@ impl InvalidGaussians {
         }
     }
 
-    /// Refuses the file at `path` if it has invalid Gaussians.
-    ///
-    /// # Errors
-    /// Returns an error for the first one, which names the command that leaves them out.
+    /// Refuses the file at `path` if it has invalid Gaussians, with an error that names the first one and the command that leaves them out.
     pub fn refuse(self, path: &Path) -> Result<()> {
         match self.first {
             Some([field, found, expected]) => {

@@ -1,14 +1,12 @@
 //! mkkellogg's `.ksplat` format, versions 0.1 and later, which is only read. A header of 4,096 bytes and one of 1,024 bytes per section
 //! are followed by the sections. From compression level 1, positions are relative to the centres of buckets of Gaussians.
 
-use crate::codec::{Codec, Contents};
-use crate::invalid::InvalidGaussians;
-use crate::splat::{log_of_scale, logit_of_opacity};
-use crate::{Error, Result, SH_C0, Splat};
+use crate::invalid::{Contents, InvalidGaussians};
+use crate::numbers::{f32_at, u16_at, u32_at};
+use crate::splat::{dc_of_color, logit_of_opacity};
+use crate::{Error, Result, Splat};
+use half::f16;
 use std::path::Path;
-
-/// Functions of the format.
-pub(crate) const CODEC: Option<Codec> = Some(Codec { read, writer: None });
 
 /// Size in bytes of the header, and of the header of each section.
 const HEADER: usize = 4096;
@@ -19,31 +17,6 @@ const BUCKET: usize = 12;
 const DEFAULT_RANGE: u32 = 32767;
 /// Magnitude of the minimum and maximum of SH coefficients of level 2, if the file doesn't say otherwise.
 const DEFAULT_SH_RANGE: f32 = 1.5;
-
-/// Returns the number at `at` in little-endian bytes, which must be long enough.
-fn u16_at(bytes: &[u8], at: usize) -> u16 {
-    u16::from_le_bytes([bytes[at], bytes[at + 1]])
-}
-
-fn u32_at(bytes: &[u8], at: usize) -> u32 {
-    u32::from_le_bytes([0, 1, 2, 3].map(|byte| bytes[at + byte]))
-}
-
-fn f32_at(bytes: &[u8], at: usize) -> f32 {
-    f32::from_bits(u32_at(bytes, at))
-}
-
-/// Converts a number of 16 bits (IEEE 754 binary16), exactly.
-fn f32_from_half(bits: u16) -> f32 {
-    let mantissa = f32::from(bits & 0x3ff);
-    let size = match (bits >> 10) & 0x1f {
-        0 => mantissa * (-24f32).exp2(),
-        31 if mantissa == 0. => f32::INFINITY,
-        31 => f32::NAN,
-        exponent => (1024. + mantissa) * (f32::from(exponent) - 25.).exp2(),
-    };
-    if bits >> 15 == 0 { size } else { -size }
-}
 
 /// How the numbers of a file are stored.
 struct Encoding {
@@ -73,7 +46,7 @@ impl Encoding {
     fn number(&self, gaussian: &[u8], index: usize) -> f32 {
         match self.level {
             0 => f32_at(gaussian, 4 * index),
-            _ => f32_from_half(u16_at(gaussian, 2 * index)),
+            _ => f16::from_bits(u16_at(gaussian, 2 * index)).to_f32(),
         }
     }
 
@@ -82,17 +55,14 @@ impl Encoding {
         let [min, max] = self.sh_range.map(f64::from);
         match self.level {
             0 => f32_at(bytes, 4 * index),
-            1 => f32_from_half(u16_at(bytes, 2 * index)),
+            1 => f16::from_bits(u16_at(bytes, 2 * index)).to_f32(),
             _ => (min + f64::from(bytes[index]) / 255. * (max - min)) as f32,
         }
     }
 }
 
 /// Reads a `.ksplat`.
-///
-/// # Errors
-/// Returns an error for another version or compression level, or if the file is cut short or its numbers contradict each other.
-fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
+pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     if bytes.len() < HEADER {
         let found = format!("{} bytes", bytes.len());
         return Err(Error::input(path, "the header", found, format!("{HEADER} bytes")));
@@ -129,16 +99,10 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     }
     if splat.is_empty() || splat.len() != count as usize {
         let found = format!("{count}, with {} in the sections", splat.len());
-        return Err(Error::input(
-            path,
-            "the number of Gaussians",
-            found,
-            "1 or more, as many in the sections",
-        ));
+        let expected = "1 or more, as many in the sections";
+        return Err(Error::input(path, "the number of Gaussians", found, expected));
     }
-    let mut invalid = InvalidGaussians::default();
-    invalid.add_all(&splat);
-    Ok(Contents { splat, invalid })
+    Ok((splat, InvalidGaussians::default()))
 }
 
 /// Returns the degree of the spherical harmonics of a section, which is 0 if it has no Gaussians.
@@ -199,9 +163,8 @@ impl Section<'_> {
         }
         let (buckets, _) = buckets.as_chunks::<BUCKET>();
         if full_buckets.saturating_add(partial_buckets) > buckets.len() {
-            let found = format!("{}", buckets.len());
             let expected = format!("{full_buckets} full and {partial_buckets} partially filled ones");
-            return Err(self.error("the number of buckets", found, expected));
+            return Err(self.error("the number of buckets", buckets.len(), expected));
         }
         let range = match u32_at(self.header, 24) {
             0 => DEFAULT_RANGE,
@@ -228,12 +191,10 @@ impl Section<'_> {
 
     /// Appends the values of a Gaussian to `splat`, except for its position.
     fn push_others(&self, gaussian: &[u8], bases: usize, splat: &mut Splat) {
-        let scale = [3, 4, 5].map(|index| self.encoding.number(gaussian, index));
-        splat.log_scales.push(scale.map(log_of_scale));
-        splat.linear_scales.get_or_insert_default().push(scale);
+        splat.push_linear_scale([3, 4, 5].map(|index| self.encoding.number(gaussian, index)));
         splat.quaternions.push([6, 7, 8, 9].map(|index| self.encoding.number(gaussian, index)));
         let (color, harmonics) = gaussian[10 * self.encoding.number_bytes()..].split_at(4);
-        splat.sh.push([0, 1, 2].map(|channel| ((f64::from(color[channel]) / 255. - 0.5) / SH_C0) as f32));
+        splat.sh.push([0, 1, 2].map(|channel| dc_of_color(f64::from(color[channel]) / 255.)));
         splat.opacity_logits.push(logit_of_opacity(f64::from(color[3]) / 255.));
         // Degree by degree, and within a degree channel by channel.
         for degree in 1..bases.isqrt() {

@@ -1,7 +1,6 @@
 #![doc = include_str!("../README.md")]
 
 mod axes;
-mod codec;
 mod compressed_ply;
 mod dot_splat;
 mod formats;
@@ -10,10 +9,10 @@ mod invalid;
 mod ksplat;
 mod limits;
 mod morton;
+mod numbers;
 mod origin;
 mod ply;
-mod ply_body;
-mod ply_header;
+mod ply_table;
 mod rotations;
 mod sh;
 mod sog;
@@ -21,11 +20,10 @@ mod splat;
 mod spz;
 mod transform;
 
-pub use codec::WriteOptions;
 pub use formats::{
-    can_mark_antialiased, check_writable_splat, find_splat, has_sh_palette, is_splat_name, limits_of,
-    read_splat, read_splat_without_invalid, round_sh, splat_files, write_local_splat, write_local_splat_with,
-    write_splat,
+    WriteOptions, can_mark_antialiased, check_writable_splat, find_splat, has_sh_palette, is_splat_name,
+    limits_of, read_splat, read_splat_without_invalid, round_sh, splat_files, write_local_splat,
+    write_local_splat_with, write_splat,
 };
 pub use globalsplat_files::{Error, Result};
 pub use limits::ShLimits;

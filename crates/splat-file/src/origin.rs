@@ -33,9 +33,6 @@ pub fn check_writable_origin(path: &Path) -> Result<()> {
 }
 
 /// Returns the origin of the splat at `path`, or zero if it has no origin file.
-///
-/// # Errors
-/// Returns an error if the file can't be read or has no origin.
 pub(crate) fn read_origin(path: &Path) -> Result<DVec3> {
     let path = origin_file(path);
     if !path.is_file() {
@@ -50,9 +47,6 @@ pub(crate) fn read_origin(path: &Path) -> Result<DVec3> {
 
 /// Writes the splat at `path` with `write`, and its `origin` in a file beside it. If the origin is zero, an older origin file is removed.
 /// The new origin file is written before the splat and renamed after it, so that a full disk leaves both files unchanged.
-///
-/// # Errors
-/// Returns the error of `write`, or an error if the origin file can't be written.
 pub(crate) fn write_with_origin(
     path: &Path,
     origin: DVec3,

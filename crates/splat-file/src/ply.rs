@@ -3,16 +3,12 @@
 //! A vertex has x y z, nx ny nz (zeros), f_dc_0..2, f_rest_*, opacity (a logit), scale_0..2 (logs), rot_0..3 (w, x, y, z). f_rest is
 //! channel-major: all reds, all greens, all blues. Files are written as float32, binary, little-endian.
 
-use crate::codec::{Codec, Contents, WriteOptions, Writer};
-use crate::invalid::InvalidGaussians;
-use crate::ply_body::columns;
-use crate::ply_header::{Header, Scalar};
-use crate::{Error, MIN_SCALE, OPACITY_MARGIN, Result, SH_C0, ShLimits, Splat};
+use crate::invalid::{Contents, InvalidGaussians};
+use crate::numbers::Scalar;
+use crate::ply_table::{Header, Kind};
+use crate::{Error, MIN_SCALE, OPACITY_MARGIN, Result, SH_C0, Splat, WriteOptions};
 use globalsplat_files::write_atomically;
 use std::path::Path;
-
-/// Functions of the format.
-pub(crate) const CODEC: Option<Codec> = Some(Codec { read, writer: Some(Writer::new(write, limits)) });
 
 /// Maximum logarithm of a scale: larger scales exceed float32.
 const MAX_LOG_SCALE: f32 = 88.;
@@ -29,13 +25,10 @@ pub(crate) fn recognizes(bytes: &[u8]) -> bool {
 /// Reads a 3DGS splat of any SH degree, in text or binary of either byte order. Properties are found by name, so their order doesn't
 /// matter, and others may be present. Without `scale_2`, as in 2DGS, Gaussians are flat in their third direction; without `f_dc_*` their
 /// colors are those of `red`, `green` and `blue`.
-///
-/// # Errors
-/// Returns an error if a property is missing, or if the file is a point cloud or truncated.
-fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
+pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let header = Header::parse(path, bytes)?;
     let vertex = header.element("vertex");
-    let has = |name: &str| vertex.is_some_and(|vertex| vertex.has(name));
+    let has = |name: &str| vertex.is_some_and(|vertex| vertex.property(name).is_some());
     if vertex.is_some() && !["opacity", "scale_0", "rot_0"].into_iter().any(has) {
         let found = "a point cloud, without opacity, scale_* and rot_*";
         return Err(Error::input(path, "the element vertex", found, "the properties of a 3D Gaussian splat"));
@@ -58,9 +51,9 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         let said = "Gaussians are flat in their third direction, because scale_2 is missing";
         splat.warnings.push(format!("{}: {said}", path.display()));
     }
-    let mut values = columns(path, bytes, &header, "vertex", &names, |number| number as f32)?;
-    if let Some((colors, vertex)) = colors.zip(vertex) {
-        harmonics_from_colors(vertex.scalar(colors[0]), names.len(), &mut values);
+    let mut values = header.columns(path, bytes, "vertex", &names, |number| number as f32)?;
+    if let Some(red) = colors.zip(vertex).and_then(|(colors, vertex)| vertex.property(colors[0])) {
+        harmonics_from_colors(red.kind, names.len(), &mut values);
     }
     let invalid = find_invalid(&names, &values);
 
@@ -70,9 +63,8 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         let (rest, vertex) = vertex.split_at(3 * (bases - 1));
         splat.means.push([0, 1, 2].map(|axis| means[axis]));
         splat.sh.push([0, 1, 2].map(|channel| dc[channel]));
-        splat
-            .sh
-            .extend((0..bases - 1).map(|basis| [0, 1, 2].map(|channel| rest[channel * (bases - 1) + basis])));
+        let of_basis = |basis: usize| [0, 1, 2].map(|channel| rest[channel * (bases - 1) + basis]);
+        splat.sh.extend((0..bases - 1).map(of_basis));
         splat.opacity_logits.push(vertex[0]);
         splat.log_scales.push(match is_flat {
             true => [vertex[1], vertex[2], MIN_SCALE.ln() as f32],
@@ -81,17 +73,17 @@ fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         let quaternion = &vertex[vertex.len() - 4..];
         splat.quaternions.push([0, 1, 2, 3].map(|part| quaternion[part]));
     }
-    Ok(Contents { splat, invalid })
+    Ok((splat, invalid))
 }
 
-/// Converts the colors in columns 3 to 5 of a table, which are numbers of type `scalar` in the file, to spherical harmonics of degree 0.
-/// White is 255 for bytes and 65,535 for unsigned 16-bit numbers; for other numbers it is 1, or 255 if any is above 1.
-fn harmonics_from_colors(scalar: Option<Scalar>, width: usize, values: &mut [f32]) {
+/// Converts the colors in columns 3 to 5 of a table, which are of type `kind` in the file, to spherical harmonics of degree 0. White is 255
+/// for bytes and 65,535 for unsigned 16-bit numbers; for other numbers it is 1, or 255 if any is above 1.
+fn harmonics_from_colors(kind: Kind, width: usize, values: &mut [f32]) {
     let colors = values.chunks_exact(width).flat_map(|vertex| &vertex[3..6]);
     let brightest = colors.filter(|color| color.is_finite()).fold(0f32, |a, &b| a.max(b));
-    let white = match scalar {
-        Some(Scalar::U8) => 255.,
-        Some(Scalar::U16) => 65535.,
+    let white = match kind {
+        Kind::Number(Scalar::U8) => 255.,
+        Kind::Number(Scalar::U16) => 65535.,
         _ if brightest > 1. => 255.,
         _ => 1.,
     };
@@ -128,17 +120,8 @@ fn find_invalid(names: &[String], values: &[f32]) -> InvalidGaussians {
     invalid
 }
 
-/// Returns the limits of coefficients: a PLY can hold any number.
-fn limits() -> ShLimits {
-    ShLimits::up_to(3)
-}
-
-/// Writes a PLY, atomically. Infinite logits and logarithms, which not every program reads, become those of [`OPACITY_MARGIN`] and
-/// [`MIN_SCALE`].
-///
-/// # Errors
-/// Returns an error if the file can't be written.
-fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
+/// Writes a PLY. Infinite logits and logarithms, which not every program reads, become those of [`OPACITY_MARGIN`] and [`MIN_SCALE`].
+pub(crate) fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
     let max_logit = ((1. - OPACITY_MARGIN) / OPACITY_MARGIN).ln() as f32;
     let finite = |number: f32, min: f32, max: f32| match number.is_finite() {
         true => number,
@@ -166,15 +149,10 @@ fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
 
 /// Returns the header that [`write`] writes before the values of the Gaussians.
 fn header(splat: &Splat) -> String {
-    let means_and_normals = owned(["x", "y", "z", "nx", "ny", "nz"]);
-    let names = [means_and_normals, sh_names(splat.bases()), shape_names()].concat();
-    let mut header = Header::first_lines(splat.antialiased);
-    header.push_str(&format!("element vertex {}\n", splat.len()));
-    for name in &names {
-        header.push_str(&format!("property float {name}\n"));
-    }
-    header.push_str("end_header\n");
-    header
+    let names = [owned(["x", "y", "z", "nx", "ny", "nz"]), sh_names(splat.bases()), shape_names()].concat();
+    let properties: String = names.iter().map(|name| format!("property float {name}\n")).collect();
+    let first = Header::first_lines(splat.antialiased);
+    format!("{first}element vertex {}\n{properties}end_header\n", splat.len())
 }
 
 fn owned<const N: usize>(names: [&str; N]) -> Vec<String> {
@@ -187,14 +165,12 @@ fn sh_names(bases: usize) -> Vec<String> {
 }
 
 fn shape_names() -> Vec<String> {
-    let names = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"];
-    owned(names)
+    owned(["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"])
 }
 
 /// Returns the size in bytes of the file that [`write`] would write.
 pub(crate) fn size(splat: &Splat) -> u64 {
     /// Number of values of position, normal, opacity, scale and rotation.
     const NUMBERS: usize = 14;
-    let (n, bases) = (splat.len(), splat.bases());
-    header(splat).len() as u64 + (n * (NUMBERS + 3 * bases) * 4) as u64
+    header(splat).len() as u64 + (splat.len() * (NUMBERS + 3 * splat.bases()) * 4) as u64
 }

@@ -60,18 +60,8 @@ impl Splat {
         opacity_logits: Vec<f32>,
         sh: Vec<[f32; 3]>,
     ) -> Result<Self> {
-        let splat = Splat {
-            means,
-            log_scales,
-            linear_scales: None,
-            quaternions,
-            opacity_logits,
-            sh,
-            sh_degree,
-            antialiased: false,
-            origin: DVec3::ZERO,
-            warnings: vec![],
-        };
+        let splat =
+            Splat { means, log_scales, quaternions, opacity_logits, sh, sh_degree, ..Splat::default() };
         splat.check_lengths()?;
         Ok(splat)
     }
@@ -164,20 +154,18 @@ impl Splat {
     /// # Panics
     /// Panics if there is no such Gaussian.
     pub fn select(&self, indices: &[usize]) -> Self {
+        fn select<T: Copy>(list: &[T], indices: &[usize]) -> Vec<T> {
+            indices.iter().map(|&index| list[index]).collect()
+        }
         Splat {
-            means: indices.iter().map(|&index| self.means[index]).collect(),
-            log_scales: indices.iter().map(|&index| self.log_scales[index]).collect(),
-            linear_scales: self
-                .linear_scales
-                .as_ref()
-                .map(|scales| indices.iter().map(|&index| scales[index]).collect()),
-            quaternions: indices.iter().map(|&index| self.quaternions[index]).collect(),
-            opacity_logits: indices.iter().map(|&index| self.opacity_logits[index]).collect(),
+            means: select(&self.means, indices),
+            log_scales: select(&self.log_scales, indices),
+            linear_scales: self.linear_scales.as_ref().map(|scales| select(scales, indices)),
+            quaternions: select(&self.quaternions, indices),
+            opacity_logits: select(&self.opacity_logits, indices),
             sh: indices.iter().flat_map(|&index| self.sh_of(index)).copied().collect(),
-            sh_degree: self.sh_degree,
-            antialiased: self.antialiased,
-            origin: self.origin,
             warnings: self.warnings.clone(),
+            ..*self
         }
     }
 
@@ -253,20 +241,19 @@ impl Splat {
     }
 
     /// Checks that all numbers, which are to be written at `path`, are finite. Logits may be infinite.
-    ///
-    /// # Errors
-    /// Returns an error otherwise.
     pub(crate) fn check_finite(&self, path: &Path) -> Result<()> {
         let lists = [self.means.as_flattened(), self.quaternions.as_flattened(), self.sh.as_flattened()];
         let is_finite = lists.iter().all(|numbers| numbers.iter().all(|number| number.is_finite()))
             && (0..self.len()).all(|index| self.scale(index).iter().all(|scale| scale.is_finite()))
             && !self.opacity_logits.iter().any(|logit| logit.is_nan());
-        match is_finite {
-            true => Ok(()),
-            false => {
-                Err(Error::failed(format!("{}: the splat has numbers that aren't finite", path.display())))
-            }
-        }
+        let error = || Error::failed(format!("{}: the splat has numbers that aren't finite", path.display()));
+        if is_finite { Ok(()) } else { Err(error()) }
+    }
+
+    /// Appends the scales of a Gaussian to both lists of scales. The logarithm of 0 is −∞.
+    pub(crate) fn push_linear_scale(&mut self, scale: [f32; 3]) {
+        self.log_scales.push(scale.map(|scale| f64::from(scale).ln() as f32));
+        self.linear_scales.get_or_insert_default().push(scale);
     }
 
     /// Returns the rotation of Gaussian `index` as a quaternion of length 1.
@@ -275,12 +262,17 @@ impl Splat {
     }
 }
 
-/// Returns the natural logarithm of a scale, which is −∞ for 0.
-pub(crate) fn log_of_scale(scale: f32) -> f32 {
-    f64::from(scale).ln() as f32
-}
-
 /// Returns the logit of an opacity in [0, 1], which is infinite for 0 and 1.
 pub(crate) fn logit_of_opacity(opacity: f64) -> f32 {
     (opacity / (1. - opacity)).ln() as f32
+}
+
+/// Returns the color, before it is clamped to [0, 1], for an SH coefficient of degree 0.
+pub(crate) fn color_of_dc(coefficient: f32) -> f64 {
+    f64::from(coefficient) * SH_C0 + 0.5
+}
+
+/// Returns the SH coefficient of degree 0 for a color.
+pub(crate) fn dc_of_color(color: f64) -> f32 {
+    ((color - 0.5) / SH_C0) as f32
 }

@@ -16,36 +16,25 @@ struct Similarity {
 
 impl Similarity {
     /// Decomposes a matrix.
-    ///
-    /// # Errors
-    /// Returns an error if the matrix isn't finite, or does more than rotate, scale uniformly and translate.
     fn from_matrix(matrix: &DMat4) -> Result<Self> {
         let linear = DMat3::from_mat4(*matrix);
         let scale = linear.determinant().cbrt();
+        let refuse = |found: String, expected: &str| Err(Error::setting("the matrix", found, expected));
         let is_affine = matrix.row(3).abs_diff_eq(DMat4::IDENTITY.row(3), TOLERANCE);
         if !(matrix.is_finite() && is_affine) {
             let found = format!("{:?}", matrix.transpose().to_cols_array());
-            return Err(Error::setting(
-                "the matrix",
-                found,
-                "finite numbers, and 0, 0, 0, 1 as the last row",
-            ));
+            return refuse(found, "finite numbers, and 0, 0, 0, 1 as the last row");
         }
         if !(scale > 0. && scale.is_finite() && (linear * scale.recip()).is_finite()) {
             let found = format!("one of the determinant {}", linear.determinant());
-            let expected = "a rotation and a scale above 0, which have a finite determinant above 0";
-            return Err(Error::setting("the matrix", found, expected));
+            return refuse(found, "a rotation and a scale above 0, which have a finite determinant above 0");
         }
         let rotation = linear * scale.recip();
         if !(rotation.transpose() * rotation).abs_diff_eq(DMat3::IDENTITY, TOLERANCE) {
             let lengths =
                 [rotation.x_axis, rotation.y_axis, rotation.z_axis].map(|axis| axis.length() * scale);
             let found = format!("one whose axes have the lengths {lengths:.6?} or aren't perpendicular");
-            return Err(Error::setting(
-                "the matrix",
-                found,
-                "a rotation, the same scale along all axes and a translation",
-            ));
+            return refuse(found, "a rotation, the same scale along all axes and a translation");
         }
         // Removes the rounding errors of the matrix.
         let rotation = DMat3::from_quat(DQuat::from_mat3(&rotation).normalize());

@@ -37,32 +37,3 @@ fn rotation(pose: &DMat4) -> DMat3 {
 fn nearest_rotation(sum: DMat3) -> DMat3 {
     (0..30).fold(sum, |x, _| (x + x.inverse().transpose()) * 0.5)
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn errors_are_those_left_by_a_similarity() {
-        let pose = |i: usize| {
-            let i = i as f64;
-            DMat4::from_translation(DVec3::new(i, (2. * i).sin(), (3. * i).cos()))
-                * DMat4::from_rotation_y(0.2 * i)
-        };
-        let truth: Vec<DMat4> = (0..40).map(pose).collect();
-        let moved = |pose: &DMat4| {
-            let motion = DMat4::from_translation(DVec3::new(3., -1., 2.)) * DMat4::from_rotation_x(2.);
-            let mut moved = motion * *pose;
-            moved.w_axis = (2.5 * moved.w_axis.truncate()).extend(1.);
-            moved
-        };
-        let mut found: Vec<DMat4> = truth.iter().map(moved).collect();
-        let is_zero = |&(position, angle): &(f64, f64)| position < 1e-12 && angle < 1e-5;
-        assert!(pose_errors(&found, &truth).iter().all(is_zero));
-        found[20] *= DMat4::from_translation(DVec3::X) * DMat4::from_rotation_z(0.1);
-        let (position, angle) = pose_errors(&found, &truth)[20];
-        // One camera of 40 moves the fit a little.
-        assert!((position / (0.4 / 39.) - 1.).abs() < 0.06, "{position}");
-        assert!((angle / 0.1f64.to_degrees() - 1.).abs() < 0.06, "{angle}");
-    }
-}

@@ -9,9 +9,6 @@ use std::path::Path;
 use zip::CompressionMethod;
 use zip::read::ZipArchive;
 
-/// First bytes of an archive.
-pub(crate) const MAGIC: &[u8] = b"PK\x03\x04";
-
 /// Parts of a file that torch.save wrote since torch 1.6, as byte ranges in the file. No two of them overlap.
 /// [`TorchFile`](crate::TorchFile) reads them; this type serves readers that call [`unpickle`](crate::unpickle) themselves.
 #[derive(Debug)]

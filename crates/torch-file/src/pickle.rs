@@ -5,38 +5,185 @@
 //! value that contains itself is harmless. Each value takes at least one byte of the program, so the size of the result is proportional to
 //! the length of the pickle, whatever it contains.
 
-use crate::globals::{find_tensor_global, is_plain_constructor};
-use crate::value::{Id, Rebuild, Value, Values};
+use safetensors::Dtype;
 
-/// Treatment of values that aren't tensors, lists, dicts, strings or numbers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum UnknownGlobals {
-    /// Returns an error for such values. This is for files that don't need them.
-    Refuse,
-    /// Keeps such values as data of an unknown type. A pickle that would make Python call a function is still refused, unless the function
-    /// is known to only assemble data.
-    Keep,
+/// Index of a value in [`Values`].
+pub type Id = usize;
+
+/// A value that a pickle creates. It refers to others by their index in [`Values`].
+#[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
+pub enum Value<'a> {
+    /// None.
+    None,
+    /// Boolean.
+    Bool(bool),
+    /// Integer of up to 64 bits.
+    Int(i64),
+    /// Floating-point number.
+    Float(f64),
+    /// String.
+    Str(&'a str),
+    /// Class or function.
+    Global {
+        /// Module that defines it.
+        module: &'a str,
+        /// Name in the module.
+        name: &'a str,
+    },
+    /// Storage: bytes in the file. The device on which they were when they were saved is ignored.
+    Storage {
+        /// Type of the elements.
+        dtype: Dtype,
+        /// Key of the storage in [`Storages`](crate::Storages).
+        key: &'a str,
+    },
+    /// Tensor: view of a storage, in elements of the storage. [`Array::locate`](crate::Array::locate) checks it.
+    Tensor {
+        /// A [`Value::Storage`].
+        storage: Id,
+        /// First element, a [`Value::Int`].
+        offset: Id,
+        /// Size of each dimension, a [`Value::Tuple`].
+        size: Id,
+        /// Stride of each dimension, a [`Value::Tuple`].
+        stride: Id,
+    },
+    /// Tuple.
+    Tuple(Vec<Id>),
+    /// List.
+    List(Vec<Id>),
+    /// Dict or OrderedDict: keys and values. The last of equal keys counts.
+    Dict(Vec<(Id, Id)>),
+    /// Set, bytes, integer of more than 64 bits, or data of an unknown class. If it is also a dict: keys and values.
+    Object(Vec<(Id, Id)>),
 }
 
-/// Executes the pickle at the start of `rest`, of protocol 2 to 5, and leaves in `rest` the bytes after it. Nothing is called: see
-/// [`UnknownGlobals`].
+impl Value<'_> {
+    /// Returns the name of the value's type for error messages, as in "a dict".
+    pub fn type_name(&self) -> &'static str {
+        match self {
+            Value::None | Value::Bool(_) | Value::Float(_) => "a constant",
+            Value::Int(_) => "an integer",
+            Value::Str(_) => "a string",
+            Value::Global { .. } => "a class or a function",
+            Value::Storage { .. } => "a storage",
+            Value::Tensor { .. } => "a tensor",
+            Value::Tuple(_) => "a tuple",
+            Value::List(_) => "a list",
+            Value::Dict(_) => "a dict",
+            Value::Object(_) => "an object",
+        }
+    }
+
+    /// Returns the number if the value is an integer of up to 64 bits.
+    pub fn as_int(&self) -> Option<i64> {
+        match self {
+            &Value::Int(number) => Some(number),
+            _ => None,
+        }
+    }
+}
+
+/// All values that a pickle created.
+#[derive(Debug)]
+pub struct Values<'a> {
+    values: Vec<Value<'a>>,
+    /// Index of the pickle's result.
+    pub root: Id,
+}
+
+impl<'a> Values<'a> {
+    /// Returns the value with index `id`, which another of these values refers to.
+    ///
+    /// # Panics
+    /// Panics if `id` is an index of other values, and too large for these.
+    pub fn get(&self, id: Id) -> &Value<'a> {
+        &self.values[id]
+    }
+
+    /// Returns an iterator over all values, in the order in which the pickle creates them.
+    pub fn iter(&self) -> impl Iterator<Item = &Value<'a>> {
+        self.values.iter()
+    }
+
+    /// Returns the value under the string `key` in `items`, the keys and values of a dict.
+    pub fn find(&self, items: &[(Id, Id)], key: &str) -> Option<&Value<'a>> {
+        let entry = items.iter().rev().find(|(id, _)| self.values[*id] == Value::Str(key));
+        entry.map(|(_, value)| &self.values[*value])
+    }
+}
+
+/// Classes of the module `torch` for storages, by the type of their elements.
+pub(crate) const STORAGES: [(Dtype, &str); 11] = [
+    (Dtype::U8, "ByteStorage"),
+    (Dtype::I8, "CharStorage"),
+    (Dtype::I16, "ShortStorage"),
+    (Dtype::I32, "IntStorage"),
+    (Dtype::I64, "LongStorage"),
+    (Dtype::F16, "HalfStorage"),
+    (Dtype::BF16, "BFloat16Storage"),
+    (Dtype::F32, "FloatStorage"),
+    (Dtype::F64, "DoubleStorage"),
+    (Dtype::BOOL, "BoolStorage"),
+    (Dtype::C64, "ComplexFloatStorage"),
+];
+
+/// Functions and classes that only assemble data when Python calls them: the parts of settings, optimizers and training states. Modules,
+/// and names in them.
+const DATA_CONSTRUCTORS: [(&str, &str); 14] = [
+    (
+        "builtins __builtin__",
+        "bool bytearray bytes complex dict float frozenset int list long object range set slice str tuple",
+    ),
+    ("_codecs", "encode"),
+    ("argparse", "Namespace"),
+    ("collections", "Counter OrderedDict defaultdict deque"),
+    ("copyreg copy_reg", "_reconstructor"),
+    ("datetime", "date datetime time timedelta timezone"),
+    ("functools", "partial"),
+    ("numpy", "dtype ndarray"),
+    ("numpy._core.multiarray numpy.core.multiarray", "_reconstruct scalar"),
+    ("numpy._core.numeric numpy.core.numeric", "_frombuffer"),
+    ("pathlib pathlib._local", "Path PosixPath PurePosixPath PureWindowsPath WindowsPath"),
+    ("torch", "Size device"),
+    ("torch._utils", "_rebuild_qtensor _rebuild_sparse_tensor _rebuild_tensor_v3"),
+    ("torch.serialization", "_get_layout"),
+];
+/// Packages whose classes, recognized by their initial capital letter, hold settings and training states.
+const DATA_PACKAGES: [&str; 6] =
+    ["lightning", "lightning_fabric", "omegaconf", "pytorch_lightning", "torchmetrics", "yacs"];
+
+/// Returns `true` if a call of this function or class does nothing but assemble data.
+fn is_plain_constructor(module: &str, name: &str) -> bool {
+    let has = |words: &str, word: &str| words.split(' ').any(|listed| listed == word);
+    let package = module.split('.').next().unwrap_or_default();
+    let is_class = name.starts_with(|first: char| first.is_ascii_uppercase()) && !name.contains('.');
+    DATA_CONSTRUCTORS.iter().any(|(modules, names)| has(modules, module) && has(names, name))
+        || (is_class && DATA_PACKAGES.contains(&package))
+}
+
+/// Executes the pickle at the start of `bytes`, of protocol 2 to 5. Values that aren't tensors, lists, dicts, strings or numbers are kept as
+/// data of an unknown type. Nothing is called, and a pickle that would make Python call a function is refused, unless the function is known
+/// to only assemble data.
 ///
 /// # Errors
 /// Returns a description of what the pickle requests but may not, or of what is broken in it.
-pub fn unpickle<'a>(rest: &mut &'a [u8], unknown_globals: UnknownGlobals) -> Result<Values<'a>, String> {
+pub fn unpickle(bytes: &[u8]) -> Result<Values<'_>, String> {
     let (values, stack, marks, memo) = (vec![], vec![], vec![], vec![]);
-    let mut machine = Machine { rest, unknown_globals, values, stack, marks, memo };
+    let mut machine = Machine { rest: bytes, values, stack, marks, memo };
     loop {
         if let Some(root) = machine.instruction()? {
-            *rest = machine.rest;
             return Ok(Values { values: machine.values, root });
         }
     }
 }
 
+/// Message about a call that creates a tensor of other arguments than it has.
+const NO_TENSOR: &str = "a pickle with a tensor of other than storage, offset, size and stride";
+
 struct Machine<'a> {
     rest: &'a [u8],
-    unknown_globals: UnknownGlobals,
     values: Vec<Value<'a>>,
     stack: Vec<Id>,
     /// Lengths of the stack at the marks.
@@ -143,17 +290,6 @@ impl<'a> Machine<'a> {
         Ok(())
     }
 
-    /// Pushes the value of a global name: a known one, or with [`UnknownGlobals::Keep`] one that has just its name.
-    fn global(&mut self, module: &'a str, name: &'a str) -> Result<(), String> {
-        let value = match (find_tensor_global(module, name), self.unknown_globals) {
-            (Some(value), _) => value,
-            (None, UnknownGlobals::Keep) => Value::Global { module, name },
-            (None, UnknownGlobals::Refuse) => return Err(format!("a pickle that asks for {module}.{name}")),
-        };
-        self.push(value);
-        Ok(())
-    }
-
     fn tuple(&self, id: Id) -> &[Id] {
         match &self.values[id] {
             Value::Tuple(items) => items,
@@ -161,70 +297,80 @@ impl<'a> Machine<'a> {
         }
     }
 
-    /// Returns the storage of a persistent id: ("storage", its type, its key, the device, its number of elements). Files that are no
-    /// archives have one more item, the storage that this one is a part of, which must be None.
+    /// Returns the storage of a persistent id: ("storage", its type, its key, the device, its number of elements).
     fn storage(&self, id: Id) -> Result<Value<'a>, String> {
         let unsupported = || "a pickle with a persistent id that is no storage".to_string();
-        let of = |id: &Id| &self.values[*id];
-        let (fields, whole) = match self.tuple(id) {
-            [fields @ .., whole] if fields.len() == 5 && self.unknown_globals == UnknownGlobals::Keep => {
-                (fields, of(whole) == &Value::None)
-            }
-            fields => (fields, true),
+        let &[tag, class, key, device, length] = self.tuple(id) else { return Err(unsupported()) };
+        let of = |id: Id| &self.values[id];
+        let (Value::Str("storage"), Value::Global { module, name }, Value::Str(key)) =
+            (of(tag), of(class), of(key))
+        else {
+            return Err(unsupported());
         };
-        let [tag, dtype, key, device, length] = fields else { return Err(unsupported()) };
-        match (of(tag), of(dtype), of(key), of(device), of(length)) {
-            (Value::Str("storage"), &Value::Dtype(dtype), Value::Str(key), Value::Str(_), Value::Int(_))
-                if whole =>
-            {
-                Ok(Value::Storage { dtype, key })
-            }
-            _ => Err(unsupported()),
-        }
+        let (Value::Str(_), Value::Int(_)) = (of(device), of(length)) else { return Err(unsupported()) };
+        let stored = STORAGES.iter().find(|(_, class)| *module == "torch" && class == name);
+        Ok(match (stored, *name) {
+            (Some(&(dtype, _)), _) => Value::Storage { dtype, key },
+            (None, "UntypedStorage") => Value::Storage { dtype: Dtype::U8, key },
+            // Quantized numbers, for example.
+            _ => Value::Object(vec![]),
+        })
     }
 
     /// Returns the result of `function` for the tuple `arguments`.
     fn call(&self, function: Id, arguments: Id) -> Result<Value<'a>, String> {
-        let is = |id: Id, what: fn(&Value) -> bool| what(&self.values[id]);
-        let is_object = |id: Id| is(id, |v| matches!(v, Value::Object(_)));
-        match (&self.values[function], self.tuple(arguments)) {
-            (Value::OrderedDict, []) => Ok(Value::Dict(vec![])),
-            (Value::Rebuild(Rebuild::Tensor), &[storage, offset, size, stride, ..])
-                if is(storage, |v| matches!(v, Value::Storage { .. }))
-                    && is(offset, |v| matches!(v, Value::Int(_)))
-                    && is(size, |v| matches!(v, Value::Tuple(_)))
-                    && is(stride, |v| matches!(v, Value::Tuple(_))) =>
-            {
-                Ok(Value::Tensor { storage, offset, size, stride })
-            }
-            (Value::Rebuild(Rebuild::Parameter), &[data, ..])
-                if is(data, |v| matches!(v, Value::Tensor { .. })) =>
-            {
-                Ok(self.values[data].clone())
-            }
-            (Value::Rebuild(Rebuild::FromType), &[function, _class, arguments, ..]) => {
-                match &self.values[function] {
-                    Value::Rebuild(Rebuild::Tensor | Rebuild::Parameter) => self.call(function, arguments),
-                    _ => Ok(Value::Object(vec![])),
-                }
-            }
-            (Value::Rebuild(_), &[data, ..]) if is_object(data) => Ok(Value::Object(vec![])),
-            (Value::Rebuild(_), _) => {
-                Err("a pickle with a tensor of other than storage, offset, size and stride".into())
-            }
-            (&Value::Global { module, name }, _) => match is_plain_constructor(module, name) {
-                true => Ok(Value::Object(vec![])),
-                false => Err(format!("a pickle that calls {module}.{name}")),
-            },
-            (other, _) => Err(format!("a pickle that calls {}", other.type_name())),
+        let &Value::Global { module, name } = &self.values[function] else {
+            return Err(format!("a pickle that calls {}", self.values[function].type_name()));
+        };
+        let arguments = self.tuple(arguments);
+        if let Some(made) = self.rebuild(module, name, arguments) {
+            return made;
         }
+        match (module, name, arguments) {
+            ("collections", "OrderedDict", []) => Ok(Value::Dict(vec![])),
+            // A function that creates a tensor, a class, the arguments of the function, and attributes.
+            ("torch._tensor", "_rebuild_from_type_v2", &[function, _class, arguments, ..]) => {
+                let &Value::Global { module, name } = &self.values[function] else {
+                    return Err(NO_TENSOR.into());
+                };
+                let made = self.rebuild(module, name, self.tuple(arguments));
+                made.unwrap_or(Ok(Value::Object(vec![])))
+            }
+            _ if is_plain_constructor(module, name) => Ok(Value::Object(vec![])),
+            _ => Err(format!("a pickle that calls {module}.{name}")),
+        }
+    }
+
+    /// Returns the result of a function that creates a tensor or parameter, or `None` if it is another function. More arguments than those
+    /// that are used may follow, such as `requires_grad` and hooks.
+    fn rebuild(&self, module: &str, name: &str, arguments: &[Id]) -> Option<Result<Value<'a>, String>> {
+        let of = |id: Id| &self.values[id];
+        let made = match (module, name, arguments) {
+            (
+                "torch._utils",
+                "_rebuild_tensor" | "_rebuild_tensor_v2",
+                &[storage, offset, size, stride, ..],
+            ) => match (of(storage), of(offset), of(size), of(stride)) {
+                (Value::Storage { .. }, Value::Int(_), Value::Tuple(_), Value::Tuple(_)) => {
+                    Some(Value::Tensor { storage, offset, size, stride })
+                }
+                (Value::Object(_), ..) => Some(Value::Object(vec![])),
+                _ => None,
+            },
+            ("torch._utils", "_rebuild_parameter" | "_rebuild_parameter_with_state", &[data, ..]) => {
+                Some(of(data).clone()).filter(|data| matches!(data, Value::Tensor { .. } | Value::Object(_)))
+            }
+            ("torch._utils", "_rebuild_tensor" | "_rebuild_tensor_v2" | "_rebuild_parameter", _) => None,
+            _ => return None,
+        };
+        Some(made.ok_or(NO_TENSOR.into()))
     }
 
     /// Pushes an instance of `class`, which Python creates by `__new__` alone.
     fn instance(&mut self, class: Id) -> Result<(), String> {
         let made = match &self.values[class] {
+            Value::Global { module: "collections", name: "OrderedDict" } => Value::Dict(vec![]),
             Value::Global { .. } => Value::Object(vec![]),
-            Value::OrderedDict => Value::Dict(vec![]),
             other => return Err(format!("a pickle with an instance of {}", other.type_name())),
         };
         self.push(made);
@@ -281,7 +427,7 @@ impl<'a> Machine<'a> {
                 }
                 bytes => {
                     self.take(bytes)?;
-                    self.push(Value::LargeInt);
+                    self.push(Value::Object(vec![]));
                 }
             },
             // BINFLOAT
@@ -304,7 +450,7 @@ impl<'a> Machine<'a> {
             // GLOBAL
             b'c' => {
                 let (module, name) = (self.line()?, self.line()?);
-                self.global(module, name)?;
+                self.push(Value::Global { module, name });
             }
             // STACK_GLOBAL
             0x93 => {
@@ -313,7 +459,7 @@ impl<'a> Machine<'a> {
                 else {
                     return Err("a pickle with a name that is no string".into());
                 };
-                self.global(module, name)?;
+                self.push(Value::Global { module, name });
             }
             // BINPUT, LONG_BINPUT, BINGET, LONG_BINGET
             b'q' => self.unsigned(1).and_then(|id| self.memoize(id))?,

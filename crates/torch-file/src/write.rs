@@ -1,8 +1,8 @@
 //! Writer for checkpoints in the zip format of `torch.save`, which `torch.load` reads without any code of this project. The archive has an
 //! entry with a pickle of protocol 2, and an uncompressed entry with the bytes of each tensor.
 
-use crate::array::row_major;
-use crate::{Dtype, Error, Result};
+use crate::pickle::STORAGES;
+use crate::{Dtype, Error, Result, row_major};
 use globalsplat_files::write_atomically;
 use std::collections::HashMap;
 use std::io::{Cursor, Write};
@@ -28,7 +28,7 @@ const COUNTERS: [&str; 2] = ["epoch", "global_step"];
 pub struct TensorView<'a> {
     /// Name in the state dict.
     pub name: &'a str,
-    /// Type of the elements. Quantized types aren't supported.
+    /// Type of the elements, one of those that torch has a class of storages for.
     pub dtype: Dtype,
     /// Size of each dimension.
     pub shape: &'a [usize],
@@ -37,19 +37,16 @@ pub struct TensorView<'a> {
 }
 
 impl TensorView<'_> {
-    fn check(&self) -> Result<()> {
+    /// Returns the name of the class of storages for the type of the elements, after a check of the number of bytes.
+    fn storage_class(&self) -> Result<&'static str> {
         let TensorView { name, dtype, shape, bytes } = self;
-        if dtype.is_quantized() {
-            return Err(Error::failed(format!("tensors of type {dtype} are not stored")));
+        let class = STORAGES.iter().find(|(stored, _)| stored == dtype).map(|(_, class)| *class);
+        let class = class.ok_or_else(|| Error::failed(format!("tensors of type {dtype} are not stored")))?;
+        let size = shape.iter().try_fold(dtype.bitsize() / 8, |size, &count| size.checked_mul(count));
+        if size == Some(bytes.len()) {
+            return Ok(class);
         }
-        let size = shape.iter().try_fold(dtype.size(), |size, &count| size.checked_mul(count));
-        match size == Some(bytes.len()) {
-            true => Ok(()),
-            false => {
-                let found = format!("{} bytes for {dtype} {shape:?}", bytes.len());
-                Err(Error::failed(format!("tensor {name} has {found}")))
-            }
-        }
+        Err(Error::failed(format!("tensor {name} has {} bytes for {dtype} {shape:?}", bytes.len())))
     }
 }
 
@@ -57,14 +54,13 @@ impl TensorView<'_> {
 /// `metadata`. The keys that Lightning requires are added: "pytorch-lightning_version", "epoch" and "global_step".
 ///
 /// # Errors
-/// Returns an error if a tensor is quantized or its bytes don't fit its shape, or if the file can't be written.
+/// Returns an error if torch has no storages for a tensor's type, or its bytes don't fit its shape, or if the file can't be written.
 pub fn write_checkpoint(
     path: &Path,
     tensors: &[TensorView],
     metadata: &HashMap<String, String>,
 ) -> Result<()> {
-    tensors.iter().try_for_each(TensorView::check)?;
-    let pickle = pickle(tensors, metadata);
+    let pickle = pickle(tensors, metadata)?;
     let mut zip = ZipWriter::new(Cursor::new(vec![]));
     let mut add = |name: &str, contents: &[u8]| {
         let options = FileOptions::default()
@@ -87,20 +83,20 @@ pub fn write_checkpoint(
     write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
 }
 
-fn pickle(tensors: &[TensorView], metadata: &HashMap<String, String>) -> Vec<u8> {
+fn pickle(tensors: &[TensorView], metadata: &HashMap<String, String>) -> Result<Vec<u8>> {
     // PROTO 2, EMPTY_DICT, MARK
     let mut p = Pickle(b"\x80\x02}(".into());
     p.text("state_dict");
     p.ordered_dict();
     p.0.push(b'(');
-    for (key, TensorView { name, dtype, shape, .. }) in tensors.iter().enumerate() {
+    for (key, tensor @ TensorView { name, shape, .. }) in tensors.iter().enumerate() {
         p.text(name);
         p.global("torch._utils", "_rebuild_tensor_v2");
         p.0.push(b'(');
         // BINPERSID: the persistent id that refers to a storage.
         p.0.push(b'(');
         p.text("storage");
-        p.global("torch", dtype.storage_class());
+        p.global("torch", tensor.storage_class()?);
         p.text(&key.to_string());
         p.text("cpu");
         p.integer(shape.iter().product());
@@ -129,7 +125,7 @@ fn pickle(tensors: &[TensorView], metadata: &HashMap<String, String>) -> Vec<u8>
     }
     // SETITEMS, STOP
     p.0.extend(b"u.");
-    p.0
+    Ok(p.0)
 }
 
 /// Pickle under construction: instructions for the stack machine of Python's unpickler.

@@ -7,7 +7,7 @@ use crate::geometry::{Camera, Intrinsics};
 use crate::pixels::{SUPPORTED_IMAGES, encoded_image_size};
 use glam::{DMat4, DVec4};
 use globalsplat_files::{Error, Result, split_keyed_path};
-use globalsplat_torch_file::{Archive, Array, Dtype, Id, UnknownGlobals, Value, Values, unpickle};
+use globalsplat_torch_file::{Archive, Array, Dtype, Id, Value, Values, unpickle};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -178,7 +178,7 @@ pub fn camera_numbers(camera: &Camera) -> [f32; CAMERA_NUMBERS] {
 /// # Errors
 /// Fails if the pickle uses anything that isn't allowed, or is not a list of scenes.
 fn read_scenes(bytes: &[u8], archive: &Archive) -> Result<Vec<Scene>, String> {
-    let values = unpickle(&mut &bytes[archive.pickle.clone()], UnknownGlobals::Refuse)?;
+    let values = unpickle(&bytes[archive.pickle.clone()])?;
     let max_views = ALWAYS_ALLOWED_VIEWS + bytes.len() / MIN_BYTES_PER_VIEW;
     list_scenes(&values, archive, max_views).map_err(|why| format!("unusable ({why})"))
 }
@@ -243,7 +243,7 @@ impl<'v, 'a> Fields<'v, 'a> {
     fn scene(&self, images: &[Id]) -> Result<Scene, String> {
         let views = images.len();
         let cameras = self.array("cameras", self.get("cameras")?)?;
-        if !cameras.dtype.is_float() || cameras.shape != [views, CAMERA_NUMBERS] {
+        if !cameras.is_float() || cameras.shape != [views, CAMERA_NUMBERS] {
             let (found, field) = (format!("{} {:?}", cameras.dtype, cameras.shape), self.name("cameras"));
             let expected = format!("F32 [{views}, {CAMERA_NUMBERS}] for as many images");
             return Err(format!("{field} is {found}, expected {expected}"));

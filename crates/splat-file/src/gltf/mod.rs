@@ -1,24 +1,12 @@
 //! Splats in glTF 2.0: mesh primitives of points with the extension KHR_gaussian_splatting, in a `.glb`, or in a `.gltf` and the files that
 //! it refers to. Scales and opacities are linear. The axes are half a turn about z away from those of other formats, so that y is up.
 
-mod accessors;
-mod container;
-mod json;
+mod document;
 mod read;
-mod scene;
 mod write;
 
-pub(crate) use write::buffer_file;
-
-use crate::ShLimits;
-use crate::codec::{Codec, Writer};
-
-/// Functions of `.glb`.
-pub(crate) const GLB_CODEC: Option<Codec> =
-    Some(Codec { read: read::read, writer: Some(Writer::new(write::write_glb, limits)) });
-/// Functions of `.gltf`.
-pub(crate) const GLTF_CODEC: Option<Codec> =
-    Some(Codec { read: read::read, writer: Some(Writer::new(write::write_gltf, limits)) });
+pub(crate) use read::read;
+pub(crate) use write::{buffer_file, write_glb, write_gltf};
 
 /// Name of the extension, with which its attributes begin.
 const EXTENSION: &str = "KHR_gaussian_splatting";
@@ -53,9 +41,4 @@ fn turn_rotation([w, x, y, z]: [f32; 4]) -> [f32; 4] {
 /// Inverts [`turn_rotation`].
 fn turn_rotation_back([w, x, y, z]: [f32; 4]) -> [f32; 4] {
     [z, y, -x, -w]
-}
-
-/// Returns the limits of coefficients: glTF holds any number.
-fn limits() -> ShLimits {
-    ShLimits::up_to(3)
 }

@@ -1,11 +1,11 @@
 //! Writes splats as glTF: one primitive with float32 attributes, and colors of bytes for programs that show points only.
 
-use super::container::encode_percent;
 use super::{COLOR_SPACE, EXTENSION, KERNEL, MAGIC, POINTS, sh_attribute, turn_rotation};
 use crate::axes::Axes;
-use crate::codec::WriteOptions;
-use crate::{Error, Result, SH_C0, Splat};
+use crate::splat::color_of_dc;
+use crate::{Error, Result, Splat, WriteOptions};
 use globalsplat_files::{write_atomically, write_temporary};
+use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
 use serde_json::{Map, Value, json};
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -17,6 +17,8 @@ const FLOAT: u32 = 5126;
 const ARRAY_BUFFER: u32 = 34962;
 /// Maximum difference from 1 of the squared length of a quaternion that is written unchanged.
 const UNIT_TOLERANCE: f64 = 1e-6;
+/// Characters of a file name that are encoded in a URI.
+const ENCODED: &AsciiSet = &NON_ALPHANUMERIC.remove(b'-').remove(b'.').remove(b'_').remove(b'~');
 
 /// Returns the path of the buffer that [`write_gltf`] writes beside the `.gltf` at `path`.
 pub(crate) fn buffer_file(path: &Path) -> PathBuf {
@@ -24,14 +26,11 @@ pub(crate) fn buffer_file(path: &Path) -> PathBuf {
 }
 
 /// Writes a `.glb`.
-///
-/// # Errors
-/// Returns an error if there is no Gaussian, or more than 4 GiB, or the file can't be written.
-pub fn write_glb(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
+pub(crate) fn write_glb(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
     let attributes = attributes(path, splat)?;
-    let mut json = document(&attributes, splat, None).to_string().into_bytes();
+    let mut json = document(&attributes, splat.len(), None).to_string().into_bytes();
     json.resize(json.len().next_multiple_of(4), b' ');
-    let body = size(&attributes, splat);
+    let body: usize = attributes.iter().map(|attribute| attribute.bytes.len()).sum();
     let length = 12 + 8 + json.len() + 8 + body;
     let (Ok(length), Ok(body)) = (u32::try_from(length), u32::try_from(body)) else {
         return Err(Error::failed(format!(
@@ -46,79 +45,91 @@ pub fn write_glb(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
         for part in [header.as_flattened(), json_header.as_flattened(), &json, body_header.as_flattened()] {
             writer.write_all(part).map_err(Error::write(path))?;
         }
-        write_buffer(writer, &attributes, splat).map_err(Error::write(path))
+        write_buffer(writer, &attributes).map_err(Error::write(path))
     })
 }
 
 /// Writes a `.gltf`, and its buffer in the file of [`buffer_file`]. Both files are complete before either replaces an older one.
-///
-/// # Errors
-/// Returns an error if there is no Gaussian, or the name isn't UTF-8, or a file can't be written.
-pub fn write_gltf(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
+pub(crate) fn write_gltf(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
     let attributes = attributes(path, splat)?;
     let file = buffer_file(path);
     let Some(name) = file.file_name().and_then(|name| name.to_str()) else {
         return Err(Error::failed(format!("{}: the name of a .gltf must be UTF-8", path.display())));
     };
-    let json = format!("{:#}\n", document(&attributes, splat, Some(name)));
-    let buffer = write_temporary(&file, |writer| {
-        write_buffer(writer, &attributes, splat).map_err(Error::write(&file))
-    })?;
+    let json = format!("{:#}\n", document(&attributes, splat.len(), Some(name)));
+    let buffer =
+        write_temporary(&file, |writer| write_buffer(writer, &attributes).map_err(Error::write(&file)))?;
     let gltf = write_temporary(path, |writer| writer.write_all(json.as_bytes()).map_err(Error::write(path)))?;
     buffer.persist()?;
     gltf.persist()
 }
 
-/// Attribute of a primitive, which is written for all Gaussians.
+fn write_buffer(writer: &mut dyn Write, attributes: &[Attribute]) -> std::io::Result<()> {
+    attributes.iter().try_for_each(|attribute| writer.write_all(&attribute.bytes))
+}
+
+/// Attribute of a primitive: its accessor, and the values of all Gaussians, whose size is a multiple of 4 bytes.
 struct Attribute {
     name: String,
-    values: Values,
+    shape: &'static str,
+    component: u32,
+    /// Minimum and maximum of each component, which only positions must have.
+    bounds: Option<[[f32; 3]; 2]>,
+    bytes: Vec<u8>,
 }
 
-/// Kind of values of an attribute.
-#[derive(Clone, Copy, PartialEq)]
-enum Values {
-    Position,
-    Color,
-    Rotation,
-    Scale,
-    Opacity,
-    /// Index of a basis of the spherical harmonics, and its factor in glTF's axes.
-    Harmonic(usize, f32),
+impl Attribute {
+    fn floats(name: String, shape: &'static str, numbers: impl Iterator<Item = f32>) -> Self {
+        let bytes = numbers.flat_map(f32::to_le_bytes).collect();
+        Attribute { name, shape, component: FLOAT, bounds: None, bytes }
+    }
 }
 
-impl Values {
-    /// Returns the type, the component type and the size in bytes.
-    fn layout(self) -> (&'static str, u32, usize) {
-        match self {
-            Values::Color => ("VEC4", UNSIGNED_BYTE, 4),
-            Values::Rotation => ("VEC4", FLOAT, 16),
-            Values::Opacity => ("SCALAR", FLOAT, 4),
-            Values::Position | Values::Scale | Values::Harmonic(..) => ("VEC3", FLOAT, 12),
-        }
+/// Returns the attributes in the order in which they are written.
+fn attributes(path: &Path, splat: &Splat) -> Result<Vec<Attribute>> {
+    if splat.is_empty() {
+        let message = format!("{}: glTF holds one Gaussian at least, found 0", path.display());
+        return Err(Error::failed(message));
     }
-
-    /// Appends the value of Gaussian `index` to `bytes`.
-    fn append(self, splat: &Splat, index: usize, bytes: &mut Vec<u8>) {
-        let mut append =
-            |numbers: &[f32]| bytes.extend(numbers.iter().flat_map(|number| number.to_le_bytes()));
-        match self {
-            Values::Position => append(&Axes::LUF.position(splat.means[index])),
-            Values::Rotation => {
-                let [w, x, y, z] = turn_rotation(unit_quaternion(splat, index));
-                append(&[x, y, z, w]);
-            }
-            Values::Scale => append(&splat.scale(index)),
-            Values::Opacity => append(&[splat.opacity(index)]),
-            Values::Harmonic(basis, sign) => append(&splat.sh_of(index)[basis].map(|channel| sign * channel)),
-            Values::Color => {
-                let color = splat.sh_of(index)[0].map(|dc| f64::from(dc) * SH_C0 + 0.5);
-                let byte = |number: f64| (number * 255.).round() as u8; // clamps to 0 and 255
-                bytes.extend(color.map(byte));
-                bytes.push(byte(splat.opacity(index).into()));
-            }
-        }
+    let mut turned = splat.clone();
+    Axes::LUF.convert_without_rotations(&mut turned);
+    let extreme = |choose: fn(f32, f32) -> f32, first: f32| {
+        turned.means.iter().fold([first; 3], |a, b| std::array::from_fn(|axis| choose(a[axis], b[axis])))
+    };
+    let all = || 0..splat.len();
+    let rotation = |index: usize| {
+        let [w, x, y, z] = turn_rotation(unit_quaternion(splat, index));
+        [x, y, z, w]
+    };
+    let byte = |number: f64| (number * 255.).round() as u8; // clamps to 0 and 255
+    let color = |index: usize| {
+        let [red, green, blue] = splat.sh_of(index)[0].map(|dc| byte(color_of_dc(dc)));
+        [red, green, blue, byte(splat.opacity(index).into())]
+    };
+    let own = |name: &str| format!("{EXTENSION}:{name}");
+    let mut attributes = vec![
+        Attribute {
+            bounds: Some([extreme(f32::min, f32::INFINITY), extreme(f32::max, f32::NEG_INFINITY)]),
+            ..Attribute::floats("POSITION".into(), "VEC3", turned.means.as_flattened().iter().copied())
+        },
+        Attribute {
+            name: "COLOR_0".into(),
+            shape: "VEC4",
+            component: UNSIGNED_BYTE,
+            bounds: None,
+            bytes: all().flat_map(color).collect(),
+        },
+        Attribute::floats(own("ROTATION"), "VEC4", all().flat_map(rotation)),
+        Attribute::floats(own("SCALE"), "VEC3", all().flat_map(|index| splat.scale(index))),
+        Attribute::floats(own("OPACITY"), "SCALAR", all().map(|index| splat.opacity(index))),
+    ];
+    for basis in 0..splat.bases() {
+        let degree = basis.isqrt();
+        let name = sh_attribute(degree, basis - degree * degree);
+        let numbers = all().flat_map(|index| turned.sh_of(index)[basis]);
+        attributes.push(Attribute::floats(name, "VEC3", numbers));
     }
+    Ok(attributes)
 }
 
 /// Returns the quaternion of Gaussian `index` with length 1. One that has this length already, but for rounding, keeps its bits.
@@ -128,63 +139,30 @@ fn unit_quaternion(splat: &Splat, index: usize) -> [f32; 4] {
     if (squared - 1.).abs() < UNIT_TOLERANCE { quaternion } else { splat.unit_quaternion(index) }
 }
 
-/// Returns the attributes in the order in which they are written.
-///
-/// # Errors
-/// Returns an error if there is no Gaussian: glTF has no empty accessors.
-fn attributes(path: &Path, splat: &Splat) -> Result<Vec<Attribute>> {
-    if splat.is_empty() {
-        let message = format!("{}: glTF holds one Gaussian at least, found 0", path.display());
-        return Err(Error::failed(message));
-    }
-    let own = |name: &str| format!("{EXTENSION}:{name}");
-    let mut attributes = vec![
-        Attribute { name: "POSITION".into(), values: Values::Position },
-        Attribute { name: "COLOR_0".into(), values: Values::Color },
-        Attribute { name: own("ROTATION"), values: Values::Rotation },
-        Attribute { name: own("SCALE"), values: Values::Scale },
-        Attribute { name: own("OPACITY"), values: Values::Opacity },
-    ];
-    let signs = std::iter::once(1.).chain(Axes::LUF.harmonics());
-    for (basis, sign) in (0..splat.bases()).zip(signs) {
-        let degree = basis.isqrt();
-        let name = sh_attribute(degree, basis - degree * degree);
-        attributes.push(Attribute { name, values: Values::Harmonic(basis, sign) });
-    }
-    Ok(attributes)
-}
-
-/// Returns the size of the buffer in bytes.
-fn size(attributes: &[Attribute], splat: &Splat) -> usize {
-    attributes.iter().map(|attribute| attribute.values.layout().2 * splat.len()).sum()
-}
-
-/// Returns the JSON. The buffer is in the file `buffer` or, if there is none, in the binary chunk.
-fn document(attributes: &[Attribute], splat: &Splat, buffer: Option<&str>) -> Value {
+/// Returns the JSON for `count` Gaussians. The buffer is in the file `buffer` or, if there is none, in the binary chunk.
+fn document(attributes: &[Attribute], count: usize, buffer: Option<&str>) -> Value {
     let (mut views, mut accessors, mut names) = (vec![], vec![], Map::new());
     let mut offset = 0;
-    for (index, attribute) in attributes.iter().enumerate() {
-        let (shape, component, bytes) = attribute.values.layout();
-        let length = bytes * splat.len();
-        views.push(json!({"buffer": 0, "byteOffset": offset, "byteLength": length, "target": ARRAY_BUFFER}));
+    for (index, Attribute { name, shape, component, bounds, bytes }) in attributes.iter().enumerate() {
+        views.push(
+            json!({"buffer": 0, "byteOffset": offset, "byteLength": bytes.len(), "target": ARRAY_BUFFER}),
+        );
         let mut accessor =
-            json!({"bufferView": index, "componentType": component, "count": splat.len(), "type": shape});
-        match attribute.values {
-            Values::Position => {
-                let [min, max] = bounds(splat);
-                accessor["min"] = json!(min);
-                accessor["max"] = json!(max);
-            }
-            Values::Color => accessor["normalized"] = json!(true),
-            _ => {}
+            json!({"bufferView": index, "componentType": component, "count": count, "type": shape});
+        if let Some([min, max]) = bounds {
+            accessor["min"] = json!(min);
+            accessor["max"] = json!(max);
+        }
+        if *component == UNSIGNED_BYTE {
+            accessor["normalized"] = json!(true);
         }
         accessors.push(accessor);
-        names.insert(attribute.name.clone(), json!(index));
-        offset += length;
+        names.insert(name.clone(), json!(index));
+        offset += bytes.len();
     }
     let mut own_buffer = json!({"byteLength": offset});
     if let Some(name) = buffer {
-        own_buffer["uri"] = json!(encode_percent(name));
+        own_buffer["uri"] = json!(utf8_percent_encode(name, ENCODED).to_string());
     }
     let splatting = json!({
         "kernel": KERNEL,
@@ -207,29 +185,4 @@ fn document(attributes: &[Attribute], splat: &Splat, buffer: Option<&str>) -> Va
         "bufferViews": views,
         "buffers": [own_buffer],
     })
-}
-
-/// Returns the minimum and maximum of the positions in glTF's axes.
-fn bounds(splat: &Splat) -> [[f32; 3]; 2] {
-    let mut bounds = [[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]];
-    for mean in splat.means.iter().map(|&mean| Axes::LUF.position(mean)) {
-        for (axis, number) in mean.into_iter().enumerate() {
-            bounds[0][axis] = bounds[0][axis].min(number);
-            bounds[1][axis] = bounds[1][axis].max(number);
-        }
-    }
-    bounds
-}
-
-/// Writes the values of each attribute for all Gaussians. All sizes are multiples of 4 bytes.
-fn write_buffer(writer: &mut dyn Write, attributes: &[Attribute], splat: &Splat) -> std::io::Result<()> {
-    let mut bytes = vec![];
-    for attribute in attributes {
-        for index in 0..splat.len() {
-            bytes.clear();
-            attribute.values.append(splat, index, &mut bytes);
-            writer.write_all(&bytes)?;
-        }
-    }
-    Ok(())
 }

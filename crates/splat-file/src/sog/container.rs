@@ -29,9 +29,6 @@ pub struct Reader<'a> {
 
 impl<'a> Reader<'a> {
     /// Opens the archive at `path`, whose contents are `bytes`.
-    ///
-    /// # Errors
-    /// Returns an error if `bytes` aren't a ZIP archive.
     pub fn open_zip(path: &'a Path, bytes: &'a [u8]) -> Result<Self> {
         let archive = ZipArchive::new(Cursor::new(bytes))
             .map_err(|why| Error::input(path, "the file", format!("damaged: {why}"), "a ZIP archive"))?;
@@ -43,19 +40,12 @@ impl<'a> Reader<'a> {
         Reader { path, archive: None }
     }
 
-    /// Returns the contents of the file `name`.
-    ///
-    /// # Errors
-    /// Returns an error if there is no such file, it is damaged, or it is outside of the folder.
+    /// Returns the contents of the file `name`, which must be in the archive or folder.
     pub fn file(&mut self, name: &str) -> Result<Vec<u8>> {
         let Some((archive, max)) = &mut self.archive else {
             if name.is_empty() || name.contains(['/', '\\']) || name == ".." {
-                return Err(Error::input(
-                    self.path,
-                    "a file name",
-                    format!("{name:?}"),
-                    "a name without a folder",
-                ));
+                let found = format!("{name:?}");
+                return Err(Error::input(self.path, "a file name", found, "a name without a folder"));
             }
             let file = parent_of(self.path).join(name);
             check_regular(&file)?;
@@ -73,9 +63,6 @@ impl<'a> Reader<'a> {
 
     /// Returns the image `name` if `is_allowed` returns `true` for its numbers of pixels and of bytes in the file, which are known before
     /// memory is allocated.
-    ///
-    /// # Errors
-    /// Returns an error if the file is absent, damaged, or too large.
     pub fn image(&mut self, name: &str, is_allowed: impl FnOnce(usize, usize) -> bool) -> Result<Image> {
         let file = self.file(name)?;
         let damaged = |why: image_webp::DecodingError| {
@@ -86,12 +73,8 @@ impl<'a> Reader<'a> {
         let count = width as usize * height as usize;
         if !is_allowed(count, file.len()) {
             let found = format!("of {width}×{height} pixels");
-            return Err(Error::input(
-                self.path,
-                name,
-                found,
-                "about as many pixels as Gaussians, and at most 256 times the bytes of the file",
-            ));
+            let expected = "about as many pixels as Gaussians, and at most 256 times the bytes of the file";
+            return Err(Error::input(self.path, name, found, expected));
         }
         let bytes_per_pixel = if decoder.has_alpha() { 4 } else { 3 };
         let mut bytes = vec![0; count * bytes_per_pixel];
@@ -104,10 +87,7 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// Returns the images as lossless WebP files.
-///
-/// # Errors
-/// Returns an error that names `path` if an image is larger than WebP allows: 16,384 pixels in a dimension.
+/// Returns the images as lossless WebP files, which allow 16,384 pixels in each dimension.
 pub fn encode_all(path: &Path, images: Vec<(&'static str, Image)>) -> Result<Vec<(&'static str, Vec<u8>)>> {
     let encode = |(name, image): (&'static str, Image)| {
         let file = encode_webp(&image)
@@ -120,13 +100,9 @@ pub fn encode_all(path: &Path, images: Vec<(&'static str, Image)>) -> Result<Vec
 /// Encodes an image with and without prediction of pixels from their neighbours, and returns the smaller file.
 fn encode_webp(image: &Image) -> std::result::Result<Vec<u8>, image_webp::EncodingError> {
     let is_opaque = image.pixels.iter().all(|pixel| pixel[3] == 255);
-    let (bytes, color) = match is_opaque {
-        true => (
-            image.pixels.iter().flat_map(|&[red, green, blue, _]| [red, green, blue]).collect(),
-            ColorType::Rgb8,
-        ),
-        false => (image.pixels.as_flattened().to_vec(), ColorType::Rgba8),
-    };
+    let color = if is_opaque { ColorType::Rgb8 } else { ColorType::Rgba8 };
+    let channels = if is_opaque { 3 } else { 4 };
+    let bytes: Vec<u8> = image.pixels.iter().flat_map(|pixel| &pixel[..channels]).copied().collect();
     let height = image.pixels.len() / image.width;
     let mut smallest: Option<Vec<u8>> = None;
     for use_predictor_transform in [false, true] {
@@ -141,10 +117,7 @@ fn encode_webp(image: &Image) -> std::result::Result<Vec<u8>, image_webp::Encodi
     Ok(smallest.expect("two files"))
 }
 
-/// Writes `meta.json` and the images to a ZIP archive, atomically.
-///
-/// # Errors
-/// Returns an error if the file can't be written.
+/// Writes `meta.json` and the images to a ZIP archive.
 pub fn write_zip(path: &Path, meta: &[u8], images: &[(&'static str, Vec<u8>)]) -> Result<()> {
     // WebP can't be compressed further.
     let options = FileOptions::default().compression_method(CompressionMethod::Stored);
@@ -159,9 +132,6 @@ pub fn write_zip(path: &Path, meta: &[u8], images: &[(&'static str, Vec<u8>)]) -
 }
 
 /// Writes `meta.json` to `path` and the images beside it. No file is replaced before all of them are written.
-///
-/// # Errors
-/// Returns an error if a file can't be written.
 pub fn write_files(path: &Path, meta: &[u8], images: &[(&'static str, Vec<u8>)]) -> Result<()> {
     let beside = images.iter().map(|(name, file)| (parent_of(path).join(name), &file[..]));
     let mut partials = vec![];
@@ -173,9 +143,8 @@ pub fn write_files(path: &Path, meta: &[u8], images: &[(&'static str, Vec<u8>)])
     partials.into_iter().try_for_each(PartialFile::persist)?;
     // Images of an older splat of a higher SH degree.
     let is_old = |name: &&&str| images.iter().all(|(written, _)| written != *name);
-    for old in
-        IMAGES.iter().filter(is_old).map(|name| path.with_file_name(name)).filter(|file| file.is_file())
-    {
+    let old = IMAGES.iter().filter(is_old).map(|name| path.with_file_name(name));
+    for old in old.filter(|file| file.is_file()) {
         std::fs::remove_file(&old).map_err(Error::write(&old))?;
     }
     Ok(())

@@ -1,8 +1,8 @@
 //! Container of SPZ: a header and six streams, together in gzip up to version 3, each in Zstandard since version 4.
 
-use super::{MAGIC, recognizes};
 use crate::axes::Axes;
-use crate::{Error, Result, Splat};
+use crate::numbers::{u32_at, u64_at};
+use crate::{Error, Result};
 use flate2::Compression;
 use flate2::bufread::GzDecoder;
 use flate2::write::GzEncoder;
@@ -10,6 +10,10 @@ use globalsplat_files::write_atomically;
 use std::io::{Read, Write};
 use std::path::Path;
 
+/// First bytes of every version, after gzip is decompressed.
+const MAGIC: [u8; 4] = *b"NGSP";
+/// First bytes of gzip. In the next byte, the flags, the upper three bits are 0.
+const GZIP: [u8; 3] = [0x1f, 0x8b, 8];
 /// Size of the header in bytes, up to version 3 (`GZIP_HEADER`) and since version 4 (`PLAIN_HEADER`).
 const GZIP_HEADER: usize = 16;
 const PLAIN_HEADER: usize = 32;
@@ -27,17 +31,9 @@ const MAX_SMALL: u128 = 1 << 20;
 /// Level of Zstandard: higher ones take three times as long and save a hundredth.
 const ZSTD_LEVEL: i32 = 12;
 
-/// Streams in the file's order, each with the values of all Gaussians.
-pub struct Streams {
-    /// Three coordinates per Gaussian, float16 in version 1, 24 bits each since version 2.
-    pub positions: Vec<u8>,
-    pub opacities: Vec<u8>,
-    pub colors: Vec<u8>,
-    pub scales: Vec<u8>,
-    /// Three bytes per Gaussian up to version 2, four since version 3.
-    pub rotations: Vec<u8>,
-    pub harmonics: Vec<u8>,
-}
+/// Streams in the file's order, each with the values of all Gaussians: positions (three coordinates, float16 in version 1, 24 bits each since
+/// version 2), opacities, colors, scales, rotations (three bytes up to version 2, four since version 3), spherical harmonics.
+pub type Streams = [Vec<u8>; 6];
 
 /// Properties of the streams, as a file declares them.
 #[derive(Debug, Clone, Copy)]
@@ -52,19 +48,12 @@ pub struct Description {
 }
 
 impl Description {
-    /// Creates the description of a splat that is to be written.
-    pub fn written(version: u32, splat: &Splat, fractional_bits: u32) -> Self {
-        let Splat { sh_degree, antialiased, .. } = *splat;
-        Description { version, count: splat.len(), sh_degree, fractional_bits, antialiased, axes: Axes::RUB }
-    }
-
     /// Parses the part of the header that all versions have in common.
     fn parse(path: &Path, header: &[u8]) -> Result<(Self, u8)> {
-        let word = |at: usize| u32::from_le_bytes([0, 1, 2, 3].map(|byte| header[at + byte]));
         if header[..4] != MAGIC {
             return Err(Error::input(path, "the first bytes", format!("{:?}", &header[..4]), "NGSP"));
         }
-        let (version, count) = (word(4), word(8) as usize);
+        let (version, count) = (u32_at(header, 4), u32_at(header, 8) as usize);
         let [sh_degree, fractional_bits, flags] = [12, 13, 14].map(|at| header[at]);
         if !(1..=4).contains(&version) {
             return Err(Error::input(path, "the version", version, "1 to 4"));
@@ -105,27 +94,21 @@ impl Description {
     }
 }
 
+/// Returns `true` if `bytes` begin like an SPZ of any version.
+pub(crate) fn recognizes(bytes: &[u8]) -> bool {
+    bytes.starts_with(&MAGIC) || (bytes.starts_with(&GZIP) && bytes.get(3).is_some_and(|flags| flags < &0x20))
+}
+
 pub fn read(path: &Path, bytes: &[u8]) -> Result<(Description, Streams)> {
-    if !recognizes(bytes) {
-        return Err(Error::input(path, "the file", "no SPZ", "one in gzip, or NGSP"));
+    match recognizes(bytes) {
+        true if bytes.starts_with(&MAGIC) => read_plain(path, bytes),
+        true => read_gzip(path, bytes),
+        false => Err(Error::input(path, "the file", "no SPZ", "one in gzip, or NGSP")),
     }
-    let (description, streams) =
-        if bytes.starts_with(&MAGIC) { read_plain(path, bytes)? } else { read_gzip(path, bytes)? };
-    let mut streams = streams.into_iter();
-    let mut next = || streams.next().expect("six streams");
-    let streams = Streams {
-        positions: next(),
-        opacities: next(),
-        colors: next(),
-        scales: next(),
-        rotations: next(),
-        harmonics: next(),
-    };
-    Ok((description, streams))
 }
 
 /// Reads versions 1 to 3: header, streams and extensions in one gzip.
-fn read_gzip(path: &Path, bytes: &[u8]) -> Result<(Description, Vec<Vec<u8>>)> {
+fn read_gzip(path: &Path, bytes: &[u8]) -> Result<(Description, Streams)> {
     let mut decoder = GzDecoder::new(bytes);
     let mut unfold = |length: u64, what: &str| -> Result<Vec<u8>> {
         let mut unfolded = vec![];
@@ -143,16 +126,15 @@ fn read_gzip(path: &Path, bytes: &[u8]) -> Result<(Description, Vec<Vec<u8>>)> {
         return Err(Error::input(path, "the version in gzip", description.version, "1 to 3"));
     }
     description.check_claim(path, bytes.len())?;
-    let mut streams = vec![];
-    for width in description.widths() {
+    let mut streams = Streams::default();
+    for (stream, width) in streams.iter_mut().zip(description.widths()) {
         let length = width * description.count;
-        let stream = unfold(length as u64, "the body")?;
+        *stream = unfold(length as u64, "the body")?;
         if stream.len() < length {
             let found = format!("cut short: {} bytes of a stream", stream.len());
             let expected = format!("{length} bytes for {} Gaussians", description.count);
             return Err(Error::input(path, "the body", found, expected));
         }
-        streams.push(stream);
     }
     // Reading to the end also verifies gzip's checksum.
     let extensions = unfold(MAX_EXTENSIONS, "the end")?;
@@ -163,7 +145,7 @@ fn read_gzip(path: &Path, bytes: &[u8]) -> Result<(Description, Vec<Vec<u8>>)> {
 }
 
 /// Reads version 4: uncompressed header, extensions and table of contents, then each stream compressed separately.
-fn read_plain(path: &Path, bytes: &[u8]) -> Result<(Description, Vec<Vec<u8>>)> {
+fn read_plain(path: &Path, bytes: &[u8]) -> Result<(Description, Streams)> {
     if bytes.len() < PLAIN_HEADER {
         let found = format!("{} bytes", bytes.len());
         return Err(Error::input(path, "the header", found, format!("{PLAIN_HEADER} bytes")));
@@ -173,11 +155,11 @@ fn read_plain(path: &Path, bytes: &[u8]) -> Result<(Description, Vec<Vec<u8>>)> 
         return Err(Error::input(path, "the version outside of gzip", description.version, "4"));
     }
     description.check_claim(path, bytes.len())?;
-    let contents = u32::from_le_bytes([16, 17, 18, 19].map(|at| bytes[at])) as usize;
-    let streams = usize::from(bytes[15]);
-    let end = contents.saturating_add(16 * streams);
+    let contents = u32_at(bytes, 16) as usize;
+    let stored = usize::from(bytes[15]);
+    let end = contents.saturating_add(16 * stored);
     if contents < PLAIN_HEADER || end > bytes.len() {
-        let expected = format!("{streams} entries within the file's {} bytes", bytes.len());
+        let expected = format!("{stored} entries within the file's {} bytes", bytes.len());
         return Err(Error::input(path, "the table of contents", format!("at {contents}"), expected));
     }
     if flags & HAS_EXTENSIONS != 0 {
@@ -185,45 +167,38 @@ fn read_plain(path: &Path, bytes: &[u8]) -> Result<(Description, Vec<Vec<u8>>)> 
     }
     let mut rest = &bytes[end..];
     let mut entries = bytes[contents..end].as_chunks::<16>().0.iter();
-    let mut unfolded = vec![];
-    for (index, width) in description.widths().into_iter().enumerate() {
+    let mut streams = Streams::default();
+    for (index, (stream, width)) in streams.iter_mut().zip(description.widths()).enumerate() {
         let length = width * description.count;
+        let error =
+            |found: String, expected: String| Error::input(path, format!("stream {index}"), found, expected);
         let Some(entry) = entries.next() else {
             if length > 0 {
-                let expected = format!("one of {length} bytes");
-                return Err(Error::input(path, format!("stream {index}"), "missing", expected));
+                return Err(error("missing".into(), format!("one of {length} bytes")));
             }
-            unfolded.push(vec![]);
             continue;
         };
-        let stored = u64::from_le_bytes([0, 1, 2, 3, 4, 5, 6, 7].map(|at| entry[at]));
-        let Some((stream, after)) = usize::try_from(stored).ok().and_then(|at| rest.split_at_checked(at))
-        else {
-            let found = format!("cut short: {} bytes", rest.len());
-            return Err(Error::input(path, format!("stream {index}"), found, format!("{stored} bytes")));
-        };
+        let stored = u64_at(entry, 0);
+        let split = usize::try_from(stored).ok().and_then(|at| rest.split_at_checked(at));
+        let cut_short = || error(format!("cut short: {} bytes", rest.len()), format!("{stored} bytes"));
+        let (compressed, after) = split.ok_or_else(cut_short)?;
         rest = after;
-        let mut bytes = vec![];
-        let read = zstd::stream::read::Decoder::new(stream)
-            .and_then(|decoder| decoder.take(length as u64 + 1).read_to_end(&mut bytes));
-        read.map_err(|why| {
-            Error::input(path, format!("stream {index}"), format!("damaged: {why}"), "Zstandard")
-        })?;
-        if bytes.len() != length {
-            let found = format!("{} bytes or more", bytes.len());
+        zstd::stream::read::Decoder::new(compressed)
+            .and_then(|decoder| decoder.take(length as u64 + 1).read_to_end(stream))
+            .map_err(|why| error(format!("damaged: {why}"), "Zstandard".into()))?;
+        if stream.len() != length {
             let expected = format!("{length} bytes for {} Gaussians", description.count);
-            return Err(Error::input(path, format!("stream {index}"), found, expected));
+            return Err(error(format!("{} bytes or more", stream.len()), expected));
         }
-        unfolded.push(bytes);
     }
-    Ok((description, unfolded))
+    Ok((description, streams))
 }
 
 /// Returns the axes that one of the `extensions` names. Each extension is a type, a length and that many bytes.
 fn axes_of(path: &Path, mut extensions: &[u8]) -> Result<Axes> {
     let mut axes = Axes::RUB;
     while let Some((head, rest)) = extensions.split_first_chunk::<8>() {
-        let [kind, length] = [0, 4].map(|at| u32::from_le_bytes([0, 1, 2, 3].map(|byte| head[at + byte])));
+        let [kind, length] = [0, 4].map(|at| u32_at(head, at));
         let Some((contents, after)) = rest.split_at_checked(length as usize) else {
             let found = format!("cut short: {} bytes", rest.len());
             return Err(Error::input(path, "an extension", found, format!("{length} bytes")));
@@ -239,12 +214,8 @@ fn axes_of(path: &Path, mut extensions: &[u8]) -> Result<Axes> {
 }
 
 /// Writes the streams atomically: together in gzip up to version 3, each in Zstandard since version 4.
-///
-/// # Errors
-/// Returns an error if the file can't be written.
 pub fn write(path: &Path, description: &Description, streams: Streams) -> Result<()> {
-    let Streams { positions, opacities, colors, scales, rotations, harmonics } = streams;
-    let mut streams = vec![positions, opacities, colors, scales, rotations, harmonics];
+    let mut streams = Vec::from(streams);
     // Since version 4 a splat of degree 0 has no sixth stream.
     streams.retain(|stream| !stream.is_empty());
     let is_plain = description.version >= 4;

@@ -1,16 +1,131 @@
-//! Containers of glTF: the chunks of a `.glb`, and the buffers, which are a chunk, a file or a data URI.
+//! Files of glTF: the JSON, as far as splats need it; the chunks of a `.glb`; and the buffers, which are a chunk, a file or a data URI.
 
-use super::json::Gltf;
 use super::recognizes_glb;
+use crate::numbers::u32_at;
 use crate::{Error, Result};
 use base64::engine::{DecodePaddingMode, GeneralPurpose, GeneralPurposeConfig};
 use base64::{Engine, alphabet};
+use glam::{DMat4, DQuat, DVec3};
 use globalsplat_files::parent_of;
+use percent_encoding::percent_decode_str;
+use serde::Deserialize;
 use std::borrow::Cow;
 use std::cell::OnceCell;
+use std::collections::BTreeMap;
 use std::fs;
 use std::io::Read;
 use std::path::{Component, Path, PathBuf};
+
+#[derive(Default, Deserialize)]
+#[serde(default, rename_all = "camelCase")]
+pub struct Gltf {
+    asset: Asset,
+    extensions_required: Vec<String>,
+    pub scene: Option<usize>,
+    pub scenes: Vec<Scene>,
+    pub nodes: Vec<Node>,
+    pub meshes: Vec<Mesh>,
+    pub accessors: Vec<Accessor>,
+    buffer_views: Vec<BufferView>,
+    buffers: Vec<Buffer>,
+}
+
+#[derive(Default, Deserialize)]
+#[serde(default)]
+struct Asset {
+    version: String,
+}
+
+#[derive(Default, Deserialize)]
+#[serde(default)]
+pub struct Scene {
+    pub nodes: Vec<usize>,
+}
+
+#[derive(Default, Deserialize)]
+#[serde(default)]
+pub struct Node {
+    pub children: Vec<usize>,
+    pub mesh: Option<usize>,
+    /// If it is present, the other transforms are absent.
+    pub matrix: Option<DMat4>,
+    pub translation: Option<DVec3>,
+    pub rotation: Option<DQuat>,
+    pub scale: Option<DVec3>,
+}
+
+#[derive(Deserialize)]
+pub struct Mesh {
+    pub primitives: Vec<Primitive>,
+}
+
+#[derive(Default, Deserialize)]
+#[serde(default)]
+pub struct Primitive {
+    pub attributes: BTreeMap<String, usize>,
+    pub mode: Option<u32>,
+    pub extensions: PrimitiveExtensions,
+}
+
+#[derive(Default, Deserialize)]
+pub struct PrimitiveExtensions {
+    #[serde(rename = "KHR_gaussian_splatting")]
+    pub splatting: Option<Splatting>,
+}
+
+#[derive(Default, Deserialize)]
+#[serde(default, rename_all = "camelCase")]
+pub struct Splatting {
+    pub kernel: Option<String>,
+    pub color_space: Option<String>,
+    pub extensions: SplattingExtensions,
+}
+
+#[derive(Default, Deserialize)]
+pub struct SplattingExtensions {
+    #[serde(rename = "KHR_gaussian_splatting_compression_spz_2")]
+    pub spz: Option<Spz>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub struct Spz {
+    pub buffer_view: usize,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub struct Accessor {
+    pub buffer_view: Option<usize>,
+    #[serde(default)]
+    pub byte_offset: usize,
+    pub component_type: u32,
+    #[serde(default)]
+    pub normalized: bool,
+    pub count: usize,
+    /// Number of components: SCALAR, VEC2, VEC3, …
+    #[serde(rename = "type")]
+    pub shape: String,
+    pub sparse: Option<serde::de::IgnoredAny>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct BufferView {
+    buffer: usize,
+    #[serde(default)]
+    byte_offset: usize,
+    byte_length: usize,
+    byte_stride: Option<usize>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase")]
+struct Buffer {
+    /// Relative path or data URI, or `None` for the binary chunk of a `.glb`.
+    uri: Option<String>,
+    byte_length: usize,
+}
 
 /// Base64 with the standard alphabet, whose padding may be absent.
 const BASE64: GeneralPurpose = GeneralPurpose::new(
@@ -43,9 +158,6 @@ pub struct Document<'a> {
 
 impl<'a> Document<'a> {
     /// Parses the file at `path`, a `.glb` or a `.gltf`.
-    ///
-    /// # Errors
-    /// Returns an error for another version, or an extension that is required but unknown, or if the file is damaged or truncated.
     pub fn parse(path: &'a Path, bytes: &'a [u8]) -> Result<Self> {
         let (json, bin) = if recognizes_glb(bytes) { chunks(path, bytes)? } else { (bytes, None) };
         let gltf: Gltf = serde_json::from_slice(json)
@@ -72,35 +184,28 @@ impl<'a> Document<'a> {
     }
 
     /// Returns the bytes of a buffer view, and its stride if it has one.
-    ///
-    /// # Errors
-    /// Returns an error if there is no such view, or it is outside of its buffer, or the buffer can't be read.
     pub fn view(&self, index: usize) -> Result<(&[u8], Option<usize>)> {
-        let count = self.gltf.buffer_views.len();
-        let Some(view) = self.gltf.buffer_views.get(index) else {
-            return Err(self.missing("buffer view", index, count));
-        };
+        let view = self.get(&self.gltf.buffer_views, "buffer view", index)?;
         let buffer = self.buffer(view.buffer)?;
-        let bytes = buffer
-            .get(view.byte_offset..)
-            .and_then(|bytes| bytes.get(..view.byte_length))
-            .ok_or_else(|| {
-                let found = format!("{} bytes at {}", view.byte_length, view.byte_offset);
-                let expected = format!("a part of buffer {}, which has {} bytes", view.buffer, buffer.len());
-                Error::input(self.path, format!("buffer view {index}"), found, expected)
-            })?;
+        let bytes = buffer.get(view.byte_offset..).and_then(|bytes| bytes.get(..view.byte_length));
+        let bytes = bytes.ok_or_else(|| {
+            let found = format!("{} bytes at {}", view.byte_length, view.byte_offset);
+            let expected = format!("a part of buffer {}, which has {} bytes", view.buffer, buffer.len());
+            Error::input(self.path, format!("buffer view {index}"), found, expected)
+        })?;
         Ok((bytes, view.byte_stride))
     }
 
-    /// Returns the error for an index without an element.
-    pub fn missing(&self, what: &str, index: usize, count: usize) -> Error {
-        Error::input(self.path, format!("{what} {index}"), "missing", format!("an index below {count}"))
+    /// Returns the element of `list` with this index; `what` names it in the error if there is none.
+    pub fn get<'l, T>(&self, list: &'l [T], what: &str, index: usize) -> Result<&'l T> {
+        list.get(index).ok_or_else(|| {
+            let expected = format!("an index below {}", list.len());
+            Error::input(self.path, format!("{what} {index}"), "missing", expected)
+        })
     }
 
     fn buffer(&self, index: usize) -> Result<&[u8]> {
-        let Some(cell) = self.buffers.get(index) else {
-            return Err(self.missing("buffer", index, self.buffers.len()));
-        };
+        let cell = self.get(&self.buffers, "buffer", index)?;
         match cell.get() {
             Some(bytes) => Ok(bytes),
             None => {
@@ -111,54 +216,48 @@ impl<'a> Document<'a> {
     }
 
     fn read_buffer(&self, index: usize) -> Result<Cow<'a, [u8]>> {
-        let buffer = &self.gltf.buffers[index];
+        let Buffer { uri, byte_length } = &self.gltf.buffers[index];
         let field = format!("buffer {index}");
-        let (path, bytes) = match &buffer.uri {
+        let error = |found: &str, expected: &str| Error::input(self.path, &field, found, expected);
+        let mut path = self.path.to_owned();
+        let mut bytes = match uri.as_deref().map(|uri| (uri, uri.strip_prefix("data:"))) {
             None => {
-                let bin = self.bin.filter(|_| index == 0).ok_or_else(|| {
-                    Error::input(self.path, &field, "without a uri", "one, or the binary chunk of a .glb")
-                })?;
-                (self.path.to_owned(), Cow::Borrowed(bin))
+                let bin = self.bin.filter(|_| index == 0);
+                Cow::Borrowed(
+                    bin.ok_or_else(|| error("without a uri", "one, or the binary chunk of a .glb"))?,
+                )
             }
-            Some(uri) => match uri.strip_prefix("data:") {
-                Some(data) => {
-                    let bytes = data.split_once(";base64,").and_then(|(_, text)| BASE64.decode(text).ok());
-                    let bytes = bytes.ok_or_else(|| {
-                        Error::input(self.path, &field, "another or a damaged data URI", "one in base64")
-                    })?;
-                    (self.path.to_owned(), Cow::Owned(bytes))
-                }
-                None => {
-                    let file = self.relative_path(&field, uri)?;
-                    let bytes = read_file(&file, buffer.byte_length)?;
-                    (file, Cow::Owned(bytes))
-                }
-            },
+            Some((_, Some(data))) => {
+                let bytes = data.split_once(";base64,").and_then(|(_, text)| BASE64.decode(text).ok());
+                Cow::Owned(bytes.ok_or_else(|| error("another or a damaged data URI", "one in base64"))?)
+            }
+            Some((uri, None)) => {
+                path = self.relative_path(&field, uri)?;
+                Cow::Owned(read_file(&path, *byte_length)?)
+            }
         };
-        if bytes.len() < buffer.byte_length {
+        if bytes.len() < *byte_length {
             let found = format!("cut short: {} bytes", bytes.len());
-            return Err(Error::input(path, field, found, format!("{} bytes", buffer.byte_length)));
+            return Err(Error::input(path, field, found, format!("{byte_length} bytes")));
         }
-        Ok(match bytes {
-            Cow::Borrowed(bytes) => Cow::Borrowed(&bytes[..buffer.byte_length]),
-            Cow::Owned(mut bytes) => {
-                bytes.truncate(buffer.byte_length);
-                Cow::Owned(bytes)
-            }
-        })
+        match &mut bytes {
+            Cow::Borrowed(bytes) => *bytes = &bytes[..*byte_length],
+            Cow::Owned(bytes) => bytes.truncate(*byte_length),
+        }
+        Ok(bytes)
     }
 
     /// Returns the path of the file that a URI refers to.
     fn relative_path(&self, field: &str, uri: &str) -> Result<PathBuf> {
         // A colon after the first slash, or in percent-encoding, is part of a name.
         let is_url = uri.split_once(':').is_some_and(|(scheme, _)| !scheme.contains('/'));
-        let name = decode_percent(uri).filter(|name| {
+        let name = percent_decode_str(uri).decode_utf8().ok().filter(|name| {
             let is_absolute = name.starts_with(['/', '\\'])
-                || Path::new(name).components().any(|part| matches!(part, Component::Prefix(_)));
+                || Path::new(&**name).components().any(|part| matches!(part, Component::Prefix(_)));
             !(name.is_empty() || is_url || is_absolute || name.contains('\0'))
         });
         match name {
-            Some(name) => Ok(parent_of(self.path).join(name)),
+            Some(name) => Ok(parent_of(self.path).join(&*name)),
             None => {
                 let expected = "a data URI, or a path relative to the file's folder";
                 Err(Error::input(self.path, format!("the uri of {field}"), quoted(uri), expected))
@@ -174,12 +273,11 @@ pub fn quoted(text: &str) -> String {
 
 /// Returns the JSON and the binary chunk of a `.glb`.
 fn chunks<'a>(path: &Path, bytes: &'a [u8]) -> Result<(&'a [u8], Option<&'a [u8]>)> {
-    let word = |bytes: &[u8], at: usize| u32::from_le_bytes([0, 1, 2, 3].map(|byte| bytes[at + byte]));
     if bytes.len() < HEADER {
         let found = format!("{} bytes", bytes.len());
         return Err(Error::input(path, "the header", found, format!("{HEADER} bytes")));
     }
-    let (version, length) = (word(bytes, 4), word(bytes, 8));
+    let (version, length) = (u32_at(bytes, 4), u32_at(bytes, 8));
     if version != GLB_VERSION {
         return Err(Error::input(path, "the version of the .glb", version, GLB_VERSION.to_string()));
     }
@@ -190,7 +288,7 @@ fn chunks<'a>(path: &Path, bytes: &'a [u8]) -> Result<(&'a [u8], Option<&'a [u8]
     let (mut json, mut bin) = (None, None);
     while !rest.is_empty() {
         let chunk = rest.split_at_checked(CHUNK_HEADER).and_then(|(header, contents)| {
-            Some((header, contents.split_at_checked(word(header, 0) as usize)?))
+            Some((header, contents.split_at_checked(u32_at(header, 0) as usize)?))
         });
         let Some((header, (contents, after))) = chunk else {
             let found = format!("cut short: {} bytes", rest.len());
@@ -223,45 +321,4 @@ fn read_file(path: &Path, length: usize) -> Result<Vec<u8>> {
     let file = fs::File::open(path).map_err(Error::read(path))?;
     file.take(length as u64).read_to_end(&mut bytes).map_err(Error::read(path))?;
     Ok(bytes)
-}
-
-/// Decodes the percent-encoded bytes of a URI, or returns `None` if they aren't UTF-8.
-fn decode_percent(uri: &str) -> Option<String> {
-    let mut bytes = vec![];
-    let mut rest = uri.as_bytes();
-    while let Some((&byte, after)) = rest.split_first() {
-        let digits = after.get(..2).filter(|_| byte == b'%');
-        let code = digits.and_then(|digits| {
-            let value = |digit: u8| char::from(digit).to_digit(16);
-            Some(value(digits[0])? * 16 + value(digits[1])?)
-        });
-        bytes.push(code.map_or(byte, |code| code as u8));
-        rest = if code.is_some() { &after[2..] } else { after };
-    }
-    String::from_utf8(bytes).ok()
-}
-
-/// Encodes a file name as a URI.
-pub fn encode_percent(name: &str) -> String {
-    let encode = |byte: u8| match byte {
-        b'A'..=b'Z' | b'a'..=b'z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' => char::from(byte).to_string(),
-        _ => format!("%{byte:02X}"),
-    };
-    name.bytes().map(encode).collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn names_are_encoded_and_decoded() {
-        for name in ["a.bin", "my room (2).bin", "100%25.bin", "große Höhle.bin", "a:b?#&.bin"] {
-            let uri = encode_percent(name);
-            assert!(uri.is_ascii() && !uri.contains([' ', ':', '?', '#']), "{uri}");
-            assert_eq!(decode_percent(&uri).as_deref(), Some(name));
-        }
-        assert_eq!(decode_percent("a%zz%2").as_deref(), Some("a%zz%2"));
-        assert_eq!(decode_percent("%ff"), None);
-    }
 }

@@ -1,22 +1,25 @@
 //! Invalid files, and files of which only a part of the Gaussians can be drawn.
 
-mod common;
-
-use common::{
-    Random, assert_says, body_of_ply, endings, files_with_invalid_values, files_without_a_rotation,
-    random_splat, refused, refused_file, set, small_gaussians, write_changed_ply, write_ply, written,
+use super::common::{
+    ENDINGS, Random, assert_bytes_refused, assert_refused, assert_says, body_of_ply, bytes_of,
+    files_with_invalid_values, files_without_a_rotation, random_splat, read_bytes, round_trip, set,
+    small_gaussians, write_changed_ply, write_ply,
 };
 use globalsplat_splat_file::{read_splat, read_splat_without_invalid, write_splat};
 
-fn in_header(bytes: &mut Vec<u8>, from: &str, to: &str) {
+/// Replaces a part of a header.
+fn replace(bytes: &mut Vec<u8>, from: &str, to: &str) {
     let at = bytes.windows(from.len()).position(|w| w == from.as_bytes()).unwrap();
     bytes.splice(at..at + from.len(), to.bytes());
 }
 
 /// Checks the errors for files of `ending` after a change of a header, each with what is replaced, its replacement and the error.
 fn assert_headers_are_refused(ending: &str, cases: &[(&str, &str, &str)]) {
+    let whole = bytes_of(ending, &random_splat(300, 1, 9));
     for (from, to, message) in cases {
-        assert_says(&refused(ending, |bytes| in_header(bytes, from, to)), &[message]);
+        let mut bytes = whole.clone();
+        replace(&mut bytes, from, to);
+        assert_bytes_refused(ending, &bytes, &[message]);
     }
 }
 
@@ -48,12 +51,11 @@ fn bad_plys() {
         (f64::NAN, "the length of the list i in row 0 of face is NaN"),
         (1e300, "the body is cut short"),
     ] {
-        let error = refused("ply", |bytes| {
-            in_header(bytes, "element vertex", "element face 1\nproperty list double int i\nelement vertex");
-            let body = body_of_ply(bytes);
-            bytes.splice(body..body, f64::to_le_bytes(length));
-        });
-        assert_says(&error, &[message]);
+        let mut bytes = bytes_of("ply", &random_splat(3, 1, 9));
+        replace(&mut bytes, "element vertex", "element face 1\nproperty list double int i\nelement vertex");
+        let body = body_of_ply(&bytes);
+        bytes.splice(body..body, f64::to_le_bytes(length));
+        assert_bytes_refused("ply", &bytes, &[message]);
     }
 }
 
@@ -76,27 +78,18 @@ fn bad_compressed_plys() {
 
 #[test]
 fn bad_splats() {
-    assert_says(
-        &refused("splat", |bytes| bytes.truncate(33)),
-        &["the length is 33 bytes", "32 bytes for each"],
-    );
-    assert_says(&refused("splat", |bytes| bytes.clear()), &["the length is 0 bytes"]);
+    assert_bytes_refused("splat", &[0; 33], &["the length is 33 bytes", "32 bytes for each"]);
+    assert_bytes_refused("splat", &[], &["the length is 0 bytes"]);
 }
 
 /// No truncated or changed file of any format makes its reader panic, or allocate what the file can't hold.
 #[test]
 fn random_changes_are_read_or_refused() {
-    let folder = tempfile::tempdir().unwrap();
     let mut random = Random::new(8);
-    let mut files: Vec<(&str, Vec<u8>)> = endings()
-        .map(|ending| {
-            let path = written(folder.path(), &format!("whole.{ending}"), &random_splat(40, 1, 9));
-            (ending, std::fs::read(path).unwrap())
-        })
-        .collect();
-    files.push(("ksplat", include_bytes!("files/level_1.ksplat").to_vec()));
+    let splat = random_splat(40, 1, 9);
+    let mut files = Vec::from(ENDINGS.map(|ending| (ending, bytes_of(ending, &splat))));
+    files.push(("ksplat", include_bytes!("../files/level_1.ksplat").to_vec()));
     for (ending, whole) in files {
-        let path = folder.path().join(format!("a.{ending}"));
         for round in 0..100 {
             let mut bytes = whole.clone();
             // Headers are at the beginning of most files.
@@ -107,8 +100,7 @@ fn random_changes_are_read_or_refused() {
             if round % 4 == 0 {
                 bytes.truncate((random.uniform() * bytes.len() as f32) as usize);
             }
-            std::fs::write(&path, bytes).unwrap();
-            if let Err(error) = read_splat(&path) {
+            if let Err(error) = read_bytes(ending, &bytes) {
                 assert_eq!(error.to_string().lines().count(), 1, "{error}");
                 assert!(error.is_invalid_request(), "{error}");
             }
@@ -120,7 +112,7 @@ fn random_changes_are_read_or_refused() {
 #[test]
 fn numbers_that_a_format_cannot_store_are_refused() {
     let folder = tempfile::tempdir().unwrap();
-    for ending in endings() {
+    for ending in ENDINGS {
         let path = folder.path().join(format!("a.{ending}"));
         let splat = random_splat(3, 1, 1);
         let mut changed = [(); 5].map(|()| splat.clone());
@@ -148,8 +140,8 @@ fn gaussians_without_a_rotation_are_left_out() {
     assert_eq!(drawable.len(), 250);
     let expected = "the splat: 50 of 300 Gaussians are left out, whose rotations have length 0";
     assert_eq!(drawable.warnings, [expected]);
-    for ending in endings() {
-        let copy = read_splat(&written(folder.path(), &format!("a.{ending}"), &splat)).unwrap();
+    for ending in ENDINGS {
+        let copy = round_trip(ending, &splat);
         assert_eq!((copy.len(), copy.warnings.len()), (250, 0), "{ending}");
     }
     for path in &files_without_a_rotation(folder.path()) {
@@ -165,7 +157,7 @@ fn gaussians_without_a_rotation_are_left_out() {
 fn invalid_values_are_refused_or_left_out() {
     let folder = tempfile::tempdir().unwrap();
     for (path, field, property) in files_with_invalid_values(folder.path()) {
-        assert_says(&refused_file(&path), &[field, "`globalsplat convert` leaves out"]);
+        assert_refused(&path, &[field, "`globalsplat convert` leaves out"]);
         let repaired = read_splat_without_invalid(&path).unwrap();
         assert_eq!(repaired.len(), 2);
         let expected = format!(
@@ -173,8 +165,8 @@ fn invalid_values_are_refused_or_left_out() {
             path.display()
         );
         assert_eq!(repaired.warnings, [expected]);
-        for ending in endings() {
-            let copy = read_splat(&written(folder.path(), &format!("repaired.{ending}"), &repaired)).unwrap();
+        for ending in ENDINGS {
+            let copy = round_trip(ending, &repaired);
             assert_eq!((copy.len(), copy.warnings.len()), (2, 0), "{ending}");
         }
     }
@@ -198,13 +190,12 @@ fn invalid_values_are_refused_or_left_out() {
 /// An invalid bound of a chunk of a compressed PLY makes all of the chunk's Gaussians invalid.
 #[test]
 fn compressed_gaussians_without_bounds_are_left_out() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = written(folder.path(), "a.compressed.ply", &random_splat(300, 0, 4));
-    let mut bytes = std::fs::read(&path).unwrap();
+    let mut bytes = bytes_of("compressed.ply", &random_splat(300, 0, 4));
     let body = body_of_ply(&bytes);
     bytes[body + 4..][..4].copy_from_slice(&f32::NAN.to_le_bytes());
-    std::fs::write(&path, bytes).unwrap();
-    let repaired = read_splat_without_invalid(&path).unwrap();
+    let file = tempfile::NamedTempFile::with_suffix(".ply").unwrap();
+    std::fs::write(&file, bytes).unwrap();
+    let repaired = read_splat_without_invalid(file.path()).unwrap();
     assert_eq!(repaired.len(), 44);
     assert_says(&repaired.warnings[0], &["256 of 300 Gaussians are left out", ": min_y"]);
 }
@@ -219,30 +210,11 @@ fn point_clouds_are_refused() {
     columns.extend(["red", "green", "blue"].map(|name| (name, [200.; 3])));
     write_ply(&path, &columns, &["red", "green", "blue"].map(|name| (name, "uchar")));
     let message = ["points.ply: the element vertex is a point cloud, without opacity, scale_* and rot_*"];
-    assert_says(&refused_file(&path), &message);
+    assert_refused(&path, &message);
     for absent in ["opacity", "scale_0", "rot_2", "f_dc_1"] {
         let mut columns = small_gaussians();
         columns.retain(|(name, _)| *name != absent);
         write_ply(&path, &columns, &[]);
-        assert_says(&refused_file(&path), &[&format!("property {absent} is missing")]);
+        assert_refused(&path, &[&format!("property {absent} is missing")]);
     }
-}
-
-/// A build without SPZ says so, whatever the file's name, before anything is written.
-#[cfg(not(feature = "spz"))]
-#[test]
-fn spz_needs_its_feature() {
-    let folder = tempfile::tempdir().unwrap();
-    let expected = ["the format is .spz", "its feature spz"];
-    for name in ["a.spz", "a.splat"] {
-        let path = folder.path().join(name);
-        std::fs::write(&path, [0x1f, 0x8b, 8, 0]).unwrap();
-        assert_says(&refused_file(&path), &expected);
-    }
-    let path = folder.path().join("b.spz");
-    assert_says(&write_splat(&path, &random_splat(3, 0, 1)).unwrap_err().to_string(), &expected);
-    let error = globalsplat_splat_file::check_writable_splat(&path).unwrap_err();
-    assert_says(&error.to_string(), &expected);
-    assert_says(&globalsplat_splat_file::limits_of(&path).unwrap_err().to_string(), &expected);
-    assert!(!path.exists());
 }

@@ -1,26 +1,22 @@
 //! SPZ: its bytes, older versions, and invalid files.
-#![cfg(feature = "spz")]
 
-mod common;
-
-use common::{assert_says, largest_error, random_splat, refused, refused_file, written};
-use globalsplat_splat_file::{
-    Splat, WriteOptions, read_splat, read_splat_without_invalid, write_local_splat_with, write_splat,
+use super::common::{
+    assert_bytes_refused, assert_says, bytes_of, largest_error, random_splat, read_bytes, round_trip,
 };
+use globalsplat_splat_file::{Splat, WriteOptions, write_local_splat_with, write_splat};
 use std::io::{Read, Write};
-use std::path::{Path, PathBuf};
 
-/// Writes `splat` as an SPZ of a version and returns its path.
-fn written_version(folder: &Path, spz_version: u32, splat: &Splat) -> PathBuf {
-    let path = folder.join(format!("{spz_version}.spz"));
+/// Returns the bytes of an SPZ of a version.
+fn bytes_of_version(spz_version: u32, splat: &Splat) -> Vec<u8> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.spz");
     write_local_splat_with(&path, splat, &WriteOptions { spz_version }).unwrap();
-    path
+    std::fs::read(path).unwrap()
 }
 
 /// An SPZ file has the values of the first Gaussian at the offsets of SPZ's documentation.
 #[test]
 fn an_spz_is_as_documented() {
-    let folder = tempfile::tempdir().unwrap();
     let splat = Splat::new(
         1,
         vec![[1., 2., 3.]],
@@ -30,8 +26,7 @@ fn an_spz_is_as_documented() {
         vec![[0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]],
     )
     .unwrap();
-    let bytes = std::fs::read(written_version(folder.path(), 3, &splat)).unwrap();
-    let unfolded = ungzip(&bytes);
+    let unfolded = ungzip(&bytes_of_version(3, &splat));
     assert_eq!(unfolded[..4], *b"NGSP");
     assert_eq!(unfolded[4..16], [3, 0, 0, 0, 1, 0, 0, 0, 1, 21, 0, 0], "version, Gaussians, degree, bits");
     // Niantic's library gives these bytes for these values, except for positions, which it stores with 12 fractional bits, and
@@ -42,13 +37,13 @@ fn an_spz_is_as_documented() {
     let fixed = |at: usize| i32::from_le_bytes([0, unfolded[at], unfolded[at + 1], unfolded[at + 2]]) >> 8;
     assert_eq!([16, 19, 22].map(fixed), [1 << 21, -(2 << 21), -(3 << 21)]);
     // Version 2 differs in its rotations, a byte for each of x, y and z.
-    let older = ungzip(&std::fs::read(written_version(folder.path(), 2, &splat)).unwrap());
+    let older = ungzip(&bytes_of_version(2, &splat));
     assert_eq!(older[4], 2);
     assert_eq!(older[5..32], unfolded[5..32]);
     assert_eq!(older[32..35], hex("8d6558"));
     assert_eq!(older[35..], unfolded[36..]);
     // Version 4 has the same streams, each by itself in Zstandard, after a header of 32 bytes and a table of contents.
-    let newest = std::fs::read(written(folder.path(), "one.spz", &splat)).unwrap();
+    let newest = bytes_of("spz", &splat);
     assert_eq!(newest[..16], [&unfolded[..4], &[4, 0, 0, 0], &unfolded[8..15], &[6]].concat());
     assert_eq!(newest[16..32], [&[32u8][..], &[0; 15]].concat());
     let word = |at: usize| u64::from_le_bytes(newest[at..at + 8].try_into().unwrap()) as usize;
@@ -61,25 +56,24 @@ fn an_spz_is_as_documented() {
         at += word(entry);
     }
     assert_eq!((at, &streams[..]), (newest.len(), &unfolded[16..]));
-    let flat = std::fs::read(written(folder.path(), "flat.spz", &splat.with_sh_degree(0))).unwrap();
+    let flat = bytes_of("spz", &splat.with_sh_degree(0));
     assert_eq!(flat[15], 5, "no stream of coefficients");
 }
 
 /// Each version that is written gives the same Gaussians when it is read, up to version 2's rotations.
 #[test]
 fn all_versions_are_written() {
-    let folder = tempfile::tempdir().unwrap();
     let splat = random_splat(300, 3, 4);
     let [two, three, four] =
-        [2, 3, 4].map(|version| read_splat(&written_version(folder.path(), version, &splat)).unwrap());
+        [2, 3, 4].map(|version| read_bytes("spz", &bytes_of_version(version, &splat)).unwrap());
     assert_eq!(three, four);
     let product = |(a, b): (&[f32; 4], &[f32; 4])| a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>().abs();
     let closeness = two.quaternions.iter().zip(&four.quaternions).map(product).fold(1f32, f32::min);
     assert!(closeness > 0.995 && closeness < 1., "{closeness}");
     assert_eq!(Splat { quaternions: four.quaternions.clone(), ..two }, four);
     for spz_version in [1, 5] {
-        let path = folder.path().join("none.spz");
-        let error = write_local_splat_with(&path, &splat, &WriteOptions { spz_version }).unwrap_err();
+        let path = std::path::Path::new("none.spz");
+        let error = write_local_splat_with(path, &splat, &WriteOptions { spz_version }).unwrap_err();
         assert_says(&error.to_string(), &["the version of SPZ", "expected 2 to 4"]);
         assert!(!path.exists());
     }
@@ -99,7 +93,6 @@ fn hex(text: &str) -> Vec<u8> {
 /// Each of the four versions of SPZ gives the same Gaussian, from bytes written by the format's documentation.
 #[test]
 fn older_versions_of_spz_are_read() {
-    let folder = tempfile::tempdir().unwrap();
     let head = |version: u8| [b"NGSP", &[version, 0, 0, 0, 1, 0, 0, 0, 1, 12, 0, 0][..]].concat();
     let shape = hex("9f83878b908070");
     let harmonics = hex("706858504030d8e8f0");
@@ -117,9 +110,7 @@ fn older_versions_of_spz_are_read() {
          d2004210000de52aac428b52ffd2009490000706858504030d8e8f0",
     );
     for (version, bytes) in [(1, gzip(&one)), (2, gzip(&two)), (3, gzip(&three)), (4, four)] {
-        let path = folder.path().join(format!("{version}.spz"));
-        std::fs::write(&path, bytes).unwrap();
-        let splat = read_splat(&path).unwrap_or_else(|e| panic!("{e}"));
+        let splat = read_bytes("spz", &bytes).unwrap_or_else(|e| panic!("{e}"));
         let near = |found: &[f32], expected: &[f32], step: f64| {
             let error = largest_error(found, expected);
             assert!(error <= step, "version {version}: {found:?}, not {expected:?}");
@@ -143,17 +134,14 @@ fn gzip(bytes: &[u8]) -> Vec<u8> {
 /// The axes that an extension of an SPZ names are applied: here those of PLYs, for which no sign changes.
 #[test]
 fn the_axes_of_an_spz_are_applied() {
-    let folder = tempfile::tempdir().unwrap();
     let with_axes = |number: u32| {
         let head = [b"NGSP", &[3, 0, 0, 0, 1, 0, 0, 0, 1, 12, 2, 0][..]].concat();
         let extension = [0xADBE_0003u32, 4, number].map(u32::to_le_bytes).concat();
         let unknown = [0x1234_0001u32, 4, 0].map(u32::to_le_bytes).concat();
         let streams = hex("00100000e0ff00d0ff9f83878b908070de52aac4706858504030d8e8f0");
-        let path = folder.path().join(format!("{number}.spz"));
-        std::fs::write(&path, gzip(&[head, streams, unknown, extension].concat())).unwrap();
-        path
+        gzip(&[head, streams, unknown, extension].concat())
     };
-    let [rub, rdf] = [4, 6].map(|number| read_splat(&with_axes(number)).unwrap());
+    let [rub, rdf] = [4, 6].map(|number| read_bytes("spz", &with_axes(number)).unwrap());
     let [x, y, z] = rub.means[0];
     assert_eq!(rdf.means[0], [x, -y, -z]);
     // The order of degree 1 is y, z, x.
@@ -162,26 +150,13 @@ fn the_axes_of_an_spz_are_applied() {
     assert_eq!(rdf.sh, turned.collect::<Vec<_>>());
     let [w, x, y, z] = rub.quaternions[0];
     assert_eq!(rdf.quaternions[0], [w, x, -y, -z]);
-    assert_says(&refused_file(&with_axes(9)), &["the coordinate system is 9", "1 to 8"]);
+    assert_bytes_refused("spz", &with_axes(9), &["the coordinate system is 9", "1 to 8"]);
 }
 
 #[test]
 fn bad_spzs() {
-    let folder = tempfile::tempdir().unwrap();
-    let gzipped = std::fs::read(written_version(folder.path(), 3, &random_splat(300, 1, 9))).unwrap();
-    let unfolded = |change: &dyn Fn(&mut Vec<u8>)| {
-        refused("spz", |bytes| {
-            let mut inside = ungzip(&gzipped);
-            change(&mut inside);
-            *bytes = gzip(&inside);
-        })
-    };
-    let changed = |change: &dyn Fn(&mut Vec<u8>)| {
-        refused("spz", |bytes| {
-            *bytes = gzipped.clone();
-            change(bytes);
-        })
-    };
+    let gzipped = bytes_of_version(3, &random_splat(300, 1, 9));
+    let unfolded = ungzip(&gzipped);
     for (at, byte, message) in [
         (0, b'n', "the first bytes is"),
         (4, 5, "the version is 5, expected 1 to 4"),
@@ -191,46 +166,50 @@ fn bad_spzs() {
         (8, 45, "the body is cut short"),
         (11, 59, "256 times the file's bytes"),
     ] {
-        assert_says(&unfolded(&|inside| inside[at] = byte), &[message]);
+        let mut inside = unfolded.clone();
+        inside[at] = byte;
+        assert_bytes_refused("spz", &gzip(&inside), &[message]);
     }
-    assert_says(&unfolded(&|inside| inside.truncate(9)), &["the header is 9 bytes"]);
-    let bomb = unfolded(&|inside| {
-        inside[8..12].copy_from_slice(&200_000u32.to_le_bytes());
-        inside.resize(6_000_000, 0);
-    });
-    assert_says(&bomb, &["the number of Gaussians is 200000", "256 times the file's bytes"]);
-    let extension = unfolded(&|inside| {
-        inside[14] = 2;
-        inside.extend([3, 0, 0xbe, 0xad, 9, 0, 0, 0, 6]);
-    });
-    assert_says(&extension, &["an extension is cut short: 1 bytes, expected 9 bytes"]);
-    assert_says(&changed(&|bytes| bytes.truncate(100)), &["damaged", "a whole gzip"]);
-    assert_says(&changed(&|bytes| *bytes.last_mut().unwrap() ^= 1), &["the end is damaged"]);
-    assert_says(&refused("spz", |bytes| *bytes = b"no gzip".to_vec()), &["the file is no SPZ"]);
+    assert_bytes_refused("spz", &gzip(&unfolded[..9]), &["the header is 9 bytes"]);
+    let mut bomb = unfolded.clone();
+    bomb[8..12].copy_from_slice(&200_000u32.to_le_bytes());
+    bomb.resize(6_000_000, 0);
+    let message = ["the number of Gaussians is 200000", "256 times the file's bytes"];
+    assert_bytes_refused("spz", &gzip(&bomb), &message);
+    let mut extended = [unfolded, vec![3, 0, 0xbe, 0xad, 9, 0, 0, 0, 6]].concat();
+    extended[14] = 2;
+    let message = ["an extension is cut short: 1 bytes, expected 9 bytes"];
+    assert_bytes_refused("spz", &gzip(&extended), &message);
+    assert_bytes_refused("spz", &gzipped[..100], &["damaged", "a whole gzip"]);
+    let mut damaged = gzipped.clone();
+    *damaged.last_mut().unwrap() ^= 1;
+    assert_bytes_refused("spz", &damaged, &["the end is damaged"]);
+    assert_bytes_refused("spz", b"no gzip", &["the file is no SPZ"]);
 }
 
 /// A table of contents that doesn't match the data is refused.
 #[test]
 fn bad_spzs_of_version_4() {
-    let plain = |change: &dyn Fn(&mut Vec<u8>)| {
-        refused("spz", |bytes| {
-            let head = [b"NGSP", &[4, 0, 0, 0, 1, 0, 0, 0, 0, 12, 0, 5, 32, 0, 0, 0][..], &[0; 12]].concat();
-            let streams = [9, 1, 3, 3, 4].map(|length| zstd::encode_all(&vec![128; length][..], 1).unwrap());
-            let entries = streams.iter().flat_map(|one| [(one.len() as u64).to_le_bytes(), [0; 8]].concat());
-            *bytes = [head, entries.collect(), streams.concat()].concat();
-            change(bytes);
-        })
-    };
-    assert_says(&plain(&|bytes| bytes[4] = 3), &["the version outside of gzip is 3, expected 4"]);
-    assert_says(&plain(&|bytes| bytes.truncate(20)), &["the header is 20 bytes, expected 32"]);
-    assert_says(&plain(&|bytes| bytes[15] = 200), &["the table of contents is at 32", "200 entries"]);
-    assert_says(&plain(&|bytes| bytes[16..20].fill(255)), &["the table of contents is at 4294967295"]);
-    assert_says(&plain(&|bytes| bytes[15] = 4), &["stream"]);
-    assert_says(&plain(&|bytes| bytes[32..40].fill(255)), &["stream 0 is cut short"]);
-    assert_says(&plain(&|bytes| bytes[8] = 2), &["stream 0 is 9 bytes or more, expected 18 bytes for 2"]);
-    assert_says(&plain(&|bytes| bytes[12] = 1), &["stream 5 is missing, expected one of 9 bytes"]);
-    assert_says(&plain(&|bytes| bytes[32 + 5 * 16] = 0), &["stream 0 is damaged"]);
-    assert_says(&plain(&|bytes| bytes[8..12].fill(255)), &["the number of Gaussians is 4294967295"]);
+    let head = [b"NGSP", &[4, 0, 0, 0, 1, 0, 0, 0, 0, 12, 0, 5, 32, 0, 0, 0][..], &[0; 12]].concat();
+    let streams = [9, 1, 3, 3, 4].map(|length| zstd::encode_all(&vec![128; length][..], 1).unwrap());
+    let entries = streams.iter().flat_map(|one| [(one.len() as u64).to_le_bytes(), [0; 8]].concat());
+    let whole = [head, entries.collect(), streams.concat()].concat();
+    assert_bytes_refused("spz", &whole[..20], &["the header is 20 bytes, expected 32"]);
+    for (at, bytes, message) in [
+        (4, &[3][..], "the version outside of gzip is 3, expected 4"),
+        (15, &[200], "the table of contents is at 32, expected 200 entries"),
+        (16, &[255; 4], "the table of contents is at 4294967295"),
+        (15, &[4], "stream"),
+        (32, &[255; 8], "stream 0 is cut short"),
+        (8, &[2], "stream 0 is 9 bytes or more, expected 18 bytes for 2"),
+        (12, &[1], "stream 5 is missing, expected one of 9 bytes"),
+        (32 + 5 * 16, &[0], "stream 0 is damaged"),
+        (8, &[255; 4], "the number of Gaussians is 4294967295"),
+    ] {
+        let mut changed = whole.clone();
+        changed[at..][..bytes.len()].copy_from_slice(bytes);
+        assert_bytes_refused("spz", &changed, &[message]);
+    }
 }
 
 /// Positions that 24 bits can't hold are refused, and nothing is written. Values that nearly exceed the range are as exact as 24 bits
@@ -244,27 +223,17 @@ fn positions_have_24_bits() {
     assert_says(&error, &["a coordinate is 10000000, expected at most 8388607"]);
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
     far.means[1] = [-8_388_000.; 3];
-    let near = read_splat(&written(folder.path(), "a.spz", &far)).unwrap();
+    let near = round_trip("spz", &far);
     assert!(largest_error(near.means.as_flattened(), far.means.as_flattened()) <= 0.5);
 }
 
 /// The oldest version has half-precision floats, which needn't be finite.
 #[test]
 fn positions_of_version_1_are_checked() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("half.spz");
-    std::fs::write(&path, gzip(&half_precision())).unwrap();
-    let message = ["the position of Gaussian 1 is NaN", "`globalsplat convert` leaves out"];
-    assert_says(&refused_file(&path), &message);
-    let repaired = read_splat_without_invalid(&path).unwrap();
-    assert_eq!(repaired.len(), 2);
-    assert_says(&repaired.warnings[0], &["1 of 3 Gaussians are left out", ": position"]);
-}
-
-/// Returns the decompressed contents of an SPZ of version 1, in which one of three Gaussians has a NaN.
-fn half_precision() -> Vec<u8> {
     let head = [b"NGSP", &[1, 0, 0, 0, 3, 0, 0, 0, 0, 12, 0, 0][..]].concat();
     let halves = [0x3c00u16, 0x3c00, 0x4400, 0x3c00, 0x7e00, 0x4400, 0xbc00, 0x3c00, 0x4400];
     let rest = [vec![200; 3], vec![128; 9], vec![130; 9], vec![128; 9]].concat();
-    [head, halves.map(u16::to_le_bytes).concat(), rest].concat()
+    let bytes = gzip(&[head, halves.map(u16::to_le_bytes).concat(), rest].concat());
+    let message = ["the position of Gaussian 1 is NaN", "`globalsplat convert` leaves out"];
+    assert_bytes_refused("spz", &bytes, &message);
 }

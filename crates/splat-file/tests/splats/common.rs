@@ -1,16 +1,11 @@
 //! Test utilities: splats, files that other programs would write, and checks of error messages.
-#![allow(dead_code)] // every test binary uses only a part
+#![allow(dead_code)] // the program's tests use only a part
 
-use globalsplat_splat_file::{Splat, limits_of, read_splat, write_splat};
+use globalsplat_splat_file::{Error, SH_C0, Splat, read_splat, write_splat};
 use std::path::{Path, PathBuf};
 
 /// Extensions of all formats that are written.
 pub const ENDINGS: [&str; 7] = ["ply", "compressed.ply", "sog", "spz", "splat", "glb", "gltf"];
-
-/// Returns the extensions of the formats that this build writes.
-pub fn endings() -> impl Iterator<Item = &'static str> {
-    ENDINGS.into_iter().filter(|ending| limits_of(Path::new(&format!("a.{ending}"))).is_ok())
-}
 
 /// Random numbers (SplitMix64).
 pub struct Random(u64);
@@ -65,32 +60,142 @@ pub fn largest_error(a: &[f32], b: &[f32]) -> f64 {
     a.iter().zip(b).map(|(a, b)| (f64::from(*a) - f64::from(*b)).abs()).fold(0., f64::max)
 }
 
+/// Returns the difference between rotations, from quaternions of any length; q and −q are the same rotation.
+fn rotation_error(a: &Splat, b: &Splat) -> f64 {
+    let unit = |quaternion: &[f32; 4]| {
+        let length = quaternion.iter().map(|&part| f64::from(part).powi(2)).sum::<f64>().sqrt();
+        quaternion.map(|part| f64::from(part) / length)
+    };
+    let errors = a.quaternions.iter().zip(&b.quaternions).map(|(a, b)| {
+        let (a, b) = (unit(a), unit(b));
+        let sign = a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>().signum();
+        a.iter().zip(b).map(|(a, b)| (a - sign * b).abs()).fold(0., f64::max)
+    });
+    errors.fold(0., f64::max)
+}
+
+/// Reorders the Gaussians of `to` to match `from`, each to its nearest.
+pub fn matched(from: &Splat, to: &Splat) -> Splat {
+    let distance =
+        |a: &[f32; 3], b: &[f32; 3]| -> f32 { a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum() };
+    let nearest: Vec<usize> = from
+        .means
+        .iter()
+        .map(|mean| {
+            let nearer = |a: &usize, b: &usize| {
+                distance(mean, &to.means[*a]).total_cmp(&distance(mean, &to.means[*b]))
+            };
+            (0..to.len()).min_by(nearer).expect("a Gaussian")
+        })
+        .collect();
+    let mut distinct = nearest.clone();
+    distinct.sort_unstable();
+    distinct.dedup();
+    assert_eq!(distinct.len(), nearest.len(), "each to another");
+    to.select(&nearest)
+}
+
+/// Returns the coefficients of the bases from `from` up to `to`.
+pub fn bases(splat: &Splat, from: usize, to: usize) -> Vec<f32> {
+    let range = from.min(splat.bases())..to.min(splat.bases());
+    (0..splat.len()).flat_map(|index| splat.sh_of(index)[range.clone()].as_flattened()).copied().collect()
+}
+
+/// Checks that the quantization errors are at most those of [`max_errors`].
+pub fn assert_within(what: &str, original: &Splat, copy: &Splat, max_errors: [f64; 7]) {
+    let (a, b) = (original, &matched(original, copy));
+    let opacities = |splat: &Splat| (0..splat.len()).map(|index| splat.opacity(index)).collect::<Vec<_>>();
+    let errors = [
+        ("means", largest_error(a.means.as_flattened(), b.means.as_flattened())),
+        ("log scales", largest_error(a.log_scales.as_flattened(), b.log_scales.as_flattened())),
+        ("quaternions", rotation_error(a, b)),
+        ("opacities", largest_error(&opacities(a), &opacities(b))),
+        ("degree 0", largest_error(&bases(a, 0, 1), &bases(b, 0, 1))),
+        ("degree 1", largest_error(&bases(a, 1, 4), &bases(b, 1, 4))),
+        ("degrees 2 and 3", largest_error(&bases(a, 4, 16), &bases(b, 4, 16))),
+    ];
+    for ((name, error), max) in errors.into_iter().zip(max_errors) {
+        assert!(error <= max, "{what}: {name} are off by {error}, {max} at most");
+    }
+}
+
+/// Returns the maximum quantization errors of a format, half a step with a margin for float32: of positions, logarithms of scales,
+/// quaternions, opacities, SH of degree 0, of degree 1 and of higher degrees.
+pub fn max_errors(ending: &str) -> [f64; 7] {
+    match ending {
+        "ply" => [0.; 7],
+        // Steps are fractions of the Gaussians' bounds, which are 6 wide in positions, 2 in logarithms, 1.8·C0 and more in colors.
+        "compressed.ply" => {
+            [3.1 / 1023., 1.01 / 1023., 0.0028, 0.51 / 255., 0.91 / 255., 0.5 / 32. + 1e-6, 0.5 / 32. + 1e-6]
+        }
+        // Positions are at most 9, in 65,535 steps of 4.5 in their logarithms; rotations have eight bits of ±1/√2; the codebooks
+        // have 256 values for 6 in the most dense part, and about as many for all colors and coefficients.
+        "sog" => [4.5 * 10. / 65_535., 0.02, 0.006, 0.51 / 255., 0.02, 0.02, 0.02],
+        // The largest position, 9, is below 2^23 / 2^19; rotations have nine bits of 1/√2.
+        "spz" => [
+            0.5 / f64::from(1 << 19) + 1e-6,
+            0.5 / 16. + 1e-6,
+            0.0028,
+            0.51 / 255.,
+            0.51 / 255. / 0.15,
+            0.5 / 128. + 1e-6,
+            0.5 / 64. + 1e-6,
+        ],
+        // Scales and opacities are linear, colors unlimited, all in float32.
+        "glb" | "gltf" => [0., 1e-6, 1e-6, 1e-7, 0., 0., 0.],
+        _ => [0., 1e-6, 0.012, 0.51 / 255., 0.51 / 255. / SH_C0, 0., 0.],
+    }
+}
+
 /// Checks that `error` contains all of `parts`.
+#[track_caller]
 pub fn assert_says(error: &str, parts: &[&str]) {
     for part in parts {
         assert!(error.contains(part), "{part:?} is not in: {error}");
     }
 }
 
-/// Returns the one-sentence error with which the file at `path` is refused, as a wrong request.
-pub fn refused_file(path: &Path) -> String {
-    let error = read_splat(path).expect_err("an invalid file");
+/// Writes `splat` to a file of the format `ending` and reads it again.
+pub fn round_trip(ending: &str, splat: &Splat) -> Splat {
+    let folder = tempfile::tempdir().unwrap();
+    read_splat(&written(folder.path(), &format!("a.{ending}"), splat)).unwrap()
+}
+
+/// Returns the bytes of a file of the format `ending`.
+pub fn bytes_of(ending: &str, splat: &Splat) -> Vec<u8> {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::read(written(folder.path(), &format!("a.{ending}"), splat)).unwrap()
+}
+
+/// Reads a file of the format `ending` with these bytes.
+pub fn read_bytes(ending: &str, bytes: &[u8]) -> Result<Splat, Error> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(format!("a.{ending}"));
+    std::fs::write(&path, bytes).unwrap();
+    read_splat(&path)
+}
+
+/// Returns the one-sentence message of an error, which is a wrong request.
+pub fn refusal(read: Result<Splat, Error>) -> String {
+    let error = read.expect_err("an invalid file");
     assert!(error.is_invalid_request(), "{error}");
     let text = error.to_string();
     assert_eq!(text.lines().count(), 1, "one sentence: {text}");
     text
 }
 
-/// Returns the error message for a file of `ending` whose bytes are changed.
-pub fn refused(ending: &str, change: impl FnOnce(&mut Vec<u8>)) -> String {
-    let folder = tempfile::tempdir().unwrap();
-    let path = written(folder.path(), &format!("broken.{ending}"), &random_splat(300, 1, 9));
-    let mut bytes = std::fs::read(&path).unwrap();
-    change(&mut bytes);
-    std::fs::write(&path, bytes).unwrap();
-    let error = refused_file(&path);
-    assert_says(&error, &[&format!("broken.{ending}: ")]);
-    error
+/// Checks that the file at `path` is refused with a message that contains all of `parts`.
+#[track_caller]
+pub fn assert_refused(path: &Path, parts: &[&str]) {
+    assert_says(&refusal(read_splat(path)), parts);
+}
+
+/// Checks that a file of the format `ending` with these bytes is refused with a message that contains all of `parts`.
+#[track_caller]
+pub fn assert_bytes_refused(ending: &str, bytes: &[u8], parts: &[&str]) {
+    let error = refusal(read_bytes(ending, bytes));
+    assert_says(&error, &[&format!("a.{ending}: ")]);
+    assert_says(&error, parts);
 }
 
 /// Returns the offset of the first byte after the header of a PLY.
@@ -164,16 +269,16 @@ pub fn files_with_invalid_values(folder: &Path) -> Vec<(PathBuf, &'static str, &
     })
     .collect();
     // .splat files have no property names.
-    let dot_splat = |name: &str, at: usize, value: f32| {
-        let path = written(folder, name, &random_splat(3, 0, 1));
-        let mut bytes = std::fs::read(&path).unwrap();
+    for (name, at, value, property) in [
+        ("position.splat", 4, f32::NAN, "position"),
+        ("infinite.splat", 12, f32::INFINITY, "scale"),
+        ("negative.splat", 20, -0.1, "scale"),
+    ] {
+        let mut bytes = bytes_of("splat", &random_splat(3, 0, 1));
         bytes[32 + at..][..4].copy_from_slice(&value.to_le_bytes());
-        std::fs::write(&path, bytes).unwrap();
-        path
-    };
-    cases.push((dot_splat("position.splat", 4, f32::NAN), "the position", "position"));
-    cases.push((dot_splat("infinite.splat", 12, f32::INFINITY), "the scale", "scale"));
-    cases.push((dot_splat("negative.splat", 20, -0.1), "the scale", "scale"));
+        std::fs::write(folder.join(name), bytes).unwrap();
+        cases.push((folder.join(name), property, property));
+    }
     cases
 }
 
@@ -184,8 +289,8 @@ pub fn files_without_a_rotation(folder: &Path) -> [PathBuf; 2] {
     let mut columns = small_gaussians();
     columns.iter_mut().filter(|(name, _)| name.starts_with("rot")).for_each(|(_, values)| values[1] = 1e-40);
     write_ply(&ply, &columns, &[]);
-    let dot_splat = written(folder, "zero.splat", &random_splat(3, 0, 1));
-    let mut bytes = std::fs::read(&dot_splat).unwrap();
+    let dot_splat = folder.join("zero.splat");
+    let mut bytes = bytes_of("splat", &random_splat(3, 0, 1));
     bytes[32 + 28..64].fill(128);
     std::fs::write(&dot_splat, bytes).unwrap();
     [ply, dot_splat]
@@ -193,13 +298,9 @@ pub fn files_without_a_rotation(folder: &Path) -> [PathBuf; 2] {
 
 /// Writes a PLY of [`small_gaussians`] with spherical harmonics of degree 1, after `change`.
 pub fn write_changed_ply(folder: &Path, name: &str, change: impl FnOnce(&mut Columns)) -> PathBuf {
-    const REST: [&str; 9] = [
-        "f_rest_0", "f_rest_1", "f_rest_2", "f_rest_3", "f_rest_4", "f_rest_5", "f_rest_6", "f_rest_7",
-        "f_rest_8",
-    ];
     let path = folder.join(name);
     let mut columns = small_gaussians();
-    columns.extend(REST.map(|name| (name, [if name == "f_rest_0" { 0.1 } else { 0. }; 3])));
+    columns.extend((0..9).map(|k| (&*format!("f_rest_{k}").leak(), [if k == 0 { 0.1 } else { 0. }; 3])));
     change(&mut columns);
     write_ply(&path, &columns, &[]);
     path
@@ -208,13 +309,4 @@ pub fn write_changed_ply(folder: &Path, name: &str, change: impl FnOnce(&mut Col
 /// Sets a value of the property `name`.
 pub fn set(columns: &mut Columns, name: &str, row: usize, value: f64) {
     columns.iter_mut().find(|(own, _)| *own == name).unwrap().1[row] = value;
-}
-
-/// Writes `surfels.ply`, a 2DGS splat of [`small_gaussians`], which has no third scale, and returns its path.
-pub fn write_surfels(folder: &Path) -> PathBuf {
-    let mut columns = small_gaussians();
-    columns.retain(|(name, _)| *name != "scale_2");
-    let path = folder.join("surfels.ply");
-    write_ply(&path, &columns, &[]);
-    path
 }

@@ -3,20 +3,10 @@
 use globalsplat_torch_file::{Array, Dtype, TensorView, TorchFile, Value, write_checkpoint};
 use std::collections::HashMap;
 
-const DTYPES: [Dtype; 12] = [
-    Dtype::U8,
-    Dtype::I8,
-    Dtype::I16,
-    Dtype::I32,
-    Dtype::I64,
-    Dtype::F16,
-    Dtype::BF16,
-    Dtype::F32,
-    Dtype::F64,
-    Dtype::Bool,
-    Dtype::C64,
-    Dtype::C128,
-];
+const DTYPES: [Dtype; 11] = {
+    use Dtype::*;
+    [U8, I8, I16, I32, I64, F16, BF16, F32, F64, BOOL, C64]
+};
 
 #[test]
 fn checkpoints_are_read_as_they_were_written() {
@@ -24,7 +14,7 @@ fn checkpoints_are_read_as_they_were_written() {
     let path = folder.path().join("model.ckpt");
     let names: Vec<String> = DTYPES.iter().map(|dtype| format!("a {dtype}")).collect();
     let contents: Vec<Vec<u8>> =
-        DTYPES.iter().map(|dtype| (0..6 * dtype.size()).map(|i| i as u8).collect()).collect();
+        DTYPES.iter().map(|dtype| (0..6 * dtype.bitsize() / 8).map(|i| i as u8).collect()).collect();
     let mut tensors: Vec<TensorView> = names
         .iter()
         .zip(DTYPES)
@@ -66,7 +56,7 @@ fn tensors_that_cannot_be_stored_are_refused() {
         let tensor = TensorView { name: "a", dtype, shape, bytes };
         write_checkpoint(&path, &[tensor], &HashMap::new()).unwrap_err().to_string()
     };
-    assert_eq!(refuse(Dtype::QI8, &[1], &[0]), "tensors of type QI8 are not stored");
+    assert_eq!(refuse(Dtype::U64, &[1], &[0; 8]), "tensors of type U64 are not stored");
     assert_eq!(refuse(Dtype::F32, &[2], &[0; 7]), "tensor a has 7 bytes for F32 [2]");
     assert!(refuse(Dtype::F32, &[usize::MAX, 4], &[0; 7]).contains("has 7 bytes"));
     assert!(!path.exists());

@@ -1,68 +1,56 @@
 //! Values that the properties and bytes of files stand for.
 
-mod common;
-
-use common::{
-    assert_says, body_of_ply, largest_error, random_splat, refused_file, small_gaussians, write_ply,
-    write_surfels, written,
+use super::common::{
+    assert_bytes_refused, assert_says, body_of_ply, bytes_of, largest_error, random_splat, read_bytes,
+    round_trip, small_gaussians, write_ply,
 };
 use globalsplat_splat_file::{MIN_SCALE, OPACITY_MARGIN, SH_C0, read_splat};
 
 /// A PLY is read identically as text, in both byte orders, and with all other elements that it may contain.
 #[test]
 fn a_ply_is_read_however_it_is_written() {
-    let folder = tempfile::tempdir().unwrap();
     let splat = random_splat(3, 1, 5);
-    let plain = std::fs::read(written(folder.path(), "plain.ply", &splat)).unwrap();
+    let plain = bytes_of("ply", &splat);
     let end = body_of_ply(&plain);
     let names: Vec<String> = String::from_utf8_lossy(&plain[..end])
         .lines()
         .filter_map(|line| Some(line.strip_prefix("property float ")?.to_string()))
         .collect();
     let numbers: Vec<f32> = plain[end..].as_chunks().0.iter().map(|&four| f32::from_le_bytes(four)).collect();
-    let order: Vec<usize> = (0..names.len()).rev().collect();
     for encoding in ["ascii", "binary_little_endian", "binary_big_endian"] {
-        let (text, big) = (encoding == "ascii", encoding == "binary_big_endian");
         let mut header =
             format!("ply\r\nformat {encoding} 1.0\r\ncomment end_header of element vertex 7\r\n");
         header += "element camera 2\r\nproperty list uchar short matrix\r\nproperty double focal\r\n";
         header += "element vertex 3\r\n";
-        for &column in &order {
-            header +=
-                &format!("property double {}\r\nproperty list int uchar more_{column}\r\n", names[column]);
+        for (column, name) in names.iter().enumerate().rev() {
+            header += &format!("property double {name}\r\nproperty list int uchar more_{column}\r\n");
         }
         header += "element face 1\r\nproperty list uchar int vertex_indices\r\nend_header\r\n";
         let mut bytes = header.into_bytes();
-        let mut put = |number: f64, size: usize, integer: bool| {
-            if text {
-                bytes.extend(format!("{number}\n ").bytes());
-                return;
+        // Appends a double, or an integer of a number of bytes.
+        let mut put = |number: f64, integer: Option<usize>| {
+            let mut one = integer.map_or(number.to_le_bytes(), |_| (number as i64).to_le_bytes());
+            let one = &mut one[..integer.unwrap_or(8)];
+            match encoding {
+                "ascii" => return bytes.extend(format!("{number}\n ").bytes()),
+                "binary_big_endian" => one.reverse(),
+                _ => {}
             }
-            let mut one = if integer { (number as i64).to_le_bytes() } else { number.to_le_bytes() };
-            if big {
-                one[..size].reverse();
-            }
-            bytes.extend(&one[..size]);
+            bytes.extend(&*one);
         };
         for length in [3, 0] {
-            put(f64::from(length), 1, true);
-            (0..length).for_each(|k| put(f64::from(k - 1), 2, true));
-            put(1.5, 8, false);
+            put(f64::from(length), Some(1));
+            (0..length).for_each(|k| put(f64::from(k - 1), Some(2)));
+            put(1.5, None);
         }
-        for row in 0..3 {
-            for &column in &order {
-                put(f64::from(numbers[row * names.len() + column]), 8, false);
-                put(2., 4, true);
-                put(200., 1, true);
-                put(7., 1, true);
-            }
+        for &number in numbers.chunks(names.len()).flat_map(|row| row.iter().rev()) {
+            put(f64::from(number), None);
+            [(2., 4), (200., 1), (7., 1)].into_iter().for_each(|(number, size)| put(number, Some(size)));
         }
-        put(1., 1, true);
-        put(-2., 4, true);
-        let path = folder.path().join("other.ply");
-        std::fs::write(&path, &bytes).unwrap();
-        let original = read_splat(&folder.path().join("plain.ply")).unwrap();
-        assert_eq!(read_splat(&path).unwrap(), original, "{encoding}");
+        put(1., Some(1));
+        put(-2., Some(4));
+        let read = read_bytes("ply", &bytes).unwrap();
+        assert_eq!(read, read_bytes("ply", &plain).unwrap(), "{encoding}");
     }
 }
 
@@ -70,9 +58,7 @@ fn a_ply_is_read_however_it_is_written() {
 /// are kept in memory, and written as finite numbers.
 #[test]
 fn infinite_logits_are_opacities_of_0_and_1() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = written(folder.path(), "a.ply", &random_splat(1, 0, 3));
-    let mut bytes = std::fs::read(&path).unwrap();
+    let mut bytes = bytes_of("ply", &random_splat(1, 0, 3));
     let body = bytes.len() - 17 * 4;
     let set = |bytes: &mut Vec<u8>, column: usize, number: f32| {
         bytes[body + 4 * column..][..4].copy_from_slice(&number.to_le_bytes());
@@ -80,19 +66,17 @@ fn infinite_logits_are_opacities_of_0_and_1() {
     for (logit, opacity) in [(f32::INFINITY, 1.), (f32::NEG_INFINITY, 0.)] {
         set(&mut bytes, 9, logit);
         set(&mut bytes, 10, f32::NEG_INFINITY);
-        std::fs::write(&path, &bytes).unwrap();
-        let splat = read_splat(&path).unwrap();
+        let splat = read_bytes("ply", &bytes).unwrap();
         assert_eq!((splat.opacity_logits[0], splat.log_scales[0][0]), (logit, f32::NEG_INFINITY));
         assert_eq!((splat.opacity(0), splat.scale(0)[0]), (opacity, 0.));
-        let copy = read_splat(&written(folder.path(), "b.ply", &splat)).unwrap();
+        let copy = round_trip("ply", &splat);
         assert!((f64::from(copy.opacity(0) - opacity).abs() - OPACITY_MARGIN).abs() < 1e-7);
         assert_eq!(copy.log_scales[0][0], MIN_SCALE.ln() as f32);
-        let copy = read_splat(&written(folder.path(), "b.splat", &splat)).unwrap();
+        let copy = round_trip("splat", &splat);
         assert_eq!((copy.opacity_logits[0], copy.log_scales[0][0]), (logit, f32::NEG_INFINITY));
     }
     set(&mut bytes, 10, 89.);
-    std::fs::write(&path, &bytes).unwrap();
-    assert_says(&refused_file(&path), &["scale_0 of vertex 0 is 89", "at most 88"]);
+    assert_bytes_refused("ply", &bytes, &["scale_0 of vertex 0 is 89", "at most 88"]);
 }
 
 /// Linear scales and opacities are those of the logarithms and logits, rounded once.
@@ -105,29 +89,25 @@ fn scales_and_opacities_are_rounded_once() {
         let logit = f64::from(splat.opacity_logits[index]);
         assert!((f64::from(splat.opacity(index)) - logit.exp() / (1. + logit.exp())).abs() < 3e-8);
     }
-    let folder = tempfile::tempdir().unwrap();
-    let bytes = std::fs::read(written(folder.path(), "a.splat", &splat)).unwrap();
     let importance = |index: &usize| {
         splat.scale(*index).iter().map(|&s| f64::from(s)).product::<f64>() * f64::from(splat.opacity(*index))
     };
     let first = (0..100).max_by(|a, b| importance(a).total_cmp(&importance(b))).unwrap();
-    assert_eq!(bytes[12..16], splat.scale(first)[0].to_le_bytes());
+    assert_eq!(bytes_of("splat", &splat)[12..16], splat.scale(first)[0].to_le_bytes());
 }
 
 /// Bytes are the colors themselves in older files, without bounds of colors.
 #[test]
 fn older_compressed_plys_are_read() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = written(folder.path(), "a.compressed.ply", &random_splat(2, 0, 4));
-    let bytes = std::fs::read(&path).unwrap();
-    let body = body_of_ply(&bytes);
-    let header = String::from_utf8(bytes[..body].to_vec()).unwrap();
-    let colors = ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"];
-    let header =
-        colors.iter().fold(header, |header, name| header.replace(&format!("property float {name}\n"), ""));
-    let vertices = &bytes[body + 18 * 4..];
-    std::fs::write(&path, [header.as_bytes(), &bytes[body..][..12 * 4], vertices].concat()).unwrap();
-    let read = read_splat(&path).unwrap();
+    let bytes = bytes_of("compressed.ply", &random_splat(2, 0, 4));
+    let (header, body) = bytes.split_at(body_of_ply(&bytes));
+    let header = ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"]
+        .iter()
+        .fold(String::from_utf8(header.to_vec()).unwrap(), |header, name| {
+            header.replace(&format!("property float {name}\n"), "")
+        });
+    let vertices = &body[18 * 4..];
+    let read = read_bytes("ply", &[header.as_bytes(), &body[..12 * 4], vertices].concat()).unwrap();
     let red = f64::from(vertices[15]) / 255.; // the highest byte of the fourth word
     assert!(((red - 0.5) / SH_C0 - f64::from(read.sh[0][0])).abs() < 1e-6);
 }
@@ -136,7 +116,10 @@ fn older_compressed_plys_are_read() {
 #[test]
 fn surfels_are_flat() {
     let folder = tempfile::tempdir().unwrap();
-    let surfels = write_surfels(folder.path());
+    let surfels = folder.path().join("surfels.ply");
+    let mut columns = small_gaussians();
+    columns.retain(|(name, _)| *name != "scale_2");
+    write_ply(&surfels, &columns, &[]);
     let splat = read_splat(&surfels).unwrap();
     assert_says(&splat.warnings[0], &["surfels.ply: Gaussians are flat", "scale_2"]);
     assert_eq!(splat.log_scales, [[-1.5, -2., MIN_SCALE.ln() as f32]; 3]);

@@ -1,8 +1,8 @@
 //! SOG: the values of its images, and invalid files.
 
-mod common;
-
-use common::{assert_says, largest_error, refused, refused_file, written};
+use super::common::{
+    Random, assert_bytes_refused, assert_refused, assert_says, bytes_of, largest_error, written,
+};
 use globalsplat_splat_file::{Splat, read_splat, read_splat_without_invalid, splat_files};
 use image_webp::{ColorType, WebPDecoder, WebPEncoder};
 use serde_json::{Value, json};
@@ -112,78 +112,80 @@ fn bundles_hold_the_same_files() {
     assert!(largest_error(unbundled.means.as_flattened(), splat.means.as_flattened()) < 25.);
 }
 
+/// Changes the `meta.json` at `path`.
+fn change_meta(path: &Path, change: impl FnOnce(&mut Value)) {
+    let mut meta = serde_json::from_slice(&fs::read(path).unwrap()).unwrap();
+    change(&mut meta);
+    fs::write(path, meta.to_string()).unwrap();
+}
+
 #[test]
 fn bad_metas() {
     let folder = tempfile::tempdir().unwrap();
     let (_, path) = three(folder.path());
-    let whole: Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
-    for (section, key, value, message) in [
-        ("", "version", json!(1), "the version in meta.json is 1, expected 2"),
-        ("", "count", json!(-3), "-3"),
-        ("", "count", json!(5), "pixels of means_l.webp is 4, expected 5"),
-        ("", "count", json!(u64::MAX), "expected 18446744073709551615"),
-        ("", "scales", json!({}), "codebook"),
-        ("scales", "codebook", json!([1.]), "an index in scales.webp"),
-        ("quats", "files", json!(["../quats.webp"]), "expected a name without a folder"),
-        ("shN", "bands", json!(4), "shN.bands is 4, expected 1 to 3"),
-        ("shN", "bands", json!(2), "the width of shN_centroids.webp is 192, expected 512"),
-        ("shN", "count", json!(2), "an index in shN_labels.webp is 2, expected less than 2"),
-        ("shN", "count", json!(65), "shN_centroids.webp is 192 pixels"),
-        ("shN", "count", json!(u64::MAX / 3 + 1), "shN.count is 6148914691236517206, expected 1 to 65536"),
-        ("means", "maxs", json!([200., 1., 40.]), "the position of Gaussian"),
+    let whole = fs::read(&path).unwrap();
+    for (pointer, value, message) in [
+        ("/version", json!(1), "the version in meta.json is 1, expected 2"),
+        ("/count", json!(-3), "-3"),
+        ("/count", json!(5), "pixels of means_l.webp is 4, expected 5"),
+        ("/count", json!(u64::MAX), "expected 18446744073709551615"),
+        ("/scales", json!({}), "codebook"),
+        ("/scales/codebook", json!([1.]), "an index in scales.webp"),
+        ("/quats/files", json!(["../quats.webp"]), "expected a name without a folder"),
+        ("/shN/bands", json!(4), "shN.bands is 4, expected 1 to 3"),
+        ("/shN/bands", json!(2), "the width of shN_centroids.webp is 192, expected 512"),
+        ("/shN/count", json!(2), "an index in shN_labels.webp is 2, expected less than 2"),
+        ("/shN/count", json!(65), "shN_centroids.webp is 192 pixels"),
+        ("/shN/count", json!(u64::MAX / 3 + 1), "shN.count is 6148914691236517206, expected 1 to 65536"),
+        ("/means/maxs", json!([200., 1., 40.]), "the position of Gaussian"),
+        // Version 1 has no number.
+        ("", json!([1]), "the version in meta.json is missing"),
+        ("", json!({"means": {"shape": [3, 3]}}), "the version in meta.json is missing"),
     ] {
-        let mut meta = whole.clone();
-        let object = if section.is_empty() { &mut meta } else { &mut meta[section] };
-        object[key] = value;
-        fs::write(&path, serde_json::to_vec(&meta).unwrap()).unwrap();
-        assert_says(&refused_file(&path), &[message]);
-    }
-    for older in [json!([1]), json!({"means": {"shape": [3, 3]}})] {
-        fs::write(&path, serde_json::to_vec(&older).unwrap()).unwrap();
-        assert_says(&refused_file(&path), &["the version in meta.json is missing"]);
+        fs::write(&path, &whole).unwrap();
+        change_meta(&path, |meta| *meta.pointer_mut(pointer).unwrap() = value);
+        assert_refused(&path, &[message]);
     }
 }
 
 #[test]
 fn bad_images_and_archives() {
     let folder = tempfile::tempdir().unwrap();
-    let (_, path) = three(folder.path());
+    let (splat, path) = three(folder.path());
     let file = folder.path().join("quats.webp");
     let (width, mut quats) = pixels(&file);
     quats[1][3] = 251;
     write_pixels(&file, width, &quats);
-    assert_says(&refused_file(&path), &["the alpha of pixel 1 in quats.webp is 251, expected 252 to 255"]);
+    assert_refused(&path, &["the alpha of pixel 1 in quats.webp is 251, expected 252 to 255"]);
     assert_eq!(read_splat_without_invalid(&path).unwrap().len(), 2);
     write_pixels(&file, 1000, &vec![[9; 4]; 1_000_000]);
-    assert_says(&refused_file(&path), &["quats.webp is of 1000×1000 pixels, expected about as many"]);
+    assert_refused(&path, &["quats.webp is of 1000×1000 pixels, expected about as many"]);
     // As many pixels as the Gaussians that the file claims, from a few bytes.
     let small = tempfile::tempdir().unwrap();
     let (_, bomb) = three(small.path());
     for name in ["means_l.webp", "means_u.webp", "scales.webp", "quats.webp", "sh0.webp", "shN_labels.webp"] {
         write_pixels(&small.path().join(name), 700, &vec![[9, 9, 9, 255]; 700 * 700]);
     }
-    let mut meta: Value = serde_json::from_slice(&fs::read(&bomb).unwrap()).unwrap();
-    meta["count"] = json!(700 * 700);
-    fs::write(&bomb, serde_json::to_vec(&meta).unwrap()).unwrap();
-    assert_says(&refused_file(&bomb), &["means_l.webp is of 700×700 pixels", "256 times the bytes"]);
+    change_meta(&bomb, |meta| meta["count"] = json!(700 * 700));
+    assert_refused(&bomb, &["means_l.webp is of 700×700 pixels", "256 times the bytes"]);
     // Other properties may be the same for all Gaussians.
-    let mut random = common::Random::new(1);
-    let noise: Vec<[u8; 4]> = (0..700 * 700)
-        .map(|_| [0; 4].map(|_: u8| (random.uniform() * 256.) as u8))
-        .map(|[red, green, blue, _]| [red, green, blue, 255])
-        .collect();
+    let mut random = Random::new(1);
+    let mut byte = || (random.uniform() * 256.) as u8;
+    let noise: Vec<[u8; 4]> = (0..700 * 700).map(|_| [byte(), byte(), byte(), 255]).collect();
     write_pixels(&small.path().join("means_l.webp"), 700, &noise);
     write_pixels(&small.path().join("quats.webp"), 700, &vec![[128, 128, 128, 252]; 700 * 700]);
     write_pixels(&small.path().join("shN_labels.webp"), 700, &vec![[0, 0, 0, 255]; 700 * 700]);
-    meta["scales"]["codebook"] = json!(vec![-3.; 256]);
-    meta["sh0"]["codebook"] = json!(vec![0.5; 256]);
-    fs::write(&bomb, serde_json::to_vec(&meta).unwrap()).unwrap();
+    change_meta(&bomb, |meta| {
+        meta["scales"]["codebook"] = json!(vec![-3.; 256]);
+        meta["sh0"]["codebook"] = json!(vec![0.5; 256]);
+    });
     assert_eq!(read_splat(&bomb).unwrap().len(), 700 * 700);
     fs::write(&file, b"RIFF").unwrap();
-    assert_says(&refused_file(&path), &["quats.webp is damaged"]);
+    assert_refused(&path, &["quats.webp is damaged"]);
     fs::remove_file(&file).unwrap();
     let error = read_splat(&path).unwrap_err().to_string();
     assert_says(&error, &["quats.webp"]);
-    assert_says(&refused("sog", |bytes| bytes.truncate(300)), &["the file is damaged", "a ZIP archive"]);
-    assert_says(&refused("sog", |bytes| *bytes = b"no archive".to_vec()), &["the file is damaged"]);
+    let bundle = bytes_of("sog", &splat);
+    assert_bytes_refused("sog", &bundle[..300], &["the file is damaged", "a ZIP archive"]);
+    assert_bytes_refused("sog", b"no archive", &["the file is damaged"]);
 }

@@ -1,0 +1,288 @@
+//! Tables of a PLY: its header, which describes the elements and their properties, and the numbers of selected properties, among any other
+//! elements and properties (spec 10.9).
+
+use crate::numbers::Scalar;
+use crate::{Error, Result};
+use std::path::Path;
+
+/// Encoding of numbers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Encoding {
+    Ascii,
+    LittleEndian,
+    BigEndian,
+}
+
+/// Type of a property in a row.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Kind {
+    Number(Scalar),
+    /// List: a number of the first type is the number of items of the second type that follow.
+    List(Scalar, Scalar),
+}
+
+pub struct Property {
+    pub name: String,
+    pub kind: Kind,
+}
+
+/// Rows with the same properties.
+pub struct Element {
+    name: String,
+    /// Number of rows, as the file claims.
+    pub count: usize,
+    pub properties: Vec<Property>,
+}
+
+impl Element {
+    pub fn property(&self, name: &str) -> Option<&Property> {
+        self.properties.iter().find(|property| property.name == name)
+    }
+}
+
+pub struct Header {
+    /// Number of bytes up to the first row.
+    length: usize,
+    encoding: Encoding,
+    elements: Vec<Element>,
+    /// `true` if a comment says that the splat is antialiased.
+    pub antialiased: bool,
+}
+
+/// Comment of an antialiased splat, after the keyword, as Brush, gsplat and nerfstudio write it.
+const ANTIALIASED: [&str; 2] = ["SplatRenderMode:", "mip"];
+
+impl Header {
+    /// Returns `true` if `bytes` begin like a PLY.
+    pub fn begins(bytes: &[u8]) -> bool {
+        bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r")
+    }
+
+    pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self> {
+        let error = |field: String, found: &str, expected: &str| Error::input(path, field, found, expected);
+        if !Self::begins(bytes) {
+            return Err(error("the file".into(), "no PLY", "a PLY of a 3D Gaussian splat"));
+        }
+        let (mut length, mut encoding, mut antialiased) = (0, None, false);
+        let mut elements: Vec<Element> = vec![];
+        for line in bytes.split_inclusive(|&byte| byte == b'\n') {
+            length += line.len();
+            let text = String::from_utf8_lossy(line);
+            let words: Vec<&str> = text.split_whitespace().collect();
+            match words.as_slice() {
+                ["end_header"] if line.ends_with(b"\n") => {
+                    let missing = || error("the line format".into(), "missing", "how numbers are written");
+                    let encoding = encoding.ok_or_else(missing)?;
+                    return Ok(Header { length, encoding, elements, antialiased });
+                }
+                ["format", name, ..] => {
+                    encoding = Some(match *name {
+                        "ascii" => Encoding::Ascii,
+                        "binary_little_endian" => Encoding::LittleEndian,
+                        "binary_big_endian" => Encoding::BigEndian,
+                        _ => {
+                            let expected = "ascii, binary_little_endian or binary_big_endian";
+                            return Err(error("the format".into(), name, expected));
+                        }
+                    });
+                }
+                ["element", name, count] => {
+                    let Ok(count) = count.parse() else {
+                        let field = format!("the number of rows of the element {name}");
+                        return Err(error(field, count, "a whole number"));
+                    };
+                    elements.push(Element { name: name.to_string(), count, properties: vec![] });
+                }
+                ["property", kind @ .., name] => {
+                    let Some(element) = elements.last_mut() else {
+                        let field = format!("the property {name}");
+                        return Err(error(field, "without an element", "a line element before it"));
+                    };
+                    let kind = parse_kind(path, kind, name)?;
+                    element.properties.push(Property { name: name.to_string(), kind });
+                }
+                // Postshot writes `antialiased 1`.
+                ["comment", comment @ ..] => {
+                    antialiased |= comment == ANTIALIASED || comment == ["antialiased", "1"];
+                }
+                _ => {}
+            }
+        }
+        Err(error("the header".into(), "without its end", "a line end_header"))
+    }
+
+    /// Returns the lines at the beginning of a written header, up to the first element.
+    pub fn first_lines(antialiased: bool) -> String {
+        let comment =
+            if antialiased { format!("comment {}\n", ANTIALIASED.join(" ")) } else { String::new() };
+        format!("ply\nformat binary_little_endian 1.0\n{comment}")
+    }
+
+    pub fn element(&self, name: &str) -> Option<&Element> {
+        self.elements.iter().find(|element| element.name == name)
+    }
+
+    /// Returns the numbers of the properties `names` of an element, row by row, each converted by `convert`. Other elements and properties
+    /// are skipped. `bytes` are the contents of the file at `path`.
+    pub fn columns<T>(
+        &self,
+        path: &Path,
+        bytes: &[u8],
+        element: &str,
+        names: &[String],
+        convert: impl Fn(f64) -> T,
+    ) -> Result<Vec<T>> {
+        let rest = &bytes[self.length..];
+        let mut body = Body { path, rest, encoding: self.encoding };
+        for before in self.elements.iter().take_while(|before| before.name != element) {
+            body.read_rows(before, |_, _| ())?;
+        }
+        let Some(element) = self.element(element) else {
+            return Err(Error::input(path, format!("the element {element}"), "missing", "the Gaussians"));
+        };
+        // Index in `names` of each property of the element.
+        let mut places: Vec<Option<usize>> = vec![None; element.properties.len()];
+        for (place, name) in names.iter().enumerate() {
+            let field = || format!("property {name}");
+            let Some(at) = element.properties.iter().position(|property| property.name == *name) else {
+                let expected = "one of a 3D Gaussian splat's properties";
+                return Err(Error::input(path, field(), "missing", expected));
+            };
+            if let Kind::List(..) = element.properties[at].kind {
+                return Err(Error::input(path, field(), "a list", "numbers"));
+            }
+            places[at] = Some(place);
+        }
+        let mut values = vec![];
+        let mut row = vec![0.; names.len()];
+        body.read_rows(element, |property, number| {
+            if let Some(place) = places[property] {
+                row[place] = number;
+            }
+            if property + 1 == places.len() {
+                values.extend(row.iter().map(|&number| convert(number)));
+            }
+        })?;
+        Ok(values)
+    }
+}
+
+fn parse_kind(path: &Path, words: &[&str], name: &str) -> Result<Kind> {
+    let field = || format!("the type of {name}");
+    let scalar = |word: &str| {
+        Ok(match word {
+            "char" | "int8" => Scalar::I8,
+            "uchar" | "uint8" => Scalar::U8,
+            "short" | "int16" => Scalar::I16,
+            "ushort" | "uint16" => Scalar::U16,
+            "int" | "int32" => Scalar::I32,
+            "uint" | "uint32" => Scalar::U32,
+            "float" | "float32" => Scalar::F32,
+            "double" | "float64" => Scalar::F64,
+            _ => return Err(Error::input(path, field(), word, "a PLY number type")),
+        })
+    };
+    match words {
+        [word] => Ok(Kind::Number(scalar(word)?)),
+        ["list", count, item] => Ok(Kind::List(scalar(count)?, scalar(item)?)),
+        _ => {
+            let found = format!("{:?}", words.join(" "));
+            Err(Error::input(path, field(), found, "a number type, or a list of one"))
+        }
+    }
+}
+
+/// The part of the file that is still to be read.
+struct Body<'a> {
+    path: &'a Path,
+    rest: &'a [u8],
+    encoding: Encoding,
+}
+
+/// A number's place in a file, for messages.
+struct Place<'a> {
+    element: &'a Element,
+    row: usize,
+    property: &'a str,
+}
+
+impl std::fmt::Display for Place<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        write!(f, "{} in row {} of {}", self.property, self.row, self.element.name)
+    }
+}
+
+impl Body<'_> {
+    /// Reads the rows of an element. Calls `visit` with the index of each property and its number, which is its length for a list.
+    fn read_rows(&mut self, element: &Element, mut visit: impl FnMut(usize, f64)) -> Result<()> {
+        self.check_length(element)?;
+        if element.properties.is_empty() {
+            return Ok(()); // however many rows there are
+        }
+        for row in 0..element.count {
+            for (index, Property { name, kind }) in element.properties.iter().enumerate() {
+                let place = Place { element, row, property: name };
+                let (Kind::Number(scalar) | Kind::List(scalar, _)) = *kind;
+                let number = self.number(scalar, &place)?;
+                if let Kind::List(_, item) = *kind {
+                    if number < 0. || number.fract() != 0. {
+                        let field = format!("the length of the list {place}");
+                        return Err(Error::input(self.path, field, number, "a whole number"));
+                    }
+                    for _ in 0..number as u64 {
+                        self.number(item, &place)?;
+                    }
+                }
+                visit(index, number);
+            }
+        }
+        Ok(())
+    }
+
+    /// Checks that the file is long enough for the rows that the header claims. No memory is allocated for them before this check.
+    fn check_length(&self, element: &Element) -> Result<()> {
+        let smallest = |kind: Kind| match (self.encoding, kind) {
+            (Encoding::Ascii, _) => 2, // a digit and a separator
+            (_, Kind::Number(scalar) | Kind::List(scalar, _)) => scalar.size(),
+        };
+        let row: usize = element.properties.iter().map(|property| smallest(property.kind)).sum();
+        let needed = row as u128 * element.count as u128;
+        // The separator after the last number may be missing.
+        let there = self.rest.len() as u128 + u128::from(self.encoding == Encoding::Ascii);
+        if there < needed {
+            let found = format!("cut short: {} bytes of the element {}", self.rest.len(), element.name);
+            let expected = format!("{needed} bytes at least for its {} rows", element.count);
+            return Err(Error::input(self.path, "the body", found, expected));
+        }
+        Ok(())
+    }
+
+    fn number(&mut self, scalar: Scalar, place: &Place) -> Result<f64> {
+        let cut_short = || {
+            let expected = format!("{} rows", place.element.count);
+            Error::input(self.path, "the body", format!("cut short: at {place}"), expected)
+        };
+        if self.encoding == Encoding::Ascii {
+            let text = self.rest.trim_ascii_start();
+            let length = text.iter().position(u8::is_ascii_whitespace).unwrap_or(text.len());
+            let (word, rest) = text.split_at(length);
+            if word.is_empty() {
+                return Err(cut_short());
+            }
+            self.rest = rest;
+            return std::str::from_utf8(word).ok().and_then(|word| word.parse().ok()).ok_or_else(|| {
+                let found = String::from_utf8_lossy(&word[..word.len().min(20)]).into_owned();
+                Error::input(self.path, place.to_string(), format!("{found:?}"), "a number")
+            });
+        }
+        let (number, rest) = self.rest.split_at_checked(scalar.size()).ok_or_else(cut_short)?;
+        self.rest = rest;
+        if self.encoding == Encoding::LittleEndian {
+            return Ok(scalar.read(number));
+        }
+        let mut bytes = [0; 8];
+        bytes[..number.len()].copy_from_slice(number);
+        bytes[..number.len()].reverse();
+        Ok(scalar.read(&bytes))
+    }
+}
