@@ -4,7 +4,7 @@ use crate::error::Result;
 use crate::render::{compensate_mean_color, fit_harmonics, shrink_harmonics};
 use crate::scene::{Camera, Gaussians, RawGaussians, splat_frame};
 use glam::DVec3;
-use globalsplat_splat_file::{ShLimits, Splat, has_sh_palette, limits_of, round_sh};
+use globalsplat_splat_file::{ShLimits, Splat, limits_of, sh_rounding_of};
 use std::path::Path;
 use tch::Tensor;
 
@@ -18,12 +18,12 @@ const MAX_SPACING_RATIO: f64 = 1e-4;
 /// Returns an error for an unknown extension.
 pub fn fit_splat(path: &Path, splat: &Splat, limits: &ShLimits, cameras: &[Camera]) -> Result<Splat> {
     let limits = limits.intersect(&limits_of(path)?);
-    let has_palette = !cameras.is_empty() && has_sh_palette(path)?;
+    let round_sh = if cameras.is_empty() { None } else { sh_rounding_of(path)? };
     let gaussians = Gaussians::from_splat(splat);
     let frame = gaussians.local_frame(splat.origin);
     let cameras = frame.cameras_to_local(cameras);
     let local = gaussians.to_local(&frame, splat.origin);
-    let smallest = if has_palette { shrink_harmonics(&local, &cameras) } else { local };
+    let smallest = if round_sh.is_some() { shrink_harmonics(&local, &cameras) } else { local };
     let fitted = fit_harmonics(&smallest, &cameras, &limits);
     // Logits of opacities that stay are kept to the bit.
     let logits = RawGaussians::from_gaussians(&fitted).opacity_logits;
@@ -39,11 +39,9 @@ pub fn fit_splat(path: &Path, splat: &Splat, limits: &ShLimits, cameras: &[Camer
         })
     };
     let within_limits = with_sh(&fitted)?;
-    if !has_palette {
-        return Ok(within_limits);
-    }
+    let Some(round_sh) = round_sh else { return Ok(within_limits) };
     let rounded = Gaussians {
-        sh: Gaussians::from_splat(&round_sh(path, &within_limits)?).sh,
+        sh: Gaussians::from_splat(&round_sh(&within_limits)).sh,
         ..fitted.map(Tensor::shallow_clone)
     };
     let compensated = compensate_mean_color(&fitted, &rounded, &cameras);

@@ -4,13 +4,12 @@
 use crate::common::browser::Browser;
 use crate::common::program::{arg, command, room, succeed};
 use crate::common::{captures, has_viewer};
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
+use crate::{LEAST, assert_like, own_picture, picture_from_base64};
 use globalsplat::data::{load_views, open_capture};
-use globalsplat::io::{Splat, read_image, read_splat, tensor_from_rgb, write_splat};
+use globalsplat::io::{Splat, read_splat, write_splat};
 use globalsplat::metrics::psnr;
-use globalsplat::render::{depth_colors, render_views};
-use globalsplat::scene::{Gaussians, ImageSize};
+use globalsplat::render::depth_colors;
+use globalsplat::scene::ImageSize;
 use serde_json::{Value, json};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
@@ -18,13 +17,10 @@ use std::time::{Duration, Instant};
 use tch::{Kind, Tensor};
 
 const SIDE: u32 = 512;
-/// Minimum PSNR between the page's image and our own render, in dB.
-const LEAST: f64 = 25.;
 
 /// Page in a browser whose window is as large as the square photos, without animations.
 struct Shown {
     browser: Browser,
-    folder: tempfile::TempDir,
 }
 
 impl Shown {
@@ -35,14 +31,10 @@ impl Shown {
         let still = json!({"features": [{"name": "prefers-reduced-motion", "value": "reduce"}]});
         browser.call("Emulation.setEmulatedMedia", still);
         browser.open(page);
-        let mut shown = Shown { browser, folder: tempfile::tempdir().expect("a folder") };
+        let mut shown = Shown { browser };
         shown.wait_for("document.body.dataset.state !== 'loading'");
-        assert_eq!(
-            shown.value("document.body.dataset.state"),
-            "ready",
-            "{}",
-            shown.value("document.body.innerText")
-        );
+        let text = shown.value("document.body.innerText");
+        assert_eq!(shown.value("document.body.dataset.state"), "ready", "{text}");
         Some(shown)
     }
 
@@ -72,9 +64,7 @@ impl Shown {
 
     fn screen(&mut self) -> Tensor {
         let png = self.browser.call("Page.captureScreenshot", json!({"format": "png"}));
-        let file = self.folder.path().join("picture.png");
-        std::fs::write(&file, STANDARD.decode(png["data"].as_str().unwrap()).unwrap()).unwrap();
-        tensor_from_rgb(&read_image(&file).unwrap())
+        picture_from_base64(png["data"].as_str().unwrap())
     }
 
     /// Presses a key briefly.
@@ -132,9 +122,7 @@ fn capture() -> Option<PathBuf> {
 fn expected(capture: &Path, splat: &Path, index: usize) -> (Tensor, Tensor) {
     let size = ImageSize { width: SIDE, height: SIDE };
     let view = load_views(&open_capture(capture).unwrap(), &[index], Some(size)).unwrap().remove(0);
-    let own =
-        render_views(&Gaussians::from_splat(&read_splat(splat).unwrap()), &[view.camera]).unwrap().remove(0);
-    (own.rgb.clamp(0., 1.), view.image.to_float())
+    (own_picture(&read_splat(splat).unwrap(), view.camera), view.image.to_float())
 }
 
 /// Returns the mean distance of an image's pixels from the nearest depth color.
@@ -176,8 +164,7 @@ fn a_page_shows_the_scene_and_can_be_walked_in() {
     // The view from the first camera matches our own render.
     let (own, photo) = expected(&capture, &splat, 0);
     let picture = shown.picture();
-    println!("the first camera: {:.2} dB", psnr(&picture, &own));
-    assert!(psnr(&picture, &own) >= LEAST, "{:.2} dB", psnr(&picture, &own));
+    assert_like("the first camera", &picture, &own, LEAST);
     assert_eq!(shown.value("page.walk.at"), 0);
     let count = open_capture(&capture).unwrap().len();
     assert_eq!(shown.value("document.querySelectorAll('#strip img').length"), count);
@@ -193,20 +180,15 @@ fn a_page_shows_the_scene_and_can_be_walked_in() {
     shown.value(&hide("hidden"));
     let over = shown.screen();
     shown.value(&hide("visible"));
-    assert!(psnr(&over, &photo) > psnr(&picture, &photo) + 1., "{:.2} dB", psnr(&over, &photo));
-    assert!(psnr(&over, &photo) > 28., "{:.2} dB", psnr(&over, &photo));
+    assert_like("the photo", &over, &photo, 28f64.max(psnr(&picture, &photo) + 1.));
     shown.value("share.value = 0, share.dispatchEvent(new Event('input'))");
 
     // Jump by the photo strip, and by keys.
     shown.click("#strip button:nth-child(4)");
     let jumped = shown.picture();
     let (own, _) = expected(&capture, &splat, 3);
-    println!("the fourth camera: {:.2} dB", psnr(&jumped, &own));
-    assert!(
-        psnr(&jumped, &own) >= LEAST && shown.value("page.walk.at") == 3,
-        "{:.2} dB",
-        psnr(&jumped, &own)
-    );
+    assert_like("the fourth camera", &jumped, &own, LEAST);
+    assert_eq!(shown.value("page.walk.at"), 3);
     shown.key("Comma");
     shown.wait_for("page.walk.at === 2");
     assert_eq!(shown.value("[...strip.children].findIndex((of) => of.hasAttribute('aria-current'))"), 2);
@@ -264,16 +246,6 @@ fn a_page_shows_the_scene_and_can_be_walked_in() {
     assert_eq!(pages, 1, "{asked:?}");
 }
 
-/// Writes a program `xdg-open` that records the path it is asked to open, and returns its folder.
-fn opener(folder: &Path) -> PathBuf {
-    let bin = folder.join("bin");
-    std::fs::create_dir_all(&bin).unwrap();
-    let program = bin.join("xdg-open");
-    std::fs::write(&program, format!("#!/bin/sh\nprintf %s \"$1\" > {:?}\n", folder.join("opened"))).unwrap();
-    std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
-    bin
-}
-
 #[cfg(target_os = "linux")]
 #[test]
 fn view_opens_a_page_of_a_splat_alone() {
@@ -284,22 +256,21 @@ fn view_opens_a_page_of_a_splat_alone() {
     // Names are escaped as text.
     let splat = folder.path().join("a <b>room&.ply");
     std::fs::copy(room.join("truth.ply"), &splat).unwrap();
-    let path = format!("{}:/usr/bin:/bin", opener(folder.path()).display());
+    // A program `xdg-open` that records the path it is asked to open.
+    let opener = folder.path().join("xdg-open");
+    let opened = folder.path().join("opened");
+    std::fs::write(&opener, format!("#!/bin/sh\nprintf %s \"$1\" > {opened:?}\n")).unwrap();
+    std::fs::set_permissions(&opener, std::fs::Permissions::from_mode(0o755)).unwrap();
+    let path = format!("{}:/usr/bin:/bin", folder.path().display());
     let done =
         command(&["view", arg(&splat)]).env("PATH", path).env("TMPDIR", folder.path()).output().unwrap();
     assert!(done.status.success() && done.stderr.is_empty(), "{}", String::from_utf8_lossy(&done.stderr));
     let page = PathBuf::from(String::from_utf8(done.stdout).unwrap().trim_end());
     let begun = Instant::now();
-    let opened = loop {
-        if let Some(opened) =
-            std::fs::read_to_string(folder.path().join("opened")).ok().filter(|o| !o.is_empty())
-        {
-            break opened;
-        }
-        assert!(begun.elapsed() < Duration::from_secs(20), "nothing was opened");
+    while std::fs::read_to_string(&opened).unwrap_or_default() != arg(&page) {
+        assert!(begun.elapsed() < Duration::from_secs(20), "the page was not opened");
         std::thread::sleep(Duration::from_millis(20));
-    };
-    assert_eq!(Path::new(&opened), page);
+    }
     assert_eq!(page.parent().unwrap(), folder.path());
 
     let Some(mut shown) = Shown::open(&page) else { return };

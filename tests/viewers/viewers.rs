@@ -3,12 +3,11 @@
 use crate::common::browser::Browser;
 use crate::common::program::{arg, succeed};
 use crate::common::{captures, skip};
+use crate::{LEAST, assert_like, own_picture, picture_from_base64};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use globalsplat::data::open_capture;
-use globalsplat::io::{Splat, read_image, read_splat, tensor_from_rgb};
-use globalsplat::metrics::psnr;
-use globalsplat::render::render_views;
+use globalsplat::io::{Splat, read_splat};
 use globalsplat::scene::{Camera, Gaussians, ImageSize, Intrinsics};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -16,18 +15,14 @@ use std::process::Command;
 use tch::{Kind, Tensor};
 
 const SIZE: ImageSize = ImageSize { width: 512, height: 512 };
-/// Minimum PSNR between a viewer's image and our own render, in dB.
-const LEAST: f64 = 25.;
 
 /// Returns the pages with the viewers, by their names.
 fn viewers(folder: &Path) -> Option<Vec<(&'static str, PathBuf)>> {
     let npm = Path::new(env!("CARGO_MANIFEST_DIR")).join("parity/npm");
     let bundler = npm.join("node_modules/.bin/esbuild");
     if !bundler.exists() {
-        skip(
-            "other viewers",
-            "parity/npm has no packages; install Node.js 20 or newer with npm and run make venv",
-        );
+        let why = "parity/npm has no packages; install Node.js 20 or newer with npm and run make venv";
+        skip("other viewers", why);
         return None;
     }
     let page = |name| {
@@ -62,9 +57,7 @@ fn show(browser: &mut Browser, page: &Path, file: &Path, camera: &Camera) -> (Va
     let k = camera.intrinsics;
     let angle = 2. * (f64::from(camera.height) / 2. / k.fy).atan();
     let (width, height) = (camera.width, camera.height);
-    let camera = json!({
-        "c2w": c2w, "angle": angle, "aspect": k.fy / k.fx, "width": width, "height": height,
-    });
+    let camera = json!({"c2w": c2w, "angle": angle, "aspect": k.fy / k.fx, "width": width, "height": height});
     let bytes = STANDARD.encode(std::fs::read(file).unwrap());
     let ending = file.extension().unwrap().to_str().unwrap();
     let report = browser.evaluate(&format!(
@@ -72,10 +65,8 @@ fn show(browser: &mut Browser, page: &Path, file: &Path, camera: &Camera) -> (Va
     ));
     assert!(browser.errors().is_empty(), "{:?}", browser.errors());
     let png = report["png"].as_str().unwrap().strip_prefix("data:image/png;base64,").unwrap();
-    let folder = tempfile::tempdir().unwrap();
-    let picture = folder.path().join("picture.png");
-    std::fs::write(&picture, STANDARD.decode(png).unwrap()).unwrap();
-    (report, tensor_from_rgb(&read_image(&picture).unwrap()))
+    let picture = picture_from_base64(png);
+    (report, picture)
 }
 
 /// Returns the corners of the bounding box of the means.
@@ -128,8 +119,7 @@ fn public_viewers_show_our_splats_as_we_do() {
     ];
     for (name, original, file, least, readers) in files {
         let splat = read_splat(&original).unwrap();
-        let own =
-            render_views(&Gaussians::from_splat(&splat), &[camera]).unwrap().remove(0).rgb.clamp(0., 1.);
+        let own = own_picture(&splat, camera);
         let ending = file.extension().unwrap().to_str().unwrap();
         for (viewer, page) in viewers.iter().filter(|(viewer, _)| readers.contains(viewer)) {
             let what = format!("{name}, .{ending}, in {viewer}");
@@ -141,9 +131,7 @@ fn public_viewers_show_our_splats_as_we_do() {
                     assert!((a - b).abs() <= 1e-3 * b.abs(), "{what}: {corner} {a}, {b}");
                 }
             }
-            let psnr = psnr(&picture, &own);
-            println!("{what}: {psnr:.2} dB");
-            assert!(psnr >= least, "{what}: {psnr:.2} dB");
+            assert_like(&what, &picture, &own, least);
         }
     }
 }

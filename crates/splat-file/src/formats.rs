@@ -40,8 +40,11 @@ struct Writer {
     write: fn(&Path, &Splat, &WriteOptions) -> Result<()>,
     limits: fn() -> ShLimits,
     /// Function that rounds SH coefficients above degree 0 as the format does, if it has a palette of them.
-    round_sh: Option<fn(&Splat) -> Splat>,
+    round_sh: Option<RoundSh>,
 }
+
+/// Function that returns a splat with rounded SH coefficients.
+pub type RoundSh = fn(&Splat) -> Splat;
 
 impl Writer {
     /// Creates the functions of a format without a palette.
@@ -215,22 +218,13 @@ pub fn limits_of(path: &Path) -> Result<ShLimits> {
     Ok((writer_of(path)?.limits)())
 }
 
-/// Returns `true` if the format that the extension of `path` selects holds SH coefficients above degree 0 as a palette, as a SOG does.
+/// Returns the function that rounds SH coefficients above degree 0 as a file at `path` would, if its format has a palette of them, which
+/// depends on all Gaussians. Writing the rounded splat doesn't change them.
 ///
 /// # Errors
 /// Returns an error for an unknown extension, or a format that is only read.
-pub fn has_sh_palette(path: &Path) -> Result<bool> {
-    Ok(writer_of(path)?.round_sh.is_some())
-}
-
-/// Returns the splat with the SH coefficients above degree 0 that a file at `path` would hold, if its format has a palette of them, which
-/// depends on all Gaussians. Writing the returned splat doesn't change them. Other formats don't change the splat.
-///
-/// # Errors
-/// Returns the errors of [`has_sh_palette`], or an error if a list of the splat has the wrong length.
-pub fn round_sh(path: &Path, splat: &Splat) -> Result<Splat> {
-    splat.check_lengths()?;
-    Ok(writer_of(path)?.round_sh.map_or_else(|| splat.clone(), |round_sh| round_sh(splat)))
+pub fn sh_rounding_of(path: &Path) -> Result<Option<RoundSh>> {
+    Ok(writer_of(path)?.round_sh)
 }
 
 /// Reads a splat in the format that is recognized by its contents, or else in the format of its extension. Gaussians whose quaternion has

@@ -18,44 +18,28 @@ const DEFAULT_RANGE: u32 = 32767;
 /// Magnitude of the minimum and maximum of SH coefficients of level 2, if the file doesn't say otherwise.
 const DEFAULT_SH_RANGE: f32 = 1.5;
 
-/// How the numbers of a file are stored.
+/// How the numbers of a file are stored: float32, float16 or bytes, by their sizes in bytes.
 struct Encoding {
-    /// Compression level: 0 for float32, 1 for 16 bits, 2 for 16 bits with bytes for spherical harmonics.
-    level: u16,
-    /// Minimum and maximum of the spherical harmonics of level 2.
+    /// Size of a position's coordinate, which above compression level 0 is an integer, of a scale and of a quaternion's component.
+    number_bytes: usize,
+    /// Size of an SH coefficient.
+    sh_bytes: usize,
+    /// SH coefficients of the bytes 0 and 255.
     sh_range: [f32; 2],
 }
 
 impl Encoding {
-    /// Returns the number of bytes of a position, a scale or a quaternion's component.
-    fn number_bytes(&self) -> usize {
-        if self.level == 0 { 4 } else { 2 }
-    }
-
-    /// Returns the number of bytes of an SH coefficient.
-    fn sh_bytes(&self) -> usize {
-        [4, 2, 1][usize::from(self.level)]
-    }
-
     /// Returns the number of bytes of a Gaussian: position, scale, quaternion, then color and opacity, then spherical harmonics.
     fn gaussian_bytes(&self, bases: usize) -> usize {
-        10 * self.number_bytes() + 4 + 3 * (bases - 1) * self.sh_bytes()
+        10 * self.number_bytes + 4 + 3 * (bases - 1) * self.sh_bytes
     }
 
-    /// Returns number `index` of a Gaussian: 3 to 5 are the scales, 6 to 9 the quaternion. At level 0, the first three are the position.
-    fn number(&self, gaussian: &[u8], index: usize) -> f32 {
-        match self.level {
-            0 => f32_at(gaussian, 4 * index),
-            _ => f16::from_bits(u16_at(gaussian, 2 * index)).to_f32(),
-        }
-    }
-
-    /// Returns number `index` of the spherical harmonics in `bytes`.
-    fn sh(&self, bytes: &[u8], index: usize) -> f32 {
+    /// Returns number `index` of those in `bytes`, each of `size` bytes.
+    fn number(&self, bytes: &[u8], index: usize, size: usize) -> f32 {
         let [min, max] = self.sh_range.map(f64::from);
-        match self.level {
-            0 => f32_at(bytes, 4 * index),
-            1 => f16::from_bits(u16_at(bytes, 2 * index)).to_f32(),
+        match size {
+            4 => f32_at(bytes, 4 * index),
+            2 => f16::from_bits(u16_at(bytes, 2 * index)).to_f32(),
             _ => (min + f64::from(bytes[index]) / 255. * (max - min)) as f32,
         }
     }
@@ -78,7 +62,8 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let or_default = |bound: f32, default: f32| if bound == 0. { default } else { bound };
     let sh_range =
         [or_default(f32_at(bytes, 36), -DEFAULT_SH_RANGE), or_default(f32_at(bytes, 40), DEFAULT_SH_RANGE)];
-    let encoding = Encoding { level, sh_range };
+    let [number_bytes, sh_bytes] = [[4, 4], [2, 2], [2, 1]][usize::from(level)];
+    let encoding = Encoding { number_bytes, sh_bytes, sh_range };
     let (sections, count) = (u32_at(bytes, 4) as usize, u32_at(bytes, 16));
     let Some((headers, mut rest)) =
         sections.checked_mul(SECTION_HEADER).and_then(|length| bytes[HEADER..].split_at_checked(length))
@@ -150,7 +135,7 @@ impl Section<'_> {
             return Err(self.error("the number of Gaussians", count, format!("{max_count} at most")));
         }
         let gaussians = gaussians.chunks_exact(stride).take(count);
-        if self.encoding.level == 0 {
+        if self.encoding.number_bytes == 4 {
             for gaussian in gaussians {
                 splat.means.push([0, 1, 2].map(|axis| f32_at(gaussian, 4 * axis)));
                 self.push_others(gaussian, bases, splat);
@@ -191,16 +176,19 @@ impl Section<'_> {
 
     /// Appends the values of a Gaussian to `splat`, except for its position.
     fn push_others(&self, gaussian: &[u8], bases: usize, splat: &mut Splat) {
-        splat.push_linear_scale([3, 4, 5].map(|index| self.encoding.number(gaussian, index)));
-        splat.quaternions.push([6, 7, 8, 9].map(|index| self.encoding.number(gaussian, index)));
-        let (color, harmonics) = gaussian[10 * self.encoding.number_bytes()..].split_at(4);
+        let Encoding { number_bytes, sh_bytes, .. } = *self.encoding;
+        let number = |index: usize| self.encoding.number(gaussian, index, number_bytes);
+        splat.push_linear_scale([3, 4, 5].map(number));
+        splat.quaternions.push([6, 7, 8, 9].map(number));
+        let (color, harmonics) = gaussian[10 * number_bytes..].split_at(4);
         splat.sh.push([0, 1, 2].map(|channel| dc_of_color(f64::from(color[channel]) / 255.)));
         splat.opacity_logits.push(logit_of_opacity(f64::from(color[3]) / 255.));
         // Degree by degree, and within a degree channel by channel.
         for degree in 1..bases.isqrt() {
             let (begin, count) = (3 * (degree * degree - 1), 2 * degree + 1);
             splat.sh.extend((0..count).map(|basis| {
-                [0, 1, 2].map(|channel| self.encoding.sh(harmonics, begin + channel * count + basis))
+                let index = |channel: usize| begin + channel * count + basis;
+                [0, 1, 2].map(|channel| self.encoding.number(harmonics, index(channel), sh_bytes))
             }));
         }
         splat.sh.resize(splat.means.len() * splat.bases(), [0.; 3]);

@@ -21,8 +21,8 @@ mod spz;
 mod transform;
 
 pub use formats::{
-    WriteOptions, can_mark_antialiased, check_writable_splat, find_splat, has_sh_palette, is_splat_name,
-    limits_of, read_splat, read_splat_without_invalid, round_sh, splat_files, write_local_splat,
+    RoundSh, WriteOptions, can_mark_antialiased, check_writable_splat, find_splat, is_splat_name, limits_of,
+    read_splat, read_splat_without_invalid, sh_rounding_of, splat_files, write_local_splat,
     write_local_splat_with, write_splat,
 };
 pub use globalsplat_files::{Error, Result};

@@ -104,22 +104,6 @@ mod tests {
     use super::*;
     use glam::DQuat;
 
-    #[test]
-    fn harmonics_are_orthonormal() {
-        let mut products = [[0.; BASES]; BASES];
-        for (direction, weight) in quadrature() {
-            let values = sh_basis(direction);
-            for (row, a) in products.iter_mut().zip(values) {
-                row.iter_mut().zip(values).for_each(|(product, b)| *product += weight * a * b);
-            }
-        }
-        for (i, row) in products.iter().enumerate() {
-            for (j, product) in row.iter().enumerate() {
-                assert!((product - f64::from(i == j)).abs() < 1e-12, "{i}, {j}: {product}");
-            }
-        }
-    }
-
     /// A rotated function has the value in a rotated direction that it had before.
     #[test]
     fn rotated_functions_have_the_same_values() {

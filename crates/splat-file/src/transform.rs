@@ -99,27 +99,3 @@ impl Splat {
         Ok(splat)
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn only_similarities_are_accepted() {
-        let rotation = DQuat::from_euler(glam::EulerRot::XYZ, 0.3, -1., 2.);
-        let matrix =
-            DMat4::from_scale_rotation_translation(DVec3::splat(2.5), rotation, DVec3::new(1., 2., 3.));
-        let to = Similarity::from_matrix(&matrix).unwrap();
-        assert!((to.scale - 2.5).abs() < 1e-12 && to.translation == DVec3::new(1., 2., 3.));
-        assert!(to.rotation.abs_diff_eq(DMat3::from_quat(rotation), 1e-12));
-        for refused in [
-            DMat4::from_scale(DVec3::new(1., 1., 2.)),
-            DMat4::from_scale(DVec3::new(1., 1., -1.)),
-            DMat4::ZERO,
-            DMat4::NAN,
-            DMat4::from_cols_array(&std::array::from_fn(|k| if k % 5 == 0 || k == 3 { 1. } else { 0. })),
-        ] {
-            assert!(Similarity::from_matrix(&refused).is_err(), "{refused}");
-        }
-    }
-}

@@ -19,13 +19,6 @@ pub struct Archive {
     pub storages: Storages,
 }
 
-/// A file in the archive.
-struct Entry {
-    name: String,
-    contents: Range<usize>,
-    crc32: u32,
-}
-
 impl Archive {
     /// Finds the parts of `bytes`, the contents of `file`, and verifies their checksums. Whatever the archive claims, no part is larger
     /// than the file, nor are all parts together: compressed entries, which could inflate without limit, are refused, and so are entries
@@ -37,20 +30,14 @@ impl Archive {
         let refuse = |field: &str, found: &dyn Display, expected: &str| {
             Err(Error::input(file, field, found, expected))
         };
-        let mut zip = match ZipArchive::new(Cursor::new(bytes)) {
-            Ok(zip) => zip,
-            Err(e) => {
-                return refuse("the file", &format!("no whole zip archive ({e})"), "what torch.save writes");
-            }
-        };
+        let mut zip = ZipArchive::new(Cursor::new(bytes)).map_err(|e| {
+            Error::input(file, "the file", format!("no whole zip archive ({e})"), "what torch.save writes")
+        })?;
         let mut entries = vec![];
         for index in 0..zip.len() {
-            let entry = match zip.by_index_raw(index) {
-                Ok(entry) => entry,
-                Err(e) => {
-                    return refuse(&format!("entry {index}"), &format!("broken ({e})"), "a stored file");
-                }
-            };
+            let entry = zip.by_index_raw(index).map_err(|e| {
+                Error::input(file, format!("entry {index}"), format!("broken ({e})"), "a stored file")
+            })?;
             let name = entry.name();
             let stored =
                 entry.compression() == CompressionMethod::Stored && entry.size() == entry.compressed_size();
@@ -62,14 +49,14 @@ impl Archive {
             if contents.end > bytes.len() {
                 return refuse(name, &format!("{} bytes at byte {start}", entry.size()), "inside the file");
             }
-            entries.push(Entry { name: name.into(), contents, crc32: entry.crc32() });
+            entries.push((name.to_string(), contents, entry.crc32()));
         }
-        entries.sort_by_key(|entry| (entry.contents.start, entry.contents.end));
-        if let Some(pair) = entries.windows(2).find(|pair| pair[0].contents.end > pair[1].contents.start) {
-            return refuse(&pair[0].name, &"in one place with another entry", "a place of its own");
+        entries.sort_by_key(|(_, contents, _)| (contents.start, contents.end));
+        if let Some(pair) = entries.windows(2).find(|pair| pair[0].1.end > pair[1].1.start) {
+            return refuse(&pair[0].0, &"in one place with another entry", "a place of its own");
         }
         let (mut pickle, mut storages) = (None, Storages::new());
-        for Entry { name, contents, crc32 } in entries {
+        for (name, contents, crc32) in entries {
             if crc32fast::hash(&bytes[contents.clone()]) != crc32 {
                 return refuse(&name, &"damaged: its checksum differs", "the bytes that were written");
             }
