@@ -25,8 +25,8 @@
 //! losses, [`data`] reads captures, [`stereo`] estimates depths, [`synth`] generates synthetic scenes, [`io`] reads and writes files,
 //! [`distributed`] connects the processes of distributed training, [`render`] is the differentiable splat op, [`model`] the network.
 
-#[doc(hidden)]
-pub mod bench;
+#[cfg(feature = "cli")]
+mod cli;
 pub mod config;
 pub mod data;
 pub mod device;
@@ -39,9 +39,6 @@ pub mod loss;
 pub mod metrics;
 pub mod model;
 pub mod optim;
-#[cfg(feature = "cli")]
-#[doc(hidden)]
-pub mod parity;
 pub mod reconstruct;
 pub mod refine;
 pub mod render;
@@ -49,6 +46,9 @@ pub mod scene;
 pub mod stereo;
 pub mod train;
 
+#[cfg(feature = "cli")]
+#[doc(hidden)]
+pub use cli::{main, run};
 pub use error::{Error, Result};
 pub use globalsplat_synth as synth;
 

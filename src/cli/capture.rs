@@ -1,11 +1,10 @@
 //! The command `capture`, and the captures that other commands make of photos.
 
-use super::signals::StopRequest;
-use super::{print_json, progress};
+use super::{print_json, progress, signals};
+use crate::Error;
+use crate::io::check_writable_dir;
 use anyhow::Result;
 use clap::Args;
-use globalsplat::Error;
-use globalsplat::io::check_writable_dir;
 use globalsplat_colmap::{CaptureOptions, CaptureReport, Colmap, Matching, make_capture};
 use std::path::{Path, PathBuf};
 
@@ -58,8 +57,9 @@ impl Capture {
         if self.frames.is_some() && self.source.is_dir() {
             return Err(Error::request("--frames is for videos, and the source is a folder of photos").into());
         }
-        let stop = StopRequest::install()?;
-        let report = run_make_capture(&self.source, &self.out, &options, &stop)?;
+        signals::handle_stop_requests()?;
+        signals::end_at_request(1);
+        let report = run_make_capture(&self.source, &self.out, &options)?;
         if self.json {
             let mut json = serde_json::to_value(&report)?;
             json["out"] = self.out.to_string_lossy().into();
@@ -82,18 +82,13 @@ fn quoted(path: &Path) -> String {
 }
 
 /// Makes a capture of `source` in the folder `out`, with progress on standard error. A request to stop ends the program with an error.
-fn run_make_capture(
-    source: &Path,
-    out: &Path,
-    options: &CaptureOptions,
-    stop: &StopRequest,
-) -> Result<CaptureReport> {
+fn run_make_capture(source: &Path, out: &Path, options: &CaptureOptions) -> Result<CaptureReport> {
     std::fs::metadata(source).map_err(Error::read(source))?;
     let colmap = Colmap::find()?;
     check_writable_dir(out)?;
     eprintln!("{colmap}");
     let mut bar: Option<(&'static str, progress::Progress)> = None;
-    stop.set_ends_at_once(false);
+    signals::end_at_request(2);
     let report = make_capture(source, out, options, &colmap, &mut |at| {
         let unit = at.step.unit();
         if bar.as_ref().is_none_or(|(current, _)| *current != unit) {
@@ -106,9 +101,9 @@ fn run_make_capture(
             bar.set_length(at.total as u64);
             bar.set_position(at.done as u64);
         }
-        !stop.is_requested()
+        !signals::is_stop_requested()
     });
-    stop.set_ends_at_once(true);
+    signals::end_at_request(1);
     if let Some((_, bar)) = bar {
         bar.finish_and_clear();
     }
@@ -142,7 +137,7 @@ impl SceneSource {
     }
 
     /// Returns the path of the capture. If it has to be made, it is made beside the output `out`, with the masks in the folder `masks`.
-    pub fn path(&self, masks: Option<&Path>, out: &Path, stop: &StopRequest) -> Result<PathBuf> {
+    pub fn path(&self, masks: Option<&Path>, out: &Path) -> Result<PathBuf> {
         let Some(photos) = &self.photos else { return Ok(self.scene.clone().unwrap_or_default()) };
         let name = out.file_name().unwrap_or_default().to_string_lossy();
         let stem = name.rsplit_once('.').map_or(&*name, |(stem, _)| stem);
@@ -150,7 +145,7 @@ impl SceneSource {
         // A capture that `globalsplat capture` made with other settings is used as it is.
         let masks = masks.map(Path::to_owned);
         let options = CaptureOptions { keeps_finished: true, masks, ..CaptureOptions::default() };
-        let report = run_make_capture(photos, &capture, &options, stop)?;
+        let report = run_make_capture(photos, &capture, &options)?;
         eprintln!("{}: {report}", capture.display());
         Ok(capture)
     }

@@ -1,17 +1,17 @@
 use super::edits::Edits;
 use super::{open_capture, print_json, splat_out, warn};
-use anyhow::Result;
-use clap::Args;
-use glam::{DMat4, DVec3};
-use globalsplat::Error;
-use globalsplat::data::write_transforms_json;
-use globalsplat::io::{
+use crate::Error;
+use crate::data::write_transforms_json;
+use crate::io::{
     InputFiles, ShLimits, Splat, WriteOptions, check_writable_file, check_writable_splat, fit_splat,
     read_splat, read_splat_without_invalid, splat_files,
 };
-use globalsplat::metrics::psnr_between;
-use globalsplat::render::{SplatEdit, edit_splat, move_cameras, orbit_around_splat};
-use globalsplat::scene::{Camera, LocalFrame, splat_frame};
+use crate::metrics::psnr_between;
+use crate::render::{SplatEdit, edit_splat, move_cameras, orbit_around_splat};
+use crate::scene::{Camera, LocalFrame, splat_frame};
+use anyhow::Result;
+use clap::Args;
+use glam::{DMat4, DVec3};
 use serde_json::{Value, json};
 use std::cmp::Ordering;
 use std::path::{Path, PathBuf};
@@ -70,9 +70,6 @@ pub struct Convert {
     /// Version of SPZ, 2 to 4; by default 4, or with --clamp-sh 3, because some viewers don't read 4
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..=4))]
     spz_version: Option<u32>,
-    /// Remove Gaussians with values that aren't finite; `convert` always does, and scripts for splat-transform may say so
-    #[arg(long)]
-    filter_nan: bool,
     #[command(flatten)]
     edits: Edits,
     /// Print the result as one JSON object

@@ -1,6 +1,6 @@
 //! Parser of `--device cpu|cuda[:N]`.
 
-use globalsplat::{Error, Result};
+use crate::{Error, Result};
 use std::ffi::CStr;
 use tch::{Cuda, Device};
 

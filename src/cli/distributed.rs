@@ -1,8 +1,8 @@
 //! Distributed runs: this process as one of several that `torchrun` started.
 
 use super::device;
-use globalsplat::distributed::{DistributedEnv, ProcessGroup, Rendezvous};
-use globalsplat::error::{Error, Result};
+use crate::distributed::{DistributedEnv, ProcessGroup, Rendezvous};
+use crate::error::{Error, Result};
 use std::sync::OnceLock;
 use tch::Device;
 

@@ -1,19 +1,16 @@
 use super::{device, print_json, view};
+use crate::config::Config;
+use crate::device::total_memory_bytes;
+use crate::distributed::Backends;
+use crate::io::{WEIGHTS_VARIABLE, find_ffmpeg, find_pretrained};
+use crate::loss::LpipsNetwork;
+use crate::model::Precision;
+use crate::reconstruct::BUNDLED_MODEL;
+use crate::render::cpu::{libtorch_simd_level, simd_level};
+use crate::render::cuda::{Driver, KernelOrigin, Nvrtc, cache_folder, load_kernels};
+use crate::train::MemoryEstimate;
 use anyhow::Result;
 use clap::Args;
-use globalsplat::config::Config;
-use globalsplat::device::total_memory_bytes;
-use globalsplat::distributed::Backends;
-use globalsplat::error::Error;
-use globalsplat::io::{WEIGHTS_VARIABLE, find_ffmpeg, find_pretrained};
-use globalsplat::loss::LpipsNetwork;
-use globalsplat::model::Precision;
-use globalsplat::reconstruct::BUNDLED_MODEL;
-use globalsplat::render::cpu::{libtorch_simd_level, simd_level};
-use globalsplat::render::cuda::{
-    CodeFormat, Driver, KernelOrigin, KernelResources, Nvrtc, cache_folder, load_kernels, parse_resources,
-};
-use globalsplat::train::MemoryEstimate;
 use globalsplat_colmap::Colmap;
 use serde_json::{Value, json};
 use std::fmt::Display;
@@ -23,14 +20,10 @@ use tch::Device;
 /// Report what this machine offers: libtorch, devices, SIMD level, threads, GPUs and their requirements, and the weights,
 /// the ffmpeg and the COLMAP found.
 #[derive(Args)]
-#[command(after_help = "Examples:\n  globalsplat doctor\n  globalsplat doctor --kernels\n  \
-    globalsplat doctor --config configs/re10k_16k.toml --set train.precision=bf16")]
+#[command(after_help = "Examples:\n  globalsplat doctor\n  globalsplat doctor --config configs/re10k_16k.toml --set train.precision=bf16")]
 pub struct Doctor {
-    /// Compile the kernels for every GPU architecture that NVRTC supports, and report the resources that each uses
-    #[arg(long)]
-    kernels: bool,
     /// Report how much memory a training step with this configuration takes, on a CPU and on a GPU
-    #[arg(long, value_name = "FILE", conflicts_with = "kernels")]
+    #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Override a key of the configuration, as in train.micro_batch=4
     #[arg(long, value_name = "KEY=VALUE", requires = "config")]
@@ -42,9 +35,6 @@ pub struct Doctor {
 
 impl Doctor {
     pub fn run(self) -> Result<()> {
-        if self.kernels {
-            return Ok(kernels(self.json)?);
-        }
         if let Some(file) = &self.config {
             return Ok(memory_of_training(&Config::read(file, &self.set)?, self.json)?);
         }
@@ -52,7 +42,7 @@ impl Doctor {
         let usable = tch::Cuda::device_count();
         let devices: Vec<String> =
             std::iter::once("cpu".to_string()).chain((0..usable).map(|i| format!("cuda:{i}"))).collect();
-        let (simd, libtorch) = (simd_level()?, globalsplat::render::libtorch_version());
+        let (simd, libtorch) = (simd_level()?, crate::render::libtorch_version());
         let (threads, cores) = (tch::get_num_threads(), std::thread::available_parallelism()?.get());
         let weights =
             LpipsNetwork::ALL.map(|network| (network.metric(), find_pretrained(network.file_name())));
@@ -223,7 +213,7 @@ fn state_of_kernels(prepared: Option<&Result<KernelOrigin, String>>, unusable: &
 
 /// Prints the memory of a training step, a column for each kind of device, and whether it fits into the devices of this
 /// machine.
-fn memory_of_training(config: &Config, as_json: bool) -> globalsplat::Result<()> {
+fn memory_of_training(config: &Config, as_json: bool) -> crate::Result<()> {
     let cpu = MemoryEstimate::new(config, Device::Cpu)?;
     let gpu = MemoryEstimate::new(config, Device::Cuda(0))?;
     let driver = Driver::find();
@@ -277,42 +267,6 @@ fn memory_of_training(config: &Config, as_json: bool) -> globalsplat::Result<()>
             false => format!("it does not fit; to save memory: {savings}"),
         };
         println!("{name} has {:.1} GB: {fits}", bytes as f64 * 1e-9);
-    }
-    Ok(())
-}
-
-/// Prints a table of the resources of kernels, a row for each kernel and a column for each architecture.
-fn kernels(as_json: bool) -> globalsplat::Result<()> {
-    let nvrtc = Nvrtc::find().map_err(Error::request)?;
-    let mut of_all: Vec<(i32, Vec<KernelResources>)> = vec![];
-    for &architecture in &nvrtc.architectures {
-        let compiled = nvrtc.compile(architecture, CodeFormat::Cubin).map_err(Error::request)?;
-        let mut kernels = parse_resources(&compiled.log);
-        kernels.sort_by(|a, b| a.name.cmp(&b.name));
-        of_all.push((architecture, kernels));
-    }
-    if as_json {
-        let entries = of_all.iter().map(|(architecture, kernels)| {
-            let kernels: Vec<Value> = kernels
-                .iter()
-                .map(|k| json!({ "name": k.name, "registers": k.registers, "shared": k.shared, "stack": k.stack, "spills": k.spills }))
-                .collect();
-            json!({ "compute_capability": capability(*architecture), "kernels": kernels })
-        });
-        print_json(&entries.collect());
-        return Ok(());
-    }
-    println!("Registers of a thread, shared bytes of a block, and bytes spilled, by compute capability\n");
-    print!("{:<22}", "");
-    of_all.iter().for_each(|(architecture, _)| print!("{:>14}", capability(*architecture)));
-    println!();
-    for (row, kernel) in of_all[0].1.iter().enumerate() {
-        print!("{:<22}", kernel.name);
-        for (_, kernels) in &of_all {
-            let KernelResources { registers, shared, spills, .. } = &kernels[row];
-            print!("{:>14}", format!("{registers}/{shared}/{spills}"));
-        }
-        println!();
     }
     Ok(())
 }

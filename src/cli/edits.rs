@@ -1,10 +1,10 @@
 //! Options that edit a splat, in the order in which they are given.
 
 use super::open_capture;
+use crate::io::{InputFiles, read_splat_without_invalid, splat_files};
+use crate::render::SplatEdit;
 use clap::{Arg, ArgAction, ArgMatches, Args, Command, FromArgMatches};
 use glam::{DMat4, DQuat, DVec3};
-use globalsplat::io::{InputFiles, read_splat_without_invalid, splat_files};
-use globalsplat::render::SplatEdit;
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::path::PathBuf;
 
@@ -170,8 +170,8 @@ impl Edits {
         &self,
         inputs: &mut InputFiles,
         warn: impl Fn(&[String]),
-    ) -> globalsplat::Result<Vec<(&str, SplatEdit)>> {
-        let mut read = |argument: &EditArgument| -> globalsplat::Result<SplatEdit> {
+    ) -> crate::Result<Vec<(&str, SplatEdit)>> {
+        let mut read = |argument: &EditArgument| -> crate::Result<SplatEdit> {
             Ok(match argument {
                 EditArgument::Edit(edit) => edit.clone(),
                 EditArgument::PruneUnseen(path) => {

@@ -1,25 +1,24 @@
 use super::{
     check_views, device, distributed, model, open_masked_capture, parse_holdout, print_json, progress,
-    report_downscaling, stop_flag, warn, warn_of_many,
+    report_downscaling, signals, warn, warn_of_many,
 };
-use anyhow::Result;
-use clap::{ArgGroup, Args};
-use globalsplat::data::{Capture, Dataset, Holdout, PhotoSize, Split, View};
-use globalsplat::device::peak_memory_bytes;
-use globalsplat::error::Error;
-use globalsplat::eval::{
+use crate::data::{Capture, Dataset, Holdout, PhotoSize, Split, View};
+use crate::device::peak_memory_bytes;
+use crate::error::Error;
+use crate::eval::{
     Baselines, DatasetEvaluation, EvalScene, Evaluation, EvaluationIndex, LazyPhotos, Method, REPORT, TABLE,
     evaluation_files, machine, score_output, weights_fingerprint, write_csv, write_evaluation, write_report,
 };
-use globalsplat::io::{InputFiles, check_writable_dir, check_writable_png};
-use globalsplat::metrics::{CaptureScores, ContactSheet, Perceptual};
-use globalsplat::model::Precision;
-use globalsplat::reconstruct::{LoadedModel, Model, context_views};
-use globalsplat::scene::ImageSize;
+use crate::io::{InputFiles, check_writable_dir, check_writable_png};
+use crate::metrics::{CaptureScores, ContactSheet, Perceptual};
+use crate::model::Precision;
+use crate::reconstruct::{LoadedModel, Model, context_views};
+use crate::scene::ImageSize;
+use anyhow::Result;
+use clap::{ArgGroup, Args};
 use serde_json::json;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering;
 use tch::Device;
 
 /// Evaluate a model, splats or images against photos: PSNR, SSIM, and LPIPS if `make weights` was run.
@@ -315,7 +314,7 @@ impl Eval {
         let model = loaded.as_ref().map(Model::from);
         let target_size = self.target_size(model)?;
         let fingerprint = self.fingerprint()?;
-        let stop = stop_flag()?;
+        signals::handle_stop_requests()?;
 
         let mut evaluations = vec![];
         for ((index, folder), dataset_name) in indices.iter().zip(folders).zip(dataset_names) {
@@ -344,7 +343,7 @@ impl Eval {
                 |done, of| {
                     bar.set_length(of as u64);
                     bar.set_position(done as u64);
-                    !stop.load(Ordering::Relaxed)
+                    !signals::is_stop_requested()
                 },
             )?;
             bar.finish_and_clear();

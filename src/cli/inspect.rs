@@ -1,16 +1,16 @@
 use super::{open_capture, print_json, splat_out, warn};
-use anyhow::Result;
-use clap::Args;
-use glam::DVec3;
-use globalsplat::data::{Chunk, Dataset, INDEX_FILE, Split};
-use globalsplat::error::Error;
-use globalsplat::io::{
+use crate::data::{Chunk, Dataset, INDEX_FILE, Split};
+use crate::error::Error;
+use crate::io::{
     InputFiles, Splat, WeightsFile, check_writable_png, is_splat_name, is_weights_name,
     read_splat_without_invalid, splat_files, write_png,
 };
-use globalsplat::reconstruct::{CONFIG_KEY, ModelFile, STAGE_KEY};
-use globalsplat::render::{SplatRenderer, orbit_around_splat};
-use globalsplat::scene::Gaussians;
+use crate::reconstruct::{CONFIG_KEY, ModelFile, STAGE_KEY};
+use crate::render::{SplatRenderer, orbit_around_splat};
+use crate::scene::Gaussians;
+use anyhow::Result;
+use clap::Args;
+use glam::DVec3;
 use serde_json::{Value, json};
 use std::f64::consts::PI;
 use std::path::{Path, PathBuf};
@@ -208,6 +208,6 @@ fn capture(path: &Path) -> Result<Value> {
         "masks": Some(capture.mask_count()).filter(|&count| count > 0),
         "image_size": [first.height, first.width],
         "focal_lengths": [first.intrinsics.fx, first.intrinsics.fy],
-        "extent": globalsplat::scene::normalize(&poses)?.world_from_normalized.scale,
+        "extent": crate::scene::normalize(&poses)?.world_from_normalized.scale,
     }))
 }

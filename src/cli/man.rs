@@ -1,13 +1,13 @@
 //! Descriptions of the command line for other programs: man pages and shell completions.
 
 use super::{command_line, print_json};
+use crate::Error;
+use crate::io::{check_writable_dir, write_atomically};
 use anyhow::Result;
 use clap::{Args, Command};
 use clap_complete::Shell;
 use clap_mangen::Man as Page;
 use clap_mangen::roff::{Roff, roman};
-use globalsplat::Error;
-use globalsplat::io::{check_writable_dir, write_atomically};
 use serde_json::json;
 use std::io::{self, Write};
 use std::path::PathBuf;

@@ -28,17 +28,15 @@ mod train;
 mod view;
 mod weights;
 
+use crate::Error;
+use crate::data::{Capture, Holdout};
+use crate::error::panic_message;
+use crate::scene::ImageSize;
 use clap::{CommandFactory, Parser, Subcommand};
-use globalsplat::Error;
-use globalsplat::data::{Capture, Holdout};
-use globalsplat::error::panic_message;
-use globalsplat::scene::ImageSize;
 use std::backtrace::{Backtrace, BacktraceStatus};
 use std::panic;
 use std::path::Path;
 use std::process::ExitCode;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 const DONE: u8 = 0;
 const FAILED: u8 = 1;
@@ -124,8 +122,6 @@ pub fn main() -> ExitCode {
             return ExitCode::from(e.exit_code() as u8);
         }
     };
-    // Errors stay one sentence.
-    globalsplat_csrc::render::disable_stack_traces();
     // Denormals halve the speed of training on some processors. This must precede the start of other threads.
     globalsplat_csrc::processor::flush_denormals();
     // Errors of libtorch that the library's own checks don't catch arrive as panics: the user still gets one sentence, and with
@@ -137,45 +133,77 @@ pub fn main() -> ExitCode {
             eprintln!("{backtrace}");
         }
     }));
-    let result = panic::catch_unwind(|| {
-        if !cli.command.is_shared() {
-            distributed::require_single_process()?;
+    match cli.command.run_to_end() {
+        Ok(()) => ExitCode::from(DONE),
+        Err((code, message)) => {
+            if let Some(message) = message {
+                eprintln!("globalsplat: {message}");
+            }
+            ExitCode::from(code)
         }
-        cli.command.run()
-    });
-    let code = match result {
-        Ok(Ok(())) => DONE,
-        Ok(Err(error)) => {
-            let message = error.to_string();
-            // An error of the lower crates is one of the library's.
-            let error = error.downcast::<globalsplat_files::Error>().map(Error::from);
-            let error = error.or_else(|other| other.downcast::<Error>()).ok();
-            print_error(&message, error.as_ref().is_some_and(Error::is_distributed));
-            if error.as_ref().is_some_and(Error::is_invalid_request) { WRONG_REQUEST } else { FAILED }
+    }
+}
+
+/// Runs the program with `arguments` in this process, for tests, which thereby save the start of another one.
+///
+/// # Errors
+/// Returns the exit code of a failure, and the message that the program would print.
+pub fn run(arguments: &[&str]) -> Result<(), (u8, String)> {
+    let cli = Cli::try_parse_from([&["globalsplat"], arguments].concat());
+    let cli = cli.map_err(|e| (e.exit_code() as u8, e.to_string()))?;
+    cli.command.run_to_end().map_err(|(code, message)| (code, message.unwrap_or_default()))
+}
+
+impl Command {
+    /// Runs the command. A failure is returned as its exit code and the message for the user, unless another process prints it.
+    fn run_to_end(self) -> Result<(), (u8, Option<String>)> {
+        // Errors stay one sentence.
+        globalsplat_csrc::render::disable_stack_traces();
+        let result = panic::catch_unwind(panic::AssertUnwindSafe(|| {
+            if !self.is_shared() {
+                distributed::require_single_process()?;
+            }
+            self.run()
+        }));
+        match result {
+            Ok(Ok(())) => Ok(()),
+            Ok(Err(error)) => {
+                let message = error.to_string();
+                // An error of the lower crates is one of the library's.
+                let error = error.downcast::<globalsplat_files::Error>().map(Error::from);
+                let error = error.or_else(|other| other.downcast::<Error>()).ok();
+                let message = user_message(&message, error.as_ref().is_some_and(Error::is_distributed));
+                Err((
+                    if error.as_ref().is_some_and(Error::is_invalid_request) {
+                        WRONG_REQUEST
+                    } else {
+                        FAILED
+                    },
+                    message,
+                ))
+            }
+            Err(panic) => Err((
+                FAILED,
+                user_message(&format!("internal error (please report): {}", panic_message(&*panic)), false),
+            )),
         }
-        Err(panic) => {
-            print_error(&format!("internal error (please report): {}", panic_message(&*panic)), false);
-            FAILED
-        }
-    };
-    ExitCode::from(code)
+    }
 }
 
 /// Start of the message of `println!`'s panic if standard output can't be written.
 const PRINTING: &str = "failed printing to stdout: ";
 
-/// Prints an error to standard error. Errors from below the program's own checks are reworded for the user.
-fn print_error(message: &str, is_secondary: bool) {
-    let Some(message) = distributed::message_to_print(message, is_secondary) else { return };
+/// Returns an error's message as the user sees it, or `None` if there is nothing to say: another process reports it, or a reader of
+/// standard output, such as `head`, has closed the pipe early.
+fn user_message(message: &str, is_secondary: bool) -> Option<String> {
+    let message = distributed::message_to_print(message, is_secondary)?;
     if message.contains("DefaultCPUAllocator") || message.contains("std::bad_alloc") {
-        eprintln!("globalsplat: out of memory");
-    } else if let Some((_, why)) = message.split_once(PRINTING) {
-        // A reader that closes the pipe early, such as `head`, isn't an error.
-        if !why.contains("Broken pipe") {
-            eprintln!("globalsplat: standard output can't be written: {why}");
-        }
-    } else {
-        eprintln!("globalsplat: {message}");
+        return Some("out of memory".into());
+    }
+    match message.split_once(PRINTING) {
+        Some((_, why)) if why.contains("Broken pipe") => None,
+        Some((_, why)) => Some(format!("standard output can't be written: {why}")),
+        None => Some(message),
     }
 }
 
@@ -198,14 +226,6 @@ fn parse_holdout(text: &str) -> anyhow::Result<Holdout> {
     Ok(text.parse::<Holdout>().map_err(Error::request)?)
 }
 
-/// Returns a flag that becomes true when the user or the system asks the program to stop.
-fn stop_flag() -> anyhow::Result<Arc<AtomicBool>> {
-    let stop = Arc::new(AtomicBool::new(false));
-    let flag = stop.clone();
-    signals::on_stop(move || flag.store(true, Ordering::Relaxed))?;
-    Ok(stop)
-}
-
 /// Returns an error if --views is smaller than the number of photos that a reconstruction needs.
 fn check_views(views: Option<usize>) -> Result<(), Error> {
     match views {
@@ -215,13 +235,13 @@ fn check_views(views: Option<usize>) -> Result<(), Error> {
 }
 
 /// Opens a capture and prints warnings about what is ignored or changed in it.
-fn open_capture(path: &Path) -> globalsplat::Result<Capture> {
+fn open_capture(path: &Path) -> crate::Result<Capture> {
     open_masked_capture(path, None)
 }
 
 /// Opens a capture like [`open_capture`], with the masks in the folder `masks` if it is given.
-fn open_masked_capture(path: &Path, masks: Option<&Path>) -> globalsplat::Result<Capture> {
-    let mut capture = globalsplat::data::open_capture(path)?;
+fn open_masked_capture(path: &Path, masks: Option<&Path>) -> crate::Result<Capture> {
+    let mut capture = crate::data::open_capture(path)?;
     if let Some(masks) = masks {
         capture = capture.with_masks(masks)?;
     }

@@ -1,10 +1,10 @@
 //! Shared code for `--weights` and `--precision auto|f32|bf16`.
 
 use super::distributed;
-use globalsplat::config::Config;
-use globalsplat::model::{Precision, Stage};
-use globalsplat::reconstruct::{BUNDLED_MODEL, LoadedModel, ModelFile};
-use globalsplat::{Error, Result};
+use crate::config::Config;
+use crate::model::{Precision, Stage};
+use crate::reconstruct::{BUNDLED_MODEL, LoadedModel, ModelFile};
+use crate::{Error, Result};
 use std::path::Path;
 use tch::Device;
 

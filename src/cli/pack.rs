@@ -1,9 +1,9 @@
 use super::{print_json, progress, warn_of_many};
+use crate::data::{ChunkWriter, Holdout, find_captures, open_capture};
+use crate::error::Error;
+use crate::io::{InputFiles, check_writable_dir};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::data::{ChunkWriter, Holdout, find_captures, open_capture};
-use globalsplat::error::Error;
-use globalsplat::io::{InputFiles, check_writable_dir};
 use serde_json::json;
 use std::path::PathBuf;
 

@@ -2,28 +2,27 @@
 
 use super::capture::SceneSource;
 use super::progress::{self, Progress};
-use super::signals::StopRequest;
 use super::{
     check_views, device, keep_freed_memory, model, open_masked_capture, print_json, report_downscaling,
-    splat_out, warn,
+    signals, splat_out, warn,
 };
-use anyhow::Result;
-use clap::Args;
-use globalsplat::data::{Capture, PhotoSize};
-use globalsplat::device::process_age;
-use globalsplat::error::Error;
-use globalsplat::io::{
+use crate::data::{Capture, PhotoSize};
+use crate::device::process_age;
+use crate::error::Error;
+use crate::io::{
     InputFiles, check_writable_dir, check_writable_file, check_writable_png, check_writable_splat,
     read_splat, splat_files,
 };
-use globalsplat::metrics::CaptureScores;
-use globalsplat::model::Precision;
-use globalsplat::reconstruct::spread_over_path;
-use globalsplat::refine::{
+use crate::metrics::{CaptureScores, Scores};
+use crate::model::Precision;
+use crate::reconstruct::spread_over_path;
+use crate::refine::{
     Budget, Correction, EvalPoint, RefineEvent, RefineLog, RefineOptions, RefineResult, RefineSession,
-    RefineState, SampleScores, SceneInit,
+    RefineState, SceneInit,
 };
-use globalsplat::scene::{Camera, LocalFrame};
+use crate::scene::{Camera, LocalFrame};
+use anyhow::Result;
+use clap::Args;
 use serde_json::json;
 use std::cell::RefCell;
 use std::path::PathBuf;
@@ -122,8 +121,9 @@ impl Refine {
         if let Some(log) = &self.reports.log {
             check_writable_dir(log)?;
         }
-        let stop = StopRequest::install()?;
-        let path = self.scene.path(self.masks.as_deref(), &self.out, &stop)?;
+        signals::handle_stop_requests()?;
+        signals::end_at_request(1);
+        let path = self.scene.path(self.masks.as_deref(), &self.out)?;
         // The time budget begins after the poses of photos are found.
         let clock = match self.scene.is_unposed() {
             true => Instant::now(),
@@ -157,7 +157,7 @@ impl Refine {
         let on_event = |event: RefineEvent| {
             bar.update(event);
             write_event(&mut log.borrow_mut(), event);
-            !stop.is_requested()
+            !signals::is_stop_requested()
         };
         let mut session = RefineSession::load(&capture, &self.options, init, on_event)?;
         if let (None, SceneInit::Photos, PhotoSize::Within(side)) =
@@ -170,9 +170,9 @@ impl Refine {
             bar.bar.suspend(|| eprintln!("{line}"));
         }
         // Depths of a subset of the photos are enough for an initial splat, too.
-        stop.set_ends_at_once(matches!(init, SceneInit::Model(_)));
+        signals::end_at_request(if matches!(init, SceneInit::Model(_)) { 1 } else { 2 });
         let gaussians = session.start()?;
-        stop.set_ends_at_once(false);
+        signals::end_at_request(2);
         if self.resume {
             let count = gaussians.count().max(session.gaussians() as i64);
             session.reserve(STATE_TIME_PER_GAUSSIAN * count as u32);
@@ -196,7 +196,7 @@ impl Refine {
         }
         let held_out = session.score_held_out(&result)?;
         if let Some(sheet) = &self.reports.contact_sheet {
-            if stop.is_requested() {
+            if signals::is_stop_requested() {
                 eprintln!("{}: stopped before it was written", sheet.display());
             } else {
                 report_downscaling(sheet, session.contact_sheet(&result)?.write(sheet)?);
@@ -222,22 +222,20 @@ impl Refine {
             lpips.map_or([None; 2], |scores| scores.each_ref().map(|scores| scores.mean.lpips_vgg));
         let (of_photos, of_held_out) =
             if session.held_out().is_empty() { (distances, [None; 2]) } else { ([None; 2], distances) };
-        let scores = |psnr: f64, ssim: f64, lpips: Option<f64>| json!({ "psnr": psnr, "ssim": ssim, "lpips_vgg": lpips });
         if self.json {
-            let of = |scores_of: &SampleScores, lpips| scores(scores_of.psnr, scores_of.ssim, lpips);
+            let of = |scores: &Scores, lpips: Option<f64>| json!({ "psnr": scores.psnr, "ssim": scores.ssim, "lpips_vgg": lpips });
             let mut object = json!({
                 "splat": self.out.to_string_lossy(), "gaussians": count, "photos": photos, "near_duplicates": session.near_duplicates(),
                 "steps": steps, "seconds": ended, "begin_seconds": begun, "corrections": corrections,
                 "shown": { "before": of(before, of_photos[0]), "after": of(after, of_photos[1]) },
             });
             if let Some([before, after]) = held_out {
-                let of = |of: &CaptureScores, lpips| scores(of.mean.psnr, of.mean.ssim, lpips);
                 let scores = session.sample_scores(after);
                 let last = EvalPoint { seconds: *ended, steps: *steps, scores };
                 let curve: Vec<&EvalPoint> = result.curve.iter().chain([&last]).collect();
                 object["held_out"] = json!({
-                    "views": after.views.len(), "before": of(before, of_held_out[0]),
-                    "after": of(after, of_held_out[1]), "curve": curve,
+                    "views": after.views.len(), "before": of(&before.mean, of_held_out[0]),
+                    "after": of(&after.mean, of_held_out[1]), "curve": curve,
                 });
             }
             print_json(&object);

@@ -1,8 +1,8 @@
 use super::print_json;
+use crate::eval::{evaluation_files, read_evaluation, write_report};
+use crate::io::{InputFiles, check_writable_file};
 use anyhow::Result;
 use clap::Args;
-use globalsplat::eval::{evaluation_files, read_evaluation, write_report};
-use globalsplat::io::{InputFiles, check_writable_file};
 use serde_json::json;
 use std::path::PathBuf;
 

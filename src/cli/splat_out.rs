@@ -1,12 +1,12 @@
 //! Output of a splat, with coordinates relative to the world's origin or to a local one.
 
-use glam::DVec3;
-use globalsplat::error::{Error, Result};
-use globalsplat::io::{
+use crate::error::{Error, Result};
+use crate::io::{
     ShLimits, Splat, WriteOptions, can_mark_antialiased, check_writable_origin, fit_splat, rounding_warning,
     splat_files, write_local_splat_with,
 };
-use globalsplat::scene::Camera;
+use crate::scene::Camera;
+use glam::DVec3;
 use std::path::Path;
 
 /// Checks that the origin file of a splat at `path` can be written, if one is to be written (`is_local`).

@@ -1,15 +1,15 @@
 use super::{print_json, progress};
-use anyhow::Result;
-use clap::Args;
-use globalsplat::Error;
-use globalsplat::data::{Capture, ChunkWriter, SyntheticDataset, load_views, read_pictures};
-use globalsplat::eval::{EvaluationIndex, SceneFrames};
-use globalsplat::io::{
+use crate::Error;
+use crate::data::{Capture, ChunkWriter, SyntheticDataset, load_views, read_pictures};
+use crate::eval::{EvaluationIndex, SceneFrames};
+use crate::io::{
     InputFiles, check_writable_dir, check_writable_png, tile_horizontally, tile_vertically, write_atomically,
     write_png,
 };
-use globalsplat::scene::ImageSize;
-use globalsplat::synth::VideoSettings;
+use crate::scene::ImageSize;
+use crate::synth::VideoSettings;
+use anyhow::Result;
+use clap::Args;
 use npyz::WriterBuilder;
 use rayon::prelude::*;
 use serde_json::json;

@@ -1,20 +1,19 @@
-use super::{distributed, keep_freed_memory, print_json, progress, stop_flag, warn_of_many};
-use anyhow::Result;
-use clap::Args;
-use globalsplat::config::Config;
-use globalsplat::data::{BadData, Capture, Dataset, SceneGroups, Split, TrainingScenes};
-use globalsplat::error::Error;
-use globalsplat::eval::{HeldOut, HeldOutScores, write_curves};
-use globalsplat::io::{InputFiles, check_writable_dir};
-use globalsplat::loss::{Term, psnr_of_mse};
-use globalsplat::train::{
+use super::{distributed, keep_freed_memory, print_json, progress, signals, warn_of_many};
+use crate::config::Config;
+use crate::data::{BadData, Capture, Dataset, SceneGroups, Split, TrainingScenes};
+use crate::error::Error;
+use crate::eval::{HeldOut, HeldOutScores, write_curves};
+use crate::io::{InputFiles, check_writable_dir};
+use crate::loss::{Term, psnr_of_mse};
+use crate::train::{
     CONFIG_FILE, Event, METRICS_FILE, Outcome, Resume, Trainer, Validator, retry_on_disk_full, run,
 };
+use anyhow::Result;
+use clap::Args;
 use serde_json::json;
 use std::ffi::OsString;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 /// Train a model on captures, or on chunks of RealEstate10K and the like.
@@ -107,8 +106,8 @@ impl Train {
         }
 
         let start = Instant::now();
-        let stop = stop_flag()?;
-        let outcome = self.train(&config, &mut trainer, &mut held_out, &resume, &stop)?;
+        signals::handle_stop_requests()?;
+        let outcome = self.train(&config, &mut trainer, &mut held_out, &resume)?;
         let seconds = start.elapsed().as_secs_f64();
         let bad_data = trainer.bad_data();
         trainer.group().shutdown()?;
@@ -129,7 +128,7 @@ impl Train {
             };
             anyhow::bail!("stopped; {checkpoint} is complete; {command} resumes");
         }
-        self.report(&outcome, seconds, held_out.scores(), &bad_data, &stop)
+        self.report(&outcome, seconds, held_out.scores(), &bad_data)
     }
 
     /// Returns an error for a folder whose files would replace an input. The configuration may be the run's own, since it is
@@ -152,7 +151,6 @@ impl Train {
         trainer: &mut Trainer,
         held_out: &mut HeldOut,
         resume: &Resume,
-        stop: &AtomicBool,
     ) -> Result<Outcome> {
         let is_main_process = trainer.group().is_main_process();
         let bar = progress::bar_on_first_rank(is_main_process, config.train.steps, "steps");
@@ -161,7 +159,7 @@ impl Train {
         let mut first = true;
         let validator = (!held_out.is_empty()).then_some(held_out as &mut dyn Validator);
         let outcome = run(trainer, &self.out, resume, validator, |event| {
-            let should_continue = !stop.load(Ordering::Relaxed);
+            let should_continue = !signals::is_stop_requested();
             let (report, samples_per_second) = match event {
                 Event::Step { report, samples_per_second } => (report, samples_per_second),
                 Event::Validation(score) => {
@@ -206,7 +204,6 @@ impl Train {
         seconds: f64,
         validation: &[HeldOutScores],
         bad_data: &BadData,
-        stop: &AtomicBool,
     ) -> Result<()> {
         let mean = |value: fn(&HeldOutScores) -> f64| {
             validation.iter().map(value).sum::<f64>() / validation.len() as f64
@@ -217,7 +214,7 @@ impl Train {
             if let Event::Notice(text) = event {
                 eprintln!("{text}");
             }
-            !stop.load(Ordering::Relaxed)
+            !signals::is_stop_requested()
         };
         retry_on_disk_full(&mut on_event, || write_curves(&curves, &self.out, nearest))?;
         if self.json {

@@ -1,13 +1,13 @@
 //! The commands `export` and `import`, which write weights.
 
 use super::{model, print_json};
+use crate::config::Config;
+use crate::io::{InputFiles, check_writable_file, write_weights};
+use crate::model::{GlobalSplat, Precision, Stage};
+use crate::reconstruct::{ModelDtype, ModelFile, load_model, model_weights, save_checkpoint};
+use crate::train::{MODEL_FILE, add_run_inputs, best_checkpoint, latest_checkpoint};
 use anyhow::Result;
 use clap::{ArgGroup, Args, ValueEnum};
-use globalsplat::config::Config;
-use globalsplat::io::{InputFiles, check_writable_file, write_weights};
-use globalsplat::model::{GlobalSplat, Precision, Stage};
-use globalsplat::reconstruct::{ModelDtype, ModelFile, load_model, model_weights, save_checkpoint};
-use globalsplat::train::{MODEL_FILE, add_run_inputs, best_checkpoint, latest_checkpoint};
 use serde_json::{Value, json};
 use std::path::PathBuf;
 use tch::{Device, nn};

@@ -13,7 +13,7 @@ pub use scores::{CaptureScores, ViewScore, psnr_between, score_view, score_views
 use serde::{Deserialize, Serialize};
 
 /// Scores of an image, or means over images.
-#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Scores {
     /// PSNR in dB.
     pub psnr: f64,

@@ -62,9 +62,9 @@ pub struct EvalPoint {
     pub seconds: f64,
     /// Number of steps done.
     pub steps: u64,
-    /// Scores of the sample.
+    /// Mean scores of the sample.
     #[serde(flatten)]
-    pub scores: SampleScores,
+    pub scores: Scores,
 }
 
 /// Log in the folder of a run: `metrics.jsonl`, with a line for some of the steps and one for each score, and event files in `tensorboard`.
@@ -154,15 +154,6 @@ pub(super) struct ViewSample {
     views: Vec<View>,
 }
 
-/// Mean scores of a sample.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct SampleScores {
-    /// PSNR in dB.
-    pub psnr: f64,
-    /// SSIM, as scikit-image computes it.
-    pub ssim: f64,
-}
-
 impl ViewSample {
     /// Chooses up to eight of `views`, fewer if they are large, to be scored several times.
     pub fn small(views: &[View]) -> Self {
@@ -198,16 +189,13 @@ impl ViewSample {
     ///
     /// # Errors
     /// Fails if rendering fails.
-    pub fn score(&self, gaussians: &Gaussians) -> Result<Option<SampleScores>> {
-        let scores = score_views("sample", gaussians, &self.views, None, |_| true)?;
-        Ok(scores.map(|scores| SampleScores { psnr: scores.mean.psnr, ssim: scores.mean.ssim }))
+    pub fn score(&self, gaussians: &Gaussians) -> Result<Option<Scores>> {
+        Ok(score_views("sample", gaussians, &self.views, None, |_| true)?.map(|scores| scores.mean))
     }
 
     /// Returns the mean scores of the sample, given the `scores` of all views that it was chosen from.
-    pub fn select_scores(&self, scores: &CaptureScores) -> SampleScores {
-        let Scores { psnr, ssim, .. } =
-            Scores::mean(self.indices.iter().map(|&index| &scores.views[index].scores));
-        SampleScores { psnr, ssim }
+    pub fn select_scores(&self, scores: &CaptureScores) -> Scores {
+        Scores::mean(self.indices.iter().map(|&index| &scores.views[index].scores))
     }
 }
 

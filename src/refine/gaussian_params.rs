@@ -66,38 +66,27 @@ impl GaussianParams {
 
     /// Returns a copy that requires no gradients.
     pub fn copy(&self) -> Self {
-        let copy = |t: &Tensor| t.detach().copy();
-        GaussianParams {
-            means: copy(&self.means),
-            log_scales: copy(&self.log_scales),
-            quaternions: copy(&self.quaternions),
-            opacity_logits: copy(&self.opacity_logits),
-            sh0: copy(&self.sh0),
-            sh_rest: copy(&self.sh_rest),
-        }
+        self.map(|_, t| t.detach().copy())
     }
 
     /// Returns these Gaussians followed by `count` copies of the first one with almost no opacity (sigmoid(−30)), which the next relocation
     /// moves. Requires at least one Gaussian.
     pub fn append_dead(&self, count: i64) -> Self {
-        let append = |t: &Tensor, more: &Tensor| Tensor::cat(&[t, more], 1).detach().set_requires_grad(true);
-        let append_copies = |t: &Tensor| {
+        self.map(|name, t| {
             let mut size = t.size();
             size[1] = count;
-            append(t, &t.narrow(1, 0, 1).expand(&size, false))
-        };
-        let logits = &self.opacity_logits;
-        GaussianParams {
-            means: append_copies(&self.means),
-            log_scales: append_copies(&self.log_scales),
-            quaternions: append_copies(&self.quaternions),
-            opacity_logits: append(
-                logits,
-                &Tensor::full([1, count], DEAD_LOGIT, (Kind::Float, logits.device())),
-            ),
-            sh0: append_copies(&self.sh0),
-            sh_rest: append_copies(&self.sh_rest),
-        }
+            let more = match name {
+                "opacity_logits" => Tensor::full(&size, DEAD_LOGIT, (Kind::Float, t.device())),
+                _ => t.narrow(1, 0, 1).expand(&size, false),
+            };
+            Tensor::cat(&[t, &more], 1).detach().set_requires_grad(true)
+        })
+    }
+
+    fn map(&self, f: impl Fn(&str, &Tensor) -> Tensor) -> Self {
+        let [means, log_scales, quaternions, opacity_logits, sh0, sh_rest] =
+            self.named_parameters().map(|(name, t)| f(name, t));
+        GaussianParams { means, log_scales, quaternions, opacity_logits, sh0, sh_rest }
     }
 
     /// Returns the number of Gaussians.

@@ -17,7 +17,7 @@ mod state;
 
 pub use config::RefineConfig;
 pub use corrections::{Correction, Corrections};
-pub use events::{EvalPoint, RefineEvent, RefineLog, RefineMetrics, SampleScores};
+pub use events::{EvalPoint, RefineEvent, RefineLog, RefineMetrics};
 pub use gaussian_optimizer::GaussianOptimizer;
 pub use init::{PhotoInit, SceneInit, gaussians_from_photos};
 pub use options::{Budget, ExposureCorrection, MaskBackground, RefineOptions};
@@ -252,11 +252,11 @@ pub fn scene_depth(gaussians: &Gaussians, views: &[View]) -> Result<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bench::synthetic_gaussians;
+    use crate::data::view_batch;
     use crate::device::num_threads;
     use crate::metrics::score_views;
     use crate::render::DEFAULT_EPS2D;
-    use crate::scene::{ImageSize, Intrinsics, RawGaussians};
+    use crate::scene::{Intrinsics, RawGaussians};
     use glam::{DMat4, DVec3};
     use globalsplat_csrc::ops::{WAITING, computing, record_ops, record_outermost_ops};
     use tch::Device;
@@ -291,6 +291,15 @@ mod tests {
             View { image: image.into(), mask: is_masked.then(|| mask.into()), ..view.shallow_clone() }
         });
         [blobs.collect(), clean]
+    }
+
+    /// Returns 40 Gaussians of the wall, and its first `count` cameras.
+    fn gaussians_of_wall(count: usize) -> (Gaussians, Cameras) {
+        let [_, views] = wall(false);
+        let scene =
+            gaussians_from_photos(&views, &[], 40, 0, ExposureCorrection::Off, |_| true).expect("depths");
+        let poses: Vec<DMat4> = views[..count].iter().map(|view| view.camera.c2w).collect();
+        (scene.gaussians.activate(), view_batch(&views[..count], &poses, Device::Cpu).cameras())
     }
 
     /// Refines a splat on `views`, which starts from the depths of `start`, and returns it.
@@ -404,7 +413,7 @@ mod tests {
     /// The splat is compared over the background: one that is empty matches a photo that is masked out.
     #[test]
     fn masked_pixels_have_the_background_s_color() {
-        let (gaussians, cameras) = synthetic_gaussians(40, 1, ImageSize { width: 32, height: 24 });
+        let (gaussians, cameras) = gaussians_of_wall(1);
         let rendered = render(&gaussians, &cameras, DEFAULT_EPS2D).unwrap();
         let config = RefineConfig { opacity_reg: 0., ..RefineConfig::default() };
         let loss_of = |alpha: f64, masked: bool, background: [f32; 3]| {
@@ -433,7 +442,7 @@ mod tests {
     /// the device only where memory for (splat, tile) pairs is allocated.
     #[test]
     fn a_step_makes_only_expected_device_copies() {
-        let (gaussians, cameras) = synthetic_gaussians(40, 4, ImageSize { width: 32, height: 24 });
+        let (gaussians, cameras) = gaussians_of_wall(4);
         let rendered = render(&gaussians, &cameras, DEFAULT_EPS2D).unwrap();
         let c2w = cameras.w2c.inverse();
         let intrinsics = cameras.intrinsics.shallow_clone();

@@ -3,7 +3,7 @@
 
 use super::config::RefineConfig;
 use super::corrections::{Correction, Corrections};
-use super::events::{EvalPoint, RefineEvent, RefineMetrics, SampleScores, ViewSample, summarize_names};
+use super::events::{EvalPoint, RefineEvent, RefineMetrics, ViewSample, summarize_names};
 use super::exposures::LogGains;
 use super::gaussian_optimizer::GaussianOptimizer;
 use super::init::{PhotoInit, SceneInit, gaussians_from_photos, most_visible};
@@ -14,7 +14,7 @@ use super::{OptimizeArgs, refine, scene_depth};
 use crate::data::{Capture, PhotoSize, Point, View, read_points};
 use crate::error::{Error, Result};
 use crate::io::Splat;
-use crate::metrics::{CaptureScores, ContactSheet, Perceptual, score_views};
+use crate::metrics::{CaptureScores, ContactSheet, Perceptual, Scores, score_views};
 use crate::reconstruct::{LoadedModel, Model, reconstruct, spread_over_path};
 use crate::scene::{Camera, Gaussians, LocalFrame, RawGaussians};
 use crate::stereo::DepthMap;
@@ -51,7 +51,7 @@ pub struct RefineResult {
     /// State from which [`SceneInit::State`] continues; `None` if the final Gaussians are the initial ones.
     pub state: Option<RefineState>,
     /// Scores of a sample of the photos before and after the optimization.
-    pub shown: [SampleScores; 2],
+    pub shown: [Scores; 2],
     /// Number of photos in this sample.
     pub shown_photos: usize,
     /// Scores of a sample of the held-out views during the optimization.
@@ -413,7 +413,7 @@ impl<'a> RefineSession<'a> {
     }
 
     /// Returns the mean scores of the sample of [`EvalPoint`], given the scores of all views by [`RefineSession::score_held_out`].
-    pub fn sample_scores(&self, scores: &CaptureScores) -> SampleScores {
+    pub fn sample_scores(&self, scores: &CaptureScores) -> Scores {
         self.held_out_sample.select_scores(scores)
     }
 

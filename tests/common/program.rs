@@ -1,5 +1,7 @@
 //! Running the program as a user does, on a small capture that it generates itself.
 
+use serde_json::Value;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
@@ -38,6 +40,9 @@ batch_size = 1
 checkpoint_every = 2
 "#;
 
+/// Setting with which several threads don't slow down the other tests.
+pub const WAIT_PASSIVELY: (&str, &str) = ("OMP_WAIT_POLICY", "passive");
+
 /// Runs `globalsplat` with `arguments` and returns its output.
 pub fn globalsplat(arguments: &[&str]) -> Output {
     command(arguments).output().expect("a program that starts")
@@ -63,15 +68,13 @@ pub fn refuse(arguments: &[&str]) -> String {
     fail(arguments, 2)
 }
 
-/// Returns the one-sentence error of a run that must end with `code`.
-pub fn fail(arguments: &[&str], code: i32) -> String {
-    let output = globalsplat(arguments);
-    let err = String::from_utf8_lossy(&output.stderr).trim().to_string();
-    assert_eq!(output.status.code(), Some(code), "{arguments:?}: {err}");
-    assert!(output.stdout.is_empty(), "a refusal prints no result");
-    assert_eq!(err.lines().count(), 1, "one sentence: {err}");
-    assert!(!err.contains("panicked"), "{err}");
-    err
+/// Returns the one-sentence error of a run that must end with `code`. The run is in this process, which saves the start of another.
+#[track_caller]
+pub fn fail(arguments: &[&str], code: u8) -> String {
+    let (found, message) = globalsplat::run(arguments).expect_err("a failure");
+    assert_eq!((found, message.lines().count()), (code, 1), "{arguments:?}: {message}");
+    assert!(!message.contains("internal error"), "{message}");
+    message
 }
 
 /// Returns the path as an argument.
@@ -98,7 +101,7 @@ pub fn room() -> (TempDir, PathBuf) {
     (folder, room)
 }
 
-fn copy_dir(from: &Path, to: &Path) {
+pub fn copy_dir(from: &Path, to: &Path) {
     std::fs::create_dir_all(to).expect("a folder");
     for entry in std::fs::read_dir(from).expect("a folder") {
         let entry = entry.expect("an entry");
@@ -118,10 +121,15 @@ pub fn tiny_config(folder: &Path, capture: &Path) -> PathBuf {
     file
 }
 
-/// Exports untrained weights of [`TINY_CONFIG`].
+/// Writes untrained weights of [`TINY_CONFIG`].
 pub fn tiny_weights(folder: &Path, capture: &Path) -> PathBuf {
+    static WEIGHTS: OnceLock<Vec<u8>> = OnceLock::new();
     let (config, weights) = (tiny_config(folder, capture), folder.join("tiny.safetensors"));
-    succeed(&["export", "--config", arg(&config), "--out", arg(&weights)]);
+    let bytes = WEIGHTS.get_or_init(|| {
+        globalsplat::run(&["export", "--config", arg(&config), "--out", arg(&weights)]).expect("weights");
+        std::fs::read(&weights).expect("weights")
+    });
+    std::fs::write(&weights, bytes).expect("weights");
     weights
 }
 
@@ -135,4 +143,154 @@ pub fn train(config: &Path, run: &Path, settings: &[&str]) -> Vec<String> {
 /// Returns the arguments as string slices.
 pub fn text(arguments: &[String]) -> Vec<&str> {
     arguments.iter().map(String::as_str).collect()
+}
+
+/// A temporary folder for the commands of a test. In their lines, words that begin with @ are files in the folder, and LPIPS is off, because
+/// it takes longer than all the rest.
+pub struct Sandbox(TempDir);
+
+impl Sandbox {
+    pub fn empty() -> Self {
+        Sandbox(tempfile::tempdir().expect("a folder"))
+    }
+
+    /// Contains the capture `room` of nine 40×40 photos with its splat `room/truth.ply`, and the configuration `tiny.toml`, which trains with
+    /// it.
+    pub fn new() -> Self {
+        let (folder, original) = room();
+        std::fs::rename(original, folder.path().join("room")).expect("a folder");
+        tiny_config(folder.path(), &folder.path().join("room"));
+        Sandbox(folder)
+    }
+
+    /// Also contains untrained weights, `tiny.safetensors`.
+    pub fn with_weights() -> Self {
+        let sandbox = Sandbox::new();
+        tiny_weights(sandbox.folder(), &sandbox.path("room"));
+        sandbox
+    }
+
+    pub fn folder(&self) -> &Path {
+        self.0.path()
+    }
+
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.0.path().join(name)
+    }
+
+    pub fn read(&self, name: &str) -> Vec<u8> {
+        std::fs::read(self.path(name)).unwrap_or_else(|e| panic!("{name}: {e}"))
+    }
+
+    pub fn text(&self, name: &str) -> String {
+        String::from_utf8(self.read(name)).expect("text")
+    }
+
+    /// Writes a file, and the folders that lead to it.
+    pub fn write(&self, name: &str, contents: impl AsRef<[u8]>) {
+        let path = self.path(name);
+        std::fs::create_dir_all(path.parent().expect("a folder")).expect("a folder");
+        std::fs::write(path, contents).expect("a file");
+    }
+
+    pub fn copy(&self, from: &str, to: &str) {
+        self.write(to, self.read(from));
+    }
+
+    /// Changes the JSON object in the file `name`.
+    pub fn change_json(&self, name: &str, change: impl FnOnce(&mut Value)) {
+        let mut json = serde_json::from_slice(&self.read(name)).expect("JSON");
+        change(&mut json);
+        self.write(name, json.to_string());
+    }
+
+    /// Returns the sorted names of the entries of the folder `name`.
+    pub fn names(&self, name: &str) -> Vec<String> {
+        let entries = std::fs::read_dir(self.path(name)).expect("a folder");
+        let mut names: Vec<String> =
+            entries.map(|entry| entry.expect("an entry").file_name().into_string().expect("text")).collect();
+        names.sort();
+        names
+    }
+
+    /// Returns every file of the folder, with its contents.
+    pub fn contents(&self) -> BTreeMap<PathBuf, Vec<u8>> {
+        contents(self.folder())
+    }
+
+    fn words(&self, line: &str) -> Vec<String> {
+        let words = shlex::split(line).expect("words");
+        words.into_iter().map(|word| word.replace('@', &format!("{}/", arg(self.folder())))).collect()
+    }
+
+    /// Returns the command of `line`, to run it in a process of its own.
+    pub fn command(&self, line: &str) -> Command {
+        let mut command = command(&text(&self.words(line)));
+        command.env("GLOBALSPLAT_WEIGHTS", self.folder());
+        command
+    }
+
+    /// Returns the exit code, the standard output and the standard error of a process.
+    pub fn output(&self, line: &str) -> (Option<i32>, String, String) {
+        let output = self.command(line).output().expect("a program that starts");
+        let text = |bytes: Vec<u8>| String::from_utf8(bytes).expect("text");
+        (output.status.code(), text(output.stdout), text(output.stderr))
+    }
+
+    /// Returns the standard output of a process that must succeed.
+    #[track_caller]
+    pub fn succeed(&self, line: &str) -> String {
+        let (code, out, err) = self.output(line);
+        assert_eq!(code, Some(0), "{line}: {err}");
+        out
+    }
+
+    /// Returns the one JSON object that a process prints with `--json`.
+    #[track_caller]
+    pub fn json(&self, line: &str) -> Value {
+        let out = self.succeed(&format!("{line} --json"));
+        assert_eq!(out.lines().count(), 1, "one object: {out}");
+        serde_json::from_str(&out).expect("JSON")
+    }
+
+    /// Runs a command that must succeed in this process, which saves the start of another. Its output is lost.
+    #[track_caller]
+    pub fn run(&self, line: &str) {
+        if let Err((_, message)) = globalsplat::run(&text(&self.words(line))) {
+            panic!("{line}: {message}");
+        }
+    }
+
+    /// Returns the one-sentence error of a command that must be refused with exit code 2, in this process.
+    #[track_caller]
+    pub fn refuse(&self, line: &str) -> String {
+        self.fail(line, 2)
+    }
+
+    /// Returns the one-sentence error of a command that must end with `code`, in this process.
+    #[track_caller]
+    pub fn fail(&self, line: &str, code: u8) -> String {
+        fail(&text(&self.words(line)), code)
+    }
+}
+
+/// Returns every file below `folder`, with its contents.
+fn contents(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut files = BTreeMap::new();
+    for entry in std::fs::read_dir(folder).expect("a folder") {
+        let path = entry.expect("an entry").path();
+        match path.is_dir() {
+            true => files.extend(contents(&path)),
+            false => drop(files.insert(path.clone(), std::fs::read(&path).expect("a file"))),
+        }
+    }
+    files
+}
+
+/// Asserts that `message` contains each of `parts`.
+#[track_caller]
+pub fn assert_says(message: &str, parts: &[&str]) {
+    for part in parts {
+        assert!(message.contains(part), "{part:?} is not in: {message}");
+    }
 }

@@ -1,186 +1,144 @@
 //! The evaluation protocol on a dataset: `eval --data ROOT --index FILE --out DIR`.
 
 use crate::common::has_lpips;
-use crate::common::program::{arg, command, fail, refuse, room, rooms, succeed, text, tiny_weights};
+use crate::common::program::{Sandbox, assert_says, copy_dir, rooms};
 use globalsplat::data::{Dataset, Split};
-use globalsplat::eval::{SceneScores, read_evaluation};
+use globalsplat::eval::{Evaluation, SceneScores, read_evaluation};
 use globalsplat::io::{read_image, write_png};
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
-use tempfile::TempDir;
+use std::path::Path;
+use std::sync::OnceLock;
 
-/// Dataset of three rooms with five 256×256 photos each in `captures/`, the same in `chunks/`, their splats in `splats/`, and
-/// an index of two of them that also names a missing scene.
-struct Set {
-    folder: TempDir,
-}
-
-impl Set {
-    fn new() -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        let captures = folder.path().join("captures");
-        rooms(&captures, 3, 5, 256);
-        succeed(&["pack", arg(&captures), "--out", arg(&folder.path().join("chunks"))]);
-        std::fs::create_dir(folder.path().join("splats")).unwrap();
+/// Returns a dataset of three rooms with five 64×64 photos each in `captures`, the same in `chunks`, their splats in `splats`, and an index of
+/// two of them that also names a missing scene; and untrained weights for images of 32×32.
+fn dataset() -> Sandbox {
+    static ORIGINAL: OnceLock<Sandbox> = OnceLock::new();
+    let original = ORIGINAL.get_or_init(|| {
+        let sandbox = Sandbox::with_weights();
+        rooms(&sandbox.path("captures"), 3, 5, 64);
+        sandbox.run("pack @captures --out @chunks");
         for room in ["room_000", "room_001", "room_002"] {
-            let splat = folder.path().join(format!("splats/{room}.ply"));
-            std::fs::copy(captures.join(room).join("truth.ply"), splat).unwrap();
+            sandbox.copy(&format!("captures/{room}/truth.ply"), &format!("splats/{room}.ply"));
         }
-        let set = Set { folder };
         let frames = json!({"context": [0, 2, 4], "target": [1, 3]});
-        set.write_index(&json!({"room_002": frames, "room_000": frames, "absent": frames, "left_out": null}));
-        set
-    }
-
-    fn path(&self, name: &str) -> PathBuf {
-        self.folder.path().join(name)
-    }
-
-    fn write_index(&self, index: &Value) {
-        std::fs::write(self.path("re10k_3v.json"), index.to_string()).unwrap();
-    }
-
-    /// Returns the arguments for a subject and a dataset.
-    fn arguments(&self, subject: &[&str], data: &str) -> Vec<String> {
-        let (data, index, out) = (self.path(data), self.path("re10k_3v.json"), self.path("out"));
-        let rest = ["--data", arg(&data), "--index", arg(&index), "--out", arg(&out)];
-        ["eval"].iter().chain(subject).chain(&rest).map(|argument| argument.to_string()).collect()
-    }
+        let index = json!({"room_002": frames, "room_000": frames, "absent": frames, "left_out": null});
+        sandbox.write("re10k_3v.json", index.to_string());
+        sandbox
+    });
+    let sandbox = Sandbox::empty();
+    copy_dir(original.folder(), sandbox.folder());
+    sandbox
 }
 
-/// Runs the command without LPIPS, which takes longer than all the rest.
-fn run(arguments: &[String], folder: &Path) -> (Option<i32>, String, String) {
-    let output = command(&text(arguments)).env("GLOBALSPLAT_WEIGHTS", folder).output().unwrap();
-    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-    (output.status.code(), text(&output.stdout), text(&output.stderr))
+const SPLATS: &str = "eval --splat @splats --render-height 64 --index @re10k_3v.json --out @out --data";
+const MODEL: &str = "eval --weights @tiny.safetensors --index @re10k_3v.json --data";
+
+/// Runs an evaluation that must succeed, and returns its standard output and error.
+#[track_caller]
+fn run(sandbox: &Sandbox, line: &str) -> (String, String) {
+    let (code, out, err) = sandbox.output(line);
+    assert_eq!(code, Some(0), "{line}: {err}");
+    (out, err)
+}
+
+fn read(sandbox: &Sandbox, folder: &str) -> Evaluation {
+    read_evaluation(&sandbox.path(folder)).unwrap()
 }
 
 #[test]
 fn splats_are_scored_by_an_index_from_chunks_and_captures_alike() {
-    let set = Set::new();
-    let splats = set.path("splats");
+    let sandbox = dataset();
     for data in ["chunks", "captures"] {
-        let (code, out, err) = run(&set.arguments(&["--splat", arg(&splats)], data), set.folder.path());
-        assert_eq!(code, Some(0), "{err}");
-        assert!(out.contains("2 of 3 scenes") && out.contains("LPIPS-VGG absent"), "{out}");
-        assert!(err.contains("left out: lpips_vgg and lpips_alex") && err.contains("make weights"), "{err}");
-        let evaluation = read_evaluation(&set.path("out")).unwrap();
+        let (out, err) = run(&sandbox, &format!("{SPLATS} @{data}"));
+        assert_says(&out, &["2 of 3 scenes", "LPIPS-VGG absent"]);
+        assert_says(&err, &["left out: lpips_vgg and lpips_alex", "make weights"]);
+        let evaluation = read(&sandbox, "out");
         let names: Vec<&str> = evaluation.scenes.iter().map(|scene| scene.scores.scene.as_str()).collect();
         assert_eq!((names.as_slice(), evaluation.indexed_scenes), (["room_000", "room_002"].as_slice(), 3));
         // The photos were rendered from these splats: the only difference is the photos' 8-bit rounding.
-        assert!(
-            evaluation.summary.mean.psnr > 50. && evaluation.summary.mean.ssim > 0.999,
-            "{:?}",
-            evaluation.summary
-        );
+        let mean = &evaluation.summary.mean;
+        assert!(mean.psnr > 50. && mean.ssim > 0.999, "{:?}", evaluation.summary);
         assert_eq!((evaluation.dataset.as_str(), evaluation.context_views), ("re10k", 3));
         let views: Vec<&str> =
             evaluation.scenes[0].scores.views.iter().map(|view| view.image.as_str()).collect();
         assert_eq!(views, ["000001", "000003"]);
-        for file in ["report.html", "scores.json", "scores.csv", "scenes/room_000.jpg"] {
-            assert!(set.path("out").join(file).is_file(), "{file}");
+        for file in ["report.html", "scores.json", "scenes/room_000.jpg"] {
+            assert!(sandbox.path("out").join(file).is_file(), "{file}");
         }
-        let csv = std::fs::read_to_string(set.path("out/scores.csv")).unwrap();
-        assert_eq!(csv.lines().count(), 1 + 2 * 2);
-        std::fs::remove_dir_all(set.path("out")).unwrap();
+        assert_eq!(sandbox.text("out/scores.csv").lines().count(), 1 + 2 * 2);
+        std::fs::remove_dir_all(sandbox.path("out")).unwrap();
     }
 }
 
 #[test]
 fn an_interrupted_evaluation_resumes() {
-    let set = Set::new();
-    let weights = tiny_weights(set.folder.path(), &set.path("captures"));
-    let arguments = set.arguments(&["--precision", "f32", "--weights", arg(&weights)], "chunks");
-    assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
-    let first = read_evaluation(&set.path("out")).unwrap();
+    let sandbox = dataset();
+    let eval = format!("{MODEL} @chunks --precision f32 --out @out");
+    run(&sandbox, &eval);
+    let first = read(&sandbox, "out");
     let efficiency = first.efficiency.expect("a model's cost");
     assert_eq!(efficiency.timed_scenes, 1, "the first scene warms up");
     assert!(efficiency.forward_seconds > 0. && efficiency.peak_memory_bytes > 1_000_000);
     assert_eq!(first.image_size, [32, 32]);
 
     // One scene's scores are incomplete, as if it hadn't been done yet; those of the other are reused unchecked.
-    let kept = set.path("out/scenes/room_000.json");
-    let mut scores: Value = serde_json::from_slice(&std::fs::read(&kept).unwrap()).unwrap();
-    scores["psnr"] = json!(99.5);
-    std::fs::write(&kept, scores.to_string()).unwrap();
-    std::fs::write(set.path("out/scenes/room_002.json"), "{\"scene\": \"room_002\", \"psn").unwrap();
-    assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
-    let second = read_evaluation(&set.path("out")).unwrap();
+    sandbox.change_json("out/scenes/room_000.json", |scores| scores["psnr"] = json!(99.5));
+    sandbox.write("out/scenes/room_002.json", "{\"scene\": \"room_002\", \"psn");
+    run(&sandbox, &eval);
+    let second = read(&sandbox, "out");
     assert_eq!(second.scenes[0].scores.mean.psnr, 99.5);
     assert_eq!(second.scenes[1].scores.mean.psnr, first.scenes[1].scores.mean.psnr);
 
-    // Scores of another subject must not be mixed with these.
-    let splats = set.path("splats");
-    let error = refuse(&text(&set.arguments(&["--splat", arg(&splats)], "chunks")));
-    assert!(error.contains("evaluation.json: the evaluation is of tiny.safetensors"), "{error}");
-    // Scores of the same weights in another precision must not, either.
-    let half = set.arguments(&["--precision", "bf16", "--weights", arg(&weights)], "chunks");
-    let (code, _, err) = run(&half, set.folder.path());
-    // The line before it may warn that bf16 is slower.
-    let refusal = err.lines().last().unwrap_or_default();
-    assert!(
-        code == Some(2) && refusal.contains("evaluation.json: the evaluation is of tiny.safetensors"),
-        "{err}"
-    );
-    let elsewhere = set.path("half");
-    let half: Vec<String> = half
-        .into_iter()
-        .map(|a| if a == arg(&set.path("out")) { arg(&elsewhere).into() } else { a })
-        .collect();
-    assert_eq!(run(&half, set.folder.path()).0, Some(0));
-    let half = read_evaluation(&elsewhere).unwrap();
+    // Scores of another subject, or of the same weights in another precision, must not be mixed with these.
+    let half = format!("{MODEL} @chunks --precision bf16");
+    for line in [format!("{SPLATS} @chunks"), format!("{half} --out @out")] {
+        assert_says(&sandbox.refuse(&line), &["evaluation.json: the evaluation is of tiny.safetensors"]);
+    }
+    run(&sandbox, &format!("{half} --out @half"));
+    let half = read(&sandbox, "half");
     assert_eq!(half.method, "tiny bf16");
-    assert_ne!(half.scenes[1].scores.mean.psnr, first.scenes[1].scores.mean.psnr);
-    assert!((half.scenes[1].scores.mean.psnr - first.scenes[1].scores.mean.psnr).abs() < 0.2);
+    let [ours, theirs] = [&half, &first].map(|evaluation| evaluation.scenes[1].scores.mean.psnr);
+    assert!(ours != theirs && (ours - theirs).abs() < 0.2, "{ours} {theirs}");
 
     let index = json!({"room_000": {"context": [0, 1], "target": [3]}});
-    set.write_index(&index);
-    let error = refuse(&text(&arguments));
-    assert!(error.contains("choose another --out"), "{error}");
+    sandbox.write("re10k_3v.json", index.to_string());
+    assert_says(&sandbox.refuse(&eval), &["choose another --out"]);
 }
 
-/// Replaces the contents of the file at `path` without changing its size or modification time.
-fn replace_unnoticed(path: &Path, mut bytes: Vec<u8>) {
-    let metadata = std::fs::metadata(path).unwrap();
+/// Replaces the contents of a file without changing its size or modification time.
+fn replace_unnoticed(sandbox: &Sandbox, name: &str, mut bytes: Vec<u8>) {
+    let path = sandbox.path(name);
+    let metadata = std::fs::metadata(&path).unwrap();
     let (length, modified) = (metadata.len() as usize, metadata.modified().unwrap());
     assert!(bytes.len() <= length, "{} bytes for {length}", bytes.len());
     // Decoders ignore bytes behind an image's end.
     bytes.resize(length, 0);
-    std::fs::write(path, bytes).unwrap();
-    let file = std::fs::File::options().write(true).open(path).unwrap();
+    std::fs::write(&path, bytes).unwrap();
+    let file = std::fs::File::options().write(true).open(&path).unwrap();
     file.set_times(std::fs::FileTimes::new().set_modified(modified)).unwrap();
 }
 
 #[test]
 fn changes_of_same_size_and_time_are_scored_again() {
-    let set = Set::new();
-    let photo = set.path("captures/room_000/images/001.png");
-    std::fs::write(&photo, [std::fs::read(&photo).unwrap(), vec![0; 1 << 20]].concat()).unwrap();
-    let arguments = set.arguments(&["--splat", arg(&set.path("splats"))], "captures");
+    let sandbox = dataset();
+    let photo = "captures/room_000/images/001.png";
+    sandbox.write(photo, [sandbox.read(photo), vec![0; 1 << 20]].concat());
     let psnr = || {
-        let (code, _, err) = run(&arguments, set.folder.path());
-        assert_eq!(code, Some(0), "{err}");
-        let evaluation = read_evaluation(&set.path("out")).unwrap();
-        evaluation.scenes.iter().map(|scene| scene.scores.mean.psnr).collect::<Vec<_>>()
+        run(&sandbox, &format!("{SPLATS} @captures"));
+        let scenes = read(&sandbox, "out").scenes;
+        <[f64; 2]>::try_from(scenes.iter().map(|scene| scene.scores.mean.psnr).collect::<Vec<_>>()).unwrap()
     };
     let first = psnr();
     // Scores that are reused as long as nothing changes.
-    let kept = set.path("out/scenes/room_002.json");
-    let mut scores: Value = serde_json::from_slice(&std::fs::read(&kept).unwrap()).unwrap();
-    scores["psnr"] = json!(99.5);
-    std::fs::write(&kept, scores.to_string()).unwrap();
-
-    let read = |name: &str| std::fs::read(set.path(name)).unwrap();
-    replace_unnoticed(&set.path("splats/room_000.ply"), read("splats/room_001.ply"));
+    sandbox.change_json("out/scenes/room_002.json", |scores| scores["psnr"] = json!(99.5));
+    replace_unnoticed(&sandbox, "splats/room_000.ply", sandbox.read("splats/room_001.ply"));
     let second = psnr();
     assert!(second[0] < first[0] - 10. && second[1] == 99.5, "another splat: {first:?} and {second:?}");
-    replace_unnoticed(&photo, read("captures/room_002/images/000.png"));
+    replace_unnoticed(&sandbox, photo, sandbox.read("captures/room_002/images/000.png"));
     let third = psnr();
     assert!(third[0] != second[0] && third[1] == 99.5, "another photo: {second:?} and {third:?}");
-    let cameras = "captures/room_000/cameras.json";
-    let mut moved: Value = serde_json::from_slice(&read(cameras)).unwrap();
-    moved["views"][1]["c2w"][0][3] = json!(0.123);
-    std::fs::write(set.path(cameras), moved.to_string()).unwrap();
+    sandbox
+        .change_json("captures/room_000/cameras.json", |json| json["views"][1]["c2w"][0][3] = json!(0.123));
     let fourth = psnr();
     assert!(fourth[0] != third[0] && fourth[1] == 99.5, "another camera: {third:?} and {fourth:?}");
 
@@ -189,9 +147,10 @@ fn changes_of_same_size_and_time_are_scored_again() {
         return;
     }
     let has_lpips = |scene: &SceneScores| scene.scores.mean.lpips_alex.is_some();
-    assert!(!read_evaluation(&set.path("out")).unwrap().scenes.iter().any(has_lpips));
-    succeed(&text(&arguments));
-    assert!(read_evaluation(&set.path("out")).unwrap().scenes.iter().all(has_lpips));
+    assert!(!read(&sandbox, "out").scenes.iter().any(has_lpips));
+    let mut eval = sandbox.command(&format!("{SPLATS} @captures"));
+    assert!(eval.env_remove("GLOBALSPLAT_WEIGHTS").status().unwrap().success());
+    assert!(read(&sandbox, "out").scenes.iter().all(has_lpips));
 }
 
 #[test]
@@ -227,189 +186,140 @@ fn photos_are_scored_one_at_a_time() {
     // Each takes 24 MB as a tensor, and as much again as a render.
     const PHOTOS: u64 = 40;
     let (width, height) = (1632, 1224);
-    let folder = tempfile::tempdir().unwrap();
-    let images = folder.path().join("images");
-    std::fs::create_dir(&images).unwrap();
+    let sandbox = Sandbox::new();
+    std::fs::create_dir(sandbox.path("images")).unwrap();
     let rows = tch::Tensor::linspace(0., 1., height, (tch::Kind::Float, tch::Device::Cpu));
     let photo = rows.view([1, height, 1]).expand([3, height, width], false);
-    write_png(&images.join("000.png"), &photo).unwrap();
+    write_png(&sandbox.path("images/000.png"), &photo).unwrap();
     let frame = |i: u64| {
         let file = format!("images/{i:03}.png");
         if i > 0 {
-            std::fs::hard_link(images.join("000.png"), folder.path().join(&file)).unwrap();
+            std::fs::hard_link(sandbox.path("images/000.png"), sandbox.path(&file)).unwrap();
         }
-        let at = i as f64 * 0.05;
-        let pose = json!([[1., 0., 0., at], [0., 1., 0., 0.], [0., 0., 1., 2.], [0., 0., 0., 1.]]);
+        let x = i as f64 * 0.05;
+        let pose = json!([[1., 0., 0., x], [0., 1., 0., 0.], [0., 0., 1., 2.], [0., 0., 0., 1.]]);
         json!({"file_path": file, "transform_matrix": pose})
     };
     let frames: Vec<Value> = (0..PHOTOS).map(frame).collect();
     let capture = json!({
         "w": width, "h": height, "fl_x": 1300., "fl_y": 1300., "cx": 816., "cy": 612., "frames": frames,
     });
-    std::fs::write(folder.path().join("transforms.json"), capture.to_string()).unwrap();
-    let (_rooms, room) = room();
-    let (splat, sheet) = (room.join("truth.ply"), folder.path().join("sheet.png"));
-    let scene = ["--scene", arg(folder.path()), "--json"];
-    for subject in
-        [&["--splat", arg(&splat), "--contact-sheet", arg(&sheet)][..], &["--renders", arg(&images)]]
+    sandbox.write("transforms.json", capture.to_string());
+    for (subject, is_shrunk) in
+        [("--splat @room/truth.ply --contact-sheet @sheet.png", true), ("--renders @images", false)]
     {
-        let arguments: Vec<String> =
-            ["eval"].iter().chain(subject).chain(&scene).map(|argument| argument.to_string()).collect();
-        let (code, out, err) = run(&arguments, folder.path());
-        assert_eq!(code, Some(0), "{err}");
+        let (out, err) = run(&sandbox, &format!("eval {subject} --scene @ --json"));
         let scores: Value = serde_json::from_str(&out).unwrap();
         assert_eq!(scores["views"].as_array().unwrap().len() as u64, PHOTOS);
-        let is_shrunk = err.contains("sheet.png: pictures are shrunk to 1/2");
-        assert_eq!(is_shrunk, subject.contains(&"--contact-sheet"), "{err}");
+        assert_eq!(err.contains("sheet.png: pictures are shrunk to 1/2"), is_shrunk, "{err}");
         let peak = peak_of_children();
-        assert!(peak < PHOTOS * 24_000_000, "{subject:?}: {peak} bytes");
+        assert!(peak < PHOTOS * 24_000_000, "{subject}: {peak} bytes");
     }
     // 40 rows of three images of 816×612, and the gaps.
-    let size = read_image(&sheet).unwrap().dimensions();
+    let size = read_image(&sandbox.path("sheet.png")).unwrap().dimensions();
     assert_eq!(size, (3 * 816 + 2 * 4, PHOTOS as u32 * 612 + (PHOTOS as u32 - 1) * 4));
 }
 
 #[test]
 fn external_renders_are_scored_by_an_index() {
-    let set = Set::new();
+    let sandbox = dataset();
     for (room, folder) in [("room_000", "renders/room_000"), ("room_002", "renders/room_002/color")] {
-        let folder = set.path(folder);
-        std::fs::create_dir_all(&folder).unwrap();
         for frame in [1, 3] {
-            let photo = set.path(&format!("captures/{room}/images/{frame:03}.png"));
-            std::fs::copy(photo, folder.join(format!("{frame:06}.png"))).unwrap();
+            sandbox
+                .copy(&format!("captures/{room}/images/{frame:03}.png"), &format!("{folder}/{frame:06}.png"));
         }
     }
-    let renders = set.path("renders");
-    let arguments = set.arguments(&["--renders", arg(&renders), "--name", "the photos", "--json"], "chunks");
-    let (code, out, err) = run(&arguments, set.folder.path());
-    assert_eq!(code, Some(0), "{err}");
-    let report: Value = serde_json::from_str(&out).unwrap();
+    let report = sandbox.json(
+        "eval --renders @renders --name 'the photos' --render-height 64 --data @chunks --index @re10k_3v.json --out @out",
+    );
     assert_eq!(report["evaluations"][0]["summary"], json!({"psnr": 100., "ssim": 1.}));
-    assert_eq!(read_evaluation(&set.path("out")).unwrap().method, "the photos");
+    assert_eq!(read(&sandbox, "out").method, "the photos");
 }
 
 #[test]
 fn several_indices_make_one_report() {
-    let set = Set::new();
-    let splats = set.path("splats");
-    let more = set.path("acid_2v.json");
-    std::fs::write(&more, json!({"room_001": {"context": [0, 4], "target": [2]}}).to_string()).unwrap();
-    let mut arguments = set.arguments(&["--splat", arg(&splats)], "chunks");
-    arguments.extend(["--index".into(), arg(&more).into()]);
-    let (code, _, err) = run(&arguments, set.folder.path());
-    assert_eq!(code, Some(0), "{err}");
-    let report = std::fs::read_to_string(set.path("out/report.html")).unwrap();
-    assert!(report.contains("room_001") && report.contains("room_002"));
-    assert_eq!(read_evaluation(&set.path("out/acid_2v")).unwrap().dataset, "acid");
-    let twice = set.path("other/acid_2v.json");
-    std::fs::create_dir(set.path("other")).unwrap();
-    std::fs::copy(&more, &twice).unwrap();
-    arguments.extend(["--index".into(), arg(&twice).into()]);
-    assert!(refuse(&text(&arguments)).contains("two of them would go to"));
-}
+    let sandbox = dataset();
+    let index = json!({"room_001": {"context": [0, 4], "target": [2]}}).to_string();
+    ["acid_2v.json", "other/acid_2v.json"].iter().for_each(|name| sandbox.write(name, &index));
+    let eval = format!("{SPLATS} @chunks --index @acid_2v.json");
+    run(&sandbox, &eval);
+    assert_says(&sandbox.text("out/report.html"), &["room_001", "room_002"]);
+    assert_eq!(read(&sandbox, "out/acid_2v").dataset, "acid");
+    let error = sandbox.refuse(&format!("{eval} --index @other/acid_2v.json"));
+    assert_says(&error, &["two of them would go to"]);
 
-#[test]
-fn ambiguous_dataset_names_are_refused() {
-    let set = Set::new();
-    let splats = set.path("splats");
-    let frames = std::fs::read(set.path("re10k_3v.json")).unwrap();
-    let named = |data: &str, index: &str| -> Vec<String> {
-        std::fs::write(set.path(index), &frames).unwrap();
-        let mut arguments = set.arguments(&["--splat", arg(&splats)], data);
-        let at = arguments.iter().position(|argument| argument == "--index").expect("an index");
-        arguments[at + 1] = arg(&set.path(index)).into();
-        arguments
-    };
-    // The index has two names, and the folder has neither.
-    let mut ambiguous = named("chunks", "acid_from_re10k_3v.json");
-    let error = refuse(&text(&ambiguous));
-    assert!(error.contains("acid_from_re10k_3v.json: ") && error.contains("acid or re10k"), "{error}");
-    assert!(error.contains("--dataset"), "{error}");
-    assert!(!set.path("out").exists(), "nothing was begun");
-    ambiguous.extend(["--dataset".into(), "ACID".into()]);
-    assert_eq!(run(&ambiguous, set.folder.path()).0, Some(0));
-    assert_eq!(read_evaluation(&set.path("out")).unwrap().dataset, "acid");
+    // A name of two datasets is refused, unless --dataset names one.
+    sandbox.write("acid_from_re10k_2v.json", &index);
+    let eval = SPLATS.replace("re10k_3v", "acid_from_re10k_2v").replace("@out", "@named");
+    let error = sandbox.refuse(&format!("{eval} @chunks"));
+    assert_says(&error, &["acid_from_re10k_2v.json: ", "acid or re10k", "--dataset"]);
+    assert!(!sandbox.path("named").exists(), "nothing was begun");
+    run(&sandbox, &format!("{eval} @chunks --dataset ACID"));
+    assert_eq!(read(&sandbox, "named").dataset, "acid");
 }
 
 #[test]
 fn images_are_scored_at_the_height_that_is_asked_for() {
-    let set = Set::new();
-    let (room, splat) = (set.path("captures/room_000"), set.path("splats/room_000.ply"));
-    let arguments = ["eval", "--splat", arg(&splat), "--scene", arg(&room), "--json", "--render-height"];
-    let psnr = |height: &str| -> Value {
-        let output = [&arguments[..], &[height]].concat();
-        let (code, out, err) =
-            run(&output.iter().map(|a| a.to_string()).collect::<Vec<_>>(), set.folder.path());
-        assert_eq!(code, Some(0), "{err}");
-        serde_json::from_str::<Value>(&out).unwrap()["psnr"].clone()
-    };
-    assert!(psnr("256").as_f64() > psnr("64").as_f64(), "the photos were rendered at 256");
-    let error = refuse(&[&arguments[..], &["8"]].concat());
-    assert!(error.contains("--render-height is 8, expected images with sides of 11 to 16384"), "{error}");
+    let sandbox = dataset();
+    let eval = "eval --splat @splats/room_000.ply --scene @captures/room_000 --render-height";
+    let psnr = |height: u32| sandbox.json(&format!("{eval} {height}"))["psnr"].as_f64();
+    assert!(psnr(64) > psnr(32), "the photos were rendered at 64");
+    let error = sandbox.refuse(&format!("{eval} 8"));
+    assert_says(&error, &["--render-height is 8, expected images with sides of 11 to 16384"]);
 }
 
 #[test]
 fn invalid_indices_are_refused() {
-    let set = Set::new();
-    let splats = set.path("splats");
-    let one = splats.join("room_000.ply");
-    let error = refuse(&text(&set.arguments(&["--splat", arg(&one)], "chunks")));
-    assert!(error.contains("room_000.ply: what is to be scored is no folder"), "{error}");
-    let arguments = set.arguments(&["--splat", arg(&splats)], "chunks");
-    set.write_index(&json!({"room_000": {"context": [0, 7], "target": [1]}}));
-    let error = fail(&text(&arguments), 1);
+    let sandbox = dataset();
+    let error = sandbox.refuse(&format!("{} @chunks", SPLATS.replace("@splats", "@splats/room_000.ply")));
+    assert_says(&error, &["room_000.ply: what is to be scored is no folder"]);
+    let eval = format!("{SPLATS} @chunks");
+    let write = |index: Value| sandbox.write("re10k_3v.json", index.to_string());
+    write(json!({"room_000": {"context": [0, 7], "target": [1]}}));
     let expected = "re10k_3v.json: a frame of scene room_000 is 7, expected one of the scene's 5, 0 to 4";
-    assert!(error.contains(expected), "{error}");
-    set.write_index(&json!({"elsewhere": {"context": [0, 7], "target": [1]}}));
-    let error = refuse(&text(&arguments));
-    assert!(error.contains("none of the 3 in the dataset chunks"), "{error}");
-    std::fs::remove_file(set.path("splats/room_000.ply")).unwrap();
-    set.write_index(&json!({"room_000": {"context": [0, 3], "target": [1]}}));
-    let error = fail(&text(&arguments), 1);
-    assert!(error.contains("room_000: ") && error.contains("room_000.ply can't be read"), "{error}");
-    std::fs::remove_file(set.path("chunks/000000.torch")).unwrap();
-    let error = fail(&text(&arguments), 1);
-    assert!(error.contains("room_000: ") && error.contains("000000.torch can't be read"), "{error}");
+    assert_says(&sandbox.fail(&eval, 1), &[expected]);
+    write(json!({"elsewhere": {"context": [0, 7], "target": [1]}}));
+    assert_says(&sandbox.refuse(&eval), &["none of the 3 in the dataset chunks"]);
+    write(json!({"room_000": {"context": [0, 3], "target": [1]}}));
+    for file in ["splats/room_000.ply", "chunks/000000.torch"] {
+        std::fs::remove_file(sandbox.path(file)).unwrap();
+        let (code, _, error) = sandbox.output(&eval);
+        assert_eq!(code, Some(1), "{error}");
+        let name = file.split('/').next_back().unwrap();
+        assert_says(&error, &["room_000: ", &format!("{name} can't be read")]);
+    }
+    // Files that no evaluation wrote are kept.
+    sandbox.write("foreign/scores.csv", "mine");
+    let error = sandbox.refuse(&eval.replace("@out", "@foreign"));
+    assert_says(&error, &["a scores.csv that no evaluation wrote"]);
+    assert_eq!(sandbox.text("foreign/scores.csv"), "mine");
 }
 
 #[test]
 fn a_scene_that_fails_is_named_and_the_first_of_the_others_warms_up() {
-    let set = Set::new();
-    let weights = tiny_weights(set.folder.path(), &set.path("captures"));
-    let photo = set.path("captures/room_000/images/000.png");
-    let bytes = std::fs::read(&photo).unwrap();
-    std::fs::write(&photo, &bytes[..bytes.len() / 2]).unwrap();
+    let sandbox = dataset();
+    let photo = "captures/room_000/images/000.png";
+    let bytes = sandbox.read(photo);
+    sandbox.write(photo, &bytes[..bytes.len() / 2]);
     let frames = json!({"context": [0, 2, 4], "target": [1, 3]});
-    set.write_index(&json!({"room_000": frames, "room_001": frames, "room_002": frames}));
-    let arguments = set.arguments(&["--weights", arg(&weights)], "captures");
-    let (code, _, err) = run(&arguments, set.folder.path());
+    let index = json!({"room_000": frames, "room_001": frames, "room_002": frames});
+    sandbox.write("re10k_3v.json", index.to_string());
+    let eval = format!("{MODEL} @captures --out @out");
+    let (code, _, err) = sandbox.output(&eval);
     assert_eq!(code, Some(1), "{err}");
-    assert!(err.contains("room_000: ") && err.contains("images/000.png: the image is undecodable"), "{err}");
-    assert!(err.contains("1 scenes could not be scored"), "{err}");
-    let evaluation = read_evaluation(&set.path("out")).unwrap();
+    let undecodable = "images/000.png: the image is undecodable";
+    assert_says(&err, &["room_000: ", undecodable, "1 scenes could not be scored"]);
+    let evaluation = read(&sandbox, "out");
     assert_eq!((evaluation.scenes.len(), evaluation.failures.len()), (2, 1));
     let efficiency = evaluation.efficiency.expect("a model's cost");
-    assert_eq!(efficiency.timed_scenes, 1);
-    assert!(efficiency.peak_memory_bytes > 1_000_000);
+    assert!(efficiency.timed_scenes == 1 && efficiency.peak_memory_bytes > 1_000_000);
     let [first, second] = evaluation.scenes.as_slice() else { panic!("two scenes") };
     assert!(first.warm_up && first.peak_memory_bytes.is_some());
     assert!(!second.warm_up && second.peak_memory_bytes.is_none());
 
     // Once the photo is repaired, the same command does the rest.
-    std::fs::write(&photo, bytes).unwrap();
-    assert_eq!(run(&arguments, set.folder.path()).0, Some(0));
-    let evaluation = read_evaluation(&set.path("out")).unwrap();
+    sandbox.write(photo, bytes);
+    run(&sandbox, &eval);
+    let evaluation = read(&sandbox, "out");
     assert_eq!((evaluation.scenes.len(), evaluation.failures.len()), (3, 0));
-}
-
-#[test]
-fn foreign_scores_are_not_overwritten() {
-    let set = Set::new();
-    let (splats, scores) = (set.path("splats"), set.path("out/scores.csv"));
-    std::fs::create_dir(set.path("out")).unwrap();
-    std::fs::write(&scores, "mine").unwrap();
-    let (code, _, err) = run(&set.arguments(&["--splat", arg(&splats)], "chunks"), set.folder.path());
-    assert!(code == Some(2) && err.contains("a scores.csv that no evaluation wrote"), "{err}");
-    assert_eq!(std::fs::read_to_string(&scores).unwrap(), "mine");
 }

@@ -2,7 +2,7 @@
 //! exit code 2.
 
 use crate::common::formats::{Format, rewrite};
-use crate::common::program::{arg, globalsplat, refuse, room};
+use crate::common::program::{Sandbox, arg, assert_says, room};
 use globalsplat::data::open_capture;
 use serde_json::{Value, json};
 use std::path::Path;
@@ -131,29 +131,23 @@ fn transforms_with_lenses_that_are_none() {
 }
 
 #[test]
-fn inspect_refuses_invalid_captures() {
+fn the_program_refuses_invalid_captures() {
     for (format, file) in [
         (Format::Transforms, "transforms.json"),
         (Format::ColmapText, "sparse/0/cameras.txt"),
         (Format::ColmapBinary, "sparse/0/images.bin"),
     ] {
-        let (_folder, room) = room();
-        rewrite(&room, format);
-        std::fs::write(room.join(file), b"nonsense").unwrap();
-        let error = refuse(&["inspect", arg(&room)]);
-        assert!(error.contains(file) && error.contains("expected"), "{error}");
+        let sandbox = Sandbox::new();
+        rewrite(&sandbox.path("room"), format);
+        sandbox.write(&format!("room/{file}"), "nonsense");
+        assert_says(&sandbox.refuse("inspect @room"), &[file, "expected"]);
     }
-}
-
-#[test]
-fn a_photo_of_another_size_than_transforms_say() {
-    let (_folder, room) = room();
-    rewrite(&room, Format::Transforms);
-    image::RgbImage::new(40, 30).save(room.join("images/003.png")).unwrap();
-    let error = refuse(&["eval", "--splat", arg(&room.join("truth.ply")), "--scene", arg(&room)]);
-    for part in ["images/003.png", "40×30 pixels", "expected 40×40", "transforms.json"] {
-        assert!(error.contains(part), "{part:?} is not in: {error}");
-    }
+    let sandbox = Sandbox::new();
+    rewrite(&sandbox.path("room"), Format::Transforms);
+    image::RgbImage::new(40, 30).save(sandbox.path("room/images/003.png")).unwrap();
+    let error = sandbox.refuse("reconstruct --scene @room --views 9 --out @out.ply");
+    assert_says(&error, &["images/003.png", "40×30 pixels", "expected 40×40", "transforms.json"]);
+    assert_says(&sandbox.refuse("inspect @room/nowhere"), &["no such file or folder"]);
 }
 
 /// Calls [`refused`] for a text file of a COLMAP model, with `from` replaced by `to`.
@@ -299,24 +293,13 @@ fn colmap_binaries_with_any_byte_wrong_never_panic() {
 
 #[test]
 fn warnings_list_skipped_input_in_one_line() {
-    let (folder, room) = room();
-    rewrite(&room, Format::Transforms);
-    std::fs::remove_file(room.join("images/004.png")).unwrap();
-    let splat = room.join("truth.ply");
-    let (page, pack) = (folder.path().join("room.html"), folder.path().join("chunks"));
-    for arguments in [
-        &["inspect", arg(&room)][..],
-        &["eval", "--splat", arg(&splat), "--scene", arg(&room)],
-        &["render", "--splat", arg(&splat), "--scene", arg(&room), "--html", arg(&page)],
-        &["pack", arg(&room), "--out", arg(&pack)],
-    ] {
-        let output = globalsplat(arguments);
-        let said = String::from_utf8(output.stderr).unwrap();
-        assert!(output.status.success(), "{said}");
-        let lines = said
-            .lines()
-            .filter(|line| line.contains("1 of 9 photos are missing and left out: images/004.png"));
-        assert_eq!(lines.count(), 1, "{arguments:?}: {said}");
+    let sandbox = Sandbox::new();
+    rewrite(&sandbox.path("room"), Format::Transforms);
+    std::fs::remove_file(sandbox.path("room/images/004.png")).unwrap();
+    for line in ["inspect @room", "eval --splat @room/truth.ply --scene @room", "pack @room --out @chunks"] {
+        let (code, _, message) = sandbox.output(line);
+        assert_eq!(code, Some(0), "{message}");
+        let warning = "1 of 9 photos are missing and left out: images/004.png";
+        assert_eq!(message.lines().filter(|line| line.contains(warning)).count(), 1, "{line}: {message}");
     }
-    assert!(refuse(&["inspect", arg(&room.join("nowhere"))]).contains("no such file or folder"));
 }

@@ -5,9 +5,8 @@ use globalsplat::render::cuda::{CodeFormat, Driver, Nvrtc, cache_folder, load_ke
 use std::path::Path;
 use std::process::Command;
 
-/// Oldest and newest supported GPU architectures.
-const OLDEST: i32 = 75;
-const NEWEST: i32 = 120;
+/// Supported GPU architectures, from the oldest to the newest. Variants for embedded systems are left out.
+const ARCHITECTURES: [i32; 7] = [75, 80, 86, 89, 90, 100, 120];
 /// Shared memory in bytes that every GPU grants a block, registers per block, and threads of the largest block.
 const SHARED: u32 = 48 << 10;
 const REGISTERS: u32 = 64 << 10;
@@ -20,14 +19,12 @@ fn nvrtc() -> Option<Nvrtc> {
 #[test]
 fn kernels_compile_for_every_gpu_and_need_no_memory_for_registers() {
     let Some(nvrtc) = nvrtc() else { return };
-    let promised: Vec<i32> =
-        nvrtc.architectures.iter().copied().filter(|of| (OLDEST..=NEWEST).contains(of)).collect();
-    assert!(promised.contains(&OLDEST) && promised.contains(&NEWEST), "{promised:?}");
-    for architecture in promised {
+    for architecture in ARCHITECTURES {
         let compiled = nvrtc.compile(architecture, CodeFormat::Cubin).unwrap();
         assert!(compiled.image.starts_with(b"\x7fELF"), "{architecture}");
         let kernels = parse_resources(&compiled.log);
         assert_eq!(kernels.len(), 12, "{}", compiled.log);
+        println!("compute capability {architecture}: {kernels:#?}");
         for kernel in kernels {
             assert!(kernel.spills == 0 && kernel.shared <= SHARED, "{architecture}: {kernel:?}");
             // Kernels with blocks of 128 threads may use all registers.
@@ -41,22 +38,17 @@ fn kernels_compile_for_every_gpu_and_need_no_memory_for_registers() {
 }
 
 #[test]
-fn a_splat_s_sums_take_eleven_shuffles() {
-    let Some(nvrtc) = nvrtc() else { return };
-    let ptx = nvrtc.compile(90, CodeFormat::Ptx).unwrap().image;
-    let ptx = String::from_utf8_lossy(&ptx);
-    let kernel = ptx.split(".entry ").find(|text| text.starts_with("gs_blend_backward")).expect("a kernel");
-    assert_eq!(kernel.matches("shfl.sync.bfly").count(), 11);
-}
-
-#[test]
 fn newer_gpus_get_ptx_and_older_ones_are_refused() {
     let Some(nvrtc) = nvrtc() else { return };
     let newest = *nvrtc.architectures.last().unwrap();
     assert_eq!(nvrtc.target(newest), Ok((newest, CodeFormat::Cubin)));
     assert_eq!(nvrtc.target(newest + 10), Ok((newest, CodeFormat::Ptx)));
     let ptx = nvrtc.compile(newest, CodeFormat::Ptx).unwrap().image;
-    assert!(ptx.ends_with(&[0]) && String::from_utf8_lossy(&ptx).contains(".entry gs_blend"));
+    assert!(ptx.ends_with(&[0]));
+    // A splat's sums over a warp take eleven shuffles.
+    let ptx = String::from_utf8_lossy(&ptx);
+    let kernel = ptx.split(".entry ").find(|text| text.starts_with("gs_blend_backward")).expect("a kernel");
+    assert_eq!(kernel.matches("shfl.sync.bfly").count(), 11);
     let refused = nvrtc.target(nvrtc.architectures[0] - 1).unwrap_err();
     assert!(refused.contains("compute capability") && refused.contains("expected"), "{refused}");
 }

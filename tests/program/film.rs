@@ -2,7 +2,7 @@
 
 use crate::common::browser::Browser;
 use crate::common::formats::{Format, rewrite};
-use crate::common::program::{arg, command, refuse, room, succeed};
+use crate::common::program::{Sandbox, arg, assert_says};
 use crate::common::skip;
 use base64::Engine;
 use glam::{DMat4, DVec4};
@@ -21,11 +21,6 @@ fn has_ffmpeg() -> bool {
     find_ffmpeg().map_err(|why| skip("ffmpeg", &why)).is_ok()
 }
 
-/// Returns the arguments that render `splat` to `out`, followed by `more`.
-fn render<'a>(splat: &'a Path, out: &'a Path, more: &[&'a str]) -> Vec<&'a str> {
-    [&["render", "--splat", arg(splat), "--out", arg(out)][..], more].concat()
-}
-
 /// Returns the images in `folder`, sorted by name.
 fn pictures(folder: &Path) -> Vec<image::RgbImage> {
     let mut files: Vec<PathBuf> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
@@ -39,11 +34,6 @@ fn psnr(a: &[u8], b: &[u8]) -> f64 {
     let square = |(&a, &b): (&u8, &u8)| (f64::from(a) - f64::from(b)).powi(2);
     let error = a.iter().zip(b).map(square).sum::<f64>() / a.len() as f64;
     10. * (255f64.powi(2) / error.max(1e-9)).log10()
-}
-
-fn names(folder: &Path) -> Vec<String> {
-    let entries = fs::read_dir(folder).unwrap();
-    entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect()
 }
 
 /// Returns the description of a video's stream by ffprobe.
@@ -62,10 +52,10 @@ fn an_mp4_shows_what_the_pictures_show() {
     if !has_ffmpeg() {
         return;
     }
-    let (folder, room) = room();
-    let (splat, film) = (room.join("truth.ply"), folder.path().join("film.mp4"));
-    let cameras = ["--scene", arg(&room), "--size", "384x256"];
-    succeed(&render(&splat, &film, &[&cameras[..], &["--depth", "--fps", "25"]].concat()));
+    let sandbox = Sandbox::new();
+    let render = "render --splat @room/truth.ply --scene @room --size 384x256 --depth";
+    sandbox.run(&format!("{render} --fps 25 --out @film.mp4"));
+    let film = sandbox.path("film.mp4");
     let found = probed(&film);
     for (key, expected) in [
         ("codec_name", "h264"),
@@ -79,7 +69,7 @@ fn an_mp4_shows_what_the_pictures_show() {
     }
     // Color and depth side by side, with a gap.
     assert_eq!((found["width"].as_i64(), found["height"].as_i64()), (Some(2 * 384 + 4), Some(256)));
-    let bytes = fs::read(&film).unwrap();
+    let bytes = sandbox.read("film.mp4");
     let at = |name: &[u8]| bytes.windows(4).position(|four| four == name).unwrap();
     assert!(at(b"moov") < at(b"mdat"), "a page would have to load all of it first");
 
@@ -92,9 +82,8 @@ fn an_mp4_shows_what_the_pictures_show() {
         .stdout;
     let frames: Vec<&[u8]> = decoded.chunks(3 * 772 * 256).collect();
     assert_eq!(frames.len(), 9);
-    let views = folder.path().join("views");
-    succeed(&render(&splat, &views, &[&cameras[..], &["--depth"]].concat()));
-    let parts = pictures(&views);
+    sandbox.run(&format!("{render} --out @views"));
+    let parts = pictures(&sandbox.path("views"));
     for (i, (frame, parts)) in frames.iter().zip(parts.chunks(2)).enumerate() {
         let mut picture = image::RgbImage::from_pixel(772, 256, image::Rgb([255; 3]));
         // Sorted by name: 000.png, then 000_depth.png.
@@ -106,11 +95,10 @@ fn an_mp4_shows_what_the_pictures_show() {
     }
 
     // An odd side is cropped by one line, and nothing else.
-    let odd = folder.path().join("odd.mp4");
-    succeed(&render(&splat, &odd, &["--scene", arg(&room), "--size", "33x41"]));
-    let found = probed(&odd);
+    sandbox.run("render --splat @room/truth.ply --scene @room --size 33x41 --out @odd.mp4");
+    let found = probed(&sandbox.path("odd.mp4"));
     assert_eq!((found["width"].as_i64(), found["height"].as_i64()), (Some(32), Some(40)));
-    assert!(names(folder.path()).iter().all(|name| !name.contains("partial")));
+    assert!(sandbox.names("").iter().all(|name| !name.contains("partial")));
 }
 
 #[test]
@@ -119,17 +107,14 @@ fn a_browser_plays_an_mp4_from_disk() {
         return;
     }
     let Some(mut browser) = Browser::start() else { return };
-    let (folder, room) = room();
-    let (splat, film) = (room.join("truth.ply"), folder.path().join("film.mp4"));
-    let cameras = ["--scene", arg(&room), "--size", "384x256"];
-    succeed(&render(&splat, &film, &cameras));
-    let views = folder.path().join("views");
-    succeed(&render(&splat, &views, &cameras));
-    let page = folder.path().join("page.html");
+    let sandbox = Sandbox::new();
+    for out in ["film.mp4", "views"] {
+        sandbox.run(&format!("render --splat @room/truth.ply --scene @room --size 384x256 --out @{out}"));
+    }
     let text = "<!doctype html><body style='margin:0'><canvas width=384 height=256 style='display:block'></canvas>\
         <video src=film.mp4 muted></video>";
-    fs::write(&page, text).unwrap();
-    browser.open(&page);
+    sandbox.write("page.html", text);
+    browser.open(&sandbox.path("page.html"));
     let measured = browser.evaluate(
         "new Promise((done, failed) => {
             const v = document.querySelector('video');
@@ -141,7 +126,7 @@ fn a_browser_plays_an_mp4_from_disk() {
     // Nine frames at 20 frames per second.
     assert!((measured[1].as_f64().unwrap() - 0.45).abs() < 0.01, "{measured}");
     assert_eq!((measured[2].as_i64(), measured[3].as_i64()), (Some(384), Some(256)));
-    for (i, picture) in pictures(&views).iter().enumerate().step_by(4) {
+    for (i, picture) in pictures(&sandbox.path("views")).iter().enumerate().step_by(4) {
         // Seek to the middle of the frame.
         browser.evaluate(&format!(
             "new Promise((done) => {{
@@ -192,48 +177,43 @@ fn with_ffmpeg(script: &str) -> TempDir {
     folder
 }
 
-/// Returns the error message and the exit code of a video that can't be written with `path`, and asserts that no file is left.
-fn no_film(path: &Path, splat: &Path) -> (String, Option<i32>) {
-    let out = tempfile::tempdir().unwrap();
-    let film = out.path().join("film.mp4");
-    let output =
-        command(&render(splat, &film, &["--orbit", "--frames", "9"])).env("PATH", path).output().unwrap();
+/// Asserts that a video can't be written with `path`, for a reason with all of `parts`, and that no file is left.
+fn no_film(sandbox: &Sandbox, path: &Path, splat: &str, code: i32, parts: &[&str]) {
+    let mut render =
+        sandbox.command(&format!("render --splat @{splat} --orbit --frames 9 --out @out/film.mp4"));
+    let output = render.env("PATH", path).output().unwrap();
     let message = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(message.lines().count(), 1, "{message}");
-    assert_eq!(names(out.path()), [""; 0], "{message}");
-    (message, output.status.code())
+    assert_eq!((output.status.code(), message.lines().count()), (Some(code), 1), "{message}");
+    assert_says(&message, parts);
+    assert_eq!(sandbox.names("out"), [""; 0], "{message}");
 }
 
 #[test]
 fn an_mp4_without_an_encoder_is_refused_before_anything_is_read() {
+    let sandbox = Sandbox::new();
+    fs::create_dir(sandbox.path("out")).unwrap();
     let nothing = tempfile::tempdir().unwrap();
-    let absent = Path::new("no_such_splat.ply");
     // Like a folder that may not be entered, a file that may not be executed makes the search of the PATH fail with a lack of permission.
     let denied = tempfile::tempdir().unwrap();
-    std::fs::write(denied.path().join("ffmpeg"), "not executable").unwrap();
+    fs::write(denied.path().join("ffmpeg"), "not executable").unwrap();
     for path in [nothing.path(), denied.path()] {
-        let (message, code) = no_film(path, absent);
-        assert_eq!(code, Some(2));
-        for part in ["film.mp4", "ffmpeg isn't on the PATH", "apt install ffmpeg", ".gif", "PNGs"] {
-            assert!(message.contains(part), "{part}: {message}");
-        }
+        let parts = ["film.mp4", "ffmpeg isn't on the PATH", "apt install ffmpeg", ".gif", "PNGs"];
+        no_film(&sandbox, path, "no_such_splat.ply", 2, &parts);
     }
     let other = with_ffmpeg("echo ' V....D mpeg4  MPEG-4 part 2'");
-    let (message, code) = no_film(other.path(), absent);
-    assert!(code == Some(2) && message.contains("lacks libx264") && message.contains(".gif"), "{message}");
+    no_film(&sandbox, other.path(), "no_such_splat.ply", 2, &["lacks libx264", ".gif"]);
     // A GIF needs no ffmpeg.
-    let (folder, room) = room();
-    let film = folder.path().join("film.gif");
-    let splat = room.join("truth.ply");
-    let arguments = render(&splat, &film, &["--orbit", "--frames", "2", "--size", "16x16"]);
-    assert!(command(&arguments).env("PATH", nothing.path()).status().unwrap().success());
+    let mut render =
+        sandbox.command("render --splat @room/truth.ply --orbit --frames 2 --size 16x16 --out @film.gif");
+    assert!(render.env("PATH", nothing.path()).status().unwrap().success());
 }
 
 #[test]
 fn an_encoder_that_fails_is_quoted_and_leaves_nothing() {
     const KNOWS: &str =
         "case $* in *-encoders*) echo libx264; exit;; esac; for out; do :; done; echo begun > \"$out\"";
-    let (_folder, room) = room();
+    let sandbox = Sandbox::new();
+    fs::create_dir(sandbox.path("out")).unwrap();
     for (script, message) in [
         ("head -c 9 > /dev/null; echo 'the disk is full' >&2; exit 1", "ffmpeg failed: the disk is full"),
         ("cat > /dev/null; echo 'no trailer' >&2; exit 1", "ffmpeg failed: no trailer"),
@@ -241,28 +221,24 @@ fn an_encoder_that_fails_is_quoted_and_leaves_nothing() {
         ("exit 0", "ffmpeg ended early"),
     ] {
         let ffmpeg = with_ffmpeg(&format!("{KNOWS}; {script}"));
-        let (sentence, code) = no_film(ffmpeg.path(), &room.join("truth.ply"));
-        assert!(code == Some(1) && sentence.contains(message), "{script}: {sentence}");
+        no_film(&sandbox, ffmpeg.path(), "room/truth.ply", 1, &[message]);
     }
 }
 
 #[test]
 fn ctrl_c_leaves_no_half_film() {
-    let (_folder, room) = room();
-    let splat = room.join("truth.ply");
     for ending in ["gif", "mp4"] {
         if ending == "mp4" && !has_ffmpeg() {
             return;
         }
-        let out = tempfile::tempdir().unwrap();
-        let film = out.path().join(format!("film.{ending}"));
-        let mut program =
-            command(&render(&splat, &film, &["--orbit", "--frames", "100000", "--size", "64x64"]))
-                .stderr(Stdio::piped())
-                .spawn()
-                .unwrap();
+        let sandbox = Sandbox::new();
+        fs::create_dir(sandbox.path("out")).unwrap();
+        let mut render = sandbox.command(&format!(
+            "render --splat @room/truth.ply --orbit --frames 100000 --size 64x64 --out @out/film.{ending}"
+        ));
+        let mut program = render.stderr(Stdio::piped()).spawn().unwrap();
         // Frames are written as they are rendered.
-        let partial = out.path().join(format!(".film.{ending}.globalsplat-partial"));
+        let partial = sandbox.path(&format!("out/.film.{ending}.globalsplat-partial"));
         let deadline = Instant::now() + Duration::from_secs(60);
         let written = || fs::metadata(&partial).is_ok_and(|file| ending == "mp4" || file.len() > 100_000);
         while !written() {
@@ -273,41 +249,46 @@ fn ctrl_c_leaves_no_half_film() {
         let output = program.wait_with_output().unwrap();
         let message = String::from_utf8(output.stderr).unwrap();
         assert_eq!(output.status.code(), Some(1), "{message}");
-        assert!(message.contains("stopped after") && message.contains("of 100000 views"), "{message}");
-        assert_eq!(names(out.path()), [""; 0]);
+        assert_says(&message, &["stopped after", "of 100000 views"]);
+        assert_eq!(sandbox.names("out"), [""; 0]);
     }
 }
 
-#[test]
-fn gifs_have_the_requested_duration() {
-    let (folder, room) = room();
-    let (splat, film) = (room.join("truth.ply"), folder.path().join("film.gif"));
-    let orbit = ["--orbit", "--frames", "12", "--size", "20x16", "--alpha"];
-    succeed(&render(&splat, &film, &[&orbit[..], &["--fps", "24"]].concat()));
-    let mut decoder = gif::DecodeOptions::new().read_info(fs::File::open(&film).unwrap()).unwrap();
-    assert_eq!((decoder.width(), decoder.height()), (44, 16));
+/// Returns the size of a GIF in pixels, and the delays of its frames in hundredths of a second.
+fn delays(film: &Path) -> ((u16, u16), Vec<u16>) {
+    let mut decoder = gif::DecodeOptions::new().read_info(fs::File::open(film).unwrap()).unwrap();
     let mut delays = vec![];
     while let Some(frame) = decoder.read_next_frame().unwrap() {
         delays.push(frame.delay);
     }
-    // Half a second in total, although 1/24 s is not a whole number of hundredths.
-    assert_eq!((delays.len(), delays.iter().sum::<u16>()), (12, 50), "{delays:?}");
+    ((decoder.width(), decoder.height()), delays)
+}
 
-    let message = refuse(&render(&splat, &film, &[&orbit[..], &["--fps", "60"]].concat()));
-    assert!(message.contains("frames per second is 60, expected 1 to 50 in a .gif"), "{message}");
-    let views = folder.path().join("views");
-    let message = refuse(&render(&splat, &views, &[&orbit[..], &["--fps", "24"]].concat()));
-    assert!(message.contains("--fps is for films") && !views.exists(), "{message}");
+#[test]
+fn gifs_have_the_requested_duration() {
+    let sandbox = Sandbox::new();
+    let render = "render --splat @room/truth.ply --orbit --frames 12 --size 20x16 --alpha";
+    sandbox.run(&format!("{render} --fps 24 --out @film.gif"));
+    let (size, delays) = delays(&sandbox.path("film.gif"));
+    // Half a second in total, although 1/24 s is not a whole number of hundredths.
+    assert_eq!((size, delays.len(), delays.iter().sum::<u16>()), ((44, 16), 12, 50), "{delays:?}");
+    let message = sandbox.refuse(&format!("{render} --fps 60 --out @film.gif"));
+    assert_says(&message, &["frames per second is 60, expected 1 to 50 in a .gif"]);
+    let message = sandbox.refuse(&format!("{render} --fps 24 --out @views"));
+    assert!(message.contains("--fps is for films") && !sandbox.path("views").exists(), "{message}");
 }
 
 #[test]
 fn a_smooth_path_goes_from_the_first_camera_to_the_last() {
-    let (folder, room) = room();
-    let splat = room.join("truth.ply");
-    let [views, smooth, along] = ["views", "smooth", "along"].map(|name| folder.path().join(name));
-    succeed(&render(&splat, &views, &["--scene", arg(&room)]));
-    succeed(&render(&splat, &smooth, &["--scene", arg(&room), "--frames", "25"]));
-    succeed(&render(&splat, &along, &["--path", arg(&room), "--frames", "25"]));
+    let sandbox = Sandbox::new();
+    for (out, cameras) in [
+        ("views", "--scene @room"),
+        ("smooth", "--scene @room --frames 25"),
+        ("along", "--path @room --frames 25"),
+    ] {
+        sandbox.run(&format!("render --splat @room/truth.ply {cameras} --out @{out}"));
+    }
+    let [views, smooth, along] = ["views", "smooth", "along"].map(|name| sandbox.path(name));
     let (views, path) = (pictures(&views), pictures(&smooth));
     assert_eq!((views.len(), path.len()), (9, 25));
     assert_eq!(path, pictures(&along));
@@ -326,17 +307,15 @@ fn a_smooth_path_goes_from_the_first_camera_to_the_last() {
 
 #[test]
 fn all_pictures_have_one_scale_of_depth() {
-    let (folder, room) = room();
-    let splat = room.join("truth.ply");
+    let sandbox = Sandbox::new();
     // Both cameras have one position, and the second has eight times the focal length. The centre has the same depth in both images.
-    let mut wide = open_capture(&room).unwrap().cameras()[8];
+    let mut wide = open_capture(&sandbox.path("room")).unwrap().cameras()[8];
     (wide.intrinsics.cx, wide.intrinsics.cy) = (20., 20.);
     let mut long = wide;
     (long.intrinsics.fx, long.intrinsics.fy) = (8. * wide.intrinsics.fx, 8. * wide.intrinsics.fy);
-    let (path, out) = (folder.path().join("zoom.json"), folder.path().join("views"));
-    write_cameras_json(&path, &[String::new(), String::new()], &[wide, long]).unwrap();
-    succeed(&render(&splat, &out, &["--path", arg(&path), "--depth", "--size", "320x320"]));
-    let [_, wide, _, long] = <[_; 4]>::try_from(pictures(&out)).unwrap();
+    write_cameras_json(&sandbox.path("zoom.json"), &[String::new(), String::new()], &[wide, long]).unwrap();
+    sandbox.run("render --splat @room/truth.ply --path @zoom.json --depth --size 320x320 --out @views");
+    let [_, wide, _, long] = <[_; 4]>::try_from(pictures(&sandbox.path("views"))).unwrap();
     // The centre of the one, enlarged, equals the other.
     let middle = image::imageops::crop_imm(&wide, 140, 140, 40, 40).to_image();
     let middle = image::imageops::resize(&middle, 320, 320, image::imageops::FilterType::Triangle);
@@ -358,14 +337,13 @@ fn assert_same(path: &Path, expected: &[Camera], tolerance: f64) {
 
 #[test]
 fn a_path_takes_every_format_and_needs_no_photos() {
-    let (folder, original) = room();
-    let cameras = open_capture(&original).unwrap().cameras();
-    let chunks = folder.path().join("chunks");
-    succeed(&["pack", arg(&original), "--out", arg(&chunks)]);
-    let chunk = names(&chunks).into_iter().find(|name| name.ends_with(".torch")).unwrap();
-    assert_same(&chunks.join(format!("{chunk}#room_000")), &cameras, 1e-5);
+    let sandbox = Sandbox::new();
+    let cameras = open_capture(&sandbox.path("room")).unwrap().cameras();
+    sandbox.run("pack @room --out @chunks");
+    assert_same(&sandbox.path("chunks/000000.torch#room"), &cameras, 1e-5);
     for format in [None, Some(Format::Transforms), Some(Format::ColmapText), Some(Format::ColmapBinary)] {
-        let (_folder, room) = room();
+        let sandbox = Sandbox::new();
+        let room = sandbox.path("room");
         if let Some(format) = format {
             rewrite(&room, format);
         }
@@ -376,12 +354,10 @@ fn a_path_takes_every_format_and_needs_no_photos() {
         for file in ["cameras.json", "transforms.json"].map(|name| room.join(name)) {
             if file.exists() {
                 assert_same(&file, &cameras, 1e-9);
-                let renamed = room.join("my path.json");
-                fs::rename(&file, &renamed).unwrap();
-                assert_same(&renamed, &cameras, 1e-9);
-                let row = room.join("row.png");
-                succeed(&render(&room.join("truth.ply"), &row, &["--path", arg(&renamed)]));
-                assert_eq!(image::image_dimensions(&row).unwrap(), (9 * 40 + 8 * 4, 40));
+                fs::rename(&file, sandbox.path("my path.json")).unwrap();
+                assert_same(&sandbox.path("my path.json"), &cameras, 1e-9);
+                sandbox.run("render --splat @room/truth.ply --path '@my path.json' --out @row.png");
+                assert_eq!(image::image_dimensions(sandbox.path("row.png")).unwrap(), (9 * 40 + 8 * 4, 40));
             }
         }
     }
@@ -389,21 +365,20 @@ fn a_path_takes_every_format_and_needs_no_photos() {
 
 #[test]
 fn a_path_without_image_sizes_needs_photos_or_size() {
-    let (_folder, room) = room();
+    let sandbox = Sandbox::new();
+    let room = sandbox.path("room");
     rewrite(&room, Format::Transforms);
-    let file = room.join("transforms.json");
-    let mut json: Value = serde_json::from_str(&fs::read_to_string(&file).unwrap()).unwrap();
-    json.as_object_mut().unwrap().retain(|key, _| key != "w" && key != "h");
-    fs::write(&file, json.to_string()).unwrap();
+    sandbox.change_json("room/transforms.json", |json| {
+        json.as_object_mut().unwrap().retain(|key, _| key != "w" && key != "h");
+    });
     let cameras = open_capture(&room).unwrap().cameras();
     assert_same(&room, &cameras, 1e-9);
     fs::remove_dir_all(room.join("images")).unwrap();
-    let (splat, out) = (room.join("truth.ply"), room.join("row.png"));
-    let message = refuse(&render(&splat, &out, &["--path", arg(&room)]));
-    assert!(message.contains("the size of frame 0 is missing") && message.contains("--size"), "{message}");
+    let render = "render --splat @room/truth.ply --path @room --out @row.png";
+    assert_says(&sandbox.refuse(render), &["the size of frame 0 is missing", "--size"]);
     let found = read_camera_path(&room, Some([40, 40].into())).unwrap().cameras;
     assert_eq!((found[0].width, found[0].intrinsics), (40, cameras[0].intrinsics));
-    succeed(&render(&splat, &out, &["--path", arg(&room), "--size", "40x40"]));
+    sandbox.run(&format!("{render} --size 40x40"));
 }
 
 /// Returns a camera path as nerfstudio's viewer writes it.
@@ -421,26 +396,21 @@ fn of_viewer(cameras: &[Camera]) -> Value {
 
 #[test]
 fn a_path_of_nerfstudio_s_viewer_is_flown() {
-    let (folder, room) = room();
-    let mut cameras = open_capture(&room).unwrap().cameras();
+    let sandbox = Sandbox::new();
+    let mut cameras = open_capture(&sandbox.path("room")).unwrap().cameras();
     for camera in &mut cameras {
         // Such a path stores only square pixels and a principal point in the middle.
         camera.width = 60;
         camera.intrinsics.fx = camera.intrinsics.fy;
         (camera.intrinsics.cx, camera.intrinsics.cy) = (30., 20.);
     }
-    let file = folder.path().join("2026-01-01.json");
+    let file = sandbox.path("2026-01-01.json");
     fs::write(&file, of_viewer(&cameras).to_string()).unwrap();
     assert_same(&file, &cameras, 1e-9);
     assert_eq!(read_camera_path(&file, None).unwrap().frames_per_second, Some(24));
-    let film = folder.path().join("film.gif");
-    succeed(&render(&room.join("truth.ply"), &film, &["--path", arg(&file), "--frames", "12"]));
-    let mut decoder = gif::DecodeOptions::new().read_info(fs::File::open(&film).unwrap()).unwrap();
-    let mut lasts = 0;
-    while let Some(frame) = decoder.read_next_frame().unwrap() {
-        lasts += frame.delay;
-    }
-    assert_eq!(lasts, 50);
+    let render = "render --splat @room/truth.ply --path @2026-01-01.json";
+    sandbox.run(&format!("{render} --frames 12 --out @film.gif"));
+    assert_eq!(delays(&sandbox.path("film.gif")).1.iter().sum::<u16>(), 50);
 
     type Change = fn(&mut Value);
     let changes: [(Change, &[&str]); 12] = [
@@ -463,17 +433,15 @@ fn a_path_of_nerfstudio_s_viewer_is_flown() {
         (|json| json["fps"] = json!(0), &["fps is 0", "1 to 120"]),
         (|json| json["fps"] = json!("fast"), &["fps is \"fast\"", "1 to 120"]),
     ];
-    let out = folder.path().join("refused.gif");
+    let refuse =
+        |parts: &[&str]| assert_says(&sandbox.refuse(&format!("{render} --out @refused.gif")), parts);
     for (change, parts) in changes {
         let mut json = of_viewer(&cameras);
         change(&mut json);
         fs::write(&file, json.to_string()).unwrap();
-        let message = refuse(&render(&room.join("truth.ply"), &out, &["--path", arg(&file)]));
-        for part in ["2026-01-01.json"].iter().chain(parts) {
-            assert!(message.contains(part), "{part}: {message}");
-        }
+        refuse(&[&["2026-01-01.json"], parts].concat());
     }
-    assert!(!out.exists());
+    assert!(!sandbox.path("refused.gif").exists());
     // These files aren't camera paths.
     for (text, part) in [
         ("{", "not a description of cameras"),
@@ -481,7 +449,6 @@ fn a_path_of_nerfstudio_s_viewer_is_flown() {
         ("{\"frames\": []}", "number of views is 0, expected one or more"),
     ] {
         fs::write(&file, text).unwrap();
-        let message = refuse(&render(&room.join("truth.ply"), &out, &["--path", arg(&file)]));
-        assert!(message.contains(part), "{text}: {message}");
+        refuse(&[part]);
     }
 }

@@ -10,6 +10,5 @@ mod commands;
 mod cuda;
 mod examples;
 mod film;
-mod foreign_files;
 mod outputs;
 mod paths;

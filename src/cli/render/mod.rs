@@ -3,22 +3,21 @@
 mod output;
 mod shots;
 
-use super::{model, open_capture, parse_size, print_json, progress, stop_flag, view, warn};
+use super::{model, open_capture, parse_size, print_json, progress, signals, view, warn};
+use crate::data::{Capture, Holdout};
+use crate::error::Error;
+use crate::io::{InputFiles, read_splat, splat_files, tiled_size};
+use crate::model::Precision;
+use crate::reconstruct::{load_context, reconstruct};
+use crate::render::{DepthScale, RenderedView, SplatRenderer};
+use crate::scene::{Camera, Gaussians, ImageSize};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
 use glam::DVec3;
-use globalsplat::data::{Capture, Holdout};
-use globalsplat::error::Error;
-use globalsplat::io::{InputFiles, read_splat, splat_files, tiled_size};
-use globalsplat::model::Precision;
-use globalsplat::reconstruct::{load_context, reconstruct};
-use globalsplat::render::{DepthScale, RenderedView, SplatRenderer};
-use globalsplat::scene::{Camera, Gaussians, ImageSize};
 use output::Output;
 use serde_json::json;
 use shots::Shots;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::Ordering;
 use tch::{Device, Tensor};
 
 /// File name suffixes of images of depth and of alpha.
@@ -118,7 +117,7 @@ impl Render {
         let shots = self.shots((&gaussians, origin), &renderer, capture.as_ref())?;
         let scale = if self.depth { Some(DepthScale::estimate(&renderer, &shots.cameras)?) } else { None };
 
-        let stop = stop_flag()?;
+        signals::handle_stop_requests()?;
         let mut inputs = self.inputs(capture.as_ref());
         inputs.extend(shots.inputs.clone());
         let film = (self.size_of_all(&shots.cameras), shots.frames_per_second);
@@ -127,7 +126,7 @@ impl Render {
         for camera in &shots.cameras {
             let rendered = renderer.render(std::slice::from_ref(camera))?.remove(0);
             output.add(&self.parts(&rendered, scale))?;
-            if stop.load(Ordering::Relaxed) {
+            if signals::is_stop_requested() {
                 let (done, of, out) = (bar.position() + 1, shots.cameras.len(), out.display());
                 return Err(Error::failed(format!("{out}: stopped after {done} of {of} views")).into());
             }

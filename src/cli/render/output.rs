@@ -1,12 +1,12 @@
 //! Output of rendered images, one by one.
 
 use super::super::report_downscaling;
-use globalsplat::error::{Error, Result};
-use globalsplat::io::{
+use crate::error::{Error, Result};
+use crate::io::{
     InputFiles, Mosaic, VideoWriter, check_regular, check_writable_dir, check_writable_file, is_png_name,
     tile_horizontally, write_png,
 };
-use globalsplat::scene::ImageSize;
+use crate::scene::ImageSize;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use tch::Tensor;

@@ -1,12 +1,12 @@
 //! Cameras of `render`.
 
 use crate::cli::warn;
+use crate::data::{CameraPath, Capture, read_camera_path};
+use crate::io::InputFiles;
+use crate::render::{SplatRenderer, orbit_around_gaussians};
+use crate::scene::{Camera, Gaussians, ImageSize, orbit_around_cameras, smooth_path};
 use anyhow::Result;
 use glam::DVec3;
-use globalsplat::data::{CameraPath, Capture, read_camera_path};
-use globalsplat::io::InputFiles;
-use globalsplat::render::{SplatRenderer, orbit_around_gaussians};
-use globalsplat::scene::{Camera, Gaussians, ImageSize, orbit_around_cameras, smooth_path};
 use std::path::Path;
 
 const FRAMES_PER_SECOND: u32 = 20;

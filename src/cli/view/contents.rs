@@ -1,13 +1,13 @@
 //! Data about the scene that is embedded in a page.
 
+use crate::data::{Capture, load_views};
+use crate::io::{encode_photo, rgb_from_tensor};
+use crate::render::{SplatRenderer, default_eps2d, orbit_around_gaussians};
+use crate::scene::{Camera, Gaussians, ImageSize, LocalFrame, smooth_path};
 use anyhow::Result;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use glam::DVec3;
-use globalsplat::data::{Capture, load_views};
-use globalsplat::io::{encode_photo, rgb_from_tensor};
-use globalsplat::render::{SplatRenderer, default_eps2d, orbit_around_gaussians};
-use globalsplat::scene::{Camera, Gaussians, ImageSize, LocalFrame, smooth_path};
 use serde::Serialize;
 
 /// Maximum length of a photo's longer side, in pixels.

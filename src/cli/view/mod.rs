@@ -6,11 +6,11 @@ mod page;
 pub use page::{check_writable, has_viewer, write_page};
 
 use super::{open_capture, print_json, warn};
+use crate::error::Error;
+use crate::io::read_splat;
+use crate::scene::Gaussians;
 use anyhow::Result;
 use clap::Args;
-use globalsplat::error::Error;
-use globalsplat::io::read_splat;
-use globalsplat::scene::Gaussians;
 use serde_json::json;
 use std::fs::DirEntry;
 use std::path::{Path, PathBuf};

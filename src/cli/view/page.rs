@@ -1,16 +1,16 @@
 //! The page: HTML around the viewer that `web/` bundles, with all its data.
 
 use super::contents::Contents;
+use crate::data::Capture;
+use crate::error::Error;
+use crate::io::{
+    ShLimits, Splat, WriteOptions, check_writable_file, fit_splat, write_atomically, write_local_splat_with,
+};
+use crate::scene::{Camera, Gaussians};
 use anyhow::Result;
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use glam::DVec3;
-use globalsplat::data::Capture;
-use globalsplat::error::Error;
-use globalsplat::io::{
-    ShLimits, Splat, WriteOptions, check_writable_file, fit_splat, write_atomically, write_local_splat_with,
-};
-use globalsplat::scene::{Camera, Gaussians};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use std::path::Path;
 
@@ -158,7 +158,7 @@ fn help() -> Markup {
 
 /// Returns an SVG filter that maps greyscale depth to the colors of `render --depth`, and keeps empty pixels black.
 fn depth_colors() -> Markup {
-    let colors = globalsplat::render::depth_colors();
+    let colors = crate::render::depth_colors();
     let table = |channel: usize| -> String {
         let values = colors[1..].iter().map(|color| format!(" {:.3}", color[channel]));
         std::iter::once("0".into()).chain(values).collect()

@@ -184,6 +184,11 @@ pub fn absent() -> Markup {
     html! { span.absent { "absent" } }
 }
 
+/// Renders a swatch of the color that plots use for a method.
+pub fn swatch(RGBColor(red, green, blue): RGBColor) -> Markup {
+    html! { span.swatch style={ "background: rgb(" (red) " " (green) " " (blue) ")" } aria-hidden="true" {} }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -10,10 +10,10 @@ pub use plots::write_curves;
 use super::evaluation::Evaluation;
 use crate::error::{Error, Result};
 use crate::io::write_atomically;
-use entries::{Entry, absent, count, dataset_name, decimal, entries, finite, thousands};
+use entries::{Entry, absent, count, dataset_name, decimal, entries, finite, swatch, thousands};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use std::path::{Path, PathBuf};
-use tables::{partial_badge, share, swatch};
+use tables::{partial_badge, share};
 
 const STYLE: &str = include_str!("style.css");
 /// Script that sorts a table when a heading is clicked. The page is complete without it.

@@ -1,7 +1,6 @@
 //! Plots as SVG: quality by the number of context views and by size, the distribution over scenes, and the curves of a training run.
 
-use super::entries::{Entry, Row, count, dataset_name, decimal, finite, rows, short, view_counts};
-use super::tables::swatch;
+use super::entries::{Entry, Row, count, dataset_name, decimal, finite, rows, short, swatch, view_counts};
 use crate::error::{Error, Result};
 use crate::io::write_atomically;
 use crate::train::Curves;

@@ -1,7 +1,7 @@
 //! Scores scene by scene, worst first: comparison images of the worst scenes, and the scores of all.
 
-use super::entries::{Entry, absent, count, dataset_name, decimal, thousands};
-use super::tables::{Head, cell, swatch, table};
+use super::entries::{Entry, absent, count, dataset_name, decimal, swatch, thousands};
+use super::tables::{Head, cell, table};
 use crate::error::{Error, Result};
 use crate::eval::evaluation::{SceneScores, comparison_path};
 use crate::io::read_image_size;

@@ -1,12 +1,11 @@
 //! Tables of the report: measured beside published scores, the cost of a reconstruction, and the paper's model sizes and ablations.
 
 use super::entries::{
-    Entry, Row, absent, count, dataset_name, decimal, finite, rows, short, thousands, view_counts,
+    Entry, Row, absent, count, dataset_name, decimal, finite, rows, short, swatch, thousands, view_counts,
 };
 use super::plots;
 use crate::eval::published::{IMAGE_SIZE, published};
 use maud::{Markup, html};
-use plotters::style::RGBColor;
 
 /// Heading of a column, which is aligned like its cells.
 pub enum Head {
@@ -67,11 +66,6 @@ pub fn partial_badge(entry: &Entry) -> Markup {
 pub fn share(entry: &Entry) -> String {
     let of = count(entry.evaluation.indexed_scenes, "scene");
     format!("{} of {of}", thousands(entry.scored() as u64))
-}
-
-/// Renders a swatch of the color that plots use for a method.
-pub fn swatch(RGBColor(red, green, blue): RGBColor) -> Markup {
-    html! { span.swatch style={ "background: rgb(" (red) " " (green) " " (blue) ")" } aria-hidden="true" {} }
 }
 
 const COMPARISON_HEAD: [Head; 6] = [

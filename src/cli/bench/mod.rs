@@ -1,16 +1,28 @@
-use super::{device, distributed, keep_freed_memory, model, open_capture, parse_size, print_json, warn};
+//! `globalsplat bench`: benchmarks, which tests don't run. Each returns the JSON object that the command prints.
+
+mod measure;
+mod model;
+mod raster;
+mod refine;
+mod train;
+
+use self::model::bench_model;
+use self::raster::{bench_raster, synthetic_gaussians};
+use self::refine::bench_refine;
+use self::train::bench_train;
+use super::model::{parse_precision, precision};
+use super::{device, distributed, keep_freed_memory, open_capture, parse_size, print_json, warn};
+use crate::config::Config;
+use crate::data::{load_all_views, view_batch};
+use crate::device::total_memory_bytes;
+use crate::distributed::ProcessGroup;
+use crate::error::{Error, panic_message};
+use crate::io::read_splat;
+use crate::refine::RefineConfig;
+use crate::scene::Gaussians;
+use crate::train::largest_fitting_batch;
 use anyhow::Result;
 use clap::{Args, Subcommand};
-use globalsplat::bench::{bench_model, bench_raster, bench_refine, bench_train, synthetic_gaussians};
-use globalsplat::config::Config;
-use globalsplat::data::{load_all_views, view_batch};
-use globalsplat::device::total_memory_bytes;
-use globalsplat::distributed::ProcessGroup;
-use globalsplat::error::{Error, panic_message};
-use globalsplat::io::read_splat;
-use globalsplat::refine::RefineConfig;
-use globalsplat::scene::Gaussians;
-use globalsplat::train::largest_fitting_batch;
 use serde_json::{Map, Value};
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::path::PathBuf;
@@ -35,15 +47,9 @@ enum Part {
 impl Bench {
     pub fn run(self) -> Result<()> {
         match self.part {
-            Part::Raster(raster) => {
-                keep_freed_memory();
-                raster.run()
-            }
+            Part::Raster(raster) => raster.run(),
             Part::Model(model) => model.run(),
-            Part::Refine(refine) => {
-                keep_freed_memory();
-                refine.run()
-            }
+            Part::Refine(refine) => refine.run(),
             Part::Train(train) => train.run(),
         }
     }
@@ -88,11 +94,11 @@ pub struct Raster {
     #[arg(long, value_name = "PATH", requires = "splat")]
     scene: Option<PathBuf>,
     /// Number of Gaussians in the synthetic scene
-    #[arg(long, value_name = "N", default_value_t = 16_384, conflicts_with = "splat")]
-    gaussians: usize,
+    #[arg(long, value_name = "N", default_value_t = 16_384, value_parser = clap::value_parser!(u32).range(1..), conflicts_with = "splat")]
+    gaussians: u32,
     /// Number of cameras of the synthetic scene, all in one call
-    #[arg(long, value_name = "N", default_value_t = 12, conflicts_with = "splat")]
-    cameras: usize,
+    #[arg(long, value_name = "N", default_value_t = 12, value_parser = clap::value_parser!(u16).range(1..), conflicts_with = "splat")]
+    cameras: u16,
     /// Image size of the synthetic scene's cameras
     #[arg(long, value_name = "WxH", default_value = "256x256", conflicts_with = "splat")]
     size: String,
@@ -100,7 +106,7 @@ pub struct Raster {
     #[arg(long, value_name = "N")]
     threads: Option<u16>,
     /// Number of timed calls
-    #[arg(long, value_name = "N", default_value_t = 30)]
+    #[arg(long, value_name = "N", default_value_t = 30, value_parser = clap::value_parser!(u32).range(1..))]
     repeats: u32,
     #[command(flatten)]
     common: Common,
@@ -108,14 +114,9 @@ pub struct Raster {
 
 impl Raster {
     fn run(self) -> Result<()> {
+        keep_freed_memory();
         if let Some(threads) = self.threads {
             tch::set_num_threads(i32::from(threads).max(1));
-        }
-        if self.repeats == 0 {
-            return Err(Error::request("--repeats is 0, expected 1 or more").into());
-        }
-        if self.gaussians == 0 || self.cameras == 0 {
-            return Err(Error::request("--gaussians and --cameras are expected to be 1 or more").into());
         }
         // The device is parsed before tensors are created, so that a missing one is reported immediately.
         let device = device::parse(&self.common.device)?;
@@ -130,7 +131,7 @@ impl Raster {
                 let gaussians = gaussians.to_local(&frame, splat.origin);
                 (gaussians, view_batch(&views, &poses, Device::Cpu).cameras())
             }
-            _ => synthetic_gaussians(self.gaussians, self.cameras, parse_size(&self.size)?),
+            _ => synthetic_gaussians(self.gaussians as usize, self.cameras.into(), parse_size(&self.size)?),
         };
         let (gaussians, cameras) = (gaussians.to_device(device), cameras.to_device(device));
         self.common.print(&bench_raster(&gaussians, &cameras, self.repeats as usize)?);
@@ -184,9 +185,9 @@ impl Configuration {
 impl Model {
     fn run(self) -> Result<()> {
         let device = device::parse(&self.common.device)?;
-        let requested = model::parse_precision(&self.precision)?;
+        let requested = parse_precision(&self.precision)?;
         let mut config = self.config.read()?;
-        let precision = model::precision(requested, device, config.model.width);
+        let precision = precision(requested, device, config.model.width);
         config.data.context_views = self.views.into();
         self.common.print(&bench_model(&config, precision, self.repeats as usize, device)?);
         Ok(())
@@ -217,6 +218,7 @@ pub struct Refine {
 
 impl Refine {
     fn run(self) -> Result<()> {
+        keep_freed_memory();
         let config = RefineConfig::with(&self.set, true)?;
         let (size, device) = (parse_size(&self.size)?, device::parse(&self.common.device)?);
         self.common.print(&bench_refine(self.gaussians as usize, size, &config, self.steps, device)?);

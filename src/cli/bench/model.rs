@@ -1,7 +1,7 @@
 //! Benchmark of the forward pass: the time of its parts, and its memory use.
 
+use super::measure::{Measured, PeakThroughput, TimingStats};
 use super::train::synthetic_scene;
-use super::{PartRecorder, PeakThroughput, TimingStats};
 use crate::config::Config;
 use crate::data::Batch;
 use crate::device::{Stopwatch, peak_memory_bytes_on, reset_peak_memory};
@@ -38,7 +38,7 @@ pub fn bench_model(config: &Config, precision: Precision, repeats: usize, device
         drop(no_grad(|| watch.time("pass", || model.forward(&input, stage))));
         Ok(1e3 * watch.sections()?[0].1.as_secs_f64())
     };
-    let (mut parts, mut passes, mut products) = (PartRecorder::default(), vec![], vec![]);
+    let (mut parts, mut passes, mut products) = (Measured::default(), vec![], vec![]);
     // The first pass warms up caches, threads and the GPU's libraries.
     forward()?;
     reset_peak_memory(device);
@@ -58,7 +58,7 @@ pub fn bench_model(config: &Config, precision: Precision, repeats: usize, device
         "threads": tch::get_num_threads(),
         "repeats": repeats,
         "milliseconds": TimingStats::from_milliseconds(passes),
-        "parts": parts.into_stats(peak_gflops),
+        "parts": parts.parts(peak_gflops),
         "peak_gflops": peak_gflops,
         "peak_bytes": peak_memory_bytes_on(device),
     }))

@@ -4,7 +4,9 @@
 
 mod cases;
 
+use super::device;
 use crate::error::{Error, Result};
+use clap::Args;
 use ndarray::ArrayD;
 use npyz::npz::{NpzArchive, NpzWriter};
 use npyz::{DType, Deserialize, NpyFile, WriterBuilder};
@@ -14,6 +16,20 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use tch::kind::Element;
 use tch::{Device, Kind, Tensor};
+
+/// Answer the requests of parity/run.py.
+#[derive(Args)]
+pub struct Parity {
+    /// Folder of request files
+    #[arg(long, value_name = "DIR")]
+    requests: PathBuf,
+    /// Folder for the responses
+    #[arg(long, value_name = "DIR")]
+    responses: PathBuf,
+    /// Device: cpu, cuda or cuda:N
+    #[arg(long, default_value = "cpu")]
+    device: String,
+}
 
 /// Tensors by name.
 type Tensors = BTreeMap<String, Tensor>;
@@ -34,27 +50,24 @@ struct Answer {
     params: Tensors,
 }
 
-/// Runs every request `*.npz` in `requests` and writes a file of the same name to `responses`. Returns the number of requests.
-///
-/// # Errors
-/// Fails if a folder or file can't be read or written. If a case fails, its response holds the error message.
-pub fn answer_all(requests: &Path, responses: &Path, device: Device) -> Result<usize> {
-    let mut files: Vec<PathBuf> = vec![];
-    for entry in std::fs::read_dir(requests).map_err(Error::read(requests))? {
-        let path = entry.map_err(Error::read(requests))?.path();
-        if path.extension().is_some_and(|ending| ending == "npz") {
-            files.push(path);
+impl Parity {
+    /// Answers every request `*.npz` by a file of the same name. If a case fails, its response holds the error message.
+    pub fn run(self) -> anyhow::Result<()> {
+        let device = device::parse(&self.device)?;
+        let mut files = vec![];
+        for entry in std::fs::read_dir(&self.requests).map_err(Error::read(&self.requests))? {
+            files.push(entry.map_err(Error::read(&self.requests))?.path());
         }
+        files.retain(|path| path.extension().is_some_and(|ending| ending == "npz"));
+        files.sort();
+        for file in &files {
+            let arrays = answer(file, device).unwrap_or_else(|error| {
+                Tensors::from([("error".into(), Tensor::from_slice(error.to_string().as_bytes()))])
+            });
+            write_npz(&self.responses.join(file.file_name().expect("a file's name")), &arrays)?;
+        }
+        Ok(())
     }
-    files.sort();
-    for file in &files {
-        let arrays = match answer(file, device) {
-            Ok(arrays) => arrays,
-            Err(error) => Tensors::from([("error".into(), text_array(&error.to_string()))]),
-        };
-        write_npz(&responses.join(file.file_name().expect("a file's name")), &arrays)?;
-    }
-    Ok(files.len())
 }
 
 fn answer(file: &Path, device: Device) -> Result<Tensors> {
@@ -120,10 +133,6 @@ fn read_request(file: &Path, device: Device) -> Result<Request> {
 
 fn unknown(file: &Path, what: &str, name: &str) -> Error {
     Error::input(file, format!("{what} {name}"), "out of place", "what parity/run.py writes")
-}
-
-fn text_array(text: &str) -> Tensor {
-    Tensor::from_slice(text.as_bytes())
 }
 
 /// Reads float32, float64, int64 and uint8 arrays in C order.

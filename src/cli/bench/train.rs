@@ -1,6 +1,6 @@
 //! Benchmark of a training step: the time of its parts, and its memory use.
 
-use super::{Measured, PartRecorder, PeakThroughput};
+use super::measure::{Measured, PeakThroughput};
 use crate::config::Config;
 use crate::data::{Batch, Capture, LoadTimes, LoadedScene};
 use crate::device::{Stopwatch, Upload, peak_memory_bytes_on};
@@ -41,7 +41,7 @@ pub fn bench_train(config: &Config, steps: usize, device: Device, group: Process
     let scenes: Vec<LoadedScene> =
         seeds.take(config.train.batch_size).map(|seed| synthetic_scene(&config, seed)).collect();
     let upload = Upload::new(device)?;
-    let mut parts = PartRecorder::default();
+    let mut parts = Measured::default();
     let measured = measure(&mut trainer, &scenes, steps, &upload, &mut parts)?;
     let peak_bytes = peak_memory_bytes_on(device);
     let precision = config.train.precision;
@@ -69,7 +69,7 @@ pub fn bench_train(config: &Config, steps: usize, device: Device, group: Process
         "steps": steps,
         "milliseconds": milliseconds,
         "sections": sections,
-        "parts": parts.into_stats(peak_gflops),
+        "parts": parts.parts(peak_gflops),
         "precision": precision,
         "peak_gflops": peak_gflops,
         "peak_bytes": peak_bytes,
@@ -86,7 +86,7 @@ fn measure(
     scenes: &[LoadedScene],
     steps: usize,
     upload: &Upload,
-    parts: &mut PartRecorder,
+    parts: &mut Measured,
 ) -> Result<Measured> {
     let mut measured = Measured::default();
     for step in 0..=steps {
@@ -98,7 +98,7 @@ fn measure(
             _ => parts.record(upload.device(), train_step)?,
         };
         if step > 0 {
-            measured.add(&mut watch)?;
+            measured.add_watch(&mut watch)?;
         }
     }
     Ok(measured)
@@ -120,14 +120,14 @@ fn measure_distributed_cost(
         let mut watch = Stopwatch::new(upload.device());
         watch.time(COMMUNICATION, || trainer.add_gradients_up())?;
         if step > 0 {
-            communication.add(&mut watch)?;
+            communication.add_watch(&mut watch)?;
         }
     }
     let communication = communication.total();
     let gradient_bytes = trainer.gradient_bytes();
     trainer.group().shutdown()?;
     let mut apart = trainer.with_group(ProcessGroup::single());
-    let apart = measure(&mut apart, scenes, steps, upload, &mut PartRecorder::default())?;
+    let apart = measure(&mut apart, scenes, steps, upload, &mut Measured::default())?;
     Ok(json!({
         "ranks": ranks,
         "scenes_per_second": scenes_per_second,

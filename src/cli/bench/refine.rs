@@ -1,6 +1,7 @@
 //! Benchmark of a refinement step: the time of its parts, and the share of rendering.
 
-use super::{TimingStats, synthetic_gaussians};
+use super::measure::TimingStats;
+use super::raster::synthetic_gaussians;
 use crate::data::ViewBatch;
 use crate::device::Stopwatch;
 use crate::error::Result;

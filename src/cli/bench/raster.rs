@@ -1,6 +1,6 @@
 //! Benchmark of the rasterizer: from tensors of Gaussians to images, and back to gradients.
 
-use super::{Measured, Section, TimingStats};
+use super::measure::{Measured, Section, TimingStats, Work};
 use crate::device::{Stopwatch, peak_memory_bytes_on, reset_peak_memory, resident_memory_bytes};
 use crate::error::Result;
 use crate::render::cpu::{PairCounts, StageTimes, count_pairs, multiply_add_peak, simd_level, stage_times};
@@ -46,7 +46,7 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
         _ => peak_memory_bytes_on(device),
     };
     let (mut forward, mut forward_backward) = (vec![], vec![]);
-    let mut stages: Vec<StageTimes> = vec![];
+    let mut stages = Measured::default();
     // The first round warms up caches and threads.
     for round in 0..=repeats {
         let mut watch = Stopwatch::new(device);
@@ -61,14 +61,17 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
             let [without, with] = [0, 1].map(|section| sections[section].1.as_secs_f64());
             forward.push(per_view(without));
             forward_backward.push(per_view(with));
-            stages.push(stage_times());
+            stages.add_run(
+                named_stages(stage_times())
+                    .map(|(name, seconds)| (name.into(), per_view(seconds), Work::default())),
+            );
         }
     }
     let working_bytes = peak_memory_bytes_on(device).saturating_sub(memory_before);
     let counts = count_pairs(gaussians, cameras, default_eps2d(gaussians))?;
     let (stages, rates, against_cpu) = match device {
         Device::Cpu => {
-            let stages = sections(&stages, per_view);
+            let stages = stages.sections();
             let rates = rates(&stages, &counts, views as f64);
             (stages, rates, vec![])
         }
@@ -117,9 +120,8 @@ fn time_kernels(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) -> Res
     let result: Result<()> = (0..repeats).try_for_each(|_| {
         measure_kernels(true);
         render_with_gradients(gaussians, cameras)?;
-        for time in kernel_times()? {
-            measured.add_section(time.kernel.into(), time.milliseconds / views);
-        }
+        let times = kernel_times()?.into_iter();
+        measured.add_run(times.map(|time| (time.kernel.into(), time.milliseconds / views, Work::default())));
         Ok(())
     });
     measure_kernels(false);
@@ -162,18 +164,15 @@ fn render_with_gradients(gaussians: &Gaussians, cameras: &Cameras) -> Result<Vec
     ])
 }
 
-fn sections(stages: &[StageTimes], per_view: impl Fn(f64) -> f64) -> Vec<Section> {
-    let stage = |name: &'static str, seconds: fn(&StageTimes) -> f64| Section {
-        name: name.into(),
-        milliseconds: TimingStats::from_milliseconds(stages.iter().map(|t| per_view(seconds(t))).collect()),
-    };
-    vec![
-        stage("project", |t| t.project),
-        stage("sort", |t| t.sort),
-        stage("bin", |t| t.bin),
-        stage(BLEND, |t| t.blend),
-        stage(BLEND_BACKWARD, |t| t.blend_backward),
-        stage("project backward", |t| t.project_backward),
+/// Returns the stages of a call by name, in seconds.
+fn named_stages(times: StageTimes) -> [(&'static str, f64); 6] {
+    [
+        ("project", times.project),
+        ("sort", times.sort),
+        ("bin", times.bin),
+        (BLEND, times.blend),
+        (BLEND_BACKWARD, times.blend_backward),
+        ("project backward", times.project_backward),
     ]
 }
 
