@@ -20,7 +20,9 @@ use tch::Device;
 /// Report what this machine offers: libtorch, devices, SIMD level, threads, GPUs and their requirements, and the weights,
 /// the ffmpeg and the COLMAP found.
 #[derive(Args)]
-#[command(after_help = "Examples:\n  globalsplat doctor\n  globalsplat doctor --config configs/re10k_16k.toml --set train.precision=bf16")]
+#[command(
+    after_help = "Examples:\n  globalsplat doctor\n  globalsplat doctor --config configs/re10k_16k.toml --set train.precision=bf16"
+)]
 pub struct Doctor {
     /// Report how much memory a training step with this configuration takes, on a CPU and on a GPU
     #[arg(long, value_name = "FILE")]

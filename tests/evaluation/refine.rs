@@ -118,7 +118,8 @@ fn threads_do_not_change_the_bytes() {
                 "refine --scene @world/000000.torch#7_000000 --out @a.ply --steps 60 --seed {seed} \
                  --set relocate_every=7 {options}"
             );
-            let done = sandbox.command(&line).envs([("OMP_NUM_THREADS", threads), WAIT_PASSIVELY]).output().unwrap();
+            let done =
+                sandbox.command(&line).envs([("OMP_NUM_THREADS", threads), WAIT_PASSIVELY]).output().unwrap();
             assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
             sandbox.read("a.ply")
         };
@@ -266,18 +267,18 @@ fn a_continued_refinement_equals_one_without_a_break() {
             |event| matches!(event, RefineEvent::Optimizing { steps, .. } if *steps == last),
         )
     };
-    let whole = options(300);
-    let unbroken = run(&whole, SceneInit::Photos, 300).unwrap();
+    let whole = options(500);
+    let unbroken = run(&whole, SceneInit::Photos, 500).unwrap();
     let file = sandbox.path("room.state.safetensors");
     // The second break is among the last steps, over which the parameters are averaged.
-    for (last, counts) in [(100, 61..300), (258, 300..301)] {
+    for (last, counts) in [(170, 61..300), (430, 300..301)] {
         let stopped = run(&whole, SceneInit::Photos, last).unwrap();
         stopped.state.unwrap().write(&file).unwrap();
         let state = RefineState::read(&file).unwrap();
         assert_eq!((state.steps(), state.count()), (last, stopped.gaussians.count() as usize));
         assert!(counts.contains(&state.count()), "{}", state.count());
-        let continued = run(&whole, SceneInit::State(&state), 300).unwrap();
-        assert_eq!((continued.steps, continued.corrections.len()), (300, unbroken.corrections.len()));
+        let continued = run(&whole, SceneInit::State(&state), 500).unwrap();
+        assert_eq!((continued.steps, continued.corrections.len()), (500, unbroken.corrections.len()));
         assert!(continued.splat == unbroken.splat);
     }
     let state = RefineState::read(&file).unwrap();
@@ -285,7 +286,7 @@ fn a_continued_refinement_equals_one_without_a_break() {
     // What doesn't fit is refused in a sentence.
     let others = RefineOptions { holdout: Holdout::Every { every: 4, first: 0 }, ..whole.clone() };
     for (options, expected) in [
-        (options(258), "the refinement is one of 258 steps already, expected more steps in all"),
+        (options(430), "the refinement is one of 430 steps already, expected more steps in all"),
         (others, "the list of photos is that of another refinement, "),
     ] {
         let error = run(&options, SceneInit::State(&state), 0).unwrap_err();

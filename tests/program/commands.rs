@@ -65,7 +65,8 @@ fn threads_do_not_change_a_splat() {
     for precision in ["f32", "bf16"] {
         let splat = |threads: &str| {
             let line = format!("reconstruct --scene @room --precision {precision} --out @{threads}.ply");
-            let output = sandbox.command(&line).envs([("OMP_NUM_THREADS", threads), WAIT_PASSIVELY]).output().unwrap();
+            let output =
+                sandbox.command(&line).envs([("OMP_NUM_THREADS", threads), WAIT_PASSIVELY]).output().unwrap();
             assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
             sandbox.read(&format!("{threads}.ply"))
         };

@@ -74,7 +74,7 @@ struct Common {
 impl Common {
     fn print(&self, report: &Value) {
         match report {
-            Value::Object(report) if !self.json => print_report(report),
+            Value::Object(report) if !self.json => print_report("", report),
             report => print_json(report),
         }
     }
@@ -324,55 +324,39 @@ impl Train {
     }
 }
 
-/// Prints the values of a report, and then a row for every time in it, with what else is known of the same part.
-fn print_report(report: &Map<String, Value>) {
-    let is_time = |value: &Value| value.get("median").is_some();
+/// Prints the plain values of `report` in a line, its time among them, and then a line for each object and for each row in it.
+fn print_report(name: &str, report: &Map<String, Value>) {
+    let mut values = report.clone();
+    values.remove("name");
+    if let Some(Value::Object(time)) = values.remove("milliseconds") {
+        values.extend(time);
+    }
     let is_table =
         |value: &Value| value.as_array().is_some_and(|rows| rows.iter().any(|row| !row.is_number()));
-    let (tables, values): (Vec<_>, Vec<_>) =
-        report.iter().partition(|(_, value)| is_time(value) || is_table(value) || value.is_object());
-    println!(
-        "{}",
-        values.iter().map(|(name, value)| format_value(name, value)).collect::<Vec<_>>().join(", ")
-    );
-    for (name, value) in tables {
-        match value {
-            Value::Array(rows) => rows.iter().for_each(print_row),
-            Value::Object(value) if !value.contains_key("median") => {
-                print!("{name}: ");
-                print_report(value);
-            }
-            time => print_time(name, time, ""),
+    let (nested, plain): (Vec<_>, Vec<_>) =
+        values.iter().partition(|(_, value)| value.is_object() || is_table(value));
+    let format = |(key, value): &(&String, &Value)| match (value.as_f64(), value.as_str()) {
+        (Some(number), _) if number.fract() != 0. => format!("{key} {number:.4}"),
+        (_, Some(text)) => format!("{key} {text}"),
+        _ => format!("{key} {value}"),
+    };
+    println!("{name:<28} {}", plain.iter().map(format).collect::<Vec<_>>().join(", "));
+    for (key, value) in nested {
+        if let Value::Object(group) = value {
+            print_report(key, group);
         }
-    }
-}
-
-/// Prints a part of a report: an object with a name and a time, a pair of a name and a mean time, or an object of values.
-fn print_row(row: &Value) {
-    match row {
-        Value::Array(pair) => println!("{:<28} {:>10.3} ms", pair[0].as_str().unwrap_or(""), pair[1]),
-        Value::Object(values) => {
-            let others = values.iter().filter(|(name, _)| !["name", "milliseconds"].contains(&name.as_str()));
-            let others: Vec<String> = others.map(|(name, value)| format_value(name, value)).collect();
-            match values.get("milliseconds") {
-                Some(time) => print_time(values["name"].as_str().unwrap_or(""), time, &others.join(", ")),
-                None => println!("{}", others.join(", ")),
+        for row in value.as_array().into_iter().flatten() {
+            match row {
+                Value::Object(row) => {
+                    print_report(row.get("name").and_then(Value::as_str).unwrap_or(key), row)
+                }
+                // A name and a mean time.
+                pair => println!(
+                    "{:<28} {:.3} ms",
+                    pair[0].as_str().unwrap_or_default(),
+                    pair[1].as_f64().unwrap_or(f64::NAN)
+                ),
             }
         }
-        other => println!("{other}"),
-    }
-}
-
-fn print_time(name: &str, time: &Value, others: &str) {
-    let [median, min, p75] =
-        ["median", "least", "upper_quartile"].map(|key| time[key].as_f64().unwrap_or(f64::NAN));
-    println!("{name:<28} {median:>10.3} ms median, {min:>10.3} min, {p75:>10.3} p75  {others}");
-}
-
-fn format_value(name: &str, value: &Value) -> String {
-    match (value.as_f64().filter(|number| number.fract() != 0.), value) {
-        (Some(number), _) => format!("{name} {number:.4}"),
-        (None, Value::String(text)) => format!("{name} {text}"),
-        (None, other) => format!("{name} {other}"),
     }
 }
