@@ -97,16 +97,3 @@ fn byte_tensor(planes: &Planes) -> Tensor {
 pub fn tensor_from_planes(planes: &Planes) -> Tensor {
     Pixels::from(byte_tensor(planes)).to_float()
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::io::tensor_from_rgb;
-    use image::{Rgb, RgbImage};
-
-    #[test]
-    fn planes_are_converted_like_interleaved_images() {
-        let image = RgbImage::from_fn(7, 5, |x, y| Rgb([x as u8 * 30, y as u8 * 40, (x * y) as u8]));
-        assert!(tensor_from_planes(&Planes::from_rgb(&image)).equal(&tensor_from_rgb(&image)));
-    }
-}

@@ -195,21 +195,3 @@ fn crc32c(bytes: &[u8]) -> u32 {
     };
     !bytes.iter().fold(!0, |crc, &byte| crc >> 8 ^ TABLE[usize::from(crc as u8 ^ byte)])
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn checksums_are_those_of_rfc_3720() {
-        assert_eq!(crc32c(b"123456789"), 0xe306_9283);
-        assert_eq!(crc32c(&[0; 32]), 0x8a91_36aa);
-        assert_eq!(crc32c(&[0xff; 32]), 0x62a8_ab43);
-    }
-
-    #[test]
-    fn numbers_are_in_the_wire_format() {
-        let message = Message::default().varint(1, 150).bytes(2, b"testing").float(3, 1.);
-        assert_eq!(message.0, b"\x08\x96\x01\x12\x07testing\x1d\x00\x00\x80\x3f");
-    }
-}

@@ -345,7 +345,6 @@ impl Optimizer {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use globalsplat_csrc::ops::record_ops;
     use tch::Kind;
 
     fn leaf(values: &[f32]) -> Tensor {
@@ -362,31 +361,6 @@ mod tests {
         adamw.steps += 1;
         (0..adamw.groups.len()).try_for_each(|group| adamw.update_fused(group))
     }];
-
-    #[test]
-    fn steps_match_the_equations() {
-        for step in WAYS {
-            steps_follow_the_equations(step);
-        }
-    }
-
-    fn steps_follow_the_equations(step: fn(&mut Optimizer) -> Result<()>) {
-        let (weight, bias) = (leaf(&[2.]), leaf(&[2.]));
-        let groups = vec![group(&[("weight", &weight)], 1e-2, 0.1), group(&[("bias", &bias)], 3e-2, 0.)];
-        let mut adamw = Optimizer::new(groups);
-        let (mut m, mut v, mut expected) = (0f64, 0f64, [2f64, 2f64]);
-        for (i, gradient) in [0.5f64, -1.5, 0.25].into_iter().enumerate() {
-            adamw.zero_grad();
-            ((&weight + &bias).sum(Kind::Float) * gradient).backward();
-            step(&mut adamw).unwrap();
-            let t = i as i32 + 1;
-            (m, v) = (0.9 * m + 0.1 * gradient, 0.999 * v + 0.001 * gradient * gradient);
-            let update = (m / (1. - 0.9f64.powi(t))) / ((v / (1. - 0.999f64.powi(t))).sqrt() + 1e-8);
-            expected = [expected[0] * (1. - 1e-2 * 0.1) - 1e-2 * update, expected[1] - 3e-2 * update];
-        }
-        assert!((weight.double_value(&[0]) - expected[0]).abs() < 1e-6);
-        assert!((bias.double_value(&[0]) - expected[1]).abs() < 1e-6);
-    }
 
     /// Elements of an extended parameter go on as they would alone, and the new ones begin without moments.
     #[test]
@@ -443,22 +417,6 @@ mod tests {
     }
 
     #[test]
-    fn a_fused_step_is_one_op_for_each_group() {
-        let leaves: Vec<Tensor> = (0..40).map(|i| leaf(&[i as f32])).collect();
-        let named: Vec<(String, &Tensor)> =
-            leaves.iter().enumerate().map(|(i, t)| (format!("{i}"), t)).collect();
-        let named: Vec<(&str, &Tensor)> = named.iter().map(|(name, t)| (name.as_str(), *t)).collect();
-        let mut adamw = Optimizer::new(vec![group(&named[..30], 1e-2, 0.1), group(&named[30..], 1e-2, 0.)]);
-        leaves.iter().map(Tensor::square).reduce(|a, b| a + b).expect("some").sum(Kind::Float).backward();
-        let (done, mut ops) = record_ops(|| WAYS[1](&mut adamw));
-        done.unwrap();
-        // On the CPU, the op itself reads the number of steps of each parameter.
-        ops.retain(|op| op != "aten::item" && op != "aten::_local_scalar_dense");
-        let fused = ops.iter().filter(|op| *op == "aten::_fused_adamw_").count();
-        assert!(fused == 2 && ops.len() <= 8, "{ops:?}");
-    }
-
-    #[test]
     fn gradients_are_clipped_together() {
         let (a, b) = (leaf(&[0.]), leaf(&[0.]));
         let adamw = Optimizer::new(vec![group(&[("b", &b)], 1., 0.), group(&[("a", &a)], 1., 0.)]);
@@ -469,20 +427,5 @@ mod tests {
         assert_eq!(a.grad().double_value(&[0]), 3.);
         adamw.clip_gradients(norm, 1.).unwrap();
         assert!((a.grad().double_value(&[0]) - 0.6).abs() < 1e-5);
-    }
-
-    #[test]
-    fn gradients_can_be_changed_before_they_are_used() {
-        let (a, b) = (leaf(&[1.]), leaf(&[1.]));
-        let mut adamw = Optimizer::new(vec![group(&[("a", &a), ("b", &b)], 0.1, 0.)]);
-        (&a * 3. + &b * 0.).sum(Kind::Float).backward();
-        for (name, mut gradient) in adamw.gradients() {
-            // An all-reduce also changes gradients in place.
-            let _ = if name == "a" { gradient.zero_() } else { gradient.fill_(2.) };
-        }
-        assert!((adamw.gradient_norm().unwrap().double_value(&[]) - 2.).abs() < 1e-6);
-        adamw.step().unwrap();
-        assert_eq!(a.double_value(&[0]), 1.);
-        assert!((b.double_value(&[0]) - 0.9).abs() < 1e-6);
     }
 }

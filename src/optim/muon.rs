@@ -118,20 +118,6 @@ mod tests {
     }
 
     #[test]
-    fn singular_values_become_about_1() {
-        let numbers =
-            Tensor::arange(2 * 40 * 70, (Kind::Double, Device::Cpu)).square().sin().view([2, 40, 70]);
-        let (u, _, v) = numbers.svd(true, true);
-        for matrices in [numbers.shallow_clone(), numbers.transpose(1, 2).contiguous() * 1e-6] {
-            let (_, s, _) = orthogonalize(&matrices).svd(true, true);
-            let [least, most] = [s.min(), s.max()].map(|t| t.double_value(&[]));
-            assert!(least > 0.6 && most < 1.3, "{least} to {most}");
-        }
-        let off = (orthogonalize(&numbers) - u.matmul(&v.transpose(1, 2))).norm() / (2f64 * 40.).sqrt();
-        assert!(off.double_value(&[]) < 0.3, "{off:?}");
-    }
-
-    #[test]
     fn any_number_of_threads_gives_the_same_bits() {
         use globalsplat_csrc::render::set_num_threads;
         let expected = stepped(Kind::Float, update, 3);

@@ -166,28 +166,3 @@ fn neighbor_distances(points: &[[f32; 3]], k: usize) -> Vec<f32> {
     };
     points.par_iter().map(distance).collect()
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn distances_are_those_of_all_pairs() {
-        let coordinate = |seed: usize| ((seed as f32 * 12.9898).sin() * 43_758.547).fract();
-        let points: Vec<[f32; 3]> = (0..500)
-            .map(|k| [0, 1, 2].map(|axis| coordinate(3 * k + axis)))
-            .chain([[5.; 3], [5.; 3]])
-            .collect();
-        let found = neighbor_distances(&points, 4);
-        for (index, point) in points.iter().enumerate() {
-            let distance =
-                |other: &[f32; 3]| point.iter().zip(other).map(|(a, b)| (a - b).powi(2)).sum::<f32>();
-            let others = points.iter().enumerate().filter(|(other, _)| *other != index);
-            let mut all: Vec<f32> = others.map(|(_, other)| distance(other).sqrt()).collect();
-            all.sort_by(f32::total_cmp);
-            assert_eq!(found[index], all[3], "point {index}");
-        }
-        assert_eq!(neighbor_distances(&points[..3], 3), [f32::INFINITY; 3]);
-        assert!(neighbor_distances(&[], 3).is_empty());
-    }
-}

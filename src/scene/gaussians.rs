@@ -178,26 +178,6 @@ mod tests {
         );
     }
 
-    /// Activation has the gradients d exp(s) = exp(s) and d sigmoid(o) = α (1 − α).
-    #[test]
-    fn activation_has_its_gradients() {
-        let leaf =
-            |values: &[f64], shape: &[i64]| Tensor::from_slice(values).view(shape).set_requires_grad(true);
-        let raw = RawGaussians {
-            means: leaf(&[0.; 3], &[1, 1, 3]),
-            log_scales: leaf(&[-3., 0., 1.5], &[1, 1, 3]),
-            quaternions: leaf(&[1., 0., 0., 0.], &[1, 1, 4]),
-            opacity_logits: leaf(&[-1.2], &[1, 1]),
-            sh: leaf(&[0.; 3], &[1, 1, 1, 3]),
-        };
-        let active = raw.activate();
-        (active.scales.sum(Kind::Double) + active.opacities.sum(Kind::Double)).backward();
-        assert!(raw.log_scales.grad().equal(&active.scales));
-        let expected = &active.opacities * (1. - &active.opacities);
-        let off: Tensor = raw.opacity_logits.grad() - expected;
-        assert!(off.abs().max().double_value(&[]) < 1e-15);
-    }
-
     #[test]
     fn sigmoid_has_the_same_bits_for_any_number_of_threads() {
         let _guard = num_threads::change();

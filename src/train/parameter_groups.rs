@@ -54,30 +54,7 @@ fn turn(name: &str) -> i64 {
 mod tests {
     use super::*;
     use crate::model::{GlobalSplat, ModelConfig};
-    use tch::{Device, nn::Init};
-
-    #[test]
-    fn only_layer_weights_decay() {
-        let vs = nn::VarStore::new(Device::Cpu);
-        let layer = vs.root() / "layer";
-        let _variables = [
-            layer.var("weight", &[2, 3], Init::Const(0.)),
-            layer.var("bias", &[2], Init::Const(0.)),
-            (vs.root() / "norm").var("weight", &[3], Init::Const(1.)),
-            vs.root().var("tokens", &[1, 4, 3], Init::Const(0.)),
-            vs.root().zeros_no_train("constant", &[2, 2]),
-        ];
-        let groups = parameter_groups(&vs, &TrainConfig { weight_decay: 0.1, ..Default::default() });
-        assert_eq!((names(&groups[0]), groups[0].weight_decay), (vec!["layer.weight".into()], 0.1));
-        let others: Vec<String> = ["layer.bias", "norm.weight", "tokens"].map(String::from).into();
-        assert_eq!((names(&groups[1]), groups[1].weight_decay), (others, 0.));
-    }
-
-    fn names(group: &ParameterGroup) -> Vec<String> {
-        let mut names: Vec<String> = group.parameters.iter().map(|(name, _)| name.clone()).collect();
-        names.sort();
-        names
-    }
+    use tch::Device;
 
     #[test]
     fn muon_updates_the_encoders_matrices_and_nothing_else() {

@@ -296,28 +296,6 @@ fn a_step_in_parts_matches_one_backward_pass() {
     }
 }
 
-#[test]
-fn the_network_of_l_perc_has_the_model_s_precision() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let file = folder.path().join("vgg19.safetensors");
-    let vs = nn::VarStore::new(Device::Cpu);
-    Vgg19::new(&vs.root());
-    vs.save(&file).expect("weights");
-    for (precision, kind) in [(Precision::F32, Kind::Float), (Precision::Bf16, Kind::BFloat16)] {
-        let mut config = config(small(), TrainConfig { precision, ..Default::default() });
-        config.loss.perceptual = PerceptualKind::Vgg19;
-        config.loss.perceptual_weights = file.display().to_string();
-        let scenes = Arc::new(Vec::<Capture>::new());
-        let trainer = Trainer::new(&config, scenes, Device::Cpu).expect("a trainer");
-        let Some(PerceptualLoss::Vgg19(network)) = trainer.perceptual else { panic!("a network") };
-        let features = network.features(&Tensor::zeros([1, 3, 16, 16], (Kind::Float, Device::Cpu)));
-        // The image itself is compared in float32.
-        let kinds: Vec<Kind> = features.iter().map(Tensor::kind).collect();
-        assert_eq!(kinds, [Kind::Float, kind, kind, kind, kind, kind]);
-        assert_eq!(network.compare(&features, &features).kind(), Kind::Float);
-    }
-}
-
 /// The GPU is waited for once in a step, for the losses; rendering moves its images to the device of the Gaussians.
 #[test]
 fn a_step_makes_only_expected_device_copies() {
