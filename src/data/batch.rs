@@ -1,7 +1,6 @@
 //! Batches of views: images and cameras as the tensors that the model and the renderer take.
 
-use super::pixels::Pixels;
-use super::view::View;
+use super::view::{Pixels, View};
 use crate::model::{IMAGENET_MEAN, ModelInput};
 use crate::render::Cameras;
 use crate::scene::{Camera, pose_to_rows};
@@ -83,18 +82,16 @@ impl ViewBatch {
         ViewBatch { images, masks, depths, c2w: cat(0), w2c: cat(1), intrinsics: cat(2) }
     }
 
-    /// Returns the four tensors besides the masks and depths in the order that [`ViewBatch::from_tensors`] takes.
-    pub(super) fn tensors(&self) -> [&Tensor; 4] {
-        [&self.images, &self.c2w, &self.w2c, &self.intrinsics]
-    }
-
-    /// Builds a batch from tensors in the order of [`ViewBatch::tensors`], the masks and the depths.
-    pub(super) fn from_tensors(
-        [images, c2w, w2c, intrinsics]: [Tensor; 4],
-        masks: Option<Tensor>,
-        depths: Option<Tensor>,
-    ) -> Self {
-        ViewBatch { images, masks, depths, c2w, w2c, intrinsics }
+    /// Applies `f` to every tensor.
+    pub(super) fn map(&self, mut f: impl FnMut(&Tensor) -> Tensor) -> Self {
+        ViewBatch {
+            images: f(&self.images),
+            masks: self.masks.as_ref().map(&mut f),
+            depths: self.depths.as_ref().map(&mut f),
+            c2w: f(&self.c2w),
+            w2c: f(&self.w2c),
+            intrinsics: f(&self.intrinsics),
+        }
     }
 
     /// Returns the views as a model sees them: masked pixels have the color that its normalization (spec 3.1) makes 0.
@@ -128,28 +125,7 @@ impl ViewBatch {
 
     /// Returns the views at `positions` of every scene.
     pub fn select(&self, positions: &[usize]) -> Self {
-        let select = |t: &Tensor| select_views(t, positions);
-        ViewBatch {
-            images: select(&self.images),
-            masks: self.masks.as_ref().map(select),
-            depths: self.depths.as_ref().map(select),
-            c2w: select(&self.c2w),
-            w2c: select(&self.w2c),
-            intrinsics: select(&self.intrinsics),
-        }
-    }
-
-    /// Returns `count` of the scenes, starting at `first`.
-    pub fn scenes(&self, first: i64, count: i64) -> Self {
-        let narrow = |t: &Tensor| t.narrow(0, first, count);
-        ViewBatch {
-            images: narrow(&self.images),
-            masks: self.masks.as_ref().map(narrow),
-            depths: self.depths.as_ref().map(narrow),
-            c2w: narrow(&self.c2w),
-            w2c: narrow(&self.w2c),
-            intrinsics: narrow(&self.intrinsics),
-        }
+        self.map(|t| select_views(t, positions))
     }
 
     /// Concatenates scenes that have equally many views along the batch dimension.

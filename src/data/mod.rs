@@ -6,10 +6,7 @@ mod batch;
 mod chunk_writer;
 mod config;
 mod dataset;
-mod jitter;
 mod loading;
-mod photo_size;
-mod pixels;
 mod view;
 
 pub use batch::{ViewBatch, view_batch};
@@ -23,16 +20,12 @@ pub use globalsplat_capture::{
     write_transforms_json,
 };
 pub use globalsplat_synth::{SyntheticDataset, read_pictures};
-pub use loading::{
-    BadData, Batch, BatchShard, DataLoader, LoadTimes, LoadedScene, SceneGroups, TrainingScenes,
-};
-pub(crate) use photo_size::MIN_SHORTER_SIDE;
-pub use photo_size::{MIN_SIDE, PhotoSize};
-pub use pixels::Pixels;
-pub use view::{View, load_all_views, load_views, tensor_from_planes};
+pub use loading::{BadData, Batch, BatchShard, DataLoader, LoadedScene, SceneGroups, TrainingScenes};
+pub(crate) use view::MIN_SHORTER_SIDE;
+pub use view::{MIN_SIDE, PhotoSize, Pixels, View, load_all_views, load_views, tensor_from_planes};
 
 // Exchanged between processes.
 pub(crate) use loading::BadSceneReport;
 // Used by the parity checks, which run every part separately.
+pub(crate) use augment::Jitter;
 pub(crate) use globalsplat_capture::{Region, Resampler};
-pub(crate) use jitter::Jitter;

@@ -1,12 +1,156 @@
-//! A photo as a tensor, and its camera.
+//! Photos in memory: their size, their pixels, and views, which are photos with their cameras.
 
-use super::pixels::Pixels;
 use crate::error::Result;
 use crate::io::rgb_from_tensor;
 use crate::scene::{Camera, ImageSize};
 use globalsplat_capture::{CHANNELS, Capture, Photo, Planes, resize_and_crop};
 use rayon::prelude::*;
+use serde::Deserialize;
+use std::str::FromStr;
 use tch::{Device, Kind, Tensor};
+
+/// Pixels of a photo or of its mask, `[C, H, W]`: floats, nominally in [0, 1], or the 8-bit levels of a file, which take a quarter of the
+/// memory.
+#[derive(Debug)]
+pub struct Pixels(Tensor);
+
+impl From<Tensor> for Pixels {
+    /// Takes floats, or levels from 0 to 255 of kind `Uint8`.
+    ///
+    /// # Panics
+    /// If the tensor has another kind.
+    fn from(values: Tensor) -> Self {
+        assert!(matches!(values.kind(), Kind::Float | Kind::Uint8), "pixels are floats or 8-bit levels");
+        Pixels(values)
+    }
+}
+
+impl Pixels {
+    /// Returns the pixels as floats; level 255 becomes 1. Floats are not copied.
+    pub fn to_float(&self) -> Tensor {
+        match self.0.kind() {
+            // Divide in place: a second copy of a photo of 16 million pixels takes 192 MB.
+            Kind::Uint8 => self.0.to_kind(Kind::Float).divide_scalar_(255.),
+            _ => self.0.shallow_clone(),
+        }
+    }
+
+    /// Returns the pixels of several images of one size as floats, `[N, C, H, W]`.
+    pub(crate) fn stack(images: &[&Pixels]) -> Tensor {
+        let is_of_levels = images.iter().all(|image| image.0.kind() == Kind::Uint8);
+        match is_of_levels {
+            true => {
+                Pixels(Tensor::stack(&images.iter().map(|image| &image.0).collect::<Vec<_>>(), 0)).to_float()
+            }
+            false => Tensor::stack(&images.iter().map(|image| image.to_float()).collect::<Vec<_>>(), 0),
+        }
+    }
+
+    /// Returns `count` images of 8-bit levels that are not initialized, of a size [C, H, W], in one allocation: small tensors that are
+    /// allocated one by one between larger ones, which are freed, would leave gaps in memory where no larger one fits.
+    pub(crate) fn allocate(count: i64, [channels, height, width]: [i64; 3], device: Device) -> Vec<Self> {
+        let levels = Tensor::empty([count, channels, height, width], (Kind::Uint8, device));
+        (0..count).map(|index| Pixels(levels.get(index))).collect()
+    }
+
+    /// Overwrites 8-bit levels with floats, limited to [0, 1] and rounded to the nearest level.
+    pub(crate) fn copy_from_floats(&mut self, floats: &Tensor) {
+        assert_eq!(self.0.kind(), Kind::Uint8, "floats would not be rounded");
+        self.0.copy_(&(floats.clamp(0., 1.) * 255.).round_());
+    }
+
+    /// Returns the size, [C, H, W].
+    pub fn size(&self) -> Vec<i64> {
+        self.0.size()
+    }
+
+    /// Returns a copy that shares the memory.
+    pub fn shallow_clone(&self) -> Self {
+        Pixels(self.0.shallow_clone())
+    }
+
+    /// Returns the pixels on `device`.
+    pub(crate) fn to_device(&self, device: Device) -> Self {
+        Pixels(self.0.to_device(device))
+    }
+}
+
+/// Minimum length in pixels of a photo's shorter side after downscaling.
+pub(crate) const MIN_SHORTER_SIDE: u32 = 32;
+
+/// Minimum side in pixels of a photo that is scored or matched: the side of the SSIM window (spec 9.4).
+pub const MIN_SIDE: u32 = 11;
+/// Maximum side in pixels of a photo.
+const MAX_SIDE: u32 = 16_384;
+
+/// Size that the photos of a capture are loaded at.
+///
+/// ```
+/// use globalsplat::data::PhotoSize;
+/// use globalsplat::scene::{Camera, ImageSize, Intrinsics};
+///
+/// let intrinsics = Intrinsics { fx: 1500., fy: 1500., cx: 1000., cy: 500. };
+/// let camera = Camera { intrinsics, c2w: Default::default(), width: 2000, height: 1000 };
+/// assert_eq!(PhotoSize::Within(500).of(&camera), ImageSize { width: 500, height: 250 });
+/// assert_eq!(PhotoSize::Within(4000).of(&camera), ImageSize { width: 2000, height: 1000 });
+/// ```
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[serde(try_from = "String")]
+pub enum PhotoSize {
+    /// The size that the photos have.
+    Own,
+    /// Photos whose longer side has more pixels are downscaled to this number, and keep their shape. The shorter side keeps at least 32.
+    Within(u32),
+    /// Photos are cropped and resized to this size.
+    Exactly(ImageSize),
+}
+
+impl FromStr for PhotoSize {
+    type Err = String;
+
+    /// Parses the longer side, as in `1600`, or width and height, as in `640x480`.
+    fn from_str(text: &str) -> std::result::Result<Self, String> {
+        let side = |text: &str| text.parse().ok().filter(|side| (MIN_SIDE..=MAX_SIDE).contains(side));
+        let size = match text.split_once('x') {
+            Some((width, height)) => side(width)
+                .zip(side(height))
+                .map(|(width, height)| PhotoSize::Exactly(ImageSize { height, width })),
+            None => side(text).map(PhotoSize::Within),
+        };
+        size.ok_or_else(|| {
+            format!("expected the longer side, as in 1600, or WxH, as in 640x480, with sides of {MIN_SIDE} to {MAX_SIDE}")
+        })
+    }
+}
+
+impl TryFrom<String> for PhotoSize {
+    type Error = String;
+
+    fn try_from(text: String) -> std::result::Result<Self, String> {
+        text.parse()
+    }
+}
+
+impl PhotoSize {
+    /// Returns the size of the photo of `camera` after loading.
+    pub fn of(self, camera: &Camera) -> ImageSize {
+        let Camera { width, height, .. } = *camera;
+        self.resized(camera).unwrap_or(ImageSize { height, width })
+    }
+
+    /// Returns the size that the photo of `camera` is resized to, or `None` if it is loaded as it is.
+    pub fn resized(self, camera: &Camera) -> Option<ImageSize> {
+        let longest = match self {
+            PhotoSize::Own => return None,
+            PhotoSize::Exactly(size) => return Some(size),
+            PhotoSize::Within(longest) => f64::from(longest),
+        };
+        let (longer, shorter) = (camera.width.max(camera.height), camera.width.min(camera.height));
+        let scale = (longest / f64::from(longer)).max(f64::from(MIN_SHORTER_SIDE) / f64::from(shorter));
+        let side = |pixels: u32| ((f64::from(pixels) * scale).round() as u32).max(1);
+        (scale < 1.).then(|| ImageSize { height: side(camera.height), width: side(camera.width) })
+    }
+}
 
 /// A photo and its camera.
 #[derive(Debug)]
@@ -96,4 +240,25 @@ fn byte_tensor(planes: &Planes) -> Tensor {
 /// Converts an image to a float tensor, `[3, H, W]`, values in [0, 1].
 pub fn tensor_from_planes(planes: &Planes) -> Tensor {
     Pixels::from(byte_tensor(planes)).to_float()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn levels_become_the_floats_they_stand_for() {
+        let levels = Tensor::arange(256, (Kind::Uint8, Device::Cpu)).view([1, 16, 16]);
+        let floats = Pixels::from(levels.shallow_clone()).to_float();
+        assert_eq!((floats.kind(), floats.double_value(&[0, 15, 15])), (Kind::Float, 1.));
+        assert!(Pixels::from(floats.shallow_clone()).to_float().equal(&floats));
+        let mut rounded = Pixels::from(levels.zeros_like());
+        rounded.copy_from_floats(&(floats + 0.4 / 255.));
+        assert!(rounded.0.equal(&levels));
+        let floats = rounded.to_float();
+        let mixed = Pixels::from(floats.shallow_clone());
+        for images in [[&rounded, &rounded], [&rounded, &mixed]] {
+            assert!(Pixels::stack(&images).equal(&Tensor::stack(&[&floats, &floats], 0)));
+        }
+    }
 }

@@ -1,37 +1,130 @@
-//! Losses (spec 7.1), one file per term, and their weighted sum.
+//! Losses (spec 7.1): the terms and their weighted sum.
 
 mod config;
-mod consistency;
-mod decoder_regularization;
-mod depth_smoothness;
-mod frustum;
 mod lpips;
-mod mask;
-mod mse;
 mod perceptual;
-mod photometric;
 mod terms;
 mod vgg19;
 
 pub use config::{LossConfig, PerceptualKind};
-pub use decoder_regularization::{DecoderRegularization, decoder_regularization, sh_soft_cap};
-pub use depth_smoothness::{depth_smoothness, masked_depth_smoothness};
-pub use frustum::frustum;
 pub use lpips::{Lpips, LpipsNetwork};
-pub use mask::{fill_masked, mean_weight};
-pub use mse::{masked_mse, mse, psnr_of_mse};
 pub use perceptual::PerceptualLoss;
-pub use photometric::{masked_photometric, photometric, ssim};
-pub use terms::{Losses, Term};
+pub use terms::{
+    DecoderRegularization, decoder_regularization, depth_smoothness, fill_masked, frustum,
+    masked_depth_smoothness, masked_mse, masked_photometric, mean_weight, mse, photometric, psnr_of_mse,
+    sh_soft_cap, ssim,
+};
 pub use vgg19::Vgg19;
 
 // Used by training, which may run the model in slices.
-pub(crate) use consistency::{StepFraction, consistency, depth_pixels};
+pub(crate) use terms::{StepFraction, consistency, depth_pixels};
 
 use crate::data::Batch;
 use crate::model::Decoded;
 use crate::render::RenderOutput;
-use tch::Tensor;
+use std::ops::Index;
+use tch::{Kind, Tensor, no_grad};
+
+/// Declares [`Term`] from a list, so that each entry defines a term's name and index: sums, logs and TensorBoard iterate over [`Term::ALL`].
+macro_rules! terms {
+    ($($(#[$meta:meta])* $term:ident $name:literal)*) => {
+        /// Term of the loss, or a part of a term that is logged separately.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+        pub enum Term {
+            $($(#[$meta])* $term),*
+        }
+
+        impl Term {
+            /// All terms, in the order in which they are summed and logged.
+            pub const ALL: [Term; [$($name),*].len()] = [$(Term::$term),*];
+
+            /// Returns the term's name in logs.
+            pub fn name(self) -> &'static str {
+                match self {
+                    $(Term::$term => $name),*
+                }
+            }
+        }
+    };
+}
+
+terms! {
+    /// Mean squared error of the rendered colors.
+    Mse "mse"
+    /// Perceptual loss, L_perc; 0 if it is left out.
+    Perceptual "perceptual"
+    /// Consistency of the two subsets, L_con, with its factors; 0 if the sample isn't paired.
+    Consistency "consistency"
+    /// Frustum constraint, L_fru.
+    Frustum "frustum"
+    /// Regularization of the decoder, L_dec: the sum of the following parts, with its own factor.
+    Decoder "decoder"
+    /// Opacity part of L_dec, L_opacity; 0 if it is left out.
+    DecoderOpacity "decoder_opacity"
+    /// Scale part of L_dec, L_scale.
+    DecoderScale "decoder_scale"
+    /// Rotation part of L_dec, L_rot.
+    DecoderRotation "decoder_rotation"
+    /// Spherical harmonics part of L_dec, L_SH.
+    DecoderSh "decoder_sh"
+}
+
+impl Term {
+    /// Returns the term's weight in the sum; `None` for a part of another term.
+    pub fn factor(self, config: &LossConfig) -> Option<f64> {
+        match self {
+            Term::Mse => Some(config.mse),
+            Term::Perceptual => Some(config.perceptual_factor),
+            Term::Consistency => Some(1.),
+            Term::Frustum => Some(config.frustum),
+            Term::Decoder => Some(config.decoder),
+            Term::DecoderOpacity | Term::DecoderScale | Term::DecoderRotation | Term::DecoderSh => None,
+        }
+    }
+}
+
+/// Total loss and its terms without their weights: scalar tensors, or numbers.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Losses<T> {
+    /// Weighted sum of the terms, which is minimized.
+    pub total: T,
+    terms: [T; Term::ALL.len()],
+}
+
+impl Losses<Tensor> {
+    /// Computes every term with `term`, and their sum weighted by `config`.
+    pub fn weighted(config: &LossConfig, term: impl Fn(Term) -> Tensor) -> Self {
+        let terms = Term::ALL.map(term);
+        let counted = Term::ALL.iter().zip(&terms).filter_map(|(of, term)| Some(term * of.factor(config)?));
+        let total = counted.reduce(|sum, term| sum + term).expect("terms that count");
+        Losses { total, terms }
+    }
+
+    /// Packs the values into one float64 tensor, the total first and then the terms, so that they can be summed over slices of a step
+    /// without losing precision and read in one transfer.
+    pub fn packed(&self) -> Tensor {
+        let all: Vec<&Tensor> = std::iter::once(&self.total).chain(&self.terms).collect();
+        no_grad(|| Tensor::stack(&all, 0).to_kind(Kind::Double))
+    }
+}
+
+impl Losses<f64> {
+    /// Number of values in the tensor of [`Losses::packed`].
+    pub const COUNT: usize = 1 + Term::ALL.len();
+
+    /// Unpacks the values of [`Losses::packed`].
+    pub fn unpacked(values: &[f64; Self::COUNT]) -> Self {
+        Losses { total: values[0], terms: std::array::from_fn(|term| values[1 + term]) }
+    }
+}
+
+impl<T> Index<Term> for Losses<T> {
+    type Output = T;
+
+    fn index(&self, term: Term) -> &T {
+        &self.terms[term as usize]
+    }
+}
 
 /// Computes the loss terms of `decoded`, which was rendered from the target cameras to `rendered`. All terms are means over equally
 /// large halves, so for a paired sample the sum is ½(L_a + L_b) + L_con. The losses of all shares of a step add up to the step's loss.
@@ -98,4 +191,24 @@ fn mean_over_scenes(
         loss(&repeated.select(1, scene), &ground_truth, &mask)
     };
     (0..count).map(of_scene).reduce(|sum, loss| sum + loss).expect("a scene") / count as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_term_has_its_own_place_and_name() {
+        let config =
+            LossConfig { mse: 2., perceptual_factor: 3., frustum: 5., decoder: 7., ..Default::default() };
+        let tensors = Losses::weighted(&config, |term| Tensor::from(term as usize as f64));
+        let twice = tensors.packed() * 2.;
+        let values = Vec::<f64>::try_from(twice).expect("numbers").try_into().expect("one of each");
+        let sum = Losses::unpacked(&values);
+        assert_eq!(sum.total, 2. * (2. * 0. + 3. * 1. + 2. + 5. * 3. + 7. * 4.));
+        for (place, term) in Term::ALL.into_iter().enumerate() {
+            assert_eq!((term as usize, sum[term]), (place, 2. * place as f64), "{}", term.name());
+            assert_eq!(Term::ALL.iter().filter(|other| other.name() == term.name()).count(), 1);
+        }
+    }
 }

@@ -1,11 +1,15 @@
 //! The configuration of the model: its inference from the shapes of weights, and the growth of a smaller model into a larger one.
 
-use super::decoder::{OPACITY, PARAMETERS};
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
 use tch::{Kind, Tensor};
+
+/// Number of outputs per candidate of the parameter head: 3 log-scales, 6 rotation values, 1 opacity logit.
+pub(super) const PARAMETERS: i64 = 10;
+/// Index of the opacity logit among these outputs.
+pub(super) const OPACITY: i64 = 9;
 
 /// Number of streams of scene tokens.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

@@ -1,6 +1,6 @@
 //! The decoder: linear heads, the merging of candidates, and the activations that turn both into Gaussians (spec 5).
 
-use super::config::ModelConfig;
+use super::config::{ModelConfig, OPACITY, PARAMETERS};
 use super::encoder::EncodedTokens;
 use super::layers::linear;
 use super::precision::Precision;
@@ -13,10 +13,6 @@ use tch::{Kind, Tensor, nn};
 const GEOMETRY_STD: f64 = 1e-2;
 /// Standard deviation of the initial weights of the SH head.
 const SH_STD: f64 = 1e-3;
-/// Number of outputs per candidate of the parameter head: 3 log-scales, 6 rotation values, 1 opacity logit.
-pub(super) const PARAMETERS: i64 = 10;
-/// Index of the opacity logit among these outputs.
-pub(super) const OPACITY: i64 = 9;
 
 /// Offset added to every position: initially the scene lies in front of the mean camera.
 const MEAN_OFFSET: [f32; 3] = [0., 0., 1.5];

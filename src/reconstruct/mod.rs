@@ -4,7 +4,6 @@
 mod color_fit;
 mod context;
 mod model_file;
-mod published;
 
 pub use context::{context_views, load_context, spread_over_path};
 pub use model_file::{

@@ -1,12 +1,48 @@
-//! Edits of a splat: moving it, removing Gaussians, and joining splats.
+//! Edits of a splat: moving it (spec 2.4), removing Gaussians, by how much they contribute to images or otherwise, and joining splats.
 
-use super::{contributions, largest_contributions, orbit_around_splat};
+use super::{Cameras, default_eps2d, orbit_around_splat, render};
 use crate::error::{Error, Result};
-use crate::scene::{Camera, Gaussians, splat_frame};
-use glam::{DMat3, DMat4, DVec3};
-use globalsplat_splat_file::Splat;
+use crate::scene::{Camera, Gaussians, SH_C0, Similarity, splat_frame};
+use glam::{DMat3, DMat4, DQuat, DVec3};
+use globalsplat_splat_file::{ShRotation, Splat};
 use kd_tree::KdTree;
 use rayon::prelude::*;
+use tch::{Tensor, with_grad};
+
+/// Returns the splat with every point x moved to `to(x)`. Images from cameras that are moved along stay the same, and their depth is
+/// scaled.
+pub fn transform(gaussians: &Gaussians, to: &Similarity) -> Gaussians {
+    let on = |t: Tensor, like: &Tensor| t.to_kind(like.kind()).to_device(like.device());
+    let rotation =
+        on(Tensor::from_slice(&to.rotation.transpose().to_cols_array()).view([3, 3]), &gaussians.means);
+    let translation = on(Tensor::from_slice(&to.translation.to_array()), &gaussians.means);
+    Gaussians {
+        means: gaussians.means.matmul(&rotation.tr()) * to.scale + translation,
+        scales: &gaussians.scales * to.scale,
+        quaternions: rotate_quaternions(&gaussians.quaternions, DQuat::from_mat3(&to.rotation)),
+        opacities: gaussians.opacities.shallow_clone(),
+        sh: rotate_sh(&gaussians.sh, &to.rotation),
+        antialiased: gaussians.antialiased,
+    }
+}
+
+/// Returns `by` · q for every quaternion q in [.., 4], (w, x, y, z).
+fn rotate_quaternions(quaternions: &Tensor, by: DQuat) -> Tensor {
+    let [x, y, z, w] = by.to_array();
+    // Left multiplication by a quaternion is linear.
+    let matrix = [w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w];
+    let matrix =
+        Tensor::from_slice(&matrix).view([4, 4]).to_kind(quaternions.kind()).to_device(quaternions.device());
+    quaternions.matmul(&matrix.tr())
+}
+
+/// Returns the coefficients [.., bases, 3] of the functions d ↦ f(Rᵀd), for the coefficients of functions f.
+fn rotate_sh(sh: &Tensor, rotation: &DMat3) -> Tensor {
+    let bases = sh.size()[sh.dim() - 2];
+    let matrix = Tensor::from_slice(ShRotation::new(rotation).rows().as_flattened()).view([16, 16]);
+    let matrix = matrix.narrow(0, 0, bases).narrow(1, 0, bases);
+    matrix.to_kind(sh.kind()).to_device(sh.device()).matmul(sh)
+}
 
 /// Contribution to all images, in pixels, below which cameras don't see a Gaussian.
 const MIN_CONTRIBUTION: f32 = 1e-3;
@@ -55,7 +91,7 @@ pub struct EditedSplat {
 /// the original splat, or if there are none, to views around the splat.
 ///
 /// # Errors
-/// Fails if a matrix does more than rotate, scale uniformly and translate, if no Gaussian is left, or like [`crate::render::render`].
+/// Fails if a matrix does more than rotate, scale uniformly and translate, if no Gaussian is left, or like [`render`].
 pub fn edit_splat(original: &Splat, edits: &[SplatEdit], cameras: &[Camera]) -> Result<EditedSplat> {
     let mut edited = EditedSplat { splat: original.clone(), from_original: DMat4::IDENTITY, counts: vec![] };
     for (index, edit) in edits.iter().enumerate() {
@@ -165,4 +201,71 @@ fn neighbor_distances(points: &[[f32; 3]], k: usize) -> Vec<f32> {
         nearest.get(k).map_or(f32::INFINITY, |neighbor| neighbor.squared_distance.sqrt())
     };
     points.par_iter().map(distance).collect()
+}
+
+/// Returns the contribution of each Gaussian to the images of `cameras`, in pixels: the sum over all pixels of its weight α·T, its opacity
+/// there times the transmittance in front of it. `gaussians` are of one scene, in the cameras' local frame (spec 2.5).
+///
+/// The weight of a Gaussian in a pixel is the derivative of the pixel's color with respect to the Gaussian's color.
+///
+/// # Errors
+/// Fails like [`render`].
+pub fn contributions(gaussians: &Gaussians, cameras: &[Camera]) -> Result<Vec<f32>> {
+    let mut total = gaussians.opacities.zeros_like();
+    for camera in cameras {
+        total += image_contributions(gaussians, &Cameras::single(camera))?;
+    }
+    Ok(Vec::try_from(total.view([-1]))?)
+}
+
+/// Returns the indices of the `count` Gaussians, or of all if there are fewer, with the largest `contributions`, the largest first.
+pub(crate) fn largest_contributions(contributions: &[f32], count: usize) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..contributions.len()).collect();
+    order.sort_by(|&a, &b| contributions[b].total_cmp(&contributions[a]));
+    order.truncate(count);
+    order
+}
+
+/// Returns the contribution of each Gaussian to the images of `cameras` together, [B, N], as [`contributions`] does.
+///
+/// # Errors
+/// Fails like [`render`].
+pub(crate) fn image_contributions(gaussians: &Gaussians, cameras: &Cameras) -> Result<Tensor> {
+    let (b, n) = gaussians.opacities.size2()?;
+    let colors = Tensor::zeros([b, n, 1, 3], (gaussians.means.kind(), gaussians.means.device()));
+    let colors = colors.set_requires_grad(true);
+    let grey = Gaussians { sh: colors.shallow_clone(), ..gaussians.map(Tensor::detach) };
+    let red = with_grad(|| -> Result<Tensor> {
+        let image = render(&grey, cameras, default_eps2d(gaussians))?;
+        Ok(image.rgb.select(2, 0).sum(None))
+    })?;
+    Ok(Tensor::run_backward(&[red], &[colors], false, false)[0].select(3, 0).select(2, 0) / SH_C0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Intrinsics;
+    use tch::{Device, Kind};
+
+    /// The contributions add up to the accumulated opacity, and a Gaussian behind an opaque one contributes little.
+    #[test]
+    fn contributions_add_up_to_alpha() {
+        let options = (Kind::Float, Device::Cpu);
+        let gaussians = Gaussians {
+            means: Tensor::from_slice(&[0f32, 0., 2., 0., 0., 4., 0., 0., -2.]).view([1, 3, 3]),
+            scales: Tensor::from_slice(&[0.3f32, 0.3, 0.3]).view([1, 3, 1]).repeat([1, 1, 3]),
+            quaternions: Tensor::from_slice(&[1f32, 0., 0., 0.]).repeat([1, 3, 1]),
+            opacities: Tensor::from_slice(&[0.99f32, 0.9, 0.9]).view([1, 3]),
+            sh: Tensor::full([1, 3, 4, 3], -9., options), // black
+            antialiased: false,
+        };
+        let intrinsics = Intrinsics { fx: 30., fy: 30., cx: 16., cy: 16. };
+        let camera = Camera { intrinsics, c2w: DMat4::IDENTITY, width: 32, height: 32 };
+        let found = contributions(&gaussians, &[camera, camera]).unwrap();
+        let image = render(&gaussians, &Cameras::single(&camera), default_eps2d(&gaussians)).unwrap();
+        let alpha = 2. * image.alpha.sum(Kind::Double).double_value(&[]);
+        assert!((f64::from(found.iter().sum::<f32>()) - alpha).abs() < 1e-3 * alpha, "{found:?}, {alpha}");
+        assert!(found[0] > 5. * found[1] && found[1] > 0. && found[2] == 0., "{found:?}");
+    }
 }

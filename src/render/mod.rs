@@ -1,29 +1,41 @@
 //! Safe, typed bindings to the differentiable splat op (spec 6).
 
-mod contribution;
 pub mod cpu;
-pub mod cuda;
 mod depth_colors;
 mod edit;
 mod harmonics;
-mod orbit;
-mod transform;
 mod views;
 
-use crate::ffi::take_outputs;
-pub use contribution::contributions;
-pub(crate) use contribution::{image_contributions, largest_contributions};
 pub use depth_colors::{DepthScale, colorize_depth, depth_colors};
-pub use edit::{EditedSplat, SplatEdit, edit_splat, move_cameras};
+pub use edit::{EditedSplat, SplatEdit, contributions, edit_splat, move_cameras, transform};
+pub(crate) use edit::{image_contributions, largest_contributions};
 pub use harmonics::{compensate_mean_color, fit_harmonics, shrink_harmonics};
-pub use orbit::{orbit_around_gaussians, orbit_around_splat};
-pub use transform::transform;
-pub use views::{RenderedView, SplatRenderer, render_views};
+pub use views::{RenderedView, SplatRenderer, orbit_around_gaussians, orbit_around_splat, render_views};
 
 use crate::error::Result;
+use crate::ffi::take_outputs;
 use crate::scene::{Camera, Gaussians, pose_to_rows};
 use globalsplat_csrc::render::{self as ffi, SplatArguments};
 use tch::{Device, Kind, Tensor};
+
+/// GPU-only functions: the driver, and kernels that are compiled at first use.
+pub mod cuda {
+    pub use globalsplat_csrc::cuda::{
+        CodeFormat, Driver, Gpu, KernelOrigin, KernelResources, Nvrtc, cache_folder, load_kernels,
+        parse_resources,
+    };
+
+    pub use globalsplat_csrc::render::{KernelTime, measure_kernels};
+
+    /// Returns the total time of each of the rasterizer's kernels since [`measure_kernels`]`(true)`, in the order of their first launches.
+    /// Waits for the GPU.
+    ///
+    /// # Errors
+    /// Fails if the GPU reports an error.
+    pub fn kernel_times() -> crate::error::Result<Vec<KernelTime>> {
+        Ok(globalsplat_csrc::render::kernel_times()?)
+    }
+}
 
 /// Value added to the diagonal of every projected covariance of a splat that isn't antialiased, in pixels².
 pub const DEFAULT_EPS2D: f64 = 0.05;

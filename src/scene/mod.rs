@@ -3,17 +3,14 @@
 //! All cameras use OpenCV axes: x right, y down, z forward. Poses are camera-to-world.
 
 mod gaussians;
-mod radial_warp;
 mod rays;
-mod splat;
 
 pub(crate) use gaussians::sigmoid;
-pub use gaussians::{Gaussians, RawGaussians};
+pub use gaussians::{Gaussians, RawGaussians, splat_frame};
 pub use globalsplat_capture::{
     Camera, ImageSize, Intrinsics, LocalFrame, Normalization, Similarity, normalize, orbit_around_cameras,
     orbit_around_point, pose_to_rows, smooth_path,
 };
 pub(crate) use globalsplat_splat_file::SH_C0;
-pub use radial_warp::RadialWarp;
+pub use rays::RadialWarp;
 pub(crate) use rays::plucker_rays;
-pub use splat::splat_frame;

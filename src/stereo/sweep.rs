@@ -1,10 +1,7 @@
 //! Depth estimation by a plane sweep (Collins 1996): finds for every pixel the depth at which its neighbourhood looks most alike in photos
 //! taken from other positions. It needs no weights and no points.
 
-use super::consistency::{MatchedDepths, agreement};
-use super::depth_map::DepthMap;
-use super::depth_search::{ComparedPhoto, Search, match_semi_globally, search_depths};
-use super::small_photo::SmallPhoto;
+use super::depth_search::{ComparedPhoto, Search, SmallPhoto, search_depths};
 use super::view_selection::{
     are_near_duplicates, at_octaves, extent, farthest_first, neighbours, projection,
 };
@@ -35,21 +32,19 @@ const RESOLVED: f64 = 2.;
 /// Minimum fraction of the pixels that must agree on a depth.
 const MIN_AGREEING_FRACTION: f64 = 0.05;
 /// Correlation at or below which a depth has no weight.
-const UNSURE: f64 = 0.5;
+const ZERO_WEIGHT_CORRELATION: f64 = 0.5;
 /// Correlation above which a depth is usually right.
-const SURE: f64 = 0.8;
-/// Power of the fraction of photos that agree on a depth that is its weight.
-const AGREEMENT_POWER: i64 = 8;
+const MIN_CORRELATION: f64 = 0.8;
 /// Number of times that known depths are spread to larger neighbourhoods.
-const SPREADS: usize = 6;
+const FILL_ROUNDS: usize = 6;
 /// Factor of the weight of the spread depths, each time.
-const SPREAD_WEIGHT: f64 = 0.1;
+const FILL_DECAY: f64 = 0.1;
 /// Minimum number of points that a view has to see. With fewer, its depths are estimated from the photos alone.
 const MIN_POINTS: usize = 30;
 /// Fraction of the points that may be nearer than the nearest plane.
-const NEARER: f64 = 0.02;
+const MAX_NEARER_FRACTION: f64 = 0.02;
 /// Ratio of the depth of the nearest remaining point to that of the nearest plane.
-const ROOM: f64 = 1.3;
+const NEAR_PLANE_MARGIN: f64 = 1.3;
 
 /// Result of a plane sweep.
 pub(crate) struct PlaneSweepOutput {
@@ -81,14 +76,14 @@ pub(crate) fn sweep(
         if swept.iter().all(is_new) {
             let (others, nearest) = sweep.compared_with(index, &scene);
             let (inverse, correlation) = most_alike(this, &others, nearest, PLANES, search_depths);
-            let weight = (&correlation - UNSURE).clamp_min(0.).square();
+            let weight = (&correlation - ZERO_WEIGHT_CORRELATION).clamp_min(0.).square();
             let filled = filled(&inverse, &weight, this.counted().as_ref());
             let map = DepthMap {
                 photo: this.name.clone(),
                 camera: this.camera,
                 image: this.image.shallow_clone(),
                 depth: filled.clamp_min(nearest / FARTHEST).reciprocal(),
-                sure: correlation.gt(SURE),
+                sure: correlation.gt(MIN_CORRELATION),
                 counted: this.counted(),
             };
             swept.push((index, map));
@@ -98,30 +93,8 @@ pub(crate) fn sweep(
     PlaneSweepOutput { photos, depth_maps: swept }
 }
 
-/// Computes the inverse depths of all pixels of all `photos` by semi-global matching among `planes` candidates, and how sure each is, in
-/// [0, 1]: the fraction of the other photos that agree, and 0 if there is no photo to compare with. Both are [h, w]. Depths on which photos
-/// disagree come from pixels around.
-pub(crate) fn inverse_depths(photos: &[SmallPhoto], planes: i64) -> Vec<[Tensor; 2]> {
-    let mut sweep = Sweep::new(photos, &[]);
-    let scenes: Vec<SceneDepth> = (0..photos.len()).map(|index| sweep.scene_depth(index)).collect();
-    let matched = |(index, scene)| {
-        let photo: &SmallPhoto = &photos[index];
-        let (others, nearest) = sweep.compared_with(index, scene);
-        let (inverse, sureness) = most_alike(photo, &others, nearest, planes, match_semi_globally);
-        let step = nearest / (planes - 1) as f64;
-        MatchedDepths { photo, inverse, sureness, step, is_measured: !others.is_empty() }
-    };
-    let all: Vec<MatchedDepths> = scenes.iter().enumerate().map(matched).collect();
-    let depths = |(index, of): (usize, &MatchedDepths)| {
-        let agreement = if of.is_measured { agreement(index, &all) } else { of.inverse.zeros_like() };
-        let weight = agreement.pow_tensor_scalar(AGREEMENT_POWER);
-        [filled(&of.inverse, &weight, of.photo.counted().as_ref()), agreement]
-    };
-    all.iter().enumerate().map(depths).collect()
-}
-
 /// Photos whose depths are searched, one after the other.
-struct Sweep<'a> {
+pub(super) struct Sweep<'a> {
     photos: &'a [SmallPhoto],
     coarse: Vec<SmallPhoto>,
     cameras: Vec<Camera>,
@@ -131,7 +104,7 @@ struct Sweep<'a> {
 }
 
 /// Distance of the scene from a photo.
-struct SceneDepth {
+pub(super) struct SceneDepth {
     /// Median depth of what the photo shows.
     depth: f64,
     /// Inverse depth of the nearest plane, if points determine it.
@@ -139,14 +112,14 @@ struct SceneDepth {
 }
 
 impl<'a> Sweep<'a> {
-    fn new(photos: &'a [SmallPhoto], points: &'a [Point]) -> Self {
+    pub fn new(photos: &'a [SmallPhoto], points: &'a [Point]) -> Self {
         let coarse = photos.iter().map(|photo| photo.downscaled(COARSE_SIDE)).collect();
         let cameras = photos.iter().map(|photo| photo.camera).collect();
         Sweep { photos, coarse, cameras, points, medians: vec![] }
     }
 
     /// Estimates how far the scene is from photo `index`. If the photo itself doesn't tell, uses those that came before.
-    fn scene_depth(&mut self, index: usize) -> SceneDepth {
+    pub fn scene_depth(&mut self, index: usize) -> SceneDepth {
         let EstimatedDepth { median, nearest } = EstimatedDepth::of(index, &self.coarse, self.points);
         self.medians.extend(median);
         let depth = median.unwrap_or_else(|| typical_depth(&self.medians, extent(&self.cameras)));
@@ -155,7 +128,7 @@ impl<'a> Sweep<'a> {
 
     /// Returns the photos that photo `index` is compared with, which is about as far from the scene as `scene` says, and the inverse depth
     /// of the nearest plane.
-    fn compared_with(&self, index: usize, scene: &SceneDepth) -> (Vec<&'a SmallPhoto>, f64) {
+    pub fn compared_with(&self, index: usize, scene: &SceneDepth) -> (Vec<&'a SmallPhoto>, f64) {
         let others = neighbours(index, &self.cameras, scene.depth);
         let others: Vec<&SmallPhoto> = others.into_iter().map(|other| &self.photos[other]).collect();
         let nearest = match (scene.nearest, others.first()) {
@@ -184,8 +157,8 @@ impl EstimatedDepth {
         let this = &photos[index];
         if let Some(inverse) = inverse_depths_of(points, &this.camera) {
             let median = Some(1. / inverse[inverse.len() / 2]);
-            let last = ((1. - NEARER) * inverse.len() as f64) as usize;
-            return EstimatedDepth { median, nearest: Some(ROOM * inverse[last]) };
+            let last = ((1. - MAX_NEARER_FRACTION) * inverse.len() as f64) as usize;
+            return EstimatedDepth { median, nearest: Some(NEAR_PLANE_MARGIN * inverse[last]) };
         }
         let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
         let compared = at_octaves(index, &cameras, OCTAVES).into_iter().map(|i| measured(this, &photos[i]));
@@ -199,18 +172,18 @@ impl EstimatedDepth {
 
 /// Depth on which two photos agree.
 struct Measured {
-    /// Median depth of the pixels whose correlation is above `SURE`.
+    /// Median depth of the pixels whose correlation is above `MIN_CORRELATION`.
     depth: f64,
     /// Distance of the median from infinity, in planes.
     planes: f64,
-    /// Fraction of the pixels that count whose correlation is above `SURE`.
+    /// Fraction of the pixels that count whose correlation is above `MIN_CORRELATION`.
     share: f64,
 }
 
 fn measured(this: &SmallPhoto, other: &SmallPhoto) -> Measured {
     let nearest = nearest_of_cameras(this, other);
     let (inverse, correlation) = most_alike(this, &[other], nearest, COARSE_PLANES, search_depths);
-    let sure = inverse.masked_select(&correlation.gt(SURE));
+    let sure = inverse.masked_select(&correlation.gt(MIN_CORRELATION));
     let pixels =
         this.counted().map_or(inverse.numel() as i64, |counted| counted.sum(Kind::Int64).int64_value(&[]));
     let share = sure.numel() as f64 / pixels as f64;
@@ -247,7 +220,7 @@ fn inverse_depths_of(points: &[Point], camera: &Camera) -> Option<Vec<f64>> {
 
 /// Returns the inverse depth of every pixel that `search` finds, and the correlation there or how sure it is, both [h, w]. The candidates
 /// are `planes` inverse depths, evenly spaced from 0 to `nearest`.
-fn most_alike(
+pub(super) fn most_alike(
     this: &SmallPhoto,
     others: &[&SmallPhoto],
     nearest: f64,
@@ -263,14 +236,14 @@ fn most_alike(
 }
 
 /// Replaces inverse depths of low weight by those of reliable pixels around them, the nearest weighted most.
-fn filled(inverse: &Tensor, weight: &Tensor, counted: Option<&Tensor>) -> Tensor {
+pub(super) fn filled(inverse: &Tensor, weight: &Tensor, counted: Option<&Tensor>) -> Tensor {
     let size = inverse.size();
     let (mut sum, mut weights) = ((inverse * weight).unsqueeze(0), weight.unsqueeze(0));
     let (mut total, mut total_weights, mut factor) = (sum.copy(), weights.copy(), 1.);
-    for _ in 0..SPREADS {
+    for _ in 0..FILL_ROUNDS {
         let pool = |t: &Tensor| t.avg_pool2d(5, 1, 2, false, true, None);
         (sum, weights) = (pool(&pool(&sum)), pool(&pool(&weights)));
-        factor *= SPREAD_WEIGHT;
+        factor *= FILL_DECAY;
         total += &sum * factor;
         total_weights += &weights * factor;
     }
@@ -280,10 +253,81 @@ fn filled(inverse: &Tensor, weight: &Tensor, counted: Option<&Tensor>) -> Tensor
     ((total + least * median) / (total_weights + least)).view(size.as_slice())
 }
 
+/// Downscaled photo with a depth for every pixel, on the CPU.
+#[derive(Debug)]
+pub struct DepthMap {
+    /// Name of the photo.
+    pub photo: String,
+    /// Camera at the size of the downscaled photo.
+    pub camera: Camera,
+    /// Downscaled photo, [3, h, w].
+    pub image: Tensor,
+    /// Depth along the camera's axis, [h, w].
+    pub depth: Tensor,
+    /// Mask of the pixels on whose depth the photos agree, [h, w]. Other depths come from pixels around them.
+    pub sure: Tensor,
+    /// Mask of the pixels that count, [h, w], at least one; `None` if all do. The depths of the others are meaningless.
+    pub counted: Option<Tensor>,
+}
+
+impl DepthMap {
+    /// Returns the depth of every pixel, row by row.
+    pub fn depths(&self) -> Vec<f32> {
+        numbers(&self.depth)
+    }
+
+    /// Returns the photo's values, channel by channel.
+    pub fn colors(&self) -> Vec<f32> {
+        numbers(&self.image)
+    }
+
+    /// Returns for every pixel whether the photos agree on its depth.
+    pub fn sure_pixels(&self) -> Vec<bool> {
+        truths(&self.sure)
+    }
+
+    /// Returns for every pixel whether it counts; `None` if all do.
+    pub fn counted_pixels(&self) -> Option<Vec<bool>> {
+        self.counted.as_ref().map(truths)
+    }
+
+    /// Returns a map of one depth in black, all of it sure and counted, of a camera at the origin.
+    #[cfg(test)]
+    pub fn flat(width: u32, height: u32, depth: f64) -> Self {
+        use crate::scene::Intrinsics;
+        let (k, size) = (f64::from(width) / 2., [i64::from(height), i64::from(width)]);
+        let options = (Kind::Float, Device::Cpu);
+        DepthMap {
+            photo: String::new(),
+            camera: Camera {
+                intrinsics: Intrinsics { fx: k, fy: k, cx: k, cy: f64::from(height) / 2. },
+                c2w: glam::DMat4::IDENTITY,
+                width,
+                height,
+            },
+            image: Tensor::zeros([3, size[0], size[1]], options),
+            depth: Tensor::full(size, depth, options),
+            sure: Tensor::ones(size, (Kind::Bool, Device::Cpu)),
+            counted: None,
+        }
+    }
+}
+
+/// Returns the values of a float32 tensor.
+pub(crate) fn numbers(t: &Tensor) -> Vec<f32> {
+    Vec::try_from(t.contiguous().view([-1])).expect("numbers")
+}
+
+/// Returns the values of a Boolean tensor.
+pub(crate) fn truths(t: &Tensor) -> Vec<bool> {
+    Vec::try_from(t.contiguous().view([-1])).expect("truths")
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::scene::Intrinsics;
+    use crate::stereo::pixel_depths::inverse_depths;
     use glam::{DMat4, DVec3};
 
     /// Depths of a plane are found: a wave pattern at depth 4, seen by three cameras in a row.

@@ -1,19 +1,14 @@
 //! Logs of a run: `metrics.jsonl`, with one line for every step and for every validation, and `RUN/tensorboard`, with one event file for
 //! every time that the run was started or resumed.
 
-use super::run::Score;
-use super::step::StepReport;
+use super::step::{Score, StepReport};
 use super::{METRICS_FILE, is_due};
-use crate::data::Batch;
 use crate::error::{Error, Result};
-use crate::io::{AppendFile, EventFile, tile_horizontally, write_atomically};
+use crate::io::{AppendFile, EventFile, write_atomically};
 use crate::loss::Term;
-use crate::model::{GlobalSplat, Stage};
-use crate::render::{DEFAULT_EPS2D, colorize_depth, render};
 use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::Path;
-use tch::{Device, Tensor};
 
 /// Returns the values that describe a step, with their names, except the terms of its loss.
 pub(super) fn step_values(report: &StepReport, samples_per_second: f64) -> [(&'static str, f64); 7] {
@@ -201,24 +196,6 @@ impl TensorBoard {
         ];
         self.file.write_scalars(step, &values.map(|(tag, value)| (tag.to_string(), value)))
     }
-}
-
-/// Renders a preview of the first scene of `batch`, which isn't paired: a context photo, a target photo, its rendered image, its depth
-/// and its accumulated opacity, side by side, `[3, H, W']` in [0, 1] on the CPU.
-pub(super) fn preview(model: &GlobalSplat, batch: &Batch, stage: Stage) -> Result<Tensor> {
-    let Batch { context, target, .. } = batch.slice(0, 1);
-    let middle = |views: &Tensor| views.size()[1] as usize / 2;
-    let (shown, target) =
-        (context.select(&[middle(&context.images)]), target.select(&[middle(&target.images)]));
-    let pictures = tch::no_grad(|| {
-        let decoded = model.forward(&context.model_input(), stage);
-        render(&decoded.gaussians, &target.cameras(), DEFAULT_EPS2D)
-    })?;
-    let first = |t: &Tensor| t.select(0, 0).select(0, 0).to_device(Device::Cpu);
-    let (photo, ground_truth, rgb) = (first(&shown.images), first(&target.images), first(&pictures.rgb));
-    let (depth, alpha) = (first(&pictures.depth), first(&pictures.alpha));
-    let grey = alpha.unsqueeze(0).expand([3, -1, -1], false);
-    Ok(tile_horizontally(&[photo, ground_truth, rgb.clamp(0., 1.), colorize_depth(&depth, &alpha), grey]))
 }
 
 #[cfg(test)]

@@ -4,7 +4,6 @@ mod checkpoint;
 mod gradients;
 mod logs;
 mod memory_estimate;
-mod parameter_groups;
 mod run;
 mod schedule;
 mod step;
@@ -16,13 +15,12 @@ pub use crate::io::{CONFIG_FILE, METRICS_FILE};
 pub use checkpoint::{MODEL_FILE, best_checkpoint, latest_checkpoint, list_checkpoints};
 pub use logs::Curves;
 pub use memory_estimate::{MemoryEstimate, largest_fitting_batch};
-pub use run::{Event, Outcome, Resume, Score, Validator, add_run_inputs, retry_on_disk_full, run};
-pub use step::StepReport;
+pub use run::{Event, Outcome, Resume, Validator, add_run_inputs, retry_on_disk_full, run};
+pub use step::{Score, StepReport};
 pub use trainer::Trainer;
 
 // The parity checks run each of these functions by itself.
-pub(crate) use parameter_groups::parameter_groups;
-pub(crate) use schedule::{learning_rate, stage_at, subsets};
+pub(crate) use schedule::{learning_rate, parameter_groups, stage_at, subsets};
 // Benchmarks read the time of this span.
 pub(crate) use trainer::COMMUNICATION;
 

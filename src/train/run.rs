@@ -6,13 +6,12 @@ use super::checkpoint::{
 };
 use super::is_due;
 use super::logs::{MetricsWriter, TensorBoard};
-use super::step::StepReport;
+use super::step::{Score, StepReport};
 use super::trainer::Trainer;
 use super::{CONFIG_FILE, METRICS_FILE};
 use crate::config::{TrainConfig, changed_keys};
 use crate::error::{Error, Result};
 use crate::io::{InputFiles, event_files, write_atomically};
-use crate::model::Stage;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -54,21 +53,6 @@ pub struct Outcome {
     pub complete: bool,
     /// Number of steps that were skipped because loss or gradient wasn't finite.
     pub skipped: u64,
-}
-
-/// Mean scores over all held-out views or scenes.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Score {
-    /// Mean PSNR over the scenes, in dB.
-    pub psnr: f64,
-    /// Mean SSIM over the scenes.
-    pub ssim: f64,
-    /// Number of scenes.
-    pub scenes: usize,
-    /// Stage at which the model was evaluated: the one that it has been trained to.
-    pub stage: Stage,
-    /// Reasons why scenes were left out, each listed once.
-    pub left_out: Vec<String>,
 }
 
 /// Evaluation of a model on data that training doesn't use.

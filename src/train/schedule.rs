@@ -1,9 +1,11 @@
 //! What depends on the number of a step alone: its learning rate (spec 8.6), its stage of the curriculum (spec 8.7), and the subsets of
-//! its context views that are compared (spec 7.8).
+//! its context views that are compared (spec 7.8). And which weights decay, and which optimizer updates them (spec 8.5).
 
-use crate::config::{CurriculumConfig, TrainConfig};
+use crate::config::{CurriculumConfig, OptimizerKind, TrainConfig};
 use crate::model::Stage;
+use crate::optim::{ParameterGroup, UpdateRule};
 use std::f64::consts::PI;
+use tch::{Tensor, nn};
 
 /// Learning rate at the start of the warm-up, as a share of the peak.
 const WARMUP_START: f64 = 1e-3;
@@ -52,4 +54,79 @@ pub fn subsets(views: usize, step: u64) -> [Vec<usize>; 2] {
     odd.resize(longer, last);
     even.resize(longer, last);
     if step.is_multiple_of(2) { [odd, even] } else { [even, odd] }
+}
+
+/// Suffix of the weights of self-attention's queries, keys and values, which are one layer.
+const QKV: &str = ".qkv.weight";
+
+/// Returns the trained variables of `vs` in groups. Weights of two or more dimensions decay; biases, norms, LayerScale and learned tokens
+/// don't. If the optimizer is Muon, it updates the encoder's matrices, and AdamW updates all other variables (spec 8.5).
+pub fn parameter_groups(vs: &nn::VarStore, config: &TrainConfig) -> Vec<ParameterGroup> {
+    let trained = vs.variables().into_iter().filter(|(_, value)| value.requires_grad());
+    let decays = |(name, value): &(String, Tensor)| name.ends_with(".weight") && value.dim() >= 2;
+    let (decaying, others): (Vec<_>, Vec<_>) = trained.partition(decays);
+    let is_muons = |name: &str| config.optimizer == OptimizerKind::Muon && name.starts_with("slot_encoder.");
+    let (matrices, decaying): (Vec<_>, Vec<_>) = decaying.into_iter().partition(|(name, _)| is_muons(name));
+    let (threefold, matrices): (Vec<_>, Vec<_>) =
+        matrices.into_iter().partition(|(name, _)| name.ends_with(QKV));
+    let group = |rule, parameters, weight_decay| ParameterGroup {
+        rule,
+        parameters,
+        learning_rate: config.learning_rate,
+        weight_decay,
+    };
+    vec![
+        group(UpdateRule::AdamW, decaying, config.weight_decay),
+        group(UpdateRule::AdamW, others, 0.),
+        group(UpdateRule::Muon { parts: 1 }, matrices, config.weight_decay),
+        group(UpdateRule::Muon { parts: 3 }, threefold, config.weight_decay),
+    ]
+}
+
+/// Returns the trained variables of `vs` approximately in the order in which the backward pass computes their gradients: the decoder, the
+/// encoder's rounds from the last to the first, and the rest. The order depends only on the names, so it is the same in all processes.
+pub fn in_backward_order(vs: &nn::VarStore) -> Vec<(String, Tensor)> {
+    let mut trained: Vec<_> = vs.variables().into_iter().filter(|(_, value)| value.requires_grad()).collect();
+    trained.sort_by_cached_key(|(name, _)| (turn(name), name.clone()));
+    trained
+}
+
+/// Returns the sort key of a variable in [`in_backward_order`]. Gradients of lower keys come earlier.
+fn turn(name: &str) -> i64 {
+    let mut words = name.split('.');
+    match (words.next(), words.next(), words.next().and_then(|word| word.parse::<i64>().ok())) {
+        (Some("gaussian_decoder"), ..) => i64::MIN,
+        (Some("slot_encoder"), Some("geo_rounds" | "tex_rounds" | "pair_adapters"), Some(round)) => -round,
+        (Some("slot_encoder"), ..) => 1,
+        _ => 2,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::{GlobalSplat, ModelConfig};
+    use tch::Device;
+
+    #[test]
+    fn muon_updates_the_encoders_matrices_and_nothing_else() {
+        let vs = nn::VarStore::new(Device::Cpu);
+        let model = ModelConfig { rounds: 1, self_attention_blocks: 1, ..Default::default() };
+        let _model = GlobalSplat::new(&vs.root(), &model).expect("a model");
+        let of = |optimizer| parameter_groups(&vs, &TrainConfig { optimizer, ..Default::default() });
+        let [adamw, muon] = [OptimizerKind::AdamW, OptimizerKind::Muon].map(of);
+        let counts =
+            |groups: &[ParameterGroup]| groups.iter().map(|g| g.parameters.len()).collect::<Vec<_>>();
+        assert_eq!(counts(&adamw)[2..], [0, 0]);
+        // Two layers before the rounds. Ten in the round of each stream, one of which computes queries, keys and values. Two in the mixer.
+        assert_eq!(counts(&muon)[2..], [2 + 2 * 9 + 2, 2]);
+        assert_eq!(counts(&muon).iter().sum::<usize>(), counts(&adamw).iter().sum::<usize>());
+        for (group, parts) in muon[2..].iter().zip([1, 3]) {
+            assert_eq!((group.rule, group.weight_decay), (UpdateRule::Muon { parts }, 1e-6));
+            for (name, value) in &group.parameters {
+                assert!(name.starts_with("slot_encoder.") && value.dim() == 2, "{name}");
+                assert_eq!(value.size()[0] == 3 * value.size()[1], parts == 3, "{name}");
+            }
+        }
+    }
 }

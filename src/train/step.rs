@@ -1,7 +1,11 @@
-//! Report of a training step, and the sums over all ranks that it makes in addition to those of the gradients.
+//! Reports of a training step and of a validation, and the sums over all ranks that a step makes in addition to those of the gradients.
 
+use crate::data::Batch;
+use crate::error::Result;
+use crate::io::tile_horizontally;
 use crate::loss::{Losses, Term, psnr_of_mse};
-use crate::model::Stage;
+use crate::model::{GlobalSplat, Stage};
+use crate::render::{DEFAULT_EPS2D, colorize_depth, render};
 use tch::{Device, Kind, Tensor};
 
 /// Report of a training step.
@@ -32,6 +36,39 @@ impl StepReport {
     pub fn psnr(&self) -> f64 {
         psnr_of_mse(self.losses[Term::Mse])
     }
+}
+
+/// Renders a preview of the first scene of `batch`, which isn't paired: a context photo, a target photo, its rendered image, its depth
+/// and its accumulated opacity, side by side, `[3, H, W']` in [0, 1] on the CPU.
+pub(super) fn preview(model: &GlobalSplat, batch: &Batch, stage: Stage) -> Result<Tensor> {
+    let Batch { context, target, .. } = batch.slice(0, 1);
+    let middle = |views: &Tensor| views.size()[1] as usize / 2;
+    let (shown, target) =
+        (context.select(&[middle(&context.images)]), target.select(&[middle(&target.images)]));
+    let pictures = tch::no_grad(|| {
+        let decoded = model.forward(&context.model_input(), stage);
+        render(&decoded.gaussians, &target.cameras(), DEFAULT_EPS2D)
+    })?;
+    let first = |t: &Tensor| t.select(0, 0).select(0, 0).to_device(Device::Cpu);
+    let (photo, ground_truth, rgb) = (first(&shown.images), first(&target.images), first(&pictures.rgb));
+    let (depth, alpha) = (first(&pictures.depth), first(&pictures.alpha));
+    let grey = alpha.unsqueeze(0).expand([3, -1, -1], false);
+    Ok(tile_horizontally(&[photo, ground_truth, rgb.clamp(0., 1.), colorize_depth(&depth, &alpha), grey]))
+}
+
+/// Mean scores over all held-out views or scenes.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Score {
+    /// Mean PSNR over the scenes, in dB.
+    pub psnr: f64,
+    /// Mean SSIM over the scenes.
+    pub ssim: f64,
+    /// Number of scenes.
+    pub scenes: usize,
+    /// Stage at which the model was evaluated: the one that it has been trained to.
+    pub stage: Stage,
+    /// Reasons why scenes were left out, each listed once.
+    pub left_out: Vec<String>,
 }
 
 /// Values of one rank that decide how a step goes on, or their sums over all ranks.

@@ -2,7 +2,7 @@
 
 use super::{StepReport, Trainer, subsets};
 use crate::config::{Config, TrainConfig};
-use crate::data::{Batch, Capture, LoadTimes, LoadedScene};
+use crate::data::{Batch, Capture, LoadedScene};
 use crate::device::{Stopwatch, num_threads};
 use crate::distributed::ProcessGroup;
 use crate::distributed::tests::{can_meet, run_on_ranks};
@@ -44,7 +44,6 @@ fn scenes(count: usize) -> Vec<LoadedScene> {
             context: vec![0, 1, 2, 3, 4],
             target: vec![1, 3],
             far: 10. + number as f64,
-            times: LoadTimes::default(),
         }
     };
     (0..count).map(scene).collect()

@@ -2,10 +2,8 @@
 
 use super::gradients::{ForwardBackward, ModelReplica, gradients_in_parallel};
 use super::is_due;
-use super::logs::preview;
-use super::parameter_groups::{in_backward_order, parameter_groups};
-use super::schedule::{learning_rate, stage_at, subsets};
-use super::step::{StepReport, StepSums, StepSync};
+use super::schedule::{in_backward_order, learning_rate, parameter_groups, stage_at, subsets};
+use super::step::{StepReport, StepSums, StepSync, preview};
 use crate::config::{Config, changed_keys};
 use crate::data::{BadData, BadSceneReport, Batch, BatchShard, DataLoader, SceneGroups};
 use crate::device::Stopwatch;
@@ -252,7 +250,8 @@ impl Trainer {
     fn all_reduce(&self, losses: Tensor, should_continue: &mut dyn FnMut() -> bool) -> Result<Tensor> {
         let gradients = self.buckets.finish()?;
         let is_asked_to_stop = !should_continue();
-        let has_bad_data = self.loader.as_ref().is_some_and(DataLoader::has_bad_scene_reports);
+        let has_bad_data =
+            self.loader.as_ref().is_some_and(|loader| loader.bad_data_log().has_bad_scene_reports());
         let sums = StepSync::of_rank(is_asked_to_stop, has_bad_data, gradients).to_tensor(losses);
         self.group.all_reduce(&sums)?;
         Ok(sums)
@@ -260,12 +259,12 @@ impl Trainer {
 
     /// Exchanges the bad data that the ranks found, so that every rank counts all of it.
     fn exchange_bad_data(&self) -> Result<()> {
-        let Some(loader) = &self.loader else { return Ok(()) };
+        let Some(log) = self.loader.as_ref().map(DataLoader::bad_data_log) else { return Ok(()) };
         if self.group.world_size() > 1 {
             let reports: Vec<Vec<BadSceneReport>> =
-                self.group.all_gather_object(loader.take_bad_scene_reports())?;
+                self.group.all_gather_object(log.take_bad_scene_reports())?;
             let others = reports.into_iter().enumerate().filter(|(rank, _)| *rank != self.group.rank());
-            others.map(|(_, reports)| reports).try_for_each(|reports| loader.record_reports(reports))?;
+            others.flat_map(|(_, reports)| reports).try_for_each(|report| log.record_report(report))?;
         }
         Ok(())
     }

@@ -1,6 +1,7 @@
-//! The splat op, compared with finite differences and with a brute-force renderer.
+//! The splat op, as far as parity/run.py doesn't compare it: instruction sets, threads, kernels for GPUs, and invalid input.
 
-use crate::common::{Random, exit_code_of_test, largest_error};
+use crate::common::{Random, exit_code_of_test, largest_error, relative_error};
+use globalsplat::render::cpu::simd_level;
 use globalsplat::render::{Cameras, DEFAULT_EPS2D, RenderOutput, render};
 use globalsplat::scene::Gaussians;
 use std::collections::BTreeMap;
@@ -124,60 +125,49 @@ fn gaussians_without_a_rotation_are_dropped() {
     }
 }
 
-/// Returns Gaussians that culling is likely to lose, one per scene: needles at any angle, large and tiny ones, faint ones,
-/// centres on the borders of tiles and blocks, and outside the image. The camera is that of [`straight_camera`].
-fn lone_gaussians(width: f64, height: f64, seed: u64) -> Gaussians {
-    const COUNT: usize = 600;
-    let mut random = Random::new(seed);
-    let mut number = || random.uniform(&[1]).double_value(&[0]);
-    let (mut means, mut scales, mut quaternions, mut opacities) = (vec![], vec![], vec![], vec![]);
-    for i in 0..COUNT {
-        let (mut x, mut y) = (width * (2. * number() - 0.5), height * (2. * number() - 0.5));
-        if i % 3 == 0 {
-            (x, y) = (4. * (x / 4.).round(), 4. * (y / 4.).round());
+/// Environment variable that names the file to which a repeated test saves its tensors.
+const OUT: &str = "GLOBALSPLAT_TEST_OUT";
+/// Exit code of a repeated test on a machine without the instruction set.
+const UNSUPPORTED: i32 = 77;
+
+/// Repeats `test` with each of `values` of the environment variable `variable`, which a process reads once. Returns the tensors that it
+/// saves to `OUT`, with their value; a value that this machine doesn't support is left out.
+fn repeat_with<'a>(
+    test: &str,
+    variable: &str,
+    values: &[&'a str],
+) -> Vec<(&'a str, BTreeMap<String, Tensor>)> {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let mut answers = vec![];
+    for &value in values {
+        let out = folder.path().join(value);
+        match exit_code_of_test(test, &[(variable, Path::new(value)), (OUT, &out)]) {
+            Some(0) => {
+                let tensors = Tensor::read_safetensors(&out).expect("what was written");
+                answers.push((value, tensors.into_iter().collect()));
+            }
+            code => assert_eq!(code, Some(UNSUPPORTED), "{value}"),
         }
-        // Standard deviations in pixels, at depth 1 and focal length 1 pixel · 100.
-        let size = [[3., 3.], [60., 0.05], [200., 0.3], [0.02, 0.02], [8., 1.], [300., 40.]][i % 6];
-        let opacity = [0.99, 0.5, 1.02 / 255., 0.05, 1., 4. / 255.][(i / 6) % 6];
-        let half_turn = std::f64::consts::PI * number() / 2.;
-        means.extend([(x - width / 2.) / 100., (y - height / 2.) / 100., 1.]);
-        scales.extend([size[0] / 100., size[1] / 100., 1e-4]);
-        quaternions.extend([half_turn.cos(), 0., 0., half_turn.sin()]);
-        opacities.push(opacity);
     }
-    let n = COUNT as i64;
-    let tensor = |values: &[f64], shape: &[i64]| Tensor::from_slice(values).view(shape).to_kind(Kind::Float);
-    Gaussians {
-        means: tensor(&means, &[n, 1, 3]),
-        scales: tensor(&scales, &[n, 1, 3]),
-        quaternions: tensor(&quaternions, &[n, 1, 4]),
-        opacities: tensor(&opacities, &[n, 1]),
-        sh: Tensor::zeros([n, 1, 1, 3], (Kind::Float, Device::Cpu)),
-        antialiased: false,
-    }
+    answers
 }
 
-/// Returns a camera at the origin, looking along z, focal length 100 pixels; one for each of `scenes`.
-fn straight_camera(scenes: i64, width: i64, height: i64) -> Cameras {
-    let intrinsics = [100., 0., width as f64 / 2., 0., 100., height as f64 / 2., 0., 0., 1.];
-    Cameras {
-        w2c: Tensor::eye(4, (Kind::Float, Device::Cpu)).repeat([scenes, 1, 1, 1]),
-        intrinsics: Tensor::from_slice(&intrinsics)
-            .view([3, 3])
-            .to_kind(Kind::Float)
-            .repeat([scenes, 1, 1, 1]),
-        width,
-        height,
-    }
+/// Returns the rendered images and the gradients of [`objective`], by name.
+fn tensors(g: &Gaussians, c: &Cameras) -> Vec<(&'static str, Tensor)> {
+    let c = Cameras {
+        w2c: c.w2c.detach().set_requires_grad(true),
+        intrinsics: c.intrinsics.shallow_clone(),
+        ..*c
+    };
+    let (p, gradients) = differentiated(g, &c);
+    let images = [("rgb", p.rgb), ("alpha", p.alpha), ("depth", p.depth), ("w2c", c.w2c.grad())];
+    images.into_iter().chain(gradients).collect()
 }
 
 #[test]
 fn instruction_sets_agree() {
-    // The instruction set is selected once per process: this test runs itself again for every set, to render and save.
-    const OUT: &str = "GLOBALSPLAT_TEST_OUT";
-    const UNSUPPORTED: i32 = 77;
     if let Some(out) = std::env::var_os(OUT) {
-        if globalsplat::render::cpu::simd_level().is_err() {
+        if simd_level().is_err() {
             std::process::exit(UNSUPPORTED);
         }
         let g = gaussians(1, 16384, 3, Kind::Float, 4);
@@ -189,20 +179,8 @@ fn instruction_sets_agree() {
         tensors.extend(fields(&g).map(|(name, leaf)| (name, leaf.grad())));
         return Tensor::write_safetensors(&tensors, out).expect("a writable file");
     }
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    let mut answers = vec![];
-    for level in ["avx512", "avx2", "neon", "portable"] {
-        let out = folder.path().join(level);
-        let variables = [("GLOBALSPLAT_SIMD", Path::new(level)), (OUT, &out)];
-        match exit_code_of_test("splat::instruction_sets_agree", &variables) {
-            Some(0) => {
-                let tensors = Tensor::read_safetensors(&out).expect("what was written");
-                answers.push((level, tensors.into_iter().collect::<BTreeMap<_, _>>()));
-            }
-            code => assert_eq!(code, Some(UNSUPPORTED), "{level}"),
-        }
-    }
-    println!("compared: {:?}", answers.iter().map(|(level, _)| level).collect::<Vec<_>>());
+    let levels = ["avx512", "avx2", "neon", "portable"];
+    let answers = repeat_with("splat::instruction_sets_agree", "GLOBALSPLAT_SIMD", &levels);
     // Other processors have only one instruction set.
     if answers.len() < 2 && cfg!(target_arch = "x86_64") {
         crate::common::skip("a second instruction set", "the processor has none but the portable one");
@@ -210,8 +188,8 @@ fn instruction_sets_agree() {
     let (_, first) = answers.first().expect("an instruction set");
     for (level, tensors) in &answers[1..] {
         for (name, expected) in first {
-            let found = &tensors[name];
-            let error = largest_error(found, expected) / expected.abs().max().double_value(&[]).max(1.);
+            let error =
+                largest_error(&tensors[name], expected) / expected.abs().max().double_value(&[]).max(1.);
             assert!(error <= 1e-5, "{level}: {name} differs by {error:.1e}");
         }
     }
@@ -225,18 +203,10 @@ fn instruction_sets_agree() {
 /// much as each differs from the float64 gradient, and this distance is the bound.
 #[test]
 fn kernels_for_gpus_draw_the_cpus_bits() {
-    // An environment variable selects the kernels: this test runs itself again, to render and save.
-    const OUT: &str = "GLOBALSPLAT_TEST_OUT";
     let answer = |kind: Kind| {
         let g = of_any_length(&gaussians(2, 700, 3, Kind::Float, 21)).map(|t| t.to_kind(kind));
-        let (g, c) = (leaves(&g), cameras(2, 2, 75, 50, Kind::Float));
-        let w2c = c.w2c.to_kind(kind).set_requires_grad(true);
-        let c = Cameras { w2c, intrinsics: c.intrinsics.to_kind(kind), ..c };
-        let p = draw(&g, &c);
-        objective(&p).backward();
-        let drawn = [("rgb", p.rgb), ("alpha", p.alpha), ("depth", p.depth)];
-        let gradients = fields(&g).into_iter().chain([("w2c", &c.w2c)]).map(|(name, t)| (name, t.grad()));
-        drawn.into_iter().chain(gradients).collect::<Vec<_>>()
+        let c = cameras(2, 2, 75, 50, Kind::Float);
+        tensors(&g, &Cameras { w2c: c.w2c.to_kind(kind), intrinsics: c.intrinsics.to_kind(kind), ..c })
     };
     let was_cpu = || globalsplat::render::cpu::stage_times().blend_backward > 0.;
     if let Some(out) = std::env::var_os(OUT) {
@@ -246,30 +216,21 @@ fn kernels_for_gpus_draw_the_cpus_bits() {
     }
     let expected = answer(Kind::Float);
     assert!(was_cpu());
-    let exact = answer(Kind::Double);
-    let has_fused_gradients =
-        globalsplat::render::cpu::simd_level().expect("an instruction set") != "portable";
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    let mut answers = vec![];
-    for order in ["1", "2"] {
-        let out = folder.path().join(order);
-        let variables = [("GLOBALSPLAT_CUDA_ON_CPU", Path::new(order)), (OUT, &out)];
-        assert_eq!(exit_code_of_test("splat::kernels_for_gpus_draw_the_cpus_bits", &variables), Some(0));
-        let tensors = Tensor::read_safetensors(&out).expect("what was written");
-        answers.push(tensors.into_iter().collect::<BTreeMap<_, _>>());
-    }
-    for (place, ((name, expected), (_, exact))) in expected.iter().zip(&exact).enumerate() {
-        let [found, other] = [&answers[0][*name], &answers[1][*name]];
+    let has_fused_gradients = simd_level().expect("an instruction set") != "portable";
+    // The second order renders the tiles in another order.
+    let test = "splat::kernels_for_gpus_draw_the_cpus_bits";
+    let answers = repeat_with(test, "GLOBALSPLAT_CUDA_ON_CPU", &["1", "2"]);
+    for ((name, expected), (_, exact)) in expected.iter().zip(&answer(Kind::Double)) {
+        let [found, other] = [&answers[0].1[*name], &answers[1].1[*name]];
         assert!(found.equal(other), "{name} depends on the order");
-        let rounding = crate::common::relative_error(expected, exact);
-        let is_picture = place < 3;
-        if is_picture {
+        let rounding = relative_error(expected, exact);
+        if ["rgb", "alpha", "depth"].contains(name) {
             assert!(found.equal(expected), "{name}");
             // If a pixel blended other Gaussians in float64, the distance of the gradients would be large.
             assert!(rounding < 1e-6, "{name}: float64 differs by {rounding:.1e}");
             continue;
         }
-        let difference = crate::common::relative_error(found, expected);
+        let difference = relative_error(found, expected);
         assert!(
             difference <= rounding,
             "{name}: {difference:.1e} from the CPU's, which is {rounding:.1e} from float64"
@@ -283,22 +244,12 @@ fn kernels_for_gpus_draw_the_cpus_bits() {
 fn bits_do_not_depend_on_threads() {
     let run = |threads: i32| {
         tch::set_num_threads(threads);
-        let g = leaves(&gaussians(2, 3000, 3, Kind::Float, 9));
-        let c = cameras(2, 3, 150, 90, Kind::Float);
-        let c = Cameras { w2c: c.w2c.set_requires_grad(true), ..c };
-        let p = draw(&g, &c);
-        objective(&p).backward();
-        let gradients: Vec<Tensor> =
-            fields(&g).into_iter().map(|(_, leaf)| leaf).chain([&c.w2c]).map(Tensor::grad).collect();
-        (p, gradients)
+        tensors(&gaussians(2, 3000, 3, Kind::Float, 9), &cameras(2, 3, 150, 90, Kind::Float))
     };
     let before = tch::get_num_threads();
-    let ((p, gradients), (q, others)) = (run(1), run(2));
+    let (one, two) = (run(1), run(2));
     tch::set_num_threads(before);
-    assert!(p.rgb.equal(&q.rgb) && p.alpha.equal(&q.alpha) && p.depth.equal(&q.depth));
-    for (a, b) in gradients.iter().zip(&others) {
-        assert!(a.equal(b));
-    }
+    assert!(one.iter().zip(&two).all(|((_, a), (_, b))| a.equal(b)));
 }
 
 #[test]

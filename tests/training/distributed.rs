@@ -287,24 +287,43 @@ fn assert_same_bits(a: &Path, b: &Path) {
     }
 }
 
+/// Two ranks make the steps of one process with twice the batch size. The script for Slurm starts them, with a fake Slurm of one node, this
+/// machine.
 #[test]
-fn ranks_train_like_one() {
-    let Some(_turn) = turn() else { return };
-    let Some(torchrun) = torchrun() else { return };
+fn ranks_of_slurm_s_script_train_like_one() {
+    let (Some(_turn), Some(torchrun)) = (turn(), torchrun()) else { return };
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/slurm_train.sh");
     let (folder, config) = data(5);
-    let of = |name: &str| folder.path().join(name);
-    let [one, two] = ["one", "two"].map(of);
+    let [one, two, tools, checkout] = ["one", "two", "bin", "checkout"].map(|name| folder.path().join(name));
     // At a higher learning rate, AdamW amplifies gradients that are little more than rounding errors.
     let settings = |batch| ["train.steps=12", "train.validate_every=5", "train.learning_rate=2e-4", batch];
     succeed(&text(&train(&config, &one, &settings("train.batch_size=2"))));
-    let arguments = train(&config, &two, &settings("train.batch_size=1"));
-    let ended = Started::by_torchrun(&torchrun, 2, &[], &text(&arguments)).end().remove(0);
+
+    fs::create_dir(&tools).unwrap();
+    for (name, does) in
+        [("scontrol", "[ \"$*\" = 'show hostnames here' ] && echo 127.0.0.1"), ("srun", "exec \"$@\"")]
+    {
+        let tool = tools.join(name);
+        fs::write(&tool, format!("#!/bin/sh\n{does}\n")).unwrap();
+        fs::set_permissions(&tool, fs::Permissions::from_mode(0o755)).unwrap();
+    }
+    // The folder from which the job is submitted contains the program.
+    fs::create_dir_all(checkout.join("target/release")).unwrap();
+    symlink(env!("CARGO_BIN_EXE_globalsplat"), checkout.join("target/release/globalsplat")).unwrap();
+    let path = format!("{}:{}", tools.display(), std::env::var("PATH").unwrap());
+    let mut job = Command::new(&script);
+    job.args([&config, &two]).args(settings("train.batch_size=1").iter().flat_map(|set| ["--set", set]));
+    job.env("PATH", path).env("OMP_NUM_THREADS", "1");
+    for (name, value) in
+        [("JOB_ID", "4321"), ("JOB_NODELIST", "here"), ("NNODES", "1"), ("SUBMIT_DIR", arg(&checkout))]
+    {
+        job.env(format!("SLURM_{name}"), value);
+    }
+    job.env("PROCESSES", "2").env("DEVICE", "cpu").env("TORCHRUN", torchrun);
+    let ended = Started::start(vec![job]).end().remove(0);
     assert_eq!(ended.code, Some(0), "{}", ended.err);
-    assert!(
-        ended.out.matches("trained in ").count() == 1 && sentences(&ended.err).is_empty(),
-        "{}",
-        ended.out
-    );
+    assert!(ended.err.contains("2 processes train together"), "{}", ended.err);
+    assert_eq!(ended.out.matches("trained in ").count(), 1, "{}", ended.out);
 
     assert_same_steps(&two, &one);
     let [of_one, of_two] = [&one, &two].map(|run| metrics(run).1);
@@ -315,10 +334,6 @@ fn ranks_train_like_one() {
         assert_close(&a["psnr"], &b["psnr"], 1e-4);
         assert_close(&a["ssim"], &b["ssim"], 1e-4);
     }
-    let fresh = weights(&tiny_weights(folder.path(), &folder.path().join("captures")));
-    let (moved, apart) =
-        (distance(&last_weights(&one), &fresh), distance(&last_weights(&one), &last_weights(&two)));
-    assert!(moved > 1e-3 && apart < 1e-5, "moved by {moved}, {apart} from each other");
 }
 
 #[test]
@@ -402,64 +417,49 @@ fn unfinished_save(run: &Path) -> Option<()> {
     (partial.max()? > checkpoints(run).pop().unwrap_or(0)).then_some(())
 }
 
+/// An error of one rank or of all is one sentence, whichever rank finds it.
 #[test]
 fn an_error_is_printed_once() {
     let Some(_turn) = turn() else { return };
     let (folder, config) = data(2);
-    let run = folder.path().join("run");
-    let arguments = |setting: &str| train(&config, &run, &[setting]);
-    let mistakes = [
-        ("train.steps=\"x\"", "train.steps=\"x\": "),
-        ("train.stepz=3", "unknown field `stepz`"),
-        ("data.captures=[\"nowhere\"]", "nowhere"),
-        // Only the first rank detects this one.
-        ("train.keep_checkpoints=3", "config.toml that no run wrote"),
-    ];
-    fs::create_dir(&run).unwrap();
-    fs::write(run.join("config.toml"), "").unwrap();
-    for (setting, expected) in mistakes {
-        let ended = Started::by_environment(2, &text(&arguments(setting))).end();
-        assert!(ended.iter().all(|of| of.code != Some(0) && of.out.is_empty()), "{setting}");
-        let err: String = ended.iter().map(|of| of.err.as_str()).collect();
-        let [sentence] = sentences(&err)[..] else { panic!("{setting}: one sentence: {err}") };
-        assert!(sentence.contains(expected) && !sentence.contains("communication failed"), "{sentence}");
-        // The other rank's communication fails, which doesn't change the exit code of the first.
-        assert_eq!(ended[0].code, Some(2), "{setting}: {err}");
-    }
-}
-
-#[test]
-fn ranks_with_different_training_are_refused() {
-    let Some(_turn) = turn() else { return };
-    let (folder, config) = data(2);
     let (_more, more) = data(3);
     let run = folder.path().join("run");
-    let others = [
-        (
-            train(&config, &run, &["train.seed=5"]),
-            "configuration differs from the first rank's: train.seed 0 → 5",
-        ),
-        (train(&more, &run, &[]), "this rank's training scenes differ from the first rank's: 3 of 3"),
-    ];
+    let settings = |setting: &str| train(&config, &run, &[setting]);
     let first = train(&config, &run, &[]);
-    for (other, expected) in others {
-        let ended = Started::by_environment_of(&[text(&first), text(&other)]).end();
-        assert!(ended.iter().all(|of| of.code != Some(0)), "{expected}");
+    let other_run = |other: Vec<String>| [first.clone(), other];
+    let both = |arguments: Vec<String>| [arguments.clone(), arguments];
+    fs::create_dir(&run).unwrap();
+    let foreign = run.join("config.toml");
+    fs::write(&foreign, "").unwrap();
+    let mistakes = [
+        (both(vec!["inspect".into(), "x".into()]), 2, "this is work for one process, and torchrun started 2: expected train,"),
+        (both(settings("train.steps=\"x\"")), 2, "train.steps=\"x\": "),
+        (both(settings("train.stepz=3")), 2, "unknown field `stepz`"),
+        (both(settings("data.captures=[\"nowhere\"]")), 2, "nowhere"),
+        // Only the first rank detects this one. The other rank's communication fails, which doesn't change the exit code of the first.
+        (both(settings("train.keep_checkpoints=3")), 2, "config.toml that no run wrote"),
+        (
+            other_run(settings("train.seed=5")),
+            1,
+            "rank 1 of 2: this rank's configuration differs from the first rank's: train.seed 0 → 5",
+        ),
+        (
+            other_run(train(&more, &run, &[])),
+            1,
+            "rank 1 of 2: this rank's training scenes differ from the first rank's: 3 of 3",
+        ),
+    ];
+    for (arguments, code, expected) in mistakes {
+        if code == 1 {
+            let _ = fs::remove_file(&foreign);
+        }
+        let ended = Started::by_environment_of(&arguments.each_ref().map(|rank| text(rank))).end();
+        assert!(ended.iter().all(|of| of.code != Some(0) && of.out.is_empty()), "{expected}");
         let err: String = ended.iter().map(|of| of.err.as_str()).collect();
         let [sentence] = sentences(&err)[..] else { panic!("{expected}: one sentence: {err}") };
-        assert!(sentence.starts_with("rank 1 of 2: ") && sentence.contains(expected), "{sentence}");
+        assert!(sentence.contains(expected) && !sentence.contains("communication failed"), "{sentence}");
+        assert_eq!(ended[0].code, Some(code), "{expected}: {err}");
     }
-}
-
-#[test]
-fn commands_for_one_process_are_refused_once() {
-    let Some(_turn) = turn() else { return };
-    let Some(torchrun) = torchrun() else { return };
-    let ended = Started::by_torchrun(&torchrun, 2, &[], &["inspect", "x"]).end().remove(0);
-    assert_ne!(ended.code, Some(0));
-    let [sentence] = sentences(&ended.err)[..] else { panic!("one sentence: {}", ended.err) };
-    let expected = "this is work for one process, and torchrun started 2: expected train,";
-    assert!(sentence.starts_with(expected), "{sentence}");
 }
 
 /// Returns the result of an evaluation, without times and memory.
@@ -564,40 +564,4 @@ fn bad_data_is_reported_by_any_rank() {
             .collect()
     };
     assert_eq!((judged(&two), judged(&two).len()), (judged(&one), 5));
-}
-
-/// The script for Slurm trains, with a fake Slurm of one node, this machine, which starts two processes.
-#[test]
-fn slurm_s_script_trains() {
-    let (Some(_turn), Some(torchrun)) = (turn(), torchrun()) else { return };
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/slurm_train.sh");
-    assert!(Command::new("bash").args(["-n", arg(&script)]).status().unwrap().success());
-    let (folder, config) = data(1);
-    let run = folder.path().join("run");
-    let tools = folder.path().join("bin");
-    fs::create_dir(&tools).unwrap();
-    for (name, does) in
-        [("scontrol", "[ \"$*\" = 'show hostnames here' ] && echo 127.0.0.1"), ("srun", "exec \"$@\"")]
-    {
-        let tool = tools.join(name);
-        fs::write(&tool, format!("#!/bin/sh\n{does}\n")).unwrap();
-        fs::set_permissions(&tool, fs::Permissions::from_mode(0o755)).unwrap();
-    }
-    // The folder from which the job is submitted contains the program.
-    let checkout = folder.path().join("checkout");
-    fs::create_dir_all(checkout.join("target/release")).unwrap();
-    symlink(env!("CARGO_BIN_EXE_globalsplat"), checkout.join("target/release/globalsplat")).unwrap();
-    let path = format!("{}:{}", tools.display(), std::env::var("PATH").unwrap());
-    let mut job = Command::new(&script);
-    job.args([&config, &run]).args(["--set", "train.steps=2"]).env("PATH", path).env("OMP_NUM_THREADS", "1");
-    for (name, value) in
-        [("JOB_ID", "4321"), ("JOB_NODELIST", "here"), ("NNODES", "1"), ("SUBMIT_DIR", arg(&checkout))]
-    {
-        job.env(format!("SLURM_{name}"), value);
-    }
-    job.env("PROCESSES", "2").env("DEVICE", "cpu").env("TORCHRUN", torchrun);
-    let ended = Started::start(vec![job]).end().remove(0);
-    assert_eq!(ended.code, Some(0), "{}", ended.err);
-    assert!(ended.err.contains("2 processes train together"), "{}", ended.err);
-    assert_eq!(checkpoints(&run).last(), Some(&2));
 }

@@ -2,7 +2,7 @@
 
 use super::measure::{Measured, PeakThroughput};
 use crate::config::Config;
-use crate::data::{Batch, Capture, LoadTimes, LoadedScene};
+use crate::data::{Batch, Capture, LoadedScene};
 use crate::device::{Stopwatch, Upload, peak_memory_bytes_on};
 use crate::distributed::ProcessGroup;
 use crate::error::Result;
@@ -164,7 +164,6 @@ pub(super) fn synthetic_scene(config: &Config, seed: u64) -> LoadedScene {
         context,
         target,
         far: FAR,
-        times: LoadTimes::default(),
     }
 }
 

@@ -1,6 +1,6 @@
 //! Bookkeeping of scenes that can't be trained on. They are counted and skipped; too many of them are an error.
 
-use super::order::SceneIndex;
+use super::sampler::SceneIndex;
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
@@ -9,7 +9,7 @@ use std::sync::Mutex;
 
 /// Kind of defect of a scene.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub(super) enum Fault {
+pub(crate) enum Fault {
     /// The file that holds the scene together with others is broken.
     Group,
     /// The cameras, or anything else that all views of the scene share, are broken.
@@ -73,7 +73,7 @@ pub(crate) struct BadSceneReport {
 
 /// Collects [`BadData`] from all threads.
 #[derive(Debug)]
-pub(super) struct BadDataLog {
+pub(crate) struct BadDataLog {
     largest_share: f64,
     entries: Mutex<Entries>,
 }
@@ -164,10 +164,12 @@ impl BadDataLog {
         Ok(())
     }
 
+    /// Returns `true` if [`BadDataLog::take_bad_scene_reports`] would return anything.
     pub fn has_bad_scene_reports(&self) -> bool {
         !self.entries.lock().expect("no thread panics here").reports.is_empty()
     }
 
+    /// Returns the bad scenes that this process found since the last call.
     pub fn take_bad_scene_reports(&self) -> Vec<BadSceneReport> {
         std::mem::take(&mut self.entries.lock().expect("no thread panics here").reports)
     }

@@ -1,12 +1,44 @@
-//! Samples: the views of a training step as tensors.
+//! Samples: scenes as passed from the loader threads to the training thread, and the views of a training step as tensors.
 
-use super::scene::LoadedScene;
 use crate::data::batch::{ViewBatch, view_matrices};
 use crate::device::{PendingCopy, Upload};
 use crate::error::Result;
+use crate::scene::{Camera, ImageSize};
 use globalsplat_capture::CHANNELS;
 use std::ops::Range;
 use tch::{Device, Kind, Tensor};
+
+/// A scene of a training sample: N photos, each of them context, target or both.
+#[derive(Debug, Clone)]
+pub struct LoadedScene {
+    /// Name of the capture.
+    pub name: String,
+    /// 8-bit pixels, `[N, 3, H, W]`.
+    pub images: Vec<u8>,
+    /// 8-bit weights of the pixels, `[N, H, W]`: 255 where a pixel counts, 0 where it is masked out. `None` if every pixel counts.
+    pub masks: Option<Vec<u8>>,
+    /// Depths of the context images, `[C, 2, H, W]`: inverse depth in normalized world coordinates, and how sure it is. `None` if
+    /// the model reads none.
+    pub depths: Option<Vec<f32>>,
+    /// Size of all images.
+    pub size: ImageSize,
+    /// Cameras of the images, in normalized world coordinates.
+    pub cameras: Vec<Camera>,
+    /// Indices of the context images, ascending.
+    pub context: Vec<usize>,
+    /// Indices of the target images, which renderings are compared with, ascending.
+    pub target: Vec<usize>,
+    /// Far plane of the frusta in normalized world coordinates.
+    pub far: f64,
+}
+
+impl LoadedScene {
+    /// Returns the depths as a tensor, `[C, 2, H, W]`.
+    pub(super) fn depth_tensor(&self) -> Option<Tensor> {
+        let [height, width] = [self.size.height, self.size.width].map(i64::from);
+        self.depths.as_ref().map(|depths| Tensor::from_slice(depths).view([-1, 2, height, width]))
+    }
+}
 
 /// Largest value of a byte.
 const LEVELS: f32 = 255.;
@@ -40,6 +72,17 @@ impl Batch {
         match upload.device() {
             Device::Cpu => Batch::on_host(scenes, |images, shape| Ok(floats(images, shape))),
             _ => PendingBatch::begin(scenes, upload)?.wait(),
+        }
+    }
+
+    /// Applies `f` to every tensor.
+    fn map(&self, mut f: impl FnMut(&Tensor) -> Tensor) -> Self {
+        Batch {
+            names: self.names.clone(),
+            context: self.context.map(&mut f),
+            target: self.target.map(&mut f),
+            far: f(&self.far),
+            paired: self.paired,
         }
     }
 
@@ -99,14 +142,7 @@ impl Batch {
     pub fn slice(&self, first: usize, count: usize) -> Self {
         let count = count.min(self.scenes() - first);
         let names = self.names[first..first + count].to_vec();
-        let (first, count) = (first as i64, count as i64);
-        Batch {
-            names,
-            context: self.context.scenes(first, count),
-            target: self.target.scenes(first, count),
-            far: self.far.narrow(0, first, count),
-            paired: false,
-        }
+        Batch { names, ..self.map(|t| t.narrow(0, first as i64, count as i64)) }
     }
 
     /// Returns `targets`, a tensor of the target views, of every scene once: a paired sample has the same targets twice.
@@ -125,47 +161,36 @@ impl Batch {
     }
 }
 
-/// A sample that is being copied to a device.
-///
-/// Images are copied as bytes and converted to floats on the device.
+/// A batch that is being copied to a device. Images are copied as bytes and converted to floats there.
 #[derive(Debug)]
 pub(super) struct PendingBatch {
-    names: Vec<String>,
-    tensors: PendingCopy<9>,
-    /// Masks of the context and target views.
-    masks: Option<PendingCopy<2>>,
-    /// Depths of the context views.
-    depths: Option<PendingCopy<1>>,
+    host: Batch,
+    /// Copies of all tensors of `host`, in the order of [`Batch::map`].
+    copies: PendingCopy,
 }
 
 impl PendingBatch {
     /// Starts to copy the batch that [`Batch::from_scenes`] builds from `scenes`.
     pub fn begin(scenes: &[LoadedScene], upload: &Upload) -> Result<Self> {
-        let Batch { names, context, target, far, .. } =
-            Batch::on_host(scenes, |images, shape| Ok(bytes(images, upload.bytes(shape)?)))?;
-        let ([a, b, c, d], [e, f, g, h]) = (context.tensors(), target.tensors());
-        let masks = context.masks.as_ref().zip(target.masks.as_ref());
-        let masks = masks.map(|(context, target)| upload.begin([context, target])).transpose()?;
-        let depths = context.depths.as_ref().map(|depths| upload.begin([depths])).transpose()?;
-        Ok(PendingBatch { names, tensors: upload.begin([a, b, c, d, e, f, g, h, &far])?, masks, depths })
+        let host = Batch::on_host(scenes, |images, shape| Ok(bytes(images, upload.bytes(shape)?)))?;
+        let mut tensors = vec![];
+        host.map(|t| {
+            tensors.push(t.shallow_clone());
+            t.shallow_clone()
+        });
+        Ok(PendingBatch { host, copies: upload.begin(&tensors)? })
     }
 
-    /// Waits for the copies and returns the sample on the device.
+    /// Waits for the copies and returns the batch on the device.
     pub fn wait(self) -> Result<Batch> {
-        let [a, b, c, d, e, f, g, h, far] = self.tensors.wait()?;
-        let in_floats = |bytes: Tensor| -> Tensor {
-            let mut floats = bytes.to_kind(Kind::Float);
-            let _in_place = floats.g_div_scalar_(f64::from(LEVELS));
-            floats
-        };
-        let [context_masks, target_masks] = match self.masks {
-            Some(masks) => masks.wait()?.map(|masks| Some(in_floats(masks))),
-            None => [None, None],
-        };
-        let depths = self.depths.map(|depths| depths.wait().map(|[depths]| depths)).transpose()?;
-        let context = ViewBatch::from_tensors([in_floats(a), b, c, d], context_masks, depths);
-        let target = ViewBatch::from_tensors([in_floats(e), f, g, h], target_masks, None);
-        Ok(Batch { names: self.names, context, target, far, paired: false })
+        let mut copies = self.copies.wait()?.into_iter();
+        Ok(self.host.map(|_| {
+            let copy = copies.next().expect("a copy of every tensor");
+            match copy.kind() {
+                Kind::Uint8 => copy.to_kind(Kind::Float).g_div_scalar_(f64::from(LEVELS)),
+                _ => copy,
+            }
+        }))
     }
 }
 
@@ -221,8 +246,7 @@ fn floats(images: &[&[u8]], shape: &[i64]) -> Tensor {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::data::LoadTimes;
-    use crate::scene::{Camera, Intrinsics};
+    use crate::scene::Intrinsics;
     use glam::DMat4;
 
     /// Scenes with and without masks make a batch, on either way to a device.
@@ -239,7 +263,6 @@ mod tests {
             context: vec![0, 2],
             target: vec![1],
             far: 1.,
-            times: LoadTimes::default(),
         };
         let masks: Vec<u8> = (0..24).map(|i| if i % 4 == 0 { 0 } else { 255 - i }).collect();
         let scenes = [scene(None), scene(Some(masks.clone()))];

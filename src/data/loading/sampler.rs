@@ -1,10 +1,112 @@
-//! Choice of the views of a video for a training sample (spec 8.2).
+//! What a sample shows, which follows from its index alone: the scene, by a random order of every epoch (spec 8.1), and the views of its
+//! video (spec 8.2); and the samples of each process.
 
 use crate::data::config::{DataConfig, Sampling};
 use glam::DVec3;
-use rand::seq::index;
+use rand::seq::{SliceRandom, index};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+/// Seed modifier that separates the order's random numbers from those of the samples.
+const ORDER_KEY: u64 = 0x6f72_6465_725f_6f66;
+
+/// Location of a scene in the data: the index of its group, and its index in that group.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct SceneIndex {
+    /// Index of the group.
+    pub group: usize,
+    /// Index of the scene in the group.
+    pub scene: usize,
+}
+
+/// A random order of groups of scenes that changes with every epoch.
+#[derive(Debug, Clone)]
+pub struct Order {
+    sizes: Vec<usize>,
+    scenes: u64,
+    seed: u64,
+}
+
+impl Order {
+    /// Creates an order of groups with `sizes` scenes each. At least one size must be above 0.
+    pub fn new(sizes: Vec<usize>, seed: u64) -> Self {
+        let scenes = sizes.iter().sum::<usize>() as u64;
+        assert!(scenes > 0, "an order of nothing");
+        Order { sizes, scenes, seed }
+    }
+
+    /// Returns the number of scenes of an epoch.
+    pub fn scenes(&self) -> u64 {
+        self.scenes
+    }
+
+    /// Returns the scene of `sample`, and the groups of its epoch from there on, each of them once.
+    pub fn locate(&self, sample: u64) -> (SceneIndex, Vec<usize>) {
+        let (epoch, mut position) = (sample / self.scenes, (sample % self.scenes) as usize);
+        let mut groups = self.shuffled(self.sizes.len(), epoch, 0);
+        let mut turn = 0;
+        while position >= self.sizes[groups[turn]] {
+            position -= self.sizes[groups[turn]];
+            turn += 1;
+        }
+        groups.rotate_left(turn);
+        let group = groups[0];
+        let scene = self.shuffled(self.sizes[group], epoch, group as u64 + 1)[position];
+        (SceneIndex { group, scene }, groups)
+    }
+
+    /// Returns the number of scenes of the group.
+    pub fn size(&self, group: usize) -> usize {
+        self.sizes[group]
+    }
+
+    /// Returns 0 to `count` (exclusive) in a random order of `epoch`. `what` distinguishes the orders of one epoch.
+    fn shuffled(&self, count: usize, epoch: u64, what: u64) -> Vec<usize> {
+        let mut random = ChaCha8Rng::seed_from_u64(self.seed ^ ORDER_KEY);
+        random.set_stream(epoch << 32 | what);
+        let mut order: Vec<usize> = (0..count).collect();
+        order.shuffle(&mut random);
+        order
+    }
+}
+
+/// One of the equal parts of every step. Together, the parts of a step are the samples that a single process would load.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct BatchShard {
+    /// Number of samples of a step in this part.
+    pub batch: usize,
+    /// Index of this part, starting at 0.
+    pub number: usize,
+    /// Number of parts.
+    pub parts: usize,
+}
+
+impl BatchShard {
+    /// Returns the number of samples of a step in all parts.
+    pub fn global_batch_size(self) -> u64 {
+        (self.batch * self.parts) as u64
+    }
+
+    /// Returns the index of this part's sample number `turn`, where the first step begins with sample `first`.
+    pub fn sample(self, first: u64, turn: u64) -> u64 {
+        let (step, within) = (turn / self.batch as u64, turn % self.batch as u64);
+        first + step * self.global_batch_size() + (self.batch * self.number) as u64 + within
+    }
+
+    /// Returns the index of the step of sample number `turn`, computed from the step's first sample. All samples of a step get the
+    /// same index, even if a resumed run uses another batch size.
+    pub(super) fn step(self, first: u64, turn: u64) -> u64 {
+        (first + turn / self.batch as u64 * self.global_batch_size()) / self.global_batch_size()
+    }
+}
+
+/// Converts a batch size to whole steps of that many samples.
+impl From<usize> for BatchShard {
+    fn from(batch: usize) -> Self {
+        BatchShard { batch, number: 0, parts: 1 }
+    }
+}
 
 /// XORed with the seed for drawing the number of context views.
 const CONTEXT_COUNT_SEED: u64 = 0x7669_6577_5f63_6e74;
@@ -83,6 +185,60 @@ fn sample_farthest(centres: &[DVec3], count: usize, random: &mut impl Rng) -> Ve
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::collections::BTreeSet;
+
+    #[test]
+    fn every_epoch_shows_every_scene_once_and_keeps_groups_together() {
+        let order = Order::new(vec![3, 0, 5, 1, 4], 7);
+        let epoch = |e: u64| (0..13).map(|i| order.locate(13 * e + i).0).collect::<Vec<_>>();
+        for e in 0..20 {
+            let shown = epoch(e);
+            assert_eq!(shown.iter().collect::<BTreeSet<_>>().len(), 13);
+            let changes = shown.windows(2).filter(|pair| pair[0].group != pair[1].group).count();
+            assert_eq!(changes, 3, "{shown:?}");
+        }
+        assert_ne!(epoch(0), epoch(1));
+        let other = Order::new(vec![3, 0, 5, 1, 4], 8);
+        assert_ne!(epoch(0), (0..13).map(|i| other.locate(i).0).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn locate_lists_the_groups_that_follow() {
+        let order = Order::new(vec![2, 2, 2], 3);
+        let (first, groups) = order.locate(0);
+        assert_eq!(groups[0], first.group);
+        assert_eq!(groups[1], order.locate(2).0.group);
+        assert_eq!(groups[2], order.locate(4).0.group);
+        assert_eq!(order.locate(2).1[2], first.group);
+    }
+
+    #[test]
+    fn samples_of_a_step_have_its_index() {
+        let whole = BatchShard::from(6);
+        assert_eq!((0..12).map(|turn| whole.step(12, turn)).collect::<Vec<_>>(), [[2; 6], [3; 6]].concat());
+        // Resumed after steps of 4 samples.
+        assert_eq!((0..12).map(|turn| whole.step(8, turn)).collect::<Vec<_>>(), [[1; 6], [2; 6]].concat());
+        for number in 0..3 {
+            let shard = BatchShard { batch: 2, number, parts: 3 };
+            assert_eq!((0..4).map(|turn| shard.step(8, turn)).collect::<Vec<_>>(), [1, 1, 2, 2]);
+        }
+    }
+
+    #[test]
+    fn parts_share_the_samples_of_every_step_out() {
+        let whole: Vec<u64> = (0..24).map(|turn| BatchShard::from(6).sample(5, turn)).collect();
+        assert_eq!(whole, (5..29).collect::<Vec<_>>());
+        for parts in [2, 3, 6] {
+            let batch = 6 / parts;
+            let of = |number: usize| BatchShard { batch, number, parts };
+            for step in 0..4 {
+                let turns = (step * batch as u64)..((step + 1) * batch as u64);
+                let samples =
+                    (0..parts).flat_map(|number| turns.clone().map(move |turn| of(number).sample(5, turn)));
+                assert_eq!(samples.collect::<Vec<_>>(), whole[step as usize * 6..][..6], "{parts} parts");
+            }
+        }
+    }
 
     fn config(sampling: Sampling) -> DataConfig {
         DataConfig { window: [40, 220], target_views: 12, sampling, ..Default::default() }

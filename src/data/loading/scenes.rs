@@ -1,4 +1,4 @@
-//! Sources of scenes: groups of scenes that are read together.
+//! Sources of scenes: groups of scenes that are read together, and a cache of them.
 
 use crate::data::dataset::{Dataset, SceneGroup, Split};
 use crate::error::Result;
@@ -6,6 +6,7 @@ use crate::io::InputFiles;
 use globalsplat_capture::Capture;
 use std::fmt;
 use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, OnceLock};
 
 /// Groups of scenes. Each group is opened as a whole, for example as a file that holds several scenes.
 pub trait SceneGroups: Send + Sync + fmt::Debug {
@@ -113,5 +114,44 @@ impl SceneGroups for TrainingScenes {
 
     fn decoded_bytes(&self) -> Option<u64> {
         self.others.is_empty().then(|| self.captures.decoded_bytes())?
+    }
+}
+
+/// Number of groups that stay open while no thread uses them: two during the transition from one group to the next, and a spare one.
+const CAPACITY: usize = 3;
+
+/// Scenes of a group, or the reason why the group can't be opened.
+pub(super) type OpenedGroup = Arc<Result<Vec<Result<Capture>>>>;
+
+/// Least-recently-used cache of [`CAPACITY`] groups.
+#[derive(Debug)]
+pub(super) struct GroupCache {
+    source: Arc<dyn SceneGroups>,
+    /// Groups ordered by last use, the most recent one last.
+    entries: Mutex<Vec<(usize, Slot)>>,
+}
+
+/// Slot for a group. The first thread that needs the group fills the slot while other threads wait.
+type Slot = Arc<OnceLock<OpenedGroup>>;
+
+impl GroupCache {
+    pub fn new(source: Arc<dyn SceneGroups>) -> Self {
+        GroupCache { source, entries: Mutex::default() }
+    }
+
+    /// Returns the group with index `group`, which it opens first if the group isn't in the cache.
+    pub fn open(&self, group: usize) -> OpenedGroup {
+        let slot = {
+            let mut entries = self.entries.lock().expect("no thread panics here");
+            let position = entries.iter().position(|(cached, _)| *cached == group);
+            let entry =
+                position.map_or_else(|| (group, Slot::default()), |position| entries.remove(position));
+            let slot = entry.1.clone();
+            entries.push(entry);
+            let surplus = entries.len().saturating_sub(CAPACITY);
+            entries.drain(..surplus);
+            slot
+        };
+        slot.get_or_init(|| Arc::new(self.source.open(group))).clone()
     }
 }
