@@ -114,6 +114,24 @@ def needles(rng, size):
     return in_front_of_cameras(rng, size, means_in_view(rng, rng.uniform(1.0, 3.0, 24)), np.tile(kinds, (6, 1)), 0.5)
 
 
+@scene("alone", THIN, size=(33, 50))
+def alone(rng, size):
+    """Scenes of one Gaussian, which culling could lose: needles of any direction, large, tiny and faint ones, with centers on
+    borders of blocks of pixels and outside the image."""
+    count, center = 36, np.array([size[1], size[0]]) / 2
+    pixels = np.array([[3.0, 3.0], [60.0, 0.05], [200.0, 0.3], [0.02, 0.02], [8.0, 1.0], [300.0, 40.0]])
+    opacities = np.repeat([0.99, 0.5, 1.02 / 255, 0.05, 1.0, 4 / 255], 6)
+    places = rng.uniform(-1.0, 3.0, (count, 2)) * center
+    places[::3] = 4.0 * np.round(places[::3] / 4.0)
+    means = np.concatenate([(places - center) / 32.0, np.ones((count, 1))], axis=-1)
+    scales = np.concatenate([np.tile(pixels, (6, 1)) / 32.0, np.full((count, 1), 1e-4)], axis=-1)
+    inputs = in_front_of_cameras(rng, size, means, scales, opacities)
+    turn = rng.uniform(0.0, np.pi, count) / 2
+    inputs["quaternions"][0] = np.stack([np.cos(turn), 0 * turn, 0 * turn, np.sin(turn)], axis=-1)
+    cameras = {name: np.repeat(inputs[name], count, axis=0) for name in ("w2c", "intrinsics")}
+    return {name: np.swapaxes(value, 0, 1) for name, value in inputs.items()} | cameras
+
+
 @scene("huge")
 def huge(rng, size):
     scales = 10.0 ** rng.uniform(1.0, 3.0, (8, 1)) * rng.uniform(0.5, 1.5, (8, 3))

@@ -90,31 +90,3 @@ fn peak_from_usage() -> u64 {
     let unit = if cfg!(target_os = "macos") { 1 } else { 1024 };
     usage.ru_maxrss as u64 * unit
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use globalsplat_test_kit::rerun_test;
-
-    const TEST: &str = "device::memory::tests::the_peak_excludes_the_parent_process";
-    const PARENT_PEAK: &str = "GLOBALSPLAT_TEST_PARENT_PEAK";
-
-    #[test]
-    fn the_peak_excludes_the_parent_process() {
-        if let Some(parent) = std::env::var_os(PARENT_PEAK) {
-            let parent: u64 = parent.to_str().unwrap().parse().unwrap();
-            assert!(peak_memory_bytes() < parent / 2, "{} of {parent}", peak_memory_bytes());
-            return;
-        }
-        if !cfg!(target_os = "linux") {
-            return;
-        }
-        let bytes = std::hint::black_box(vec![1u8; 1 << 30]);
-        let peak = peak_memory_bytes().to_string();
-        assert!(peak_memory_bytes() > bytes.len() as u64);
-        assert!(
-            rerun_test(TEST, &[(PARENT_PEAK, Path::new(&peak))]).0,
-            "the child counts its parent's memory"
-        );
-    }
-}

@@ -34,9 +34,6 @@ pub(crate) enum DeviceEvent {
 
 impl DeviceEvent {
     /// Records an event now, without waiting for the GPU.
-    ///
-    /// # Errors
-    /// Returns an error if the GPU is missing or fails.
     pub fn now(device: Device) -> Result<Self> {
         Ok(match gpu(device) {
             Some(gpu) => DeviceEvent::Gpu(ffi::record_event(gpu)?),
@@ -91,9 +88,6 @@ impl Upload {
 
     /// Returns uninitialized bytes on the host, in page-locked memory if the device is a GPU, so that they are copied without
     /// an intermediate buffer.
-    ///
-    /// # Errors
-    /// Returns an error if the system has no page-locked memory left.
     pub fn bytes(&self, shape: &[i64]) -> Result<Tensor> {
         if self.stream.is_none() {
             return Ok(Tensor::empty(shape, (Kind::Uint8, Device::Cpu)));
@@ -104,9 +98,6 @@ impl Upload {
     }
 
     /// Starts copying `tensors` from the host; the caller may drop them immediately.
-    ///
-    /// # Errors
-    /// Returns an error if the GPU fails, or if memory runs out there or on the host.
     pub fn begin(&self, tensors: &[Tensor]) -> Result<PendingCopy> {
         Ok(match &self.stream {
             Some(stream) => {
@@ -134,9 +125,6 @@ pub(crate) enum PendingCopy {
 
 impl PendingCopy {
     /// Returns the tensors on the device. Work queued on the device from now on waits for the copy; the host doesn't.
-    ///
-    /// # Errors
-    /// Returns an error if the GPU fails.
     pub fn wait(self) -> Result<Vec<Tensor>> {
         match self {
             PendingCopy::Done(tensors) => Ok(tensors),

@@ -51,17 +51,11 @@ pub struct EventFile {
 
 impl EventFile {
     /// Creates the file at `path`, whose name must contain `tfevents`.
-    ///
-    /// # Errors
-    /// Returns an error if the file can't be opened.
     pub fn create(path: &Path) -> Result<Self> {
         Ok(EventFile { file: AppendFile::open(path)? })
     }
 
     /// Creates the next file of the run in the folder `run`, in its folder `tensorboard`.
-    ///
-    /// # Errors
-    /// Returns an error if a folder or the file can't be created.
     pub fn create_for(run: &Path) -> Result<Self> {
         let folder = run.join(FOLDER);
         std::fs::create_dir_all(&folder).map_err(Error::write(&folder))?;
@@ -75,9 +69,6 @@ impl EventFile {
 
     /// Writes the first records of the file: the version, and a session start that invalidates events of `step` and later steps in earlier
     /// files.
-    ///
-    /// # Errors
-    /// Returns an error if the file can't be written.
     pub fn start(&mut self, step: u64) -> Result<()> {
         let version = record(&Message::event(0).bytes(3, VERSION.as_bytes()));
         let session = record(&Message::event(step).message(7, &Message::default().varint(1, START)));
@@ -85,9 +76,6 @@ impl EventFile {
     }
 
     /// Writes the scalars of one step, by tag.
-    ///
-    /// # Errors
-    /// Returns an error if the file can't be written.
     pub fn write_scalars(&mut self, step: u64, values: &[(String, f64)]) -> Result<()> {
         let summary = values.iter().fold(Message::default(), |summary, (tag, value)| {
             summary.message(1, &Message::default().bytes(1, tag.as_bytes()).float(2, *value as f32))
@@ -96,9 +84,6 @@ impl EventFile {
     }
 
     /// Writes an image [3, H, W] in [0, 1].
-    ///
-    /// # Errors
-    /// Returns an error if the file can't be written.
     pub fn write_image(&mut self, step: u64, tag: &str, image: &Tensor) -> Result<()> {
         let pixels = rgb_from_tensor(image)?;
         let image = Message::default()

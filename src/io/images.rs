@@ -52,25 +52,15 @@ pub fn check_writable_png(path: &Path) -> Result<()> {
 /// # Errors
 /// Returns an error if the file can't be written.
 pub fn write_png(path: &Path, image: &Tensor) -> Result<()> {
-    write_tensor_image(path, image, false)
+    write_image(path, &rgb_from_tensor(image)?, false)
 }
 
 /// Writes a tensor like [`write_png`], but as a JPEG, which is smaller and lossy.
-///
-/// # Errors
-/// Returns the errors of [`write_png`].
-pub fn write_jpeg(path: &Path, image: &Tensor) -> Result<()> {
-    write_tensor_image(path, image, true)
-}
-
-fn write_tensor_image(path: &Path, image: &Tensor, as_jpeg: bool) -> Result<()> {
-    write_image(path, &rgb_from_tensor(image)?, as_jpeg)
+pub(crate) fn write_jpeg(path: &Path, image: &Tensor) -> Result<()> {
+    write_image(path, &rgb_from_tensor(image)?, true)
 }
 
 /// Writes an image as a JPEG, or as a PNG.
-///
-/// # Errors
-/// Returns an error if the format doesn't support the size, or if the file can't be written.
 fn write_image(path: &Path, image: &RgbImage, as_jpeg: bool) -> Result<()> {
     let bytes = encode_photo(image, as_jpeg)?;
     write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))

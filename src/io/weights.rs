@@ -325,9 +325,6 @@ const SETTINGS: [&str; 1] = ["num_heads"];
 
 /// Returns the tensors of the state dict in `file`, which was read from `path`. The metadata are the strings beside the state dict, and
 /// settings.
-///
-/// # Errors
-/// Returns an error if there is no state dict, or if a tensor is broken.
 fn state_dict(file: &TorchFile, path: &Path) -> Result<Contents> {
     let TorchFile { values, storages } = file;
     let refuse = |found: &str| {
@@ -394,9 +391,6 @@ fn to_kind(dtype: Dtype) -> Kind {
 }
 
 /// Returns the type of `kind` in a file.
-///
-/// # Errors
-/// Returns an error if files have no such type.
 fn to_dtype(kind: Kind) -> Result<Dtype> {
     let dtype = DTYPES.iter().find(|(_, k)| *k == kind).map(|(dtype, _)| *dtype);
     dtype.ok_or_else(|| Error::failed(format!("tensors of kind {kind:?} are not stored")))

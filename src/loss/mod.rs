@@ -192,23 +192,3 @@ fn mean_over_scenes(
     };
     (0..count).map(of_scene).reduce(|sum, loss| sum + loss).expect("a scene") / count as f64
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn every_term_has_its_own_place_and_name() {
-        let config =
-            LossConfig { mse: 2., perceptual_factor: 3., frustum: 5., decoder: 7., ..Default::default() };
-        let tensors = Losses::weighted(&config, |term| Tensor::from(term as usize as f64));
-        let twice = tensors.packed() * 2.;
-        let values = Vec::<f64>::try_from(twice).expect("numbers").try_into().expect("one of each");
-        let sum = Losses::unpacked(&values);
-        assert_eq!(sum.total, 2. * (2. * 0. + 3. * 1. + 2. + 5. * 3. + 7. * 4.));
-        for (place, term) in Term::ALL.into_iter().enumerate() {
-            assert_eq!((term as usize, sum[term]), (place, 2. * place as f64), "{}", term.name());
-            assert_eq!(Term::ALL.iter().filter(|other| other.name() == term.name()).count(), 1);
-        }
-    }
-}

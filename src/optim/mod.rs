@@ -59,32 +59,6 @@ impl Parameter {
     fn moments(&self) -> impl Iterator<Item = (&'static str, &Tensor)> {
         std::iter::once(("first", &self.first)).chain(self.second.iter().map(|second| ("second", second)))
     }
-
-    /// Updates the parameter by AdamW on the CPU. `step_size` is the learning rate over 1 − β₁ᵗ, and `bias_correction2_sqrt` is √(1 − β₂ᵗ).
-    fn update(
-        &self,
-        gradient: &Tensor,
-        step_size: f64,
-        bias_correction2_sqrt: f64,
-        decay: f64,
-        epsilon: f64,
-    ) {
-        let arguments = AdamArguments {
-            value: address(&self.value),
-            gradient: address(gradient),
-            first: address(&self.first),
-            second: address(self.second.as_ref().expect("AdamW's")),
-            step_size,
-            bias_correction2_sqrt,
-            decay,
-            beta1: BETA1,
-            beta2: BETA2,
-            epsilon,
-        };
-        // SAFETY: the tensors outlive the call, and nothing else works on them meanwhile.
-        let done = unsafe { adam(&arguments) };
-        done.expect("a parameter, its gradient and its moments are alike");
-    }
 }
 
 /// Returns the address by which the C++ side refers to a tensor. It is valid as long as the tensor lives.
@@ -264,7 +238,21 @@ impl Optimizer {
         let (step_size, decay) = (learning_rate / bias_correction1, learning_rate * weight_decay);
         let (parameters, gradients) = self.with_gradients(group);
         for (p, gradient) in parameters.iter().zip(&gradients) {
-            p.update(gradient, step_size, bias_correction2_sqrt, decay, self.epsilon);
+            let arguments = AdamArguments {
+                value: address(&p.value),
+                gradient: address(gradient),
+                first: address(&p.first),
+                second: address(p.second.as_ref().expect("AdamW's")),
+                step_size,
+                bias_correction2_sqrt,
+                decay,
+                beta1: BETA1,
+                beta2: BETA2,
+                epsilon: self.epsilon,
+            };
+            // SAFETY: the tensors outlive the call, and nothing else works on them meanwhile.
+            let done = unsafe { adam(&arguments) };
+            done.expect("a parameter, its gradient and its moments are alike");
         }
     }
 

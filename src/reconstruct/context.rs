@@ -114,14 +114,4 @@ mod tests {
         let turns = cameras([0., 0., 0., 0.5, 1.].into_iter().map(DMat4::from_rotation_y));
         assert_eq!(spread_over_path(&turns, &[0, 1, 2, 3, 4], 3), [0, 3, 4]);
     }
-
-    #[test]
-    fn exactly_the_requested_number_is_selected() {
-        let bunched = along(&[0., 9., 9., 9., 9., 9., 9.1]);
-        for wanted in 2..7 {
-            let chosen = spread_over_path(&bunched, &[0, 1, 2, 3, 4, 5, 6], wanted);
-            assert!(chosen.len() == wanted && chosen.is_sorted_by(|a, b| a < b), "{chosen:?}");
-            assert_eq!((chosen[0], chosen[wanted - 1]), (0, 6));
-        }
-    }
 }

@@ -243,9 +243,6 @@ fn is_ours(name: &str) -> bool {
 
 /// Returns the model's tensors under the model's own names, and the number of other tensors in the file. In a checkpoint the names begin
 /// with `model.`, and other networks, such as those of a loss, are stored beside them.
-///
-/// # Errors
-/// Fails if the file holds no model.
 fn model_tensors(file: WeightsFile) -> Result<(WeightsFile, usize)> {
     let plain = |name: &str| {
         let parts: Vec<&str> = name.split('.').filter(|part| !WRAPPERS.contains(part)).collect();
@@ -271,9 +268,6 @@ fn model_tensors(file: WeightsFile) -> Result<(WeightsFile, usize)> {
 }
 
 /// Returns the configuration of a model, inferred from its weights.
-///
-/// # Errors
-/// Fails if the shapes fit no model.
 fn configuration(file: &WeightsFile) -> Result<Config> {
     let shapes: BTreeMap<_, _> = file.shapes().into_iter().map(|(name, (_, shape))| (name, shape)).collect();
     let mut model = ModelConfig::from_shapes(&shapes, file.path())?;

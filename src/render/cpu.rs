@@ -5,7 +5,8 @@ use crate::error::Result;
 use crate::scene::Gaussians;
 use globalsplat_csrc::render as ffi;
 
-pub use ffi::{PairCounts, StageTimes};
+pub use ffi::{PairCounts, StageTimes, multiply_add_peak, stage_times};
+pub use globalsplat_csrc::processor::libtorch_simd_level;
 
 /// Returns the instruction set of the rasterizer's kernels: `avx512`, `avx2`, `neon` or `portable`.
 ///
@@ -15,11 +16,6 @@ pub fn simd_level() -> Result<String> {
     Ok(ffi::simd_level()?)
 }
 
-/// Returns the wall-clock time of each stage of this thread's last [`render()`](super::render()) on the CPU and of its backward pass.
-pub fn stage_times() -> StageTimes {
-    ffi::stage_times()
-}
-
 /// Counts the tile entries and (pixel, splat) pairs that a call of [`render()`](super::render()) with float32 Gaussians has to blend.
 ///
 /// # Errors
@@ -27,16 +23,6 @@ pub fn stage_times() -> StageTimes {
 pub fn count_pairs(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<PairCounts> {
     // SAFETY: the tensors outlive the call.
     Ok(unsafe { ffi::count_pairs(&arguments(gaussians, cameras, eps2d)) }?)
-}
-
-/// Returns the instruction set of libtorch's own kernels, such as "AVX2".
-pub fn libtorch_simd_level() -> String {
-    globalsplat_csrc::processor::libtorch_simd_level()
-}
-
-/// Measures the peak floating-point operations per second of multiply-adds on every thread for `seconds` seconds.
-pub fn multiply_add_peak(seconds: f64) -> f64 {
-    ffi::multiply_add_peak(seconds)
 }
 
 /// Guard that limits libtorch to one thread while it lives. The kernels of this program use as many threads as libtorch did before. This is

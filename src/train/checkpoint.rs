@@ -8,7 +8,7 @@
 use super::trainer::Trainer;
 use crate::error::{Error, Result};
 use crate::io::{
-    InputFiles, WeightsFile, read_weights, recover_dirs, remove_dir, replace_dir, write_atomically,
+    self, InputFiles, WeightsFile, read_weights, recover_dirs, remove_dir, replace_dir, write_atomically,
     write_weights,
 };
 use crate::reconstruct::{ModelDtype, save_model};
@@ -116,9 +116,6 @@ pub(super) fn add_checkpoints(run: &Path, inputs: &mut InputFiles) {
 }
 
 /// Cleans up what a run left if it was killed during a save.
-///
-/// # Errors
-/// Returns an error if files can't be read, renamed or removed.
 pub(super) fn recover(run: &Path) -> Result<()> {
     recover_dirs(run, &FILES)?;
     Ok(recover_dirs(&run.join(FOLDER), &FILES)?)
@@ -201,9 +198,6 @@ impl Trainer {
 
 /// Removes the oldest checkpoints beyond the `kept` newest ones, but never `latest`. Damaged checkpoints don't count, and are removed if
 /// they are older than `latest`.
-///
-/// # Errors
-/// Returns an error if a folder can't be removed.
 pub(super) fn prune_checkpoints(run: &Path, latest: &Path, kept: usize) -> Result<()> {
     let mut others = list_checkpoints(run)?;
     others.retain(|other| other != latest);
@@ -217,9 +211,6 @@ pub(super) fn prune_checkpoints(run: &Path, latest: &Path, kept: usize) -> Resul
 }
 
 /// Checks that a checkpoint is complete and its files have not changed since they were written. Returns its state.
-///
-/// # Errors
-/// Returns an error that names what is missing or damaged.
 pub(super) fn check(checkpoint: &Path) -> Result<State> {
     let state = read_state(checkpoint)?;
     for (name, (bytes, crc)) in &state.files {
@@ -264,17 +255,8 @@ fn write_state(checkpoint: &Path, state: &State) -> Result<()> {
 
 /// Returns the size and CRC-32 of a file.
 fn checksum(path: &Path) -> Result<(u64, u32)> {
-    let mut file = File::open(path).map_err(Error::read(path))?;
-    let (mut buffer, mut hasher, mut size) = (vec![0; 1 << 20], crc32fast::Hasher::new(), 0);
-    loop {
-        match file.read(&mut buffer).map_err(Error::read(path))? {
-            0 => return Ok((size, hasher.finalize())),
-            count => {
-                hasher.update(&buffer[..count]);
-                size += count as u64;
-            }
-        }
-    }
+    let size = fs::metadata(path).map_err(Error::read(path))?.len();
+    Ok((size, io::checksum([path])?))
 }
 
 /// Lock that limits a run's folder to one training process; two would overwrite each other's checkpoints. It is released when it is dropped, or when the process ends for any reason.

@@ -153,9 +153,6 @@ impl ModelReplica {
 /// slice with `forward_backward`. Each other slice is computed by a new thread with one of `replicas`, of which there must be enough. The
 /// slices share libtorch's threads equally, so there must be at most as many slices as threads. `stopwatch` records the sections of the
 /// first slice and the time of waiting for the other slices.
-///
-/// # Errors
-/// Returns an error if rendering fails.
 pub(super) fn gradients_in_parallel(
     forward_backward: &ForwardBackward,
     replicas: &mut [ModelReplica],

@@ -188,9 +188,6 @@ impl Trainer {
 
     /// Computes the loss and gradient of `sample`, which isn't paired yet, and updates the weights. Records the time of each section of the
     /// step in `stopwatch`.
-    ///
-    /// # Errors
-    /// Returns an error if rendering fails, or if another rank is gone.
     pub(crate) fn train_step(
         &mut self,
         sample: &Batch,
@@ -270,9 +267,6 @@ impl Trainer {
     }
 
     /// Repeats the sum of the gradients over all ranks, with no other work at the same time. For benchmarks.
-    ///
-    /// # Errors
-    /// Returns an error if another rank is gone.
     pub(crate) fn add_gradients_up(&self) -> Result<()> {
         self.buckets.begin();
         self.buckets.finish().map(|_| ())

@@ -7,5 +7,4 @@ mod fuzz_seeds;
 mod loader;
 mod model;
 mod perceptual;
-mod published;
 mod splat;

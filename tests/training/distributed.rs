@@ -1,9 +1,9 @@
 //! Distributed processes: they compute what one process computes, and they survive failures.
 #![cfg(target_os = "linux")]
 
-use crate::common::largest_error;
 use crate::common::program::{arg, command, rooms, succeed, text, tiny_config, tiny_weights, train};
 use crate::common::skip;
+use crate::{assert_same_bits, checkpoints, metrics, steps};
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
 use std::fs::{self, File};
@@ -221,44 +221,6 @@ fn data(scenes: u32) -> (TempDir, PathBuf) {
     (folder, config)
 }
 
-/// Returns the lines of metrics.jsonl about steps, and those about validations.
-fn metrics(run: &Path) -> (Vec<Value>, Vec<Value>) {
-    let text = fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
-    // The last line may be incomplete.
-    let lines = text.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
-    let (validations, steps) = lines.partition(|line| line["validation"].is_object());
-    (steps, validations)
-}
-
-fn numbers(lines: &[Value]) -> Vec<u64> {
-    lines.iter().map(|line| line["step"].as_u64().unwrap()).collect()
-}
-
-/// Returns the number of steps before each checkpoint.
-fn checkpoints(run: &Path) -> Vec<u64> {
-    let paths = globalsplat::train::list_checkpoints(run).unwrap();
-    paths.iter().map(|path| arg(path).rsplit_once('-').unwrap().1.parse().unwrap()).collect()
-}
-
-fn weights(file: &Path) -> Vec<(String, tch::Tensor)> {
-    let mut all: Vec<_> = globalsplat::io::read_weights(file).unwrap().tensors.into_iter().collect();
-    all.sort_by(|a, b| a.0.cmp(&b.0));
-    all
-}
-
-fn last_weights(run: &Path) -> Vec<(String, tch::Tensor)> {
-    weights(&globalsplat::train::latest_checkpoint(run).unwrap().join("model.safetensors"))
-}
-
-fn distance(a: &[(String, tch::Tensor)], b: &[(String, tch::Tensor)]) -> f64 {
-    assert!(a.len() > 10 && a.len() == b.len());
-    let errors = a.iter().zip(b).map(|((name, x), (other, y))| {
-        assert_eq!(name, other);
-        largest_error(x, y)
-    });
-    errors.fold(0., f64::max)
-}
-
 #[track_caller]
 fn assert_close(a: &Value, b: &Value, tolerance: f64) {
     let (x, y) = (a.as_f64().unwrap(), b.as_f64().unwrap());
@@ -268,22 +230,12 @@ fn assert_close(a: &Value, b: &Value, tolerance: f64) {
 /// Asserts that the steps of both runs agree up to the order of summation.
 #[track_caller]
 fn assert_same_steps(a: &Path, b: &Path) {
+    assert_eq!(steps(a).0, steps(b).0);
     let (a, b) = (metrics(a).0, metrics(b).0);
-    assert_eq!(numbers(&a), numbers(&b));
     for (a, b) in a.iter().zip(&b) {
         for field in ["loss", "psnr", "gradient_norm", "learning_rate"] {
             assert_close(&a[field], &b[field], 1e-5);
         }
-    }
-}
-
-/// Asserts that both runs ended bit-identically.
-#[track_caller]
-fn assert_same_bits(a: &Path, b: &Path) {
-    let [a, b] = [a, b].map(|run| globalsplat::train::latest_checkpoint(run).unwrap());
-    assert_eq!(a.file_name(), b.file_name());
-    for file in ["model.safetensors", "optimizer.safetensors", "state.json"] {
-        assert!(fs::read(a.join(file)).unwrap() == fs::read(b.join(file)).unwrap(), "{file}");
     }
 }
 
@@ -326,8 +278,8 @@ fn ranks_of_slurm_s_script_train_like_one() {
     assert_eq!(ended.out.matches("trained in ").count(), 1, "{}", ended.out);
 
     assert_same_steps(&two, &one);
+    assert_eq!(steps(&two).1, [4, 9, 11]);
     let [of_one, of_two] = [&one, &two].map(|run| metrics(run).1);
-    assert_eq!((numbers(&of_one), numbers(&of_two)), (vec![4, 9, 11], vec![4, 9, 11]));
     for (a, b) in of_one.iter().zip(&of_two) {
         let [a, b] = [a, b].map(|line| &line["validation"]);
         assert_eq!((a["scenes"].as_u64(), b["scenes"].as_u64()), (Some(5), Some(5)));
@@ -395,9 +347,7 @@ fn ranks_that_die_are_survived_to_the_same_bits() {
 
     assert_same_bits(&run, &whole);
     assert_same_steps(&run, &whole);
-    let (steps, validations) = metrics(&run);
-    assert_eq!(numbers(&steps), (0..20).collect::<Vec<_>>(), "every step once");
-    assert_eq!(numbers(&validations), [9, 19]);
+    assert_eq!(steps(&run), ((0..20).collect(), vec![9, 19]), "every step once");
     let [a, b] = [&run, &whole].map(|run| fs::read(run.join("best/state.json")).unwrap());
     assert!(a == b, "the best checkpoint, by the same score");
     assert_eq!(
@@ -432,7 +382,11 @@ fn an_error_is_printed_once() {
     let foreign = run.join("config.toml");
     fs::write(&foreign, "").unwrap();
     let mistakes = [
-        (both(vec!["inspect".into(), "x".into()]), 2, "this is work for one process, and torchrun started 2: expected train,"),
+        (
+            both(vec!["inspect".into(), "x".into()]),
+            2,
+            "this is work for one process, and torchrun started 2: expected train,",
+        ),
         (both(settings("train.steps=\"x\"")), 2, "train.steps=\"x\": "),
         (both(settings("train.stepz=3")), 2, "unknown field `stepz`"),
         (both(settings("data.captures=[\"nowhere\"]")), 2, "nowhere"),

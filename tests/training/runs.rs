@@ -2,6 +2,7 @@
 #![cfg(unix)]
 
 use crate::common::program::{arg, command, fail, refuse, room, succeed, text, tiny_config, train};
+use crate::{assert_same_bits, checkpoints, metrics, steps};
 use globalsplat::config::Config;
 use globalsplat::data::TrainingScenes;
 use globalsplat::error::Error;
@@ -26,33 +27,6 @@ fn tensors(run: &Path) -> Vec<(String, tch::Tensor)> {
     }
     all.sort_by(|a, b| a.0.cmp(&b.0));
     all
-}
-
-#[track_caller]
-fn assert_same_bits(a: &Path, b: &Path) {
-    let (a, b) = (tensors(a), tensors(b));
-    assert!(a.len() > 10 && a.len() == b.len());
-    for ((name, x), (other, y)) in a.iter().zip(&b) {
-        assert!(name == other && x.equal(y), "{name}");
-    }
-}
-
-fn metrics(run: &Path) -> Vec<Value> {
-    let text = std::fs::read_to_string(run.join("metrics.jsonl")).unwrap();
-    text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
-}
-
-/// Returns the steps that metrics.jsonl records, and those after which it records a validation.
-fn steps(run: &Path) -> (Vec<u64>, Vec<u64>) {
-    let (validations, steps): (Vec<_>, Vec<_>) =
-        metrics(run).into_iter().partition(|line| line["validation"].is_object());
-    let numbers = |lines: Vec<Value>| lines.iter().map(|line| line["step"].as_u64().unwrap()).collect();
-    (numbers(steps), numbers(validations))
-}
-
-fn checkpoints(run: &Path) -> Vec<String> {
-    let paths = globalsplat::train::list_checkpoints(run).unwrap();
-    paths.iter().map(|path| path.file_name().unwrap().to_string_lossy().into_owned()).collect()
 }
 
 #[test]
@@ -235,9 +209,9 @@ fn numbers_that_are_not_finite_end_a_run_and_leave_the_checkpoint_before_them() 
     {
         assert!(error.contains(part), "{part}: {error}");
     }
-    assert_eq!(checkpoints(&run), ["step-00000002", "step-00000004"]);
+    assert_eq!(checkpoints(&run), [2, 4]);
     assert!(tensors(&run).iter().zip(&good).all(|((_, x), (_, y))| x.equal(y)));
-    let records = metrics(&run);
+    let records = metrics(&run).0;
     let skipped: Vec<bool> = records.iter().filter_map(|line| line["skipped"].as_bool()).collect();
     assert_eq!(skipped, [[false; 5], [true; 5]].concat());
     assert_eq!(records.last().unwrap()["scenes"], serde_json::json!(["room_000"]));
@@ -291,8 +265,8 @@ fn the_best_checkpoint_is_kept_and_exported() {
         &[&settings[..], &["train.steps=14", "train.learning_rate=1"]].concat(),
     )));
     let validations: Vec<(u64, f64)> = metrics(&run)
+        .1
         .iter()
-        .filter(|line| line["validation"].is_object())
         .map(|line| (line["step"].as_u64().unwrap(), line["validation"]["psnr"].as_f64().unwrap()))
         .collect();
     assert_eq!(
@@ -304,7 +278,7 @@ fn the_best_checkpoint_is_kept_and_exported() {
     let state: Value = serde_json::from_slice(&std::fs::read(run.join("best/state.json")).unwrap()).unwrap();
     let reported = (state["step"].as_u64(), state["validation"]["psnr"].as_f64());
     assert_eq!(reported, (Some(best.0 + 1), Some(best.1)));
-    assert_eq!(checkpoints(&run), ["step-00000014"], "the best one is kept beside them");
+    assert_eq!(checkpoints(&run), [14], "the best one is kept beside them");
 
     let weights = folder.path().join("best.safetensors");
     succeed(&["export", "--run", arg(&run), "--best", "--out", arg(&weights)]);
@@ -345,7 +319,7 @@ fn a_run_goes_on_from_a_checkpoint_that_is_named_unless_it_has_later_ones() {
     let (folder, room) = room();
     let (config, run) = (tiny_config(folder.path(), &room), folder.path().join("run"));
     succeed(&text(&train(&config, &run, &["train.checkpoint_every=2"])));
-    assert_eq!(checkpoints(&run), ["step-00000004", "step-00000006"]);
+    assert_eq!(checkpoints(&run), [4, 6]);
     let from = run.join("checkpoints/step-00000004");
     let resume = |out: &Path| [train(&config, out, &[]), vec!["--resume".into(), arg(&from).into()]].concat();
     let error = fail(&text(&resume(&run)), 2);
@@ -394,7 +368,7 @@ fn held_out_scenes_are_checked_before_training() {
     let [out, err] = [output.stdout, output.stderr].map(|bytes| String::from_utf8(bytes).unwrap());
     assert_eq!(out.lines().filter(|line| line.starts_with("room_000")).count(), 2, "{out}");
     assert!(err.contains("room_000 of data.validation is also a training scene"), "{err}");
-    assert_eq!(metrics(&run).last().unwrap()["validation"]["scenes"], 2);
+    assert_eq!(metrics(&run).1.last().unwrap()["validation"]["scenes"], 2);
 }
 
 #[test]
@@ -405,13 +379,9 @@ fn weights_are_used_at_the_stage_that_they_were_trained_to() {
     let settings = ["train.checkpoint_every=1", "train.keep_checkpoints=6", "train.validate_every=1"];
     let out = command(&text(&train(&config, &run, &settings))).output().unwrap();
     assert!(out.status.success());
-    let validations: Vec<Value> = metrics(&run)
-        .into_iter()
-        .map(|mut line| line["validation"].take())
-        .filter(Value::is_object)
-        .collect();
-    let stages: Vec<_> =
-        validations.iter().map(|v| (v["stage"].as_u64().unwrap(), v["mix"].as_f64().unwrap())).collect();
+    let validations = metrics(&run).1;
+    let scores = validations.iter().map(|line| &line["validation"]);
+    let stages: Vec<_> = scores.map(|v| (v["stage"].as_u64().unwrap(), v["mix"].as_f64().unwrap())).collect();
     assert_eq!(
         stages,
         [(0, 1.), (0, 1.), (1, 0.), (1, 0.5), (2, 0.), (2, 1.)],
@@ -472,7 +442,7 @@ fn a_run_begins_with_the_weights_that_are_named() {
     for ((name, x), (_, y)) in of_model(&first).iter().zip(of_model(&second)) {
         assert!(x.equal(&y), "{name}");
     }
-    let stage = metrics(&second)[0]["stage"].as_u64();
+    let stage = metrics(&second).0[0]["stage"].as_u64();
     assert_eq!(stage, Some(2), "all Gaussians are shown from the first step on");
 
     // Weights for patches with half the edge sum up to those they come from. Each scene token is split into several, which together cover
