@@ -22,73 +22,53 @@ pub struct ComparedPhoto<'a> {
     pub to_pixels: [DVec3; 4],
 }
 
-/// Search for the depths of a photo: [`search_depths`] or [`match_semi_globally`].
-pub type Search = fn(&Tensor, Option<&Tensor>, &[ComparedPhoto], f64, i64) -> (Tensor, Tensor);
-
-/// Returns the inverse depth at which each pixel of `grey` [h, w] looks most alike in the other photos, and the correlation there, both
-/// [h, w], float32 on the CPU. The candidates are the multiples 0 to `planes` − 1 of `step`.
-///
-/// The correlation is that of the patches around the pixel, weighted by the product of both photos' weights, on average over the better
-/// half of the photos. It is −1 for a photo that doesn't show the pixel, or in which less than half of it, or less than a quarter of the
-/// patch, counts.
-///
-/// # Panics
-/// Panics if there are no other photos or no planes, or if shapes don't fit.
-pub fn search_depths(
-    grey: &Tensor,
-    weight: Option<&Tensor>,
-    others: &[ComparedPhoto],
-    step: f64,
-    planes: i64,
-) -> (Tensor, Tensor) {
-    run(kernel::search_depths, grey, weight, others, step, planes)
+/// Search for the depths of a photo's pixels among the multiples 0 to `planes` − 1 of an inverse depth.
+#[derive(Debug, Clone, Copy)]
+pub enum Search {
+    /// The inverse depth at which a pixel looks most alike in the other photos, and the correlation there: that of the patches around the
+    /// pixel, weighted by the product of both photos' weights, on average over the better half of the photos. It is −1 for a photo that
+    /// doesn't show the pixel, or in which less than half of it, or less than a quarter of the patch, counts.
+    PatchCorrelation,
+    /// The inverse depth by semi-global matching, and how sure it is, in [0, 1]. The costs are those of the candidates of the other search;
+    /// depths that differ little between pixels cost less (`csrc/kernels/semi_global.h`).
+    SemiGlobal,
 }
 
-/// Returns the inverse depths of the pixels of `grey` [h, w] by semi-global matching, and how sure each is, in [0, 1], both [h, w], float32
-/// on the CPU. The costs are those of the candidates of [`search_depths`]; depths that differ little between pixels cost less
-/// (`csrc/kernels/semi_global.h`).
-///
-/// # Panics
-/// Panics if there are no other photos or no planes, or if shapes don't fit.
-pub fn match_semi_globally(
-    grey: &Tensor,
-    weight: Option<&Tensor>,
-    others: &[ComparedPhoto],
-    step: f64,
-    planes: i64,
-) -> (Tensor, Tensor) {
-    run(kernel::match_semi_globally, grey, weight, others, step, planes)
-}
-
-/// Search as this module's kernels export it: addresses of the photo and its weights, the photos to compare, the step and number of planes,
-/// and where the addresses of two new tensors are stored.
-type Kernel =
-    unsafe fn(usize, usize, &[PhotoToCompare], f32, i32, &mut [usize]) -> Result<(), cxx::Exception>;
-
-fn run(
-    kernel: Kernel,
-    grey: &Tensor,
-    weight: Option<&Tensor>,
-    others: &[ComparedPhoto],
-    step: f64,
-    planes: i64,
-) -> (Tensor, Tensor) {
-    let address = |tensor: Option<&Tensor>| tensor.map_or(0, |tensor| tensor.as_ptr() as usize);
-    let others: Vec<PhotoToCompare> = others
-        .iter()
-        .map(|other| PhotoToCompare {
-            grey: address(Some(other.grey)),
-            weight: address(other.weight),
-            to_pixels: std::array::from_fn(|i| other.to_pixels[i % 4][i / 4] as f32),
-        })
-        .collect();
-    let [grey, weight] = [Some(grey), weight].map(address);
-    // SAFETY: the tensors outlive the call, and on success the C++ side has stored two new tensors in `out`.
-    let search =
-        |out: &mut [usize]| unsafe { kernel(grey, weight, &others, step as f32, planes as i32, out) };
-    let done = unsafe { take_outputs(search) };
-    let [first, second] = done.unwrap_or_else(|error| panic!("{error}"));
-    (first, second)
+impl Search {
+    /// Returns the inverse depth of every pixel of `grey` [h, w], among the multiples of `step`, and its correlation or how sure it is, both
+    /// [h, w], float32 on the CPU.
+    ///
+    /// # Panics
+    /// Panics if there are no other photos or no planes, or if shapes don't fit.
+    pub fn run(
+        self,
+        grey: &Tensor,
+        weight: Option<&Tensor>,
+        others: &[ComparedPhoto],
+        step: f64,
+        planes: i64,
+    ) -> (Tensor, Tensor) {
+        let address = |tensor: Option<&Tensor>| tensor.map_or(0, |tensor| tensor.as_ptr() as usize);
+        let others: Vec<PhotoToCompare> = others
+            .iter()
+            .map(|other| PhotoToCompare {
+                grey: address(Some(other.grey)),
+                weight: address(other.weight),
+                to_pixels: std::array::from_fn(|i| other.to_pixels[i % 4][i / 4] as f32),
+            })
+            .collect();
+        let [grey, weight] = [Some(grey), weight].map(address);
+        let kernel = match self {
+            Search::PatchCorrelation => kernel::search_depths,
+            Search::SemiGlobal => kernel::match_semi_globally,
+        };
+        // SAFETY: the tensors outlive the call, and on success the C++ side has stored two new tensors in `out`.
+        let done = unsafe {
+            take_outputs(|out| kernel(grey, weight, &others, step as f32, planes as i32, out))
+        };
+        let [inverse_depths, scores] = done.unwrap_or_else(|error| panic!("{error}"));
+        (inverse_depths, scores)
+    }
 }
 
 /// Downscaled photo.

@@ -1,6 +1,6 @@
 //! Depths of all pixels of the views that a model reads (spec 3.5), on which several photos agree.
 
-use super::depth_search::{SmallPhoto, match_semi_globally};
+use super::depth_search::{Search, SmallPhoto};
 use super::sweep::{SceneDepth, Sweep, filled, most_alike};
 use crate::scene::Camera;
 use tch::{Device, Kind, Tensor, no_grad};
@@ -42,7 +42,7 @@ pub(super) fn inverse_depths(photos: &[SmallPhoto], planes: i64) -> Vec<[Tensor;
     let matched = |(index, scene)| {
         let photo: &SmallPhoto = &photos[index];
         let (others, nearest) = sweep.compared_with(index, scene);
-        let (inverse, sureness) = most_alike(photo, &others, nearest, planes, match_semi_globally);
+        let (inverse, sureness) = most_alike(photo, &others, nearest, planes, Search::SemiGlobal);
         let step = nearest / (planes - 1) as f64;
         MatchedDepths { photo, inverse, sureness, step, is_measured: !others.is_empty() }
     };

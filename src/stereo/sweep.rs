@@ -1,7 +1,7 @@
 //! Depth estimation by a plane sweep (Collins 1996): finds for every pixel the depth at which its neighbourhood looks most alike in photos
 //! taken from other positions. It needs no weights and no points.
 
-use super::depth_search::{ComparedPhoto, Search, SmallPhoto, search_depths};
+use super::depth_search::{ComparedPhoto, Search, SmallPhoto};
 use super::view_selection::{
     are_near_duplicates, at_octaves, extent, farthest_first, neighbours, projection,
 };
@@ -75,7 +75,7 @@ pub(crate) fn sweep(
         };
         if swept.iter().all(is_new) {
             let (others, nearest) = sweep.compared_with(index, &scene);
-            let (inverse, correlation) = most_alike(this, &others, nearest, PLANES, search_depths);
+            let (inverse, correlation) = most_alike(this, &others, nearest, PLANES, Search::PatchCorrelation);
             let weight = (&correlation - ZERO_WEIGHT_CORRELATION).clamp_min(0.).square();
             let filled = filled(&inverse, &weight, this.counted().as_ref());
             let map = DepthMap {
@@ -182,7 +182,7 @@ struct Measured {
 
 fn measured(this: &SmallPhoto, other: &SmallPhoto) -> Measured {
     let nearest = nearest_of_cameras(this, other);
-    let (inverse, correlation) = most_alike(this, &[other], nearest, COARSE_PLANES, search_depths);
+    let (inverse, correlation) = most_alike(this, &[other], nearest, COARSE_PLANES, Search::PatchCorrelation);
     let sure = inverse.masked_select(&correlation.gt(MIN_CORRELATION));
     let pixels =
         this.counted().map_or(inverse.numel() as i64, |counted| counted.sum(Kind::Int64).int64_value(&[]));
@@ -232,7 +232,7 @@ pub(super) fn most_alike(
         return (Tensor::full(this.size(), nearest / 2., options), Tensor::zeros(this.size(), options));
     }
     let compared: Vec<ComparedPhoto> = others.iter().map(|other| other.compared_with(&this.camera)).collect();
-    search(&this.grey, this.weight.as_ref(), &compared, nearest / (planes - 1) as f64, planes)
+    search.run(&this.grey, this.weight.as_ref(), &compared, nearest / (planes - 1) as f64, planes)
 }
 
 /// Replaces inverse depths of low weight by those of reliable pixels around them, the nearest weighted most.

@@ -11,7 +11,7 @@ use crate::optim::Optimizer;
 use crate::reconstruct::fit_colors;
 use crate::render::{self, Cameras};
 use crate::scene::{self, Gaussians, RadialWarp};
-use crate::stereo::depth_search::{ComparedPhoto, Search, match_semi_globally, search_depths};
+use crate::stereo::depth_search::{ComparedPhoto, Search};
 use crate::train;
 use glam::{DMat4, DVec3};
 use image::RgbImage;
@@ -76,8 +76,8 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
             request.input("photo")?,
             request.number("factor")?,
         )),
-        "depth_search" => depth_search(request, search_depths, "correlation"),
-        "semi_global_matching" => depth_search(request, match_semi_globally, "sureness"),
+        "depth_search" => depth_search(request, Search::PatchCorrelation, "correlation"),
+        "semi_global_matching" => depth_search(request, Search::SemiGlobal, "sureness"),
         "sh_soft_cap" => loss_of(loss::sh_soft_cap(request.input("sh")?)),
         "decoder_regularization" => decoder_regularization(request),
         "lpips" => lpips(request),
@@ -387,7 +387,7 @@ fn depth_search(request: &Request, search: Search, score: &'static str) -> Resul
     let others = greys.iter().enumerate().map(compared).collect::<Result<Vec<_>>>()?;
     let (step, planes) = (request.number("step")?, request.number("planes")?);
     let (inverse_depth, scores) =
-        search(request.input("grey")?, request.inputs.get("weight"), &others, step, planes);
+        search.run(request.input("grey")?, request.inputs.get("weight"), &others, step, planes);
     let image = |t: Tensor| t.unsqueeze(0).unsqueeze(0);
     outputs([("inverse_depth", image(inverse_depth)), (score, image(scores))])
 }
