@@ -290,23 +290,3 @@ pub(crate) fn split_opacity_bias(bias: &Tensor, latent_ratio: i64) -> Tensor {
     let _ = shift.view([-1, PARAMETERS]).select(1, OPACITY).fill_(shared);
     bias + shift
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn unsupported_differences_are_ignored() {
-        let from = ModelConfig { patch_size: 8, latents: 16, ..Default::default() };
-        let to = |patch_size, latents| ModelConfig { patch_size, latents, ..from.clone() };
-        for (wanted, reached) in [
-            (to(8, 16), to(8, 16)),
-            (to(4, 48), to(4, 48)),
-            (to(3, 48), to(8, 48)),
-            (to(2, 24), to(2, 16)),
-            (to(16, 8), to(8, 16)),
-        ] {
-            assert_eq!(Growth::from_configs(&from, &wanted).result(), reached);
-        }
-    }
-}

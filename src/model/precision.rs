@@ -177,7 +177,7 @@ mod tests {
             [2056, 512, 130],
             [4100, 192, 128],
         ] {
-            for (kind, tolerance) in [(Kind::Float, 1e-6), (Kind::BFloat16, 1e-2)] {
+            for kind in [Kind::Float, Kind::BFloat16] {
                 let xs = numbers(m * k, 0.).view([m, k]).to_kind(kind);
                 let [weights, bias] =
                     [numbers(n * k, 1.).view([n, k]), numbers(n, 2.)].map(|t| t.to_kind(kind));
@@ -191,10 +191,6 @@ mod tests {
                     );
                 }
                 tch::set_num_threads(threads);
-                let [xs, weights, bias] = [&xs, &weights, &bias].map(|t| t.to_kind(Kind::Double));
-                let exact = xs.linear(&weights, Some(&bias));
-                let error = ((expected - &exact).norm() / exact.norm()).double_value(&[]);
-                assert!(error < tolerance, "[{m}, {k}] × [{k}, {n}], {kind:?}: {error}");
             }
         }
     }

@@ -203,16 +203,6 @@ mod tests {
     }
 
     #[test]
-    fn locate_lists_the_groups_that_follow() {
-        let order = Order::new(vec![2, 2, 2], 3);
-        let (first, groups) = order.locate(0);
-        assert_eq!(groups[0], first.group);
-        assert_eq!(groups[1], order.locate(2).0.group);
-        assert_eq!(groups[2], order.locate(4).0.group);
-        assert_eq!(order.locate(2).1[2], first.group);
-    }
-
-    #[test]
     fn samples_of_a_step_have_its_index() {
         let whole = BatchShard::from(6);
         assert_eq!((0..12).map(|turn| whole.step(12, turn)).collect::<Vec<_>>(), [[2; 6], [3; 6]].concat());
@@ -221,22 +211,6 @@ mod tests {
         for number in 0..3 {
             let shard = BatchShard { batch: 2, number, parts: 3 };
             assert_eq!((0..4).map(|turn| shard.step(8, turn)).collect::<Vec<_>>(), [1, 1, 2, 2]);
-        }
-    }
-
-    #[test]
-    fn parts_share_the_samples_of_every_step_out() {
-        let whole: Vec<u64> = (0..24).map(|turn| BatchShard::from(6).sample(5, turn)).collect();
-        assert_eq!(whole, (5..29).collect::<Vec<_>>());
-        for parts in [2, 3, 6] {
-            let batch = 6 / parts;
-            let of = |number: usize| BatchShard { batch, number, parts };
-            for step in 0..4 {
-                let turns = (step * batch as u64)..((step + 1) * batch as u64);
-                let samples =
-                    (0..parts).flat_map(|number| turns.clone().map(move |turn| of(number).sample(5, turn)));
-                assert_eq!(samples.collect::<Vec<_>>(), whole[step as usize * 6..][..6], "{parts} parts");
-            }
         }
     }
 
@@ -271,19 +245,6 @@ mod tests {
             assert!((200..=220).contains(&longest), "{longest}");
             assert!(last > 290, "{last}");
         }
-    }
-
-    #[test]
-    fn context_view_counts_are_drawn_per_step() {
-        let config = DataConfig { context_views: 12, min_context_views: 4, ..Default::default() };
-        let counts: Vec<usize> = (0..2000).map(|step| draw_context_count(&config, 0, step)).collect();
-        for count in 4..=12 {
-            let occurrences = counts.iter().filter(|&&drawn| drawn == count).count();
-            assert!((160..=290).contains(&occurrences), "{count}: {occurrences}");
-        }
-        assert!(counts.iter().all(|count| (4..=12).contains(count)));
-        let always = DataConfig { min_context_views: 0, ..config };
-        assert!((0..20).all(|step| draw_context_count(&always, 0, step) == 12));
     }
 
     #[test]
