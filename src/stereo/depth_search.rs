@@ -63,9 +63,8 @@ impl Search {
             Search::SemiGlobal => kernel::match_semi_globally,
         };
         // SAFETY: the tensors outlive the call, and on success the C++ side has stored two new tensors in `out`.
-        let done = unsafe {
-            take_outputs(|out| kernel(grey, weight, &others, step as f32, planes as i32, out))
-        };
+        let done =
+            unsafe { take_outputs(|out| kernel(grey, weight, &others, step as f32, planes as i32, out)) };
         let [inverse_depths, scores] = done.unwrap_or_else(|error| panic!("{error}"));
         (inverse_depths, scores)
     }

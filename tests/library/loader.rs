@@ -2,7 +2,8 @@
 
 use glam::{DMat4, DVec3};
 use globalsplat::data::{
-    Batch, Capture, DataConfig, DataLoader, JitterConfig, LoadedScene, SceneGroups, open_capture, write_cameras_json,
+    Batch, Capture, DataConfig, DataLoader, JitterConfig, LoadedScene, SceneGroups, open_capture,
+    write_cameras_json,
 };
 use globalsplat::error::{Error, Result};
 use globalsplat::scene::{Camera, Intrinsics};
