@@ -207,16 +207,8 @@ impl Mp4 {
         /// Constant rate factor with almost no visible loss; ffmpeg's default is 23.
         const QUALITY: &str = "18";
         /// Declaration of sRGB colors. Without it, players assume BT.601 for small videos and BT.709 for large ones, and colors shift.
-        const COLORS: [&str; 8] = [
-            "-colorspace",
-            "bt709",
-            "-color_primaries",
-            "bt709",
-            "-color_trc",
-            "iec61966-2-1",
-            "-color_range",
-            "tv",
-        ];
+        const COLORS: &str =
+            "-colorspace bt709 -color_primaries bt709 -color_trc iec61966-2-1 -color_range tv";
         let ImageSize { height, width } = size;
         if height < 2 || width < 2 {
             let found = format!("{width}×{height} pixels");
@@ -226,20 +218,11 @@ impl Mp4 {
         let to_yuv = "scale=in_range=pc:out_range=tv:out_color_matrix=bt709:flags=bicubic+accurate_rnd+full_chroma_int";
         let mut command = Command::new("ffmpeg");
         command
-            .args([
-                "-v",
-                "error",
-                "-y",
-                "-f",
-                "rawvideo",
-                "-pix_fmt",
-                "rgb24",
-                "-s",
-                &format!("{width}x{height}"),
-            ])
+            .args("-v error -y -f rawvideo -pix_fmt rgb24".split(' '))
+            .args(["-s", &format!("{width}x{height}")])
             .args(["-r", &frames_per_second.to_string(), "-i", "-", "-vf", &format!("{even},{to_yuv}")])
             .args(["-c:v", ENCODER, "-crf", QUALITY, "-pix_fmt", "yuv420p"])
-            .args(COLORS)
+            .args(COLORS.split(' '))
             // Puts the index that a player needs at the start, so that a page shows the video while it still loads.
             .args(["-movflags", "+faststart", "-f", "mp4"])
             .arg(place)

@@ -170,10 +170,10 @@ fn instruction_sets_agree() {
         if simd_level().is_err() {
             std::process::exit(UNSUPPORTED);
         }
-        let g = gaussians(1, 16384, 3, Kind::Float, 4);
+        let g = gaussians(1, 4096, 3, Kind::Float, 4);
         // Small Gaussians: with many of them behind each pixel, gradients would magnify the rounding.
         let g = leaves(&Gaussians { scales: &g.scales * 0.1, ..of_any_length(&g) });
-        let p = draw(&g, &cameras(1, 12, 256, 256, Kind::Float));
+        let p = draw(&g, &cameras(1, 12, 128, 128, Kind::Float));
         objective(&p).backward();
         let mut tensors = vec![("rgb", p.rgb), ("alpha", p.alpha), ("depth", p.depth)];
         tensors.extend(fields(&g).map(|(name, leaf)| (name, leaf.grad())));
@@ -204,8 +204,8 @@ fn instruction_sets_agree() {
 #[test]
 fn kernels_for_gpus_draw_the_cpus_bits() {
     let answer = |kind: Kind| {
-        let g = of_any_length(&gaussians(2, 700, 3, Kind::Float, 21)).map(|t| t.to_kind(kind));
-        let c = cameras(2, 2, 75, 50, Kind::Float);
+        let g = of_any_length(&gaussians(2, 300, 3, Kind::Float, 21)).map(|t| t.to_kind(kind));
+        let c = cameras(2, 1, 45, 35, Kind::Float);
         tensors(&g, &Cameras { w2c: c.w2c.to_kind(kind), intrinsics: c.intrinsics.to_kind(kind), ..c })
     };
     let was_cpu = || globalsplat::render::cpu::stage_times().blend_backward > 0.;

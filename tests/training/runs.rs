@@ -31,7 +31,7 @@ fn tensors(run: &Path) -> Vec<(String, tch::Tensor)> {
 
 #[test]
 fn a_run_that_is_killed_ends_with_the_same_bits() {
-    const STEPS: u64 = 25;
+    const STEPS: u64 = 15;
     let (folder, room) = room();
     let config = tiny_config(folder.path(), &room);
     let (whole, killed) = (folder.path().join("whole"), folder.path().join("killed"));
@@ -45,7 +45,7 @@ fn a_run_that_is_killed_ends_with_the_same_bits() {
     let step_time = begun.elapsed().as_secs_f64() / STEPS as f64;
     // A checkpoint after every step: saves take about as much time as steps.
     let mut random = ChaCha8Rng::seed_from_u64(7);
-    for _ in 0..4 {
+    for _ in 0..3 {
         let lines = count_metrics_lines(&killed) + random.random_range(0..=2);
         let mut child = run(&killed).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
         wait_for_lines(&mut child, &killed, lines);
