@@ -25,31 +25,41 @@ pub type Reader = fn(&[u8]);
 /// Readers, by the names that `scripts/fuzz.sh` takes and of the folders of their seeds.
 pub const READERS: [(&str, Reader); 26] = [
     ("antimatter", antimatter),
-    ("camera_path", camera_path),
+    // A camera path of nerfstudio's viewer.
+    ("camera_path", |bytes| {
+        let _ = read_camera_path(&file("camera_path", "path.json", bytes), Some([8, 8].into()));
+    }),
     ("cameras_json", cameras_json),
     ("checkpoint", checkpoint),
     ("chunk", chunk),
     ("chunk_pickle", chunk_pickle),
-    ("colmap_binary", colmap_binary),
+    ("colmap_binary", |bytes| colmap("colmap_binary", bytes, "bin")),
     ("colmap_points", colmap_points),
-    ("colmap_text", colmap_text),
-    ("compressed_ply", compressed_ply),
-    ("configuration", configuration),
+    ("colmap_text", |bytes| colmap("colmap_text", bytes, "txt")),
+    ("compressed_ply", |bytes| read_and_repair(&file("compressed_ply", "splat.compressed.ply", bytes))),
+    ("configuration", |bytes| {
+        let _ = std::str::from_utf8(bytes).map(|text| Config::parse(text, &[], Path::new("config.toml")));
+    }),
     ("dataset_index", dataset_index),
     ("evaluation", evaluation),
-    ("evaluation_index", evaluation_index),
-    ("glb", glb),
-    ("gltf", gltf),
-    ("ksplat", ksplat),
-    ("photo", photo),
-    ("ply", ply),
-    ("sog", sog),
+    ("evaluation_index", |bytes| {
+        let _ = EvaluationIndex::read(&file("evaluation_index", "index.json", bytes));
+    }),
+    ("glb", |bytes| read_and_repair(&file("glb", "splat.glb", bytes))),
+    ("gltf", |bytes| read_and_repair(&file("gltf", "splat.gltf", bytes))),
+    ("ksplat", |bytes| read_and_repair(&file("ksplat", "splat.ksplat", bytes))),
+    ("photo", |bytes| {
+        let _ = decode_photo(bytes, Path::new("photo.jpg"), (8, 8));
+    }),
+    ("ply", |bytes| read_and_repair(&file("ply", "splat.ply", bytes))),
+    ("sog", |bytes| read_and_repair(&file("sog", "splat.sog", bytes))),
     ("splat_origin", splat_origin),
-    ("spz", spz),
+    ("spz", |bytes| read_and_repair(&file("spz", "splat.spz", bytes))),
     ("spz_body", spz_body),
     ("transforms_json", transforms_json),
     ("weights", weights),
-    ("weights_pickle", weights_pickle),
+    // A checkpoint with this pickle; storages 0 to 2 have 512, 64 and no bytes.
+    ("weights_pickle", |bytes| weights(&torch_archive(bytes, &[&[0; 512], &[0; 64], &[]]))),
 ];
 
 /// Returns the folder of the readers' files: in memory, if the system has such a file system.
@@ -108,11 +118,6 @@ fn cameras_json(bytes: &[u8]) {
     let _ = read_camera_path(&file, None);
 }
 
-/// Reads a camera path of nerfstudio's viewer.
-fn camera_path(bytes: &[u8]) {
-    let _ = read_camera_path(&file("camera_path", "path.json", bytes), Some([8, 8].into()));
-}
-
 fn transforms_json(bytes: &[u8]) {
     let _ = open_capture(&file("transforms_json", "transforms.json", bytes)).map(|capture| load(&capture));
 }
@@ -131,14 +136,6 @@ fn colmap(reader: &str, bytes: &[u8], ending: &str) {
     file(reader, &format!("sparse/0/cameras.{ending}"), cameras);
     file(reader, &format!("sparse/0/images.{ending}"), images);
     let _ = open_capture(&folder(reader)).map(|capture| load(&capture));
-}
-
-fn colmap_binary(bytes: &[u8]) {
-    colmap("colmap_binary", bytes, "bin");
-}
-
-fn colmap_text(bytes: &[u8]) {
-    colmap("colmap_text", bytes, "txt");
 }
 
 /// Reads points of an otherwise valid model: text if the first byte is even, else binary.
@@ -183,10 +180,6 @@ fn dataset_index(bytes: &[u8]) {
     }
 }
 
-fn evaluation_index(bytes: &[u8]) {
-    let _ = EvaluationIndex::read(&file("evaluation_index", "index.json", bytes));
-}
-
 fn evaluation(bytes: &[u8]) {
     let folder = file("evaluation", "scores.json", bytes).parent().unwrap().to_owned();
     let Ok(evaluation) = read_evaluation(&folder) else { return };
@@ -197,34 +190,6 @@ fn checkpoint(bytes: &[u8]) {
     let state = file("checkpoint", "checkpoints/step-00000001/state.json", bytes);
     std::fs::write(state.with_file_name("model.safetensors"), [0; 3]).unwrap();
     let _ = latest_checkpoint(&folder("checkpoint"));
-}
-
-fn photo(bytes: &[u8]) {
-    let _ = decode_photo(bytes, Path::new("photo.jpg"), (8, 8));
-}
-
-fn ply(bytes: &[u8]) {
-    read_and_repair(&file("ply", "splat.ply", bytes));
-}
-
-fn compressed_ply(bytes: &[u8]) {
-    read_and_repair(&file("compressed_ply", "splat.compressed.ply", bytes));
-}
-
-fn glb(bytes: &[u8]) {
-    read_and_repair(&file("glb", "splat.glb", bytes));
-}
-
-fn gltf(bytes: &[u8]) {
-    read_and_repair(&file("gltf", "splat.gltf", bytes));
-}
-
-fn ksplat(bytes: &[u8]) {
-    read_and_repair(&file("ksplat", "splat.ksplat", bytes));
-}
-
-fn sog(bytes: &[u8]) {
-    read_and_repair(&file("sog", "splat.sog", bytes));
 }
 
 /// Reads a splat of one Gaussian with the origin file `bytes`; a splat that can be read must survive a round trip with its
@@ -238,10 +203,6 @@ fn splat_origin(bytes: &[u8]) {
     assert_eq!(read_splat(&copy).unwrap().origin, splat.origin);
     let _ = write_splat(&copy, &splat);
     let _ = rounding_warning(&splat);
-}
-
-fn spz(bytes: &[u8]) {
-    read_and_repair(&file("spz", "splat.spz", bytes));
 }
 
 /// Checks that after removal of invalid Gaussians all values are finite, and that none is removed if all are valid.
@@ -272,10 +233,6 @@ fn weights(bytes: &[u8]) {
     let _ = load_model(&file, Device::Cpu);
 }
 
-fn configuration(bytes: &[u8]) {
-    let _ = std::str::from_utf8(bytes).map(|text| Config::parse(text, &[], Path::new("config.toml")));
-}
-
 /// Returns a torch.save archive of `pickle` and of the numbered storages.
 fn torch_archive(pickle: &[u8], storages: &[&[u8]]) -> Vec<u8> {
     let mut zip = ZipWriter::new(Cursor::new(vec![]));
@@ -299,11 +256,6 @@ fn chunk_pickle(bytes: &[u8]) {
     });
     let cameras: Vec<u8> = cameras.concat().iter().flat_map(|number: &f32| number.to_le_bytes()).collect();
     chunk(&torch_archive(bytes, &[png(), &cameras, &[0; 16]]));
-}
-
-/// Reads a checkpoint with the pickle `bytes`; storages 0 to 2 have 512, 64 and no bytes.
-fn weights_pickle(bytes: &[u8]) {
-    weights(&torch_archive(bytes, &[&[0; 512], &[0; 64], &[]]));
 }
 
 /// Reads an SPZ whose gzip holds `bytes`; a splat that can be read must survive a round trip.

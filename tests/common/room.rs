@@ -37,12 +37,8 @@ pub fn write_room(path: &Path, seed: u64, frames: usize, size: ImageSize) -> glo
 /// Returns an error if a file can't be written.
 pub fn write_rooms(folder: &Path, scenes: u32, frames: u32, size: u32) -> globalsplat::Result<()> {
     (0..scenes).try_for_each(|scene| {
-        write_room(
-            &folder.join(format!("room_{scene:03}")),
-            scene.into(),
-            frames as usize,
-            [size, size].into(),
-        )
+        let room = folder.join(format!("room_{scene:03}"));
+        write_room(&room, scene.into(), frames as usize, [size, size].into())
     })
 }
 
@@ -72,38 +68,21 @@ struct Patch {
 
 fn surfaces(random: &mut impl Rng) -> Gaussians {
     let mut patches = vec![];
-    let mut color = || {
-        DVec3::new(
-            random.random_range(0.2..0.9),
-            random.random_range(0.2..0.9),
-            random.random_range(0.2..0.9),
-        )
-    };
+    let mut colors =
+        || [(); 2].map(|()| DVec3::from_array([(); 3].map(|()| random.random_range(0.2..0.9))));
     // The back wall, floor, ceiling and two side walls, each a checkerboard of two colors.
-    let walls = [
+    for (corner, along, across) in [
         (DVec3::new(-2., -1.2, 4.), DVec3::X * 4., DVec3::Y * 2.4),
         (DVec3::new(-2., 1.2, 1.), DVec3::X * 4., DVec3::Z * 3.),
         (DVec3::new(-2., -1.2, 1.), DVec3::X * 4., DVec3::Z * 3.),
         (DVec3::new(-2., -1.2, 1.), DVec3::Y * 2.4, DVec3::Z * 3.),
         (DVec3::new(2., -1.2, 1.), DVec3::Y * 2.4, DVec3::Z * 3.),
-    ];
-    for (corner, along, across) in walls {
-        let colors = [color(), color()];
-        checkerboard(&mut patches, corner, along, across, colors);
+    ] {
+        checkerboard(&mut patches, corner, along, across, colors());
     }
-    let spheres: Vec<(DVec3, f64, [DVec3; 2])> = (0..4)
-        .map(|i| {
-            let colors = [color(), color()];
-            let x = -1.2 + 0.8 * i as f64;
-            (
-                DVec3::new(x, 0.2 + 0.25 * (i as f64 * 1.7).sin(), 2.4 + 0.5 * (i as f64 * 2.3).cos()),
-                0.35,
-                colors,
-            )
-        })
-        .collect();
-    for (centre, radius, colors) in spheres {
-        striped_sphere(&mut patches, centre, radius, colors);
+    for i in (0..4).map(f64::from) {
+        let centre = DVec3::new(-1.2 + 0.8 * i, 0.2 + 0.25 * (i * 1.7).sin(), 2.4 + 0.5 * (i * 2.3).cos());
+        striped_sphere(&mut patches, centre, 0.35, colors());
     }
     gaussians_of(&patches)
 }
