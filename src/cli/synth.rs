@@ -3,8 +3,7 @@ use crate::Error;
 use crate::data::{Capture, ChunkWriter, SyntheticDataset, load_views, read_pictures};
 use crate::eval::{EvaluationIndex, SceneFrames};
 use crate::io::{
-    InputFiles, check_writable_dir, check_writable_png, tile_horizontally, tile_vertically, write_atomically,
-    write_png,
+    InputFiles, Mosaic, check_writable_dir, check_writable_png, tile_horizontally, write_atomically,
 };
 use crate::scene::ImageSize;
 use crate::synth::VideoSettings;
@@ -133,7 +132,9 @@ impl Synth {
         let index = EvaluationIndex { file: self.out.join("evaluation_index.json"), scenes: index };
         index.write()?;
         if let Some(sheet) = &self.contact_sheet {
-            write_png(sheet, &tile_vertically(&rows))?;
+            let mut mosaic = Mosaic::column(rows.len());
+            rows.iter().try_for_each(|row| mosaic.add(std::slice::from_ref(row)))?;
+            mosaic.write(sheet)?;
         }
         // This must be last: a folder with the index of its chunks is finished, and nothing more is written there.
         let chunks = writer.finish()?;

@@ -68,8 +68,7 @@ struct Patch {
 
 fn surfaces(random: &mut impl Rng) -> Gaussians {
     let mut patches = vec![];
-    let mut colors =
-        || [(); 2].map(|()| DVec3::from_array([(); 3].map(|()| random.random_range(0.2..0.9))));
+    let mut colors = || [(); 2].map(|()| DVec3::from_array([(); 3].map(|()| random.random_range(0.2..0.9))));
     // The back wall, floor, ceiling and two side walls, each a checkerboard of two colors.
     for (corner, along, across) in [
         (DVec3::new(-2., -1.2, 4.), DVec3::X * 4., DVec3::Y * 2.4),
