@@ -5,7 +5,7 @@
 
 The PyTorch model is the parity checks' reference with PyTorch's fused functions for its layers: linear, layer_norm,
 gelu, scaled_dot_product_attention; bf16 uses torch.autocast. Weights and photos are random. The program is measured
-with `globalsplat bench model`. Both warm up, and are measured alternately.
+with `globalsplat bench model`. Both warm up, and are measured alternately, so that other load affects both.
 """
 
 import argparse
@@ -19,13 +19,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch.nn import functional
-from torch.utils.flop_counter import FlopCounterMode
 
-from parity import reference
 from parity.harness import draw
-from parity.reference.names import reference_config
+from parity.reference import decoder, encoder, layers, tokens
+from parity.reference.model import forward
 
-REPOSITORY = Path(__file__).resolve().parents[1]
+PROGRAM = Path(__file__).resolve().parents[1] / "target" / "release" / "globalsplat"
 SIZE = 256
 
 
@@ -35,11 +34,7 @@ def linear(params, name, x):
 
 def layer_norm(params, name, x):
     weight = params[f"{name}.weight"]
-    return functional.layer_norm(x, weight.shape, weight, params[f"{name}.bias"], reference.layers.LAYER_NORM_EPS)
-
-
-def mlp(params, first, second, x):
-    return linear(params, second, functional.gelu(linear(params, first, x)))
+    return functional.layer_norm(x, weight.shape, weight, params[f"{name}.bias"], layers.LAYER_NORM_EPS)
 
 
 def attention(q, k, v, heads):
@@ -58,40 +53,28 @@ def in_float32(function):
 
 
 def use_fused_layers():
-    fused = {"linear": linear, "layer_norm": layer_norm, "mlp": mlp, "attention": attention, "gelu": functional.gelu}
-    for module in (reference.decoder, reference.encoder, reference.rays, reference.stream, reference.tokens):
+    fused = {"linear": linear, "layer_norm": layer_norm, "attention": attention, "gelu": functional.gelu}
+    for module in (layers, tokens, encoder, decoder):
         for name in fused.keys() & vars(module).keys():
             setattr(module, name, fused[name])
     for name in ("plucker_rays", "camera_code"):
-        setattr(reference.tokens, name, in_float32(getattr(reference.tokens, name)))
+        setattr(tokens, name, in_float32(getattr(tokens, name)))
 
 
-class Torch:
-    def __init__(self, views):
-        rng = np.random.default_rng(0)
-        self.config = reference_config(draw.MAIN_16K)
-        inputs = {"images": draw.uniform(rng, 0.0, 1.0, 1, views, 3, SIZE, SIZE)} | draw.views(
-            rng, 1, views, SIZE, SIZE
-        )
-        self.inputs = [torch.from_numpy(inputs[name]) for name in ("images", "c2w", "intrinsics")]
-        params = {name: torch.from_numpy(value) for name, value in draw.parameters(rng, draw.MAIN_16K).items()}
-        self.params = params | {"gaussian_decoder.patch_center_bias": torch.tensor([[[0.0, 0.0, 1.5]]])}
+def torch_model(views):
+    """Returns a function that runs the main model in PyTorch, at a precision, and returns the seconds that it took."""
+    rng = np.random.default_rng(0)
+    inputs = {"images": draw.uniform(rng, 0.0, 1.0, 1, views, 3, SIZE, SIZE)} | draw.views(rng, 1, views, SIZE, SIZE)
+    images, c2w, intrinsics = (torch.from_numpy(inputs[name]) for name in ("images", "c2w", "intrinsics"))
+    params = {name: torch.from_numpy(value) for name, value in draw.parameters(rng, draw.MAIN_16K).items()}
 
-    def run(self):
-        images, c2w, intrinsics = self.inputs
-        return reference.model.forward(self.config, self.params, images, c2w, intrinsics, stage=3, mix=1.0)
-
-    def seconds(self, precision):
+    def seconds(precision):
         with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
             start = time.perf_counter()
-            self.run()
+            forward(draw.MAIN_16K, params, images, c2w, intrinsics, stage=3, mix=1.0)
             return time.perf_counter() - start
 
-    def gflop(self):
-        """Returns the GFLOP of all matrix products. Uses the unfused attention, which PyTorch can count."""
-        with torch.no_grad(), FlopCounterMode(display=False) as counter:
-            self.run()
-        return counter.get_total_flops() * 1e-9
+    return seconds
 
 
 def program(binary, views, precision):
@@ -99,16 +82,23 @@ def program(binary, views, precision):
     return json.loads(subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout)
 
 
-def compare(options):
-    """Measures both models alternately, so that other load on the machine affects both."""
-    torch_model, results = Torch(options.views), {}
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    option = parser.add_argument
+    option("--views", metavar="N", type=int, default=24, help="number of photos (default: 24)")
+    option("--rounds", metavar="N", type=int, default=3, help="alternating measurements (default: 3)")
+    option("--precision", choices=["f32", "bf16"], nargs="+", default=["f32", "bf16"], help="(default: both)")
+    option("--binary", metavar="PATH", default=PROGRAM)
+    options = parser.parse_args()
+    use_fused_layers()
+    seconds, results = torch_model(options.views), {}
     for precision in options.precision:
-        torch_model.seconds(precision)
+        seconds(precision)
         ours, theirs = [], []
         for _ in range(options.rounds):
             report = program(options.binary, options.views, precision)
             ours.append(report["milliseconds"]["median"] * 1e-3)
-            theirs.append(torch_model.seconds(precision))
+            theirs.append(seconds(precision))
             print(f"{precision}: program {ours[-1]:.2f} s, PyTorch {theirs[-1]:.2f} s", file=sys.stderr)
         ratios = [a / b for a, b in zip(ours, theirs, strict=True)]
         results[precision] = {
@@ -119,24 +109,7 @@ def compare(options):
             "program_gflop": sum(part["gflop"] for part in report["parts"]),
             "program_peak_gflops": report["peak_gflops"],
         }
-    return results
-
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--views", metavar="N", type=int, default=24, help="number of photos (default: 24)")
-    parser.add_argument("--rounds", metavar="N", type=int, default=3, help="alternating measurements (default: 3)")
-    parser.add_argument(
-        "--precision", choices=["f32", "bf16"], nargs="+", default=["f32", "bf16"], help="(default: both)"
-    )
-    parser.add_argument("--gflop", action="store_true", help="only print the PyTorch model's FLOP count")
-    parser.add_argument("--binary", metavar="PATH", default=str(REPOSITORY / "target" / "release" / "globalsplat"))
-    options = parser.parse_args()
-    if options.gflop:
-        print(json.dumps({"gflop": Torch(options.views).gflop()}))
-        return
-    use_fused_layers()
-    print(json.dumps(compare(options)))
+    print(json.dumps(results))
 
 
 if __name__ == "__main__":

@@ -137,7 +137,7 @@ bench() { # NAME SECONDS ARGUMENTS…
 
 part doctor 120 "$globalsplat" doctor
 [ "$device" = cpu ] || part nvidia-smi 20 nvidia-smi
-part parity 200 "$python" -m parity --device "$device" --json "$work/figures/parity.json" ${parity[@]+"${parity[@]}"}
+part parity 200 "$python" -m parity --device "$device" ${parity[@]+"${parity[@]}"}
 bench raster 60 raster "${raster[@]}" --device "$device"
 if [ "$device" != cpu ] && command -v compute-sanitizer >"$work/found"; then
     for tool in memcheck racecheck synccheck; do

@@ -1,27 +1,19 @@
 """Random parameters and inputs with shapes and magnitudes like those of the model."""
 
+from typing import Any
+
 import numpy as np
 import torch
 
-from ..reference.loss.lpips import COMPARED, NETWORKS
-from ..reference.loss.vgg19 import BLOCKS
 from ..reference.normalize import invert_rigid
+from ..reference.perceptual import BLOCKS, COMPARED, NETWORKS
 from ..reference.rotation import matrix_from_quaternion
 
 AUXILIARIES = 4
-MAIN_16K = {
-    "patch_size": 8,
-    "latents": 2048,
-    "width": 512,
-    "rgb_width": 512,
-    "ray_width": 256,
-    "rounds": 4,
-    "self_attention_blocks": 2,
-    "heads": 8,
-    "candidates": 16,
-    "sh_degree": 3,
-    "streams": "dual",
-    "camera_code": True,
+# The paper's main model.
+MAIN_16K: dict[str, Any] = {
+    **{"patch_size": 8, "latents": 2048, "width": 512, "rgb_width": 512, "ray_width": 256, "rounds": 4},
+    **{"self_attention_blocks": 2, "heads": 8, "candidates": 16, "sh_degree": 3, "streams": "dual", "camera_code": True},
 }
 
 
@@ -132,8 +124,8 @@ def shapes(config):
     return found
 
 
-def parameters(rng, config, prefix=""):
-    """Returns random parameters whose name begins with `prefix`, by name without the prefix.
+def parameters(rng, config, *prefixes):
+    """Returns random parameters whose name begins with one of `prefixes`, by name.
 
     Weights have a standard deviation of 0.45 / sqrt(inputs), which for 512 inputs is the initial 0.02 of training.
     LayerScales are from 0.1 to 1, far above their initial value, so that every path matters. No value is exactly 0 or
@@ -141,7 +133,7 @@ def parameters(rng, config, prefix=""):
     """
     drawn = {}
     for name, shape in shapes(config).items():
-        if not name.startswith(prefix):
+        if not name.startswith(prefixes or ""):
             continue
         if name.endswith(".gamma"):
             value = uniform(rng, 0.1, 1.0, *shape)
@@ -160,7 +152,7 @@ def parameters(rng, config, prefix=""):
             ).flatten()
         else:  # biases and learnable tokens
             value = normal(rng, *shape, scale=0.3)
-        drawn[name.removeprefix(prefix)] = value
+        drawn[name] = value
     return drawn
 
 
@@ -168,9 +160,8 @@ def lpips_parameters(rng, network):
     """Returns random parameters of an LPIPS network, scaled so that features neither vanish nor grow between layers."""
     drawn, inputs, compared = {}, 3, COMPARED[network]
     for name, outputs, kernel, _, _ in (layer for row in NETWORKS[network] for layer in row):
-        drawn[f"{name}.weight"] = normal(
-            rng, outputs, inputs, kernel, kernel, scale=(2.0 / (inputs * kernel**2)) ** 0.5
-        )
+        scale = (2.0 / (inputs * kernel**2)) ** 0.5
+        drawn[f"{name}.weight"] = normal(rng, outputs, inputs, kernel, kernel, scale=scale)
         drawn[f"{name}.bias"] = normal(rng, outputs, scale=0.1)
         if name in compared:
             drawn[f"lin{compared.index(name)}.weight"] = uniform(rng, 0.0, 1.0, 1, outputs, 1, 1)
@@ -243,11 +234,11 @@ def views(rng, batch, count, height, width):
 
 
 def pictures(rng, config, batch, count):
-    """Returns the image size (height, width), a multiple of the patch size, and random images with cameras."""
+    """Returns random images of one patch and more, whose sides are multiples of the patch size, with cameras."""
     patch = config["patch_size"]
     rows = integer(rng, 1, 4)
-    height, width = patch * rows, patch * (rows + integer(rng, 1, 3))
+    height, width = patch * rows, patch * (rows + integer(rng, 0, 3))
     if rng.random() < 0.5:
         height, width = width, height
     images = uniform(rng, 0.0, 1.0, batch, count, 3, height, width)
-    return (height, width), {"images": images} | views(rng, batch, count, height, width)
+    return {"images": images} | views(rng, batch, count, height, width)

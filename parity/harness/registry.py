@@ -1,65 +1,78 @@
-"""Registry of cases and of their reference functions.
+"""Registry of cases: what is computed, on which random inputs, by which reference, and how exactly it must agree."""
 
-A case is a generator of draws, each a configuration, parameters and inputs. Its name is that of the function; the
-program computes `module`, by default the same name.
-
-The reference function of a module calls parity/reference with the names of the exchange: f(config, params, inputs) -> outputs, all
-torch tensors. `config` has the program's keys, and parameters have the published names relative to the module, as in a
-request.
-"""
-
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from .tolerance import FLOAT32, Tolerance
-
-CASES = {}
-REFERENCES = {}  # reference functions by module
+from .compare import FLOAT32, Tolerance
 
 
 @dataclass
 class Draw:
-    """The random inputs of one comparison. `label` distinguishes it from the other draws of its case."""
+    """The random inputs of one comparison.
 
-    label: str
+    `config`, `params` and `inputs` go to the program and to the reference. `prefix` begins the names of the parameters; the
+    program gets them without it.
+    """
+
     inputs: dict = field(default_factory=dict)
     config: dict = field(default_factory=dict)
     params: dict = field(default_factory=dict)
-    differentiate: tuple = ()
-    module: str = ""
-    tolerance: Tolerance = FLOAT32
-    on_gpu: Tolerance | None = None  # replaces `tolerance` on a GPU if a library has larger rounding errors there
-    gradients: bool = True
-    large: bool = False  # whether the reference computes in float32, on more than one core
+    differentiate: tuple = ()  # inputs
+    prefix: str = ""
+    label: str = ""  # distinguishes it from the other draws of its case
+    has_gradients: bool = True
+    is_large: bool = False  # whether the reference computes in float32, on more than one core
     doubtful: np.ndarray | None = None  # mask of pixels within rounding of a threshold, [B, C, H, W]
-    close_calls: Callable[[], list] = list  # decisions of a network that a GPU may make differently
 
     def __post_init__(self):
-        self.gradients = self.gradients and bool(self.params or self.differentiate)
+        self.has_gradients = self.has_gradients and bool(self.params or self.differentiate)
+        if not self.label:
+            shapes = [by(*value.shape) for value in list(self.inputs.values())[:2]]
+            settings = [f"{key} {value}" for key, value in self.config.items()]
+            self.label = ", ".join(shapes + settings)
 
 
-def case(function):
-    """Registers a function as the case of its name (decorator)."""
-    enter(CASES, function.__name__, function)
-    return function
+@dataclass(frozen=True)
+class Case:
+    """A generator of draws for a module of the program, and the reference function of that module."""
+
+    draws: Callable[[np.random.Generator], Iterator[Draw]]
+    reference: Callable
+    outputs: tuple
+    module: str
+    tolerance: Tolerance
+
+    def evaluate(self, config, params, inputs):
+        """Calls the reference with the arguments that its signature names. Returns its results, all tensors, by name."""
+        given = {"config": config, "params": params, "inputs": inputs} | config | inputs
+        found = self.reference(
+            **{name: given[name] for name in inspect.signature(self.reference).parameters if name in given}
+        )
+        if isinstance(found, dict):
+            return found
+        return dict(zip(self.outputs, found if isinstance(found, tuple) else (found,), strict=True))
 
 
-def reference_for(module):
-    """Registers a function as the reference of `module`, which several cases may use (decorator)."""
+CASES: dict[str, Case] = {}
 
-    def register(function):
-        enter(REFERENCES, module, function)
-        return function
+
+def case(reference, *outputs, module=None, tolerance=FLOAT32):
+    """Registers a generator of draws as the case of its name (decorator).
+
+    The program computes `module`, by default the case's name. `outputs` names the values that the reference returns, unless
+    it returns a dict; a lone value is the `loss` by default.
+    """
+
+    def register(draws):
+        name = draws.__name__
+        assert name not in CASES, f"{name} is in {CASES[name].draws.__module__} and in {draws.__module__}"
+        CASES[name] = Case(draws, reference, outputs or ("loss",), module or name, tolerance)
+        return draws
 
     return register
-
-
-def enter(registry, name, function):
-    """Adds a function to a registry. Asserts that its name is unique: the modules of `areas` share one registry."""
-    assert name not in registry, f"{name} is in {registry[name].__module__} and in {function.__module__}"
-    registry[name] = function
 
 
 def by(*sizes):

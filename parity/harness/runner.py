@@ -1,22 +1,50 @@
-"""Draws random inputs of cases, runs the program and the reference on them, and compares the results."""
+"""Draws random inputs of cases, runs the program and the reference on them, and compares the results.
 
+Requests and answers are folders of safetensors files. A request contains `case` (JSON: the module, its config, the inputs to
+differentiate), param.X, in.X, and cot.Y for every output Y that has a gradient. An answer contains out.Y and, if there are
+cotangents, grad.param.X and grad.in.X, the gradients of sum over Y of sum(cot.Y out.Y); or `error`, a text.
+"""
+
+import json
+import subprocess
+import tempfile
 import time
 import zlib
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import torch
+from safetensors.numpy import load_file, save_file
 
-from .areas import CASES
-from .close_calls import resolve_close_calls
-from .compare import compare
-from .evaluate import Evaluation
-from .exchange import Request, exchange
-from .perturb import find_undetected
-from .registry import Draw
-from .tolerance import Tolerance
+from .compare import Tolerance, compare, find_undetected
+from .registry import CASES, Draw
 
-THREADS = 2  # for large cases; small ones are faster on one thread
+THREADS = 2  # for large draws; small ones are faster on one thread
+
+
+class ProgramError(Exception):
+    """The program ended without answers."""
+
+
+@dataclass
+class Question:
+    """A draw of a case with the reference's results and the cotangents of its outputs."""
+
+    case: str
+    drawn: Draw
+    expected: dict
+    cotangents: dict
+    seconds: float
+
+    def write(self, path):
+        drawn = self.drawn
+        about = {"case": CASES[self.case].module, "config": drawn.config, "differentiate": list(drawn.differentiate)}
+        arrays = {"case": np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)}
+        params = {name.removeprefix(drawn.prefix): value for name, value in drawn.params.items()}
+        for kind, group in (("param", params), ("in", drawn.inputs), ("cot", self.cotangents)):
+            arrays |= {f"{kind}.{name}": np.ascontiguousarray(value) for name, value in group.items()}
+        save_file(arrays, path)
 
 
 @dataclass
@@ -30,8 +58,6 @@ class Result:
     findings: list
     doubtful: int  # number of pixels excluded from the comparison
     seconds: float  # time of the reference
-    large: bool = False  # whether the reference computed in float32, too
-    flipped: int = 0  # number of close calls that the program decided differently
     tried: int = 0  # number of perturbed results
     missed: list = field(default_factory=list)  # perturbed results that pass
 
@@ -40,90 +66,109 @@ class Result:
         return all(finding.passed for finding in self.findings)
 
 
-@dataclass
-class PreparedCase:
-    """A draw with its request and the reference's result."""
-
-    case: str
-    drawn: Draw
-    request: Request
-    expected: dict
-    seconds: float
-
-    def resolve_close_calls(self, answer):
-        """Returns the expected tensors with the program's choice of close calls, and the number that differ."""
-
-        def flipped(calls):
-            evaluation = Evaluation(self.request, torch.float64, calls)
-            return evaluation.gradient_arrays(self.request.cotangents)
-
-        return resolve_close_calls(answer, self.expected, self.drawn.close_calls(), flipped)
-
-
-def generator(seed, case):
-    """Returns the random generator of a case, which doesn't depend on the other cases that are run."""
-    return np.random.default_rng([seed, zlib.crc32(case.encode())])
-
-
-def prepare_cases(names, seed):
+def questions(names, seed):
     """Yields the draws of the named cases with the reference's results."""
     for name in names:
-        rng = generator(seed, name)
-        for drawn in CASES[name](rng):
+        # A case's numbers don't depend on the other cases that are run.
+        rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+        for drawn in CASES[name].draws(rng):
             started = time.perf_counter()
-            request = Request(
-                drawn.module or name, drawn.config, drawn.params, drawn.inputs, differentiate=drawn.differentiate
-            )
-            torch.set_num_threads(THREADS if drawn.large else 1)
-            evaluation = Evaluation(request, torch.float32 if drawn.large else torch.float64)
-            expected = evaluation.output_arrays()
-            if drawn.gradients:
-                request.cotangents = cotangents(rng, request, expected, drawn.doubtful)
-                expected |= evaluation.gradient_arrays(request.cotangents)
-            yield PreparedCase(name, drawn, request, expected, time.perf_counter() - started)
+            torch.set_num_threads(THREADS if drawn.is_large else 1)
+            expected, cotangents = evaluate(name, drawn, rng)
+            yield Question(name, drawn, expected, cotangents, time.perf_counter() - started)
 
 
-def cotangents(rng, request, outputs, doubtful):
+def evaluate(name, drawn, rng):
+    """Returns the reference's outputs and gradients as arrays, with the names of an answer, and the cotangents of the outputs."""
+    dtype = torch.float32 if drawn.is_large else torch.float64
+
+    def tensors(group, differentiated):
+        values = {}
+        for key, array in group.items():
+            value = torch.tensor(array)
+            values[key] = value.to(dtype).requires_grad_(key in differentiated) if value.is_floating_point() else value
+        return values
+
+    params, inputs = tensors(drawn.params, drawn.params), tensors(drawn.inputs, drawn.differentiate)
+    outputs = CASES[name].evaluate(drawn.config, params, inputs)
+    expected = {f"out.{key}": np.atleast_1d(value.detach().numpy()) for key, value in outputs.items()}
+    if not drawn.has_gradients:
+        return expected, {}
+    cotangents = draw_cotangents(rng, drawn, expected)
+    leaves = {f"grad.param.{key.removeprefix(drawn.prefix)}": value for key, value in params.items()}
+    leaves |= {f"grad.in.{key}": inputs[key] for key in drawn.differentiate}
+    total = torch.tensor(0.0)
+    for key, cotangent in cotangents.items():
+        total = total + (torch.tensor(cotangent).to(dtype).reshape(outputs[key].shape) * outputs[key]).sum()
+    gradients = torch.autograd.grad(total, list(leaves.values()), allow_unused=True)
+    for (key, leaf), gradient in zip(leaves.items(), gradients, strict=True):
+        expected[key] = (torch.zeros_like(leaf) if gradient is None else gradient).detach().numpy()
+    return expected, cotangents
+
+
+def draw_cotangents(rng, drawn, outputs):
     """Returns standard normal cotangents of every differentiable output, 0 at pixels that can't be compared."""
-    double = any(value.dtype == np.float64 for value in request.inputs.values())
-    drawn = {}
+    is_double = any(value.dtype == np.float64 for value in drawn.inputs.values())
+    found = {}
     for name, value in outputs.items():
         if value.dtype.kind == "i":
             continue
         cotangent = rng.standard_normal(value.shape)
-        if doubtful is not None:
-            cotangent *= ~doubtful[:, :, None] if value.ndim == 5 else ~doubtful
-        drawn[name.removeprefix("out.")] = cotangent.astype(np.float64 if double else np.float32)
-    return drawn
+        if drawn.doubtful is not None:
+            cotangent *= ~drawn.doubtful[:, :, None] if value.ndim == 5 else ~drawn.doubtful
+        found[name.removeprefix("out.")] = cotangent.astype(np.float64 if is_double else np.float32)
+    return found
 
 
-def run_cases(names, seed, answerer, self_test=(), on_progress=lambda text: None, on_gpu=False):
+def run_program(binary, device, requests, answers, on_progress):
+    """Runs the program on a folder of requests. `on_progress` gets the number of answers."""
+    command = [binary, "parity", "--requests", requests, "--responses", answers, "--device", device]
+    with tempfile.TemporaryFile() as messages:
+        process = subprocess.Popen([str(word) for word in command], stdout=messages, stderr=messages)
+        while process.poll() is None:
+            on_progress(sum(1 for _ in answers.iterdir()))
+            time.sleep(0.1)
+        if process.returncode != 0:
+            messages.seek(0)
+            said = messages.read().decode(errors="replace").strip()
+            raise ProgramError(f"{binary} parity ended with {process.returncode}: {said[-2000:]}")
+
+
+def read_answer(path):
+    """Reads an answer as arrays by name. An error or a missing answer is returned as `error` alone."""
+    if not path.exists():
+        return {"error": "no answer"}
+    arrays = load_file(path)
+    if "error" in arrays:
+        return {"error": bytes(arrays["error"]).decode(errors="replace")}
+    return arrays
+
+
+def run_cases(names, seed, binary, device, self_test, on_progress):
     """Yields a Result for every draw of the named cases. The cases `self_test` also check that wrong results are detected."""
-    prepared = []
-    for question in prepare_cases(names, seed):
-        prepared.append(question)
-        on_progress(f"reference, {len(prepared)} draws: {question.case}, {question.drawn.label}")
+    with tempfile.TemporaryDirectory(prefix="globalsplat-parity-") as folder:
+        requests, answers = Path(folder, "requests"), Path(folder, "answers")
+        requests.mkdir()
+        answers.mkdir()
+        asked = []
+        for question in questions(names, seed):
+            name = f"{len(asked):04}_{question.case}.safetensors"
+            question.write(requests / name)
+            asked.append((name, question))
+            on_progress(f"reference, {len(asked)} draws: {question.case}, {question.drawn.label}")
 
-    def on_answers(done):
-        at = prepared[min(done, len(prepared) - 1)]
-        on_progress(f"program, {done} of {len(prepared)} draws: {at.case}, {at.drawn.label}")
+        def on_answers(done):
+            at = asked[min(done, len(asked) - 1)][1]
+            on_progress(f"program, {done} of {len(asked)} draws: {at.case}, {at.drawn.label}")
 
-    answers = exchange([question.request for question in prepared], answerer, on_answers)
-    for done, (question, answer) in enumerate(zip(prepared, answers, strict=True), start=1):
-        drawn = question.drawn
-        on_progress(f"comparison, {done} of {len(prepared)} draws: {question.case}, {drawn.label}")
-        tolerance = (on_gpu and drawn.on_gpu) or drawn.tolerance
-        expected, flipped = question.expected, 0
-        findings = compare(answer, expected, tolerance, drawn.doubtful)
-        failed = [finding for finding in findings if not finding.passed]
-        # Only a gradient that has its shape may be on the other side of a threshold.
-        if on_gpu and failed and all(f.tensor.startswith("grad.") and not f.problem for f in failed):
-            expected, flipped = question.resolve_close_calls(answer)
-            findings = compare(answer, expected, tolerance, drawn.doubtful)
-        doubtful = 0 if drawn.doubtful is None else int(drawn.doubtful.sum())
-        result = Result(
-            question.case, drawn.label, seed, tolerance, findings, doubtful, question.seconds, drawn.large, flipped
-        )
-        if question.case in self_test and result.passed:
-            result.tried, result.missed = find_undetected(answer, expected, tolerance, drawn.doubtful)
-        yield result
+        run_program(binary, device, requests, answers, on_answers)
+        for done, (name, question) in enumerate(asked, start=1):
+            drawn, tolerance = question.drawn, CASES[question.case].tolerance
+            on_progress(f"comparison, {done} of {len(asked)} draws: {question.case}, {drawn.label}")
+            answer = read_answer(answers / name)
+            findings = compare(answer, question.expected, tolerance, drawn.doubtful)
+            doubtful = 0 if drawn.doubtful is None else int(drawn.doubtful.sum())
+            result = Result(question.case, drawn.label, seed, tolerance, findings, doubtful, question.seconds)
+            if question.case in self_test and result.passed:
+                result.tried, result.missed = find_undetected(answer, question.expected, tolerance, drawn.doubtful)
+            yield result

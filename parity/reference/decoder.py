@@ -14,36 +14,24 @@ OPACITY_LOGIT_RANGE = (-13.0, 6.0)
 LARGEST_OPACITY = 0.99
 LARGEST_LOG_U = -1e-12
 ROTATION_OFFSET = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+MEAN_OFFSET = (0.0, 0.0, 1.5)
 
 
-def heads(config, params, geo, app):
-    """Applies the linear readouts to geo, app [B, M, d]. Returns raw outputs [B, M, K, ...]."""
-    k = config["M_max"]
-    coefficients = (config["sh_degree"] + 1) ** 2
-    shape = (geo.shape[0], geo.shape[1], k)
-    parameters = linear(params, "gaussian_decoder.geo_param_readout", geo).reshape(*shape, 10)
-    return {
-        "position": linear(params, "gaussian_decoder.geo_pos_readout", geo).reshape(*shape, 3),
-        "log_scale": parameters[..., 0:3],
-        "rotation": parameters[..., 3:9],
-        "opacity": parameters[..., 9:10],
-        "sh": linear(params, "gaussian_decoder.sh_readout", app).reshape(*shape, coefficients, 3),
-        "gate": linear(params, "gaussian_decoder.gate_readout", geo),
-    }
-
-
-def candidates(raw, mix):
-    """Applies offsets and clamps to the raw outputs.
+def candidates(config, params, geometry, appearance, mix):
+    """Applies the heads to geometry and appearance [B, M, d]. Returns values [B, M, K, ...] after offsets and clamps.
 
     mix is the transition coefficient lambda: below 1 it lowers the opacity logit, by ln 2 at lambda = 0.
     """
-    opacity = raw["opacity"] + OPACITY_OFFSET - (1.0 - mix) * math.log(2.0)
+    shape = (*geometry.shape[:2], config["candidates"])
+    coefficients = (config["sh_degree"] + 1) ** 2
+    parameters = linear(params, "gaussian_decoder.geo_param_readout", geometry).reshape(*shape, 10)
+    opacity = parameters[..., 9:10] + OPACITY_OFFSET - (1.0 - mix) * math.log(2.0)
     return {
-        "position": raw["position"],
-        "log_scale": (raw["log_scale"] + LOG_SCALE_OFFSET).clamp(*LOG_SCALE_RANGE),
-        "rotation": raw["rotation"],
+        "position": linear(params, "gaussian_decoder.geo_pos_readout", geometry).reshape(*shape, 3),
+        "log_scale": (parameters[..., 0:3] + LOG_SCALE_OFFSET).clamp(*LOG_SCALE_RANGE),
+        "rotation": parameters[..., 3:9],
         "opacity": opacity.clamp(*OPACITY_LOGIT_RANGE),
-        "sh": raw["sh"],
+        "sh": linear(params, "gaussian_decoder.sh_readout", appearance).reshape(*shape, coefficients, 3),
     }
 
 
@@ -107,31 +95,27 @@ def merge_with_transition(full, gate, stage, mix):
     return {key: (1.0 - mix) * coarse[key] + mix * merged[key] for key in merged}
 
 
-def decode(config, params, geo, app, stage, mix):
-    """Decodes geo, app [B, M, d] to a dict of N = M G Gaussians, token-major.
+def decode(config, params, geometry, appearance, stage, mix):
+    """Decodes geometry and appearance [B, M, d] to a dict of N = M G Gaussians, token-major.
 
-    The dict has means [B, N, 3], scales [B, N, 3], rotations_6d [B, N, 6], quats_wxyz [B, N, 4], opacities [B, N, 1],
-    sh [B, N, C, 3], and "raw", the inputs of the regularizers per candidate: values before clamps and merging, and the
-    opacity logits "opacity_logit" [B, M, K, 1] after offset and clamp.
+    The dict has means [B, N, 3], scales [B, N, 3], rotations_6d [B, N, 6], quaternions (w, x, y, z) [B, N, 4],
+    opacities [B, N] and sh [B, N, C, 3].
     """
-    raw = heads(config, params, geo, app)
-    full = candidates(raw, mix)
-    merged = merge_with_transition(full, raw["gate"], stage, mix)
+    full = candidates(config, params, geometry, appearance, mix)
+    gate = linear(params, "gaussian_decoder.gate_readout", geometry)
+    merged = merge_with_transition(full, gate, stage, mix)
     flat = {key: value.flatten(1, 2) for key, value in merged.items()}
 
-    six = flat["rotation"] + torch.tensor(ROTATION_OFFSET, dtype=geo.dtype, device=geo.device)
+    def constant(values):
+        return torch.tensor(values, dtype=geometry.dtype, device=geometry.device)
+
+    six = flat["rotation"] + constant(ROTATION_OFFSET)
     six = torch.cat([normalize(six[..., :3], 1e-8), normalize(six[..., 3:], 1e-8)], dim=-1)
     return {
-        "means": flat["position"] + params["gaussian_decoder.patch_center_bias"],  # the constant (0, 0, 1.5)
+        "means": flat["position"] + params.get("gaussian_decoder.patch_center_bias", constant(MEAN_OFFSET)),
         "scales": torch.exp(flat["log_scale"]),
         "rotations_6d": six,
-        "quats_wxyz": quaternion_from_matrix(matrix_from_6d(six)),
-        "opacities": torch.sigmoid(flat["opacity"]).clamp(0.0, LARGEST_OPACITY),
+        "quaternions": quaternion_from_matrix(matrix_from_6d(six)),
+        "opacities": torch.sigmoid(flat["opacity"]).clamp(0.0, LARGEST_OPACITY).squeeze(-1),
         "sh": flat["sh"],
-        "raw": {
-            "log_scale": raw["log_scale"] + LOG_SCALE_OFFSET,
-            "rotation": raw["rotation"],
-            "sh": raw["sh"],
-            "opacity_logit": full["opacity"],
-        },
     }

@@ -9,7 +9,7 @@ LEAST_WEIGHT = 0.5
 LEAST_MASS = 0.25
 CLOSE = 1e-3  # distance from a threshold within which rounding may decide
 
-MATCHED_LEAST_VARIANCE = 1e-5
+MATCHED_LEAST_VARIANCE, MATCHED_CLOSE = 1e-5, 2e-5
 STEP_COST, JUMP_COST, EDGE_RATE = 0.1, 3.0, 10.0
 FAR_BONUS = 0.1
 HALF_MARGIN = 0.05
@@ -30,9 +30,7 @@ def sample(image, x, y):
     return F.grid_sample(images, grid, padding_mode="border", align_corners=False).squeeze(1)
 
 
-def correlations(
-    grey, weight, other, other_weight, to_pixels, inverse_depths, least_variance=LEAST_VARIANCE, limit=CLOSE
-):
+def correlations(grey, weight, other, other_weight, to_pixels, inverse_depths, least_variance, limit):
     """Returns the correlation of grey [H, W] with another photo on each plane, and a mask of close calls, [planes, H, W] each.
 
     The weights are None if every pixel counts. A patch's correlation is -1 where the pixel isn't shown or has too
@@ -67,17 +65,23 @@ def correlations(
     return torch.where(counts, covariance / (variance(own) * variance(seen)).sqrt(), -1.0), close
 
 
-def search(grey, weight, others, other_weights, to_pixels, step, planes):
-    """Returns each pixel's best inverse depth, the correlation there, and a mask of the pixels where rounding may decide, [H, W] each."""
+def all_correlations(grey, others, to_pixels, step, planes, weight, other_weights, least_variance, limit):
+    """Returns the `correlations` with all other photos, [others, planes, H, W]."""
     inverse_depths = step * torch.arange(planes, dtype=grey.dtype)
+    other_weights = [None] * len(others) if other_weights is None else other_weights
     compared = [
-        correlations(
-            grey, weight, other, None if other_weights is None else other_weights[k], to_pixels[k], inverse_depths
-        )
-        for k, other in enumerate(others)
+        correlations(grey, weight, other, other_weight, matrix, inverse_depths, least_variance, limit)
+        for other, other_weight, matrix in zip(others, other_weights, to_pixels, strict=True)
     ]
-    stacked, close = (torch.stack(parts) for parts in zip(*compared, strict=True))
-    better_half = stacked.topk(max(len(compared) // 2, 1), 0).values.mean(0)
+    stacked, close = zip(*compared, strict=True)
+    return torch.stack(stacked), torch.stack(close)
+
+
+def search(grey, others, to_pixels, step, planes, weight=None, other_weights=None):
+    """Returns each pixel's best inverse depth, the correlation there, and a mask of the pixels where rounding may decide, [H, W] each."""
+    photos = grey, others, to_pixels, step, planes, weight, other_weights
+    stacked, close = all_correlations(*photos, LEAST_VARIANCE, CLOSE)
+    better_half = stacked.topk(max(len(others) // 2, 1), 0).values.mean(0)
     (first, second), planes_of = better_half.topk(2, 0)
     # Planes without a photo that shows the pixel are equal; the first of them counts.
     plane = torch.where(first > -1.0, planes_of[0], 0)
@@ -105,27 +109,14 @@ def path_costs(costs, grey, dy, dx):
     return torch.stack(rows, 1)
 
 
-def match_semi_globally(grey, weight, others, other_weights, to_pixels, step, planes, limit):
+def match_semi_globally(grey, others, to_pixels, step, planes, weight=None, other_weights=None):
     """Returns each pixel's inverse depth by semi-global matching, how sure it is, and a mask of the pixels where rounding may decide.
 
-    One pixel's visibility has an effect on all others, so if it is within `limit` of a threshold, all may be wrong.
+    One pixel's visibility has an effect on all others, so if it is close to a threshold, all may be wrong.
     """
-    inverse_depths = step * torch.arange(planes, dtype=grey.dtype)
-    compared = [
-        correlations(
-            grey,
-            weight,
-            other,
-            None if other_weights is None else other_weights[k],
-            to_pixels[k],
-            inverse_depths,
-            MATCHED_LEAST_VARIANCE,
-            limit,
-        )
-        for k, other in enumerate(others)
-    ]
-    stacked, close = (torch.stack(parts) for parts in zip(*compared, strict=True))
-    costs = 1.0 - stacked.clamp_min(0.0).topk(max(len(compared) // 2, 1), 0).values.mean(0)
+    photos = grey, others, to_pixels, step, planes, weight, other_weights
+    stacked, close = all_correlations(*photos, MATCHED_LEAST_VARIANCE, MATCHED_CLOSE)
+    costs = 1.0 - stacked.clamp_min(0.0).topk(max(len(others) // 2, 1), 0).values.mean(0)
     variance = patch_means(grey * grey) - patch_means(grey) ** 2 + MATCHED_LEAST_VARIANCE
     costs[0] -= FAR_BONUS * MATCHED_LEAST_VARIANCE / variance
     means = sum(path_costs(costs, grey, dy, dx) for dy, dx in DIRECTIONS) / len(DIRECTIONS)

@@ -2,8 +2,45 @@
 
 import torch
 
-from .layers import layer_norm, layer_scale, linear, mlp
-from .stream import stream_round
+from .layers import attention, layer_norm, layer_scale, linear, mlp
+
+
+def read_memory(params, name, slots, memory, heads, update_mask):
+    """Applies the cross-attention and MLP of a round to slots [B, L, d], memory [B, S, e], update_mask [L, 1].
+
+    slots += mask * LayerScale(Wo Attn(Wq LN(slots), Wk LN(memory), Wv LN(memory)))
+    slots += mask * LayerScale(MLP(LN(slots)))
+    """
+    normed = layer_norm(params, f"{name}.mem_ln", memory)
+    q = linear(params, f"{name}.lat_q", layer_norm(params, f"{name}.slots_ln", slots))
+    k = linear(params, f"{name}.mem_k", normed)
+    v = linear(params, f"{name}.mem_v", normed)
+    read = linear(params, f"{name}.out_proj", attention(q, k, v, heads))
+    slots = slots + update_mask * layer_scale(params, f"{name}.attn_ls", read)
+
+    update = mlp(params, f"{name}.mlp.0", f"{name}.mlp.2", layer_norm(params, f"{name}.post_ln", slots))
+    return slots + update_mask * layer_scale(params, f"{name}.mlp_ls", update)
+
+
+def self_attention_block(params, name, x, heads):
+    """Computes x += LayerScale(Attn(LN x)); x += LayerScale(MLP(LN x)).
+
+    q, k, v are the thirds of the output of one linear layer, in this order.
+    """
+    q, k, v = linear(params, f"{name}.attn.qkv", layer_norm(params, f"{name}.norm1", x)).chunk(3, dim=-1)
+    mixed = linear(params, f"{name}.attn.proj", attention(q, k, v, heads))
+    x = x + layer_scale(params, f"{name}.ls1", mixed)
+
+    update = mlp(params, f"{name}.mlp.fc1", f"{name}.mlp.fc2", layer_norm(params, f"{name}.norm2", x))
+    return x + layer_scale(params, f"{name}.ls2", update)
+
+
+def stream_round(params, name, slots, memory, heads, blocks, update_mask):
+    """Applies one round of one stream to slots [B, L, d]. Returns [B, L, d]."""
+    slots = read_memory(params, name, slots, memory, heads, update_mask)
+    for block in range(blocks):
+        slots = self_attention_block(params, f"{name}.tower.{block}", slots, heads)
+    return slots
 
 
 def mixer(params, name, geo, app):
@@ -16,7 +53,7 @@ def mixer(params, name, geo, app):
 
 
 def encode(config, params, tokens):
-    """Encodes view tokens [B, V, P, e] to (geo, app), each [B, M, d].
+    """Encodes view tokens [B, V P, e] to (geo, app), each [B, M, d].
 
     Slots:  4 auxiliary queries, M scene tokens, 1 global token, 4 registers.
     Memory: 4 memory registers, then all V P view tokens.
@@ -24,8 +61,8 @@ def encode(config, params, tokens):
     this stream twice.
     """
     batch = tokens.shape[0]
-    heads, blocks = config["num_heads"], config["slot_calib_layers_per_round"]
-    single = config.get("streams", "dual") == "single"
+    heads, blocks = config["heads"], config["self_attention_blocks"]
+    single = config["streams"] == "single"
 
     def repeat(token):  # [1, n, d] -> [B, n, d]
         return token.expand(batch, -1, -1)
@@ -34,7 +71,7 @@ def encode(config, params, tokens):
     scene = params["scene_tokens"][None]
     registers = params["slot_encoder.slot_regs"]
     slots = repeat(torch.cat([auxiliary, scene, params["slot_encoder.scale_emb"], registers], dim=1))
-    memory = torch.cat([repeat(params["slot_encoder.mem_regs"]), tokens.flatten(1, 2)], dim=1)
+    memory = torch.cat([repeat(params["slot_encoder.mem_regs"]), tokens], dim=1)
 
     # Registers do not attend to the memory: only self-attention (and the mixer) updates them.
     update_mask = torch.ones(slots.shape[1], 1, dtype=slots.dtype, device=slots.device)

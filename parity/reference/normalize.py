@@ -4,7 +4,6 @@ import torch
 
 ROUNDING = 1e-14  # cameras whose extent relative to their largest coordinate is at most this keep their scale
 SMALLEST_DIRECTION = 1e-6  # a mean direction whose norm is at most this is undefined
-METRIC_FAR = 4.0 * 10.0  # far bound of the frustum loss before division by the scene scale
 
 
 def unit(v):
@@ -55,8 +54,3 @@ def normalize_scene(c2w):
     normalized = aligned.clone()
     normalized[:, :3, 3] = centres / scale
     return normalized, invert_rigid(normalized), scale
-
-
-def frustum_far(scale):
-    """Returns the far bound of the frustum loss, in normalized units."""
-    return METRIC_FAR / scale

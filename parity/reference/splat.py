@@ -1,5 +1,7 @@
 """A dense rasterizer that evaluates every Gaussian at every pixel: slow, differentiable by autograd, with all rules."""
 
+import math
+
 import torch
 
 from .rotation import matrix_from_quaternion
@@ -11,6 +13,7 @@ SMALLEST_ALPHA = 1.0 / 255.0
 LARGEST_ALPHA = 0.999
 SMALLEST_TRANSMITTANCE = 1e-4
 SMALLEST_ACCUMULATION = 1e-10
+UNSEEN = 1e-3  # pixels that are added to the contribution of every Gaussian
 
 
 def covariance(scales, quaternions):
@@ -168,3 +171,41 @@ def render(means, scales, quaternions, opacities, sh, w2c, intrinsic, width, hei
     pixels = pixel_centres(width, height, means.dtype, means.device)
     rgb, accumulated, depth = composite(projected, opacities * projected["compensation"], colors, pixels)
     return rgb.reshape(height, width, 3), accumulated.reshape(height, width), depth.reshape(height, width)
+
+
+def pixel_weights(means, scales, quaternions, opacities, w2c, intrinsic, width, height):
+    """Returns the weights of the Gaussians in the pixels of a camera, [H W, N]: each channel of a render is its product
+    with their colors."""
+    projected = project(means, scales, quaternions, w2c, intrinsic, width, height)
+    pixels = pixel_centres(width, height, means.dtype, means.device)
+    one_hot = torch.eye(len(means), dtype=means.dtype)
+    return composite(projected, opacities * projected["compensation"], one_hot, pixels)[0]
+
+
+def fit_colors(gaussians, w2cs, intrinsics, images, masks, steps):
+    """Returns the contributions [N] of Gaussians (means, scales, quaternions, opacities, sh) of one scene in pixels, and
+    their SH [N, bases, 3] after some steps of accelerated gradient descent on half the sum of squared errors."""
+    means, scales, quaternions, opacities, sh = gaussians
+    bases = sh.shape[1]
+    height, width = images.shape[-2:]
+    cameras = list(zip(w2cs, intrinsics, strict=True))
+    factors = [pixel_weights(means, scales, quaternions, opacities, *camera, width, height) for camera in cameras]
+    contributions = sum(factor.sum(0) for factor in factors)
+    degrees = torch.tensor([math.isqrt(basis) for basis in range(bases)], dtype=sh.dtype)
+    bounds = bases * (2 * degrees + 1).sqrt() / (4 * math.pi)
+    sizes = 1 / (contributions[:, None] * bounds + UNSEEN)
+
+    def gradient(sh):
+        sh = sh.detach().requires_grad_()
+        errors = [
+            mask.flatten()[:, None] * (factor @ sh_color(means, sh, w2c) - image.flatten(1).T) ** 2
+            for (w2c, _), factor, image, mask in zip(cameras, factors, images, masks, strict=True)
+        ]
+        return torch.autograd.grad(0.5 * sum(error.sum() for error in errors), sh)[0]
+
+    ahead = sh
+    for step in range(1, steps + 1):
+        following = ahead - gradient(ahead) * sizes[..., None]
+        ahead = following + (step - 1) / (step + 2) * (following - sh)
+        sh = following
+    return contributions, sh

@@ -5,7 +5,7 @@ import math
 import torch
 import torch.nn.functional as F
 
-from .rays import pixel_directions
+from .tokens import pixel_directions
 
 DISTANCE = 1.8  # to which the warp moves what the photos show
 FARTHEST = 40.0  # depth of pixels whose inverse depth is smaller
@@ -19,9 +19,9 @@ BLUR, BLURS, COARSER = (
 PRIOR = 1e-6  # weight of DISTANCE
 
 
-def points(c2w, intrinsic, inverse_depths):
+def points(c2w, intrinsics, inverse_depths):
     """Returns the points [B, V, H, W, 3] that the pixels show at inverse depths [B, V, H, W]."""
-    directions = pixel_directions(c2w, intrinsic, *inverse_depths.shape[-2:])
+    directions = pixel_directions(c2w, intrinsics, *inverse_depths.shape[-2:])
     return c2w[:, :, None, None, :3, 3] + directions / inverse_depths[..., None]
 
 
@@ -53,15 +53,15 @@ def blurred(image, sigma):
 
 
 class RadialWarp:
-    """The warp of views with c2w [B, V, 4, 4], intrinsic [B, V, 3, 3] and depths [B, V, 2, H, W]: inverse depth, sureness.
+    """The warp of views with c2w [B, V, 4, 4], intrinsics [B, V, 3, 3] and depths [B, V, 2, H, W]: inverse depth, sureness.
 
     A point X of the normalized world becomes exp(-l) X, where l is the map of directions at X: the mean of
     log(|X| / DISTANCE) over the pixels around, weighted by how sure their depths are.
     """
 
-    def __init__(self, c2w, intrinsic, depths):
+    def __init__(self, c2w, intrinsics, depths):
         self.inverse_depths = depths[:, :, 0].clamp(min=1.0 / FARTHEST)
-        xs = points(c2w, intrinsic, self.inverse_depths).flatten(1, 3)
+        xs = points(c2w, intrinsics, self.inverse_depths).flatten(1, 3)
         weights = depths[:, :, 1].flatten(1)
         logs = torch.log(xs.norm(dim=-1).clamp(min=NEAREST) / DISTANCE) * weights
         maps = []
@@ -86,9 +86,9 @@ class RadialWarp:
         moved[..., :3, 3] = c2w[..., :3, 3] * self.camera_factors[:, None, None]
         return moved
 
-    def rays(self, c2w, intrinsic):
+    def rays(self, c2w, intrinsics):
         """Returns the Plücker rays [B, V, H, W, 6] from the moved cameras through the warped points."""
-        xs = points(c2w, intrinsic, self.inverse_depths)
+        xs = points(c2w, intrinsics, self.inverse_depths)
         warped = xs * torch.exp(-self.log_factors_at(xs.flatten(1, 3))).view(*xs.shape[:-1], 1)
         origins = self.cameras(c2w)[:, :, None, None, :3, 3].expand_as(warped)
         directions = warped - origins

@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 from . import _native
 from .reference.model import forward
-from .reference.names import reference_config
 
 
 class Model(nn.Module):
@@ -48,9 +47,9 @@ class Model(nn.Module):
         decoded = forward(self.config, dict(self.named_parameters()), images, c2w, Ks, self.stage, self.mix)
         return {
             "means": decoded["means"],
-            "quats": decoded["quats_wxyz"],
+            "quats": decoded["quaternions"],
             "scales": decoded["scales"],
-            "opacities": decoded["opacities"].squeeze(-1),
+            "opacities": decoded["opacities"],
             "colors": decoded["sh"],
         }
 
@@ -68,7 +67,7 @@ def load_model(weights: str | os.PathLike[str] | None = None) -> Model:
     """
     arrays, config, stage, mix = _native.read_model(weights)
     return Model(
-        reference_config(json.loads(config)),
+        json.loads(config),
         {name: torch.from_numpy(array) for name, array in arrays.items()},
         stage,
         mix,

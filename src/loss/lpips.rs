@@ -177,7 +177,7 @@ impl Tile {
 #[derive(Debug)]
 pub struct Lpips {
     network: LpipsNetwork,
-    /// Precision of the convolutions; features are normalized and compared in float32.
+    /// Precision of the convolutions; features are normalized and compared in that of the weights, float32.
     precision: Precision,
     /// Shift of the input, [1, 3, 1, 1].
     shift: Tensor,
@@ -310,7 +310,7 @@ impl Lpips {
                 xs = xs.max_pool2d([pool, pool], [2, 2], [0, 0], [1, 1], false);
             }
             xs = convolve(&step.convolution, &xs);
-            step.linear.is_some().then(|| unit(&xs.to_kind(Kind::Float)))
+            step.linear.as_ref().map(|linear| unit(&xs.to_kind(linear.kind())))
         })
     }
 

@@ -290,3 +290,72 @@ pub(crate) fn split_opacity_bias(bias: &Tensor, latent_ratio: i64) -> Tensor {
     let _ = shift.view([-1, PARAMETERS]).select(1, OPACITY).fill_(shared);
     bias + shift
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model::tokens::patchify;
+    use tch::Device;
+
+    #[test]
+    fn smaller_patches_match_enlarged_patches() {
+        let numbers = |size: &[i64], seed: f64| {
+            let count = size.iter().product();
+            (Tensor::linspace(0., seed, count, (Kind::Double, Device::Cpu)) * 1e3).sin().view(size)
+        };
+        for (patch, times) in [(8, 2), (12, 3), (4, 4), (6, 1)] {
+            let weights = numbers(&[5, patch * patch * 3], 1.);
+            let edge = patch / times;
+            let small = numbers(&[1, 2, 2 * edge, 3 * edge, 3], 2.);
+            let enlarged =
+                small.repeat_interleave_self_int(times, 2, None).repeat_interleave_self_int(times, 3, None);
+            let expected = patchify(&enlarged, patch).linear(&weights, None::<&Tensor>);
+            let of_small = shrink_patch_weights(&weights, patch, times);
+            let found = patchify(&small, edge).linear(&of_small, None::<&Tensor>);
+            let error = ((&found - &expected).norm() / expected.norm()).double_value(&[]);
+            assert!(found.size() == [1, 2, 6, 5] && error < 1e-9, "{patch}, {times}: {error:.1e}");
+        }
+    }
+
+    #[test]
+    fn repeated_tokens_differ_by_noise_and_keep_total_opacity() {
+        tch::manual_seed(4);
+        let of = |latents| ModelConfig { latents, ..Default::default() };
+        for latent_ratio in [1, 2, 3] {
+            let growth = Growth::from_configs(&of(500), &of(500 * latent_ratio));
+            let tokens = Tensor::randn([500, 16], (Kind::Float, Device::Cpu)) * 3.;
+            let apart =
+                growth.convert("scene_tokens", &tokens).view([500, latent_ratio, 16]) - tokens.unsqueeze(1);
+            let apart = apart.square().mean(None::<Kind>).sqrt().double_value(&[]);
+            let expected = if latent_ratio == 1 { 0. } else { 3. * TOKEN_NOISE };
+            assert!((apart - expected).abs() < 0.05 * expected + 1e-9, "{latent_ratio} copies: {apart}");
+
+            // Bias of two candidates that are half opaque.
+            let bias = Tensor::zeros([2 * PARAMETERS], (Kind::Double, Device::Cpu));
+            let grown =
+                growth.convert("gaussian_decoder.geo_param_readout.bias", &bias).view([2, PARAMETERS]);
+            let left = grown.select(1, OPACITY).sigmoid().neg() + 1.;
+            let covered: Tensor = 1. - left.pow_tensor_scalar(latent_ratio);
+            assert!(
+                covered.allclose(&covered.full_like(0.5), 1e-12, 0., false),
+                "{latent_ratio} copies: {covered:?}"
+            );
+            assert_eq!(grown.narrow(1, 0, OPACITY).abs().sum(None::<Kind>).double_value(&[]), 0.);
+        }
+    }
+
+    #[test]
+    fn unsupported_differences_are_ignored() {
+        let from = ModelConfig { patch_size: 8, latents: 16, ..Default::default() };
+        let to = |patch_size, latents| ModelConfig { patch_size, latents, ..from.clone() };
+        for (wanted, reached) in [
+            (to(8, 16), to(8, 16)),
+            (to(4, 48), to(4, 48)),
+            (to(3, 48), to(8, 48)),
+            (to(2, 24), to(2, 16)),
+            (to(16, 8), to(8, 16)),
+        ] {
+            assert_eq!(Growth::from_configs(&from, &wanted).result(), reached);
+        }
+    }
+}

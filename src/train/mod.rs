@@ -19,8 +19,8 @@ pub use run::{Event, Outcome, Resume, Validator, add_run_inputs, retry_on_disk_f
 pub use step::{Score, StepReport};
 pub use trainer::Trainer;
 
-// The parity checks run each of these functions by itself.
-pub(crate) use schedule::{learning_rate, parameter_groups, stage_at, subsets};
+// The parity checks run this function by itself.
+pub(crate) use schedule::parameter_groups;
 // Benchmarks read the time of this span.
 pub(crate) use trainer::COMMUNICATION;
 

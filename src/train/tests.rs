@@ -1,6 +1,7 @@
 //! Tests that all ways to compute a step give the same gradient, and that a step of several ranks equals that of a single one.
 
-use super::{StepReport, Trainer, subsets};
+use super::schedule::subsets;
+use super::{StepReport, Trainer};
 use crate::config::{Config, TrainConfig};
 use crate::data::{Batch, Capture, LoadedScene};
 use crate::device::{Stopwatch, num_threads};

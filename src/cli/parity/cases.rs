@@ -1,7 +1,7 @@
 //! Parity cases: the code that each case name runs.
 
 use super::{Answer, Request, Tensors};
-use crate::config::{CurriculumConfig, OptimizerKind, TrainConfig};
+use crate::config::{OptimizerKind, TrainConfig};
 use crate::data::{self, ViewBatch};
 use crate::error::{Error, Result};
 use crate::io::Weights;
@@ -22,24 +22,12 @@ use tch::{Kind, Tensor, nn};
 /// Runs the case that `request` names.
 pub(super) fn run(request: &Request) -> Result<Answer> {
     match request.case.as_str() {
-        "patchify" => patchify(request),
-        "rgb_tokens" | "ray_tokens" | "tokens" => tokens(request),
-        "rays" => rays(request),
+        "tokens" => tokens(request),
         "radial_warp" => radial_warp(request),
-        "camera_code" => camera_code(request),
         "linear" => linear(request),
         "attention" => attention(request),
-        "stream_round" => stream_round(request),
-        "self_attention_block" => self_attention_block(request),
-        "mixer" => mixer(request),
         "encoder" => encoder(request),
-        "growth" => growth(request),
-        "heads" => heads(request),
-        "merge" => merge(request),
         "decoder" => decoder(request),
-        "rotation_matrix" => {
-            outputs([("matrix", model::rotation_matrix_from_6d(request.input("rotations")?))])
-        }
         "quaternion" => outputs([("quaternion", model::quaternion_from_6d(request.input("rotations")?))]),
         "scene_normalization" => scene_normalization(request),
         "color_fit" => color_fit(request),
@@ -78,17 +66,12 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
         )),
         "depth_search" => depth_search(request, Search::PatchCorrelation, "correlation"),
         "semi_global_matching" => depth_search(request, Search::SemiGlobal, "sureness"),
-        "sh_soft_cap" => loss_of(loss::sh_soft_cap(request.input("sh")?)),
         "decoder_regularization" => decoder_regularization(request),
         "lpips" => lpips(request),
-        "vgg19" => vgg19(request),
         "perceptual" => perceptual(request),
         "consistency" => consistency(request),
         "resample" => resample(request),
         "jitter" => jitter(request),
-        "subsets" => subsets(request),
-        "learning_rate" => learning_rate(request),
-        "stages" => stages(request),
         "adamw" => steps_of(OptimizerKind::AdamW, request),
         "muon" => steps_of(OptimizerKind::Muon, request),
         "model" => whole_model(request),
@@ -139,8 +122,11 @@ impl Request {
 
     /// Builds a module and loads the request's parameters into it, whose names must be those of the module.
     fn build<M>(&self, new: impl FnOnce(&nn::Path) -> M) -> Result<(M, Tensors)> {
-        let vs = nn::VarStore::new(self.device);
+        let mut vs = nn::VarStore::new(self.device);
         let module = new(&vs.root());
+        if self.params.values().any(|t| t.kind() == Kind::Double) {
+            vs.double();
+        }
         let mut tensors =
             self.params.iter().map(|(name, t)| (name.clone(), t.shallow_clone())).collect::<Tensors>();
         // The request holds trainable parameters only. Constants keep the values of the module.
@@ -165,47 +151,10 @@ fn loss_of(loss: Tensor) -> Result<Answer> {
     outputs([("loss", loss.view([1]))])
 }
 
-fn patchify(request: &Request) -> Result<Answer> {
-    outputs([("tokens", model::patchify(request.input("xs")?, request.number("patch_size")?))])
-}
-
 fn tokens(request: &Request) -> Result<Answer> {
     let config = request.model_config()?;
-    let (module, params) = match request.case.as_str() {
-        "rgb_tokens" => {
-            let (rgb, params) = request.build(|vs| model::RgbTokens::new(vs, &config))?;
-            return with_params([("tokens", rgb.forward(request.input("images")?))], params);
-        }
-        "ray_tokens" => {
-            let (ray, params) = request.build(|vs| model::RayTokens::new(vs, &config))?;
-            let [height, width] = request.image()?;
-            let (c2w, intrinsics) = (request.input("c2w")?, request.input("intrinsics")?);
-            let rays = scene::plucker_rays(c2w, intrinsics, height, width);
-            let tokens = ray.forward(&rays, c2w, intrinsics);
-            return with_params([("tokens", tokens)], params);
-        }
-        _ => request.build(|vs| model::Tokenizer::new(vs, &config))?,
-    };
-    let tokens = module.forward(&request.model_input()?, None);
-    with_params([("tokens", tokens)], params)
-}
-
-fn growth(request: &Request) -> Result<Answer> {
-    let (patch, patch_size_ratio) = (request.number("patch_size")?, request.number("patch_size_ratio")?);
-    let patch_weights = request.input("patch_weights")?;
-    outputs([
-        ("patch_weights", model::shrink_patch_weights(patch_weights, patch, patch_size_ratio)),
-        ("scene_tokens", model::repeat_scene_tokens(request.input("scene_tokens")?, request.input("noise")?)),
-        ("bias", model::split_opacity_bias(request.input("bias")?, request.number("latent_ratio")?)),
-    ])
-}
-
-fn rays(request: &Request) -> Result<Answer> {
-    let [height, width] = request.image()?;
-    outputs([(
-        "rays",
-        scene::plucker_rays(request.input("c2w")?, request.input("intrinsics")?, height, width),
-    )])
+    let (module, params) = request.build(|vs| model::Tokenizer::new(vs, &config))?;
+    with_params([("tokens", module.forward(&request.model_input()?, None))], params)
 }
 
 fn radial_warp(request: &Request) -> Result<Answer> {
@@ -227,14 +176,6 @@ fn radial_warp(request: &Request) -> Result<Answer> {
         ("means", restored.means),
         ("scales", restored.scales),
     ])
-}
-
-fn camera_code(request: &Request) -> Result<Answer> {
-    let config = request.model_config()?;
-    let [height, width] = request.image()?;
-    let (module, params) = request.build(|vs| model::CameraCode::new(vs, config.ray_width))?;
-    let code = module.forward(request.input("c2w")?, request.input("intrinsics")?, height, width);
-    with_params([("code", code)], params)
 }
 
 fn linear(request: &Request) -> Result<Answer> {
@@ -263,28 +204,6 @@ fn attention(request: &Request) -> Result<Answer> {
     outputs([("seen", seen.to_kind(inputs[0].kind()))])
 }
 
-fn stream_round(request: &Request) -> Result<Answer> {
-    let config = request.model_config()?;
-    let (module, params) = request.build(|vs| model::StreamRound::new(vs, &config))?;
-    let (slots, tokens) = (request.input("slots")?, model::ImageTokens::new(request.input("memory")?));
-    with_params([("slots", module.forward(slots, &tokens, Precision::F32))], params)
-}
-
-fn self_attention_block(request: &Request) -> Result<Answer> {
-    let config = request.model_config()?;
-    let (module, params) =
-        request.build(|vs| model::SelfAttentionBlock::new(vs, config.width, config.heads))?;
-    with_params([("slots", module.forward(request.input("slots")?, Precision::F32))], params)
-}
-
-fn mixer(request: &Request) -> Result<Answer> {
-    let config = request.model_config()?;
-    let (module, params) = request.build(|vs| model::Mixer::new(vs, config.width))?;
-    let (geometry, appearance) =
-        module.forward(request.input("geometry")?, request.input("appearance")?, Precision::F32);
-    with_params([("geometry", geometry), ("appearance", appearance)], params)
-}
-
 fn encoder(request: &Request) -> Result<Answer> {
     let config = request.model_config()?;
     let ((scene_tokens, encoder), params) = request.build(|vs| {
@@ -300,39 +219,6 @@ fn encoded(request: &Request) -> Result<EncodedTokens> {
         geometry: request.input("geometry")?.shallow_clone(),
         appearance: request.input("appearance")?.shallow_clone(),
     })
-}
-
-fn heads(request: &Request) -> Result<Answer> {
-    let config = request.model_config()?;
-    let (module, params) = request.build(|vs| model::Decoder::new(vs, &config))?;
-    let heads = module.heads(&encoded(request)?);
-    let result = [
-        ("positions", heads.positions),
-        ("log_scales", heads.log_scales),
-        ("rotations", heads.rotations),
-        ("opacity_logits", heads.opacity_logits),
-        ("gate", heads.gate),
-        ("sh", heads.sh),
-    ];
-    with_params(result, params)
-}
-
-fn merge(request: &Request) -> Result<Answer> {
-    let candidates = model::Candidates {
-        positions: request.input("positions")?.shallow_clone(),
-        log_scales: request.input("log_scales")?.shallow_clone(),
-        rotations: request.input("rotations")?.shallow_clone(),
-        opacity_logits: request.input("opacity_logits")?.shallow_clone(),
-        sh: request.input("sh")?.shallow_clone(),
-    };
-    let shown = candidates.at_stage(request.input("gate")?, request.stage()?);
-    outputs([
-        ("positions", shown.positions),
-        ("log_scales", shown.log_scales),
-        ("rotations", shown.rotations),
-        ("opacity_logits", shown.opacity_logits),
-        ("sh", shown.sh),
-    ])
 }
 
 fn decoded(decoded: model::Decoded, params: Tensors) -> Result<Answer> {
@@ -477,25 +363,12 @@ fn consistency(request: &Request) -> Result<Answer> {
     loss_of(loss::consistency(alpha, depth, None, factors, &loss::StepFraction::WHOLE))
 }
 
-fn subsets(request: &Request) -> Result<Answer> {
-    let [a, b] = train::subsets(request.number("views")?, request.number("step")?);
-    let tensor =
-        |positions: Vec<usize>| Tensor::from_slice(&positions.iter().map(|&p| p as i64).collect::<Vec<_>>());
-    outputs([("a", tensor(a)), ("b", tensor(b))])
-}
-
 fn lpips(request: &Request) -> Result<Answer> {
     let name: String = request.number("network")?;
     let network = loss::LpipsNetwork::ALL.into_iter().find(|network| network.metric() == name);
     let network = network.ok_or_else(|| Error::request(format!("{}: no network {name}", request.case)))?;
     let (lpips, params) = request.build(|vs| loss::Lpips::new(vs, network))?;
     with_params([("distance", lpips.distance(request.input("picture")?, request.input("truth")?))], params)
-}
-
-fn vgg19(request: &Request) -> Result<Answer> {
-    let (network, params) = request.build(loss::Vgg19::new)?;
-    let features = |name| Ok::<_, Error>(network.features(request.input(name)?));
-    with_params([("loss", network.compare(&features("picture")?, &features("truth")?).view([1]))], params)
 }
 
 /// Computes the loss between two renderings of the same targets, as training does. The network's weights are the inputs with a dot in their
@@ -507,7 +380,10 @@ fn perceptual(request: &Request) -> Result<Answer> {
         _ => loss::PerceptualLoss::Lpips(loss::Lpips::new(&vs.root(), loss::LpipsNetwork::AlexNet)),
     };
     let weights = request.inputs.iter().filter(|(name, _)| name.contains('.'));
-    let tensors = weights.map(|(name, t)| (name.clone(), t.shallow_clone())).collect();
+    let tensors: Tensors = weights.map(|(name, t)| (name.clone(), t.shallow_clone())).collect();
+    if tensors.values().any(|t| t.kind() == Kind::Double) {
+        vs.double();
+    }
     Weights { tensors, metadata: Default::default() }.load_into(&vs, Path::new(&request.case))?;
     vs.freeze();
     loss_of(network.loss(request.input("rendered")?, request.input("truth")?))
@@ -532,34 +408,6 @@ fn jitter(request: &Request) -> Result<Answer> {
     let mut planes = Vec::<f32>::try_from(image.flatten(0, -1))?;
     data::Jitter { adjustments: request.number("adjustments")? }.apply(&mut planes);
     outputs([("image", Tensor::from_slice(&planes).view_as(image))])
-}
-
-fn steps(request: &Request) -> Result<Vec<u64>> {
-    Ok(Vec::<i64>::try_from(request.input("steps")?)?.into_iter().map(|step| step as u64).collect())
-}
-
-fn learning_rate(request: &Request) -> Result<Answer> {
-    let config = TrainConfig {
-        learning_rate: request.number("peak")?,
-        steps: request.number("total")?,
-        warmup: request.number("warmup")?,
-        ..Default::default()
-    };
-    let rates: Vec<f64> = steps(request)?.iter().map(|&step| train::learning_rate(&config, step)).collect();
-    outputs([("learning_rate", Tensor::from_slice(&rates))])
-}
-
-fn stages(request: &Request) -> Result<Answer> {
-    let config = CurriculumConfig {
-        final_stage: request.number("final_stage")?,
-        boundaries: request.number("boundaries")?,
-        transition: request.number("transition")?,
-        full_capacity: request.number("full_capacity")?,
-    };
-    let stages: Vec<Stage> = steps(request)?.iter().map(|&step| train::stage_at(&config, step)).collect();
-    let index: Vec<i64> = stages.iter().map(|stage| i64::from(stage.index)).collect();
-    let mix: Vec<f64> = stages.iter().map(|stage| stage.mix).collect();
-    outputs([("index", Tensor::from_slice(&index)), ("mix", Tensor::from_slice(&mix))])
 }
 
 fn steps_of(optimizer: OptimizerKind, request: &Request) -> Result<Answer> {

@@ -7,14 +7,9 @@ mod cases;
 use super::device;
 use crate::error::{Error, Result};
 use clap::Args;
-use ndarray::ArrayD;
-use npyz::npz::{NpzArchive, NpzWriter};
-use npyz::{DType, Deserialize, NpyFile, WriterBuilder};
 use serde_json::Value;
 use std::collections::BTreeMap;
-use std::io::Read;
 use std::path::{Path, PathBuf};
-use tch::kind::Element;
 use tch::{Device, Kind, Tensor};
 
 /// Answer the requests of parity/run.py.
@@ -51,20 +46,22 @@ struct Answer {
 }
 
 impl Parity {
-    /// Answers every request `*.npz` by a file of the same name. If a case fails, its response holds the error message.
+    /// Answers every request `*.safetensors` by a file of the same name. If a case fails, its response holds the error message.
     pub fn run(self) -> anyhow::Result<()> {
         let device = device::parse(&self.device)?;
         let mut files = vec![];
         for entry in std::fs::read_dir(&self.requests).map_err(Error::read(&self.requests))? {
             files.push(entry.map_err(Error::read(&self.requests))?.path());
         }
-        files.retain(|path| path.extension().is_some_and(|ending| ending == "npz"));
+        files.retain(|path| path.extension().is_some_and(|ending| ending == "safetensors"));
         files.sort();
         for file in &files {
             let arrays = answer(file, device).unwrap_or_else(|error| {
                 Tensors::from([("error".into(), Tensor::from_slice(error.to_string().as_bytes()))])
             });
-            write_npz(&self.responses.join(file.file_name().expect("a file's name")), &arrays)?;
+            let arrays: Vec<_> = arrays.into_iter().map(|(name, t)| (name, t.contiguous())).collect();
+            let response = self.responses.join(file.file_name().expect("a file's name"));
+            Tensor::write_safetensors(&arrays, response)?;
         }
         Ok(())
     }
@@ -100,7 +97,7 @@ fn answer(file: &Path, device: Device) -> Result<Tensors> {
 }
 
 fn read_request(file: &Path, device: Device) -> Result<Request> {
-    let mut arrays = read_npz(file)?;
+    let mut arrays: Tensors = Tensor::read_safetensors(file)?.into_iter().collect();
     let case = arrays.remove("case").ok_or_else(|| unknown(file, "array", "case"))?;
     let case = String::from_utf8_lossy(&Vec::<u8>::try_from(case)?).into_owned();
     let case: Value = serde_json::from_str(&case)
@@ -133,64 +130,4 @@ fn read_request(file: &Path, device: Device) -> Result<Request> {
 
 fn unknown(file: &Path, what: &str, name: &str) -> Error {
     Error::input(file, format!("{what} {name}"), "out of place", "what parity/run.py writes")
-}
-
-/// Reads float32, float64, int64 and uint8 arrays in C order.
-fn read_npz(path: &Path) -> Result<Tensors> {
-    let mut archive = NpzArchive::open(path).map_err(Error::read(path))?;
-    let names: Vec<String> = archive.array_names().map(String::from).collect();
-    let mut arrays = Tensors::new();
-    for name in names {
-        let array = archive.by_name(&name).map_err(Error::read(path))?.expect("a name that the archive gave");
-        let descr = match array.dtype() {
-            DType::Plain(descr) => descr.to_string(),
-            other => format!("{other:?}"),
-        };
-        let tensor = match descr.trim_start_matches(['<', '|', '=']) {
-            "f4" => tensor_of::<f32>(array),
-            "f8" => tensor_of::<f64>(array),
-            "i8" => tensor_of::<i64>(array),
-            "u1" => tensor_of::<u8>(array),
-            _ => return Err(Error::input(path, format!("array {name}"), descr, "f4, f8, i8 or u1")),
-        };
-        arrays.insert(name, tensor.map_err(Error::read(path))?);
-    }
-    Ok(arrays)
-}
-
-fn tensor_of<T: Deserialize + Element>(array: NpyFile<impl Read>) -> std::io::Result<Tensor> {
-    let shape: Vec<i64> = array.shape().iter().map(|&size| size as i64).collect();
-    Ok(Tensor::from_slice(&array.into_vec::<T>()?).view(shape.as_slice()))
-}
-
-/// Writes arrays that [`read_npz`] can read.
-fn write_npz(path: &Path, arrays: &Tensors) -> Result<()> {
-    let mut writer = NpzWriter::create(path).map_err(Error::write(path))?;
-    for (name, tensor) in arrays {
-        match tensor.kind() {
-            Kind::Float => write_array::<f32>(&mut writer, name, tensor, path)?,
-            Kind::Double => write_array::<f64>(&mut writer, name, tensor, path)?,
-            Kind::Int64 => write_array::<i64>(&mut writer, name, tensor, path)?,
-            Kind::Uint8 => write_array::<u8>(&mut writer, name, tensor, path)?,
-            other => return Err(Error::failed(format!("{name} has kind {other:?}, which isn't exchanged"))),
-        }
-    }
-    Ok(())
-}
-
-fn write_array<T: Element + Copy + npyz::AutoSerialize>(
-    writer: &mut NpzWriter<impl std::io::Write + std::io::Seek>,
-    name: &str,
-    tensor: &Tensor,
-    path: &Path,
-) -> Result<()> {
-    let array: ArrayD<T> = (&tensor.contiguous()).try_into()?;
-    let shape: Vec<u64> = array.shape().iter().map(|&size| size as u64).collect();
-    let mut write = || -> std::io::Result<()> {
-        let mut npy =
-            writer.array::<T>(name, Default::default())?.default_dtype().shape(&shape).begin_nd()?;
-        npy.extend(array.iter().copied())?;
-        npy.finish()
-    };
-    write().map_err(Error::write(path))
 }

@@ -1,4 +1,4 @@
-//! Checkpoints that the crate writes. `parity/tests/test_checkpoints.py` reads them with torch.
+//! Checkpoints that the crate writes. `parity/tests/test_torch_files.py` reads them with torch.
 
 use globalsplat_torch_file::{Array, Dtype, TensorView, TorchFile, Value, write_checkpoint};
 use std::collections::HashMap;
