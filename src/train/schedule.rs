@@ -129,4 +129,58 @@ mod tests {
             }
         }
     }
+
+    #[test]
+    fn warm_up_peak_and_floor() {
+        let config = TrainConfig::default(); // 220,000 steps, 6,600 of them warm-up
+        let near = |step, expected: f64| {
+            let lr = learning_rate(&config, step);
+            assert!((lr / expected - 1.).abs() < 1e-9, "step {step}: {lr}");
+        };
+        near(0, 5e-7);
+        near(3_300, 5e-4 * 0.5005);
+        near(6_600, 5e-4);
+        near((6_600 + 220_000) / 2, 0.5 * (5e-4 + 1e-5));
+        near(220_000, 1e-5);
+        near(300_000, 1e-5);
+    }
+
+    #[test]
+    fn the_paper_s_curriculum() {
+        let config = CurriculumConfig::default();
+        let at = |step| {
+            let stage = stage_at(&config, step);
+            (stage.index, stage.mix)
+        };
+        assert_eq!(at(0), (0, 1.));
+        assert_eq!(at(9_999), (0, 1.));
+        assert_eq!(at(10_000), (1, 0.));
+        assert_eq!(at(11_000), (1, 0.5));
+        assert_eq!(at(12_000), (1, 1.));
+        assert_eq!(at(20_500), (2, 0.25));
+        assert_eq!(at(50_000), (3, 0.));
+        assert_eq!(at(219_999), (3, 1.));
+    }
+
+    #[test]
+    fn boundaries_beyond_the_final_stage_are_ignored() {
+        let config = CurriculumConfig { final_stage: 1, ..Default::default() };
+        assert_eq!(stage_at(&config, 60_000), Stage::complete(1));
+        let config = CurriculumConfig { final_stage: 0, ..Default::default() };
+        assert_eq!(stage_at(&config, 60_000), Stage::complete(0));
+    }
+
+    #[test]
+    fn full_capacity_starts_at_the_end() {
+        let config = CurriculumConfig { full_capacity: true, ..Default::default() };
+        assert_eq!(stage_at(&config, 0), Stage::complete(3));
+    }
+
+    #[test]
+    fn ends_are_shared_and_the_middle_alternates() {
+        assert_eq!(subsets(7, 0), [vec![0, 1, 3, 5, 6], vec![0, 2, 4, 6, 6]]);
+        assert_eq!(subsets(7, 1), [vec![0, 2, 4, 6, 6], vec![0, 1, 3, 5, 6]]);
+        assert_eq!(subsets(2, 0), [vec![0, 1], vec![0, 1]]);
+        assert_eq!(subsets(24, 0).map(|s| s.len()), [13, 13]);
+    }
 }
