@@ -232,8 +232,8 @@ impl Estimate<'_, '_> {
         if models.is_empty() {
             return Err(none_registered(total, self.out).into());
         }
-        // By a loss that weighs wrong matches less than the squared errors by which COLMAP has registered the photos. Its program has no option
-        // for it.
+        // The robust loss weighs wrong matches less than the squared errors by which COLMAP has registered the photos. COLMAP's program has no
+        // option for it.
         for model in models.iter().filter(|_| self.colmap.is_python) {
             let options = json!({
                 "input_path": text(&model.folder),
