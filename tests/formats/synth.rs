@@ -44,19 +44,15 @@ fn interrupted_synth_resumes() {
     };
     let arguments = synth(["2", "3", "24", "0"]);
     succeed(&arguments);
-    let read = || indices.each_ref().map(|index| std::fs::read(index).unwrap());
-    let (before, depth) = (read(), out.join("depth/0_000001.npy"));
-    let (bytes, depths) = (std::fs::read(&chunk).unwrap(), std::fs::read(&depth).unwrap());
+    let files = [&indices[0], &indices[1], &out.join("depth/0_000001.npy"), &chunk];
+    let read = || files.map(|file| std::fs::read(file).unwrap());
+    let (before, written) = (read(), || chunk.metadata().unwrap().modified().unwrap());
+    let when = written();
 
     // Simulates a process that was stopped before it wrote the index, and a lost file.
-    for lost in indices.iter().chain([&depth]) {
-        std::fs::remove_file(lost).unwrap();
-    }
-    let written = || chunk.metadata().unwrap().modified().unwrap();
-    let when = written();
+    files[..3].iter().for_each(|lost| std::fs::remove_file(lost).unwrap());
     succeed(&arguments);
-    assert_eq!(read(), before);
-    assert!(std::fs::read(&chunk).unwrap() == bytes && std::fs::read(&depth).unwrap() == depths);
+    assert!(read() == before);
     assert_eq!(written(), when, "made anew");
     // The existing files are of other scenes, or of other photos of them.
     std::fs::remove_file(&indices[0]).unwrap();
@@ -65,7 +61,7 @@ fn interrupted_synth_resumes() {
         let error = refuse(&synth(other));
         assert!(error.contains("000000.torch: the output is an existing chunk"), "{other:?}: {error}");
     }
-    assert!(std::fs::read(&chunk).unwrap() == bytes, "lost");
+    assert!(std::fs::read(&chunk).unwrap() == before[3], "lost");
 }
 
 /// Projects a pixel of `from` at `depth` metres into `to`; returns its position in pixels, and its depth there.
@@ -96,9 +92,10 @@ fn depths_and_poses_carry_one_view_into_the_next() {
                 continue;
             }
             let there = (y as u32 * SIDE + x as u32) as usize;
-            apart.push((f64::from(depths[1][there]) / far - 1.).abs());
+            let difference = (f64::from(depths[1][there]) / far - 1.).abs();
+            apart.push(difference);
             // A different depth: the point is occluded.
-            if *apart.last().unwrap() > 0.05 {
+            if difference > 0.05 {
                 continue;
             }
             let difference = |a: [u8; 3], b: [u8; 3]| {
@@ -117,10 +114,8 @@ fn depths_and_poses_carry_one_view_into_the_next() {
         assert!(half < 0.008 && most < 0.02, "video {index}: depths are {half} apart for half of the pixels");
         let mean = |of: &[i32]| of.iter().map(|&x| f64::from(x)).sum::<f64>() / of.len() as f64;
         let (moved, unmoved) = (mean(&differences), mean(&unmoved));
-        assert!(
-            moved < 30. && moved < 0.6 * unmoved,
-            "video {index}: {moved} of 255 apart, {unmoved} if not carried"
-        );
+        let message = format!("video {index}: {moved} of 255 apart, {unmoved} if not carried");
+        assert!(moved < 30. && moved < 0.6 * unmoved, "{message}");
     }
     assert!(compared >= 4, "{compared} videos");
 }
@@ -183,11 +178,8 @@ fn videos_are_data_like_any_other() {
     for (data, scores) in [arg(&out), name].into_iter().zip(&scores) {
         let eval = ["eval", "--weights", arg(&weights), "--data", data, "--index", arg(&index)];
         succeed(&[&eval[..], &["--out", arg(scores)]].concat());
-        assert_eq!(
-            std::fs::read_dir(scores.join("scenes")).unwrap().count(),
-            4,
-            "scores and a picture of each scene"
-        );
+        let files = std::fs::read_dir(scores.join("scenes")).unwrap().count();
+        assert_eq!(files, 4, "scores and a picture of each scene");
     }
 
     let written = Dataset::open(&out, Split::Test).unwrap();

@@ -3,7 +3,6 @@
 mod bvh;
 mod dataset;
 mod light;
-mod material;
 mod mesh;
 mod noise;
 mod objects;
@@ -11,7 +10,6 @@ mod outdoors;
 mod room;
 mod scene_builder;
 mod sensor;
-mod shapes;
 mod texture;
 mod tracer;
 mod video;

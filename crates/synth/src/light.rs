@@ -1,7 +1,9 @@
-//! Light sources and the sky.
+//! Light sources, the sky, and the materials that reflect their light.
 
 use super::noise::Noise;
-use glam::{Vec2, Vec3};
+use super::texture::Texture;
+use glam::{Affine2, Vec2, Vec3};
+use std::sync::Arc;
 
 /// A light source. Light is linear RGB, where 1 is the light reflected by a well-lit white wall.
 #[derive(Debug, Clone, Copy)]
@@ -101,5 +103,47 @@ impl Sky {
     pub fn mean_radiance(&self, normal: Vec3) -> Vec3 {
         let above = self.zenith.lerp(self.horizon, 0.5 + 0.3 * self.clouds);
         self.ground.lerp(above, 0.5 + 0.5 * normal.y)
+    }
+}
+
+/// Reflective properties of a surface.
+#[derive(Debug, Clone)]
+pub(super) struct Material {
+    pub texture: Arc<Texture>,
+    /// Transform from metres along a surface to repeats of the texture.
+    pub repeats: Affine2,
+    /// Color factor on the texture.
+    pub tint: Vec3,
+    /// Emitted light, as a factor on the texture.
+    pub emission: f32,
+    /// Share of light that is mirrored at perpendicular incidence. The rest is scattered.
+    pub mirror_reflectance: f32,
+    /// Strength of highlights.
+    pub specular: f32,
+    /// Exponent of highlights. Larger values give smaller highlights.
+    pub shininess: f32,
+}
+
+impl Material {
+    /// Creates a matte material with `texture` at its natural size.
+    pub fn matte(texture: Arc<Texture>) -> Material {
+        let repeats = Affine2::from_scale(Vec2::splat(1. / texture.repeat_metres));
+        Material {
+            texture,
+            repeats,
+            tint: Vec3::ONE,
+            emission: 0.,
+            mirror_reflectance: 0.,
+            specular: 0.,
+            shininess: 1.,
+        }
+    }
+
+    /// Returns the diffuse reflectance at `uv` metres along the surface, blurred over `footprint` metres.
+    pub fn reflectance(&self, uv: Vec2, footprint: f32) -> Vec3 {
+        let scale = self.repeats.matrix2.determinant().abs().sqrt();
+        // The v axis points up on surfaces and down in images.
+        let place = self.repeats.transform_point2(uv) * Vec2::new(1., -1.);
+        self.tint * self.texture.sample(place, footprint * scale)
     }
 }

@@ -1,6 +1,9 @@
-//! Triangle meshes with texture coordinates.
+//! Triangle meshes with texture coordinates, the plain shapes that all objects are made of, and their deformations. The y axis points up.
+//! Each shape is centred or stands on y = 0, as documented.
 
+use super::noise::Noise;
 use glam::{Affine3A, Vec2, Vec3};
+use std::f32::consts::{PI, TAU};
 
 /// A triangle mesh of one or more surfaces. Lengths are in metres.
 #[derive(Debug, Clone, Default)]
@@ -94,5 +97,186 @@ impl Mesh {
             corners.iter().for_each(|&vertex| normals[vertex as usize] += normal);
         }
         normals.into_iter().map(|normal| normal.normalize_or(Vec3::Y)).collect()
+    }
+}
+
+/// Creates a box of `size`, standing on y = 0, with edges rounded by `round` metres.
+pub(super) fn cuboid(size: Vec3, round: f32) -> Mesh {
+    let half = size / 2.;
+    let round = round.min(half.min_element());
+    let cells = if round > 0. { 7 } else { 2 };
+    let mut mesh = Mesh::default();
+    for axis in 0..3 {
+        for sign in [-1., 1.] {
+            let mut normal = Vec3::ZERO;
+            normal[axis] = sign;
+            let mut right = Vec3::ZERO;
+            right[(axis + 1) % 3] = sign;
+            let up = normal.cross(right);
+            let (along, across) = ((right * size).length(), (up * size).length());
+            // Cells are finer at the rounded edges.
+            let place = |t: f32| if round > 0. { 2. * smooth(t) - 1. } else { 2. * t - 1. };
+            mesh.join(Mesh::grid(cells, cells, Vec2::new(along, across), |u, v| {
+                let flat = (normal + place(u) * right + place(v) * up) * half;
+                let inner = flat.clamp(-half + round, half - round);
+                inner + round * (flat - inner).normalize_or_zero()
+            }));
+        }
+    }
+    mesh.warped(|p| p + Vec3::Y * half.y)
+}
+
+/// Creates a centred superellipsoid of `size`. Exponents of 1 give an ellipsoid, towards 0 a box or a cylinder, above 1 a star.
+pub(super) fn superellipsoid(size: Vec3, [polar, around]: [f32; 2], cells: usize) -> Mesh {
+    let power = |x: f32, e: f32| x.signum() * x.abs().powf(e);
+    let texture = Vec2::new(PI * size.x.max(size.z), PI / 2. * size.y);
+    Mesh::grid(2 * cells, cells, texture, |u, v| {
+        let (a, b) = (-TAU * u, PI * (v - 0.5));
+        let ring = power(b.cos().max(0.), polar);
+        let unit =
+            Vec3::new(ring * power(a.cos(), around), power(b.sin(), polar), ring * power(a.sin(), around));
+        unit * size / 2.
+    })
+}
+
+/// Creates a surface of revolution about y through `profile`, (radius, height) from bottom to top.
+pub(super) fn lathe(profile: &[Vec2], cells: usize) -> Mesh {
+    let widest = profile.iter().fold(0f32, |widest, p| widest.max(p.x));
+    let lengths: Vec<f32> = profile.windows(2).map(|pair| pair[0].distance(pair[1])).collect();
+    let mut mesh = Mesh::default();
+    let mut above = 0.;
+    // Each piece has its own grid, because profiles have corners.
+    for (pair, &length) in profile.windows(2).zip(&lengths) {
+        let mut piece = Mesh::grid(cells, 1, Vec2::new(TAU * widest, length), |u, v| {
+            let at = pair[0].lerp(pair[1], v);
+            let angle = -TAU * u;
+            Vec3::new(at.x * angle.cos(), at.y, at.x * angle.sin())
+        });
+        piece.uvs.iter_mut().for_each(|uv| uv.y += above);
+        above += length;
+        mesh.join(piece);
+    }
+    mesh
+}
+
+/// Creates a cylinder or cone on y = 0, including its caps.
+pub(super) fn cone(below: f32, above: f32, height: f32, cells: usize) -> Mesh {
+    let rim = |radius: f32, y: f32| Vec2::new(radius, y);
+    lathe(&[rim(0., 0.), rim(below, 0.), rim(above, height), rim(0., height)], cells)
+}
+
+/// Creates a tube of `radius(t)` around the curve `at(t)`, t from 0 to 1. A closed curve gives a torus.
+pub(super) fn tube(
+    at: impl Fn(f32) -> Vec3,
+    radius: impl Fn(f32) -> f32,
+    [along, around]: [usize; 2],
+) -> Mesh {
+    let step = 1e-2;
+    let points: Vec<Vec3> = (0..=along).map(|i| at(i as f32 / along as f32)).collect();
+    let length: f32 = points.windows(2).map(|pair| pair[0].distance(pair[1])).sum();
+    // The side vector is transported along the curve, so that the tube doesn't twist.
+    let mut side = (at(step) - at(0.)).normalize_or(Vec3::Y).any_orthonormal_vector();
+    let sides: Vec<(Vec3, Vec3)> = (0..=along)
+        .map(|i| {
+            let t = i as f32 / along as f32;
+            let forward = (at(t + step) - at(t - step)).normalize_or(Vec3::Y);
+            side = (side - side.dot(forward) * forward).normalize_or(forward.any_orthonormal_vector());
+            (side, forward.cross(side))
+        })
+        .collect();
+    let texture = Vec2::new(TAU * radius(0.5), length);
+    Mesh::grid(around, along, texture, |u, v| {
+        let i = (v * along as f32).round() as usize;
+        let (right, up) = sides[i];
+        let angle = TAU * u;
+        points[i] + radius(v) * (angle.cos() * right + angle.sin() * up)
+    })
+}
+
+/// Creates a sheet of `size` around the origin, at `height(x, z)` above y = 0.
+pub(super) fn height_field(size: Vec2, cells: usize, height: impl Fn(f32, f32) -> f32) -> Mesh {
+    Mesh::grid(cells, cells, size, |u, v| {
+        let (x, z) = ((u - 0.5) * size.x, (0.5 - v) * size.y);
+        Vec3::new(x, height(x, z), z)
+    })
+}
+
+/// Creates a piece of cloth that hangs from y = 0, `width` × `height`, in `folds` waves of `depth` metres.
+pub(super) fn curtain(width: f32, height: f32, folds: f32, depth: f32) -> Mesh {
+    Mesh::grid((6. * folds) as usize + 2, 4, Vec2::new(1.3 * width, height), |u, v| {
+        let wave = (TAU * folds * u).sin() + 0.3 * (3.1 * folds * u).sin();
+        Vec3::new((u - 0.5) * width, (v - 1.) * height, depth * wave * (1.2 - 0.4 * v))
+    })
+}
+
+/// Moves every point by up to `strength` metres, with wavelengths of `1 / frequency`.
+pub(super) fn roughen(mesh: Mesh, noise: &Noise, frequency: f32, strength: f32) -> Mesh {
+    mesh.warped(|p| {
+        let q = p * frequency;
+        let offset = Vec3::new(noise.sample(q), noise.sample(q + 31.7), noise.sample(q - 57.3));
+        p + strength * offset
+    })
+}
+
+/// Twists the mesh about y by `turns` full turns per metre of height.
+pub(super) fn twist(mesh: Mesh, turns: f32) -> Mesh {
+    mesh.warped(|p| {
+        let (sin, cos) = (TAU * turns * p.y).sin_cos();
+        Vec3::new(cos * p.x - sin * p.z, p.y, sin * p.x + cos * p.z)
+    })
+}
+
+/// Scales the mesh perpendicular to y by 1 + `slope` · y.
+pub(super) fn taper(mesh: Mesh, slope: f32) -> Mesh {
+    mesh.warped(|p| {
+        let scale = (1. + slope * p.y).max(0.05);
+        Vec3::new(scale * p.x, p.y, scale * p.z)
+    })
+}
+
+fn smooth(t: f32) -> f32 {
+    t * t * (3. - 2. * t)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::vec3;
+
+    /// Returns the volume by the divergence theorem. It is negative if the surface is inside out.
+    fn volume(mesh: &Mesh) -> f32 {
+        let tetrahedron = |corners: &[u32; 3]| {
+            let [a, b, c] = corners.map(|vertex| mesh.positions[vertex as usize]);
+            a.dot(b.cross(c)) / 6.
+        };
+        mesh.triangles.iter().map(tetrahedron).sum()
+    }
+
+    #[test]
+    fn shapes_are_closed_and_face_outwards() {
+        let ring = |t: f32| vec3((TAU * t).cos(), 0., -(TAU * t).sin());
+        for (name, mesh, expected) in [
+            ("box", cuboid(vec3(2., 3., 4.), 0.), 24.),
+            ("rounded box", cuboid(vec3(2., 2., 2.), 1.), 4. / 3. * PI),
+            ("ellipsoid", superellipsoid(vec3(1., 2., 3.), [1., 1.], 24), PI),
+            ("near box", superellipsoid(Vec3::ONE, [0.1, 0.1], 24), 1.),
+            ("cylinder", cone(1., 1., 2., 64), TAU),
+            ("cone", cone(1., 0., 3., 64), PI),
+            ("torus", tube(ring, |_| 0.25, [96, 32]), 2. * PI * PI * 0.0625),
+        ] {
+            let found = volume(&mesh);
+            assert!((found / expected - 1.).abs() < 0.06, "{name}: {found}, expected {expected}");
+            assert_eq!(mesh.normals().len(), mesh.uvs.len(), "{name}");
+        }
+    }
+
+    #[test]
+    fn boxes_stand_and_have_their_size() {
+        for round in [0., 0.2] {
+            let (least, most) = cuboid(vec3(1., 2., 3.), round).bounds();
+            assert!(
+                least.abs_diff_eq(vec3(-0.5, 0., -1.5), 1e-5) && most.abs_diff_eq(vec3(0.5, 2., 1.5), 1e-5)
+            );
+        }
     }
 }

@@ -1,19 +1,15 @@
 //! Objects made of plain shapes. Each stands on y = 0 around the origin and faces +z.
 
-use super::material::Material;
-use super::mesh::Mesh;
-use super::scene_builder::{SceneBuilder, standing};
-use super::shapes::{
-    cone, cuboid, curtain, height_field, lathe, roughen, superellipsoid, taper, tube, twist,
+use super::light::Material;
+use super::mesh::{
+    Mesh, cone, cuboid, curtain, height_field, lathe, roughen, superellipsoid, taper, tube, twist,
 };
+use super::scene_builder::{SceneBuilder, at, standing};
 use super::texture::Purpose;
 use super::walk::OrbitTarget;
 use glam::{Affine3A, Quat, Vec2, Vec3, vec2, vec3};
 use std::f32::consts::{FRAC_PI_2, PI, TAU};
-
-fn at(x: f32, y: f32, z: f32) -> Affine3A {
-    Affine3A::from_translation(vec3(x, y, z))
-}
+use std::ops::Range;
 
 fn turned(angle: f32) -> Affine3A {
     Affine3A::from_rotation_y(angle)
@@ -55,15 +51,10 @@ pub(super) fn plain(builder: &mut SceneBuilder, size: Vec3) -> Mesh {
             tube(knot, move |_| thick, [48, 8]).warped(|p| p * half)
         }
         _ => {
-            let profile: Vec<Vec2> = {
-                let steps = builder.within(3..8);
-                let mut radii: Vec<f32> = (0..=steps).map(|_| builder.within(0.12..0.5)).collect();
-                radii[0] = builder.within(0.2..0.5);
-                let rims = radii.iter().enumerate();
-                let mut rims: Vec<Vec2> = rims.map(|(i, &r)| vec2(r, i as f32 / steps as f32)).collect();
-                rims.insert(0, vec2(0., 0.));
-                rims
-            };
+            let steps = builder.within(3..8);
+            let mut profile = vec![Vec2::ZERO];
+            profile.extend((0..=steps).map(|i| vec2(builder.within(0.12..0.5), i as f32 / steps as f32)));
+            profile[1].x = builder.within(0.2..0.5);
             lathe(&profile, 20).warped(|p| p * size)
         }
     };
@@ -81,12 +72,18 @@ pub(super) fn plain(builder: &mut SceneBuilder, size: Vec3) -> Mesh {
     mesh.moved(at(0., -least.y, 0.))
 }
 
-/// Adds a heap of plain shapes on and beside each other, of about `size` in metres.
-pub(super) fn heap(builder: &mut SceneBuilder, size: Vec3, transform: Affine3A, count: usize) {
-    for _ in 0..count {
-        let part = size * vec3(builder.within(0.2..0.6), builder.within(0.2..0.6), builder.within(0.2..0.6));
+/// Adds a random plain shape within `size`.
+fn add_plain(builder: &mut SceneBuilder, size: Vec3, transform: Affine3A) {
+    let (mesh, material) = (plain(builder, size), builder.thing());
+    builder.add_mesh(mesh, &material, transform);
+}
+
+/// Adds a heap of plain shapes on and beside each other, of about `size` in metres. Their number is random in `counts`.
+pub(super) fn heap(builder: &mut SceneBuilder, size: Vec3, transform: Affine3A, counts: Range<usize>) {
+    for _ in 0..builder.within(counts) {
+        let part = size * builder.vector([(0.2, 0.6); 3]);
         let mesh = plain(builder, part);
-        let material = builder.material(Purpose::Thing);
+        let material = builder.thing();
         let spot =
             vec3(builder.within(-0.4..0.4), builder.within(0. ..0.6f32).powi(2), builder.within(-0.4..0.4))
                 * size;
@@ -100,8 +97,8 @@ pub(super) fn heap(builder: &mut SceneBuilder, size: Vec3, transform: Affine3A, 
 
 /// Adds a table: a top on legs or on a central foot, with objects on it.
 pub(super) fn table(builder: &mut SceneBuilder, transform: Affine3A) {
-    let size = vec3(builder.within(0.5..2.), builder.within(0.4..0.85), builder.within(0.5..1.1));
-    let (top, legs) = (builder.material(Purpose::Thing), builder.material(Purpose::Thing));
+    let size = builder.vector([(0.5, 2.), (0.4, 0.85), (0.5, 1.1)]);
+    let (top, legs) = (builder.thing(), builder.thing());
     let thick = builder.within(0.02..0.07);
     if builder.chance(0.25) {
         let round = cone(0.5 * size.x, 0.5 * size.x, thick, 28);
@@ -110,7 +107,7 @@ pub(super) fn table(builder: &mut SceneBuilder, transform: Affine3A) {
         builder.add_mesh(foot, &legs, transform);
     } else {
         let round = builder.one_of(&[0., 0.01, 0.02]);
-        builder.add_mesh(cuboid(vec3(size.x, thick, size.z), round), &top, transform * at(0., size.y, 0.));
+        builder.add_rounded_box(vec3(size.x, thick, size.z), round, &top, transform * at(0., size.y, 0.));
         let leg = builder.within(0.03..0.09);
         let slim = if builder.chance(0.5) { leg } else { 0.4 * leg };
         for (x, z) in [(-1., -1.), (-1., 1.), (1., -1.), (1., 1.)] {
@@ -132,13 +129,8 @@ pub(super) fn clutter(builder: &mut SceneBuilder, size: Vec2, transform: Affine3
             1 => vessel(builder, transform * spot),
             2 => lamp(builder, transform * spot, 0.4),
             _ => {
-                let size = vec3(
-                    builder.log_uniform(0.05, 0.35),
-                    builder.log_uniform(0.04, 0.35),
-                    builder.log_uniform(0.05, 0.35),
-                );
-                let (mesh, material) = (plain(builder, size), builder.material(Purpose::Thing));
-                builder.add_mesh(mesh, &material, transform * spot);
+                let size = builder.log_vector([(0.05, 0.35), (0.04, 0.35), (0.05, 0.35)]);
+                add_plain(builder, size, transform * spot);
             }
         }
     }
@@ -147,7 +139,7 @@ pub(super) fn clutter(builder: &mut SceneBuilder, size: Vec2, transform: Affine3
 /// Adds a bowl, cup, bottle or vase, sometimes with a plant in it.
 pub(super) fn vessel(builder: &mut SceneBuilder, transform: Affine3A) {
     let (radius, height) = (builder.within(0.03..0.14), builder.within(0.06..0.4));
-    let material = builder.material(Purpose::Thing);
+    let material = builder.thing();
     let mut rims = vec![vec2(0., 0.), vec2(radius * builder.within(0.4..1.), 0.)];
     for i in 1..=4 {
         rims.push(vec2(radius * builder.within(0.4..1.1), height * i as f32 / 4.));
@@ -165,8 +157,7 @@ pub(super) fn books(builder: &mut SceneBuilder, transform: Affine3A, length: f32
     while reached < length {
         let thick = builder.within(0.012..0.06);
         let (height, depth) = (builder.within(0.16..0.32), builder.within(0.12..0.24));
-        let material = builder.material(Purpose::Thing);
-        let book = cuboid(vec3(thick, height, depth), 0.);
+        let material = builder.thing();
         let spot = match piled {
             true => {
                 at(0., reached, 0.)
@@ -179,7 +170,7 @@ pub(super) fn books(builder: &mut SceneBuilder, transform: Affine3A, length: f32
                 at(reached - 0.5 * length, 0., 0.) * Affine3A::from_rotation_z(lean)
             }
         };
-        builder.add_mesh(book, &material, transform * spot);
+        builder.add_box(vec3(thick, height, depth), &material, transform * spot);
         reached += thick + builder.within(0. ..0.004);
         if piled && reached > 0.4 * length || builder.chance(0.05) {
             break;
@@ -189,23 +180,18 @@ pub(super) fn books(builder: &mut SceneBuilder, transform: Affine3A, length: f32
 
 /// Adds shelves with objects on them, a cupboard with doors, or a chest of drawers.
 pub(super) fn cabinet(builder: &mut SceneBuilder, transform: Affine3A) {
-    let size = vec3(builder.within(0.5..2.2), builder.within(0.6..2.3), builder.within(0.25..0.6));
-    let (body, front) = (builder.material(Purpose::Thing), builder.material(Purpose::Thing));
+    let size = builder.vector([(0.5, 2.2), (0.6, 2.3), (0.25, 0.6)]);
+    let (body, front) = (builder.thing(), builder.thing());
     let board = 0.025;
     if builder.chance(0.5) {
-        let side = cuboid(vec3(board, size.y, size.z), 0.);
         for x in [-0.5, 0.5] {
-            builder.add_mesh(side.clone(), &body, transform * at(x * (size.x - board), 0., 0.));
+            builder.add_box(vec3(board, size.y, size.z), &body, transform * at(x * (size.x - board), 0., 0.));
         }
-        builder.add_mesh(
-            cuboid(vec3(size.x, size.y, 0.01), 0.),
-            &body,
-            transform * at(0., 0., -0.5 * size.z),
-        );
+        builder.add_box(vec3(size.x, size.y, 0.01), &body, transform * at(0., 0., -0.5 * size.z));
         let shelves = builder.within(2..7);
         for i in 0..=shelves {
             let height = (size.y - board) * i as f32 / shelves as f32;
-            builder.add_mesh(cuboid(vec3(size.x, board, size.z), 0.), &body, transform * at(0., height, 0.));
+            builder.add_box(vec3(size.x, board, size.z), &body, transform * at(0., height, 0.));
             if i < shelves && builder.chance(0.8) {
                 let above = transform * at(0., height + board, 0.);
                 match builder.chance(0.5) {
@@ -218,14 +204,14 @@ pub(super) fn cabinet(builder: &mut SceneBuilder, transform: Affine3A) {
             }
         }
     } else {
-        builder.add_mesh(cuboid(size, 0.), &body, transform);
+        builder.add_box(size, &body, transform);
         let (columns, rows) = (builder.within(1..4), builder.within(1..6));
         let cell = vec2(size.x / columns as f32, size.y / rows as f32);
         for column in 0..columns {
             for row in 0..rows {
                 let x = (column as f32 + 0.5) * cell.x - 0.5 * size.x;
                 let spot = transform * at(x, (row as f32 + 0.03) * cell.y, 0.5 * size.z);
-                builder.add_mesh(cuboid(vec3(0.94 * cell.x, 0.94 * cell.y, 0.02), 0.), &front, spot);
+                builder.add_box(vec3(0.94 * cell.x, 0.94 * cell.y, 0.02), &front, spot);
                 let knob = superellipsoid(Vec3::splat(0.03), [1., 1.], 4);
                 builder.add_mesh(knob, &body, spot * at(0.3 * cell.x, 0.5 * cell.y, 0.03));
             }
@@ -236,12 +222,12 @@ pub(super) fn cabinet(builder: &mut SceneBuilder, transform: Affine3A) {
 
 /// Adds a chair or stool.
 pub(super) fn chair(builder: &mut SceneBuilder, transform: Affine3A) {
-    let (wide, deep, seat) =
-        (builder.within(0.38..0.6), builder.within(0.38..0.6), builder.within(0.38..0.5));
-    let (cloth, wood) = (builder.material(Purpose::Thing), builder.material(Purpose::Thing));
+    let [wide, deep, seat] = builder.vector([(0.38, 0.6), (0.38, 0.6), (0.38, 0.5)]).into();
+    let (cloth, wood) = (builder.thing(), builder.thing());
     let thick = builder.within(0.02..0.12);
-    builder.add_mesh(
-        cuboid(vec3(wide, thick, deep), 0.4 * thick),
+    builder.add_rounded_box(
+        vec3(wide, thick, deep),
+        0.4 * thick,
         &cloth,
         transform * at(0., seat - thick, 0.),
     );
@@ -254,14 +240,15 @@ pub(super) fn chair(builder: &mut SceneBuilder, transform: Affine3A) {
         let lean = Affine3A::from_rotation_x(-builder.within(0. ..0.25));
         let back = transform * at(0., seat, -0.47 * deep) * lean;
         match builder.chance(0.5) {
-            true => builder.add_mesh(cuboid(vec3(wide, height, 0.04), 0.015), &cloth, back),
+            true => builder.add_rounded_box(vec3(wide, height, 0.04), 0.015, &cloth, back),
             false => {
                 for i in 0..5 {
                     let bar = cone(0.01, 0.01, height, 6);
                     builder.add_mesh(bar, &wood, back * at((i as f32 / 4. - 0.5) * 0.9 * wide, 0., 0.));
                 }
-                builder.add_mesh(
-                    cuboid(vec3(wide, 0.07, 0.03), 0.01),
+                builder.add_rounded_box(
+                    vec3(wide, 0.07, 0.03),
+                    0.01,
                     &wood,
                     back * at(0., height - 0.05, 0.),
                 );
@@ -273,17 +260,16 @@ pub(super) fn chair(builder: &mut SceneBuilder, transform: Affine3A) {
 /// Adds a sofa or armchair with cushions.
 pub(super) fn sofa(builder: &mut SceneBuilder, transform: Affine3A) {
     let (wide, deep) = (builder.within(0.8..2.4), builder.within(0.75..1.));
-    let cloth = builder.material(Purpose::Thing);
-    let (seat, back, arm) =
-        (builder.within(0.35..0.45), builder.within(0.7..0.95), builder.within(0.12..0.25));
-    builder.add_mesh(cuboid(vec3(wide, seat, deep), 0.05), &cloth, transform);
-    builder.add_mesh(cuboid(vec3(wide, back, 0.22), 0.08), &cloth, transform * at(0., 0., -0.5 * deep));
+    let cloth = builder.thing();
+    let [seat, back, arm] = builder.vector([(0.35, 0.45), (0.7, 0.95), (0.12, 0.25)]).into();
+    builder.add_rounded_box(vec3(wide, seat, deep), 0.05, &cloth, transform);
+    builder.add_rounded_box(vec3(wide, back, 0.22), 0.08, &cloth, transform * at(0., 0., -0.5 * deep));
     for x in [-0.5, 0.5] {
-        builder.add_mesh(cuboid(vec3(arm, seat + 0.2, deep), 0.06), &cloth, transform * at(x * wide, 0., 0.));
+        builder.add_rounded_box(vec3(arm, seat + 0.2, deep), 0.06, &cloth, transform * at(x * wide, 0., 0.));
     }
     for _ in 0..builder.within(0..5) {
         let pillow = superellipsoid(vec3(0.45, 0.42, 0.16), [0.5, 0.5], 7);
-        let cover = builder.material(Purpose::Thing);
+        let cover = builder.thing();
         let x = builder.within(-0.4..0.4) * wide;
         let lean = Affine3A::from_rotation_x(-0.3) * Affine3A::from_rotation_y(builder.within(-0.5..0.5));
         builder.add_mesh(pillow, &cover, transform * at(x, seat + 0.2, -0.22 * deep) * lean);
@@ -293,23 +279,16 @@ pub(super) fn sofa(builder: &mut SceneBuilder, transform: Affine3A) {
 /// Adds a bed with bedding.
 pub(super) fn bed(builder: &mut SceneBuilder, transform: Affine3A) {
     let (wide, long, high) = (builder.within(0.9..2.), 2.1, builder.within(0.35..0.6));
-    let (wood, sheet, cover) = (
-        builder.material(Purpose::Thing),
-        builder.material(Purpose::Thing),
-        builder.material(Purpose::Thing),
-    );
-    builder.add_mesh(cuboid(vec3(wide + 0.06, 0.6 * high, long), 0.01), &wood, transform);
-    builder.add_mesh(
-        cuboid(vec3(wide, 0.5 * high, long - 0.06), 0.08),
+    let (wood, sheet, cover) = (builder.thing(), builder.thing(), builder.thing());
+    builder.add_rounded_box(vec3(wide + 0.06, 0.6 * high, long), 0.01, &wood, transform);
+    builder.add_rounded_box(
+        vec3(wide, 0.5 * high, long - 0.06),
+        0.08,
         &sheet,
         transform * at(0., 0.6 * high, 0.),
     );
     let board = builder.within(0.8..1.3);
-    builder.add_mesh(
-        cuboid(vec3(wide + 0.06, board, 0.06), 0.02),
-        &wood,
-        transform * at(0., 0., -0.5 * long),
-    );
+    builder.add_rounded_box(vec3(wide + 0.06, board, 0.06), 0.02, &wood, transform * at(0., 0., -0.5 * long));
     let noise = builder.noise();
     let blanket = height_field(vec2(wide + 0.1, 0.65 * long), 16, |x, z| {
         0.06 * noise.fractal(vec3(3. * x, 0., 3. * z), 3) - 0.5 * (x.abs() - 0.5 * wide).max(0.)
@@ -323,7 +302,7 @@ pub(super) fn bed(builder: &mut SceneBuilder, transform: Affine3A) {
 
 /// Adds a lamp of `height` metres: a shade on a stand, which glows if the lamp is on.
 pub(super) fn lamp(builder: &mut SceneBuilder, transform: Affine3A, height: f32) {
-    let (stand, mut shade) = (builder.material(Purpose::Thing), builder.material(Purpose::Thing));
+    let (stand, mut shade) = (builder.thing(), builder.thing());
     shade.emission = if builder.chance(0.6) { builder.within(0.5..2.5) } else { 0. };
     shade.specular = 0.;
     let wide = (0.3 * height).min(0.25) * builder.within(0.7..1.3);
@@ -358,13 +337,10 @@ pub(super) fn leaves(builder: &mut SceneBuilder, transform: Affine3A, reach: f32
 /// Adds a plant in a pot on the floor.
 pub(super) fn plant(builder: &mut SceneBuilder, transform: Affine3A) {
     let (radius, height) = (builder.within(0.1..0.25), builder.within(0.15..0.5));
-    let pot = builder.material(Purpose::Thing);
+    let pot = builder.thing();
     let slope = builder.within(0.6..1.);
-    builder.add_mesh(
-        lathe(&[vec2(slope * radius, 0.), vec2(radius, height), vec2(0., 0.9 * height)], 18),
-        &pot,
-        transform,
-    );
+    let rims = [vec2(slope * radius, 0.), vec2(radius, height), vec2(0., 0.9 * height)];
+    builder.add_mesh(lathe(&rims, 18), &pot, transform);
     let (reach, count) = (builder.within(0.3..1.1), builder.within(12..60));
     leaves(builder, transform * at(0., 0.9 * height, 0.), reach, count);
 }
@@ -373,14 +349,10 @@ pub(super) fn plant(builder: &mut SceneBuilder, transform: Affine3A) {
 pub(super) fn picture(builder: &mut SceneBuilder, transform: Affine3A) {
     let size = vec2(builder.log_uniform(0.2, 1.4), builder.log_uniform(0.2, 1.2));
     let poster = builder.picture(size);
-    let frame = builder.material(Purpose::Thing);
+    let frame = builder.thing();
     let edge = builder.within(0.01..0.08);
     let outer = size + 2. * edge;
-    builder.add_mesh(
-        cuboid(vec3(outer.x, outer.y, 0.03), 0.),
-        &frame,
-        transform * at(0., -0.5 * outer.y, 0.015),
-    );
+    builder.add_box(vec3(outer.x, outer.y, 0.03), &frame, transform * at(0., -0.5 * outer.y, 0.015));
     let sheet = Mesh::rectangle((-0.5 * size).extend(0.032), vec3(size.x, 0., 0.), vec3(0., size.y, 0.), 0.5);
     builder.add_mesh(sheet, &poster, transform);
 }
@@ -388,9 +360,9 @@ pub(super) fn picture(builder: &mut SceneBuilder, transform: Affine3A) {
 /// Adds a framed mirror, placed like a picture.
 pub(super) fn mirror(builder: &mut SceneBuilder, transform: Affine3A) {
     let size = vec2(builder.within(0.4..1.2), builder.within(0.5..1.6));
-    let frame = builder.material(Purpose::Thing);
-    builder.add_mesh(
-        cuboid(vec3(size.x + 0.08, size.y + 0.08, 0.03), 0.),
+    let frame = builder.thing();
+    builder.add_box(
+        vec3(size.x + 0.08, size.y + 0.08, 0.03),
         &frame,
         transform * at(0., -0.5 * size.y - 0.04, 0.015),
     );
@@ -402,7 +374,7 @@ pub(super) fn mirror(builder: &mut SceneBuilder, transform: Affine3A) {
 
 /// Adds curtains on both sides of a window of `size` whose centre is at the origin.
 pub(super) fn curtains(builder: &mut SceneBuilder, transform: Affine3A, size: Vec2) {
-    let cloth = builder.material(Purpose::Thing);
+    let cloth = builder.thing();
     let (wide, folds) = (size.x * builder.within(0.2..0.4), builder.within(3. ..7.));
     let height = size.y + 0.3 + if builder.chance(0.5) { builder.within(0. ..0.6) } else { 0. };
     for x in [-0.5, 0.5] {
@@ -413,7 +385,7 @@ pub(super) fn curtains(builder: &mut SceneBuilder, transform: Affine3A, size: Ve
 
 /// Adds a tree: a bent trunk, branches, and a crown of leaves or of green clouds.
 pub(super) fn tree(builder: &mut SceneBuilder, transform: Affine3A, height: f32) {
-    let bark = builder.material(Purpose::Thing);
+    let bark = builder.thing();
     let (bend_x, bend_z) = (builder.within(-0.15..0.15) * height, builder.within(-0.15..0.15) * height);
     let stem = move |t: f32| vec3(bend_x * t * t, height * t, bend_z * t * t);
     let thick = builder.within(0.02..0.045) * height;
@@ -436,9 +408,7 @@ pub(super) fn tree(builder: &mut SceneBuilder, transform: Affine3A, height: f32)
             for _ in 0..builder.within(5..12) {
                 let middle = stem(builder.within(0.55..1.));
                 let offset = builder.direction() * builder.within(0. ..0.2) * height;
-                let size =
-                    vec3(builder.within(0.2..0.4), builder.within(0.15..0.35), builder.within(0.2..0.4))
-                        * height;
+                let size = builder.vector([(0.2, 0.4), (0.15, 0.35), (0.2, 0.4)]) * height;
                 let cloud = roughen(superellipsoid(size, [1., 1.], 9), &noise, 7. / height, 0.06 * height);
                 builder.add_mesh(cloud, &crown, transform * Affine3A::from_translation(middle + offset));
             }
@@ -457,7 +427,7 @@ pub(super) fn tree(builder: &mut SceneBuilder, transform: Affine3A, height: f32)
 
 /// Adds a bush or a tuft of grass.
 pub(super) fn bush(builder: &mut SceneBuilder, transform: Affine3A) {
-    let size = vec3(builder.within(0.4..1.6), builder.within(0.3..1.2), builder.within(0.4..1.6));
+    let size = builder.vector([(0.4, 1.6), (0.3, 1.2), (0.4, 1.6)]);
     if builder.chance(0.5) {
         leaves(builder, transform, size.y, 40);
         return;
@@ -470,7 +440,7 @@ pub(super) fn bush(builder: &mut SceneBuilder, transform: Affine3A) {
 /// Adds a rock.
 pub(super) fn rock(builder: &mut SceneBuilder, transform: Affine3A, size: f32) {
     let (stone, noise) = (builder.material(Purpose::Ground), builder.noise());
-    let size = size * vec3(builder.within(0.6..1.4), builder.within(0.4..1.), builder.within(0.6..1.4));
+    let size = size * builder.vector([(0.6, 1.4), (0.4, 1.), (0.6, 1.4)]);
     let ball = superellipsoid(size, [0.8, 0.8], 12);
     let rough = roughen(ball, &noise, 2. / size.max_element(), 0.25 * size.min_element());
     builder.add_mesh(rough, &stone, transform * at(0., 0.3 * size.y, 0.));
@@ -478,9 +448,9 @@ pub(super) fn rock(builder: &mut SceneBuilder, transform: Affine3A, size: f32) {
 
 /// Adds a house: walls with windows and doors, under a roof.
 pub(super) fn house(builder: &mut SceneBuilder, transform: Affine3A) {
-    let size = vec3(builder.within(4. ..10.), builder.within(2.6..7.), builder.within(4. ..9.));
+    let size = builder.vector([(4., 10.), (2.6, 7.), (4., 9.)]);
     let (wall, roof) = (builder.material(Purpose::Facade), builder.material(Purpose::Facade));
-    builder.add_mesh(cuboid(size, 0.), &wall, transform);
+    builder.add_box(size, &wall, transform);
     let (over, rise) = (builder.within(0.1..0.6), builder.within(0. ..0.5) * size.x);
     let half = vec3(0.5 * size.x + over, 0., 0.5 * size.z + over);
     for side in [-1., 1.] {
@@ -493,11 +463,10 @@ pub(super) fn house(builder: &mut SceneBuilder, transform: Affine3A) {
         });
         builder.add_mesh(gable, &wall, transform);
     }
-    let (glass, frame) = (window_glass(builder), builder.material(Purpose::Thing));
+    let (glass, frame) = (window_glass(builder), builder.thing());
     let floors = (size.y / 2.6).floor().max(1.) as usize;
-    for (turn, wide, deep) in
-        [(0., size.x, size.z), (1., size.z, size.x), (2., size.x, size.z), (3., size.z, size.x)]
-    {
+    for turn in 0..4 {
+        let (wide, deep) = if turn % 2 == 0 { (size.x, size.z) } else { (size.z, size.x) };
         let count = (wide / builder.within(1.6..3.)).floor().max(1.);
         for floor in 0..floors {
             for i in 0..count as usize {
@@ -505,14 +474,9 @@ pub(super) fn house(builder: &mut SceneBuilder, transform: Affine3A) {
                 let is_door = floor == 0 && builder.chance(0.15);
                 let pane = if is_door { vec2(0.9, 2.) } else { vec2(1.1, 1.3) };
                 let y = 2.6 * floor as f32 + if is_door { 0. } else { 0.8 };
-                let spot = transform * turned(turn * FRAC_PI_2) * at(x, y, 0.5 * deep);
-                builder.add_mesh(
-                    cuboid(vec3(pane.x + 0.16, pane.y + 0.16, 0.06), 0.),
-                    &frame,
-                    spot * at(0., -0.08, 0.),
-                );
-                let inner = cuboid(vec3(pane.x, pane.y, 0.08), 0.);
-                builder.add_mesh(inner, if is_door { &wall } else { &glass }, spot);
+                let spot = transform * turned(turn as f32 * FRAC_PI_2) * at(x, y, 0.5 * deep);
+                builder.add_box(vec3(pane.x + 0.16, pane.y + 0.16, 0.06), &frame, spot * at(0., -0.08, 0.));
+                builder.add_box(vec3(pane.x, pane.y, 0.08), if is_door { &wall } else { &glass }, spot);
             }
         }
     }
@@ -528,30 +492,29 @@ fn window_glass(builder: &mut SceneBuilder) -> Material {
 
 /// Adds a fence of boards and rails, `length` metres along x.
 pub(super) fn fence(builder: &mut SceneBuilder, transform: Affine3A, length: f32) {
-    let wood = builder.material(Purpose::Thing);
+    let wood = builder.thing();
     let (height, gap) = (builder.within(0.7..1.8), builder.within(0.08..0.5f32));
     let board = (0.5 * gap).min(0.12);
     for i in 0..(length / gap) as usize {
-        builder.add_mesh(
-            cuboid(vec3(board, height, 0.03), 0.),
+        builder.add_box(
+            vec3(board, height, 0.03),
             &wood,
             transform * at(i as f32 * gap - 0.5 * length, 0., 0.),
         );
     }
     for y in [0.3, 0.8] {
-        builder.add_mesh(cuboid(vec3(length, 0.08, 0.03), 0.), &wood, transform * at(0., y * height, -0.03));
+        builder.add_box(vec3(length, 0.08, 0.03), &wood, transform * at(0., y * height, -0.03));
     }
 }
 
 /// Adds a single object, on the ground at `spot` or on a block there, to be viewed from all sides.
 pub(super) fn orbit_target(builder: &mut SceneBuilder, spot: Vec3) -> OrbitTarget {
-    let size =
-        vec3(builder.log_uniform(0.3, 1.5), builder.log_uniform(0.3, 1.5), builder.log_uniform(0.3, 1.5));
+    let size = builder.log_vector([(0.3, 1.5); 3]);
     let below = if builder.chance(0.3) { 0. } else { builder.within(0.2..1.1) };
     if below > 0. {
         // The block reaches below the ground, which may be uneven.
         let (foot, broad) = (0.5, builder.within(0.6..1.6));
-        let material = builder.material(Purpose::Thing);
+        let material = builder.thing();
         let block = cuboid(vec3(broad * size.x, below + foot, broad * size.z), builder.within(0. ..0.05));
         builder.add_mesh(block, &material, Affine3A::from_translation(spot - foot * Vec3::Y));
     }
@@ -562,8 +525,7 @@ pub(super) fn orbit_target(builder: &mut SceneBuilder, spot: Vec3) -> OrbitTarge
 
 /// Adds an object on a wall at `spot`, to be viewed from the direction `front`.
 pub(super) fn hung(builder: &mut SceneBuilder, spot: Vec3, front: Vec3) -> OrbitTarget {
-    let size =
-        vec3(builder.log_uniform(0.3, 1.2), builder.log_uniform(0.2, 1.), builder.log_uniform(0.3, 1.2));
+    let size = builder.log_vector([(0.3, 1.2), (0.2, 1.), (0.3, 1.2)]);
     // The object's up axis points away from the wall.
     let off_the_wall = Quat::from_rotation_arc(Vec3::Y, front) * Quat::from_rotation_y(builder.angle());
     exhibit_object(builder, size, Affine3A::from_rotation_translation(off_the_wall, spot));
@@ -573,19 +535,10 @@ pub(super) fn hung(builder: &mut SceneBuilder, spot: Vec3, front: Vec3) -> Orbit
 /// Adds an object that merits its own video, about `size` metres large, standing at the origin of `transform`.
 fn exhibit_object(builder: &mut SceneBuilder, size: Vec3, transform: Affine3A) {
     match builder.within(0..6) {
-        0 => {
-            let (mesh, material) = (plain(builder, size), builder.material(Purpose::Thing));
-            builder.add_mesh(mesh, &material, transform);
-        }
-        1 => {
-            let largest = size.max_element();
-            rock(builder, transform, largest);
-        }
+        0 => add_plain(builder, size, transform),
+        1 => rock(builder, transform, size.max_element()),
         2 => plant(builder, transform),
-        _ => {
-            let count = builder.within(3..12);
-            heap(builder, size, transform, count);
-        }
+        _ => heap(builder, size, transform, 3..12),
     }
 }
 
@@ -603,18 +556,12 @@ pub(super) fn furniture(builder: &mut SceneBuilder, transform: Affine3A) {
         }
         9 => plant(builder, transform),
         10 => {
-            let size = vec3(
-                builder.log_uniform(0.3, 1.5),
-                builder.log_uniform(0.3, 1.5),
-                builder.log_uniform(0.3, 1.5),
-            );
-            let (mesh, material) = (plain(builder, size), builder.material(Purpose::Thing));
-            builder.add_mesh(mesh, &material, transform);
+            let size = builder.log_vector([(0.3, 1.5); 3]);
+            add_plain(builder, size, transform);
         }
         _ => {
-            let size = vec3(builder.within(0.4..1.4), builder.within(0.4..1.4), builder.within(0.4..1.4));
-            let count = builder.within(3..9);
-            heap(builder, size, transform, count);
+            let size = builder.vector([(0.4, 1.4); 3]);
+            heap(builder, size, transform, 3..9);
         }
     }
 }

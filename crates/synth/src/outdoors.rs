@@ -1,10 +1,9 @@
 //! Outdoor scenes: ground, and objects on it under the sky.
 
 use super::light::{Light, Sky};
-use super::mesh::Mesh;
+use super::mesh::{Mesh, height_field};
 use super::objects;
 use super::scene_builder::{SceneBuilder, standing};
-use super::shapes::height_field;
 use super::texture::Purpose;
 use super::walk::CameraSpace;
 use glam::{Affine3A, Vec3, vec2, vec3};
@@ -79,25 +78,15 @@ pub(super) fn landscape(builder: &mut SceneBuilder, sky: &Sky) -> CameraSpace {
         match builder.chance(0.4) {
             true => objects::furniture(builder, transform),
             false => {
-                let size = vec3(
-                    builder.log_uniform(0.3, 4.),
-                    builder.log_uniform(0.3, 4.),
-                    builder.log_uniform(0.3, 4.),
-                );
-                let count = builder.within(1..8);
-                objects::heap(builder, size, transform, count);
+                let size = builder.log_vector([(0.3, 4.); 3]);
+                objects::heap(builder, size, transform, 1..8);
             }
         }
     }
     sun(builder, sky);
     let half = 0.5 * wide;
-    CameraSpace {
-        min: vec3(-half, 0.3, -half),
-        max: vec3(half, 9., half),
-        eye_heights: (1.2, 2.2),
-        clearance: 0.4,
-        walls: None,
-    }
+    let (min, max) = (vec3(-half, 0.3, -half), vec3(half, 9., half));
+    CameraSpace { min, max, eye_heights: (1.2, 2.2), clearance: 0.4, walls: None }
 }
 
 /// Builds the surroundings that are visible through the windows of a room of `size`.
@@ -105,8 +94,7 @@ pub(super) fn outside(builder: &mut SceneBuilder, size: Vec3) {
     let below = builder.within(0. ..1f32).powi(2) * 8. + 0.1;
     let middle = vec3(0.5 * size.x, -below, 0.5 * size.z);
     let ground = builder.material(Purpose::Ground);
-    let mut yard = height_field(vec2(120., 120.), 12, |_, _| 0.);
-    yard.positions.iter_mut().for_each(|p| *p += middle);
+    let yard = height_field(vec2(120., 120.), 12, |_, _| 0.).warped(|p| p + middle);
     builder.add_mesh(yard, &ground, Affine3A::IDENTITY);
     let reach = 0.5 * size.x.max(size.z);
     for _ in 0..builder.within(2..9) {

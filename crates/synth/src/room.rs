@@ -1,12 +1,10 @@
 //! Rooms: floor, ceiling, walls with openings, and furnishings.
 
-use super::light::{Light, Sky};
-use super::material::Material;
-use super::mesh::Mesh;
+use super::light::{Light, Material, Sky};
+use super::mesh::{Mesh, cone, superellipsoid};
 use super::objects;
 use super::outdoors::outside;
-use super::scene_builder::{SceneBuilder, standing};
-use super::shapes::{cone, cuboid, superellipsoid};
+use super::scene_builder::{SceneBuilder, at, standing};
 use super::texture::Purpose;
 use super::walk::CameraSpace;
 use glam::{Affine3A, Mat3, Quat, Vec2, Vec3, vec2, vec3};
@@ -54,14 +52,13 @@ pub(super) fn room(builder: &mut SceneBuilder, sky: &mut Sky) -> CameraSpace {
     );
     let accent = if builder.chance(0.35) { builder.material(Purpose::Wall) } else { wall.clone() };
     let corners = [vec3(0., 0., size.z), vec3(0., 0., 0.), vec3(size.x, 0., 0.), size.with_y(0.)];
-    let mut walls = vec![];
-    for i in 0..4 {
+    let walls = [0, 1, 2, 3].map(|i| {
         let side = corners[(i + 1) % 4] - corners[i];
         let length = side.length();
         let mut wall = Wall { corner: corners[i], along: side / length, length, openings: vec![] };
         add_openings(builder, &mut wall, size.y);
-        walls.push(wall);
-    }
+        wall
+    });
     for (i, one) in walls.iter().enumerate() {
         build_wall(builder, one, size.y, if i == 0 { &accent } else { &wall });
     }
@@ -79,13 +76,8 @@ pub(super) fn room(builder: &mut SceneBuilder, sky: &mut Sky) -> CameraSpace {
     furnish(builder, size, &walls);
     light(builder, size, sky, has_openings);
     let behind = 0.25;
-    CameraSpace {
-        min: vec3(behind, 0.5, behind),
-        max: size - behind,
-        eye_heights: (1., 1.75),
-        clearance: 0.3,
-        walls: Some(behind),
-    }
+    let (min, max) = (vec3(behind, 0.5, behind), size - behind);
+    CameraSpace { min, max, eye_heights: (1., 1.75), clearance: 0.3, walls: Some(behind) }
 }
 
 /// Adds windows and doors to the wall.
@@ -136,12 +128,13 @@ fn build_wall(builder: &mut SceneBuilder, wall: &Wall, height: f32, material: &M
         let size = to - from;
         let (right, up, back) = (vec3(size.x, 0., 0.), vec3(0., size.y, 0.), vec3(0., 0., -deep));
         let corner = from.extend(0.);
-        for (corner, along, up) in [
+        let reveals = [
             (corner, back, up),
             (corner + right, up, back),
             (corner, right, back),
             (corner + up, back, right),
-        ] {
+        ];
+        for (corner, along, up) in reveals {
             builder.add_mesh(Mesh::rectangle(corner, along, up, 0.5), &frame, transform);
         }
         let edge = 0.06;
@@ -150,38 +143,30 @@ fn build_wall(builder: &mut SceneBuilder, wall: &Wall, height: f32, material: &M
             (vec2(to.x, from.y - edge), vec2(edge, size.y + 2. * edge)),
             (vec2(from.x, to.y), vec2(size.x, edge)),
         ] {
-            let bar = cuboid(vec3(size.x, size.y, 0.03), 0.);
             let spot = Affine3A::from_translation((at + vec2(0.5 * size.x, 0.)).extend(0.));
-            builder.add_mesh(bar, &frame, transform * spot);
+            builder.add_box(vec3(size.x, size.y, 0.03), &frame, transform * spot);
         }
         if is_door {
             if builder.chance(0.4) {
                 // The leaf of the door, opened by a random angle.
-                let leaf = cuboid(vec3(size.x, size.y, 0.04), 0.);
-                let wood = builder.material(Purpose::Thing);
-                let hinge = Affine3A::from_translation(vec3(from.x, 0., 0.))
+                let wood = builder.thing();
+                let hinge = at(from.x, 0., 0.)
                     * Affine3A::from_rotation_y(-builder.within(0. ..1.8))
-                    * Affine3A::from_translation(vec3(0.5 * size.x, 0., 0.));
-                builder.add_mesh(leaf, &wood, transform * hinge);
+                    * at(0.5 * size.x, 0., 0.);
+                builder.add_box(vec3(size.x, size.y, 0.04), &wood, transform * hinge);
             }
             continue;
         }
         // Glazing bars between the panes.
         let (columns, rows) = (builder.within(1..4), builder.within(1..4));
         for i in 1..columns {
-            let bar = cuboid(vec3(0.04, size.y, 0.04), 0.);
             let x = from.x + size.x * i as f32 / columns as f32;
-            builder.add_mesh(
-                bar,
-                &frame,
-                transform * Affine3A::from_translation(vec3(x, from.y, -0.7 * deep)),
-            );
+            builder.add_box(vec3(0.04, size.y, 0.04), &frame, transform * at(x, from.y, -0.7 * deep));
         }
         for i in 1..rows {
-            let bar = cuboid(vec3(size.x, 0.04, 0.04), 0.);
             let y = from.y + size.y * i as f32 / rows as f32;
-            let spot = vec3(from.x + 0.5 * size.x, y - 0.02, -0.7 * deep);
-            builder.add_mesh(bar, &frame, transform * Affine3A::from_translation(spot));
+            let spot = transform * at(from.x + 0.5 * size.x, y - 0.02, -0.7 * deep);
+            builder.add_box(vec3(size.x, 0.04, 0.04), &frame, spot);
         }
         let middle = Affine3A::from_translation((0.5 * (from + to)).extend(0.02));
         if builder.chance(0.4) {
@@ -193,9 +178,8 @@ fn build_wall(builder: &mut SceneBuilder, wall: &Wall, height: f32, material: &M
     let doors = wall.openings.iter().filter(|opening| opening.is_door).map(|door| (door.from.x, door.to.x));
     for (from, to) in doors.chain([(wall.length, wall.length)]) {
         if from - reached > 0.1 {
-            let board = cuboid(vec3(from - reached, tall, 0.02), 0.);
-            let spot = vec3(0.5 * (from + reached), 0., 0.01);
-            builder.add_mesh(board, &wood, transform * Affine3A::from_translation(spot));
+            let spot = transform * at(0.5 * (from + reached), 0., 0.01);
+            builder.add_box(vec3(from - reached, tall, 0.02), &wood, spot);
         }
         reached = to;
     }
@@ -203,7 +187,7 @@ fn build_wall(builder: &mut SceneBuilder, wall: &Wall, height: f32, material: &M
 
 /// Adds beams under the ceiling, or columns.
 fn beams(builder: &mut SceneBuilder, size: Vec3) {
-    let wood = builder.material(Purpose::Thing);
+    let wood = builder.thing();
     let thick = builder.within(0.08..0.3);
     let count = builder.within(1..6);
     let are_columns = builder.chance(0.25);
@@ -211,14 +195,9 @@ fn beams(builder: &mut SceneBuilder, size: Vec3) {
         let x = size.x * (i as f32 + 0.5) / count as f32;
         if are_columns {
             let z = size.z * builder.one_of(&[0.1, 0.3, 0.7, 0.9]);
-            builder.add_mesh(
-                cone(0.6 * thick, 0.6 * thick, size.y, 16),
-                &wood,
-                Affine3A::from_translation(vec3(x, 0., z)),
-            );
+            builder.add_mesh(cone(0.6 * thick, 0.6 * thick, size.y, 16), &wood, at(x, 0., z));
         } else {
-            let beam = cuboid(vec3(thick, thick, size.z), 0.);
-            builder.add_mesh(beam, &wood, Affine3A::from_translation(vec3(x, size.y - thick, 0.5 * size.z)));
+            builder.add_box(vec3(thick, thick, size.z), &wood, at(x, size.y - thick, 0.5 * size.z));
         }
     }
 }
@@ -228,12 +207,8 @@ fn furnish(builder: &mut SceneBuilder, size: Vec3, walls: &[Wall]) {
     if builder.chance(0.5) {
         let wide = vec2(builder.within(0.3..0.8) * size.x, builder.within(0.3..0.8) * size.z);
         let cloth = builder.picture(wide);
-        let mesh = Mesh::rectangle(
-            vec3(-0.5 * wide.x, 0., 0.5 * wide.y),
-            vec3(wide.x, 0., 0.),
-            vec3(0., 0., -wide.y),
-            CELL,
-        );
+        let corner = vec3(-0.5 * wide.x, 0., 0.5 * wide.y);
+        let mesh = Mesh::rectangle(corner, Vec3::X * wide.x, Vec3::NEG_Z * wide.y, CELL);
         let spot = vec3(0.5 * size.x, 0.012, 0.5 * size.z);
         let turn = if builder.chance(0.7) { 0. } else { builder.within(-0.5..0.5) };
         builder.add_mesh(mesh, &cloth, standing(spot, turn));
@@ -256,7 +231,7 @@ fn furnish(builder: &mut SceneBuilder, size: Vec3, walls: &[Wall]) {
         let mut reached = builder.within(0.4..1.4);
         while reached < wall.length - 0.4 {
             if wall.is_free(reached - 0.4, reached + 0.4) && builder.chance(0.6) {
-                let spot = Affine3A::from_translation(vec3(reached, builder.within(1.2..1.9), 0.));
+                let spot = at(reached, builder.within(1.2..1.9), 0.);
                 match builder.chance(0.08) {
                     true => objects::mirror(builder, transform * spot),
                     false => objects::picture(builder, transform * spot),
@@ -273,7 +248,7 @@ fn furnish(builder: &mut SceneBuilder, size: Vec3, walls: &[Wall]) {
             if builder.chance(0.5) { FRAC_PI_2 * builder.within(0..4) as f32 } else { builder.angle() };
         objects::furniture(builder, standing(spot, turn));
     }
-    let floor = Affine3A::from_translation(vec3(0.5 * size.x, 0., 0.5 * size.z));
+    let floor = at(0.5 * size.x, 0., 0.5 * size.z);
     objects::clutter(builder, 0.9 * vec2(size.x, size.z), floor, 8);
 }
 
@@ -290,30 +265,23 @@ fn light(builder: &mut SceneBuilder, size: Vec3, sky: &mut Sky, has_openings: bo
             let half = vec2(builder.within(0.1..0.6), builder.within(0.1..0.4));
             let (right, up) = (half.x * Vec3::X, half.y * Vec3::Z);
             let color = strength * tone;
-            builder.contents.lights.push(Light::Panel {
-                at: at - 0.05 * Vec3::Y,
-                right,
-                up,
-                facing: Vec3::NEG_Y,
-                color,
-            });
-            let mut glass = builder.material(Purpose::Ceiling);
-            glass.emission = 3.;
-            let panel = cuboid(vec3(2. * half.x, 0.03, 2. * half.y), 0.);
-            builder.add_mesh(panel, &glass, Affine3A::from_translation(at - 0.03 * Vec3::Y));
+            let (middle, facing) = (at - 0.05 * Vec3::Y, Vec3::NEG_Y);
+            builder.contents.lights.push(Light::Panel { at: middle, right, up, facing, color });
+            let glass = lamp_glass(builder);
+            builder.add_box(
+                vec3(2. * half.x, 0.03, 2. * half.y),
+                &glass,
+                Affine3A::from_translation(at - 0.03 * Vec3::Y),
+            );
         } else {
             let below = builder.within(0.2..(0.35 * size.y));
             let (radius, at) = (builder.within(0.05..0.2), at - below * Vec3::Y);
-            let mut glass = builder.material(Purpose::Ceiling);
-            glass.emission = 3.;
+            let glass = lamp_glass(builder);
             let ball = superellipsoid(Vec3::splat(2. * radius), [1., 1.], 8);
             builder.add_mesh(ball, &glass, Affine3A::from_translation(at));
-            let cord = builder.material(Purpose::Thing);
-            builder.add_mesh(
-                cone(0.006, 0.006, below - radius, 5),
-                &cord,
-                Affine3A::from_translation(at + radius * Vec3::Y),
-            );
+            let cord = builder.thing();
+            let top = Affine3A::from_translation(at + radius * Vec3::Y);
+            builder.add_mesh(cone(0.006, 0.006, below - radius, 5), &cord, top);
             builder.contents.lights.push(Light::Ball { at, radius, color: 0.8 * strength * tone });
         }
     }
@@ -325,13 +293,19 @@ fn light(builder: &mut SceneBuilder, size: Vec3, sky: &mut Sky, has_openings: bo
     if has_openings {
         // The outdoors is brighter than rooms in daytime.
         let brighter = builder.within(1. ..2.5);
-        (sky.zenith, sky.horizon, sky.ground) =
-            (brighter * sky.zenith, brighter * sky.horizon, brighter * sky.ground);
+        for color in [&mut sky.zenith, &mut sky.horizon, &mut sky.ground] {
+            *color *= brighter;
+        }
     } else {
         // Approximates the light of a closed room's lamps after more than one bounce.
         let rest = builder.within(0.1..0.5) * tone;
         (sky.zenith, sky.horizon, sky.ground) = (rest, rest, rest);
     }
+}
+
+/// Returns the material of lamps that are on.
+fn lamp_glass(builder: &mut SceneBuilder) -> Material {
+    Material { emission: 3., ..builder.material(Purpose::Ceiling) }
 }
 
 /// Builds a closed box full of plain shapes in mid-air and on the floor, with random textures. It contains no recognizable objects,
@@ -348,11 +322,10 @@ pub(super) fn box_of_shapes(builder: &mut SceneBuilder, sky: &mut Sky) -> Camera
         builder.add_mesh(Mesh::rectangle(corner, along, up, CELL), &material, Affine3A::IDENTITY);
     }
     for _ in 0..builder.within(12..45) {
-        let part =
-            vec3(builder.log_uniform(0.15, 2.), builder.log_uniform(0.15, 2.), builder.log_uniform(0.15, 2.));
+        let part = builder.log_vector([(0.15, 2.); 3]);
         let mesh = objects::plain(builder, part);
-        let material = builder.material(Purpose::Thing);
-        let mut spot = size * vec3(builder.within(0. ..1.), builder.within(0. ..1.), builder.within(0. ..1.));
+        let material = builder.thing();
+        let mut spot = size * builder.vector([(0., 1.); 3]);
         let mut turn = Quat::from_axis_angle(builder.direction(), builder.angle());
         if builder.chance(0.6) {
             (spot.y, turn) = (0., Quat::from_rotation_y(builder.angle()));
@@ -361,12 +334,6 @@ pub(super) fn box_of_shapes(builder: &mut SceneBuilder, sky: &mut Sky) -> Camera
     }
     light(builder, size, sky, false);
     let behind = 0.3;
-    let eye_heights = (0.6, size.y - 0.4);
-    CameraSpace {
-        min: Vec3::splat(behind),
-        max: size - behind,
-        eye_heights,
-        clearance: 0.3,
-        walls: Some(behind),
-    }
+    let (min, max, eye_heights) = (Vec3::splat(behind), size - behind, (0.6, size.y - 0.4));
+    CameraSpace { min, max, eye_heights, clearance: 0.3, walls: Some(behind) }
 }

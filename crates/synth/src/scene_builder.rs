@@ -1,7 +1,7 @@
 //! Builder of synthetic scenes: their contents so far, and the random number generator.
 
-use super::material::Material;
-use super::mesh::Mesh;
+use super::light::Material;
+use super::mesh::{Mesh, cuboid};
 use super::noise::Noise;
 use super::texture::{Purpose, Texture};
 use super::tracer::SceneContents;
@@ -36,6 +36,16 @@ impl SceneBuilder {
     /// Returns a random value between `least` and `most` on a logarithmic scale: each doubling is equally likely.
     pub fn log_uniform(&mut self, least: f32, most: f32) -> f32 {
         least * (most / least).powf(self.within(0. ..1.))
+    }
+
+    /// Returns a vector whose components are uniformly random between the given bounds.
+    pub fn vector(&mut self, bounds: [(f32, f32); 3]) -> Vec3 {
+        bounds.map(|(low, high)| self.within(low..high)).into()
+    }
+
+    /// Returns a vector whose components are drawn by [`SceneBuilder::log_uniform`].
+    pub fn log_vector(&mut self, bounds: [(f32, f32); 3]) -> Vec3 {
+        bounds.map(|(least, most)| self.log_uniform(least, most)).into()
     }
 
     pub fn chance(&mut self, probability: f64) -> bool {
@@ -118,9 +128,29 @@ impl SceneBuilder {
         material
     }
 
+    /// Returns a random material for furniture and other objects.
+    pub fn thing(&mut self) -> Material {
+        self.material(Purpose::Thing)
+    }
+
+    /// Adds a [`cuboid`] of `size` with sharp edges.
+    pub fn add_box(&mut self, size: Vec3, material: &Material, transform: Affine3A) {
+        self.add_rounded_box(size, 0., material, transform);
+    }
+
+    /// Adds a [`cuboid`] of `size` with edges rounded by `round` metres.
+    pub fn add_rounded_box(&mut self, size: Vec3, round: f32, material: &Material, transform: Affine3A) {
+        self.add_mesh(cuboid(size, round), material, transform);
+    }
+
     pub fn add_mesh(&mut self, mesh: Mesh, material: &Material, transform: Affine3A) {
         self.contents.meshes.push((mesh.moved(transform), material.clone()));
     }
+}
+
+/// Returns the translation by (`x`, `y`, `z`).
+pub(super) fn at(x: f32, y: f32, z: f32) -> Affine3A {
+    Affine3A::from_translation(Vec3::new(x, y, z))
 }
 
 /// Returns the transform of an upright object at `spot`, rotated by `turn` about y.

@@ -7,7 +7,7 @@ use super::texture::Texture;
 use super::tracer::{SampleChoice, Tracer};
 use super::walk::{CameraSpace, OrbitTarget, walk};
 use super::{objects, outdoors, room};
-use glam::{DMat3, DMat4, DVec2, DVec3, Vec2, Vec3, vec2, vec3};
+use glam::{DMat3, DMat4, DVec2, DVec3, Vec2, Vec3, vec2};
 use globalsplat_capture::{Camera, ImageSize, Intrinsics, Lens};
 use image::RgbImage;
 use rand::SeedableRng;
@@ -74,11 +74,6 @@ impl Video {
     /// Returns the cameras of the images.
     pub fn cameras(&self) -> &[Camera] {
         &self.cameras
-    }
-
-    /// Returns the number of triangles in the scene.
-    pub fn triangles(&self) -> usize {
-        self.tracer.triangle_count()
     }
 
     /// Renders image `index`.
@@ -177,7 +172,7 @@ fn world(builder: &mut SceneBuilder) -> (CameraSpace, Option<OrbitTarget>, Sky) 
 /// Returns a position on a wall, and the direction away from the wall.
 fn on_a_wall(builder: &mut SceneBuilder, place: CameraSpace, behind: f32) -> (Vec3, Vec3) {
     let (least, most) = (place.min - behind, place.max + behind);
-    let share = vec3(builder.within(0.2..0.8), builder.within(0.3..0.75), builder.within(0.2..0.8));
+    let share = builder.vector([(0.2, 0.8), (0.3, 0.75), (0.2, 0.8)]);
     let spot = least + share * (most - least);
     match builder.within(0..4) {
         0 => (spot.with_x(least.x), Vec3::X),

@@ -1,8 +1,8 @@
-//! Pixel buffer that texture families paint on.
+//! Pixel buffer that texture families paint on, and the shapes that they paint.
 
 use glam::{IVec2, Vec2, Vec3};
 
-use super::field::Field;
+use super::noise::Field;
 
 /// A square image of linear RGB whose width is a power of two.
 #[derive(Clone)]
@@ -49,11 +49,26 @@ impl Canvas {
         }
     }
 
+    /// Changes every pixel by a function of its previous color and of the value of a field of the same size.
+    pub fn change_by(&mut self, field: &Field, color: impl Fn(Vec3, f32) -> Vec3) {
+        for (pixel, &value) in self.pixels.iter_mut().zip(&field.values) {
+            *pixel = color(*pixel, value);
+        }
+    }
+
     /// Multiplies each pixel by 1 + `strength` times the value of a field of the same size, at least 0.1.
     pub fn shade(&mut self, field: &Field, strength: f32) {
-        for (pixel, value) in self.pixels.iter_mut().zip(&field.values) {
-            *pixel *= (1. + strength * value).max(0.1);
-        }
+        self.change_by(field, |pixel, value| pixel * (1. + strength * value).max(0.1));
+    }
+
+    /// Multiplies all pixels by `factor`.
+    pub fn tint(&mut self, factor: Vec3) {
+        self.pixels.iter_mut().for_each(|pixel| *pixel *= factor);
+    }
+
+    /// Returns the mean of the pixels.
+    pub fn mean(&self) -> Vec3 {
+        self.pixels.iter().sum::<Vec3>() / self.pixels.len() as f32
     }
 
     /// Paints over the pixels within `reach` of `centre`. `paint` returns the color and its coverage for the offset from `centre`
@@ -98,4 +113,53 @@ impl Canvas {
         };
         row(top).lerp(row(top + 1), part.y)
     }
+}
+
+/// Interpolates smoothly from 0 at `low` to 1 at `high`, with zero slope at both ends.
+pub(super) fn smoothstep(low: f32, high: f32, value: f32) -> f32 {
+    let t = ((value - low) / (high - low)).clamp(0., 1.);
+    t * t * (3. - 2. * t)
+}
+
+/// Returns the signed distance to a disk.
+pub(super) fn disk(offset: Vec2, radius: f32) -> f32 {
+    offset.length() - radius
+}
+
+/// Returns the signed distance to an ellipse, exact on its edge and approximate elsewhere.
+pub(super) fn ellipse(offset: Vec2, radii: Vec2) -> f32 {
+    ((offset / radii).length() - 1.) * radii.min_element()
+}
+
+/// Returns the signed distance to a rectangle with corners rounded by `rounding`.
+pub(super) fn rectangle(offset: Vec2, half: Vec2, rounding: f32) -> f32 {
+    let beyond = offset.abs() - half + Vec2::splat(rounding);
+    beyond.max(Vec2::ZERO).length() + beyond.max_element().min(0.) - rounding
+}
+
+/// Returns the signed distance to a stroke with round ends.
+pub(super) fn stroke(offset: Vec2, from: Vec2, to: Vec2, radius: f32) -> f32 {
+    let along = to - from;
+    let t = ((offset - from).dot(along) / along.length_squared().max(1e-12)).clamp(0., 1.);
+    (offset - from - along * t).length() - radius
+}
+
+/// Returns the signed distance to a regular polygon with `corners` corners whose inscribed circle has radius `radius`.
+pub(super) fn polygon(offset: Vec2, radius: f32, corners: usize) -> f32 {
+    let turn = std::f32::consts::TAU / corners as f32;
+    let angle = offset.to_angle() / turn;
+    offset.length() * ((angle - angle.round()) * turn).cos() - radius
+}
+
+/// Returns the approximate signed distance to a flower with `petals` petals, whose notches are `depth` times the radius deep.
+pub(super) fn flower(offset: Vec2, radius: f32, petals: usize, depth: f32) -> f32 {
+    let wave = (offset.to_angle() * petals as f32).cos();
+    offset.length() - radius * (1. - depth * (0.5 - 0.5 * wave))
+}
+
+/// Returns the approximate signed distance to a leaf between two points on the x axis, `length` apart and `width` across.
+pub(super) fn leaf(offset: Vec2, length: f32, width: f32) -> f32 {
+    let t = (offset.x / length + 0.5).clamp(0., 1.);
+    let half = 2. * width * t * (1. - t);
+    (offset.y.abs() - half).max(offset.x.abs() - 0.5 * length)
 }

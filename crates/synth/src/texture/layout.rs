@@ -3,8 +3,7 @@
 use glam::{Vec2, Vec2Swizzles};
 use rand_chacha::ChaCha8Rng;
 
-use super::rng::RandomValues;
-use super::voronoi::Voronoi;
+use super::noise::{RandomValues, Voronoi};
 
 /// Arrangement of pieces.
 pub(super) enum Layout {

@@ -3,9 +3,9 @@
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
 
-use super::palette::{self, Palette, luminance};
-use super::rng::RandomValues;
-use super::shape;
+use super::canvas;
+use super::noise::RandomValues;
+use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
 
 /// Glyphs of an invented script. A glyph consists of strokes between points of a 3 × 3 grid, in a box of height 1.
@@ -77,7 +77,7 @@ impl Script {
                 let middle = 0.5 * (from + to);
                 let reach = (to - from).abs() * 0.5 + weight + 1. / canvas.size as f32;
                 canvas.fill(start + middle, reach, color, |offset| {
-                    shape::stroke(offset, from - middle, to - middle, weight)
+                    canvas::stroke(offset, from - middle, to - middle, weight)
                 });
             }
             x += advance;
@@ -101,32 +101,26 @@ impl Script {
             let ends_paragraph = line + 1 == lines || random.happens(0.1);
             let length =
                 extent.x * if ends_paragraph { random.between(0.2, 0.9) } else { random.between(0.93, 1.) };
-            self.write(
-                random,
-                canvas,
-                corner + Vec2::new(0., (line as f32 + 0.5) * line_spacing),
-                length,
-                height,
-                color,
-            );
+            let start = corner + Vec2::new(0., (line as f32 + 0.5) * line_spacing);
+            self.write(random, canvas, start, length, height, color);
         }
     }
 }
 
+/// Returns a color of paper: white with the probability `white`, or a likely one for `purpose`.
+pub(super) fn paper(random: &mut ChaCha8Rng, purpose: Purpose, white: f32) -> Vec3 {
+    if random.happens(white) { color_of(random, WHITES) } else { Palette::draw(random, purpose, 1).color(0) }
+}
+
 /// Returns a color that is legible on `paper`.
 pub(super) fn ink_for(random: &mut ChaCha8Rng, paper: Vec3) -> Vec3 {
-    let theme = random.weighted(&[(palette::GREYS, 4.), (palette::VIVID, 1.), (palette::ACCENTS, 1.)]);
-    let ink = palette::color_of(random, theme);
+    let ink = color_among(random, &[(GREYS, 4.), (VIVID, 1.), (ACCENTS, 1.)]);
     if luminance(paper) > 0.3 { ink * 0.35 } else { Vec3::splat(0.75).lerp(ink, 0.3) }
 }
 
 /// Draws a texture of columns of writing, like newspapers, labels and notices.
 pub(super) fn writing(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let paper = if random.happens(0.6) {
-        palette::color_of(random, palette::WHITES)
-    } else {
-        Palette::draw(random, purpose, 1).color(0)
-    };
+    let paper = paper(random, purpose, 0.6);
     let mut canvas = Canvas::filled(SIZE, paper);
     let ink = ink_for(random, paper);
     let columns = random.count(1, 3);
@@ -144,7 +138,7 @@ pub(super) fn writing(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
                     let block = Palette::draw(random, Purpose::Poster, 1).color(0);
                     let half = Vec2::new(0.5 * extent.x, 0.45 * extent.y);
                     let middle = corner + half;
-                    canvas.fill(middle, half, block, |offset| shape::rectangle(offset, half, 0.));
+                    canvas.fill(middle, half, block, |offset| canvas::rectangle(offset, half, 0.));
                 }
                 _ => script.paragraph(random, &mut canvas, corner, extent, height, ink),
             }
@@ -156,8 +150,7 @@ pub(super) fn writing(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 
 /// Draws a texture of curly lines drawn by hand, as with chalk, crayons or spray paint.
 pub(super) fn scribbles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let count = random.count(2, 5);
-    let palette = Palette::draw(random, purpose, count);
+    let palette = Palette::draw_between(random, purpose, 2, 5);
     let mut canvas = Canvas::filled(SIZE, palette.color(0));
     for _ in 0..random.count(1, 12) {
         let color = palette.any(random);
@@ -170,7 +163,7 @@ pub(super) fn scribbles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
             angle += curl;
             let step = Vec2::from_angle(angle) * step_length;
             canvas.fill(at + 0.5 * step, 0.5 * step.abs() + width + 1. / SIZE as f32, color, |offset| {
-                shape::stroke(offset, -0.5 * step, 0.5 * step, width)
+                canvas::stroke(offset, -0.5 * step, 0.5 * step, width)
             });
             at += step;
         }

@@ -1,15 +1,12 @@
-//! Textures of bricks, tiles, paving and stone walls.
+//! Textures of bricks, tiles, paving, stone, concrete, plaster and asphalt.
 
-use glam::Vec2;
+use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
 
-use super::field::Field;
+use super::canvas::{self, smoothstep};
 use super::layout::Layout;
-use super::noise::{fractal, smooth};
-use super::palette::{self, Palette, luminance};
-use super::rng::{RandomValues, unit_of};
-use super::shape::smoothstep;
-use super::voronoi::Voronoi;
+use super::noise::{Field, RandomValues, Voronoi, fractal, ridged, smooth, unit_of, warped};
+use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
 
 /// Appearance of pieces and of the joints between them; lengths in repeats.
@@ -17,7 +14,7 @@ struct Finish {
     /// Colors of the pieces.
     palette: Palette,
     /// Color of the joints.
-    joint: glam::Vec3,
+    joint: Vec3,
     /// Half the width of a joint.
     joint_width: f32,
     /// Distance from a joint over which pieces are rounded.
@@ -38,16 +35,14 @@ fn lay(random: &mut ChaCha8Rng, layout: &Layout, finish: &Finish) -> Canvas {
     let [right, down] = [(); 2].map(|()| fractal(random, SIZE, [12; 2], 3, 0.6));
     let seed = random.seed();
     let light = random.direction();
-    let mut index = 0;
-    let mut height = Field { size: SIZE, values: vec![0.; SIZE * SIZE] };
+    let mut heights = Vec::with_capacity(SIZE * SIZE);
     let mut canvas = Canvas::from_fn(SIZE, |uv| {
-        let push = Vec2::new(right.values[index], down.values[index]) * finish.crookedness;
+        let push = Vec2::new(right.value(uv), down.value(uv)) * finish.crookedness;
         let piece = layout.piece(uv + push);
-        let (rough, stain) = (rough.values[index], stains.values[index]);
+        let (rough, stain) = (rough.value(uv), stains.value(uv));
         let on_piece = smoothstep(0., 2. / SIZE as f32, piece.edge - finish.joint_width + 0.5 / SIZE as f32);
         let raised = ((piece.edge - finish.joint_width) / finish.rounding).clamp(0., 1.);
-        height.values[index] = raised * (2. - raised);
-        index += 1;
+        heights.push(raised * (2. - raised));
         let tone = unit_of(seed, piece.id);
         let lightness = 1. + finish.spread * (unit_of(seed ^ 1, piece.id) - 0.5);
         let texture = 1. + finish.roughness * (rough + 0.6 * stain);
@@ -56,24 +51,19 @@ fn lay(random: &mut ChaCha8Rng, layout: &Layout, finish: &Finish) -> Canvas {
         let joint = finish.joint * (1. + 0.25 * rough).max(0.3);
         joint.lerp(color, on_piece)
     });
+    let height = Field { size: SIZE, values: heights };
     canvas.shade(&height.slope(light), random.between(0., 0.6));
     canvas
 }
 
-fn joint_color(random: &mut ChaCha8Rng, theme: palette::Theme) -> glam::Vec3 {
-    let other =
-        random.weighted(&[(palette::STONES, 4.), (palette::GREYS, 2.), (palette::WHITES, 2.), (theme, 1.)]);
-    palette::color_of(random, other) * random.between(0.5, 1.)
+fn joint_color(random: &mut ChaCha8Rng, theme: Theme) -> Vec3 {
+    let other = random.weighted(&[(STONES, 4.), (GREYS, 2.), (WHITES, 2.), (theme, 1.)]);
+    color_of(random, other) * random.between(0.5, 1.)
 }
 
 /// Draws a texture of courses of bricks.
 pub(super) fn bricks(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
-    let theme = random.weighted(&[
-        (palette::BRICKS, 6.),
-        (palette::STONES, 1.),
-        (palette::WHITES, 1.),
-        (palette::GREYS, 1.),
-    ]);
+    let theme = random.weighted(&[(BRICKS, 6.), (STONES, 1.), (WHITES, 1.), (GREYS, 1.)]);
     let rows = 2 * random.count(3, 8);
     let columns = (rows as f32 / random.between(2.2, 3.6)).round().max(1.) as usize;
     let upright = random.happens(0.05);
@@ -102,12 +92,12 @@ pub(super) fn bricks(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 /// Draws a texture of glazed or stone tiles with grout, as in kitchens, bathrooms and halls.
 pub(super) fn tiles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let theme = random.weighted(&[
-        (palette::WHITES, 3.),
-        (palette::BEIGES, 2.),
-        (palette::GREYS, 2.),
-        (palette::STONES, 2.),
-        (palette::ACCENTS, 2.),
-        (palette::BRICKS, 1.),
+        (WHITES, 3.),
+        (BEIGES, 2.),
+        (GREYS, 2.),
+        (STONES, 2.),
+        (ACCENTS, 2.),
+        (BRICKS, 1.),
     ]);
     let across = random.leaning_low(1., 14.) as usize;
     let even = 2 * across.div_ceil(2);
@@ -143,12 +133,7 @@ pub(super) fn tiles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 
 /// Draws a texture of stones of all shapes: cobbles, flagstones, dry walls.
 pub(super) fn stones(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
-    let theme = random.weighted(&[
-        (palette::STONES, 5.),
-        (palette::GREYS, 2.),
-        (palette::EARTHS, 2.),
-        (palette::BRICKS, 0.5),
-    ]);
+    let theme = random.weighted(&[(STONES, 5.), (GREYS, 2.), (EARTHS, 2.), (BRICKS, 0.5)]);
     let across = random.leaning_low(3., 14.) as usize;
     let layout = match random.count(0, 5) {
         0 => Layout::ragged(random, across, across as f32 * 0.7, 0.9, false),
@@ -162,9 +147,9 @@ pub(super) fn stones(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     };
     let wide = 1. / across as f32;
     let joint = if random.happens(0.25) {
-        palette::color_of(random, palette::GREENS) * 0.7
+        color_of(random, GREENS) * 0.7
     } else {
-        joint_color(random, palette::EARTHS) * random.between(0.3, 1.)
+        joint_color(random, EARTHS) * random.between(0.3, 1.)
     };
     let count = random.count(1, 4);
     let finish = Finish {
@@ -183,12 +168,7 @@ pub(super) fn stones(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 
 /// Draws a texture of roof tiles or shingles: rows that overlap the one below.
 pub(super) fn shingles(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
-    let theme = random.weighted(&[
-        (palette::BRICKS, 3.),
-        (palette::GREYS, 3.),
-        (palette::WOODS, 2.),
-        (palette::STONES, 1.),
-    ]);
+    let theme = random.weighted(&[(BRICKS, 3.), (GREYS, 3.), (WOODS, 2.), (STONES, 1.)]);
     let count = random.count(1, 4);
     let palette = Palette::from_theme(random, theme, count);
     let rows = 2 * random.count(2, 8);
@@ -229,11 +209,10 @@ pub(super) fn shingles(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 /// Draws a mosaic of small stones in many colors.
 pub(super) fn mosaic(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let across = random.count(16, 40);
-    let count = random.count(2, 5);
-    let palette = Palette::draw(random, purpose, count);
+    let palette = Palette::draw_between(random, purpose, 2, 5);
     let drift = smooth(random, SIZE, [4; 2]);
     let seed = random.seed();
-    let joint = joint_color(random, palette::GREYS);
+    let joint = joint_color(random, GREYS);
     let follows = random.between(0., 1.);
     let layout = if random.happens(0.5) {
         Layout::courses(across, across, 0., false)
@@ -250,4 +229,154 @@ pub(super) fn mosaic(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         joint.lerp(palette.ramp(tone) * shade, on_piece)
     });
     Surface { canvas, repeat_metres: across as f32 * random.between(0.02, 0.06) }
+}
+
+/// Draws marble: thin and wide veins through clouds.
+pub(super) fn marble(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+    let palette =
+        Palette::among(random, &[(WHITES, 4.), (GREYS, 2.), (BEIGES, 2.), (BROWNS, 1.), (ACCENTS, 1.)], 2);
+    let vein = if random.happens(0.7) {
+        color_of(random, GREYS) * random.between(0.3, 1.)
+    } else {
+        let theme = random.one_of(&[WHITES, BROWNS, AUTUMN]);
+        color_of(random, theme)
+    };
+    let cells = random.count(2, 4);
+    let clouds = fractal(random, SIZE, [cells; 2], 6, 0.6);
+    let reach = random.between(0.03, 0.15);
+    let cells = [random.count(1, 4), random.count(1, 5)];
+    let veins = smooth(random, SIZE, cells);
+    let veins = warped(random, &veins, 3, reach);
+    let cells = random.count(4, 9);
+    let fine = smooth(random, SIZE, [cells; 2]);
+    let fine = warped(random, &fine, 6, 0.04);
+    let (width, fine_width) = (random.leaning_low(0.03, 0.35), random.leaning_low(0.02, 0.15));
+    let (share, fine_share) = (random.between(0.3, 1.), random.between(0., 0.6));
+    let canvas = Canvas::from_fn(SIZE, |uv| {
+        let cloud = clouds.value(uv);
+        let ground = palette.ramp(0.5 + 0.4 * cloud);
+        let thin = |value: f32, width: f32| (1. - value.abs() / width).max(0.);
+        let strength = share * thin(veins.value(uv), width) * (0.6 + 0.5 * cloud).clamp(0., 1.)
+            + fine_share * thin(fine.value(uv), fine_width) * (0.4 - 0.6 * cloud).clamp(0., 1.);
+        ground.lerp(vein, strength.min(0.95))
+    });
+    Surface { canvas, repeat_metres: random.between(0.6, 2.5) }
+}
+
+/// Draws terrazzo: chips of stone in cement.
+pub(super) fn terrazzo(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let ground = Palette::draw(random, purpose, 1).color(0);
+    let count = random.count(2, 5);
+    let palette = Palette::among(random, &[(STONES, 3.), (WHITES, 1.), (ACCENTS, 2.), (BEIGES, 1.)], count);
+    let across = random.count(14, 48);
+    let voronoi = Voronoi::new(random, across, across, 1., false);
+    let (seed, crowd) = (random.seed(), random.between(0.25, 0.9));
+    let gap = random.between(0.04, 0.2) / across as f32;
+    let canvas = Canvas::from_fn(SIZE, |uv| {
+        let cell = voronoi.cell(uv);
+        let hash = |salt: u32| unit_of(seed ^ salt, cell.id);
+        if hash(0) > crowd {
+            return ground;
+        }
+        let chip = palette.ramp(hash(1)) * (0.8 + 0.4 * hash(2));
+        let inner = gap * (1. + 2. * hash(3));
+        ground.lerp(chip, smoothstep(0., 1.5 / SIZE as f32, cell.edge - inner))
+    });
+    Surface { canvas, repeat_metres: across as f32 * random.between(0.01, 0.04) }
+}
+
+/// Draws granite, sandstone or worktops: grains of a few colors.
+pub(super) fn speckle(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let theme = random.weighted(&[(STONES, 4.), (GREYS, 3.), (BEIGES, 2.), (BROWNS, 1.)]);
+    let base = if random.happens(0.7) {
+        color_of(random, theme)
+    } else {
+        Palette::draw(random, purpose, 1).color(0)
+    };
+    let mut canvas = Canvas::filled(SIZE, base);
+    for _ in 0..random.count(2, 4) {
+        let grain = random.one_of(&[32, 48, 64, 96, 128]);
+        let field = smooth(random, SIZE, [grain; 2]);
+        let spots = shade(random, base, 0.7);
+        let level = random.between(0., 0.9);
+        let share = random.between(0.3, 1.);
+        let share_at = |value| share * smoothstep(level, level + 0.3, value);
+        canvas.change_by(&field, |pixel, value| pixel.lerp(spots, share_at(value)));
+    }
+    Surface { canvas, repeat_metres: random.between(0.3, 1.2) }
+}
+
+/// Draws concrete with stains, pores and the joints of its formwork.
+pub(super) fn concrete(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+    let base = color_among(random, &[(GREYS, 3.), (STONES, 4.), (BEIGES, 1.)]);
+    let mut canvas = Canvas::filled(SIZE, base);
+    canvas.shade(&fractal(random, SIZE, [3; 2], 7, 0.7), random.between(0.05, 0.3));
+    let streaks = fractal(random, SIZE, [16, 2], 4, 0.6);
+    canvas.shade(&streaks, random.leaning_low(0., 0.25));
+    canvas.shade(&smooth(random, SIZE, [128; 2]), random.between(0.02, 0.12));
+    for _ in 0..random.count(0, 250) {
+        let radius = random.leaning_low(0.5, 2.5) / SIZE as f32;
+        let dark = base * random.between(0.3, 0.8);
+        canvas.fill(random.spot(), Vec2::splat(2. * radius), dark, |offset| canvas::disk(offset, radius));
+    }
+    if random.happens(0.4) {
+        let layout = Layout::courses(random.count(1, 3), random.count(1, 2), 0., false);
+        let width = random.between(0.5, 2.) / SIZE as f32;
+        let dark = random.between(0.3, 0.8);
+        canvas.change(|uv, color| color * (1. - dark * smoothstep(2. * width, 0., layout.piece(uv).edge)));
+    }
+    Surface { canvas, repeat_metres: random.between(1., 4.) }
+}
+
+/// Draws plaster or stucco: relief lit from the side.
+pub(super) fn plaster(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let color = Palette::draw(random, purpose, 1).color(0);
+    let mut canvas = Canvas::filled(SIZE, color);
+    let cells = random.leaning_low(2., 48.) as usize;
+    let gain = random.between(0.5, 0.9);
+    let relief = match random.count(0, 3) {
+        0 => ridged(random, SIZE, [cells; 2], 5, gain),
+        1 => fractal(random, SIZE, [cells, 3 * cells], 5, gain),
+        2 => {
+            let strokes = fractal(random, SIZE, [cells, 2 * cells], 4, gain);
+            warped(random, &strokes, 4, 0.12)
+        }
+        _ => fractal(random, SIZE, [cells; 2], 6, gain),
+    };
+    canvas.shade(&relief.slope(random.direction()), random.between(0.1, 0.9));
+    canvas.shade(&relief, random.between(0., 0.08));
+    canvas.shade(&fractal(random, SIZE, [2; 2], 4, 0.5), random.between(0., 0.1));
+    Surface { canvas, repeat_metres: random.between(0.8, 3.) }
+}
+
+/// Draws asphalt, tarmac or worn roads: fine grit, patches and cracks.
+pub(super) fn asphalt(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+    let base = linear_of(random.one_of(&[0x4a4a4b, 0x5f5e5c, 0x6f6c68, 0x3a3a3c, 0x85817b]));
+    let base = shade(random, base, 0.15);
+    let mut canvas = Canvas::filled(SIZE, base);
+    canvas.shade(&smooth(random, SIZE, [256; 2]), random.between(0.15, 0.5));
+    canvas.shade(&smooth(random, SIZE, [96; 2]), random.between(0.05, 0.25));
+    canvas.shade(&fractal(random, SIZE, [2; 2], 5, 0.6), random.between(0.05, 0.25));
+    if random.happens(0.5) {
+        let cells = random.count(1, 3);
+        let voronoi = Voronoi::new(random, cells + 1, cells + 1, 1., false);
+        let [right, down] = [(); 2].map(|()| fractal(random, SIZE, [6; 2], 5, 0.65));
+        let width = random.between(0.001, 0.006);
+        let dark = random.between(0.3, 0.9);
+        canvas.change(|uv, color| {
+            let push = Vec2::new(right.sample(uv), down.sample(uv)) * 0.04;
+            color * (1. - dark * smoothstep(width, 0.2 * width, voronoi.cell(uv + push).edge))
+        });
+    }
+    if random.happens(0.2) {
+        let paint = linear_of(random.one_of(&[0xe8e6e0, 0xd8b23a]));
+        let (from, half) = (random.unit(), random.between(0.02, 0.05));
+        let worn = fractal(random, SIZE, [8; 2], 5, 0.8);
+        canvas.change(|uv, color| {
+            let off = uv.x - from;
+            let inside = smoothstep(half, half - 0.006, (off - off.round()).abs());
+            color.lerp(paint, inside * (0.8 + worn.sample(uv)).clamp(0., 0.95))
+        });
+    }
+    Surface { canvas, repeat_metres: random.between(1.5, 4.) }
 }

@@ -4,8 +4,6 @@
 //! weathered.
 
 mod canvas;
-mod clouds;
-mod field;
 mod layout;
 mod marks;
 mod masonry;
@@ -15,22 +13,14 @@ mod panels;
 mod patterns;
 mod pictures;
 mod plain;
-mod rng;
 mod scatter;
-mod shape;
-mod stone;
-mod textile;
-mod voronoi;
-mod wear;
-mod wood;
 
 use glam::{Vec2, Vec3};
 use image::RgbImage;
 use rand_chacha::ChaCha8Rng;
 
 use canvas::Canvas;
-use field::Field;
-use rng::RandomValues;
+use noise::RandomValues;
 
 /// Width in pixels of all textures except pictures.
 const SIZE: usize = 256;
@@ -105,7 +95,7 @@ const FAMILIES: [(Family, [f32; 7]); 41] = [
     (plain::gradient,            [0.2, 0.7, 0.5, 0.1, 0.3, 1.5, 0.2]),
     (plain::brushed,             [0.2, 0.2, 0.2, 0.1, 1.0, 2.0, 0.0]),
     (plain::glossy,              [0.3, 0.1, 0.1, 0.1, 0.3, 1.0, 0.1]),
-    (clouds::clouds,             [1.5, 1.5, 0.5, 1.5, 0.8, 2.0, 1.5]),
+    (plain::clouds,             [1.5, 1.5, 0.5, 1.5, 0.8, 2.0, 1.5]),
     (patterns::stripes,          [0.7, 1.8, 0.3, 0.1, 0.5, 1.7, 0.0]),
     (patterns::plaid,            [0.5, 0.6, 0.0, 0.0, 0.0, 1.5, 0.0]),
     (patterns::pieces,           [1.5, 1.0, 0.2, 0.4, 0.3, 1.2, 0.0]),
@@ -116,20 +106,20 @@ const FAMILIES: [(Family, [f32; 7]); 41] = [
     (masonry::stones,            [0.8, 0.6, 0.0, 2.5, 2.0, 0.3, 0.0]),
     (masonry::shingles,          [0.0, 0.1, 0.0, 0.1, 2.0, 0.2, 0.0]),
     (masonry::mosaic,            [0.7, 0.6, 0.1, 0.3, 0.2, 0.5, 0.0]),
-    (wood::boards,               [7.0, 1.3, 1.2, 0.8, 1.8, 2.0, 0.0]),
-    (wood::veneer,               [0.3, 0.6, 0.3, 0.1, 0.3, 4.0, 0.2]),
-    (stone::marble,              [1.2, 0.5, 0.1, 0.2, 0.4, 1.2, 0.0]),
-    (stone::terrazzo,            [1.0, 0.3, 0.0, 0.4, 0.3, 0.5, 0.0]),
-    (stone::speckle,             [1.0, 0.3, 0.3, 1.0, 0.5, 1.2, 0.0]),
-    (stone::concrete,            [1.5, 1.0, 0.8, 2.0, 2.0, 0.6, 0.0]),
-    (stone::plaster,             [0.2, 3.0, 3.0, 0.2, 3.0, 0.5, 0.0]),
-    (stone::asphalt,             [0.2, 0.0, 0.0, 2.5, 0.1, 0.1, 0.0]),
-    (textile::weave,             [1.2, 0.6, 0.0, 0.0, 0.0, 3.0, 0.0]),
-    (textile::knit,              [0.2, 0.0, 0.0, 0.0, 0.0, 0.8, 0.0]),
-    (textile::pile,              [3.0, 0.1, 0.0, 0.2, 0.0, 1.5, 0.2]),
-    (textile::folds,             [0.0, 0.8, 0.0, 0.0, 0.0, 1.0, 0.0]),
-    (textile::quilted,           [0.1, 0.2, 0.1, 0.0, 0.0, 1.2, 0.0]),
-    (textile::carpet,            [2.5, 0.1, 0.0, 0.0, 0.0, 0.7, 0.0]),
+    (panels::boards,               [7.0, 1.3, 1.2, 0.8, 1.8, 2.0, 0.0]),
+    (panels::veneer,               [0.3, 0.6, 0.3, 0.1, 0.3, 4.0, 0.2]),
+    (masonry::marble,              [1.2, 0.5, 0.1, 0.2, 0.4, 1.2, 0.0]),
+    (masonry::terrazzo,            [1.0, 0.3, 0.0, 0.4, 0.3, 0.5, 0.0]),
+    (masonry::speckle,             [1.0, 0.3, 0.3, 1.0, 0.5, 1.2, 0.0]),
+    (masonry::concrete,            [1.5, 1.0, 0.8, 2.0, 2.0, 0.6, 0.0]),
+    (masonry::plaster,             [0.2, 3.0, 3.0, 0.2, 3.0, 0.5, 0.0]),
+    (masonry::asphalt,             [0.2, 0.0, 0.0, 2.5, 0.1, 0.1, 0.0]),
+    (patterns::weave,             [1.2, 0.6, 0.0, 0.0, 0.0, 3.0, 0.0]),
+    (patterns::knit,              [0.2, 0.0, 0.0, 0.0, 0.0, 0.8, 0.0]),
+    (patterns::pile,              [3.0, 0.1, 0.0, 0.2, 0.0, 1.5, 0.2]),
+    (patterns::folds,             [0.0, 0.8, 0.0, 0.0, 0.0, 1.0, 0.0]),
+    (patterns::quilted,           [0.1, 0.2, 0.1, 0.0, 0.0, 1.2, 0.0]),
+    (patterns::carpet,            [2.5, 0.1, 0.0, 0.0, 0.0, 0.7, 0.0]),
     (scatter::leaves,            [0.1, 0.1, 0.0, 2.0, 0.4, 0.2, 8.0]),
     (scatter::grass,             [0.0, 0.0, 0.0, 5.0, 0.1, 0.1, 2.0]),
     (scatter::gravel,            [0.1, 0.1, 0.0, 3.0, 0.4, 0.3, 0.1]),
@@ -158,8 +148,8 @@ fn rows_of_things(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 fn masonry_or_paint(random: &mut ChaCha8Rng) -> Surface {
     let family: Family = random.one_of(&[
         masonry::bricks as Family,
-        stone::plaster,
-        stone::concrete,
+        masonry::plaster,
+        masonry::concrete,
         plain::paint,
         panels::slats,
     ]);
@@ -181,12 +171,12 @@ fn combined(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let mask = noise::fractal(random, SIZE, [cells; 2], 6, gain);
     let (level, soft) = (random.between(-0.6, 0.8), random.leaning_low(0.03, 1.));
     let tints = random.happens(0.35);
-    let mean = other.pixels.iter().sum::<Vec3>() / other.pixels.len() as f32;
+    let mean = other.mean();
     for ((pixel, other), value) in canvas.pixels.iter_mut().zip(&other.pixels).zip(&mask.values) {
         *pixel = if tints {
             *pixel * (0.5 + 0.5 * (*other / mean.max(Vec3::splat(0.02))).min(Vec3::splat(2.)))
         } else {
-            pixel.lerp(*other, shape::smoothstep(level, level + soft, *value))
+            pixel.lerp(*other, canvas::smoothstep(level, level + soft, *value))
         };
     }
     Surface { canvas, repeat_metres }
@@ -200,7 +190,7 @@ impl Texture {
         }
         let mut surface =
             if random.happens(0.12) { combined(random, purpose) } else { surface(random, purpose) };
-        wear::weather(random, &mut surface.canvas, purpose);
+        plain::weather(random, &mut surface.canvas, purpose);
         Texture::from_surface(surface)
     }
 

@@ -4,7 +4,7 @@ use glam::Vec3;
 use rand_chacha::ChaCha8Rng;
 
 use super::Purpose;
-use super::rng::RandomValues;
+use super::noise::RandomValues;
 
 /// Colors of one kind in sRGB, as 0xrrggbb.
 pub(super) type Theme = &'static [u32];
@@ -50,6 +50,19 @@ pub(super) const VIVID: Theme = &[
     0x7ac143, 0x0b3c7d,
 ];
 
+/// Themes and their weights by purpose, in the order of [`Purpose::ALL`].
+#[rustfmt::skip]
+const THEMES: [&[(Theme, f32)]; 8] = [
+    &[(BEIGES, 3.), (GREYS, 3.), (BROWNS, 3.), (WOODS, 3.), (STONES, 2.), (ACCENTS, 2.), (WHITES, 1.)],
+    &[(WHITES, 5.), (BEIGES, 3.), (GREYS, 2.), (ACCENTS, 3.), (STONES, 1.), (VIVID, 0.3)],
+    &[(WHITES, 8.), (BEIGES, 1.5), (GREYS, 1.), (WOODS, 0.7), (ACCENTS, 0.3)],
+    &[(EARTHS, 3.), (STONES, 3.), (GREYS, 2.), (GREENS, 3.), (AUTUMN, 1.), (BRICKS, 1.)],
+    &[(WHITES, 3.), (BEIGES, 2.), (STONES, 2.), (BRICKS, 3.), (GREYS, 2.), (ACCENTS, 1.5), (WOODS, 1.)],
+    &[(WHITES, 2.), (BEIGES, 2.), (GREYS, 3.), (BROWNS, 2.), (WOODS, 3.), (ACCENTS, 4.), (VIVID, 2.)],
+    &[(GREENS, 8.), (AUTUMN, 2.), (EARTHS, 0.5), (ACCENTS, 0.5)],
+    &[(ACCENTS, 4.), (VIVID, 3.), (WHITES, 1.), (BROWNS, 1.), (GREYS, 2.), (GREENS, 1.)],
+];
+
 /// A few colors in linear RGB.
 pub(super) struct Palette {
     colors: Vec<Vec3>,
@@ -58,46 +71,17 @@ pub(super) struct Palette {
 impl Palette {
     /// Draws `count` colors that are likely for `purpose`.
     pub fn draw(random: &mut ChaCha8Rng, purpose: Purpose, count: usize) -> Palette {
-        let themes: &[(Theme, f32)] = match purpose {
-            Purpose::Floor => &[
-                (BEIGES, 3.),
-                (GREYS, 3.),
-                (BROWNS, 3.),
-                (WOODS, 3.),
-                (STONES, 2.),
-                (ACCENTS, 2.),
-                (WHITES, 1.),
-            ],
-            Purpose::Wall => {
-                &[(WHITES, 5.), (BEIGES, 3.), (GREYS, 2.), (ACCENTS, 3.), (STONES, 1.), (VIVID, 0.3)]
-            }
-            Purpose::Ceiling => &[(WHITES, 8.), (BEIGES, 1.5), (GREYS, 1.), (WOODS, 0.7), (ACCENTS, 0.3)],
-            Purpose::Ground => {
-                &[(EARTHS, 3.), (STONES, 3.), (GREYS, 2.), (GREENS, 3.), (AUTUMN, 1.), (BRICKS, 1.)]
-            }
-            Purpose::Facade => &[
-                (WHITES, 3.),
-                (BEIGES, 2.),
-                (STONES, 2.),
-                (BRICKS, 3.),
-                (GREYS, 2.),
-                (ACCENTS, 1.5),
-                (WOODS, 1.),
-            ],
-            Purpose::Thing => &[
-                (WHITES, 2.),
-                (BEIGES, 2.),
-                (GREYS, 3.),
-                (BROWNS, 2.),
-                (WOODS, 3.),
-                (ACCENTS, 4.),
-                (VIVID, 2.),
-            ],
-            Purpose::Poster => {
-                &[(ACCENTS, 4.), (VIVID, 3.), (WHITES, 1.), (BROWNS, 1.), (GREYS, 2.), (GREENS, 1.)]
-            }
-            Purpose::Foliage => &[(GREENS, 8.), (AUTUMN, 2.), (EARTHS, 0.5), (ACCENTS, 0.5)],
-        };
+        Palette::among(random, THEMES[purpose as usize], count)
+    }
+
+    /// Draws `low` to `high` colors that are likely for `purpose`.
+    pub fn draw_between(random: &mut ChaCha8Rng, purpose: Purpose, low: usize, high: usize) -> Palette {
+        let count = random.count(low, high);
+        Palette::draw(random, purpose, count)
+    }
+
+    /// Draws `count` colors of one of the themes with the given weights.
+    pub fn among(random: &mut ChaCha8Rng, themes: &[(Theme, f32)], count: usize) -> Palette {
         let theme = random.weighted(themes);
         Palette::from_theme(random, theme, count)
     }
@@ -155,6 +139,12 @@ impl Palette {
 pub(super) fn color_of(random: &mut ChaCha8Rng, theme: Theme) -> Vec3 {
     let color = linear_of(random.one_of(theme));
     shade(random, color, 0.12)
+}
+
+/// Returns a random color of one of the themes with the given weights.
+pub(super) fn color_among(random: &mut ChaCha8Rng, themes: &[(Theme, f32)]) -> Vec3 {
+    let theme = random.weighted(themes);
+    color_of(random, theme)
 }
 
 /// Returns `color` made brighter or darker by about `spread`, with small random changes of saturation and hue.

@@ -1,14 +1,112 @@
-//! Textures of regular arrangements: windows of a house, books on shelves, cupboard doors, keys, slats, ceiling boards, grids.
+//! Textures of wood, and of regular arrangements: windows of a house, books on shelves, doors, keys, slats, ceiling boards, grids.
 
-use glam::{Vec2, Vec3};
+use glam::{Vec2, Vec2Swizzles, Vec3};
 use rand_chacha::ChaCha8Rng;
 
+use super::canvas::{self, smoothstep};
+use super::layout::Layout;
 use super::marks::{Script, ink_for};
-use super::noise::{fractal, smooth};
-use super::palette::{self, Palette};
-use super::rng::RandomValues;
-use super::shape::{self, smoothstep};
+use super::noise::{Field, RandomValues, fractal, smooth, unit_of};
+use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
+
+/// Returns grain along u, about in [-1, 1]: rings cut lengthwise, stretched into fibres, with knots.
+fn grain(random: &mut ChaCha8Rng) -> Field {
+    let rings = random.count(2, 14) as f32;
+    let cells = [random.count(1, 2), random.count(2, 5)];
+    let bend = smooth(random, SIZE, cells);
+    let sway = random.between(0.3, 2.5);
+    let (drawn_out, wide) = (random.count(2, 6), random.count(4, 16));
+    let fibres = fractal(random, SIZE, [drawn_out, 64], 3, 0.8);
+    let streaks = fractal(random, SIZE, [1, wide], 3, 0.7);
+    let [figure, fibre, streak] = [(); 3].map(|()| random.between(0.1, 1.));
+    let knots: Vec<(Vec2, f32)> =
+        (0..random.one_of(&[0, 0, 1, 2, 4])).map(|_| (random.spot(), random.between(0.01, 0.035))).collect();
+    let field = Field::from_fn(SIZE, |uv| {
+        let mut phase = uv.y * rings + sway * bend.value(uv);
+        let mut dark = 0.;
+        for &(centre, radius) in &knots {
+            let off = uv - centre;
+            let off = (off - off.round()) * Vec2::new(0.5, 1.);
+            let near = radius * radius / (off.length_squared() + radius * radius);
+            phase += 2. * near;
+            dark += smoothstep(0.5, 0.9, near);
+        }
+        // Latewood ends sharply: a sawtooth with a soft flank.
+        let ring = phase - phase.floor();
+        let ring = ring * ring * (1. - smoothstep(0.88, 1., ring));
+        let value =
+            figure * (1.4 * ring - 0.5) + fibre * 0.7 * fibres.value(uv) + streak * 0.7 * streaks.value(uv);
+        value + 2. * dark
+    });
+    let scale = 1. / (figure + fibre + streak);
+    field.map(|value| value * scale)
+}
+
+/// Returns two colors of one wood: earlywood and latewood.
+fn tones(random: &mut ChaCha8Rng) -> (Vec3, Vec3) {
+    let light = color_among(random, &[(WOODS, 10.), (GREYS, 1.), (WHITES, 1.), (ACCENTS, 0.7)]);
+    let red = Vec3::new(1., random.between(0.82, 1.), random.between(0.65, 1.));
+    (light, light * red * random.between(0.35, 0.85))
+}
+
+/// Draws boards or parquet with joints.
+pub(super) fn boards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let upright = random.happens(0.5);
+    let rows = random.leaning_low(3., 16.) as usize;
+    let long = random.count(2, 6);
+    let outdoors = matches!(purpose, Purpose::Facade | Purpose::Ground);
+    let kind = if outdoors { 9 } else { random.count(0, 9) };
+    let (layout, wide) = match kind {
+        0 => (Layout::Herringbone { across: 2 * long * random.count(1, 2), long }, 0.06),
+        1 => {
+            let squares = 2 * random.count(1, 4);
+            (Layout::Basket { squares, long }, 1. / (squares * long) as f32)
+        }
+        2 => (Layout::courses(2 * rows.div_ceil(2), 2, 0.5, upright), 1. / rows as f32),
+        _ => {
+            let pieces = random.leaning_low(1., 4.);
+            let unequal = random.one_of(&[0., 0., 0.6]);
+            (Layout::ragged(random, rows, pieces, unequal, upright), 1. / rows as f32)
+        }
+    };
+    let (light, dark) = tones(random);
+    let grain = grain(random);
+    let (seed, spread) = (random.seed(), random.leaning_low(0.02, 0.9));
+    let contrast = random.between(0.3, 1.1);
+    let joint = wide * random.leaning_low(0.005, 0.06);
+    let depth = random.between(0.3, 0.9);
+    let bevel = random.between(0., 0.3);
+    let other = color_of(random, WOODS);
+    let mixed = if random.happens(0.25) { random.between(0.2, 1.) } else { 0. };
+    // With fewer boards, the grain appears larger.
+    let scale = random.between(0.6, 1.6);
+    let canvas = Canvas::from_fn(SIZE, |uv| {
+        let piece = layout.piece(uv);
+        let hash = |salt: u32| unit_of(seed ^ salt, piece.id);
+        let value = grain.sample(piece.at * scale + Vec2::new(hash(1), hash(2)));
+        let base = light.lerp(dark, (0.45 + contrast * value).clamp(0., 1.)).lerp(other, mixed * hash(3));
+        let lightness = 1. + spread * (hash(4) - 0.5);
+        let near = (piece.edge - joint) * SIZE as f32;
+        let groove = 1. - depth * (0.5 - near * 0.7).clamp(0., 1.);
+        let rounded = 1. - bevel * smoothstep(3., 0., near);
+        base * lightness * groove * rounded
+    });
+    Surface { canvas, repeat_metres: random.between(0.07, 0.2) * (1. / wide).min(16.) }
+}
+
+/// Draws grain without joints, as on doors and tables.
+pub(super) fn veneer(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+    let (light, dark) = tones(random);
+    let grain = grain(random);
+    let contrast = random.between(0.3, 1.2);
+    let upright = random.happens(0.5);
+    let canvas = Canvas::from_fn(SIZE, |uv| {
+        let value = grain.sample(if upright { uv.yx() } else { uv });
+        light.lerp(dark, (0.4 + contrast * value).clamp(0., 1.))
+    });
+    Surface { canvas, repeat_metres: random.between(0.4, 1.6) }
+}
 
 /// Paints a raised rectangle. Along its edges, over a width of `bevel` repeats, `relief` brightens the left and upper sides and darkens the
 /// right and lower sides. A rectangle with a negative `relief` is sunk.
@@ -30,13 +128,7 @@ pub(super) fn windows(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let (rows, columns) = (random.count(1, 5), random.count(1, 6));
     let cell = Vec2::new(1. / columns as f32, 1. / rows as f32);
     let share = Vec2::new(random.between(0.35, 0.95), random.between(0.4, 0.95));
-    let theme = random.weighted(&[
-        (palette::WHITES, 4.),
-        (palette::GREYS, 2.),
-        (palette::BROWNS, 2.),
-        (palette::ACCENTS, 1.),
-    ]);
-    let frame = palette::color_of(random, theme);
+    let frame = color_among(random, &[(WHITES, 4.), (GREYS, 2.), (BROWNS, 2.), (ACCENTS, 1.)]);
     let (panes_x, panes_y) = (random.count(1, 3), random.count(1, 4));
     let border = random.between(0.02, 0.07) * cell.min_element();
     let sill = random.happens(0.5);
@@ -51,7 +143,7 @@ pub(super) fn windows(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
             let below = middle + Vec2::new(0., half.y);
             paint_panel(&mut canvas, below, Vec2::new(1.1 * half.x, border), frame * 0.8, border, 0.4);
         }
-        let curtain = random.happens(curtains).then(|| palette::color_of(random, palette::BEIGES) * 0.6);
+        let curtain = random.happens(curtains).then(|| color_of(random, BEIGES) * 0.6);
         let slant = random.between(-1., 1.);
         let level = random.between(-0.8, 0.8);
         let drawn = random.between(0.2, 1.);
@@ -80,13 +172,12 @@ pub(super) fn windows(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 
 /// Draws a texture of shelves with upright books, folders or boxes.
 pub(super) fn shelves(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
-    let theme = random.weighted(&[(palette::WOODS, 4.), (palette::WHITES, 2.), (palette::GREYS, 1.)]);
-    let wood = palette::color_of(random, theme);
+    let wood = color_among(random, &[(WOODS, 4.), (WHITES, 2.), (GREYS, 1.)]);
     let mut canvas = Canvas::filled(SIZE, wood * random.between(0.15, 0.5));
     let rows = random.count(2, 6);
     let row_height = 1. / rows as f32;
     let board = row_height * random.between(0.05, 0.12);
-    let covers = [palette::ACCENTS, palette::VIVID, palette::WHITES, palette::BROWNS, palette::GREYS];
+    let covers = [ACCENTS, VIVID, WHITES, BROWNS, GREYS];
     let weights = covers.map(|theme| (theme, random.unit() * random.unit() + 0.05));
     let (thin, thick) = (random.between(0.012, 0.025), random.between(0.03, 0.08));
     let fill_probability = random.between(0.5, 1.);
@@ -99,23 +190,22 @@ pub(super) fn shelves(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
             if random.happens(fill_probability) {
                 let height = (row_height - board) * random.between(0.6, 0.96);
                 let theme = random.weighted(&weights);
-                let color = palette::color_of(random, theme);
+                let color = color_of(random, theme);
                 let middle = Vec2::new(x + 0.5 * width, floor - 0.5 * height);
                 let half = 0.5 * Vec2::new(width, height);
                 let roundness = random.between(0.2, 0.6);
                 canvas.stamp(middle, half, |offset| {
                     let across = offset.x / half.x;
-                    (
-                        color * (1. - roundness * across * across),
-                        ((half - offset.abs()).min_element() * SIZE as f32 + 0.5).clamp(0., 1.),
-                    )
+                    let edge_distance = (half - offset.abs()).min_element();
+                    let share = (edge_distance * SIZE as f32 + 0.5).clamp(0., 1.);
+                    (color * (1. - roundness * across * across), share)
                 });
                 let label = ink_for(random, color);
                 for _ in 0..random.count(0, 3) {
                     let band = random.between(0.3, 2.) / SIZE as f32;
                     let place = middle + Vec2::new(0., half.y * random.between(-0.85, 0.85));
                     let half_band = Vec2::new(0.9 * half.x, band);
-                    canvas.fill(place, half_band, label, |offset| shape::rectangle(offset, half_band, 0.));
+                    canvas.fill(place, half_band, label, |offset| canvas::rectangle(offset, half_band, 0.));
                 }
                 if width > 0.04 {
                     let start = Vec2::new(x + 0.15 * width, middle.y);
@@ -124,14 +214,8 @@ pub(super) fn shelves(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
             }
             x += width;
         }
-        paint_panel(
-            &mut canvas,
-            Vec2::new(0.5, floor + 0.5 * board),
-            Vec2::new(0.52, 0.5 * board),
-            wood,
-            0.3 * board,
-            0.3,
-        );
+        let (middle, half) = (Vec2::new(0.5, floor + 0.5 * board), Vec2::new(0.52, 0.5 * board));
+        paint_panel(&mut canvas, middle, half, wood, 0.3 * board, 0.3);
     }
     paint_panel(&mut canvas, Vec2::new(0., 0.5), Vec2::new(0.012, 0.52), wood, 0.004, 0.3);
     Surface { canvas, repeat_metres: rows as f32 * random.between(0.25, 0.4) }
@@ -139,13 +223,8 @@ pub(super) fn shelves(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 
 /// Draws a texture of doors and drawers with handles and inset panels in relief.
 pub(super) fn cupboards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let theme = random.weighted(&[
-        (palette::WHITES, 4.),
-        (palette::WOODS, 3.),
-        (palette::GREYS, 2.),
-        (palette::ACCENTS, 2.),
-    ]);
-    let color = palette::color_of(random, theme);
+    let theme = random.weighted(&[(WHITES, 4.), (WOODS, 3.), (GREYS, 2.), (ACCENTS, 2.)]);
+    let color = color_of(random, theme);
     let mut canvas = Canvas::filled(SIZE, color * random.between(0.15, 0.6));
     let (columns, rows) = (random.count(1, 4), random.count(1, 5));
     let cell = Vec2::new(1. / columns as f32, 1. / rows as f32);
@@ -153,7 +232,7 @@ pub(super) fn cupboards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let bevel = random.between(0.006, 0.02);
     let relief = random.between(0.1, 0.5);
     let insets = random.count(0, 2);
-    let metal = palette::color_of(random, palette::GREYS);
+    let metal = color_of(random, GREYS);
     let handle = random.count(0, 3);
     let handle_length = random.between(0.1, 0.4);
     for index in 0..rows * columns {
@@ -165,14 +244,8 @@ pub(super) fn cupboards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
             half -= random.between(0.1, 0.25) * cell.min_element();
             if half.min_element() > 2. * bevel {
                 // The first inset panel is sunk, and the second one is raised.
-                paint_panel(
-                    &mut canvas,
-                    middle,
-                    half,
-                    tone * 0.96,
-                    bevel,
-                    if inset == 0 { -relief } else { relief },
-                );
+                let relief = if inset == 0 { -relief } else { relief };
+                paint_panel(&mut canvas, middle, half, tone * 0.96, bevel, relief);
             }
         }
         let (place, knob) = match handle {
@@ -183,11 +256,11 @@ pub(super) fn cupboards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         };
         let at = middle + place * cell;
         canvas.fill(at + 0.006, knob + 0.01, color * 0.35, |offset| {
-            shape::rectangle(offset, knob, knob.min_element())
+            canvas::rectangle(offset, knob, knob.min_element())
         });
-        canvas.fill(at, knob + 0.01, metal, |offset| shape::rectangle(offset, knob, knob.min_element()));
+        canvas.fill(at, knob + 0.01, metal, |offset| canvas::rectangle(offset, knob, knob.min_element()));
     }
-    if theme == palette::WOODS {
+    if theme == WOODS {
         let cells = if matches!(purpose, Purpose::Wall) { [2, 48] } else { [48, 2] };
         canvas.shade(&fractal(random, SIZE, cells, 3, 0.7), random.between(0.05, 0.25));
     }
@@ -197,8 +270,7 @@ pub(super) fn cupboards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 /// Draws a texture of keys, switches, buttons or vents: small rounded boxes in rows, some of them labelled.
 pub(super) fn keys(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let ground = Palette::draw(random, purpose, 1).color(0);
-    let count = random.count(1, 3);
-    let palette = Palette::draw(random, Purpose::Thing, count);
+    let palette = Palette::draw_between(random, Purpose::Thing, 1, 3);
     let mut canvas = Canvas::filled(SIZE, ground * random.between(0.3, 1.));
     let (columns, rows) = (random.count(2, 16), random.count(2, 12));
     let cell = Vec2::new(1. / columns as f32, 1. / rows as f32);
@@ -235,7 +307,6 @@ pub(super) fn slats(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let (depth, gap) = (random.between(0.1, 0.7), random.between(0.02, 0.25));
     let seam = random.between(0.2, 0.9);
     let uneven = smooth(random, SIZE, if upright { [64, 2] } else { [2, 64] });
-    let mut index = 0;
     let canvas = Canvas::from_fn(SIZE, |uv| {
         let part = (if upright { uv.x } else { uv.y } * count).fract();
         let light = match profile {
@@ -245,15 +316,14 @@ pub(super) fn slats(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         };
         let soft = 1.5 * count / SIZE as f32;
         let joint = 1. - seam * smoothstep(0.5 * gap + soft, 0.5 * gap, part.min(1. - part));
-        index += 1;
-        color * light * joint * (1. + 0.06 * uneven.values[index - 1])
+        color * light * joint * (1. + 0.06 * uneven.value(uv))
     });
     Surface { canvas, repeat_metres: count * random.leaning_low(0.02, 0.15) }
 }
 
 /// Draws a texture of a suspended ceiling: a grid of boards, which may have specks, with some lamps.
 pub(super) fn ceiling_boards(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
-    let board = palette::color_of(random, palette::WHITES);
+    let board = color_of(random, WHITES);
     let rail = board * random.between(0.7, 1.1);
     let mut canvas = Canvas::filled(SIZE, rail);
     let (columns, rows) = random.one_of(&[(2, 2), (3, 3), (4, 4), (2, 4), (1, 2)]);
@@ -271,16 +341,13 @@ pub(super) fn ceiling_boards(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
             paint_panel(&mut canvas, middle, 0.4 * cell, Vec3::splat(0.93), 0.006, relief);
         }
     }
-    for (pixel, value) in canvas.pixels.iter_mut().zip(&rough.values) {
-        *pixel *= 1. - speck * smoothstep(0.5, 0.9, *value);
-    }
+    canvas.change_by(&rough, |pixel, value| pixel * (1. - speck * smoothstep(0.5, 0.9, value)));
     Surface { canvas, repeat_metres: columns as f32 * 0.6 }
 }
 
 /// Draws a texture of bars or wires over a background: fences, grates, nets, trellis.
 pub(super) fn grids(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let count = random.count(2, 3);
-    let palette = Palette::draw(random, purpose, count);
+    let palette = Palette::draw_between(random, purpose, 2, 3);
     let behind = fractal(random, SIZE, [3; 2], 4, 0.6);
     let dark = random.between(0.1, 0.8);
     let bar = palette.color(1);
@@ -289,7 +356,6 @@ pub(super) fn grids(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let oblique = random.happens(0.4);
     let width = random.between(0.05, 0.35);
     let has_crossbars = random.happens(0.7);
-    let mut index = 0;
     let canvas = Canvas::from_fn(SIZE, |uv| {
         let at = if oblique { Vec2::new(uv.x + uv.y, uv.x - uv.y) * bars.x } else { uv * bars };
         let part = (at - at.floor() - 0.5).abs() * 2.;
@@ -298,8 +364,7 @@ pub(super) fn grids(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let along =
             if has_crossbars { smoothstep(1. - width - soft.y, 1. - width + soft.y, part.y) } else { 0. };
         let nearness = if across > along { part.x } else { part.y };
-        let ground = palette.color(0) * dark * (1. + 0.3 * behind.values[index]);
-        index += 1;
+        let ground = palette.color(0) * dark * (1. + 0.3 * behind.value(uv));
         ground.lerp(bar * (0.6 + 0.4 * smoothstep(1. - width, 1., nearness)), across.max(along))
     });
     Surface { canvas, repeat_metres: random.leaning_low(0.3, 2.) }

@@ -1,19 +1,17 @@
-//! Textures of wallpaper, fabric and print: repeated figures in flat colors.
+//! Textures of wallpaper, print and textiles: repeated figures, threads, piles and folds.
 
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
 
+use super::canvas::{self, smoothstep};
 use super::layout::Layout;
-use super::palette::Palette;
-use super::rng::{RandomValues, unit_of};
-use super::shape;
-use super::voronoi::Voronoi;
+use super::noise::{Field, RandomValues, Voronoi, fractal, smooth, unit_of};
+use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
 
 /// Draws stripes of different widths, horizontal, upright or oblique.
 pub(super) fn stripes(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let count = random.count(2, 5);
-    let palette = Palette::draw(random, purpose, count);
+    let palette = Palette::draw_between(random, purpose, 2, 5);
     let bands = bands(random, &palette);
     let (across, along) = random.one_of(&[(1., 0.), (1., 0.), (0., 1.), (1., 1.), (1., -1.), (2., 1.)]);
     let times = random.leaning_low(1., 12.).floor();
@@ -35,8 +33,7 @@ pub(super) fn stripes(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 
 /// Draws stripes in both directions, woven into each other.
 pub(super) fn plaid(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let count = random.count(2, 4);
-    let palette = Palette::draw(random, purpose, count);
+    let palette = Palette::draw_between(random, purpose, 2, 4);
     let bands_across = bands(random, &palette);
     let bands_along = if random.happens(0.7) { bands_across.clone() } else { bands(random, &palette) };
     let times = random.leaning_low(1., 8.).floor();
@@ -117,8 +114,7 @@ pub(super) fn pieces(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 
 /// Draws dots, rings, stars, flowers and polygons on a straight, staggered or loose grid.
 pub(super) fn motifs(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let count = random.count(2, 5);
-    let palette = Palette::draw(random, purpose, count);
+    let palette = Palette::draw_between(random, purpose, 2, 5);
     let mut canvas = Canvas::filled(SIZE, palette.color(0));
     let rows = 2 * random.leaning_low(1., 8.) as usize;
     let cell = 1. / rows as f32;
@@ -178,11 +174,11 @@ impl Motif {
             canvas.fill(centre, Vec2::splat(2. * radius), color, |offset| {
                 let offset = turn.rotate(offset);
                 match figure {
-                    Figure::Disk => shape::disk(offset, radius),
-                    Figure::Polygon(corners) => shape::polygon(offset, 0.8 * radius, corners),
-                    Figure::Flower(petals, depth) => shape::flower(offset, radius, petals, depth),
-                    Figure::Leaf(width) => shape::leaf(offset, 2. * radius, width * radius),
-                    Figure::Box(aspect) => shape::rectangle(offset, Vec2::new(radius, aspect * radius), 0.),
+                    Figure::Disk => canvas::disk(offset, radius),
+                    Figure::Polygon(corners) => canvas::polygon(offset, 0.8 * radius, corners),
+                    Figure::Flower(petals, depth) => canvas::flower(offset, radius, petals, depth),
+                    Figure::Leaf(width) => canvas::leaf(offset, 2. * radius, width * radius),
+                    Figure::Box(aspect) => canvas::rectangle(offset, Vec2::new(radius, aspect * radius), 0.),
                 }
             });
         }
@@ -191,8 +187,7 @@ impl Motif {
 
 /// Draws ornaments with mirror symmetry, as on old wallpaper: tendrils, leaves and flowers.
 pub(super) fn ornament(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let count = random.count(2, 4);
-    let palette = Palette::draw(random, purpose, count);
+    let palette = Palette::draw_between(random, purpose, 2, 4);
     let mut canvas = Canvas::filled(SIZE, palette.color(0));
     let columns = random.one_of(&[1usize, 2, 2, 3, 4]);
     let cell = 1. / columns as f32;
@@ -223,7 +218,7 @@ pub(super) fn ornament(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
                 let middle = 0.5 * (from + to);
                 let reach = (to - from).abs() * 0.5 + width;
                 canvas.fill(centre + middle, reach, palette.color(1), |offset| {
-                    shape::stroke(offset, from - middle, to - middle, width)
+                    canvas::stroke(offset, from - middle, to - middle, width)
                 });
                 if step % every == 1 {
                     let length = leaf.x * cell;
@@ -231,7 +226,7 @@ pub(super) fn ornament(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
                     let tip = centre + to + Vec2::new(turn.x, -turn.y) * 0.5 * length;
                     canvas.fill(tip, Vec2::splat(length), palette.color(2), |offset| {
                         let offset = Vec2::from_angle(-angle - 0.8).rotate(offset * mirror);
-                        shape::leaf(offset, length, length * leaf.y)
+                        canvas::leaf(offset, length, length * leaf.y)
                     });
                 }
             }
@@ -239,4 +234,150 @@ pub(super) fn ornament(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         flower.paint(&mut canvas, centre, 0.5 * cell, Vec2::X);
     }
     Surface { canvas, repeat_metres: random.between(0.4, 1.6) * columns as f32 * 0.5 }
+}
+
+/// Draws threads that pass over and under each other.
+pub(super) fn weave(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let palette = Palette::draw_between(random, purpose, 1, 3);
+    let threads = random.one_of(&[24, 32, 40, 48, 64]);
+    let twill = random.one_of(&[1, 1, 2, 3]);
+    let (seed, spread) = (random.seed(), random.between(0.05, 0.5));
+    let uneven = smooth(random, SIZE, [6; 2]);
+    let (round, drift) = (random.between(0.2, 0.7), random.between(0., 0.15));
+    let scale = threads as f32;
+    let canvas = Canvas::from_fn(SIZE, |uv| {
+        let at = uv * scale;
+        let (column, row) = (at.x as u32, at.y as u32);
+        let part = at - at.floor() - 0.5;
+        let over = (column + twill * row) % (2 * twill) < twill;
+        let (thread, across) = if over { (column, part.x) } else { (row + 512, part.y) };
+        let tone = palette.ramp(if over { 0. } else { 1. }) * (1. + spread * (unit_of(seed, thread) - 0.5));
+        tone * (1. - round * 4. * across * across) * (1. + drift * uneven.sample(uv))
+    });
+    Surface { canvas, repeat_metres: random.between(0.15, 0.8) }
+}
+
+/// Draws knitted rows of loops.
+pub(super) fn knit(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let palette = Palette::draw_between(random, purpose, 1, 3);
+    let columns = random.one_of(&[12, 16, 24, 32]);
+    let seed = random.seed();
+    let banded = random.happens(0.4);
+    let canvas = Canvas::from_fn(SIZE, |uv| {
+        let at = uv * columns as f32;
+        let side = (at.x.fract() - 0.5).abs();
+        // Each loop is a V: two legs that rise outwards.
+        let climbed = at.y + side * 1.4;
+        let row = climbed.floor() as u32 % columns;
+        let (along, across) = (climbed.fract() - 0.5, side - 0.25);
+        let thick = 1. - 3. * along * along - 5. * across * across;
+        let id = if banded { row / 3 } else { row * 64 + at.x as u32 };
+        palette.ramp(unit_of(seed, id)) * (0.25 + 0.75 * thick.max(0.))
+    });
+    Surface { canvas, repeat_metres: random.between(0.1, 0.6) }
+}
+
+/// Draws carpet pile, felt or fur: fine and soft, brushed in some places.
+pub(super) fn pile(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let palette = Palette::draw_between(random, purpose, 1, 3);
+    let fine = random.one_of(&[64, 96, 128, 200]);
+    let stretch = random.one_of(&[[1, 1], [1, 1], [1, 3], [3, 1]]);
+    let tufts = fractal(random, SIZE, stretch.map(|share| fine / share), 2, 0.8);
+    let brushed = fractal(random, SIZE, [3; 2], 3, 0.5);
+    let mixed = random.between(0.1, 0.6);
+    let mut canvas = Canvas::of_field(&tufts, |value| palette.ramp(0.5 + mixed * value));
+    canvas.shade(&tufts, random.between(0.05, 0.35));
+    canvas.shade(&brushed, random.leaning_low(0., 0.25));
+    Surface { canvas, repeat_metres: random.between(0.4, 1.6) }
+}
+
+/// Draws cloth hanging in folds along v.
+pub(super) fn folds(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let palette = Palette::draw_between(random, purpose, 1, 3);
+    let depth = random.between(0.15, 0.7);
+    let (coarse, fine) = (random.count(4, 10), random.count(12, 28));
+    let folds =
+        smooth(random, SIZE, [coarse, 1]).plus(&smooth(random, SIZE, [fine, 2]), random.between(0.1, 0.7));
+    let printed = random.happens(0.3);
+    let bands = random.count(2, 8) as f32;
+    let canvas = Canvas::from_fn(SIZE, |uv| {
+        let fold = folds.value(uv);
+        let tone = if printed { (uv.y * bands).fract() } else { 0.5 + 0.3 * fold };
+        palette.ramp(tone) * (1. + depth * fold).clamp(0.2, 1.6)
+    });
+    Surface { canvas, repeat_metres: random.between(0.8, 2.) }
+}
+
+/// Draws padded leather or cloth, buttoned in diamonds or stitched in channels.
+pub(super) fn quilted(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let color = Palette::draw(random, purpose, 1).color(0);
+    let across = random.count(2, 8) as f32;
+    let kind = random.count(0, 2);
+    let (deep, light) = (random.between(0.3, 0.8), random.direction());
+    let height = Field::from_fn(SIZE, |uv| {
+        let at = match kind {
+            0 => Vec2::new(uv.x + uv.y, uv.x - uv.y) * across,
+            1 => uv * across,
+            _ => Vec2::new(uv.x * across, 0.5),
+        };
+        let part = (at - at.floor() - 0.5) * 2.;
+        ((1. - part.x.powi(4)) * (1. - part.y.powi(4))).sqrt()
+    });
+    let mut canvas = Canvas::of_field(&height, |value| color * (1. - deep + deep * value));
+    canvas.shade(&height.slope(light), random.between(1., 5.));
+    canvas.shade(&fractal(random, SIZE, [24; 2], 4, 0.8), random.between(0.01, 0.12));
+    Surface { canvas, repeat_metres: across * random.between(0.06, 0.2) }
+}
+
+/// Draws a whole carpet: borders around a field of small figures, with a medallion in the middle.
+pub(super) fn carpet(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+    let count = random.count(3, 5);
+    let palette = Palette::among(
+        random,
+        &[(ACCENTS, 5.), (BROWNS, 2.), (BEIGES, 2.), (GREYS, 1.), (VIVID, 0.5)],
+        count,
+    );
+    let mut canvas = Canvas::filled(SIZE, palette.color(0));
+    let middle = Vec2::splat(0.5);
+    // Paint the middle first, so that the borders cover what extends too far.
+    let cells = random.count(4, 14);
+    let small = Motif::draw(random, &palette);
+    let crowd = random.between(0.3, 1.);
+    for index in 0..cells * cells {
+        let place = Vec2::new((index % cells) as f32, (index / cells) as f32) + 0.5;
+        if random.happens(crowd) {
+            small.paint(&mut canvas, place / cells as f32, 1. / cells as f32, Vec2::X);
+        }
+    }
+    if random.happens(0.65) {
+        let petals = 2 * random.count(2, 9);
+        let (mut radius, depth) = (random.between(0.15, 0.38), random.between(0., 0.6));
+        let squeeze = Vec2::new(1., random.between(0.7, 1.4));
+        for layer in 0..random.count(2, 7) {
+            let color = palette.color(layer + 1);
+            canvas.fill(middle, Vec2::splat(0.5), color, |offset| {
+                canvas::flower(offset * squeeze, radius, petals, depth)
+            });
+            radius *= random.between(0.6, 0.9);
+        }
+        Motif::draw(random, &palette).paint(&mut canvas, middle, 2. * radius, Vec2::X);
+    }
+    let mut inset = 0.;
+    for border in 0..random.count(1, 6) {
+        let width = random.leaning_low(0.005, 0.07);
+        let (color, other) = (palette.color(border + 1), palette.color(border + 2));
+        let teeth = random.one_of(&[0., 0., 12., 20., 32., 48.]);
+        canvas.change(|uv, below| {
+            let from_edge = uv.min(1. - uv).min_element();
+            let share = smoothstep(-1., 1., (inset + width - from_edge) * SIZE as f32);
+            let outside = smoothstep(-1., 1., (inset - from_edge) * SIZE as f32);
+            let along = if uv.x.min(1. - uv.x) < uv.y.min(1. - uv.y) { uv.y } else { uv.x };
+            let tooth = (along * teeth).fract() * 2. - 1.;
+            let toothed = teeth > 0. && (from_edge - inset) / width > tooth.abs();
+            below.lerp(if toothed { other } else { color }, share * (1. - outside))
+        });
+        inset += width;
+    }
+    canvas.shade(&smooth(random, SIZE, [128; 2]), random.between(0.03, 0.2));
+    Surface { canvas, repeat_metres: random.between(1.5, 3.5) }
 }

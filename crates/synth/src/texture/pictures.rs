@@ -3,11 +3,10 @@
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
 
-use super::marks::{Script, ink_for};
-use super::noise::{fractal, smooth};
-use super::palette::{self, Palette};
-use super::rng::RandomValues;
-use super::shape::{self, smoothstep};
+use super::canvas::{self, smoothstep};
+use super::marks::{Script, ink_for, paper};
+use super::noise::{RandomValues, fractal, smooth};
+use super::palette::*;
 use super::{Canvas, Purpose, Surface};
 
 /// Width in pixels, larger than that of other textures because nothing repeats within a picture.
@@ -42,46 +41,36 @@ fn landscape(random: &mut ChaCha8Rng) -> Canvas {
         [0xb9a58a, 0xeee2c8],
         [0x22304a, 0x6d87a0],
     ];
-    let [zenith, haze] =
-        random.one_of(&skies).map(palette::linear_of).map(|color| palette::shade(random, color, 0.2));
+    let [zenith, haze] = random.one_of(&skies).map(linear_of).map(|color| shade(random, color, 0.2));
     let clouds = fractal(random, SIZE, [2, 5], 7, 0.6);
     let (level, cover) = (random.between(-0.5, 1.), random.between(0., 0.9));
     let horizon = random.between(0.35, 0.75);
-    let mut index = 0;
     let mut canvas = Canvas::from_fn(SIZE, |uv| {
         let sky = zenith.lerp(haze, (uv.y / horizon).min(1.));
-        let cloud = cover * smoothstep(level, level + 0.8, clouds.values[index]);
-        index += 1;
+        let cloud = cover * smoothstep(level, level + 0.8, clouds.value(uv));
         sky.lerp(Vec3::splat(0.85).lerp(haze, 0.3), cloud)
     });
     canvas.repeats = false;
     if random.happens(0.4) {
         let (sun, radius) = (Vec2::new(random.unit(), horizon * random.unit()), random.between(0.02, 0.09));
         canvas.fill(sun, Vec2::splat(2. * radius), haze.lerp(Vec3::ONE, 0.7), |offset| {
-            shape::disk(offset, radius)
+            canvas::disk(offset, radius)
         });
     }
-    let theme = random.weighted(&[
-        (palette::GREENS, 4.),
-        (palette::AUTUMN, 2.),
-        (palette::ACCENTS, 1.),
-        (palette::STONES, 1.),
-    ]);
+    let theme = random.weighted(&[(GREENS, 4.), (AUTUMN, 2.), (ACCENTS, 1.), (STONES, 1.)]);
     let ranges = random.count(2, 6);
     for range in 0..ranges {
         let near = (range + 1) as f32 / ranges as f32;
         let (hills, jagged) = (random.count(1, 4), random.between(0.3, 0.65));
         let profile = fractal(random, SIZE, [hills, 1], 6, jagged);
-        let ground = palette::color_of(random, theme).lerp(haze, 0.75 * (1. - near));
+        let ground = color_of(random, theme).lerp(haze, 0.75 * (1. - near));
         let water = random.happens(0.12);
         let texture = fractal(random, SIZE, [4, 16], 5, 0.8);
         let base = horizon + (1. - horizon) * (near - 0.5 / ranges as f32) * 0.8;
         let height = if water { 0. } else { random.between(0.03, 0.18) };
-        let mut index = 0;
         canvas.change(|uv, below| {
             let top = base - height * (1. + profile.values[(uv.x * SIZE as f32) as usize]);
-            let value = texture.values[index];
-            index += 1;
+            let value = texture.value(uv);
             let color = if water {
                 zenith.lerp(haze, 0.5 + 0.3 * value)
             } else {
@@ -98,7 +87,7 @@ fn landscape(random: &mut ChaCha8Rng) -> Canvas {
                 let slim = random.between(0.4, 1.);
                 let lobes = random.count(3, 9);
                 canvas.fill(Vec2::new(x, top - 0.3 * size), Vec2::splat(1.2 * size), color, |offset| {
-                    shape::flower(offset / Vec2::new(slim, 1.), size, lobes, 0.25)
+                    canvas::flower(offset / Vec2::new(slim, 1.), size, lobes, 0.25)
                 });
             }
         }
@@ -110,17 +99,12 @@ fn landscape(random: &mut ChaCha8Rng) -> Canvas {
 fn portrait(random: &mut ChaCha8Rng) -> Canvas {
     let backdrop = Palette::draw(random, Purpose::Poster, 2);
     let drift = smooth(random, SIZE, [2, 2]);
-    let mut index = 0;
-    let mut canvas = Canvas::bounded(SIZE, Vec3::ZERO);
-    canvas.change(|uv, _| {
-        index += 1;
-        backdrop.ramp(0.3 * uv.y + 0.35 + 0.3 * drift.values[index - 1]) * 0.7
-    });
-    let skin = palette::linear_of(random.one_of(&[0xe6b998, 0xc98f6b, 0x8d5a3c, 0x5c3a28, 0xf0d0b8]));
-    let skin = palette::shade(random, skin, 0.1);
-    let hair = palette::color_of(random, palette::BROWNS) * random.between(0.2, 1.);
-    let theme = random.weighted(&[(palette::ACCENTS, 3.), (palette::GREYS, 2.), (palette::VIVID, 1.)]);
-    let cloth = palette::color_of(random, theme);
+    let backdrop = |uv: Vec2| backdrop.ramp(0.3 * uv.y + 0.35 + 0.3 * drift.value(uv)) * 0.7;
+    let mut canvas = Canvas { repeats: false, ..Canvas::from_fn(SIZE, backdrop) };
+    let skin = linear_of(random.one_of(&[0xe6b998, 0xc98f6b, 0x8d5a3c, 0x5c3a28, 0xf0d0b8]));
+    let skin = shade(random, skin, 0.1);
+    let hair = color_of(random, BROWNS) * random.between(0.2, 1.);
+    let cloth = color_among(random, &[(ACCENTS, 3.), (GREYS, 2.), (VIVID, 1.)]);
     for _ in 0..random.one_of(&[1, 1, 1, 2, 3]) {
         let head = Vec2::new(random.between(0.3, 0.7), random.between(0.3, 0.5));
         let size = random.between(0.1, 0.24);
@@ -129,7 +113,7 @@ fn portrait(random: &mut ChaCha8Rng) -> Canvas {
             let (place, radii) = (place * size, radii * size);
             canvas.stamp(head + place, radii + 0.004, |offset| {
                 let lit = 1. + shading * (offset / radii).dot(light);
-                (color * lit.max(0.2), (0.5 - shape::ellipse(offset, radii) * SIZE as f32).clamp(0., 1.))
+                (color * lit.max(0.2), (0.5 - canvas::ellipse(offset, radii) * SIZE as f32).clamp(0., 1.))
             });
         };
         let long = random.between(0., 1.);
@@ -151,8 +135,7 @@ fn portrait(random: &mut ChaCha8Rng) -> Canvas {
 
 /// Draws an abstract picture of large flat shapes.
 fn shapes(random: &mut ChaCha8Rng) -> Canvas {
-    let count = random.count(3, 5);
-    let palette = Palette::draw(random, Purpose::Poster, count);
+    let palette = Palette::draw_between(random, Purpose::Poster, 3, 5);
     let mut canvas = Canvas::bounded(SIZE, palette.color(0));
     let straight = random.happens(0.4);
     let line = if random.happens(0.4) { random.between(0.003, 0.015) } else { 0. };
@@ -164,11 +147,11 @@ fn shapes(random: &mut ChaCha8Rng) -> Canvas {
         let distance = |offset: Vec2| {
             let local = turn.rotate(offset);
             match kind {
-                0 => shape::disk(local, size),
-                1 => shape::polygon(local, 0.6 * size, corners),
-                2 => shape::flower(local, size, corners, depth),
-                3 => shape::disk(local, size).max(local.y),
-                _ => shape::rectangle(local, half, 0.),
+                0 => canvas::disk(local, size),
+                1 => canvas::polygon(local, 0.6 * size, corners),
+                2 => canvas::flower(local, size, corners, depth),
+                3 => canvas::disk(local, size).max(local.y),
+                _ => canvas::rectangle(local, half, 0.),
             }
         };
         let centre = random.spot();
@@ -183,11 +166,7 @@ fn shapes(random: &mut ChaCha8Rng) -> Canvas {
 
 /// Draws a poster or a sign: a heading, a picture, paragraphs.
 fn print(random: &mut ChaCha8Rng) -> Canvas {
-    let paper = if random.happens(0.5) {
-        palette::color_of(random, palette::WHITES)
-    } else {
-        Palette::draw(random, Purpose::Poster, 1).color(0)
-    };
+    let paper = paper(random, Purpose::Poster, 0.5);
     let mut canvas = Canvas::bounded(SIZE, paper);
     let ink = ink_for(random, paper);
     let script = Script::draw(random);
@@ -197,14 +176,8 @@ fn print(random: &mut ChaCha8Rng) -> Canvas {
         match random.count(0, 3) {
             0 => {
                 let height = random.leaning_low(0.05, 0.3).min(left);
-                script.write(
-                    random,
-                    &mut canvas,
-                    Vec2::new(0.07, top + 0.5 * height),
-                    0.88,
-                    0.8 * height,
-                    ink,
-                );
+                let start = Vec2::new(0.07, top + 0.5 * height);
+                script.write(random, &mut canvas, start, 0.88, 0.8 * height, ink);
                 top += height;
             }
             1 => {
@@ -222,14 +195,8 @@ fn print(random: &mut ChaCha8Rng) -> Canvas {
             2 => {
                 let height = random.between(0.1, 0.4).min(left);
                 let letters = random.leaning_low(0.014, 0.05);
-                script.paragraph(
-                    random,
-                    &mut canvas,
-                    Vec2::new(0.07, top),
-                    Vec2::new(0.86, height),
-                    letters,
-                    ink,
-                );
+                let (corner, extent) = (Vec2::new(0.07, top), Vec2::new(0.86, height));
+                script.paragraph(random, &mut canvas, corner, extent, letters, ink);
                 top += height + 0.02;
             }
             _ => {
@@ -237,7 +204,7 @@ fn print(random: &mut ChaCha8Rng) -> Canvas {
                 let color = Palette::draw(random, Purpose::Poster, 1).color(0);
                 let half = Vec2::new(random.one_of(&[0.5, 0.43, 0.2]), 0.5 * height);
                 canvas.fill(Vec2::new(0.5, top + half.y), half + 0.01, color, |offset| {
-                    shape::rectangle(offset, half, 0.)
+                    canvas::rectangle(offset, half, 0.)
                 });
                 top += height + 0.02;
             }
@@ -262,7 +229,7 @@ fn painting(random: &mut ChaCha8Rng) -> Canvas {
         let along = Vec2::from_angle(turns * flow.sample(spot)) * 0.5 * length;
         let color = model.sample(spot) * (1. + spread * random.bell()).max(0.2);
         canvas.fill(spot, along.abs() + width, color, |offset| {
-            shape::stroke(offset, -along, along, 0.5 * width)
+            canvas::stroke(offset, -along, along, 0.5 * width)
         });
     }
     canvas
@@ -270,8 +237,7 @@ fn painting(random: &mut ChaCha8Rng) -> Canvas {
 
 /// Draws overlapping shapes of all sizes, more of the small ones, as in the statistics of photos (dead leaves model).
 fn dead_leaves(random: &mut ChaCha8Rng) -> Canvas {
-    let count = random.count(3, 5);
-    let palette = Palette::draw(random, Purpose::Thing, count);
+    let palette = Palette::draw_between(random, Purpose::Thing, 3, 5);
     let other = Palette::draw(random, Purpose::Poster, 3);
     let mut canvas = Canvas::bounded(SIZE, palette.color(0));
     let light = random.direction();
@@ -287,9 +253,9 @@ fn dead_leaves(random: &mut ChaCha8Rng) -> Canvas {
         canvas.stamp(random.spot(), Vec2::splat(1.42 * size), |offset| {
             let local = turn.rotate(offset);
             let distance = match kind {
-                0 => shape::ellipse(local, half),
-                1 => shape::rectangle(local, half, 0.2 * half.y),
-                _ => shape::polygon(local, 0.7 * size, 3),
+                0 => canvas::ellipse(local, half),
+                1 => canvas::rectangle(local, half, 0.2 * half.y),
+                _ => canvas::polygon(local, 0.7 * size, 3),
             };
             let lit = 1. + shading * offset.dot(light) / size;
             (color * lit.max(0.1), (0.5 - distance * SIZE as f32).clamp(0., 1.))
@@ -303,33 +269,33 @@ fn flowers(random: &mut ChaCha8Rng) -> Canvas {
     let ground = Palette::draw(random, Purpose::Wall, 1).color(0);
     let mut canvas = Canvas::bounded(SIZE, ground);
     let foot = Vec2::new(random.between(0.4, 0.6), random.between(0.8, 1.1));
-    let green = Palette::from_theme(random, palette::GREENS, 3);
+    let green = Palette::from_theme(random, GREENS, 3);
     for _ in 0..random.count(3, 16) {
         let head = Vec2::new(random.between(0.12, 0.88), random.between(0.1, 0.6));
         let stem = palette_shade(random, &green);
         let half = 0.5 * (foot - head);
-        canvas.fill(head + half, half.abs() + 0.01, stem, |offset| shape::stroke(offset, -half, half, 0.005));
+        canvas
+            .fill(head + half, half.abs() + 0.01, stem, |offset| canvas::stroke(offset, -half, half, 0.005));
         for _ in 0..random.count(0, 3) {
             let (place, turn) = (head.lerp(foot, random.between(0.2, 0.9)), random.direction());
             let (length, leaf) = (random.between(0.08, 0.2), palette_shade(random, &green));
             canvas.fill(place, Vec2::splat(0.6 * length), leaf, |offset| {
-                shape::leaf(turn.rotate(offset), length, 0.35 * length)
+                canvas::leaf(turn.rotate(offset), length, 0.35 * length)
             });
         }
-        let theme = random.weighted(&[(palette::VIVID, 2.), (palette::ACCENTS, 3.), (palette::WHITES, 1.)]);
-        let petals = palette::color_of(random, theme);
+        let petals = color_among(random, &[(VIVID, 2.), (ACCENTS, 3.), (WHITES, 1.)]);
         let (count, depth) = (random.count(4, 14), random.between(0.2, 0.7));
         let mut radius = random.between(0.04, 0.14);
         for layer in 0..random.count(2, 4) {
             let color = petals * (1. - 0.2 * layer as f32);
             let turn = random.direction();
             canvas.fill(head, Vec2::splat(radius + 0.01), color, |offset| {
-                shape::flower(turn.rotate(offset), radius, count, depth)
+                canvas::flower(turn.rotate(offset), radius, count, depth)
             });
             radius *= 0.65;
         }
-        let heart = palette::color_of(random, palette::AUTUMN);
-        canvas.fill(head, Vec2::splat(radius), heart, |offset| shape::disk(offset, 0.6 * radius));
+        let heart = color_of(random, AUTUMN);
+        canvas.fill(head, Vec2::splat(radius), heart, |offset| canvas::disk(offset, 0.6 * radius));
     }
     canvas
 }
@@ -343,12 +309,11 @@ fn window(random: &mut ChaCha8Rng) -> Canvas {
     let mut canvas = landscape(random);
     let light = random.between(1., 1.8);
     canvas.pixels.iter_mut().for_each(|pixel| *pixel = (*pixel * light).min(Vec3::ONE));
-    let theme = random.weighted(&[(palette::WHITES, 5.), (palette::WOODS, 2.), (palette::GREYS, 2.)]);
-    let frame = palette::color_of(random, theme);
+    let frame = color_among(random, &[(WHITES, 5.), (WOODS, 2.), (GREYS, 2.)]);
     let panes = Vec2::new(random.count(1, 4) as f32, random.count(1, 4) as f32);
     let (bar, edge) = (random.between(0.005, 0.02), random.between(0.02, 0.06));
     let [left, right] = [(); 2].map(|()| if random.happens(0.3) { random.between(0.1, 0.35) } else { 0. });
-    let cloth = palette::color_of(random, palette::WHITES);
+    let cloth = color_of(random, WHITES);
     let folds = random.between(60., 160.);
     canvas.change(|uv, outside| {
         let part = (uv * panes - (uv * panes).round()).abs() / panes;
@@ -379,11 +344,11 @@ fn screen(random: &mut ChaCha8Rng) -> Canvas {
         let paper = if random.happens(0.6) { Vec3::splat(0.85) } else { Vec3::splat(0.04) };
         let half = Vec2::new(random.between(0.12, 0.45), random.between(0.12, 0.45));
         let middle = Vec2::new(random.between(0.2, 0.8), random.between(0.2, 0.8));
-        canvas.fill(middle, half, paper, |offset| shape::rectangle(offset, half, 0.01));
+        canvas.fill(middle, half, paper, |offset| canvas::rectangle(offset, half, 0.01));
         let bar = Palette::draw(random, Purpose::Poster, 1).color(0);
         let half_bar = Vec2::new(half.x, 0.02);
         canvas.fill(middle - Vec2::new(0., half.y - 0.02), half_bar, bar, |offset| {
-            shape::rectangle(offset, half_bar, 0.)
+            canvas::rectangle(offset, half_bar, 0.)
         });
         let ink = ink_for(random, paper);
         let corner = middle - half + Vec2::new(0.02, 0.06);
@@ -394,15 +359,9 @@ fn screen(random: &mut ChaCha8Rng) -> Canvas {
 
 /// Adds a mat and a frame around the picture.
 fn frame(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
-    let wood = random.weighted(&[
-        (palette::WOODS, 3.),
-        (palette::GREYS, 2.),
-        (palette::WHITES, 2.),
-        (palette::AUTUMN, 1.),
-    ]);
-    let wood = palette::color_of(random, wood) * random.between(0.3, 1.);
-    let mat = random.weighted(&[(palette::WHITES, 4.), (palette::ACCENTS, 1.)]);
-    let mat = palette::color_of(random, mat);
+    let wood = color_among(random, &[(WOODS, 3.), (GREYS, 2.), (WHITES, 2.), (AUTUMN, 1.)]);
+    let wood = wood * random.between(0.3, 1.);
+    let mat = color_among(random, &[(WHITES, 4.), (ACCENTS, 1.)]);
     let bar = random.between(0.015, 0.07);
     let margin = if random.happens(0.6) { random.between(0.03, 0.2) } else { 0. };
     let relief = random.between(0.1, 0.5);

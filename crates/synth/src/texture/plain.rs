@@ -1,11 +1,11 @@
-//! Textures of paint, plastic and metal: one color with small variations.
+//! Textures of one material: paint, plastic, metal, clouds of noise; and the weathering of all textures.
 
 use glam::Vec3;
 use rand_chacha::ChaCha8Rng;
 
-use super::noise::{fractal, smooth};
-use super::palette::{self, Palette};
-use super::rng::RandomValues;
+use super::canvas::smoothstep;
+use super::noise::{Field, RandomValues, Voronoi, fractal, ridged, smooth, unit_of, warped};
+use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
 
 /// Draws an even color with a slightly uneven coat of paint.
@@ -24,8 +24,7 @@ pub(super) fn paint(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 
 /// Draws a soft gradient from one color to others and back.
 pub(super) fn gradient(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let count = random.count(2, 4);
-    let palette = Palette::draw(random, purpose, count);
+    let palette = Palette::draw_between(random, purpose, 2, 4);
     let (across, along) = random.one_of(&[(0., 1.), (1., 0.), (1., 1.), (1., -1.), (0., 2.)]);
     let cells = random.count(1, 3);
     let drift = smooth(random, SIZE, [cells; 2]);
@@ -39,20 +38,19 @@ pub(super) fn gradient(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 
 /// Draws metal brushed in one direction.
 pub(super) fn brushed(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let theme = random.weighted(&[(palette::GREYS, 4.), (palette::BEIGES, 1.), (palette::ACCENTS, 0.5)]);
-    let color = palette::color_of(random, theme);
+    let color = color_among(random, &[(GREYS, 4.), (BEIGES, 1.), (ACCENTS, 0.5)]);
     let mut canvas = Canvas::filled(SIZE, color);
     let cells = random.one_of(&[[2, 128], [128, 2], [4, 64], [64, 4], [1, 256]]);
     canvas.shade(&fractal(random, SIZE, cells, 2, 0.7), random.between(0.04, 0.2));
     canvas.shade(&smooth(random, SIZE, cells.map(|count| count.div_ceil(24))), random.between(0., 0.25));
     // Rust, mostly outdoors.
     if matches!(purpose, Purpose::Facade | Purpose::Ground) || random.happens(0.15) {
-        let rust = palette::linear_of(random.one_of(&[0x7a4426, 0x8f5a33, 0x5b3a2a]));
+        let rust = linear_of(random.one_of(&[0x7a4426, 0x8f5a33, 0x5b3a2a]));
         let patches = fractal(random, SIZE, [3; 2], 6, 0.65);
         let level = random.between(0.1, 0.9);
-        for (pixel, value) in canvas.pixels.iter_mut().zip(&patches.values) {
-            *pixel = pixel.lerp(rust * (1. + 0.4 * value), ((value - level) * 5.).clamp(0., 0.9));
-        }
+        canvas.change_by(&patches, |pixel, value| {
+            pixel.lerp(rust * (1. + 0.4 * value), ((value - level) * 5.).clamp(0., 0.9))
+        });
     }
     Surface { canvas, repeat_metres: random.between(0.5, 1.5) }
 }
@@ -66,8 +64,108 @@ pub(super) fn glossy(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let light = Vec3::splat(random.between(0.5, 0.9));
     let share = random.between(0.15, 0.5);
     let canvas = Canvas::of_field(&lights, |value| {
-        let bright = super::shape::smoothstep(level, level + 0.5, value);
-        (color * (1. + 0.15 * value)).lerp(light, share * bright)
+        (color * (1. + 0.15 * value)).lerp(light, share * smoothstep(level, level + 0.5, value))
     });
     Surface { canvas, repeat_metres: random.between(0.6, 2.) }
+}
+
+/// Draws a texture of a random kind of noise.
+pub(super) fn clouds(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+    let palette = Palette::draw_between(random, purpose, 2, 5);
+    let mut field = raw(random);
+    if random.happens(0.4) {
+        let (cells, reach) = (random.count(1, 6), random.leaning_low(0.01, 0.2));
+        field = warped(random, &field, cells, reach);
+    }
+    let mut field = field.stretched();
+    if random.happens(0.2) {
+        // Flat patches, like camouflage or flaking paint.
+        let steps = random.count(2, 6) as f32;
+        let patch = |value: f32| smoothstep(0.42, 0.58, (value * steps).fract()) + (value * steps).floor();
+        field = field.map(patch).stretched();
+    }
+    let contrast = random.between(0.6, 1.6);
+    let canvas = Canvas::of_field(&field, |value| palette.ramp(0.5 + (value - 0.5) * contrast));
+    Surface { canvas, repeat_metres: random.leaning_low(0.4, 4.) }
+}
+
+fn raw(random: &mut ChaCha8Rng) -> Field {
+    let cells = random.leaning_low(1., 24.) as usize;
+    let stretch = if random.happens(0.25) { random.one_of(&[[1, 4], [4, 1], [1, 8]]) } else { [1, 1] };
+    let cells = stretch.map(|factor| cells * factor);
+    let gain = random.between(0.4, 0.85);
+    match random.count(0, 5) {
+        0 | 1 => fractal(random, SIZE, cells, 7, gain),
+        2 => ridged(random, SIZE, cells, 6, gain),
+        kind @ (3 | 4) => {
+            let count = cells[0].max(3);
+            let voronoi = Voronoi::new(random, count, count, 0.95, false);
+            if kind == 4 {
+                let seed = random.seed();
+                return Field::from_fn(SIZE, |uv| unit_of(seed, voronoi.cell(uv).id));
+            }
+            let (scale, hollow) = (count as f32, random.happens(0.5));
+            Field::from_fn(SIZE, |uv| {
+                let cell = voronoi.cell(uv);
+                if hollow { cell.offset.length() * scale } else { (cell.edge * scale * 3.).min(1.) }
+            })
+        }
+        _ => smooth(random, SIZE, cells),
+    }
+}
+
+/// Applies some of these effects, each with its own probability.
+pub(super) fn weather(random: &mut ChaCha8Rng, canvas: &mut Canvas, purpose: Purpose) {
+    let outdoors = matches!(purpose, Purpose::Ground | Purpose::Facade | Purpose::Foliage);
+    let often = if outdoors { 1.5 } else { 1. };
+    if random.happens(0.18 * often) {
+        dirt(random, canvas);
+    }
+    if random.happens(0.07 * often) {
+        scratches(random, canvas);
+    }
+    if random.happens(0.25) {
+        let cells = random.count(1, 3);
+        canvas.shade(&fractal(random, SIZE, [cells; 2], 2, 0.5), random.between(0.03, 0.2));
+    }
+    if random.happens(0.3) {
+        let grain = random.one_of(&[64, 128, 256]);
+        canvas.shade(&smooth(random, SIZE, [grain; 2]), random.leaning_low(0.01, 0.15));
+    }
+    if random.happens(0.3) {
+        let tint = Vec3::new(random.bell(), random.bell(), random.bell()) * random.between(0.03, 0.15);
+        canvas.tint(1. + tint);
+    }
+    if random.happens(0.25) {
+        let contrast = if random.happens(0.6) { random.between(0.25, 0.9) } else { random.between(1.1, 1.5) };
+        let mean = canvas.mean();
+        canvas.pixels.iter_mut().for_each(|pixel| *pixel = mean + (*pixel - mean) * contrast);
+    }
+    if random.happens(0.2) {
+        canvas.tint(Vec3::splat(random.between(0.5, 1.3)));
+    }
+}
+
+/// Adds patches of dust, moss or soot.
+fn dirt(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
+    let color = color_among(random, &[(EARTHS, 4.), (GREYS, 2.), (GREENS, 1.)]) * random.between(0.2, 1.);
+    let cells = random.one_of(&[[2, 2], [3, 3], [5, 5], [8, 2]]);
+    let gain = random.between(0.5, 0.85);
+    let patches = fractal(random, SIZE, cells, 6, gain);
+    let (level, most) = (random.between(-0.3, 0.9), random.between(0.1, 0.6));
+    canvas
+        .change_by(&patches, |pixel, value| pixel.lerp(color, most * smoothstep(level, level + 0.9, value)));
+}
+
+/// Adds thin brighter or darker lines.
+fn scratches(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
+    let cells = random.count(2, 6);
+    let lines = ridged(random, SIZE, [cells; 2], 3, 0.6);
+    let patches = smooth(random, SIZE, [4; 2]);
+    let change = if random.happens(0.5) { random.between(0.1, 0.4) } else { -random.between(0.1, 0.5) };
+    let width = random.between(0.05, 0.2);
+    canvas.change(|uv, pixel| {
+        let strength = smoothstep(1. - width, 1., lines.value(uv)) * patches.value(uv).clamp(0., 1.);
+        pixel * (1. + change * strength)
+    });
 }

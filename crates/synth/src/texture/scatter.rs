@@ -3,14 +3,13 @@
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
 
-use super::noise::fractal;
-use super::palette::{self, Palette};
-use super::rng::RandomValues;
-use super::shape;
+use super::canvas::{self, smoothstep};
+use super::noise::{RandomValues, fractal};
+use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
 
 /// Draws ground of one theme, dark enough to lie below other objects.
-fn ground(random: &mut ChaCha8Rng, theme: palette::Theme) -> Canvas {
+fn ground(random: &mut ChaCha8Rng, theme: Theme) -> Canvas {
     let palette = Palette::from_theme(random, theme, 2);
     let cells = random.count(2, 12);
     let field = fractal(random, SIZE, [cells; 2], 6, 0.75);
@@ -23,14 +22,10 @@ fn ground(random: &mut ChaCha8Rng, theme: palette::Theme) -> Canvas {
 /// Draws overlapping leaves, the upper ones brighter.
 pub(super) fn leaves(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let fallen = !matches!(purpose, Purpose::Foliage) && random.happens(0.5);
-    let theme = if fallen {
-        palette::AUTUMN
-    } else {
-        random.weighted(&[(palette::GREENS, 6.), (palette::AUTUMN, 1.)])
-    };
-    let mut canvas = ground(random, if fallen { palette::EARTHS } else { theme });
+    let theme = if fallen { AUTUMN } else { random.weighted(&[(GREENS, 6.), (AUTUMN, 1.)]) };
+    let mut canvas = ground(random, if fallen { EARTHS } else { theme });
     if !fallen {
-        canvas.pixels.iter_mut().for_each(|pixel| *pixel *= 0.35);
+        canvas.tint(Vec3::splat(0.35));
     }
     let palette = Palette::from_theme(random, theme, 4);
     let length = random.leaning_low(0.025, 0.16);
@@ -52,7 +47,7 @@ pub(super) fn leaves(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let pixels = SIZE as f32;
         canvas.stamp(random.spot(), Vec2::splat(0.55 * size), |offset| {
             let local = turn.rotate(offset);
-            let cover = (0.5 - shape::leaf(local, size, width) * pixels).clamp(0., 1.);
+            let cover = (0.5 - canvas::leaf(local, size, width) * pixels).clamp(0., 1.);
             let vein = 1. + veined * (1. - local.y.abs() * pixels).max(0.);
             let side = 1. + tilt * local.y.signum() * (local.y.abs() * pixels).min(1.) + 0.3 * local.x / size;
             (color * vein * side, cover)
@@ -63,8 +58,8 @@ pub(super) fn leaves(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 
 /// Draws blades of grass, needles or straw.
 pub(super) fn grass(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
-    let theme = random.weighted(&[(palette::GREENS, 6.), (palette::AUTUMN, 1.5), (palette::EARTHS, 0.5)]);
-    let below = random.one_of(&[palette::EARTHS, theme]);
+    let theme = random.weighted(&[(GREENS, 6.), (AUTUMN, 1.5), (EARTHS, 0.5)]);
+    let below = random.one_of(&[EARTHS, theme]);
     let mut canvas = ground(random, below);
     let palette = Palette::from_theme(random, theme, 4);
     let patches = fractal(random, SIZE, [3; 2], 4, 0.6);
@@ -73,7 +68,7 @@ pub(super) fn grass(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let width = random.between(0.4, 1.2) / SIZE as f32;
     let upright = random.between(0., 0.9);
     let count = (random.between(50., 110.) / length) as usize;
-    let dry = palette::color_of(random, palette::AUTUMN);
+    let dry = color_of(random, AUTUMN);
     let dryness = random.leaning_low(0., 0.4);
     for _ in 0..count {
         let root = random.spot();
@@ -86,16 +81,16 @@ pub(super) fn grass(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
             continue;
         }
         canvas.fill(root, half.abs() + width + 1. / SIZE as f32, green * light, |offset| {
-            shape::stroke(offset, -half, half, width)
+            canvas::stroke(offset, -half, half, width)
         });
     }
     if random.happens(0.2) {
-        let petals =
-            [palette::VIVID, palette::WHITES, palette::ACCENTS].map(|theme| palette::color_of(random, theme));
+        let petals = [VIVID, WHITES, ACCENTS].map(|theme| color_of(random, theme));
         for _ in 0..random.count(10, 150) {
             let radius = random.between(1., 3.) / SIZE as f32;
             let color = random.one_of(&petals);
-            canvas.fill(random.spot(), Vec2::splat(2. * radius), color, |offset| shape::disk(offset, radius));
+            canvas
+                .fill(random.spot(), Vec2::splat(2. * radius), color, |offset| canvas::disk(offset, radius));
         }
     }
     Surface { canvas, repeat_metres: random.between(0.8, 3.) }
@@ -103,14 +98,8 @@ pub(super) fn grass(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 
 /// Draws pebbles, gravel, bark or rubble: rounded bits with a lit side and a shadow.
 pub(super) fn gravel(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
-    let theme = random.weighted(&[
-        (palette::STONES, 5.),
-        (palette::EARTHS, 2.),
-        (palette::GREYS, 2.),
-        (palette::BROWNS, 1.),
-        (palette::WHITES, 0.5),
-    ]);
-    let below = random.one_of(&[palette::EARTHS, theme]);
+    let theme = random.weighted(&[(STONES, 5.), (EARTHS, 2.), (GREYS, 2.), (BROWNS, 1.), (WHITES, 0.5)]);
+    let below = random.one_of(&[EARTHS, theme]);
     let mut canvas = ground(random, below);
     let palette = Palette::from_theme(random, theme, 4);
     let radius = random.leaning_low(0.008, 0.06);
@@ -130,7 +119,7 @@ pub(super) fn gravel(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         let corners = random.count(3, 6);
         let distance = |offset: Vec2| {
             let local = turn.rotate(offset) * size / radii;
-            if angular { shape::polygon(local, 0.75 * size, corners) } else { shape::disk(local, size) }
+            if angular { canvas::polygon(local, 0.75 * size, corners) } else { canvas::disk(local, size) }
         };
         let reach = Vec2::splat(1.5 * size);
         let pixels = SIZE as f32;
@@ -147,28 +136,26 @@ pub(super) fn gravel(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 
 /// Draws earth or sand, with tracks, clods and some green.
 pub(super) fn earth(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
-    let theme = random.weighted(&[(palette::EARTHS, 5.), (palette::BEIGES, 1.5), (palette::BROWNS, 1.)]);
+    let theme = random.weighted(&[(EARTHS, 5.), (BEIGES, 1.5), (BROWNS, 1.)]);
     let mut canvas = ground(random, theme);
     let cells = random.leaning_low(4., 32.) as usize;
     let stretch = random.one_of(&[[1, 1], [1, 1], [1, 3]]);
     let clods = fractal(random, SIZE, stretch.map(|factor| cells * factor), 5, 0.8);
     canvas.shade(&clods.slope(random.direction()), random.between(0.2, 1.2));
     if random.happens(0.5) {
-        let green = Palette::from_theme(random, palette::GREENS, 2);
+        let green = Palette::from_theme(random, GREENS, 2);
         let patches = fractal(random, SIZE, [3; 2], 6, 0.75);
         let level = random.between(-0.4, 1.);
-        for (pixel, value) in canvas.pixels.iter_mut().zip(&patches.values) {
-            let share = shape::smoothstep(level, level + 0.5, *value);
-            *pixel = pixel.lerp(green.ramp(0.5 + 0.5 * value), 0.9 * share);
-        }
+        canvas.change_by(&patches, |pixel, value| {
+            pixel.lerp(green.ramp(0.5 + 0.5 * value), 0.9 * smoothstep(level, level + 0.5, value))
+        });
     }
     Surface { canvas, repeat_metres: random.between(1., 4.) }
 }
 
 /// Draws confetti, splashes or brush strokes: bits of any shape in several colors.
 pub(super) fn confetti(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let count = random.count(3, 5);
-    let palette = Palette::draw(random, purpose, count);
+    let palette = Palette::draw_between(random, purpose, 3, 5);
     let mut canvas = Canvas::filled(SIZE, palette.color(0));
     let length = random.leaning_low(0.02, 0.3);
     let bits = (random.between(0.2, 2.) / (length * length)).min(800.) as usize;
@@ -183,10 +170,10 @@ pub(super) fn confetti(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         canvas.stamp(random.spot(), Vec2::splat(0.8 * size), |offset| {
             let local = turn.rotate(offset);
             let distance = match kind {
-                0 => shape::ellipse(local, Vec2::new(0.5, 0.5 * slim + 0.1) * size),
-                1 => shape::rectangle(local, Vec2::new(0.5, 0.5 * slim) * size, 0.),
-                2 => shape::polygon(local, 0.3 * size, 3),
-                _ => shape::flower(local, 0.5 * size, 5, slim),
+                0 => canvas::ellipse(local, Vec2::new(0.5, 0.5 * slim + 0.1) * size),
+                1 => canvas::rectangle(local, Vec2::new(0.5, 0.5 * slim) * size, 0.),
+                2 => canvas::polygon(local, 0.3 * size, 3),
+                _ => canvas::flower(local, 0.5 * size, 5, slim),
             };
             (color, clear * (0.5 - distance * pixels).clamp(0., 1.))
         });

@@ -2,15 +2,6 @@ use rand_chacha::rand_core::SeedableRng;
 
 use super::*;
 
-/// Returns the output of every family, for a purpose that it is likely for, with a few seeds.
-fn surfaces() -> impl Iterator<Item = (usize, Surface)> {
-    FAMILIES.iter().enumerate().flat_map(|(index, (family, weights))| {
-        let likely = weights.iter().copied().fold(0., f32::max);
-        let purpose = Purpose::ALL[weights.iter().position(|&weight| weight == likely).expect("its own")];
-        (0..4).map(move |seed| (index, family(&mut ChaCha8Rng::seed_from_u64(seed), purpose)))
-    })
-}
-
 /// Returns the mean differences between adjacent columns and between adjacent rows. The last ones are those across the border.
 fn steps(canvas: &Canvas) -> [Vec<f32>; 2] {
     let size = canvas.size;
@@ -21,72 +12,41 @@ fn steps(canvas: &Canvas) -> [Vec<f32>; 2] {
     [(0..size).map(column).collect(), (0..size).map(row).collect()]
 }
 
+/// Every family paints finite pixels of a plausible size, and its repeats have no seam, for a purpose that it is likely for.
 #[test]
-fn the_same_state_draws_the_same_bytes() {
-    for purpose in Purpose::ALL {
-        let draw = || {
-            let mut random = ChaCha8Rng::seed_from_u64(5);
-            [(); 4].map(|()| Texture::draw(&mut random, purpose))
-        };
-        for (one, other) in draw().iter().zip(&draw()) {
-            assert_eq!(one.levels, other.levels, "{purpose:?}");
-            assert_eq!(one.repeat_metres.to_bits(), other.repeat_metres.to_bits(), "{purpose:?}");
-        }
-    }
-}
-
-#[test]
-fn repeats_have_no_seam() {
-    for (family, surface) in surfaces() {
-        for steps in steps(&surface.canvas) {
-            let (across, inside) = steps.split_last().expect("many");
-            let largest = inside.iter().copied().fold(0., f32::max);
-            assert!(
-                *across <= 1.25 * largest + 0.01,
-                "family {family}: {across} at the border, {largest} inside"
-            );
-        }
-    }
-}
-
-#[test]
-fn texture_families_draw_finite_pixels_of_plausible_size() {
-    for (family, surface) in surfaces() {
-        assert!(surface.canvas.pixels.iter().all(|pixel| pixel.is_finite()), "family {family}");
-        assert!((0.02..25.).contains(&surface.repeat_metres), "family {family}: {} m", surface.repeat_metres);
-    }
-}
-
-#[test]
-fn reflectance_stays_in_range() {
-    let mut random = ChaCha8Rng::seed_from_u64(6);
-    for purpose in Purpose::ALL {
-        for _ in 0..3 {
-            let texture = Texture::draw(&mut random, purpose);
-            for level in &texture.levels {
-                let within = |texel: &[u8; 4]| texel[..3].iter().all(|byte| (36..=249).contains(byte));
-                assert!(level.iter().all(within), "{purpose:?}");
+fn families_paint_plausible_surfaces_without_seams() {
+    for (index, (family, weights)) in FAMILIES.iter().enumerate() {
+        let likely = weights.iter().copied().fold(0., f32::max);
+        let purpose = Purpose::ALL[weights.iter().position(|&weight| weight == likely).expect("its own")];
+        for seed in 0..4 {
+            let Surface { canvas, repeat_metres } = family(&mut ChaCha8Rng::seed_from_u64(seed), purpose);
+            assert!(canvas.pixels.iter().all(|pixel| pixel.is_finite()), "family {index}");
+            assert!((0.02..25.).contains(&repeat_metres), "family {index}: {repeat_metres} m");
+            for steps in steps(&canvas) {
+                let (across, inside) = steps.split_last().expect("many");
+                let largest = inside.iter().copied().fold(0., f32::max);
+                let message = format!("family {index}: {across} at the border, {largest} inside");
+                assert!(*across <= 1.25 * largest + 0.01, "{message}");
             }
         }
     }
 }
 
+/// Reflectance stays in its range, and the mean is that of the texels and a sample with a wide footprint.
 #[test]
-fn mean_equals_a_sample_with_a_wide_footprint() {
-    let mut random = ChaCha8Rng::seed_from_u64(7);
-    for purpose in Purpose::ALL {
+fn textures_of_all_purposes_are_plausible() {
+    let mut random = ChaCha8Rng::seed_from_u64(6);
+    for purpose in [Purpose::ALL; 3].concat() {
         let texture = Texture::draw(&mut random, purpose);
+        let within = |texel: &[u8; 4]| texel[..3].iter().all(|byte| (36..=249).contains(byte));
+        assert!(texture.levels.iter().flatten().all(within), "{purpose:?}");
         let texels = &texture.levels[0];
-        let mean =
-            texels.iter().map(|&texel| linear_of_texel(texel).truncate()).sum::<Vec3>() / texels.len() as f32;
+        let sum: Vec3 = texels.iter().map(|&texel| linear_of_texel(texel).truncate()).sum();
+        let (found, mean) = (texture.mean(), sum / texels.len() as f32);
         // Both the single texel and the texels that it is compared with are rounded to bytes.
-        assert!(
-            (texture.mean() - mean).abs().max_element() < 0.006,
-            "{purpose:?}: {} for {mean}",
-            texture.mean()
-        );
+        assert!((found - mean).abs().max_element() < 0.006, "{purpose:?}: {found} for {mean}");
         for footprint in [1., 3., f32::INFINITY] {
-            assert_eq!(texture.sample(random.spot() * 9. - 4., footprint), texture.mean());
+            assert_eq!(texture.sample(random.spot() * 9. - 4., footprint), found);
         }
     }
 }
@@ -110,8 +70,9 @@ fn pictures_are_mirrored_at_their_edges() {
     let at = |u, v| texture.sample(Vec2::new(u, v), 0.);
     for (u, v) in [(0.1, 0.2), (0.3, 0.45), (0.01, 0.02)] {
         let here = at(u, v);
-        assert!((at(1. - u, v) - here).abs().max_element() < 0.01);
-        assert!((at(u, 1. - v) - here).abs().max_element() < 0.01);
+        for mirrored in [at(1. - u, v), at(u, 1. - v)] {
+            assert!((mirrored - here).abs().max_element() < 0.01);
+        }
         // The middle 200 columns, repeated twice per unit because of the mirror image.
         let expected = palette::linear_of_byte((50. + 400. * u) as u8);
         assert!((here.x - expected.max(0.02)).abs() < 0.02, "{} for {expected}", here.x);
