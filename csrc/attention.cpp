@@ -1,4 +1,4 @@
-#include "attention.h"
+#include "tensor_ops.h"
 
 #include <ATen/native/CPUBlas.h>
 #include <ATen/ops/empty.h>
@@ -8,10 +8,10 @@
 #include <exception>
 #include <vector>
 
-#include "globalsplat-csrc/src/attention.rs.h"
+#include "globalsplat-csrc/src/tensor_ops.rs.h"
 #include "kernels/attention_types.h"
 #include "kernels/multi_head_attention.h"
-#include "threads.h"
+#include "runtime.h"
 
 namespace globalsplat {
 namespace {
@@ -55,7 +55,6 @@ void multiply(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row, int
 
 void release() { at::native::cpublas::brgemm_release(true); }
 
-// Returns the product functions.
 raster::Bf16Gemm bf16_gemm() { return {multiply, release}; }
 
 // Returns true if bf16 products work. libtorch throws if oneDNN doesn't support them, and oneDNN if their instructions are disabled.
@@ -117,7 +116,6 @@ bool supports_attention(int64_t width, bool is_bf16) {
 }
 
 size_t attention(size_t q_address, size_t k_address, size_t v_address, int64_t heads) {
-  const auto borrowed = [](size_t address) -> const Tensor& { return *reinterpret_cast<const Tensor*>(address); };
   const Tensor &q = borrowed(q_address), &k = borrowed(k_address), &v = borrowed(v_address);
   const bool bf16 = is_bf16(q);
   for (const Tensor* t : {&q, &k, &v})
@@ -130,8 +128,7 @@ size_t attention(size_t q_address, size_t k_address, size_t v_address, int64_t h
               q.sizes(), ", keys ", k.sizes(), " and values ", v.sizes(), ", expected [B, n, d] and twice [B, m, d] with m > 0");
   // Makes the op visible to profilers, like libtorch's own.
   RECORD_FUNCTION("globalsplat::attention", c10::ArrayRef<const c10::IValue>{});
-  const Tensor out = AttentionFunction::apply(with_whole_rows(q), with_whole_rows(k), with_whole_rows(v), heads);
-  return reinterpret_cast<size_t>(new Tensor(out));
+  return owned(AttentionFunction::apply(with_whole_rows(q), with_whole_rows(k), with_whole_rows(v), heads));
 }
 
 }  // namespace globalsplat

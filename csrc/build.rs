@@ -6,20 +6,13 @@ use std::{
 };
 
 /// Source files with the cxx bridges between Rust and C++.
-const BRIDGES: [&str; 13] = [
-    "src/attention.rs",
+const BRIDGES: [&str; 6] = [
     "src/chunk.rs",
     "src/cuda.rs",
-    "src/depth_search.rs",
-    "src/device.rs",
-    "src/image_losses.rs",
-    "src/linear.rs",
-    "src/ops.rs",
-    "src/optim.rs",
-    "src/processor.rs",
     "src/distributed.rs",
     "src/render.rs",
-    "src/tensor_memory.rs",
+    "src/runtime.rs",
+    "src/tensor_ops.rs",
 ];
 
 /// Returns the compiler settings that all C++ files share.
@@ -118,7 +111,7 @@ fn main() {
     cpp()
         .includes(["kernels", "cuda"])
         .flag("-ffp-contract=off")
-        .files(["cuda/launch_losses.cpp", "cuda/frame.cpp", "cuda/emulator.cpp", "cuda/emulated_kernels.cpp"])
+        .files(["cuda/frame.cpp", "cuda/emulator.cpp", "cuda/emulated_kernels.cpp"])
         .compile("globalsplat_cuda");
     match env::var("CARGO_CFG_TARGET_ARCH").as_deref() {
         Ok("x86_64") => {

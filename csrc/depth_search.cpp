@@ -1,13 +1,13 @@
-#include "depth_search.h"
+#include "tensor_ops.h"
 
 #include <algorithm>
 #include <vector>
 
 #include <ATen/ops/empty.h>
 
-#include "globalsplat-csrc/src/depth_search.rs.h"
-#include "kernels/depth_search.h"
-#include "threads.h"
+#include "globalsplat-csrc/src/tensor_ops.rs.h"
+#include "kernels/jobs.h"
+#include "runtime.h"
 
 namespace globalsplat {
 
@@ -31,8 +31,6 @@ struct SweepTensors {
   }
 
  private:
-  static const at::Tensor& borrowed(size_t address) { return *reinterpret_cast<const at::Tensor*>(address); }
-
   const float* data(size_t address) {
     kept.push_back(borrowed(address).to(at::kCPU, at::kFloat).contiguous());
     return kept.back().const_data_ptr<float>();
@@ -53,8 +51,8 @@ template <class Search>
 void run(const Search& search, const raster::PlaneSweep& sweep, int32_t planes, rust::Slice<size_t> out) {
   const at::Tensor inverse_depth = at::empty({sweep.own.height, sweep.own.width}, at::kFloat), score = at::empty_like(inverse_depth);
   search(sweep, planes, inverse_depth.data_ptr<float>(), score.data_ptr<float>(), get_num_threads());
-  out[0] = reinterpret_cast<size_t>(new at::Tensor(inverse_depth));
-  out[1] = reinterpret_cast<size_t>(new at::Tensor(score));
+  out[0] = owned(inverse_depth);
+  out[1] = owned(score);
 }
 
 }  // namespace

@@ -1,4 +1,4 @@
-#include "image_losses.h"
+#include "tensor_ops.h"
 
 #include <ATen/ops/empty.h>
 #include <ATen/ops/empty_like.h>
@@ -6,11 +6,11 @@
 #include <ATen/ops/sum.h>
 #include <torch/csrc/autograd/custom_function.h>
 
-#include "cuda/launch_losses.h"
+#include "cuda/frame.h"
 #include "cuda/torch_device.h"
-#include "globalsplat-csrc/src/image_losses.rs.h"
-#include "kernels/image_losses.h"
-#include "threads.h"
+#include "globalsplat-csrc/src/tensor_ops.rs.h"
+#include "kernels/jobs.h"
+#include "runtime.h"
 
 namespace globalsplat {
 namespace {
@@ -18,8 +18,6 @@ namespace {
 using at::Tensor;
 using torch::autograd::AutogradContext;
 using torch::autograd::tensor_list;
-
-const Tensor& borrowed(size_t address) { return *reinterpret_cast<const Tensor*>(address); }
 
 template <class Body>
 auto dispatch_by_type(const Tensor& t, Body body) {
@@ -114,7 +112,7 @@ void run(const Tensor& first, const Tensor& second, rust::Slice<size_t> out, Num
   const auto there = [&](const Tensor& t) { return t.to(device, type).contiguous(); };
   const bool differentiable = at::GradMode::is_enabled() && first.requires_grad();
   const Tensor value = Function::apply(there(first), there(second.detach()), numbers..., differentiable);
-  out[0] = reinterpret_cast<size_t>(new Tensor(value.to(first.device())));
+  out[0] = owned(value.to(first.device()));
 }
 
 }  // namespace

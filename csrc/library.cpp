@@ -3,7 +3,6 @@
 #include <ATen/ops/empty.h>
 #include <torch/library.h>
 
-#include "arguments.h"
 #include "backend.h"
 
 namespace globalsplat {

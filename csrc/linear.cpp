@@ -1,4 +1,4 @@
-#include "linear.h"
+#include "tensor_ops.h"
 
 #include <ATen/Context.h>
 #include <ATen/Parallel.h>
@@ -12,8 +12,8 @@
 #include <functional>
 #include <optional>
 
-#include "globalsplat-csrc/src/linear.rs.h"
-#include "processor.h"
+#include "globalsplat-csrc/src/tensor_ops.rs.h"
+#include "runtime.h"
 
 // Of MKL, which libtorch has on Intel's and compatible processors, and null elsewhere. Returns the number that this thread had before.
 extern "C" __attribute__((weak)) int MKL_Set_Num_Threads_Local(int count);
@@ -153,7 +153,6 @@ bool is_on_cpu(const Tensor& t, at::ScalarType kind) { return t.device().is_cpu(
 }  // namespace
 
 size_t linear(size_t xs_address, size_t weights_address, size_t bias_address) {
-  const auto borrowed = [](size_t address) -> const Tensor& { return *reinterpret_cast<const Tensor*>(address); };
   const Tensor &xs = borrowed(xs_address), &weights = borrowed(weights_address);
   std::optional<Tensor> bias;
   if (bias_address != 0) bias = borrowed(bias_address);
@@ -167,7 +166,7 @@ size_t linear(size_t xs_address, size_t weights_address, size_t bias_address) {
   auto size = xs.sizes().vec();
   size.back() = weights.size(0);
   const Tensor out = LinearFunction::apply(xs.reshape({-1, xs.size(-1)}), weights, bias);
-  return reinterpret_cast<size_t>(new Tensor(out.view(size)));
+  return owned(out.view(size));
 }
 
 }  // namespace globalsplat

@@ -1,4 +1,4 @@
-#include "optim.h"
+#include "tensor_ops.h"
 
 #include <ATen/Dispatch.h>
 #include <ATen/ops/_foreach_mul.h>
@@ -11,19 +11,18 @@
 #include <array>
 #include <vector>
 
-#include "globalsplat-csrc/src/optim.rs.h"
-#include "kernels/optim.h"
-#include "threads.h"
+#include "globalsplat-csrc/src/tensor_ops.rs.h"
+#include "kernels/jobs.h"
+#include "runtime.h"
 
 namespace globalsplat {
 namespace {
 
 using at::Tensor;
 
-std::vector<Tensor> borrowed(rust::Slice<const size_t> addresses) {
+std::vector<Tensor> all_borrowed(rust::Slice<const size_t> addresses) {
   std::vector<Tensor> tensors;
-  tensors.reserve(addresses.size());
-  for (const size_t address : addresses) tensors.push_back(*reinterpret_cast<const Tensor*>(address));
+  for (const size_t address : addresses) tensors.push_back(borrowed(address));
   return tensors;
 }
 
@@ -31,23 +30,23 @@ std::vector<Tensor> borrowed(rust::Slice<const size_t> addresses) {
 
 void norm(rust::Slice<const size_t> tensors, rust::Slice<size_t> out) {
   const at::NoGradGuard no_grad;
-  const Tensor norms = at::stack(at::_foreach_norm(borrowed(tensors)));
-  out[0] = reinterpret_cast<size_t>(new Tensor(at::linalg_vector_norm(norms)));
+  const Tensor norms = at::stack(at::_foreach_norm(all_borrowed(tensors)));
+  out[0] = owned(at::linalg_vector_norm(norms));
 }
 
 void scale(rust::Slice<const size_t> tensors, double factor) {
   const at::NoGradGuard no_grad;
-  at::_foreach_mul_(borrowed(tensors), factor);
+  at::_foreach_mul_(all_borrowed(tensors), factor);
 }
 
 void zero_grad(rust::Slice<const size_t> tensors) {
-  for (const Tensor& t : borrowed(tensors)) t.mutable_grad().reset();
+  for (const Tensor& t : all_borrowed(tensors)) t.mutable_grad().reset();
 }
 
 void fused_adamw(rust::Slice<const size_t> values, rust::Slice<const size_t> gradients, rust::Slice<const size_t> first,
                  rust::Slice<const size_t> second, const AdamWOptions& of) {
   if (values.empty()) return;
-  const auto x = borrowed(values), g = borrowed(gradients), m = borrowed(first), v = borrowed(second);
+  const auto x = all_borrowed(values), g = all_borrowed(gradients), m = all_borrowed(first), v = all_borrowed(second);
   // The kernel assumes equal memory layouts and checks nothing but the type.
   for (const auto* list : {&x, &g, &m, &v}) {
     TORCH_CHECK(list->size() == x.size(), "every parameter must have a gradient and two moments");
@@ -66,7 +65,7 @@ void fused_adamw(rust::Slice<const size_t> values, rust::Slice<const size_t> gra
 }
 
 void muon(rust::Slice<const size_t> values, rust::Slice<const size_t> gradients, rust::Slice<const size_t> first, const MuonOptions& of) {
-  const auto x = borrowed(values), g = borrowed(gradients), m = borrowed(first);
+  const auto x = all_borrowed(values), g = all_borrowed(gradients), m = all_borrowed(first);
   TORCH_CHECK(g.size() == x.size() && m.size() == x.size(), "every matrix must have a gradient and a running mean of it");
   std::vector<raster::MuonMatrix> matrices;
   for (size_t k = 0; k < x.size(); ++k) {
@@ -85,8 +84,7 @@ void muon(rust::Slice<const size_t> values, rust::Slice<const size_t> gradients,
 }
 
 void adam(const AdamArguments& of) {
-  const std::array<size_t, 4> addresses = {of.value, of.gradient, of.first, of.second};
-  const std::vector<Tensor> tensors = borrowed(rust::Slice<const size_t>(addresses.data(), addresses.size()));
+  const std::array<Tensor, 4> tensors = {borrowed(of.value), borrowed(of.gradient), borrowed(of.first), borrowed(of.second)};
   const Tensor& value = tensors[0];
   for (const Tensor& t : tensors)
     TORCH_CHECK(t.device().is_cpu() && t.is_contiguous() && t.sizes() == value.sizes() && t.scalar_type() == value.scalar_type() &&

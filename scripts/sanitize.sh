@@ -37,7 +37,7 @@ for sanitizer in $sanitizers; do
         compile "$sanitizer-$isa" kernels/kernels_isa.cpp "${flags_of[$sanitizer]}" -ffp-contract=off "-DGS_ISA=$isa" \
             "${flags_of[$isa]:-}"
     done
-    for source in kernels/{raster,multi_head_attention,image_losses,depth_search,optim,parallel,kernels}.cpp cuda/{launch_losses,frame}.cpp \
+    for source in kernels/{raster,multi_head_attention,image_losses,depth_search,optim,parallel,kernels}.cpp cuda/frame.cpp \
         checks/{checks,schedules}.cpp; do
         compile "$sanitizer-$(basename "$source" .cpp)" "$source" "${flags_of[$sanitizer]}" -Icsrc/kernels
     done
@@ -50,7 +50,7 @@ for sanitizer in $sanitizers; do
 done | xargs -P "$(nproc)" -d '\n' -n 1 bash -c
 for sanitizer in $sanitizers; do
     objects=()
-    for part in $isas raster multi_head_attention image_losses depth_search optim parallel kernels launch_losses frame emulated_kernels emulator checks schedules; do
+    for part in $isas raster multi_head_attention image_losses depth_search optim parallel kernels frame emulated_kernels emulator checks schedules; do
         objects+=("$out/$sanitizer-$part.o")
     done
     # shellcheck disable=SC2086

@@ -20,15 +20,13 @@
 #include <string>
 #include <thread>
 
-#include "../cuda/emulated.h"
+#include "../cuda/device.h"
 #include "../kernels/attention_types.h"
-#include "../kernels/image_losses.h"
+#include "../kernels/jobs.h"
 #include "../kernels/kernels.h"
 #include "../kernels/multi_head_attention.h"
-#include "../kernels/optim.h"
 #include "../kernels/parallel.h"
 #include "scenes.h"
-#include "schedules.h"
 
 namespace globalsplat::checks {
 namespace {
@@ -57,11 +55,6 @@ void on_timeout(int) {
   const auto say = [](const char* text, size_t length) { return write(2, text, length) == ssize_t(length); };
   const char end[] = ": never ends\n";
   _exit(say("FOUND: ", 7) && say(now.data(), now.size()) && say(end, sizeof end - 1) ? 1 : 2);
-}
-
-template <class Item>
-bool same(const std::vector<Item>& a, const std::vector<Item>& b) {
-  return a.size() == b.size() && (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(Item)) == 0);
 }
 
 // Render of a scene, with all of its inputs and outputs.
@@ -110,16 +103,16 @@ class Render {
 
   void expect_bits_of(Render& other) {
     for (size_t k = 0; k < pictures_.size(); ++k) {
-      expect(same(pictures_[k].rgb, other.pictures_[k].rgb), "colors differ from one thread's");
-      expect(same(pictures_[k].alpha, other.pictures_[k].alpha), "opacities differ from one thread's");
-      expect(same(pictures_[k].depth, other.pictures_[k].depth), "depths differ from one thread's");
+      expect(have_same_bits(pictures_[k].rgb, other.pictures_[k].rgb), "colors differ from one thread's");
+      expect(have_same_bits(pictures_[k].alpha, other.pictures_[k].alpha), "opacities differ from one thread's");
+      expect(have_same_bits(pictures_[k].depth, other.pictures_[k].depth), "depths differ from one thread's");
     }
     for (size_t b = 0; b < gradients_.size(); ++b) {
       const auto ours = arrays(gradients_[b]), theirs = arrays(other.gradients_[b]);
-      for (size_t k = 0; k < ours.size(); ++k) expect(same(*ours[k], *theirs[k]), "gradients differ from one thread's");
-      expect(same(means2d_[b], other.means2d_[b]), "gradients of projected means differ from one thread's");
+      for (size_t k = 0; k < ours.size(); ++k) expect(have_same_bits(*ours[k], *theirs[k]), "gradients differ from one thread's");
+      expect(have_same_bits(means2d_[b], other.means2d_[b]), "gradients of projected means differ from one thread's");
     }
-    expect(same(cameras_, other.cameras_), "cameras' gradients differ from one thread's");
+    expect(have_same_bits(cameras_, other.cameras_), "cameras' gradients differ from one thread's");
   }
 
  private:
@@ -188,11 +181,7 @@ int64_t same_bits(const Scene<T>& scene, const std::vector<int>& thread_counts) 
 template <class T>
 int64_t check_losses(const std::vector<int>& thread_counts) {
   Random random(11);
-  const auto numbers = [&](size_t count) {
-    std::vector<T> values;
-    for (const double value : random.uniform(count, 0, 1)) values.push_back(T(value));
-    return values;
-  };
+  const auto numbers = [&](size_t count) { return converted<T>(random.uniform(count, 0, 1)); };
   int64_t count = 0;
   // evaluate(gradient, num_threads) returns a loss, and writes the gradient's `all` values unless it is null.
   const auto expect_the_same = [&](const std::string& what, size_t all, const auto& evaluate) {
@@ -203,7 +192,7 @@ int64_t check_losses(const std::vector<int>& thread_counts) {
     for (const int num_threads : thread_counts) {
       std::vector<T> gradient(all, T(num_threads));
       const double again = evaluate(gradient.data(), num_threads);
-      expect(again == value && same(gradient, one), "threads change a loss");
+      expect(again == value && have_same_bits(gradient, one), "threads change a loss");
       ++count;
     }
   };
@@ -237,7 +226,7 @@ int64_t check_losses(const std::vector<int>& thread_counts) {
   };
   const std::vector<T> one = stepped(1);
   for (const int num_threads : thread_counts) {
-    expect(same(stepped(num_threads), one), "threads change a step of Adam");
+    expect(have_same_bits(stepped(num_threads), one), "threads change a step of Adam");
     ++count;
   }
   return count;
@@ -252,10 +241,7 @@ int64_t check_muon(const std::vector<int>& thread_counts) {
     std::vector<std::vector<float>> numbers;
     std::vector<raster::MuonMatrix> all;
     for (const auto& [rows, columns] : {std::array<int64_t, 2>{1, 1}, {1, 7}, {7, 1}, {20, 33}, {21, 23}, {128, 128}, {200, 65}}) {
-      for (int of = 0; of < 3; ++of) {
-        const std::vector<double> drawn = random.uniform(size_t(rows * columns), -1, 1);
-        numbers.emplace_back(drawn.begin(), drawn.end());
-      }
+      for (int of = 0; of < 3; ++of) numbers.push_back(converted<float>(random.uniform(size_t(rows * columns), -1, 1)));
       const size_t last = numbers.size() - 1;
       all.push_back({numbers[last - 2].data(), numbers[last].data(), numbers[last - 1].data(), rows, columns});
     }
@@ -291,11 +277,7 @@ void multiply_bf16(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row
 // Attention, forward and backward. Here, too, arrays have their exact sizes.
 int64_t check_attention(const std::vector<int>& thread_counts) {
   Random random(12);
-  const auto numbers = [&](int64_t count) {
-    std::vector<float> values;
-    for (const double value : random.normal(size_t(count), 1)) values.push_back(float(value));
-    return values;
-  };
+  const auto numbers = [&](int64_t count) { return converted<float>(random.normal(size_t(count), 1)); };
   int64_t count = 0;
   for (const raster::AttentionShape& shape : {raster::AttentionShape{1, 1, 1, 1, 4},
                                               {2, 3, 7, 65, 8},
@@ -338,7 +320,7 @@ int64_t check_attention(const std::vector<int>& thread_counts) {
     const std::vector<float> one = attended(1);
     for (const float number : one) expect(std::isfinite(number), "attention isn't finite");
     for (const int num_threads : thread_counts) {
-      expect(same(attended(num_threads), one), "threads change attention");
+      expect(have_same_bits(attended(num_threads), one), "threads change attention");
       ++count;
     }
   }

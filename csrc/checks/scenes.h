@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <limits>
 #include <random>
 #include <string>
@@ -47,6 +48,17 @@ class Random {
  private:
   std::mt19937_64 bits_;
 };
+
+// Converts values to type T.
+template <class T>
+std::vector<T> converted(const std::vector<double>& values) {
+  return std::vector<T>(values.begin(), values.end());
+}
+
+template <class Item>
+bool have_same_bits(const std::vector<Item>& a, const std::vector<Item>& b) {
+  return a.size() == b.size() && (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(Item)) == 0);
+}
 
 // Returns a camera at the origin with the rotation of the quaternion (1, x, y, z), not normalized.
 inline raster::Camera<double> rotated_camera(double x, double y, double z) {
@@ -230,10 +242,10 @@ inline Scene<double> many_gaussians(int bases) {
 // Converts a scene to numbers of type T.
 template <class T>
 Scene<T> as(const Scene<double>& scene) {
-  const auto numbers = [](const std::vector<double>& from) { return std::vector<T>(from.begin(), from.end()); };
   Scene<T> out{scene.name, scene.width, scene.height, scene.bases, {}, {}, scene.projection};
   for (const Arrays<double>& g : scene.gaussians)
-    out.gaussians.push_back({numbers(g.means), numbers(g.scales), numbers(g.quaternions), numbers(g.opacities), numbers(g.sh)});
+    out.gaussians.push_back({converted<T>(g.means), converted<T>(g.scales), converted<T>(g.quaternions), converted<T>(g.opacities),
+                             converted<T>(g.sh)});
   for (const raster::View<double>& view : scene.views) {
     const raster::Camera<double>& from = view.camera;
     raster::Camera<T> camera{{}, {}, T(from.fx), T(from.fy), T(from.cx), T(from.cy)};
@@ -243,5 +255,20 @@ Scene<T> as(const Scene<double>& scene) {
   }
   return out;
 }
+
+// ---- tests of the GPU kernels in the emulation on a CPU: schedules.cpp ----
+
+// Renders `scene`, forward and backward, with the CPU backend and with the kernels, once per seed; a seed determines the order of blocks
+// and threads. Images must have the CPU's bits, gradients must be close to the CPU's, and all orders must give the same bits. Returns a
+// description of the first difference, empty if there is none.
+std::string schedules_differ(const Scene<float>& scene, const std::vector<uint64_t>& seeds);
+
+// Tests the prefix sums that sorting needs, with more counts than one block processes. Returns a description of the difference; empty if
+// there is none.
+std::string sums_differ(uint64_t seed);
+
+// Tests the losses that compare images with photos, and their gradients. Returns a description of the first difference; empty if there is
+// none.
+std::string losses_differ(const std::vector<uint64_t>& seeds);
 
 }  // namespace globalsplat::checks

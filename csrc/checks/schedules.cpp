@@ -1,13 +1,12 @@
-#include "schedules.h"
+#include "scenes.h"
 
 #include <array>
 #include <cmath>
 #include <cstdio>
 #include <cstring>
 
-#include "../cuda/emulated.h"
+#include "../cuda/device.h"
 #include "../cuda/frame.h"
-#include "../cuda/launch_losses.h"
 #include "../kernels/kernels.h"
 
 namespace globalsplat::checks {
@@ -27,11 +26,7 @@ struct RenderResult {
 void append(Numbers& to, const Numbers& more) { to.insert(to.end(), more.begin(), more.end()); }
 
 // Returns random gradients with respect to images.
-Numbers random_gradients(Random& random, size_t count) {
-  Numbers numbers;
-  for (const double value : random.uniform(count, -1, 1)) numbers.push_back(float(value));
-  return numbers;
-}
+Numbers random_gradients(Random& random, size_t count) { return converted<float>(random.uniform(count, -1, 1)); }
 
 // Returns the number of Gaussians per scene.
 size_t count_of(const Scene<float>& scene) { return scene.gaussians.empty() ? 0 : scene.gaussians[0].opacities.size(); }
@@ -125,10 +120,6 @@ RenderResult render_on_cpu(const Scene<float>& scene) {
   return result;
 }
 
-bool have_same_bits(const Numbers& a, const Numbers& b) {
-  return a.size() == b.size() && (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(float)) == 0);
-}
-
 double max_abs(const Numbers& numbers) {
   double max = 0;
   for (const float number : numbers) max = std::max(max, std::abs(double(number)));
@@ -189,11 +180,7 @@ std::string sums_differ(uint64_t seed) {
 
 std::string losses_differ(const std::vector<uint64_t>& seeds) {
   Random random(12);
-  const auto numbers = [&](size_t count) {
-    Numbers values;
-    for (const double value : random.uniform(count, 0, 1)) values.push_back(float(value));
-    return values;
-  };
+  const auto numbers = [&](size_t count) { return converted<float>(random.uniform(count, 0, 1)); };
   const auto sum_of = [](const cuda::PartialSums& parts) {
     double sum = 0;
     for (int64_t k = 0; k < parts.count; ++k) sum += static_cast<const double*>(parts.numbers.get())[k];

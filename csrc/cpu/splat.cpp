@@ -1,20 +1,95 @@
+// The CPU backend: it runs the rasterizer of kernels/ on tensors' memory.
 #include <ATen/ops/empty.h>
+#include <ATen/ops/empty_like.h>
+#include <ATen/ops/zeros.h>
+#include <ATen/ops/zeros_like.h>
 
+#include <algorithm>
+#include <cmath>
 #include <memory>
 #include <type_traits>
 #include <vector>
 
-#include "../arguments.h"
+#include "../backend.h"
 #include "../kernels/kernels.h"
-#include "../threads.h"
-#include "backend.h"
-#include "cpu.h"
+#include "../kernels/projection_params.h"
+#include "../kernels/raster.h"
+#include "../runtime.h"
+#include "../splat.h"
 #include "globalsplat-csrc/src/render.rs.h"
-#include "memory.h"
 
 namespace globalsplat {
 namespace cpu {
 namespace {
+
+// ---- tensors as plain memory ----
+
+// Calls body(0.) or body(0.f), depending on the type of the inputs.
+template <class Body>
+auto dispatch_by_type(const Inputs& in, Body body) {
+  return in.gaussians.means.scalar_type() == at::kDouble ? body(0.) : body(0.f);
+}
+
+// Returns the Gaussians, one item per scene.
+template <class T>
+std::vector<raster::Gaussians<T>> scenes_of(const Inputs& in) {
+  std::vector<raster::Gaussians<T>> scenes;
+  const Gaussians& g = in.gaussians;
+  const int64_t count = in.count(), bases = g.sh.size(2);
+  for (int64_t b = 0; b < in.scenes(); ++b)
+    scenes.push_back({g.means.data_ptr<T>() + b * count * 3, g.scales.data_ptr<T>() + b * count * 3,
+                      g.quaternions.data_ptr<T>() + b * count * 4, g.opacities.data_ptr<T>() + b * count,
+                      g.sh.data_ptr<T>() + b * count * bases * 3, count, int(bases)});
+  return scenes;
+}
+
+// Returns the gradients of Gaussians, one item per scene.
+template <class T>
+std::vector<raster::GaussianGradients<T>> gradients_of(const Gradients& of) {
+  std::vector<raster::GaussianGradients<T>> scenes;
+  const Gaussians& g = of.gaussians;
+  const int64_t count = g.means.size(1), bases = g.sh.size(2);
+  for (int64_t b = 0; b < g.means.size(0); ++b)
+    scenes.push_back({g.means.data_ptr<T>() + b * count * 3, g.scales.data_ptr<T>() + b * count * 3,
+                      g.quaternions.data_ptr<T>() + b * count * 4, g.opacities.data_ptr<T>() + b * count,
+                      g.sh.data_ptr<T>() + b * count * bases * 3,
+                      of.means2d.defined() ? of.means2d.data_ptr<T>() + b * of.means2d[0].numel() : nullptr});
+  return scenes;
+}
+
+// Returns the views, one item per camera of each scene.
+template <class T>
+std::vector<raster::View<T>> views_of(const Inputs& in) {
+  std::vector<raster::View<T>> views;
+  for (int64_t b = 0; b < in.scenes(); ++b)
+    for (int64_t c = 0; c < in.cameras(); ++c) {
+      const int64_t view = b * in.cameras() + c;
+      views.push_back({raster::camera_of(in.w2c.data_ptr<T>() + view * 16, in.intrinsics.data_ptr<T>() + view * 9), int(b)});
+    }
+  return views;
+}
+
+// Converts the gradients of views to the gradient of the op's w2c.
+template <class T>
+Tensor w2c_gradient(const Inputs& in, const std::vector<raster::CameraGradient<T>>& of_views) {
+  const Tensor out = at::zeros_like(in.w2c);
+  for (size_t k = 0; k < of_views.size(); ++k) {
+    T* m = out.data_ptr<T>() + k * 16;
+    for (int row = 0; row < 3; ++row) {
+      for (int column = 0; column < 3; ++column) m[4 * row + column] = of_views[k].numbers[3 * row + column];
+      m[4 * row + 3] = of_views[k].numbers[9 + row];
+    }
+  }
+  return out;
+}
+
+// Returns uninitialized tensors of the same shapes.
+Gaussians empty_like(const Gaussians& g) {
+  const auto empty = [](const Tensor& t) { return at::empty_like(t); };
+  return {empty(g.means), empty(g.scales), empty(g.quaternions), empty(g.opacities), empty(g.sh)};
+}
+
+// ---- splat ----
 
 // Times of this thread's last call and of its backward pass, which autograd runs on the thread that requested it.
 thread_local raster::StageTimes last_times;
@@ -47,8 +122,6 @@ std::unique_ptr<raster::Frame<T>> draw(const Inputs& in, RenderOutput& out, rast
   return raster::Frame<T>::draw(scenes_of<T>(in), views_of<T>(in), settings, pictures_of<T>(out), times);
 }
 
-}  // namespace
-
 RenderOutput splat(const Inputs& in, std::unique_ptr<const SavedState>& saved) {
   return dispatch_by_type(in, [&](auto number) {
     using T = decltype(number);
@@ -72,6 +145,122 @@ Gradients splat_backward(const Inputs& in, const RenderOutput& outputs, const Re
     return out;
   });
 }
+
+// ---- project ----
+
+// Cameras of each scene, and the splat of every Gaussian in each of them.
+template <class T>
+struct ProjectedScenes {
+  std::vector<raster::Gaussians<T>> scenes;
+  int64_t cameras;
+  std::vector<raster::ProjectionParams<T>> params;    // [scenes · cameras]
+  std::vector<std::vector<raster::Splat<T>>> splats;  // [scenes · cameras][N]
+
+  explicit ProjectedScenes(const Inputs& in) : scenes(scenes_of<T>(in)), cameras(in.cameras()) {
+    std::vector<raster::Splat<T>*> places;
+    for (const auto& view : views_of<T>(in)) {
+      params.push_back(raster::make_projection_params(view.camera, int(in.width), int(in.height), in.projection));
+      splats.emplace_back(size_t(in.count()));
+      places.push_back(splats.back().data());
+    }
+    for (size_t b = 0; b < scenes.size(); ++b)
+      raster::kernels().of<T>().project(scenes[b], 0, scenes[b].count, params.data() + int64_t(b) * cameras, cameras,
+                                        places.data() + int64_t(b) * cameras);
+  }
+
+  // Calls visit(view, index in [B, C, N], splat) for every visible pair.
+  template <class Visit>
+  void for_each_visible(Visit visit) const {
+    int64_t place = 0;
+    for (size_t view = 0; view < splats.size(); ++view)
+      for (const raster::Splat<T>& splat : splats[view]) {
+        if (splat.z > 0) visit(view, place, splat);
+        ++place;
+      }
+  }
+};
+
+template <class T>
+Projected project_as(const Inputs& in) {
+  const auto zeros = [&](std::vector<int64_t> tail, at::TensorOptions options) {
+    tail.insert(tail.begin(), {in.scenes(), in.cameras(), in.count()});
+    return at::zeros(tail, options);
+  };
+  const auto options = in.gaussians.means.options();
+  const Projected out{zeros({}, at::kLong), zeros({2}, options), zeros({3}, options), zeros({}, options), zeros({3}, options),
+                      zeros({}, options), zeros({2}, options)};
+  const auto put = [](const Tensor& to, int64_t at, std::initializer_list<T> values) {
+    std::copy(values.begin(), values.end(), to.data_ptr<T>() + int64_t(values.size()) * at);
+  };
+  ProjectedScenes<T>(in).for_each_visible([&](size_t, int64_t at, const raster::Splat<T>& s) {
+    // Σ2D⁻¹ = 2 ln 2·UᵀU with U = [[a, b], [0, c]].
+    const T two_ln2 = T(2 / raster::kLog2E);
+    out.visible.data_ptr<int64_t>()[at] = 1;
+    put(out.mean2d, at, {s.u, s.v});
+    put(out.conic, at, {two_ln2 * s.a * s.a, two_ln2 * s.a * s.b, two_ln2 * (s.b * s.b + s.c * s.c)});
+    put(out.depth, at, {s.z});
+    put(out.color, at, {s.red, s.green, s.blue});
+    put(out.opacity, at, {std::exp2(s.log2_opacity)});
+    // From the factor, since the inverse of a needle's conic loses all digits.
+    const T slope = s.b / s.c;
+    put(out.variance, at, {(1 + slope * slope) / (two_ln2 * s.a * s.a), 1 / (two_ln2 * s.c * s.c)});
+  });
+  return out;
+}
+
+template <class T>
+Gradients project_backward_as(const Inputs& in, const Projected& gradients, GradientRequest request) {
+  const ProjectedScenes<T> projected(in);
+  // One record per visible Gaussian: the sums over pixels that project_backward() converts to exactly these gradients.
+  const size_t views = projected.splats.size(), count = size_t(in.count());
+  std::vector<std::vector<raster::SplatGradient<T>>> records(views);
+  std::vector<std::vector<uint32_t>> first(views, std::vector<uint32_t>(count + 1, 0));
+  projected.for_each_visible([&](size_t view, int64_t at, const raster::Splat<T>& s) {
+    const T *d_mean = gradients.mean2d.data_ptr<T>() + 2 * at, *d_conic = gradients.conic.data_ptr<T>() + 3 * at;
+    const T* d_color = gradients.color.data_ptr<T>() + 3 * at;
+    // With Σ2D⁻¹ = 2 ln 2·UᵀU: ∂L/∂(u, v) = 2 ln 2·UᵀM, and W = 2UNUᵀ for N = ∂L/∂(Σ2D⁻¹), where the single value xy stands for two
+    // entries.
+    const T two_ln2 = T(2 / raster::kLog2E);
+    raster::SplatGradient<T> d{};
+    d.power_p = d_mean[0] / (two_ln2 * s.a);
+    d.power_r = (d_mean[1] - two_ln2 * s.b * d.power_p) / (two_ln2 * s.c);
+    d.power_pp = 2 * (s.a * s.a * d_conic[0] + s.a * s.b * d_conic[1] + s.b * s.b * d_conic[2]);
+    d.power_pr = s.a * s.c * d_conic[1] + 2 * s.b * s.c * d_conic[2];
+    d.power_rr = 2 * s.c * s.c * d_conic[2];
+    d.red = d_color[0];
+    d.green = d_color[1];
+    d.blue = d_color[2];
+    d.z = gradients.depth.data_ptr<T>()[at];
+    records[view].push_back(d);
+    first[view][size_t(at) % count + 1] = 1;
+  });
+  std::vector<raster::SplatRecords<T>> of_views;
+  for (size_t view = 0; view < views; ++view) {
+    for (size_t i = 0; i < count; ++i) first[view][i + 1] += first[view][i];
+    of_views.push_back({records[view].data(), first[view].data()});
+  }
+  Gradients out{empty_like(in.gaussians), {}, {}};
+  const auto places = gradients_of<T>(out);
+  std::vector<raster::CameraGradient<T>> cameras(request.w2c ? views : 0);
+  for (size_t b = 0; b < projected.scenes.size(); ++b) {
+    const int64_t view = int64_t(b) * projected.cameras;
+    raster::kernels().of<T>().project_backward(projected.scenes[b], 0, int64_t(count), projected.params.data() + view,
+                                               projected.cameras, of_views.data() + view, places[b],
+                                               request.w2c ? cameras.data() + view : nullptr);
+  }
+  if (request.w2c) out.w2c = w2c_gradient(in, cameras);
+  return out;
+}
+
+Projected project(const Inputs& in) {
+  return dispatch_by_type(in, [&](auto number) { return project_as<decltype(number)>(in); });
+}
+
+Gradients project_backward(const Inputs& in, const Projected& gradients, GradientRequest request) {
+  return dispatch_by_type(in, [&](auto number) { return project_backward_as<decltype(number)>(in, gradients, request); });
+}
+
+}  // namespace
 
 const Backend backend = {at::kCPU, splat, splat_backward, project, project_backward};
 

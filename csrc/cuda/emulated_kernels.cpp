@@ -3,7 +3,7 @@
 
 #include "kernels.cu"
 
-#include "emulated.h"
+#include "device.h"
 
 namespace globalsplat::cuda::emulated {
 namespace {

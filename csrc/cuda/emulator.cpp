@@ -12,7 +12,7 @@
 #include <string>
 #include <vector>
 
-#include "emulated.h"
+#include "device.h"
 
 // Sanitizers must be notified when stacks are switched. ThreadSanitizer must not instrument this file, but must be told which threads
 // synchronized.

@@ -34,6 +34,22 @@ Call call_of(const Arguments& of) {
 // Returns the number of starts of the tiles' lists, including the end of the last one.
 int64_t places_of_tiles(const Call& call) { return int64_t(call.views) * call.grid.tiles() + 1; }
 
+PhotometricPlanes planes_of(const raster::PhotometricJob<float>& job) {
+  PhotometricPlanes planes{job.pictures, job.photos, job.width, job.height, {}};
+  std::copy_n(raster::ssim_window<float>(), raster::kWindow, planes.window);
+  return planes;
+}
+
+// Throws if there are more blocks than a launch may have.
+Blocks blocks_of(int64_t count) {
+  if (count > std::numeric_limits<int32_t>::max()) throw std::length_error("a call compares at most 2 billion tiles of images");
+  return {count};
+}
+
+Blocks tiles_of(int64_t planes, int columns, int rows) {
+  return blocks_of(planes * ceil_div(columns, kLossColumns) * ceil_div(rows, kLossRows));
+}
+
 }  // namespace
 
 ProjectedScenes::ProjectedScenes(const Device& device, const Arguments& of, bool counts_tiles)
@@ -107,6 +123,36 @@ void Frame::backward(const Device& device, const Arguments& of, const RenderOutp
             as<Splat<float>>(projected_.splats), as<TileEntry>(entries_), as<uint32_t>(tile_start_), pictures, gradients,
             as<SplatGradient<float>>(records));
   projected_.backward(device, of, as<SplatGradient<float>>(records), as<uint32_t>(first_), out, w2c);
+}
+
+PartialSums photometric(const Device& device, const raster::PhotometricJob<float>& job, double l1_weight, double ssim_weight,
+                        float* gradient) {
+  const PhotometricPlanes planes = planes_of(job);
+  const int columns = job.width - raster::kWindow + 1, rows = job.height - raster::kWindow + 1;
+  const int64_t windows = int64_t(columns) * rows * job.planes, pixels = int64_t(job.width) * job.height * job.planes;
+  const double each_window = ssim_weight / double(windows), each_pixel = l1_weight / double(pixels);
+  const Blocks of_windows = ssim_weight != 0 ? tiles_of(job.planes, columns, rows) : Blocks{0};
+  const Blocks of_pixels = l1_weight != 0 || gradient != nullptr ? tiles_of(job.planes, job.width, job.height) : Blocks{0};
+  const int64_t count = of_windows.x + of_pixels.x;
+  const Memory numbers = allocate_array<double>(device, count);
+  const Memory slopes =
+      ssim_weight != 0 && gradient != nullptr ? allocate_array<float>(device, 3 * windows) : Memory();
+  double* const of_block = as<double>(numbers);
+  float* const of_window = as<float>(slopes);
+  GS_LAUNCH(device, gs_ssim, of_windows, kLossThreads, planes, each_window, of_window, of_block);
+  GS_LAUNCH(device, gs_fit_gradient, of_pixels, kLossThreads, planes, of_window, each_pixel, float(each_window), gradient,
+            of_block + of_windows.x);
+  return {numbers, count};
+}
+
+PartialSums depth_smoothness(const Device& device, const raster::SmoothnessJob<float>& job, double factor, float* gradient) {
+  const int64_t width = job.width, height = job.height;
+  const int64_t pairs = job.views * ((width - 1) * height + width * (height - 1));
+  const Blocks blocks = blocks_of((job.views * width * height + kLossThreads - 1) / kLossThreads);
+  const Memory numbers = allocate_array<double>(device, blocks.x);
+  GS_LAUNCH(device, gs_unevenness, blocks, kLossThreads, job, pairs > 0 ? factor / double(pairs) : 0, gradient,
+            as<double>(numbers));
+  return {numbers, blocks.x};
 }
 
 }  // namespace globalsplat::cuda

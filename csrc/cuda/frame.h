@@ -1,6 +1,8 @@
-// The rasterizer on a GPU, as a sequence of kernels in float32: the counterpart of raster::Frame.
+// The rasterizer and the image losses on a GPU, as sequences of kernels in float32: the counterparts of raster::Frame and of
+// ../kernels/jobs.h.
 #pragma once
 
+#include "../kernels/jobs.h"
 #include "device.h"
 
 namespace globalsplat::cuda {
@@ -49,5 +51,15 @@ class Frame {
   Memory entries_;     // TileEntry[count]: the lists of all tiles, consecutively
   Memory tile_start_;  // uint32_t[views · tiles + 1]: index of each list's first entry
 };
+
+// Partial sums on the device, whose total is a result.
+struct PartialSums {
+  Memory numbers;  // double[count]
+  int64_t count;
+};
+
+// Compute raster::photometric() and raster::depth_smoothness(); addresses are in the device's memory.
+PartialSums photometric(const Device&, const raster::PhotometricJob<float>&, double l1_weight, double ssim_weight, float* gradient);
+PartialSums depth_smoothness(const Device&, const raster::SmoothnessJob<float>&, double factor, float* gradient);
 
 }  // namespace globalsplat::cuda

@@ -1,4 +1,4 @@
-#include "backend.h"
+// The GPU backend, and the measurement of its kernels with events around every launch, which is off unless a benchmark turns it on.
 
 #include <ATen/TensorOperators.h>
 #include <ATen/ops/cat.h>
@@ -9,10 +9,17 @@
 #include <ATen/ops/where.h>
 #include <ATen/ops/zeros.h>
 #include <ATen/ops/zeros_like.h>
+#include <c10/core/Event.h>
 
+#include <algorithm>
+#include <atomic>
+#include <mutex>
 #include <vector>
 
+#include "../backend.h"
+#include "../splat.h"
 #include "frame.h"
+#include "globalsplat-csrc/src/render.rs.h"
 #include "torch_device.h"
 
 namespace globalsplat::cuda {
@@ -121,9 +128,30 @@ Gradients project_backward(const Inputs& in, const Projected& gradients, Gradien
   return out;
 }
 
+struct Launched {
+  const char* kernel;
+  c10::Event begin, end;
+};
+
+// Not thread-local, because the backward pass launches from one of autograd's threads.
+std::atomic<bool> measuring{false};
+std::mutex guard;
+std::vector<Launched> launched;
+
 constexpr Backend backend_on(at::DeviceType device) { return {device, splat, splat_backward, project, project_backward}; }
 
 }  // namespace
+
+void measured_launch(const char* kernel, const c10::Stream& stream, const std::function<void()>& launch) {
+  if (!measuring) return launch();
+  const auto event = [&] { return c10::Event(stream.device_type(), c10::EventFlag::BACKEND_DEFAULT); };
+  Launched one{kernel, event(), event()};
+  one.begin.record(stream);
+  launch();
+  one.end.record(stream);
+  const std::lock_guard<std::mutex> lock(guard);
+  launched.push_back(std::move(one));
+}
 
 const Backend backend = backend_on(at::kCUDA);
 
@@ -133,3 +161,29 @@ const Backend* emulated_backend() {
 }
 
 }  // namespace globalsplat::cuda
+
+namespace globalsplat {
+
+void measure_kernels(bool on) {
+  const std::lock_guard<std::mutex> lock(cuda::guard);
+  cuda::launched.clear();
+  cuda::measuring = on;
+}
+
+rust::Vec<KernelTime> kernel_times() {
+  const std::lock_guard<std::mutex> lock(cuda::guard);
+  rust::Vec<KernelTime> times;
+  for (const cuda::Launched& one : cuda::launched) {
+    one.end.synchronize();
+    const auto same = [&](const KernelTime& time) { return time.kernel == one.kernel; };
+    auto known = std::find_if(times.begin(), times.end(), same);
+    if (known == times.end()) {
+      times.push_back({one.kernel, 0});
+      known = times.end() - 1;
+    }
+    known->milliseconds += one.begin.elapsedTime(one.end);
+  }
+  return times;
+}
+
+}  // namespace globalsplat

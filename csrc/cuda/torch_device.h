@@ -5,15 +5,15 @@
 #include <ATen/ops/empty.h>
 #include <ATen/ops/from_blob.h>
 #include <c10/core/DeviceGuard.h>
+#include <c10/core/Stream.h>
 #include <c10/core/impl/VirtualGuardImpl.h>
 
 #include <cstdlib>
+#include <functional>
 #include <memory>
 
 #include "device.h"
-#include "emulated.h"
 #include "globalsplat-csrc/src/cuda.rs.h"
-#include "kernel_times.h"
 
 namespace globalsplat::cuda {
 
@@ -21,6 +21,9 @@ namespace globalsplat::cuda {
 inline at::Tensor tensor_of(const void* memory, at::IntArrayRef size, const at::TensorOptions& options) {
   return at::for_blob(const_cast<void*>(memory), size).options(options).target_device(options.device()).make_tensor();
 }
+
+// Calls `launch`, which launches one kernel in `stream`, and measures it if measurement is on.
+void measured_launch(const char* kernel, const c10::Stream& stream, const std::function<void()>& launch);
 
 // GPU of a tensor: memory from torch's allocator, kernels in torch's current stream.
 class Gpu : public Device {

@@ -1,4 +1,4 @@
-#include "depth_search.h"
+#include "jobs.h"
 
 #include <algorithm>
 

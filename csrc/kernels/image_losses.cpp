@@ -1,4 +1,4 @@
-#include "image_losses.h"
+#include "jobs.h"
 
 #include <algorithm>
 #include <cmath>

@@ -20,7 +20,7 @@ struct KernelsOf {
   void (*project_backward)(const Gaussians<T>&, int64_t begin, int64_t end, const ProjectionParams<T>* params, int64_t views,
                            const SplatRecords<T>* records, const GaussianGradients<T>& out,
                            CameraGradient<T>* cameras);
-  // Kernels outside of the rasterizer: ssim.h, smoothness.h, adam.h.
+  // Kernels outside of the rasterizer: ssim.h, smoothness.h, optim.h.
   double (*ssim)(const PhotometricPlane<T>&, int begin, int end, T* scratch);
   double (*photometric_gradient)(const PhotometricPlane<T>&, T l1_weight, T ssim_weight, int begin, int end, T* scratch);
   double (*unevenness)(const SmoothnessPlane<T>&, T factor, int begin, int end, T* scratch);
@@ -42,7 +42,7 @@ struct Kernels {
                             const PackedBf16Queries& to);
   void (*attention_backward_bf16)(const AttentionHead<Bf16>&, const Bf16Gemm&, const PackedBf16Queries&, float* dq, Rows<Bf16> dk,
                                   Rows<Bf16> dv, float* scratch);
-  void (*muon)(const MuonStep&, const MuonMatrix&, float* scratch);  // muon.h
+  void (*muon)(const MuonStep&, const MuonMatrix&, float* scratch);  // optim.h
   // plane_sweep.h
   void (*sweep_planes)(const PlaneSweep&, int begin, int end, float* scores, float* scratch);
   void (*patch_variances)(const SweepPhoto&, float least_variance, float* variance, float* scratch);

@@ -1,9 +1,8 @@
 // Compiled once per instruction set: GS_ISA is its name, and compiler flags enable it.
-#include "adam.h"
 #include "attention_bf16.h"
 #include "blend.h"
 #include "kernels.h"
-#include "muon.h"
+#include "optim.h"
 #include "plane_sweep.h"
 #include "project.h"
 #include "semi_global.h"

@@ -1,4 +1,4 @@
-#include "optim.h"
+#include "jobs.h"
 
 #include <algorithm>
 

@@ -275,7 +275,7 @@ inline constexpr int64_t variance_scratch_size(const SweepPhoto& photo) {
   return stride * (photo.height + 1) + sweep_buffers_size(photo.width);
 }
 
-// Parameters of a step of Adam that all elements share; see adam.h.
+// Parameters of a step of Adam that all elements share; see optim.h.
 struct AdamStep {
   double step_size, bias_correction2_sqrt, decay;
   double beta1, beta2, epsilon;
@@ -290,7 +290,7 @@ struct AdamState {
   T* second;
 };
 
-// Parameters of a step of Muon that all matrices share; and a matrix, its gradient and the gradient's running mean; see muon.h. Row-major.
+// Parameters of a step of Muon that all matrices share; and a matrix, its gradient and the gradient's running mean; see optim.h. Row-major.
 struct MuonStep {
   double rate, decay, beta;
 };

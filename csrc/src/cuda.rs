@@ -5,12 +5,10 @@ mod cache;
 mod compile;
 mod gpu;
 mod libraries;
-mod resources;
 
 pub use cache::cache_folder;
-pub use compile::{CodeFormat, Compiled, MIN_ARCHITECTURE, Nvrtc};
+pub use compile::{CodeFormat, Compiled, KernelResources, MIN_ARCHITECTURE, Nvrtc, parse_resources};
 pub use gpu::{Driver, Gpu, KernelOrigin, load_kernels};
-pub use resources::{KernelResources, parse_resources};
 
 use gpu::launch_kernel;
 

@@ -1,8 +1,11 @@
 //! The splat ops. Tensors are passed as addresses of `at::Tensor`, which is tch's `C_tensor`.
+//!
+//! # Safety
+//! Every unsafe function requires that the arguments hold addresses of live tensors.
 
 pub use ffi::*;
 
-// Clippy doesn't see the safety sections inside of a bridge.
+// The safety section of the module holds for all functions.
 #[allow(clippy::missing_safety_doc)]
 #[cxx::bridge(namespace = "globalsplat")]
 mod ffi {
@@ -71,57 +74,33 @@ mod ffi {
     }
 
     unsafe extern "C++" {
-        include!("cpu/cpu.h");
-        include!("cuda/kernel_times.h");
         include!("splat.h");
-        include!("threads.h");
 
         /// Renders Gaussians; see `csrc/splat.h`.
-        ///
-        /// # Safety
-        /// The arguments must hold addresses of live tensors.
         unsafe fn splat(of: &SplatArguments, out: &mut [usize]) -> Result<()>;
 
         /// Projects Gaussians; see `csrc/splat.h`.
-        ///
-        /// # Safety
-        /// The arguments must hold addresses of live tensors.
         unsafe fn project(of: &SplatArguments, out: &mut [usize]) -> Result<()>;
 
         /// Evaluates the first `out.len()` (1, 4, 9 or 16) spherical harmonics at a unit vector.
         fn sh_basis(direction: &[f64; 3], out: &mut [f64]);
 
-        /// Returns the version of the libtorch whose headers this was compiled with.
-        fn libtorch_version() -> String;
-
-        /// Removes stack traces from libtorch's errors; see `csrc/splat.h`.
-        fn disable_stack_traces();
-
-        /// Counts the pairs that a call has to blend; see `csrc/cpu/cpu.h`.
-        ///
-        /// # Safety
-        /// The arguments must hold addresses of live tensors.
+        /// Counts the pairs that a call has to blend; see `csrc/splat.h`.
         unsafe fn count_pairs(of: &SplatArguments) -> Result<PairCounts>;
 
-        /// Measures the peak rate of multiply-adds; see `csrc/cpu/cpu.h`.
+        /// Measures the peak rate of multiply-adds; see `csrc/splat.h`.
         fn multiply_add_peak(seconds: f64) -> f64;
 
-        /// Returns the stage times of this thread's last call; see `csrc/cpu/cpu.h`.
+        /// Returns the stage times of this thread's last call; see `csrc/splat.h`.
         fn stage_times() -> StageTimes;
 
-        /// Starts or ends the measurement of GPU kernels; see `csrc/cuda/kernel_times.h`.
+        /// Starts or ends the measurement of GPU kernels; see `csrc/splat.h`.
         fn measure_kernels(on: bool);
 
-        /// Returns the measured times of GPU kernels; see `csrc/cuda/kernel_times.h`.
+        /// Returns the measured times of GPU kernels; see `csrc/splat.h`.
         fn kernel_times() -> Result<Vec<KernelTime>>;
 
-        /// Returns the instruction set of the CPU kernels in use; see `csrc/cpu/cpu.h`.
+        /// Returns the instruction set of the CPU kernels in use; see `csrc/splat.h`.
         fn simd_level() -> Result<String>;
-
-        /// Returns the number of threads of our own kernels; see `csrc/threads.h`.
-        fn get_num_threads() -> i32;
-
-        /// Sets the number of threads of our own kernels; see `csrc/threads.h`.
-        fn set_num_threads(count: i32);
     }
 }

@@ -123,7 +123,7 @@ pub fn main() -> ExitCode {
         }
     };
     // Denormals halve the speed of training on some processors. This must precede the start of other threads.
-    globalsplat_csrc::processor::flush_denormals();
+    globalsplat_csrc::runtime::flush_denormals();
     // Errors of libtorch that the library's own checks don't catch arrive as panics: the user still gets one sentence, and with
     // RUST_BACKTRACE=1 a backtrace.
     panic::set_hook(Box::new(|panic| {
@@ -158,7 +158,7 @@ impl Command {
     /// Runs the command. A failure is returned as its exit code and the message for the user, unless another process prints it.
     fn run_to_end(self) -> Result<(), (u8, Option<String>)> {
         // Errors stay one sentence.
-        globalsplat_csrc::render::disable_stack_traces();
+        globalsplat_csrc::runtime::disable_stack_traces();
         let result = panic::catch_unwind(panic::AssertUnwindSafe(|| {
             if !self.is_shared() {
                 distributed::require_single_process()?;

@@ -1,7 +1,7 @@
 //! Memory use of the process and of its tensors on a GPU.
 
 use crate::render::cuda::Driver;
-use globalsplat_csrc::device as ffi;
+use globalsplat_csrc::runtime as ffi;
 use std::path::{Path, PathBuf};
 use tch::Device;
 

@@ -11,7 +11,7 @@ pub use memory::{peak_memory_bytes, total_memory_bytes};
 use crate::error::Result;
 use crate::ffi::{take_output_list, take_outputs};
 use cxx::UniquePtr;
-use globalsplat_csrc::device as ffi;
+use globalsplat_csrc::runtime as ffi;
 use std::fmt;
 use std::time::{Duration, Instant};
 use tch::{Device, Kind, Tensor};

@@ -3,7 +3,7 @@
 use crate::data::ViewBatch;
 use crate::ffi::take_outputs;
 use crate::model::{MAX_SCALE, RawOutputs};
-use globalsplat_csrc::image_losses;
+use globalsplat_csrc::tensor_ops;
 use tch::{Kind, Tensor};
 
 // L_mse: ‖I − Î‖² per element (spec 7.2).
@@ -42,7 +42,7 @@ pub fn photometric(image: &Tensor, ground_truth: &Tensor, l1_weight: f64, ssim_w
     let (image, ground_truth) = (image.as_ptr() as usize, ground_truth.as_ptr() as usize);
     // SAFETY: the tensors outlive the call, and on success the C++ side has stored a new tensor in `out`.
     let done = unsafe {
-        take_outputs(|out| image_losses::photometric(image, ground_truth, l1_weight, ssim_weight, out))
+        take_outputs(|out| tensor_ops::photometric(image, ground_truth, l1_weight, ssim_weight, out))
     };
     let [loss] = done.unwrap_or_else(|error| panic!("{error}"));
     loss
@@ -229,7 +229,7 @@ pub fn sh_soft_cap(sh: &Tensor) -> Tensor {
 pub fn depth_smoothness(depths: &Tensor, photos: &Tensor, factor: f64) -> Tensor {
     let (depths, photos) = (depths.as_ptr() as usize, photos.as_ptr() as usize);
     // SAFETY: the tensors outlive the call, and on success the C++ side has stored a new tensor in `out`.
-    let done = unsafe { take_outputs(|out| image_losses::depth_smoothness(depths, photos, factor, out)) };
+    let done = unsafe { take_outputs(|out| tensor_ops::depth_smoothness(depths, photos, factor, out)) };
     let [loss] = done.unwrap_or_else(|error| panic!("{error}"));
     loss
 }

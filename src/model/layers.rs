@@ -1,8 +1,8 @@
 //! Layers that the model is built from, with the initializations of spec 4.4. Each records the time and the work of its part of a pass.
 
 use super::precision::{Precision, record_flops};
-use globalsplat_csrc::attention as ours;
-use globalsplat_csrc::processor::{Bf16Support, cpu_bf16_support};
+use globalsplat_csrc::runtime::{Bf16Support, cpu_bf16_support};
+use globalsplat_csrc::tensor_ops as ours;
 use std::cell::Cell;
 use tch::{Device, Kind, Tensor, nn, nn::Module};
 use tracing::trace_span;
@@ -196,7 +196,8 @@ fn attention_libtorch(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use globalsplat_csrc::render::{set_num_threads, simd_level};
+    use globalsplat_csrc::render::simd_level;
+    use globalsplat_csrc::runtime::set_num_threads;
     use globalsplat_test_kit::exit_code_of_test;
     use std::path::Path;
     use tch::no_grad;

@@ -226,7 +226,7 @@ pub(crate) fn backward_from_grads(outputs: &[(&Tensor, &Tensor)]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use globalsplat_csrc::ops::{computing, record_outermost_ops, without_own_linear_layers};
+    use globalsplat_csrc::runtime::{computing, record_outermost_ops, without_own_linear_layers};
 
     fn narrow() -> ModelConfig {
         ModelConfig {

@@ -1,7 +1,7 @@
 //! Precision of matrix products (spec 1.3), and the products themselves, which record their floating-point operations.
 
-use globalsplat_csrc::linear::linear;
-use globalsplat_csrc::processor::{Bf16Support, cpu_bf16_support, gpu_has_bf16};
+use globalsplat_csrc::runtime::{Bf16Support, cpu_bf16_support, gpu_has_bf16};
+use globalsplat_csrc::tensor_ops::linear;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;

@@ -5,7 +5,9 @@ mod muon;
 
 use crate::error::{Error, Result};
 use crate::ffi::take_outputs;
-use globalsplat_csrc::optim::{self as ffi, AdamArguments, AdamWOptions, adam, fused_adamw, norm, scale};
+use globalsplat_csrc::tensor_ops::{
+    self as ffi, AdamArguments, AdamWOptions, adam, fused_adamw, norm, scale,
+};
 use muon::Matrices;
 use std::collections::BTreeMap;
 use std::path::Path;

@@ -2,7 +2,7 @@
 //! all about equal. So directions with small gradients are learned as fast as others (spec 8.5).
 
 use super::addresses;
-use globalsplat_csrc::optim::{self as ffi, MuonOptions};
+use globalsplat_csrc::tensor_ops::{self as ffi, MuonOptions};
 use std::collections::BTreeMap;
 use tch::{Device, Kind, Tensor, no_grad};
 
@@ -119,7 +119,7 @@ mod tests {
 
     #[test]
     fn any_number_of_threads_gives_the_same_bits() {
-        use globalsplat_csrc::render::set_num_threads;
+        use globalsplat_csrc::runtime::set_num_threads;
         let expected = stepped(Kind::Float, update, 3);
         for threads in [1, 2, 3] {
             set_num_threads(threads);

@@ -258,7 +258,7 @@ mod tests {
     use crate::render::DEFAULT_EPS2D;
     use crate::scene::{Intrinsics, RawGaussians};
     use glam::{DMat4, DVec3};
-    use globalsplat_csrc::ops::{WAITING, computing, record_ops, record_outermost_ops};
+    use globalsplat_csrc::runtime::{WAITING, computing, record_ops, record_outermost_ops};
     use tch::Device;
 
     const SIDE: i64 = 64;

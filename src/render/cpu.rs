@@ -3,10 +3,10 @@
 use super::{Cameras, arguments};
 use crate::error::Result;
 use crate::scene::Gaussians;
-use globalsplat_csrc::render as ffi;
+use globalsplat_csrc::{render as ffi, runtime};
 
 pub use ffi::{PairCounts, StageTimes, multiply_add_peak, stage_times};
-pub use globalsplat_csrc::processor::libtorch_simd_level;
+pub use globalsplat_csrc::runtime::libtorch_simd_level;
 
 /// Returns the instruction set of the rasterizer's kernels: `avx512`, `avx2`, `neon` or `portable`.
 ///
@@ -37,8 +37,8 @@ pub struct KernelThreads {
 impl KernelThreads {
     /// Limits libtorch to one thread until the guard is dropped.
     pub fn take() -> Self {
-        let (libtorch, own) = (tch::get_num_threads(), ffi::get_num_threads());
-        ffi::set_num_threads(own);
+        let (libtorch, own) = (tch::get_num_threads(), runtime::get_num_threads());
+        runtime::set_num_threads(own);
         tch::set_num_threads(1);
         KernelThreads { libtorch, own }
     }
@@ -47,6 +47,6 @@ impl KernelThreads {
 impl Drop for KernelThreads {
     fn drop(&mut self) {
         tch::set_num_threads(self.libtorch);
-        ffi::set_num_threads(if self.own == self.libtorch { 0 } else { self.own });
+        runtime::set_num_threads(if self.own == self.libtorch { 0 } else { self.own });
     }
 }

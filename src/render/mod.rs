@@ -158,5 +158,5 @@ fn arguments(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> SplatArgum
 
 /// Returns the version of libtorch that this program was built with.
 pub fn libtorch_version() -> String {
-    ffi::libtorch_version()
+    globalsplat_csrc::runtime::libtorch_version()
 }

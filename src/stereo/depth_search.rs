@@ -4,7 +4,7 @@
 use crate::ffi::take_outputs;
 use crate::scene::{Camera, Intrinsics};
 use glam::{DMat3, DVec3};
-use globalsplat_csrc::depth_search::{self as kernel, PhotoToCompare};
+use globalsplat_csrc::tensor_ops::{self as kernel, PhotoToCompare};
 use tch::{Kind, Tensor};
 
 /// Side in pixels of the patches that are compared, the minimum of a photo's sides.

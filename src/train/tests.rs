@@ -12,7 +12,7 @@ use crate::model::{ModelConfig, Precision, Stage, Streams};
 use crate::render::{DEFAULT_EPS2D, render};
 use crate::scene::{Camera, Intrinsics};
 use glam::{DMat4, DVec3};
-use globalsplat_csrc::ops::{count_device_copies, record_ops};
+use globalsplat_csrc::runtime::{count_device_copies, record_ops};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeMap;

@@ -171,7 +171,7 @@ pub(super) fn synthetic_scene(config: &Config, seed: u64) -> LoadedScene {
 mod tests {
     use super::*;
     use crate::train::MemoryEstimate;
-    use globalsplat_csrc::tensor_memory::peak_tensor_bytes;
+    use globalsplat_csrc::runtime::peak_tensor_bytes;
     use std::path::Path;
 
     /// Returns the estimate for a step of `settings`, divided by the measured peak.
