@@ -4,7 +4,7 @@ use crate::geometry::{Camera, ImageSize, check_pose, nearest_rigid_of_scaled};
 use crate::holdout::Holdout;
 use crate::image_source::ImageSource;
 use crate::lens::{Distortion, Lens, LensModel, PhotoPart, PinholeView, Projection, split_into_views};
-use crate::photos::{find_masks_in, format_names};
+use crate::photos::{find_masks_in, format_names, part_name, unique_stems};
 use crate::pixels::{
     DecodedPhoto, Planes, Undistorter, ViewPixels, decode_photo, encode_photo, grey_to_rgb,
     has_alpha_channel, multiply, read_image_size, read_mask, resize_and_crop, source_ranges,
@@ -14,9 +14,9 @@ use globalsplat_files::{Error, InputFiles, Result, parent_of, split_keyed_path};
 use image::{GrayImage, RgbImage};
 use rayon::prelude::*;
 use std::borrow::Cow;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::ops::Range;
-use std::path::{Component, Path, PathBuf};
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// A photo whose pixels are not loaded.
@@ -252,10 +252,17 @@ impl Capture {
             };
             return Err(Error::input(&file, field, found, expected));
         }
-        let (frames_file, is_complete) = (file.clone(), true);
-        let empty =
-            Capture { name, file, frames: vec![], views: vec![], train: 0, is_complete, warnings: vec![] };
-        let capture = empty.with_test(&frames_file, frames, changes, purpose)?;
+        let described = file.clone();
+        let empty = Capture {
+            name,
+            file,
+            frames: vec![],
+            views: vec![],
+            train: 0,
+            is_complete: true,
+            warnings: vec![],
+        };
+        let capture = empty.with_test(&described, frames, changes, purpose)?;
         Ok(Capture { train: capture.views.len(), ..capture })
     }
 
@@ -366,11 +373,6 @@ impl Capture {
         self.views.len()
     }
 
-    /// Returns the number of photos.
-    pub fn photo_count(&self) -> usize {
-        self.frames.len()
-    }
-
     /// Returns `true` if there are no views, which never happens: a capture has at least one camera.
     pub fn is_empty(&self) -> bool {
         self.views.is_empty()
@@ -413,7 +415,7 @@ impl Capture {
     /// Returns names like [`Capture::render_names`] for several images of each view, whose names end in `suffixes`. No two of the
     /// names with suffixes are equal.
     pub fn render_names_with(&self, suffixes: &[&str]) -> Vec<String> {
-        render_names(&self.names().collect::<Vec<_>>(), suffixes)
+        unique_stems(&self.names().collect::<Vec<_>>(), suffixes)
     }
 
     /// Returns the number of photos with a mask: a file, or an alpha channel by their header.
@@ -718,16 +720,6 @@ fn views_of_frames(file: &Path, frames: &[Frame], purpose: Purpose) -> Result<(V
     Ok((views, lines))
 }
 
-/// Returns the name of the part `suffix` of photo `name`, with `suffix` before the name's extension.
-fn part_name(name: &str, suffix: &str) -> String {
-    let start = name.rfind('/').map_or(0, |slash| slash + 1);
-    let end = name[start..].rfind('.').filter(|&dot| dot > 0).map_or(name.len(), |dot| start + dot);
-    match suffix {
-        "" => name.into(),
-        _ => format!("{}@{suffix}{}", &name[..end], &name[end..]),
-    }
-}
-
 /// Returns the existing file in `path`, which may end in `#` and the key of one of the file's scenes.
 fn description_file(path: &Path) -> PathBuf {
     let files = split_keyed_path(path).rev().map(|(file, _)| file);
@@ -754,7 +746,7 @@ fn check_frames(
 /// returns a line about it. A photo whose size can't be read keeps its camera; loading it reports the error.
 fn fit_cameras_to_photos(file: &Path, frames: &mut [Frame]) -> Option<String> {
     let scaled = |frame: &Frame| match &frame.image {
-        ImageLocation::File(path) => scaled_to(&frame.camera, read_image_size(path).ok()?),
+        ImageLocation::File(path) => frame.camera.scaled_to(read_image_size(path).ok()?),
         ImageLocation::Bytes { .. } | ImageLocation::Source { .. } => None,
     };
     let scaled: Vec<_> = frames.par_iter().map(scaled).collect();
@@ -781,26 +773,6 @@ fn fit_cameras_to_photos(file: &Path, frames: &mut [Frame]) -> Option<String> {
     ))
 }
 
-/// Returns `camera` scaled to a photo of size (width, height) if that size differs from the camera's and the aspect ratios agree to
-/// within a pixel of the smaller image. The size may also agree with width and height swapped, because loading may rotate a photo.
-fn scaled_to(camera: &Camera, (width, height): (u32, u32)) -> Option<Camera> {
-    let said = (camera.width, camera.height);
-    let choices = [(width, height), (height, width)];
-    if choices.contains(&said) {
-        return None;
-    }
-    let shares = |a: u32, b: u32| f64::from(a.min(b)) / f64::from(a.max(b));
-    let agrees = |&(width, height): &(u32, u32)| {
-        let (x, y) = (shares(width, said.0), shares(height, said.1));
-        let is_one_way = (width <= said.0) == (height <= said.1) || x == 1. || y == 1.;
-        let pixel = |a: u32, b: u32| 1. / f64::from(a.max(b));
-        is_one_way && (x - y).abs() <= pixel(width, said.0) + pixel(height, said.1)
-    };
-    let (width, height) = choices.into_iter().find(agrees)?;
-    let (x, y) = (f64::from(width) / f64::from(said.0), f64::from(height) / f64::from(said.1));
-    Some(Camera { intrinsics: camera.intrinsics.resized(x, y), width, height, ..*camera })
-}
-
 /// Checks that the masks of `frames` have the sizes of their photos up to a factor. Returns a line about those that have another size.
 fn check_masks(file: &Path, frames: &[Frame]) -> Result<Option<String>> {
     let is_resized = |frame: &Frame| -> Result<bool> {
@@ -811,7 +783,7 @@ fn check_masks(file: &Path, frames: &[Frame]) -> Result<Option<String>> {
         if has_size(frame.camera) {
             return Ok(false);
         }
-        if scaled_to(&frame.camera, size).is_some_and(has_size) {
+        if frame.camera.scaled_to(size).is_some_and(has_size) {
             return Ok(true);
         }
         let found = format!("{}×{} pixels", size.0, size.1);
@@ -833,32 +805,6 @@ fn check_masks(file: &Path, frames: &[Frame]) -> Result<Option<String>> {
     }))
 }
 
-fn render_names(names: &[&str], suffixes: &[&str]) -> Vec<String> {
-    let plain = |part: Component| match part {
-        Component::Normal(name) => Some(name.to_string_lossy().into_owned()),
-        Component::ParentDir => Some("up".to_string()),
-        _ => None,
-    };
-    let paths: Vec<Vec<String>> =
-        names.iter().map(|name| Path::new(name).components().filter_map(plain).collect()).collect();
-    let folders = || paths.iter().map(|path| &path[..path.len().saturating_sub(1)]);
-    let shared = |depth: &usize| {
-        let first = paths[0].get(*depth);
-        folders().all(|folder| folder.get(*depth).is_some_and(|name| Some(name) == first))
-    };
-    let skipped = if paths.is_empty() { 0 } else { (0..).take_while(shared).count() };
-    let below = |path: &Vec<String>| path[skipped..].join("/");
-    let stem = |path: &Vec<String>| Path::new(&below(path)).with_extension("").to_string_lossy().into_owned();
-    let numbered = |index: usize| format!("{index:06}");
-    let choices: [Vec<String>; 2] = [paths.iter().map(stem).collect(), paths.iter().map(below).collect()];
-    let is_unique = |names: &Vec<String>| {
-        let files =
-            names.iter().flat_map(|name| suffixes.iter().map(move |suffix| format!("{name}{suffix}")));
-        files.collect::<BTreeSet<_>>().len() == names.len() * suffixes.len()
-    };
-    choices.into_iter().find(is_unique).unwrap_or_else(|| (0..names.len()).map(numbered).collect())
-}
-
 /// Checks that poses are rigid and that intrinsics are valid.
 pub(crate) fn check_cameras<'a>(file: &Path, cameras: impl Iterator<Item = &'a Camera>) -> Result<()> {
     for (i, camera) in cameras.enumerate() {
@@ -871,50 +817,4 @@ pub(crate) fn check_cameras<'a>(file: &Path, cameras: impl Iterator<Item = &'a C
             .map_err(|(name, found, expected)| Error::input(file, field(name), found, expected))?;
     }
     Ok(())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::{render_names, scaled_to};
-    use crate::geometry::{Camera, Intrinsics};
-    use glam::DMat4;
-
-    #[test]
-    fn cameras_are_scaled_where_the_aspect_agrees_to_a_pixel() {
-        let intrinsics = Intrinsics { fx: 500., fy: 510., cx: 250., cy: 180. };
-        let camera = Camera { intrinsics, c2w: DMat4::IDENTITY, width: 519, height: 339 };
-        let size = |photo| scaled_to(&camera, photo).map(|camera| (camera.width, camera.height));
-        for photo in [(519, 339), (339, 519), (519, 300), (260, 180), (600, 339), (64, 64), (1038, 600)] {
-            assert_eq!(size(photo), None, "{photo:?}");
-        }
-        // Halves and eighths, rounded down or up; twice the size; one row more. Below: width and height swapped.
-        for photo in [(259, 169), (260, 170), (64, 42), (65, 42), (1038, 678), (1037, 678), (519, 340)] {
-            assert_eq!(size(photo), Some(photo), "{photo:?}");
-        }
-        assert_eq!(size((170, 260)), Some((260, 170)));
-        let half = scaled_to(&Camera { width: 512, height: 340, ..camera }, (256, 170)).unwrap();
-        assert_eq!(half.intrinsics, Intrinsics { fx: 250., fy: 255., cx: 125., cy: 90. });
-    }
-
-    #[test]
-    fn pictures_are_named_as_photos_and_none_twice() {
-        let (one, depth): (&[&str], &[&str]) = (&[""], &["", "_depth"]);
-        let cases: [(&[&str], &[&str], &[&str]); 12] = [
-            (&["images/000.png", "images/001.png"], one, &["000", "001"]),
-            (&["./images/left/0.png", "./images/right/0.png"], one, &["left/0", "right/0"]),
-            (&["left/0.png", "1.png"], one, &["left/0", "1"]),
-            (&["a/0.png", "a/0.jpg"], one, &["0.png", "0.jpg"]),
-            (&["0.v1.png", "0.v2.png"], one, &["0.v1", "0.v2"]),
-            (&["../a/0.png", "b/0.png"], one, &["up/a/0", "b/0"]),
-            (&["0.png", "0.png"], one, &["000000", "000001"]),
-            (&["000000", "000001"], one, &["000000", "000001"]),
-            (&[], one, &[]),
-            (&["x.png", "y.png"], depth, &["x", "y"]),
-            (&["x.png", "x_depth.png"], depth, &["x.png", "x_depth.png"]),
-            (&["x", "x_depth"], depth, &["000000", "000001"]),
-        ];
-        for (names, suffixes, expected) in cases {
-            assert_eq!(render_names(names, suffixes), expected, "{names:?}");
-        }
-    }
 }

@@ -1,4 +1,4 @@
-//! Files of photos and masks: the search for those that a capture names, folders of photos without poses, and the order of names.
+//! Files of photos and masks: the search for those that a capture names, folders of photos without poses, and the order and forms of names.
 
 use crate::pixels::{PHOTO_EXTENSIONS, SUPPORTED_IMAGES, read_image_size};
 use globalsplat_files::{Error, Result};
@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use std::cmp::Ordering;
 use std::collections::BTreeSet;
 use std::ffi::OsStr;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 /// Name of the folder of masks, beside or in the folder of photos.
 pub const MASKS_FOLDER: &str = "masks";
@@ -241,6 +241,44 @@ pub(crate) fn format_names(names: &[impl AsRef<str>]) -> String {
     }
 }
 
+/// Returns the name of the part `suffix` of photo `name`, with `suffix` before the name's extension.
+pub(crate) fn part_name(name: &str, suffix: &str) -> String {
+    let start = name.rfind('/').map_or(0, |slash| slash + 1);
+    let end = name[start..].rfind('.').filter(|&dot| dot > 0).map_or(name.len(), |dot| start + dot);
+    match suffix {
+        "" => name.into(),
+        _ => format!("{}@{suffix}{}", &name[..end], &name[end..]),
+    }
+}
+
+/// Returns a unique name without extension for each of `names`, such that no two of the names followed by one of `suffixes` are equal. The
+/// names are relative to the deepest folder that contains all of them. They keep their extensions if they aren't unique otherwise, and
+/// numbers replace them if they aren't even then.
+pub(crate) fn unique_stems(names: &[&str], suffixes: &[&str]) -> Vec<String> {
+    let plain = |part: Component| match part {
+        Component::Normal(name) => Some(name.to_string_lossy().into_owned()),
+        Component::ParentDir => Some("up".to_string()),
+        _ => None,
+    };
+    let paths: Vec<Vec<String>> =
+        names.iter().map(|name| Path::new(name).components().filter_map(plain).collect()).collect();
+    let shared = |path: &Vec<String>| {
+        let folders = path[..path.len().saturating_sub(1)].iter();
+        folders.zip(&paths[0]).take_while(|(folder, first)| folder == first).count()
+    };
+    let skipped = paths.iter().map(shared).min().unwrap_or(0);
+    let below = |path: &Vec<String>| path[skipped..].join("/");
+    let stem = |path: &Vec<String>| Path::new(&below(path)).with_extension("").to_string_lossy().into_owned();
+    let choices: [Vec<String>; 2] = [paths.iter().map(stem).collect(), paths.iter().map(below).collect()];
+    let is_unique = |names: &Vec<String>| {
+        let files =
+            names.iter().flat_map(|name| suffixes.iter().map(move |suffix| format!("{name}{suffix}")));
+        files.collect::<BTreeSet<_>>().len() == names.len() * suffixes.len()
+    };
+    let numbers = || (0..names.len()).map(|index| format!("{index:06}")).collect();
+    choices.into_iter().find(is_unique).unwrap_or_else(numbers)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -296,6 +334,28 @@ mod tests {
                     "{a} {b}"
                 );
             }
+        }
+    }
+
+    #[test]
+    fn pictures_are_named_as_photos_and_none_twice() {
+        let (one, depth): (&[&str], &[&str]) = (&[""], &["", "_depth"]);
+        let cases: [(&[&str], &[&str], &[&str]); 12] = [
+            (&["images/000.png", "images/001.png"], one, &["000", "001"]),
+            (&["./images/left/0.png", "./images/right/0.png"], one, &["left/0", "right/0"]),
+            (&["left/0.png", "1.png"], one, &["left/0", "1"]),
+            (&["a/0.png", "a/0.jpg"], one, &["0.png", "0.jpg"]),
+            (&["0.v1.png", "0.v2.png"], one, &["0.v1", "0.v2"]),
+            (&["../a/0.png", "b/0.png"], one, &["up/a/0", "b/0"]),
+            (&["0.png", "0.png"], one, &["000000", "000001"]),
+            (&["000000", "000001"], one, &["000000", "000001"]),
+            (&[], one, &[]),
+            (&["x.png", "y.png"], depth, &["x", "y"]),
+            (&["x.png", "x_depth.png"], depth, &["x.png", "x_depth.png"]),
+            (&["x", "x_depth"], depth, &["000000", "000001"]),
+        ];
+        for (names, suffixes, expected) in cases {
+            assert_eq!(unique_stems(names, suffixes), expected, "{names:?}");
         }
     }
 }

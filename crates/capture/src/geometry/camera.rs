@@ -103,6 +103,25 @@ impl Camera {
         let intrinsics = Intrinsics { fx: k.fx * factor, fy: k.fy * factor, cx: k.cx * x, cy: k.cy * y };
         Camera { intrinsics, c2w: self.c2w, width, height }
     }
+
+    /// Returns the camera scaled to a photo of size (width, height) if that size differs from the camera's and the aspect ratios agree to
+    /// within a pixel of the smaller image. The size may also agree with width and height swapped, because loading may rotate a photo.
+    pub(crate) fn scaled_to(&self, (width, height): (u32, u32)) -> Option<Self> {
+        let choices = [(width, height), (height, width)];
+        if choices.contains(&(self.width, self.height)) {
+            return None;
+        }
+        let share = |a: u32, b: u32| f64::from(a.min(b)) / f64::from(a.max(b));
+        let agrees = |&(width, height): &(u32, u32)| {
+            let (x, y) = (share(width, self.width), share(height, self.height));
+            let is_one_way = (width <= self.width) == (height <= self.height) || x == 1. || y == 1.;
+            let pixel = |a: u32, b: u32| 1. / f64::from(a.max(b));
+            is_one_way && (x - y).abs() <= pixel(width, self.width) + pixel(height, self.height)
+        };
+        let (width, height) = choices.into_iter().find(agrees)?;
+        let (x, y) = (f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));
+        Some(Camera { intrinsics: self.intrinsics.resized(x, y), width, height, ..*self })
+    }
 }
 
 /// Checks that `c2w` is a rigid motion: finite, with last row (0, 0, 0, 1) and an orthonormal right-handed rotation.
@@ -183,4 +202,26 @@ pub(super) fn look_at(eye: DVec3, target: DVec3, down: DVec3) -> DMat4 {
     let right = down.cross(forward).normalize();
     let down = forward.cross(right);
     DMat4::from_cols(right.extend(0.), down.extend(0.), forward.extend(0.), eye.extend(1.))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cameras_are_scaled_where_the_aspect_agrees_to_a_pixel() {
+        let intrinsics = Intrinsics { fx: 500., fy: 510., cx: 250., cy: 180. };
+        let camera = Camera { intrinsics, c2w: DMat4::IDENTITY, width: 519, height: 339 };
+        let size = |photo| camera.scaled_to(photo).map(|camera| (camera.width, camera.height));
+        for photo in [(519, 339), (339, 519), (519, 300), (260, 180), (600, 339), (64, 64), (1038, 600)] {
+            assert_eq!(size(photo), None, "{photo:?}");
+        }
+        // Halves and eighths, rounded down or up; twice the size; one row more. Below: width and height swapped.
+        for photo in [(259, 169), (260, 170), (64, 42), (65, 42), (1038, 678), (1037, 678), (519, 340)] {
+            assert_eq!(size(photo), Some(photo), "{photo:?}");
+        }
+        assert_eq!(size((170, 260)), Some((260, 170)));
+        let half = Camera { width: 512, height: 340, ..camera }.scaled_to((256, 170)).unwrap();
+        assert_eq!(half.intrinsics, Intrinsics { fx: 250., fy: 255., cx: 125., cy: 90. });
+    }
 }

@@ -21,16 +21,6 @@ pub struct Similarity {
     pub scale: f64,
 }
 
-impl Similarity {
-    /// Returns the camera-to-world pose that the similarity transforms into `c2w`: its camera sees the original world as `c2w` sees
-    /// the transformed one.
-    pub fn inverse_transform_pose(&self, c2w: &DMat4) -> DMat4 {
-        let rotation = self.rotation.transpose();
-        let centre = rotation * (c2w.w_axis.truncate() - self.translation) / self.scale;
-        DMat4::from_mat3_translation(rotation * DMat3::from_mat4(*c2w), centre)
-    }
-}
-
 /// Result of [`normalize`].
 #[derive(Debug, Clone)]
 pub struct Normalization {
@@ -107,7 +97,10 @@ mod tests {
             assert!(DMat3::from_mat4(c2w[0]).abs_diff_eq(DMat3::IDENTITY, 1e-12), "{count}, {tilt}");
             assert!(world_from_normalized.translation.with_y(0.).length() < 1e-12);
             for (pose, before) in c2w.iter().zip(&ring) {
-                assert!(world_from_normalized.inverse_transform_pose(before).abs_diff_eq(*pose, 1e-12));
+                let Similarity { rotation, translation, scale } = world_from_normalized;
+                let (centre, turned) = (pose.w_axis.truncate(), rotation * DMat3::from_mat4(*pose));
+                let back = DMat4::from_mat3_translation(turned, scale * (rotation * centre) + translation);
+                assert!(back.abs_diff_eq(*before, 1e-12));
             }
         }
     }

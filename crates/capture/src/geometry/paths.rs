@@ -339,12 +339,10 @@ mod tests {
     #[test]
     fn two_cameras_are_joined_by_the_shortest_way() {
         let [a, b] = [cameras()[0], cameras()[3]];
-        let path = smooth_path(&[a, b], DISTANCE, 5).unwrap();
         let (from, to) = (View::of(&a, DISTANCE), View::of(&b, DISTANCE));
-        for (i, frame) in path.iter().enumerate() {
+        for (i, frame) in smooth_path(&[a, b], DISTANCE, 5).unwrap().iter().enumerate() {
             let share = i as f64 / 4.;
-            let expected = a.c2w.w_axis.lerp(b.c2w.w_axis, share);
-            assert!(frame.c2w.w_axis.abs_diff_eq(expected, 1e-9), "{i}");
+            assert!(frame.c2w.w_axis.abs_diff_eq(a.c2w.w_axis.lerp(b.c2w.w_axis, share), 1e-9), "{i}");
             let rotation = View::of(frame, DISTANCE).rotation;
             assert!(turn(rotation, from.rotation.slerp(to.rotation, share)).length() < 1e-7, "{i}");
             // A zoom interpolates the focal length geometrically.
@@ -398,10 +396,8 @@ mod tests {
             let cameras: Vec<Camera> = (0..4).map(turned).collect();
             let path = smooth_path(&cameras, DISTANCE, 601).unwrap();
             assert_rigid(&path);
-            let steps = path.windows(2).map(|pair| {
-                turn(View::of(&pair[0], DISTANCE).rotation, View::of(&pair[1], DISTANCE).rotation).length()
-            });
-            let whole: f64 = steps.sum();
+            let rotations: Vec<DQuat> = path.iter().map(|frame| View::of(frame, DISTANCE).rotation).collect();
+            let whole: f64 = rotations.windows(2).map(|pair| turn(pair[0], pair[1]).length()).sum();
             assert!(whole < 1.5 * 3. * PI, "{angle}: it turns by {whole}");
             assert!((apart(&path[600], &cameras[3])) < 1e-6);
         }

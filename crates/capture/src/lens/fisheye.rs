@@ -21,8 +21,8 @@ pub(crate) struct Fisheye {
     tangential: [f64; 2],
     prism: [f64; 4],
     is_sequential: bool,
-    /// Angle in radians up to which R grows, at most π.
-    max_angle: f64,
+    /// Largest angle in radians that the lens shows, up to which R grows, at most π.
+    pub max_angle: f64,
 }
 
 impl Fisheye {
@@ -50,11 +50,6 @@ impl Fisheye {
     /// Lists the coefficients for an error message.
     pub fn describe(&self) -> String {
         format!("k {:?}, p {:?}, s {:?}", self.radial, self.tangential, self.prism)
-    }
-
-    /// Returns the largest angle in radians that the lens shows.
-    pub fn max_angle(&self) -> f64 {
-        self.max_angle
     }
 
     /// Returns the distorted point of `q`.

@@ -271,7 +271,7 @@ impl LensModel {
             }
             LensModel::Fisheye(fisheye) => {
                 let angle = distance.atan2(z);
-                let is_seen = angle <= fisheye.max_angle() && !(distance == 0. && z <= 0.);
+                let is_seen = angle <= fisheye.max_angle && !(distance == 0. && z <= 0.);
                 let equidistant = if distance == 0. { DVec2::ZERO } else { across * (angle / distance) };
                 is_seen.then(|| fisheye.apply(equidistant))
             }

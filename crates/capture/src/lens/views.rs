@@ -131,7 +131,7 @@ fn outline(lens: &Lens) -> Vec<DVec3> {
     let mut rays: Vec<DVec3> = points.filter_map(|point| lens.ray_at(point)).collect();
     // Where the field ends inside the photo.
     let end = match lens.model {
-        LensModel::Fisheye(fisheye) => fisheye.max_angle().min(MAX_ANGLE),
+        LensModel::Fisheye(fisheye) => fisheye.max_angle.min(MAX_ANGLE),
         _ => MAX_ANGLE,
     };
     let (sin, cos) = (end - 1e-9).sin_cos();

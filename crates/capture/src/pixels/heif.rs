@@ -126,7 +126,8 @@ fn run<'a>(
                 let line = line.trim();
                 line.strip_prefix('[').and_then(|line| line.split_once("] ")).map_or(line, |(_, line)| line)
             });
-            Err(format!("{program}: {}", lines.collect::<Vec<_>>().join("; ")))
+            let lines = lines.collect::<Vec<_>>().join("; ");
+            Err(format!("{program}: {}", if lines.is_empty() { output.status.to_string() } else { lines }))
         }
     })
 }

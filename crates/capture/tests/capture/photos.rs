@@ -17,17 +17,16 @@ fn largest_difference(a: &RgbImage, b: &RgbImage) -> u8 {
     a.as_raw().iter().zip(b.as_raw()).map(|(a, b)| a.abs_diff(*b)).max().unwrap_or(0)
 }
 
-/// Returns files of `photo` with an EXIF orientation, each with its extension.
-fn encode_with_orientation(photo: &GrayImage, orientation: u8) -> [(&'static str, Vec<u8>); 3] {
-    fn encode<E: ImageEncoder>(photo: &GrayImage, mut encoder: E, orientation: u8) {
-        let exif = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0";
-        encoder.set_exif_metadata([&exif[..], &[orientation, 0, 0, 0, 0, 0, 0, 0]].concat()).unwrap();
+/// Returns a JPEG, a PNG and a WebP of `photo` with the metadata `exif`, each with its extension.
+pub fn encode_with_exif(photo: &DynamicImage, exif: &[u8]) -> [(&'static str, Vec<u8>); 3] {
+    fn encode(photo: &DynamicImage, mut encoder: impl ImageEncoder, exif: &[u8]) {
+        encoder.set_exif_metadata(exif.to_vec()).unwrap();
         photo.write_with_encoder(encoder).unwrap();
     }
     let [mut jpeg, mut png, mut webp] = [vec![], vec![], vec![]];
-    encode(photo, JpegEncoder::new(&mut jpeg), orientation);
-    encode(photo, PngEncoder::new(&mut png), orientation);
-    encode(photo, WebPEncoder::new_lossless(&mut webp), orientation);
+    encode(photo, JpegEncoder::new(&mut jpeg), exif);
+    encode(photo, PngEncoder::new(&mut png), exif);
+    encode(photo, WebPEncoder::new_lossless(&mut webp), exif);
     [("jpg", jpeg), ("png", png), ("webp", webp)]
 }
 
@@ -45,7 +44,11 @@ fn load_photo(bytes: &[u8], extension: &str, width: u32, height: u32) -> Result<
 #[test]
 fn exif_orientation_is_applied_if_the_declared_size_matches() {
     let photo = GrayImage::from_fn(24, 16, |x, y| Luma([x as u8 * 5 + y as u8 * 8]));
-    let [stored, all @ ..] = [1, 3, 5, 6, 8].map(|orientation| encode_with_orientation(&photo, orientation));
+    let [stored, all @ ..] = [1, 3, 5, 6, 8].map(|orientation| {
+        let exif = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0";
+        let exif = [&exif[..], &[orientation, 0, 0, 0, 0, 0, 0, 0]].concat();
+        encode_with_exif(&photo.clone().into(), &exif)
+    });
     for (format, (extension, stored)) in stored.iter().enumerate() {
         let stored = load_photo(stored, extension, 24, 16).unwrap();
         let load = |orientation: usize, width, height| {
