@@ -1,8 +1,11 @@
 //! Communication among processes that train together. Tensors are passed as addresses of `at::Tensor`, which is tch's `C_tensor`.
+//!
+//! # Safety
+//! Every unsafe function requires that all addresses are those of live tensors that nothing else reads or writes meanwhile.
 
 pub use ffi::*;
 
-// Clippy doesn't see the safety sections inside of a bridge.
+// The safety section of the module holds for all functions.
 #[allow(clippy::missing_safety_doc)]
 #[cxx::bridge(namespace = "globalsplat")]
 mod ffi {
@@ -50,15 +53,9 @@ mod ffi {
         ) -> Result<UniquePtr<ProcessGroup>>;
 
         /// Replaces a tensor by its sum over all ranks; see `csrc/distributed.h`.
-        ///
-        /// # Safety
-        /// `tensor` must be the address of a live tensor that nothing else reads or writes meanwhile.
         unsafe fn all_reduce(self: &ProcessGroup, tensor: usize) -> Result<()>;
 
         /// Copies a tensor of the first rank to all ranks; see `csrc/distributed.h`.
-        ///
-        /// # Safety
-        /// `tensor` must be the address of a live tensor that nothing else reads or writes meanwhile.
         unsafe fn broadcast(self: &ProcessGroup, tensor: usize) -> Result<()>;
 
         /// Shuts the process group down in order; see `csrc/distributed.h`.
@@ -68,9 +65,6 @@ mod ffi {
         type Buckets;
 
         /// Creates gradient buckets; see `csrc/distributed.h`.
-        ///
-        /// # Safety
-        /// `parameters` must be addresses of live tensors.
         unsafe fn buckets(
             group: &ProcessGroup,
             parameters: &[usize],
