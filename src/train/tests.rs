@@ -325,7 +325,7 @@ fn a_step_makes_only_expected_device_copies() {
 
 /// Number of scenes in a step of all ranks together.
 const SCENES: usize = 6;
-const STEPS: usize = 4;
+const STEPS: usize = 6;
 /// Variable of the model that no step changes.
 const NOT_TRAINED: &str = "gaussian_decoder.patch_center_bias";
 
