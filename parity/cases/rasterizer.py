@@ -147,8 +147,8 @@ ORDINARY, ALL = scenes.RANDOM | scenes.ADVERSARIAL, scenes.RANDOM | scenes.ADVER
 projections("projection", np.float64, ALL, FLOAT64)
 projections("projection_float32", np.float32, ORDINARY, FLOAT32)
 projections("projection_thin_float32", np.float32, scenes.THIN, PROJECTION_THIN_FLOAT32)
-rasterizations("rasterizer", np.float64, ALL, FLOAT64)
-rasterizations("rasterizer_float32", np.float32, ORDINARY | scenes.THIN, RASTERIZER_FLOAT32)
+rasterizations("rasterizer", np.float64, ALL | scenes.LONE, FLOAT64)
+rasterizations("rasterizer_float32", np.float32, ORDINARY | scenes.THIN | scenes.LONE, RASTERIZER_FLOAT32)
 rasterizations("rasterizer_antialiased", np.float64, ALL, FLOAT64, antialiased=True)
 rasterizations("rasterizer_antialiased_float32", np.float32, ORDINARY, RASTERIZER_FLOAT32, antialiased=True)
 

@@ -13,7 +13,14 @@ AUXILIARIES = 4
 # The paper's main model.
 MAIN_16K: dict[str, Any] = {
     **{"patch_size": 8, "latents": 2048, "width": 512, "rgb_width": 512, "ray_width": 256, "rounds": 4},
-    **{"self_attention_blocks": 2, "heads": 8, "candidates": 16, "sh_degree": 3, "streams": "dual", "camera_code": True},
+    **{
+        "self_attention_blocks": 2,
+        "heads": 8,
+        "candidates": 16,
+        "sh_degree": 3,
+        "streams": "dual",
+        "camera_code": True,
+    },
 }
 
 
