@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from parity.harness import scenes
 from parity.harness.draw import lpips_parameters
 from parity.reference import muon, perceptual, splat
 
@@ -64,18 +65,14 @@ def test_muon_against_torch():
         assert (ours - theirs).norm() < 0.02 * (ours - decayed).norm()
 
 
-def test_spherical_harmonics():
-    """The basis equals the real harmonics by their definition, in 3DGS's order and signs."""
-    direction = torch.nn.functional.normalize(
-        torch.randn(50, 3, generator=torch.Generator().manual_seed(0)).double(), dim=-1
-    )
-    x, y, z = direction.unbind(-1)
+def harmonics(x, y, z):
+    """Returns the real spherical harmonics of a unit direction by their definition, in 3DGS's order and signs."""
 
     def root(numerator, denominator):
         return math.sqrt(numerator / (denominator * math.pi))
 
-    expected = [
-        0.5 * root(1, 1) * torch.ones_like(x),
+    return [
+        0.5 * root(1, 1) + 0.0 * x,
         -root(3, 4) * y, root(3, 4) * z, -root(3, 4) * x,
         0.5 * root(15, 1) * x * y, -0.5 * root(15, 1) * y * z, 0.25 * root(5, 1) * (3 * z * z - 1),
         -0.5 * root(15, 1) * x * z, 0.25 * root(15, 1) * (x * x - y * y),
@@ -84,4 +81,88 @@ def test_spherical_harmonics():
         -0.25 * root(21, 2) * x * (5 * z * z - 1), 0.25 * root(105, 1) * z * (x * x - y * y),
         -0.25 * root(35, 2) * x * (x * x - 3 * y * y),
     ]  # fmt: skip
-    torch.testing.assert_close(splat.sh_basis(direction, 16), torch.stack(expected, -1))
+
+
+def rotated(q, v):
+    """Returns q v q*, the rotation of a vector by a quaternion (w, x, y, z) of any length."""
+    q = q / np.linalg.norm(q)
+    return v + 2.0 * np.cross(q[1:], np.cross(q[1:], v) + q[0] * v)
+
+
+def scalar_render(means, scales, quaternions, opacities, sh, w2c, intrinsic, width, height, eps2d, antialiased):
+    """Renders one pixel and one Gaussian at a time, which shares no formula with the reference: [H, W, 5]."""
+    fx, fy, cx, cy = intrinsic[0, 0], intrinsic[1, 1], intrinsic[0, 2], intrinsic[1, 2]
+    centre, drawn = -w2c[:3, :3].T @ w2c[:3, 3], []
+    for g, mean in enumerate(means):
+        x, y, z = w2c[:3, :3] @ mean + w2c[:3, 3]
+        if z <= 0.01:
+            continue
+        axes = np.stack(
+            [scale * rotated(quaternions[g], axis) for scale, axis in zip(scales[g], np.eye(3), strict=True)]
+        )
+        px = min(max(x / z, (-cx - 0.15 * width) / fx), (width - cx + 0.15 * width) / fx)
+        py = min(max(y / z, (-cy - 0.15 * height) / fy), (height - cy + 0.15 * height) / fy)
+        seen = axes @ w2c[:3, :3].T @ np.array([[fx / z, 0.0], [0.0, fy / z], [-fx * px / z, -fy * py / z]])
+        cov = seen.T @ seen
+        filtered = cov + eps2d * np.eye(2)
+        det = np.linalg.det(filtered)
+        if det <= 0:
+            continue
+        opacity = opacities[g] * (math.sqrt(max(np.linalg.det(cov), 0.0) / det) if antialiased else 1.0)
+        direction = (mean - centre) / np.linalg.norm(mean - centre)
+        color = np.maximum(0.0, 0.5 + np.array(harmonics(*direction))[: len(sh[g])] @ sh[g])
+        drawn.append((z, g, np.array([fx * x / z + cx, fy * y / z + cy]), np.linalg.inv(filtered), opacity, color))
+    drawn.sort(key=lambda item: item[:2])
+
+    images = np.zeros((height, width, 5))
+    for row, column in np.ndindex(height, width):
+        remaining, depth = 1.0, 0.0
+        for z, _, mean, conic, opacity, color in drawn:
+            offset = mean - [column + 0.5, row + 0.5]
+            alpha = min(0.999, opacity * math.exp(-0.5 * offset @ conic @ offset))
+            if alpha < 1 / 255:
+                continue
+            if remaining * (1 - alpha) <= 1e-4:
+                break
+            images[row, column, :3] += remaining * alpha * color
+            depth += remaining * alpha * z
+            remaining *= 1 - alpha
+        images[row, column, 3:] = 1 - remaining, depth / (1 - remaining) if 1 - remaining > 1e-10 else 0.0
+    return images
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_splat(antialiased):
+    """The rasterizer equals loops over pixels and Gaussians, in scenes of all kinds and with harmonics of all degrees."""
+    rng = np.random.default_rng(0)
+    for size, make in (scenes.RANDOM | scenes.ADVERSARIAL).values():
+        scene = make(rng, size)
+        config = scenes.settings(size, antialiased)
+        names = ("means", "scales", "quaternions", "opacities", "sh", "w2c", "intrinsics")
+        first = [scene[name][0] for name in names[:5]] + [scene[name][0, 0] for name in names[5:]]
+        ours = splat.render(*map(torch.tensor, first), **config)
+        images = torch.cat([value.reshape(*size, -1) for value in ours], dim=-1)
+        expected = scalar_render(*first, **config)
+        # Rounding may decide a threshold of extreme Gaussians otherwise at a few pixels.
+        close = np.abs(images.numpy() - expected).max(-1) < 1e-9
+        assert close.mean() > 0.999
+
+
+def test_spherical_harmonics():
+    generator = torch.Generator().manual_seed(0)
+    direction = torch.nn.functional.normalize(torch.randn(50, 3, generator=generator).double(), dim=-1)
+    torch.testing.assert_close(splat.sh_basis(direction, 16), torch.stack(harmonics(*direction.unbind(-1)), -1))
+
+
+def test_capped_alphas_and_negative_colors_have_no_gradient():
+    opacity = torch.tensor([1.0], dtype=torch.float64, requires_grad=True)
+    centre = torch.full((1, 2), 0.5, dtype=torch.float64)
+    projected = {"mean2d": centre, "conic": torch.tensor([[1.0, 0.0, 1.0]], dtype=torch.float64)}
+    projected |= {"depth": torch.ones(1, dtype=torch.float64), "visible": torch.ones(1, dtype=torch.bool)}
+    weight, _, _ = splat.composite(projected, opacity, torch.ones(1, 3, dtype=torch.float64), centre)
+    weight.sum().backward()
+    assert weight.tolist() == [[0.999] * 3] and opacity.grad.tolist() == [0.0]
+    sh = torch.tensor([[[-9.0, 0.3, 9.0]]], dtype=torch.float64, requires_grad=True)
+    color = splat.sh_color(torch.tensor([[0.3, 0.2, 2.0]], dtype=torch.float64), sh, torch.eye(4, dtype=torch.float64))
+    color.sum().backward()
+    assert color[0, 0].item() == 0.0 and sh.grad[0, :, 0].item() == 0.0 and sh.grad[0, :, 2].item() > 0.0
