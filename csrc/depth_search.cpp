@@ -19,15 +19,15 @@ struct SweepTensors {
   std::vector<raster::ComparedPhoto> compared;
   raster::PlaneSweep sweep;
 
-  SweepTensors(size_t grey, size_t weight, rust::Slice<const PhotoToCompare> others, float step, int32_t planes, float least_variance,
+  SweepTensors(size_t gray, size_t weight, rust::Slice<const PhotoToCompare> others, float step, int32_t planes, float least_variance,
                float least_correlation) {
     TORCH_CHECK(!others.empty() && planes > 0, "there are ", others.size(), " photos to compare and ", planes,
                 " planes, expected 1 or more");
     for (const PhotoToCompare& other : others) {
-      compared.push_back({photo_of(other.grey, other.weight), {}});
+      compared.push_back({photo_of(other.gray, other.weight), {}});
       std::copy(other.to_pixels.begin(), other.to_pixels.end(), compared.back().to_pixels);
     }
-    sweep = {photo_of(grey, weight), compared.data(), int(compared.size()), step, least_variance, least_correlation};
+    sweep = {photo_of(gray, weight), compared.data(), int(compared.size()), step, least_variance, least_correlation};
   }
 
  private:
@@ -36,13 +36,13 @@ struct SweepTensors {
     return kept.back().const_data_ptr<float>();
   }
 
-  raster::SweepPhoto photo_of(size_t grey_address, size_t weight_address) {
-    const at::Tensor& values = borrowed(grey_address);
+  raster::SweepPhoto photo_of(size_t gray_address, size_t weight_address) {
+    const at::Tensor& values = borrowed(gray_address);
     TORCH_CHECK(values.dim() == 2 && values.size(0) >= raster::kPatch && values.size(1) >= raster::kPatch, "a photo has shape ",
                 values.sizes(), ", expected [H, W] with H and W of ", raster::kPatch, " or more");
     TORCH_CHECK(weight_address == 0 || borrowed(weight_address).sizes() == values.sizes(), "the weights of a photo of shape ",
                 values.sizes(), " have another shape");
-    return {data(grey_address), weight_address == 0 ? nullptr : data(weight_address), int(values.size(1)), int(values.size(0))};
+    return {data(gray_address), weight_address == 0 ? nullptr : data(weight_address), int(values.size(1)), int(values.size(0))};
   }
 };
 
@@ -57,16 +57,16 @@ void run(const Search& search, const raster::PlaneSweep& sweep, int32_t planes, 
 
 }  // namespace
 
-void search_depths(size_t grey, size_t weight, rust::Slice<const PhotoToCompare> others, float step, int32_t planes,
+void search_depths(size_t gray, size_t weight, rust::Slice<const PhotoToCompare> others, float step, int32_t planes,
                    rust::Slice<size_t> out) {
-  const SweepTensors tensors(grey, weight, others, step, planes, 1e-4f, -1);
+  const SweepTensors tensors(gray, weight, others, step, planes, 1e-4f, -1);
   run(raster::search_depths, tensors.sweep, planes, out);
 }
 
-void match_semi_globally(size_t grey, size_t weight, rust::Slice<const PhotoToCompare> others, float step, int32_t planes,
+void match_semi_globally(size_t gray, size_t weight, rust::Slice<const PhotoToCompare> others, float step, int32_t planes,
                          rust::Slice<size_t> out) {
   // A smooth depth needs less texture. Photos that don't show a pixel say nothing about its depth, like those without any likeness.
-  const SweepTensors tensors(grey, weight, others, step, planes, 1e-5f, 0);
+  const SweepTensors tensors(gray, weight, others, step, planes, 1e-5f, 0);
   run(raster::match_semi_globally, tensors.sweep, planes, out);
 }
 

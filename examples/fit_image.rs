@@ -68,7 +68,7 @@ fn load(path: &Path) -> Result<(Tensor, Camera)> {
     Ok((tensor_from_planes(&planes), camera))
 }
 
-/// Returns round grey Gaussians scattered over the image, about one unit away, each about as large as their spacing.
+/// Returns round gray Gaussians scattered over the image, about one unit away, each about as large as their spacing.
 fn scattered(camera: &Camera) -> RawGaussians {
     let options = (Kind::Float, Device::Cpu);
     let n = GAUSSIANS;

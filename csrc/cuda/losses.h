@@ -123,15 +123,15 @@ __global__ void __launch_bounds__(kLossThreads) gs_unevenness(SmoothnessJob<floa
   if (k < of.views * pixels) {
     const int64_t view = k / pixels;
     const int row = int(k % pixels / of.width), column = int(k % of.width);
-    const auto grey = [&](int64_t at) {
+    const auto gray = [&](int64_t at) {
       const float* const photo = of.photos + 3 * view * pixels + at - view * pixels;
-      return raster::lane::grey_of<float>(photo[0], photo[pixels], photo[2 * pixels]);
+      return raster::lane::gray_of<float>(photo[0], photo[pixels], photo[2 * pixels]);
     };
-    const float a = of.depths[k], g = grey(k);
+    const float a = of.depths[k], g = gray(k);
     float slope = 0;
     // Pixels beyond the border are empty.
     const auto pair = [&](bool is_there, int64_t other) {
-      return raster::lane::unevenness_of<float>(a, g, is_there ? of.depths[other] : 0, is_there ? grey(other) : 0, slope);
+      return raster::lane::unevenness_of<float>(a, g, is_there ? of.depths[other] : 0, is_there ? gray(other) : 0, slope);
     };
     sum = pair(column + 1 < of.width, k + 1) + pair(row + 1 < of.height, k + of.width);
     if (gradient != nullptr) {

@@ -14,11 +14,11 @@ namespace globalsplat::raster::GS_ISA {
 template <class T>
 inline constexpr int kVectors = kBlock * kBlock / Simd<T>::lanes;
 
-// Centres of the pixels in every vector of a block whose first pixel is (0, 0).
+// Centers of the pixels in every vector of a block whose first pixel is (0, 0).
 template <class T>
-struct Centres {
+struct Centers {
   T x[16], y[16];
-  constexpr Centres() : x{}, y{} {
+  constexpr Centers() : x{}, y{} {
     for (int i = 0; i < 16; ++i) {
       x[i] = T(i % kBlock) + T(0.5);
       y[i] = T(i / kBlock) + T(0.5);
@@ -26,7 +26,7 @@ struct Centres {
   }
 };
 template <class T>
-inline constexpr Centres<T> kCentres{};
+inline constexpr Centers<T> kCenters{};
 
 // Number of items by which prefetching runs ahead. A tile's splats and records are scattered in memory, and waiting for each costs more
 // than blending it.
@@ -148,8 +148,8 @@ void blend_tile(const TileJob<T>& job, const RenderOutput<T>& out) {
       bool goes_on = false;
       for (int k = 0; k < kVectors<T>; ++k) {
         Pixels<T> px = pixels[block][k];
-        const V x = T(job.x0 + block % 4 * kBlock) + load<T>(kCentres<T>.x + k * Simd<T>::lanes);
-        const V y = T(job.y0 + block / 4 * kBlock) + load<T>(kCentres<T>.y + k * Simd<T>::lanes);
+        const V x = T(job.x0 + block % 4 * kBlock) + load<T>(kCenters<T>.x + k * Simd<T>::lanes);
+        const V y = T(job.y0 + block / 4 * kBlock) + load<T>(kCenters<T>.y + k * Simd<T>::lanes);
         SplatPipeline<T> pipeline(x, y, splat(0), splat(1), splat(2));
         for (int i = 0; i < length; ++i)
           add(splat(i), blend<T>(px.transmittance, pipeline.next(splat(i + 2), splat(i + 3))), px);
@@ -218,11 +218,11 @@ void blend_tile_backward(const TileJob<T>& job, const RenderOutput<const T>& pic
                          const RenderOutput<const T>& gradients, SplatGradient<T>* records) {
   using V = Vector<T>;
   PixelGradients<T> pixels[kBlocks][kVectors<T>];
-  V x[4][kVectors<T>], y[4][kVectors<T>];  // pixel centres of the blocks of each column and row
+  V x[4][kVectors<T>], y[4][kVectors<T>];  // pixel centers of the blocks of each column and row
   for (int i = 0; i < 4; ++i)
     for (int k = 0; k < kVectors<T>; ++k) {
-      x[i][k] = T(job.x0 + i * kBlock) + load<T>(kCentres<T>.x + k * Simd<T>::lanes);
-      y[i][k] = T(job.y0 + i * kBlock) + load<T>(kCentres<T>.y + k * Simd<T>::lanes);
+      x[i][k] = T(job.x0 + i * kBlock) + load<T>(kCenters<T>.x + k * Simd<T>::lanes);
+      y[i][k] = T(job.y0 + i * kBlock) + load<T>(kCenters<T>.y + k * Simd<T>::lanes);
     }
   for (int block = 0; block < kBlocks; ++block) {
     const BlockPlace at(job.x0 + block % 4 * kBlock, job.y0 + block / 4 * kBlock, job.width, job.height);
@@ -272,8 +272,8 @@ PairCounts count_tile(const TileJob<T>& job) {
       for (int k = 0; k < kVectors<T>; ++k) {
         V& t = transmittance[block][k];
         if (!any(less(V{}, t))) continue;
-        const V x = T(job.x0 + block % 4 * kBlock) + load<T>(kCentres<T>.x + k * Simd<T>::lanes);
-        const V y = T(job.y0 + block / 4 * kBlock) + load<T>(kCentres<T>.y + k * Simd<T>::lanes);
+        const V x = T(job.x0 + block % 4 * kBlock) + load<T>(kCenters<T>.x + k * Simd<T>::lanes);
+        const V y = T(job.y0 + block / 4 * kBlock) + load<T>(kCenters<T>.y + k * Simd<T>::lanes);
         Evaluated<T> e;
         evaluate(job.splats[job.entries[item].splat], x, y, e);
         const Contribution<T> c = blend<T>(t, e.raw);

@@ -56,11 +56,11 @@ void search_depths(const PlaneSweep& sweep, int planes, float* inverse_depth, fl
   });
 }
 
-void match_semi_globally(const PlaneSweep& sweep, int planes, float* inverse_depth, float* sureness, int num_threads) {
+void match_semi_globally(const PlaneSweep& sweep, int planes, float* inverse_depth, float* confidence, int num_threads) {
   const SweepPhoto& own = sweep.own;
   const Buffer<float> variance(size_t(sweep_stride(own.width) * own.height));
   kernels().patch_variances(own, sweep.least_variance, variance.data.get(), scratch(variance_scratch_size(own)));
-  const MatchedPhoto photo{own.grey, variance.data.get(), sweep.least_variance, own.width, own.height, planes};
+  const MatchedPhoto photo{own.gray, variance.data.get(), sweep.least_variance, own.width, own.height, planes};
   const size_t size = size_t(int64_t(own.width) * own.height * plane_stride(planes));
   const Buffer<float> own_costs(size), forward(size), backward(size);
   const PlaneCosts costs{own_costs.data.get(), forward.data.get(), backward.data.get()};
@@ -72,7 +72,7 @@ void match_semi_globally(const PlaneSweep& sweep, int planes, float* inverse_dep
     kernels().sum_paths(photo, costs.own, task == 1, task == 0 ? costs.forward : costs.backward, scratch(path_scratch_size(photo)));
   });
   for_rows(num_threads, own.height, [&](int begin, int end) {
-    kernels().choose_planes(photo, costs, sweep.step, begin, end, inverse_depth, sureness);
+    kernels().choose_planes(photo, costs, sweep.step, begin, end, inverse_depth, confidence);
   });
 }
 

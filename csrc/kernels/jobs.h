@@ -40,7 +40,7 @@ double depth_smoothness(const SmoothnessJob<T>& job, double factor, T* gradient,
 void search_depths(const PlaneSweep& sweep, int planes, float* inverse_depth, float* score, int num_threads);
 
 // Searches them by semi-global matching (semi_global.h). Writes the inverse depth of each pixel and how sure it is, in [0, 1], both [H, W].
-void match_semi_globally(const PlaneSweep& sweep, int planes, float* inverse_depth, float* sureness, int num_threads);
+void match_semi_globally(const PlaneSweep& sweep, int planes, float* inverse_depth, float* confidence, int num_threads);
 
 // ---- optimizer steps ----
 

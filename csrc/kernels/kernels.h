@@ -49,7 +49,7 @@ struct Kernels {
   // semi_global.h
   void (*costs_of_rows)(const MatchedPhoto&, const float* scores, int begin, int end, float* costs);
   void (*sum_paths)(const MatchedPhoto&, const float* costs, bool backward, float* sums, float* scratch);
-  void (*choose_planes)(const MatchedPhoto&, const PlaneCosts&, float step, int begin, int end, float* inverse_depth, float* sureness);
+  void (*choose_planes)(const MatchedPhoto&, const PlaneCosts&, float step, int begin, int end, float* inverse_depth, float* confidence);
   int64_t (*multiply_adds)(int64_t rounds, float* out);
 
   template <class T>

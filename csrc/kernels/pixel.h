@@ -1,7 +1,7 @@
 // Alpha blending at pixels, forward and backward (spec 6.4 and 6.5).
 //
 // For a pixel and the splats in front-to-back order i = 1, 2, …
-//     e_i = log₂ opacity_i − p² − r²,  p = aΔx + bΔy,  r = cΔy,  Δ = mean2d_i − pixel centre
+//     e_i = log₂ opacity_i − p² − r²,  p = aΔx + bΔy,  r = cΔy,  Δ = mean2d_i − pixel center
 //     α_i = min(0.999, 2^e_i),            skipped if e_i < −log₂ 255
 //     w_i = T_i α_i,  T_{i+1} = T_i − w_i,  T_1 = 1,  the pixel ends before T_{i+1} ≤ 1e-4
 //     C = Σ w_i c_i,   A = Σ w_i = 1 − T,   D = Σ w_i z_i / A.

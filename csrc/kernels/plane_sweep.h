@@ -84,7 +84,7 @@ GS_INLINE void warp_row(const SweepPhoto& own, const ComparedPhoto& other, float
     const Mask<float> shown = both(both(both(less_equal(SweepVector{}, x), less_equal(x, right)),
                                         both(less_equal(SweepVector{}, y), less_equal(y, bottom))),
                                    less(SweepVector{}, at[2]));
-    // Beyond the centres of the pixels at the border, the values there are repeated.
+    // Beyond the centers of the pixels at the border, the values there are repeated.
     const SweepVector half = vector(0.5f), one = vector(1);
     const SweepVector px = clamp(x - half, SweepVector{}, right - one), py = clamp(y - half, SweepVector{}, bottom - one);
     using Integers = Simd<float>::bits;
@@ -93,9 +93,9 @@ GS_INLINE void warp_row(const SweepPhoto& own, const ComparedPhoto& other, float
     const SweepVector fx = px - __builtin_convertvector(left, SweepVector), fy = py - __builtin_convertvector(top, SweepVector);
     const Integers corner = top * other.photo.width + left;
     const SweepVector inside = select(less(column, vector(float(width))), one, SweepVector{});
-    const SweepVector value = interpolate(other.photo.grey, other.photo.width, corner, fx, fy) * inside;
+    const SweepVector value = interpolate(other.photo.gray, other.photo.width, corner, fx, fy) * inside;
     const int64_t at_row = int64_t(row) * width + i;
-    const SweepVector mine = load_partial<float>(own.grey + at_row, width - i);
+    const SweepVector mine = load_partial<float>(own.gray + at_row, width - i);
     store<float>(to.visible + i, select(shown, one, SweepVector{}));
     const auto put = [&](Moment moment, SweepVector v) { store<float>(buffers.padded[moment] + kPatch / 2 + i, v); };
     if constexpr (weighted) {
@@ -157,7 +157,7 @@ GS_INLINE void compute_own_moments(const SweepPhoto& own, float least_variance, 
   for (int i = 0; i < stride; ++i) to.each_column[i] = i < own.width ? 1.0f / float(patch_length(i, own.width)) : 0;
   const auto fill_row = [&](int row) {
     for (int i = 0; i < own.width; i += kSweepLanes) {
-      const SweepVector value = load_partial<float>(own.grey + int64_t(row) * own.width + i, own.width - i);
+      const SweepVector value = load_partial<float>(own.gray + int64_t(row) * own.width + i, own.width - i);
       store<float>(buffers.padded[kX] + kPatch / 2 + i, value);
       store<float>(buffers.padded[kXX] + kPatch / 2 + i, value * value);
     }

@@ -228,7 +228,7 @@ GS_INLINE void compute_directions(const Group<T>& g, int bases, const Projection
   using V = Vector<T>;
   V distance2{};
   for (int k = 0; k < 3; ++k) {
-    s.direction[k] = select(visible, g.mean[k] - params.centre[k], V{});
+    s.direction[k] = select(visible, g.mean[k] - params.center[k], V{});
     distance2 += s.direction[k] * s.direction[k];
   }
   s.inverse_distance = select(visible, T(1) / sqrt(distance2), V{});

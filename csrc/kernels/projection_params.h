@@ -17,7 +17,7 @@ inline ProjectionParams<T> make_projection_params(const Camera<T>& camera, int w
   ProjectionParams<T> params{camera, width, height, T(settings.eps2d), T(settings.near_plane), T(settings.far_plane),
                              settings.antialiased, settings.direct_colors, {}, 0, 0, 0, 0};
   const T *r = camera.rotation, *t = camera.translation;
-  for (int k = 0; k < 3; ++k) params.centre[k] = -(r[k] * t[0] + r[3 + k] * t[1] + r[6 + k] * t[2]);
+  for (int k = 0; k < 3; ++k) params.center[k] = -(r[k] * t[0] + r[3 + k] * t[1] + r[6 + k] * t[2]);
   const T margin_x = T(kJacobianMargin) * width / camera.fx, margin_y = T(kJacobianMargin) * height / camera.fy;
   params.x_low = -camera.cx / camera.fx - margin_x;
   params.x_high = (width - camera.cx) / camera.fx + margin_x;

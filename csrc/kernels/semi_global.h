@@ -3,7 +3,7 @@
 //
 //   L(p, d) = C(p, d) + min(L(p − r, d), L(p − r, d ± 1) + P1, min_k L(p − r, k) + P2) − min_k L(p − r, k)
 //
-// L is C where a path begins. P2 is lower where the grey values of p and p − r differ, because depths jump mostly at edges. A pixel gets
+// L is C where a path begins. P2 is lower where the gray values of p and p − r differ, because depths jump mostly at edges. A pixel gets
 // the plane with the least mean of L over all directions, M, and between planes the vertex of a parabola. It is as sure as 1 − M, times
 // m / (m + 0.05), where m is the margin of M to the best plane that isn't adjacent.
 #pragma once
@@ -13,9 +13,9 @@
 
 namespace globalsplat::raster::GS_ISA {
 
-// P1, the cost of a step to an adjacent plane, and P2, that of a larger step where grey values are equal.
+// P1, the cost of a step to an adjacent plane, and P2, that of a larger step where gray values are equal.
 inline constexpr float kStepCost = 0.1f, kJumpCost = 3;
-// Rate at which P2 falls with the difference of grey values. It is P1 or more.
+// Rate at which P2 falls with the difference of gray values. It is P1 or more.
 inline constexpr float kEdgeRate = 10;
 // How much less the first plane, which is infinitely far, costs where a patch has no texture: it is usually the sky.
 inline constexpr float kFarBonus = 0.1f;
@@ -97,7 +97,7 @@ inline void sum_paths(const MatchedPhoto& photo, const float* costs, bool backwa
         to[k] = here[k].at(j + 1);
         const int dx = backward ? j + 1 - column[k] : column[k] - j - 1, dy = k == 0 ? 0 : backward ? 1 : -1;
         const bool begins = x + dx < 0 || x + dx >= width || y + dy < 0 || y + dy >= height;
-        const float difference = begins ? 0 : __builtin_fabsf(photo.grey[pixel] - photo.grey[pixel + dy * width + dx]);
+        const float difference = begins ? 0 : __builtin_fabsf(photo.gray[pixel] - photo.gray[pixel + dy * width + dx]);
         const float cost = kJumpCost / (1 + kEdgeRate * difference);
         before[k] = broadcast<float>(*from[k].least);
         jump[k] = broadcast<float>(*from[k].least + (cost > kStepCost ? cost : kStepCost));
@@ -123,7 +123,7 @@ inline void sum_paths(const MatchedPhoto& photo, const float* costs, bool backwa
 
 // Writes inverse depths and how sure they are, [H, W], of the rows [begin, end).
 inline void choose_planes(const MatchedPhoto& photo, const PlaneCosts& costs, float step, int begin, int end, float* inverse_depth,
-                          float* sureness) {
+                          float* confidence) {
   const int64_t stride = plane_stride(photo.planes);
   const PathVector each = broadcast<float>(0.125f);
   for (int64_t pixel = int64_t(begin) * photo.width; pixel < int64_t(end) * photo.width; ++pixel) {
@@ -147,7 +147,7 @@ inline void choose_planes(const MatchedPhoto& photo, const PlaneCosts& costs, fl
     }
     inverse_depth[pixel] = plane * step;
     const float margin = next - least, agreement = 1 - least;
-    sureness[pixel] = (agreement < 0 ? 0 : agreement > 1 ? 1 : agreement) * margin / (margin + kHalfMargin);
+    confidence[pixel] = (agreement < 0 ? 0 : agreement > 1 ? 1 : agreement) * margin / (margin + kHalfMargin);
   }
 }
 

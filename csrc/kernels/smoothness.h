@@ -7,10 +7,10 @@
 
 namespace globalsplat::raster::GS_ISA {
 
-// Depths and grey values of one row in `scratch`, preceded by one zero and followed by a vector of zeros for pixels beyond the border.
+// Depths and gray values of one row in `scratch`, preceded by one zero and followed by a vector of zeros for pixels beyond the border.
 template <class T>
 struct SmoothRow {
-  T *depth, *grey;
+  T *depth, *gray;
 };
 
 template <class T>
@@ -18,17 +18,17 @@ GS_INLINE void load_row(const SmoothnessPlane<T>& plane, int row, const SmoothRo
   constexpr int lanes = Simd<T>::lanes;
   const bool inside = row >= 0 && row < plane.height;
   const int64_t pixels = int64_t(plane.width) * plane.height, first = int64_t(row) * plane.width;
-  to.depth[0] = to.grey[0] = 0;
+  to.depth[0] = to.gray[0] = 0;
   for (int i = 0; i < plane.width + lanes; i += lanes) {
     const int left = inside && i < plane.width ? plane.width - i : 0;
-    Vector<T> depth{}, grey{};
+    Vector<T> depth{}, gray{};
     if (left > 0) {
       const T* photo = plane.photo + first + i;
       depth = load_partial<T>(plane.depth + first + i, left);
-      grey = grey_of<T>(load_partial<T>(photo, left), load_partial<T>(photo + pixels, left), load_partial<T>(photo + 2 * pixels, left));
+      gray = gray_of<T>(load_partial<T>(photo, left), load_partial<T>(photo + pixels, left), load_partial<T>(photo + 2 * pixels, left));
     }
     store<T>(to.depth + 1 + i, depth);
-    store<T>(to.grey + 1 + i, grey);
+    store<T>(to.gray + 1 + i, gray);
   }
 }
 
@@ -49,11 +49,11 @@ double unevenness(const SmoothnessPlane<T>& plane, T factor, int begin, int end,
     const SmoothRow<T>&above = rows[at % 3], &own = rows[(at + 1) % 3], &below = rows[(at + 2) % 3];
     load_row(plane, row + 1, below);
     for (int i = 0; i < plane.width; i += lanes) {
-      const V a = load<T>(own.depth + 1 + i), g = load<T>(own.grey + 1 + i);
+      const V a = load<T>(own.depth + 1 + i), g = load<T>(own.gray + 1 + i);
       V gradient{};
       // Returns the value of the pairs with a neighbour, and adds their gradient to `gradient`.
       const auto pair = [&](const SmoothRow<T>& of, int column) {
-        return unevenness_of<T>(a, g, load<T>(of.depth + column), load<T>(of.grey + column), gradient);
+        return unevenness_of<T>(a, g, load<T>(of.depth + column), load<T>(of.gray + column), gradient);
       };
       sum = sum + pair(own, i + 2) + pair(below, i + 1);
       if (plane.gradient == nullptr) continue;

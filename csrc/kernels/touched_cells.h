@@ -1,5 +1,5 @@
 // Exact test of which tiles, and which 4×4 blocks of their pixels, a splat touches: those where s = (aΔx + bΔy)² + (cΔy)² is at most
-// `reach` for some point between a block's outermost pixel centres.
+// `reach` for some point between a block's outermost pixel centers.
 //
 // s is convex with its minimum 0 at Δ = 0. Over a rectangle that doesn't contain Δ = 0, its minimum lies on a side that faces it: on x =
 // x*, the value nearest to 0 within the rectangle, or on y = y*. On either side s is a parabola, minimal at −slope_y·x* (or −slope_x·y*),

@@ -79,12 +79,12 @@ struct ProjectionParams {
   int width, height;
   T eps2d, near_plane, far_plane;  // as in ProjectionSettings
   bool antialiased, direct_colors;
-  T centre[3];                     // world
+  T center[3];                     // world
   T x_low, x_high, y_low, y_high;  // clamp range of x/z and y/z for the Jacobian
 };
 
 // A Gaussian projected into one camera. Exponents have base 2: α = min(0.999, 2^(log2_opacity − s)), where s = (aΔx + bΔy)² + (cΔy)² and Δ
-// = mean − pixel centre. A sum of squares loses no digits on needles, for which the terms of the usual quadratic form nearly cancel. 16
+// = mean − pixel center. A sum of squares loses no digits on needles, for which the terms of the usual quadratic form nearly cancel. 16
 // values: in float32 one cache line.
 template <class T>
 struct alignas(64) Splat {
@@ -179,7 +179,7 @@ struct PhotometricPlane {
   int width, height;
 };
 
-// Rate at which a difference of the photo's grey values reduces the weight of a difference of depths; see unevenness.h.
+// Rate at which a difference of the photo's gray values reduces the weight of a difference of depths; see unevenness.h.
 inline constexpr double kEdge = 10;
 
 // Depths of an image, with its photo and a buffer for the gradient; see smoothness.h. Row-major.
@@ -203,15 +203,15 @@ struct SmoothnessJob {
 // Returns the number of elements of scratch memory that a kernel needs for rows of this width.
 inline constexpr int loss_scratch_size(int width) { return 6 * (width + 33); }
 
-// Grey values of a photo whose depths are searched, or that is compared with it, and weights of its pixels; see plane_sweep.h. Row-major.
+// Gray values of a photo whose depths are searched, or that is compared with it, and weights of its pixels; see plane_sweep.h. Row-major.
 struct SweepPhoto {
-  const float* grey;    // [H, W], both sides at least 9
+  const float* gray;    // [H, W], both sides at least 9
   const float* weight;  // [H, W], null if every pixel counts
   int width, height;
 };
 
 // Photo that is compared. `to_pixels`, [3, 4], maps (column, row, 1, inverse depth) of the photo whose depths are searched to
-// (column · z, row · z, z) of this one. Coordinates are continuous: the centre of the first pixel is at ½.
+// (column · z, row · z, z) of this one. Coordinates are continuous: the center of the first pixel is at ½.
 struct ComparedPhoto {
   SweepPhoto photo;
   float to_pixels[12];
@@ -247,7 +247,7 @@ inline constexpr int64_t sweep_scratch_size(const PlaneSweep& sweep) {
 
 // Photo whose pixels choose among `planes` planes by semi-global matching; see semi_global.h.
 struct MatchedPhoto {
-  const float* grey;      // [H, W]
+  const float* gray;      // [H, W]
   const float* variance;  // of the patches and least_variance, [H, sweep_stride(W)]
   float least_variance;
   int width, height, planes;

@@ -1,5 +1,5 @@
 // Unevenness of depths between two neighbouring pixels, weighted down at edges of the photo; used by smoothness.h and ../cuda/losses.h.
-// With depths a and b and the photo's grey values g and h at the two pixels:
+// With depths a and b and the photo's gray values g and h at the two pixels:
 //
 //   e^{−10 |g − h|} · 2 |a − b| / (a + b),    ∂/∂a = ± e^{−10 |g − h|} · 4b / (a + b)²
 //
@@ -14,7 +14,7 @@ namespace globalsplat::raster::GS_ISA {
 
 // Computes the mean of red, green and blue.
 template <class T>
-GS_INLINE Vector<T> grey_of(Vector<T> red, Vector<T> green, Vector<T> blue) {
+GS_INLINE Vector<T> gray_of(Vector<T> red, Vector<T> green, Vector<T> blue) {
   return (red + green + blue) * T(1. / 3);
 }
 

@@ -13,8 +13,8 @@ pub use ffi::*;
 mod ffi {
     /// Photo that is compared with the one whose depths are searched.
     struct PhotoToCompare {
-        /// Address of the grey values, [h, w].
-        grey: usize,
+        /// Address of the gray values, [h, w].
+        gray: usize,
         /// Address of the weights of the pixels, [h, w]; 0 if every pixel counts.
         weight: usize,
         /// Matrix of three rows that maps (column, row, 1, inverse depth) of the photo whose depths are searched to (column · z, row · z, z)
@@ -105,7 +105,7 @@ mod ffi {
 
         /// Searches for the depths of a photo; see `csrc/tensor_ops.h`.
         unsafe fn search_depths(
-            grey: usize,
+            gray: usize,
             weight: usize,
             others: &[PhotoToCompare],
             step: f32,
@@ -115,7 +115,7 @@ mod ffi {
 
         /// Searches for the depths of a photo by semi-global matching; see `csrc/tensor_ops.h`.
         unsafe fn match_semi_globally(
-            grey: usize,
+            gray: usize,
             weight: usize,
             others: &[PhotoToCompare],
             step: f32,

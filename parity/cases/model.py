@@ -92,7 +92,7 @@ def radial_warp(rng):
         depths = np.concatenate([inverse, sure * uniform(rng, 0.0, 1.0, *inverse.shape)], 2)
         gaussians = {"means": normal(rng, batch, 40, 3), "scales": uniform(rng, 0.01, 0.1, batch, 40, 3)}
         inputs = views | {"depths": depths.astype(np.float32)} | gaussians
-        yield Draw(inputs, differentiate=tuple(gaussians), label=f"{by(batch, count, *image)}, sureness {sure}")
+        yield Draw(inputs, differentiate=tuple(gaussians), label=f"{by(batch, count, *image)}, confidence {sure}")
 
 
 def normalized_poses(c2w):

@@ -42,7 +42,7 @@ def resample(rng):
             yield Draw({"image": numbers.astype(np.uint8)}, {"region": region, "size": size})
 
 
-def turn_hue(image, turn):
+def shift_hue(image, turn):
     """Adds `turn` to the hue of an image [3, H, W], pixel by pixel."""
     turned = torch.empty_like(image)
     for row, column in np.ndindex(*image.shape[1:]):
@@ -57,17 +57,17 @@ def adjust_colors(image, adjustments):
     for adjustment in adjustments:
         [(name, factor)] = adjustment.items()
         if name == "hue":
-            image = turn_hue(image, factor)
+            image = shift_hue(image, factor)
             continue
-        grey = torch.tensordot(torch.tensor([0.2989, 0.587, 0.114], dtype=image.dtype), image, dims=1)
-        other = {"brightness": 0.0, "contrast": grey.mean(), "saturation": grey}[name]
+        gray = torch.tensordot(torch.tensor([0.2989, 0.587, 0.114], dtype=image.dtype), image, dims=1)
+        other = {"brightness": 0.0, "contrast": gray.mean(), "saturation": gray}[name]
         image = (factor * image + (1.0 - factor) * other).clamp(0.0, 1.0)
     return image
 
 
 @case(adjust_colors, "image")
 def jitter(rng):
-    """Each adjustment alone, and all of them in two orders; some pixels are grey, black or white."""
+    """Each adjustment alone, and all of them in two orders; some pixels are gray, black or white."""
     one = [{"brightness": 1.3}, {"contrast": 0.6}, {"saturation": 1.4}, {"hue": -0.1}, {"hue": 0.45}]
     several = [{"hue": 0.1}, {"contrast": 1.4}, {"brightness": 0.7}, {"saturation": 0.7}]
     for adjustments in [*([adjustment] for adjustment in one), several, several[::-1]]:
@@ -79,7 +79,7 @@ def jitter(rng):
 
 def photos_to_compare(rng, size, other_size, count, planes, *weighted):
     """Returns a draw of random patterns from cameras that look in about the same direction; the fifth faces away."""
-    inputs = {"grey": uniform(rng, 0.0, 1.0, *size), "others": uniform(rng, 0.0, 1.0, count, *other_size)}
+    inputs = {"gray": uniform(rng, 0.0, 1.0, *size), "others": uniform(rng, 0.0, 1.0, count, *other_size)}
     shapes = {"weight": size, "other_weights": (count, *other_size)}
     for name in weighted:
         ramp = np.linspace(-0.5, 2.0, shapes[name][-1])
@@ -141,7 +141,7 @@ MATCHING = Tolerance(
 )
 
 
-@case(as_images(search.match_semi_globally), "inverse_depth", "sureness", tolerance=MATCHING)
+@case(as_images(search.match_semi_globally), "inverse_depth", "confidence", tolerance=MATCHING)
 def semi_global_matching(rng):
     """Photos like those of depth_search, half of the first without texture.
 
@@ -157,7 +157,7 @@ def semi_global_matching(rng):
         # Rounding must not decide whether a pixel counts.
         for _ in range(100):
             drawn = photos_to_compare(rng, *shapes)
-            drawn.inputs["grey"][:, : shapes[0][1] // 2] *= 0.02
+            drawn.inputs["gray"][:, : shapes[0][1] // 2] *= 0.02
             drawn.doubtful = find_doubtful(search.match_semi_globally, drawn)
             if not drawn.doubtful.all():
                 break

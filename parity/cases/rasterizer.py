@@ -43,7 +43,7 @@ def map_cameras(inputs, function):
 
 def doubtful_pixels(config, inputs, margin):
     """Returns the mask of doubtful pixels, bool [B, C, H, W], for the arrays of a request."""
-    pixels = splat.pixel_centres(config["width"], config["height"], torch.float64)
+    pixels = splat.pixel_centers(config["width"], config["height"], torch.float64)
 
     def doubtful(means, scales, quaternions, opacities, sh, w2c, intrinsics):
         seen = splat.project(means, scales, quaternions, w2c, intrinsics, **config)

@@ -69,7 +69,7 @@ def scene(label, family=ADVERSARIAL, size=(33, 48)):
 def in_front_of_cameras(rng, size, means, scales, opacities, cameras=1):
     """Places Gaussians in front of cameras with w2c = I; other cameras are 1/4 to the left and 1/2 ahead.
 
-    Depths are exact, also in float32. The focal length is 32 and the principal point is the image centre.
+    Depths are exact, also in float32. The focal length is 32 and the principal point is the image center.
     """
     height, width = size
     means = np.asarray(means, dtype=np.float64)
@@ -96,7 +96,7 @@ def means_in_view(rng, depth, spread=0.6):
 
 @scene("near plane")
 def near_plane(rng, size):
-    """Three Gaussians at each of several depths around the near plane, some at the camera centre."""
+    """Three Gaussians at each of several depths around the near plane, some at the camera center."""
     just_above = np.nextafter(np.float32(0.01), np.float32(1))
     depth = np.repeat([-3.0, -0.01, 0.0, 1e-9, 0.0099, 0.01, just_above, 0.0101, 0.02, 0.1], 3)
     scales = rng.uniform(0.05, 0.4, (len(depth), 3)) * np.maximum(np.abs(depth), 1e-3)[:, None]
@@ -169,7 +169,7 @@ def equal_depths(rng, size):
 
 @scene("tile borders")
 def tile_borders(rng, size):
-    """Centres at multiples of 16 pixels and on the image borders: (u, v) = 16 (x, y) + (24, 16.5) at depth 2."""
+    """Centers at multiples of 16 pixels and on the image borders: (u, v) = 16 (x, y) + (24, 16.5) at depth 2."""
     u, v = np.meshgrid([0.0, 16.0, 32.0, 48.0], [0.0, 16.0, 16.5, 32.0, 33.0])
     means = np.stack([(u.ravel() - 24.0) / 16.0, (v.ravel() - 16.5) / 16.0, np.full(u.size, 2.0)], axis=-1)
     scales = np.tile([[0.001], [0.0625], [1.0], [0.5]], (5, 1))

@@ -16,9 +16,9 @@ def linear(params, name, x):
 
 def layer_norm(params, name, x):
     """Returns (x - mean) / sqrt(var + eps) * weight + bias over the last axis; the variance is the biased one."""
-    centred = x - x.mean(-1, keepdim=True)
-    variance = (centred * centred).mean(-1, keepdim=True)
-    return centred / torch.sqrt(variance + LAYER_NORM_EPS) * params[f"{name}.weight"] + params[f"{name}.bias"]
+    centered = x - x.mean(-1, keepdim=True)
+    variance = (centered * centered).mean(-1, keepdim=True)
+    return centered / torch.sqrt(variance + LAYER_NORM_EPS) * params[f"{name}.weight"] + params[f"{name}.bias"]
 
 
 def gelu(x):

@@ -88,13 +88,13 @@ def depth_smoothness(depth, photo, factor):
     """Returns the edge-aware smoothness of depth [..., H, W], 0 at pixels without depth, and photo [..., 3, H, W].
 
     The loss is `factor` times the mean over all pairs of adjacent pixels of 2 |a - b| / (a + b) exp(-10 |g - h|), where a
-    and b are their depths and g and h their grey levels; it is 0 for pairs with a = 0 or b = 0.
+    and b are their depths and g and h their gray levels; it is 0 for pairs with a = 0 or b = 0.
     """
-    grey = photo.mean(-3)
+    gray = photo.mean(-3)
     total, pairs = depth.sum() * 0.0, 0
     for axis in (-1, -2):
         a, b = (depth.narrow(axis, start, depth.shape[axis] - 1) for start in (0, 1))
-        g, h = (grey.narrow(axis, start, grey.shape[axis] - 1) for start in (0, 1))
+        g, h = (gray.narrow(axis, start, gray.shape[axis] - 1) for start in (0, 1))
         seen = (a > 0) & (b > 0)
         uneven = 2.0 * (a - b).abs() / torch.where(seen, a + b, 1.0)
         total = total + torch.where(seen, uneven * torch.exp(-EDGE * (g - h).abs()), 0.0).sum()
@@ -137,7 +137,7 @@ REGULARIZATION = 1e-2
 
 
 def frustum(means, w2c, intrinsics, far, image):
-    """Returns the frustum loss: every Gaussian centre should lie in the frustum of at least one input view.
+    """Returns the frustum loss: every Gaussian center should lie in the frustum of at least one input view.
 
     Its inputs are means [B, N, 3], w2c [B, V, 4, 4], intrinsics [B, V, 3, 3] in pixels, far [B], and the image's (H, W).
 

@@ -11,7 +11,7 @@ def unit(v):
 
 
 def average_pose(c2w):
-    """Returns the mean camera [4, 4] of c2w [C, 4, 4]: columns (right, down, forward), origin at the mean centre.
+    """Returns the mean camera [4, 4] of c2w [C, 4, 4]: columns (right, down, forward), origin at the mean center.
 
     The columns are those of the first camera if directions cancel out.
     """
@@ -42,15 +42,15 @@ def normalize_scene(c2w):
         T'_i = T_avg^-1 T_i,   s = max_ab |o'_a - o'_b|,   o'_i <- o'_i / s.
     """
     average = average_pose(c2w)
-    centred = c2w.clone()
-    centred[:, :3, 3] -= average[:3, 3]
+    centered = c2w.clone()
+    centered[:, :3, 3] -= average[:3, 3]
     average[:3, 3] = 0.0
-    aligned = invert_rigid(average) @ centred
-    centres = aligned[:, :3, 3]
-    scale = (centres[:, None] - centres[None, :]).norm(dim=-1).max()
+    aligned = invert_rigid(average) @ centered
+    centers = aligned[:, :3, 3]
+    scale = (centers[:, None] - centers[None, :]).norm(dim=-1).max()
     if not torch.isfinite(scale) or scale <= ROUNDING * c2w[:, :3, 3].abs().max():
         scale = torch.ones_like(scale)
 
     normalized = aligned.clone()
-    normalized[:, :3, 3] = centres / scale
+    normalized[:, :3, 3] = centers / scale
     return normalized, invert_rigid(normalized), scale

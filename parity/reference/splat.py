@@ -107,16 +107,16 @@ def sh_color(means, sh, w2c):
 
     The color is max(0, 0.5 + sum of basis(direction) sh).
     """
-    centre = -w2c[:3, :3].T @ w2c[:3, 3]
-    direction = means - centre
-    # A Gaussian at the camera centre is not drawn, but the gradient of this branch must be finite, too.
+    center = -w2c[:3, :3].T @ w2c[:3, 3]
+    direction = means - center
+    # A Gaussian at the camera center is not drawn, but the gradient of this branch must be finite, too.
     direction = direction / direction.norm(dim=-1, keepdim=True).clamp(min=1e-30)
     color = 0.5 + (sh_basis(direction, sh.shape[1])[..., None] * sh).sum(1)
     return torch.where(color > 0, color, 0.0)
 
 
-def pixel_centres(width, height, dtype=torch.float32, device=None):
-    """Returns pixel centres [H W, 2] as (j + 0.5, i + 0.5), row-major."""
+def pixel_centers(width, height, dtype=torch.float32, device=None):
+    """Returns pixel centers [H W, 2] as (j + 0.5, i + 0.5), row-major."""
     i, j = torch.meshgrid(
         torch.arange(height, dtype=dtype, device=device), torch.arange(width, dtype=dtype, device=device), indexing="ij"
     )
@@ -168,7 +168,7 @@ def render(means, scales, quaternions, opacities, sh, w2c, intrinsic, width, hei
     """
     projected = project(means, scales, quaternions, w2c, intrinsic, width, height, eps2d, antialiased)
     colors = sh_color(means, sh, w2c)
-    pixels = pixel_centres(width, height, means.dtype, means.device)
+    pixels = pixel_centers(width, height, means.dtype, means.device)
     rgb, accumulated, depth = composite(projected, opacities * projected["compensation"], colors, pixels)
     return rgb.reshape(height, width, 3), accumulated.reshape(height, width), depth.reshape(height, width)
 
@@ -177,7 +177,7 @@ def pixel_weights(means, scales, quaternions, opacities, w2c, intrinsic, width, 
     """Returns the weights of the Gaussians in the pixels of a camera, [H W, N]: each channel of a render is its product
     with their colors."""
     projected = project(means, scales, quaternions, w2c, intrinsic, width, height)
-    pixels = pixel_centres(width, height, means.dtype, means.device)
+    pixels = pixel_centers(width, height, means.dtype, means.device)
     one_hot = torch.eye(len(means), dtype=means.dtype)
     return composite(projected, opacities * projected["compensation"], one_hot, pixels)[0]
 

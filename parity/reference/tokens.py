@@ -8,13 +8,13 @@ from .layers import gelu, linear
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-CENTRE_FREQUENCIES = (1.0, 2.0, 4.0, 8.0)  # times pi
+CENTER_FREQUENCIES = (1.0, 2.0, 4.0, 8.0)  # times pi
 
 
 def plucker_rays(c2w, intrinsics, height, width):
     """Returns the rays [B, V, 6, H, W] of c2w [B, V, 4, 4] and intrinsics [B, V, 3, 3], with channels (o x dir, dir).
 
-    dir = normalize(R ((j + 0.5 - cx) / fx, (i + 0.5 - cy) / fy, 1)),  o = camera centre.
+    dir = normalize(R ((j + 0.5 - cx) / fx, (i + 0.5 - cy) / fy, 1)),  o = camera center.
     """
     direction = pixel_directions(c2w, intrinsics, height, width)
     direction = direction / direction.norm(dim=-1, keepdim=True)
@@ -36,15 +36,15 @@ def pixel_directions(c2w, intrinsics, height, width):
     return torch.einsum("bvrc,bvhwc->bvhwr", c2w[..., :3, :3], in_camera)
 
 
-def centre_features(centre):
-    """Encodes centres o [..., 3] as [..., 27]: o, sin(pi f o) for all f, cos(pi f o) for all f; frequency-major."""
-    sines = [torch.sin(math.pi * f * centre) for f in CENTRE_FREQUENCIES]
-    cosines = [torch.cos(math.pi * f * centre) for f in CENTRE_FREQUENCIES]
-    return torch.cat([centre, *sines, *cosines], dim=-1)
+def center_features(center):
+    """Encodes centers o [..., 3] as [..., 27]: o, sin(pi f o) for all f, cos(pi f o) for all f; frequency-major."""
+    sines = [torch.sin(math.pi * f * center) for f in CENTER_FREQUENCIES]
+    cosines = [torch.cos(math.pi * f * center) for f in CENTER_FREQUENCIES]
+    return torch.cat([center, *sines, *cosines], dim=-1)
 
 
 def camera_code(params, c2w, intrinsics, height, width):
-    """Returns a code per view, [B, V, ray width]: W [MLP(log fx/W, log fy/H, cx/W, cy/H) ; features of the centre]."""
+    """Returns a code per view, [B, V, ray width]: W [MLP(log fx/W, log fy/H, cx/W, cy/H) ; features of the center]."""
     features = torch.stack(
         [
             torch.log(intrinsics[..., 0, 0] / width),
@@ -56,7 +56,7 @@ def camera_code(params, c2w, intrinsics, height, width):
     )
     hidden = gelu(linear(params, "view_pe.k_mlp.0", features))
     hidden = gelu(linear(params, "view_pe.k_mlp.2", hidden))
-    return linear(params, "view_pe.proj", torch.cat([hidden, centre_features(c2w[..., :3, 3])], dim=-1))
+    return linear(params, "view_pe.proj", torch.cat([hidden, center_features(c2w[..., :3, 3])], dim=-1))
 
 
 def patchify(image, patch):

@@ -53,7 +53,7 @@ def blurred(image, sigma):
 
 
 class RadialWarp:
-    """The warp of views with c2w [B, V, 4, 4], intrinsics [B, V, 3, 3] and depths [B, V, 2, H, W]: inverse depth, sureness.
+    """The warp of views with c2w [B, V, 4, 4], intrinsics [B, V, 3, 3] and depths [B, V, 2, H, W]: inverse depth, confidence.
 
     A point X of the normalized world becomes exp(-l) X, where l is the map of directions at X: the mean of
     log(|X| / DISTANCE) over the pixels around, weighted by how sure their depths are.
@@ -81,7 +81,7 @@ class RadialWarp:
         return F.grid_sample(self.map, places, padding_mode="border", align_corners=False)[:, 0, :, 0]
 
     def cameras(self, c2w):
-        """Returns c2w with centres closer to the origin where the scene is far away."""
+        """Returns c2w with centers closer to the origin where the scene is far away."""
         moved = c2w.clone()
         moved[..., :3, 3] = c2w[..., :3, 3] * self.camera_factors[:, None, None]
         return moved

@@ -92,7 +92,7 @@ def rotated(q, v):
 def scalar_render(means, scales, quaternions, opacities, sh, w2c, intrinsic, width, height, eps2d, antialiased):
     """Renders one pixel and one Gaussian at a time, which shares no formula with the reference: [H, W, 5]."""
     fx, fy, cx, cy = intrinsic[0, 0], intrinsic[1, 1], intrinsic[0, 2], intrinsic[1, 2]
-    centre, drawn = -w2c[:3, :3].T @ w2c[:3, 3], []
+    center, drawn = -w2c[:3, :3].T @ w2c[:3, 3], []
     for g, mean in enumerate(means):
         x, y, z = w2c[:3, :3] @ mean + w2c[:3, 3]
         if z <= 0.01:
@@ -109,7 +109,7 @@ def scalar_render(means, scales, quaternions, opacities, sh, w2c, intrinsic, wid
         if det <= 0:
             continue
         opacity = opacities[g] * (math.sqrt(max(np.linalg.det(cov), 0.0) / det) if antialiased else 1.0)
-        direction = (mean - centre) / np.linalg.norm(mean - centre)
+        direction = (mean - center) / np.linalg.norm(mean - center)
         color = np.maximum(0.0, 0.5 + np.array(harmonics(*direction))[: len(sh[g])] @ sh[g])
         drawn.append((z, g, np.array([fx * x / z + cx, fy * y / z + cy]), np.linalg.inv(filtered), opacity, color))
     drawn.sort(key=lambda item: item[:2])
@@ -156,10 +156,10 @@ def test_spherical_harmonics():
 
 def test_capped_alphas_and_negative_colors_have_no_gradient():
     opacity = torch.tensor([1.0], dtype=torch.float64, requires_grad=True)
-    centre = torch.full((1, 2), 0.5, dtype=torch.float64)
-    projected = {"mean2d": centre, "conic": torch.tensor([[1.0, 0.0, 1.0]], dtype=torch.float64)}
+    center = torch.full((1, 2), 0.5, dtype=torch.float64)
+    projected = {"mean2d": center, "conic": torch.tensor([[1.0, 0.0, 1.0]], dtype=torch.float64)}
     projected |= {"depth": torch.ones(1, dtype=torch.float64), "visible": torch.ones(1, dtype=torch.bool)}
-    weight, _, _ = splat.composite(projected, opacity, torch.ones(1, 3, dtype=torch.float64), centre)
+    weight, _, _ = splat.composite(projected, opacity, torch.ones(1, 3, dtype=torch.float64), center)
     weight.sum().backward()
     assert weight.tolist() == [[0.999] * 3] and opacity.grad.tolist() == [0.0]
     sh = torch.tensor([[[-9.0, 0.3, 9.0]]], dtype=torch.float64, requires_grad=True)

@@ -281,8 +281,8 @@ def ksplat(splat, level):
     buckets.sort(key=len, reverse=True)
     partial = [len(bucket) for bucket in buckets if len(bucket) < capacity]
     order = np.concatenate(buckets)
-    centres = np.array([np.sign(places[bucket[0]]) * 1.75 for bucket in buckets])
-    steps = places[order] - np.repeat(centres, [len(bucket) for bucket in buckets], axis=0)
+    centers = np.array([np.sign(places[bucket[0]]) * 1.75 for bucket in buckets])
+    steps = places[order] - np.repeat(centers, [len(bucket) for bucket in buckets], axis=0)
     steps = np.round(steps / (size / 2) * middle) + middle
     turns = columns(splat, *(f"rot_{k}" for k in range(4)))
     numbers = np.hstack([np.exp(columns(splat, *(f"scale_{k}" for k in range(3)))), turns])[order]
@@ -306,7 +306,7 @@ def ksplat(splat, level):
     full = (len(buckets) - len(partial)) * has_buckets
     numbers = (COUNT, COUNT, capacity, len(buckets) * has_buckets, size, 12, middle * has_buckets)
     struct.pack_into("<IIIIfHxxI4xIIH", section, 0, *numbers, full, len(partial) * has_buckets, degree)
-    tables = np.array(partial, "<u4").tobytes() + centres.astype("<f4").tobytes()
+    tables = np.array(partial, "<u4").tobytes() + centers.astype("<f4").tobytes()
     return bytes(header) + bytes(section) + tables * has_buckets + rows.tobytes()
 
 

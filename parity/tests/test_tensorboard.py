@@ -104,7 +104,7 @@ def test_pictures_are_strips_of_five(trained):
         assert decoded.shape == (SIZE, 5 * SIZE + 4 * GAP, 3)
         photo, truth, render, depth, alpha = (decoded[:, i * (SIZE + GAP) : i * (SIZE + GAP) + SIZE] for i in range(5))
         assert photo.std() > 5 and truth.std() > 5 and not np.array_equal(photo, truth)
-        assert (alpha == alpha[..., :1]).all(), "grey"
+        assert (alpha == alpha[..., :1]).all(), "gray"
         seen.append([render.any(), depth.any(), alpha.any()])
     # An untrained model renders some images black.
     assert np.any(seen, axis=0).all()

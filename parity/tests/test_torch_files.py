@@ -120,10 +120,10 @@ def lightning(weights):
     }
 
 
-@pytest.mark.parametrize("legacy, protocol", [(False, 2), (False, 5), (True, 4)])
-def test_checkpoints_of_lightning_are_read(weights, tmp_path, legacy, protocol):
+@pytest.mark.parametrize("protocol", [2, 5])
+def test_checkpoints_of_lightning_are_read(weights, tmp_path, protocol):
     file = tmp_path / "last.ckpt"
-    torch.save(lightning(weights), file, pickle_protocol=protocol, _use_new_zipfile_serialization=not legacy)
+    torch.save(lightning(weights), file, pickle_protocol=protocol)
     read, report = imported(file)
     assert same(read, weights)
     # Frozen networks, and another tensor that isn't part of the model.
@@ -169,8 +169,7 @@ def test_the_model_is_preferred_to_its_moving_average(weights, tmp_path):
     assert same(read, weights) and report["left_out"] == len(average)
 
 
-@pytest.mark.parametrize("legacy", [False, True])
-def test_shared_storages_and_any_strides_are_read(weights, tmp_path, legacy):
+def test_shared_storages_and_any_strides_are_read(weights, tmp_path):
     flat = torch.cat([tensor.flatten() for tensor in weights.values()])
     state, offset = {}, 0
     for name, tensor in weights.items():
@@ -185,7 +184,7 @@ def test_shared_storages_and_any_strides_are_read(weights, tmp_path, legacy):
     state["slot_encoder.scale_emb"].tag = "a parameter"
     state["slot_encoder.mem_regs"] = weights["slot_encoder.mem_regs"].clone()
     state["slot_encoder.mem_regs"].tag = "a tensor"
-    torch.save(state, tmp_path / "model.pt", _use_new_zipfile_serialization=not legacy)
+    torch.save(state, tmp_path / "model.pt")
     assert same(imported(tmp_path / "model.pt")[0], weights)
 
 
@@ -241,16 +240,14 @@ class Runs:
         return self.call
 
 
-@pytest.mark.parametrize(
-    "legacy, protocol, place", [(False, 2, "beside"), (True, 4, "inside"), (False, 4, "scene_tokens")]
-)
-def test_what_would_run_code_is_refused_and_not_run(weights, tmp_path, legacy, protocol, place):
+@pytest.mark.parametrize("protocol, place", [(2, "beside"), (4, "inside"), (4, "scene_tokens")])
+def test_what_would_run_code_is_refused_and_not_run(weights, tmp_path, protocol, place):
     trap, file, out = tmp_path / "trap", tmp_path / "evil.ckpt", tmp_path / "out.safetensors"
     for name, evil in {"system": Runs(os.system, f"touch {trap}"), "open": Runs(open, str(trap), "w")}.items():
         checkpoint = (
             {"state_dict": weights, "beside": [evil]} if place == "beside" else {"state_dict": weights | {place: evil}}
         )
-        torch.save(checkpoint, file, pickle_protocol=protocol, _use_new_zipfile_serialization=not legacy)
+        torch.save(checkpoint, file, pickle_protocol=protocol)
         error = refuse("import", "--from", file, "--out", out)
         assert f".{name}," in error and "nothing was run" in error, error
     assert "nothing was run" in refuse("reconstruct", "--weights", file, "--scene", "x", "--out", tmp_path / "out.ply")

@@ -21,11 +21,11 @@ for index in range(len(capture)):
     Ks[index, :2] *= factor
 
 # COLMAP's points, or random ones in front of the cameras.
-centres = viewmats.inverse()[:, :3, 3]
-scale = (centres - centres.mean(0)).norm(dim=-1).max().item()
+centers = viewmats.inverse()[:, :3, 3]
+scale = (centers - centers.mean(0)).norm(dim=-1).max().item()
 points, colors = (torch.from_numpy(array).float() for array in capture.points())
 if len(points) == 0:
-    points = centres.mean(0) + scale * torch.randn(GAUSSIANS, 3)
+    points = centers.mean(0) + scale * torch.randn(GAUSSIANS, 3)
     colors = torch.rand(GAUSSIANS, 3)
 rates = {"means": 2e-4 * scale, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 5e-3, "shN": 2.5e-4}
 params = torch.nn.ParameterDict(

@@ -66,7 +66,7 @@ def rasterization(
         each camera.
 
     Args:
-        means (Tensor): centres of the Gaussians. :math:`(*, N, 3)`
+        means (Tensor): centers of the Gaussians. :math:`(*, N, 3)`
         quats (Tensor): rotations as quaternions (w, x, y, z) of any length. :math:`(*, N, 4)`
         scales (Tensor): standard deviations along the Gaussians' axes. :math:`(*, N, 3)`
         opacities (Tensor): opacities in [0, 1]. :math:`(*, N)`
@@ -236,8 +236,8 @@ def _describe(means2d: Tensor, projected: list[Tensor], width: int, height: int)
     extents = (2.0 * torch.log(255.0 * opacities)).clamp(min=0.0).sqrt().clamp(max=RADIUS)
     radii = torch.ceil(extents[..., None] * variances.sqrt()).clamp(max=MAX_RADIUS)
     size = torch.tensor([width, height], dtype=radii.dtype, device=radii.device)
-    centres = means2d.detach().reshape(radii.shape)
-    is_visible = (visible > 0) & ((centres + radii > 0) & (centres - radii < size)).all(-1)
+    centers = means2d.detach().reshape(radii.shape)
+    is_visible = (visible > 0) & ((centers + radii > 0) & (centers - radii < size)).all(-1)
     out = means2d.shape[:-1]
     return {
         "radii": torch.where(is_visible[..., None], radii, 0.0).to(torch.int32).reshape(means2d.shape),

@@ -68,7 +68,7 @@ def reference_rasterization(
         means2d.append(projected["mean2d"])
         bases = None if sh_degree is None else (sh_degree + 1) ** 2
         seen = colors if bases is None else reference.sh_color(means, colors[:, :bases], viewmat)
-        pixels = reference.pixel_centres(WIDTH, HEIGHT, means.dtype)
+        pixels = reference.pixel_centers(WIDTH, HEIGHT, means.dtype)
         image, alpha, depth = reference.composite(projected, opacities * projected["compensation"], seen, pixels)
         if backgrounds is not None:
             image = image + (1.0 - alpha[:, None]) * backgrounds[camera]

@@ -63,7 +63,7 @@ pub struct Convert {
     /// example for `render --path`
     #[arg(long, value_name = "FILE", requires = "scene")]
     cameras_out: Option<PathBuf>,
-    /// Write coordinates relative to the centre of the scene, which is stored in a file beside the splat: far from the world's
+    /// Write coordinates relative to the center of the scene, which is stored in a file beside the splat: far from the world's
     /// origin, as in UTM coordinates, float32 and the formats' own number types lose detail
     #[arg(long)]
     local_origin: bool,

@@ -53,13 +53,13 @@ const OPTIONS: [EditOption; 13] = [
     (
         "crop-box",
         "X,Y,Z,X,Y,Z",
-        "Keep the Gaussians whose centres are in the box between two corners; - stands for no bound",
+        "Keep the Gaussians whose centers are in the box between two corners; - stands for no bound",
         parse_box,
     ),
     (
         "crop-sphere",
         "X,Y,Z,RADIUS",
-        "Keep the Gaussians whose centres are in a sphere",
+        "Keep the Gaussians whose centers are in a sphere",
         |text| match numbers(text)? {
             [x, y, z, radius] if radius > 0. => edit(SplatEdit::CropSphere(DVec3::new(x, y, z), radius)),
             _ => Err("expected a radius above 0".into()),

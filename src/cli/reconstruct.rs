@@ -44,7 +44,7 @@ pub struct Reconstruct {
     /// Also refine the splat on all input photos for this time, as `refine --init model` does; as in 60s or 2m
     #[arg(long, value_name = "TIME", value_parser = parse_seconds, conflicts_with = "precision")]
     refine: Option<f64>,
-    /// Write coordinates relative to the centre of the cameras, which is stored in a file beside the splat: far from the
+    /// Write coordinates relative to the center of the cameras, which is stored in a file beside the splat: far from the
     /// world's origin, as in UTM coordinates, float32 loses detail
     #[arg(long)]
     local_origin: bool,

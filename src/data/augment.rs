@@ -12,8 +12,8 @@ use rand::Rng;
 use rand::seq::SliceRandom;
 use serde::{Deserialize, Serialize};
 
-/// Weights of the color channels in the grey value, as in torchvision.
-const GREY: [f32; CHANNELS] = [0.2989, 0.587, 0.114];
+/// Weights of the color channels in the gray value, as in torchvision.
+const GRAY: [f32; CHANNELS] = [0.2989, 0.587, 0.114];
 
 /// A color adjustment.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -21,9 +21,9 @@ const GREY: [f32; CHANNELS] = [0.2989, 0.587, 0.114];
 pub enum Adjustment {
     /// Factor on all color values.
     Brightness(f32),
-    /// Factor on the distance from the image's mean grey.
+    /// Factor on the distance from the image's mean gray.
     Contrast(f32),
-    /// Factor on the distance from the pixel's grey.
+    /// Factor on the distance from the pixel's gray.
     Saturation(f32),
     /// Rotation of the hue as a fraction of the full circle, −½ to ½.
     Hue(f32),
@@ -79,16 +79,16 @@ impl Jitter {
                     planes.iter_mut().for_each(|value| *value = in_range(*value * factor));
                 }
                 Adjustment::Contrast(factor) => {
-                    let offset = (1. - factor) * mean_grey(planes);
+                    let offset = (1. - factor) * mean_gray(planes);
                     planes.iter_mut().for_each(|value| *value = in_range(factor * *value + offset));
                 }
                 Adjustment::Saturation(factor) => for_pixels(planes, |pixel| {
-                    let grey = (1. - factor) * grey(pixel);
-                    pixel.map(|value| in_range(factor * value + grey))
+                    let gray = (1. - factor) * gray(pixel);
+                    pixel.map(|value| in_range(factor * value + gray))
                 }),
                 Adjustment::Hue(turn) => {
                     let shift = 6. * (turn - turn.floor());
-                    for_pixels(planes, |pixel| turn_hue(pixel, shift));
+                    for_pixels(planes, |pixel| shift_hue(pixel, shift));
                 }
             }
         }
@@ -99,8 +99,8 @@ fn in_range(value: f32) -> f32 {
     value.clamp(0., 1.)
 }
 
-fn grey([red, green, blue]: [f32; CHANNELS]) -> f32 {
-    GREY[0] * red + GREY[1] * green + GREY[2] * blue
+fn gray([red, green, blue]: [f32; CHANNELS]) -> f32 {
+    GRAY[0] * red + GRAY[1] * green + GRAY[2] * blue
 }
 
 fn split(planes: &mut [f32]) -> [&mut [f32]; CHANNELS] {
@@ -117,8 +117,8 @@ fn for_pixels(planes: &mut [f32], change: impl Fn([f32; CHANNELS]) -> [f32; CHAN
     }
 }
 
-/// Returns the mean grey of the image. Each float32 partial sum covers only a few hundred values, which keeps it accurate.
-fn mean_grey(planes: &[f32]) -> f32 {
+/// Returns the mean gray of the image. Each float32 partial sum covers only a few hundred values, which keeps it accurate.
+fn mean_gray(planes: &[f32]) -> f32 {
     const LANES: usize = 16;
     let pixels = planes.len() / CHANNELS;
     let plane_sum = |plane: &[f32]| {
@@ -135,12 +135,12 @@ fn mean_grey(planes: &[f32]) -> f32 {
         total
     };
     let sum: f64 =
-        planes.chunks_exact(pixels).zip(GREY).map(|(p, share)| f64::from(share) * plane_sum(p)).sum();
+        planes.chunks_exact(pixels).zip(GRAY).map(|(p, share)| f64::from(share) * plane_sum(p)).sum();
     (sum / pixels as f64) as f32
 }
 
 /// Rotates the hue by `shift` sixths of the circle, 0 to 6, with value and chroma unchanged: HSV and back in one formula.
-fn turn_hue([red, green, blue]: [f32; CHANNELS], shift: f32) -> [f32; CHANNELS] {
+fn shift_hue([red, green, blue]: [f32; CHANNELS], shift: f32) -> [f32; CHANNELS] {
     let (value, least) = (red.max(green).max(blue), red.min(green).min(blue));
     let chroma = value - least;
     let inverse = if chroma > 0. { 1. / chroma } else { 0. };
@@ -193,7 +193,7 @@ impl Augmentation {
     }
 
     /// Returns the visible region of a photo, and the camera of an image of `size` that shows it. The region is the largest
-    /// rectangle with `size`'s aspect ratio centred at the principal point, reduced by the extra crop. Its edges may lie inside
+    /// rectangle with `size`'s aspect ratio centered at the principal point, reduced by the extra crop. Its edges may lie inside
     /// pixels. Resampling handles that, so the intrinsics are exact.
     ///
     /// # Errors
@@ -201,10 +201,10 @@ impl Augmentation {
     pub fn visible_region(&self, camera: &Camera, size: ImageSize) -> Result<(Region, Camera)> {
         let (full_width, full_height) = (f64::from(camera.width), f64::from(camera.height));
         let k = camera.intrinsics;
-        let (centred_width, centred_height) =
+        let (centered_width, centered_height) =
             (2. * k.cx.min(full_width - k.cx), 2. * k.cy.min(full_height - k.cy));
         let aspect = f64::from(size.width) / f64::from(size.height);
-        let width = centred_width.min(centred_height * aspect);
+        let width = centered_width.min(centered_height * aspect);
         let height = width / aspect;
         if width.min(height) < SMALLEST_PART {
             return Err(Error::failed(format!(

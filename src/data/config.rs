@@ -23,9 +23,9 @@ pub enum Sampling {
 pub struct JitterConfig {
     /// Maximum brightness change x: colors are multiplied by a factor from 1 − x to 1 + x.
     pub brightness: f64,
-    /// Maximum contrast change x: distances from the image's mean grey are multiplied by a factor from 1 − x to 1 + x.
+    /// Maximum contrast change x: distances from the image's mean gray are multiplied by a factor from 1 − x to 1 + x.
     pub contrast: f64,
-    /// Maximum saturation change x: distances from the pixel's grey are multiplied by a factor from 1 − x to 1 + x.
+    /// Maximum saturation change x: distances from the pixel's gray are multiplied by a factor from 1 − x to 1 + x.
     pub saturation: f64,
     /// Maximum hue rotation in either direction, as a fraction of the full circle; at most ½.
     pub hue: f64,

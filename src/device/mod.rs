@@ -218,12 +218,12 @@ pub(crate) mod num_threads {
     static LOCK: RwLock<()> = RwLock::new(());
 
     /// Guard of a test that compares the bits of several runs.
-    pub fn keep() -> RwLockReadGuard<'static, ()> {
+    pub fn lock_shared() -> RwLockReadGuard<'static, ()> {
         LOCK.read().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Guard of a test that changes the number of threads.
-    pub fn change() -> RwLockWriteGuard<'static, ()> {
+    pub fn lock_exclusive() -> RwLockWriteGuard<'static, ()> {
         LOCK.write().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -48,7 +48,7 @@ pub(crate) mod tests {
     }
 
     /// Returns `true` if ranks can communicate in this build. Otherwise prints that the test is skipped.
-    pub(crate) fn can_meet() -> bool {
+    pub(crate) fn require_gloo() -> bool {
         if !ffi::has_gloo() {
             globalsplat_test_kit::skip("Gloo", "built without Gloo (libgloo-dev)");
         }
@@ -57,7 +57,7 @@ pub(crate) mod tests {
 
     #[test]
     fn collectives_return_the_expected_values() {
-        if !can_meet() {
+        if !require_gloo() {
             return;
         }
         for ranks in [2, 3] {
@@ -89,7 +89,7 @@ pub(crate) mod tests {
     /// Buckets sum the gradients of leaves that are used once, in two backward passes of a step, or not at all.
     #[test]
     fn gradients_are_added_up_in_buckets() {
-        if !can_meet() {
+        if !require_gloo() {
             return;
         }
         let found = run_on_ranks(3, |group| {
@@ -128,7 +128,7 @@ pub(crate) mod tests {
 
     #[test]
     fn a_second_gradient_of_a_parameter_is_an_error() {
-        if !can_meet() {
+        if !require_gloo() {
             return;
         }
         let found = run_on_ranks(2, |group| {

@@ -263,19 +263,19 @@ impl Baselines {
     }
 }
 
-/// Scores, for every target view, the context photo whose camera centre is nearest.
+/// Scores, for every target view, the context photo whose camera center is nearest.
 pub(super) fn nearest_context_baseline(
     scene: &str,
     context: &LazyPhotos,
     target: &LazyPhotos,
 ) -> Result<CaptureScores> {
-    let centres = |photos: &LazyPhotos| -> Vec<DVec3> {
+    let centers = |photos: &LazyPhotos| -> Vec<DVec3> {
         photos.poses().iter().map(|pose| pose.w_axis.truncate()).collect()
     };
-    let shown = centres(context);
+    let shown = centers(context);
     let mut scores = vec![];
-    for (i, centre) in centres(target).into_iter().enumerate() {
-        let distance = |&photo: &usize| shown[photo].distance(centre);
+    for (i, center) in centers(target).into_iter().enumerate() {
+        let distance = |&photo: &usize| shown[photo].distance(center);
         let nearest = (0..shown.len()).min_by(|a, b| distance(a).total_cmp(&distance(b)));
         let nearest = context.load(nearest.expect("a context view"))?;
         let view = target.load(i)?;
@@ -297,9 +297,9 @@ mod tests {
     #[test]
     fn baselines_are_the_nearest_photo_and_the_mean() {
         let intrinsics = Intrinsics { fx: 16., fy: 16., cx: 8., cy: 8. };
-        let view = |at: f64, grey: f64| View {
+        let view = |at: f64, gray: f64| View {
             name: String::new(),
-            image: Tensor::full([3, 16, 16], grey, (Kind::Float, Device::Cpu)).into(),
+            image: Tensor::full([3, 16, 16], gray, (Kind::Float, Device::Cpu)).into(),
             mask: None,
             camera: Camera { intrinsics, c2w: DMat4::from_translation(DVec3::X * at), width: 8, height: 8 },
         };

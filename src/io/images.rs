@@ -13,7 +13,7 @@ pub fn tensor_from_rgb(image: &RgbImage) -> Tensor {
     Tensor::from_slice(image.as_raw()).view([height, width, 3]).permute([2, 0, 1]).to_kind(Kind::Float) / 255.
 }
 
-/// Converts a tensor [3, H, W] or [H, W] (grey) to an image; values are clamped to [0, 1] and rounded.
+/// Converts a tensor [3, H, W] or [H, W] (gray) to an image; values are clamped to [0, 1] and rounded.
 ///
 /// # Errors
 /// Returns libtorch's error, for example for another shape.
@@ -47,7 +47,7 @@ pub fn check_writable_png(path: &Path) -> Result<()> {
     Ok(check_writable_file(path)?)
 }
 
-/// Writes a tensor [3, H, W] or [H, W] (grey) with values in [0, 1] as a PNG.
+/// Writes a tensor [3, H, W] or [H, W] (gray) with values in [0, 1] as a PNG.
 ///
 /// # Errors
 /// Returns an error if the file can't be written.

@@ -35,7 +35,7 @@ pub struct LossConfig {
     pub consistency_alpha: f64,
     /// Weight of the difference of the two subsets' depths.
     pub consistency_depth: f64,
-    /// Weight of the frustum constraint on the Gaussians' centres.
+    /// Weight of the frustum constraint on the Gaussians' centers.
     pub frustum: f64,
     /// Weight of L_dec, in addition to its own factor of 1e-2.
     pub decoder: f64,

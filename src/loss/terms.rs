@@ -220,7 +220,7 @@ pub fn sh_soft_cap(sh: &Tensor) -> Tensor {
 // Edge-aware depth smoothness, which regularizes geometry if there are few photos (Godard et al. 2017, eq. 3).
 
 /// Computes `factor` times the mean of 2 |a − b| / (a + b) · exp(−10 |g − h|) over all pairs of horizontally or vertically neighbouring
-/// pixels, where a and b are the depths and g and h the photo's grey values at the two pixels. Pairs with a depth of 0, where nothing is
+/// pixels, where a and b are the depths and g and h the photo's gray values at the two pixels. Pairs with a depth of 0, where nothing is
 /// visible, contribute 0. `depths` are [.., H, W], 0 or more; `photos` are [.., 3, H, W]. The result is a scalar, differentiable with
 /// respect to the depths; float64 if the depths are, and float32 otherwise.
 ///

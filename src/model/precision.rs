@@ -162,7 +162,7 @@ mod tests {
     /// because libraries split sums depending on each.
     #[test]
     fn products_have_the_same_bits_for_any_number_of_threads() {
-        let _guard = num_threads::change();
+        let _guard = num_threads::lock_exclusive();
         let numbers = |count: i64, phase: f64| {
             (Tensor::arange(count, (Kind::Double, Device::Cpu)).square() + phase).sin().to_kind(Kind::Float)
         };

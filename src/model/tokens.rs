@@ -111,13 +111,13 @@ impl RayTokens {
 
 /// Width of the intrinsics features.
 const INTRINSICS_WIDTH: i64 = 64;
-/// Frequencies of the camera centre's encoding, in units of π.
+/// Frequencies of the camera center's encoding, in units of π.
 const FREQUENCIES: [f64; 4] = [1., 2., 4., 8.];
-/// Width of the encoded camera centre: the centre, its sines and its cosines.
-const CENTRE_WIDTH: i64 = 3 + 2 * 3 * FREQUENCIES.len() as i64;
+/// Width of the encoded camera center: the center, its sines and its cosines.
+const CENTER_WIDTH: i64 = 3 + 2 * 3 * FREQUENCIES.len() as i64;
 
 /// Camera code (spec 3.3): one vector per view that distinguishes cameras beyond their Plücker rays. An MLP encodes the intrinsics, sines and
-/// cosines encode the camera centre, and one linear layer joins both.
+/// cosines encode the camera center, and one linear layer joins both.
 #[derive(Debug)]
 pub(crate) struct CameraCode {
     intrinsics_in: nn::Linear,
@@ -131,7 +131,7 @@ impl CameraCode {
         CameraCode {
             intrinsics_in: default_linear(&mlp / "0", 4, INTRINSICS_WIDTH, true),
             intrinsics_out: default_linear(&mlp / "2", INTRINSICS_WIDTH, INTRINSICS_WIDTH, true),
-            project: default_linear(vs / "proj", INTRINSICS_WIDTH + CENTRE_WIDTH, width, true),
+            project: default_linear(vs / "proj", INTRINSICS_WIDTH + CENTER_WIDTH, width, true),
         }
     }
 
@@ -144,10 +144,10 @@ impl CameraCode {
         let intrinsics = gelu(self.intrinsics_in.forward(&features));
         let intrinsics = gelu(self.intrinsics_out.forward(&intrinsics));
 
-        let centre = c2w.narrow(-2, 0, 3).select(-1, 3); // [B, V, 3]
-        let phases: Vec<Tensor> = FREQUENCIES.iter().map(|f| &centre * (f * PI)).collect();
+        let center = c2w.narrow(-2, 0, 3).select(-1, 3); // [B, V, 3]
+        let phases: Vec<Tensor> = FREQUENCIES.iter().map(|f| &center * (f * PI)).collect();
         let phases = Tensor::cat(&phases, -1); // frequency-major, xyz inside
-        let code = Tensor::cat(&[intrinsics, centre, phases.sin(), phases.cos()], -1); // [B, V, 64 + 27]
+        let code = Tensor::cat(&[intrinsics, center, phases.sin(), phases.cos()], -1); // [B, V, 64 + 27]
         self.project.forward(&code)
     }
 }

@@ -49,10 +49,10 @@ pub fn spread_over_path(cameras: &[Camera], indices: &[usize], wanted: usize) ->
         return vec![indices[count / 2]];
     }
     let pose = |i: usize| cameras[indices[i]].c2w;
-    let centre = |i: usize| pose(i).w_axis.truncate();
-    let extent = (1..count).map(|i| centre(i).distance(centre(0))).fold(0., f64::max);
+    let center = |i: usize| pose(i).w_axis.truncate();
+    let extent = (1..count).map(|i| center(i).distance(center(0))).fold(0., f64::max);
     let step = |i: usize| {
-        let moved = if extent > 0. { centre(i).distance(centre(i - 1)) / extent } else { 0. };
+        let moved = if extent > 0. { center(i).distance(center(i - 1)) / extent } else { 0. };
         moved + pose(i).z_axis.truncate().angle_between(pose(i - 1).z_axis.truncate())
     };
     let mut position = vec![0.; count];

@@ -304,7 +304,7 @@ mod tests {
 
     /// Refines a splat on `views`, which starts from the depths of `start`, and returns it.
     fn refined(start: &[View], views: &[View], background: Option<MaskBackground>, seed: u64) -> Gaussians {
-        let _guard = num_threads::change();
+        let _guard = num_threads::lock_exclusive();
         let config = RefineConfig::default();
         let off = ExposureCorrection::Off;
         let raw = gaussians_from_photos(start, &[], 400, seed, off, |_| true).expect("depths").gaussians;
@@ -380,7 +380,7 @@ mod tests {
     /// The number of Gaussians grows to the requested one, also if no relocation is due.
     #[test]
     fn the_number_of_gaussians_grows() {
-        let _guard = num_threads::change();
+        let _guard = num_threads::lock_exclusive();
         let [_, views] = wall(false);
         let off = ExposureCorrection::Off;
         let raw = gaussians_from_photos(&views, &[], 40, 0, off, |_| true).expect("depths").gaussians;
@@ -472,7 +472,7 @@ mod tests {
             let mut optimizer =
                 GaussianOptimizer::new(&RawGaussians::from_gaussians(&gaussians), 1., &config, 0);
             let mut corrections = Corrections::new(4, true, Some(&[[0.; 3]; 4]), 1., &config, Device::Cpu);
-            let _guard = num_threads::change();
+            let _guard = num_threads::lock_exclusive();
             refine(&mut optimizer, &mut corrections, &args_of(count), |_| true).unwrap();
         };
         let count = |ops: &[String], name: &str| ops.iter().filter(|op| *op == name).count();

@@ -12,7 +12,7 @@ const MIN_ALPHA: f64 = 0.05;
 const SMALLEST: f64 = f32::MIN_POSITIVE as f64;
 
 /// Color map from far to near, matplotlib's viridis: dark violet, blue, green, yellow. Its lightness grows in the most even steps among
-/// the well-known color maps, so it reads the same in grey and for the color-blind. Far depths aren't black, which is the color of empty
+/// the well-known color maps, so it reads the same in gray and for the color-blind. Far depths aren't black, which is the color of empty
 /// pixels.
 const COLORS: colorous::Gradient = colorous::VIRIDIS;
 /// Number of colors: as many as the gradient has, and as an 8-bit image distinguishes.

@@ -58,7 +58,7 @@ pub enum SplatEdit {
     Transform(DMat4),
     /// Removes Gaussians whose mean is outside of the box between two corners.
     CropBox(DVec3, DVec3),
-    /// Removes Gaussians whose mean is farther from a centre than a radius.
+    /// Removes Gaussians whose mean is farther from a center than a radius.
     CropSphere(DVec3, f64),
     /// Removes Gaussians of a lower opacity.
     MinOpacity(f64),
@@ -113,8 +113,8 @@ pub fn move_cameras(cameras: &[Camera], matrix: &DMat4) -> Vec<Camera> {
     let linear = DMat3::from_mat4(*matrix);
     let rotation = linear * linear.determinant().cbrt().recip();
     let moved = |camera: &Camera| {
-        let centre = matrix.transform_point3(camera.c2w.w_axis.truncate());
-        let c2w = DMat4::from_mat3_translation(rotation * DMat3::from_mat4(camera.c2w), centre);
+        let center = matrix.transform_point3(camera.c2w.w_axis.truncate());
+        let c2w = DMat4::from_mat3_translation(rotation * DMat3::from_mat4(camera.c2w), center);
         Camera { c2w, ..*camera }
     };
     cameras.iter().map(moved).collect()
@@ -134,8 +134,8 @@ impl EditedSplat {
             SplatEdit::CropBox(min, max) => {
                 self.retain_means(|mean| mean.cmpge(*min).all() && mean.cmple(*max).all())
             }
-            SplatEdit::CropSphere(centre, radius) => {
-                self.retain_means(|mean| mean.distance(*centre) <= *radius)
+            SplatEdit::CropSphere(center, radius) => {
+                self.retain_means(|mean| mean.distance(*center) <= *radius)
             }
             SplatEdit::MinOpacity(min) => self.retain(|splat, index| f64::from(splat.opacity(index)) >= *min),
             SplatEdit::MaxScale(max) => {
@@ -231,9 +231,9 @@ pub(crate) fn image_contributions(gaussians: &Gaussians, cameras: &Cameras) -> R
     let (b, n) = gaussians.opacities.size2()?;
     let colors = Tensor::zeros([b, n, 1, 3], (gaussians.means.kind(), gaussians.means.device()));
     let colors = colors.set_requires_grad(true);
-    let grey = Gaussians { sh: colors.shallow_clone(), ..gaussians.map(Tensor::detach) };
+    let gray = Gaussians { sh: colors.shallow_clone(), ..gaussians.map(Tensor::detach) };
     let red = with_grad(|| -> Result<Tensor> {
-        let image = render(&grey, cameras, default_eps2d(gaussians))?;
+        let image = render(&gray, cameras, default_eps2d(gaussians))?;
         Ok(image.rgb.select(2, 0).sum(None))
     })?;
     Ok(Tensor::run_backward(&[red], &[colors], false, false)[0].select(3, 0).select(2, 0) / SH_C0)

@@ -136,7 +136,7 @@ pub fn orbit_around_splat(splat: &Splat) -> Vec<Camera> {
     orbit_around_gaussians(&Gaussians::from_splat(splat), splat.origin, SIZE, VIEWS)
 }
 
-/// Returns `frames` cameras on an orbit around the opacity-weighted centre of the Gaussians of one scene, whose means are relative to
+/// Returns `frames` cameras on an orbit around the opacity-weighted center of the Gaussians of one scene, whose means are relative to
 /// `origin`. The cameras are in world coordinates, and far enough away to see most of the splat.
 pub fn orbit_around_gaussians(
     gaussians: &Gaussians,
@@ -147,19 +147,19 @@ pub fn orbit_around_gaussians(
     let means = gaussians.means.view([-1, 3]).to_kind(Kind::Double);
     let weights = gaussians.opacities.view([-1, 1]).to_kind(Kind::Double);
     let total = weights.sum(Kind::Double).clamp_min(f64::MIN_POSITIVE);
-    let centre = (&means * &weights).sum_dim_intlist([0i64].as_slice(), false, Kind::Double) / &total;
-    let spread = ((&means - &centre).square().sum_dim_intlist([1i64].as_slice(), true, Kind::Double)
+    let center = (&means * &weights).sum_dim_intlist([0i64].as_slice(), false, Kind::Double) / &total;
+    let spread = ((&means - &center).square().sum_dim_intlist([1i64].as_slice(), true, Kind::Double)
         * &weights)
         .sum(Kind::Double)
         .divide(&total)
         .sqrt()
         .double_value(&[]);
-    let centre = origin + DVec3::from_array([0, 1, 2].map(|axis| centre.double_value(&[axis])));
+    let center = origin + DVec3::from_array([0, 1, 2].map(|axis| center.double_value(&[axis])));
     // Gaussians that all have the same mean: use their size instead of the spread.
     let radius = 3. * if spread > 0. { spread } else { gaussians.local_frame(origin).typical_distance() };
     let (w, h) = (f64::from(width), f64::from(height));
     let focal = w.min(h);
     let intrinsics = Intrinsics { fx: focal, fy: focal, cx: w / 2., cy: h / 2. };
     let reference = Camera { intrinsics, c2w: DMat4::IDENTITY, width, height };
-    orbit_around_point(centre, radius, &reference, frames)
+    orbit_around_point(center, radius, &reference, frames)
 }

@@ -10,7 +10,7 @@ use tch::{Device, Kind, Tensor};
 /// 3D Gaussians of B scenes with N Gaussians each.
 #[derive(Debug)]
 pub struct Gaussians {
-    /// Centres, `[B, N, 3]`.
+    /// Centers, `[B, N, 3]`.
     pub means: Tensor,
     /// Standard deviations along the Gaussians' own axes, linear, `[B, N, 3]`.
     pub scales: Tensor,
@@ -52,7 +52,7 @@ impl Gaussians {
 /// Gaussians before activation, as 3DGS stores and optimizes them: every real value is valid.
 #[derive(Debug)]
 pub struct RawGaussians {
-    /// Centres, like [`Gaussians::means`].
+    /// Centers, like [`Gaussians::means`].
     pub means: Tensor,
     /// Natural logarithms of the scales, `[B, N, 3]`.
     pub log_scales: Tensor,
@@ -285,7 +285,7 @@ mod tests {
 
     #[test]
     fn sigmoid_has_the_same_bits_for_any_number_of_threads() {
-        let _guard = num_threads::change();
+        let _guard = num_threads::lock_exclusive();
         let logits = Tensor::arange(3 * 33_331, (Kind::Float, Device::Cpu)).sin().view([3, -1]) * 9.;
         let expected = sigmoid(&logits);
         let threads = tch::get_num_threads();

@@ -6,7 +6,7 @@ use super::gaussians::Gaussians;
 use std::f64::consts::PI;
 use tch::{Kind, Tensor, no_grad};
 
-/// Returns one ray per pixel as [o × d ; d], moment first, where d is the unit direction in the world and o the camera centre.
+/// Returns one ray per pixel as [o × d ; d], moment first, where d is the unit direction in the world and o the camera center.
 ///
 /// The inputs are `c2w` [B, V, 4, 4] and `intrinsics` [B, V, 3, 3] in pixels; the result is [B, V, H, W, 6], float32.
 pub fn plucker_rays(c2w: &Tensor, intrinsics: &Tensor, height: i64, width: i64) -> Tensor {
@@ -100,9 +100,9 @@ impl RadialWarp {
 
     /// Returns the poses of the cameras of which the model is told, [B, V, 4, 4]: closer together where the scene is far away.
     pub fn cameras(&self, c2w: &Tensor) -> Tensor {
-        let centres = c2w.narrow(-2, 0, 3).narrow(-1, 3, 1) * self.camera_factors.unsqueeze(-1);
+        let centers = c2w.narrow(-2, 0, 3).narrow(-1, 3, 1) * self.camera_factors.unsqueeze(-1);
         let rotations = c2w.narrow(-2, 0, 3).narrow(-1, 0, 3);
-        let poses = Tensor::cat(&[rotations, centres], -1);
+        let poses = Tensor::cat(&[rotations, centers], -1);
         Tensor::cat(&[poses, c2w.narrow(-2, 3, 1)], -2)
     }
 
@@ -160,7 +160,7 @@ fn map_position(points: &Tensor) -> Tensor {
 /// Adds up `values` [B, 2, N] at `places` [B, N, 2] on the map, each shared among the four cells around it, [B, 2, cells, cells].
 fn histogram(places: &Tensor, values: &Tensor) -> Tensor {
     let last = CELLS as f64 - 1.;
-    // The centre of the first cell is at 0.
+    // The center of the first cell is at 0.
     let places = ((places + 1.) * (CELLS as f64 / 2.) - 0.5).clamp(0., last);
     let corner = places.floor().clamp_max(last - 1.);
     let share = places - &corner;

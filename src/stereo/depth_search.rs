@@ -13,12 +13,12 @@ pub const PATCH: i64 = 9;
 /// Photo that is compared with the one whose depths are searched.
 #[derive(Debug)]
 pub struct ComparedPhoto<'a> {
-    /// Grey values, [h, w].
-    pub grey: &'a Tensor,
+    /// Gray values, [h, w].
+    pub gray: &'a Tensor,
     /// Weight of each pixel, [h, w]; `None` if every pixel counts.
     pub weight: Option<&'a Tensor>,
     /// Columns of the matrix that maps (column, row, 1, inverse depth) of the photo whose depths are searched to
-    /// (column · z, row · z, z) of this one. The centre of the first pixel is at ½.
+    /// (column · z, row · z, z) of this one. The center of the first pixel is at ½.
     pub to_pixels: [DVec3; 4],
 }
 
@@ -35,14 +35,14 @@ pub enum Search {
 }
 
 impl Search {
-    /// Returns the inverse depth of every pixel of `grey` [h, w], among the multiples of `step`, and its correlation or how sure it is, both
+    /// Returns the inverse depth of every pixel of `gray` [h, w], among the multiples of `step`, and its correlation or how sure it is, both
     /// [h, w], float32 on the CPU.
     ///
     /// # Panics
     /// Panics if there are no other photos or no planes, or if shapes don't fit.
     pub fn run(
         self,
-        grey: &Tensor,
+        gray: &Tensor,
         weight: Option<&Tensor>,
         others: &[ComparedPhoto],
         step: f64,
@@ -52,19 +52,19 @@ impl Search {
         let others: Vec<PhotoToCompare> = others
             .iter()
             .map(|other| PhotoToCompare {
-                grey: address(Some(other.grey)),
+                gray: address(Some(other.gray)),
                 weight: address(other.weight),
                 to_pixels: std::array::from_fn(|i| other.to_pixels[i % 4][i / 4] as f32),
             })
             .collect();
-        let [grey, weight] = [Some(grey), weight].map(address);
+        let [gray, weight] = [Some(gray), weight].map(address);
         let kernel = match self {
             Search::PatchCorrelation => kernel::search_depths,
             Search::SemiGlobal => kernel::match_semi_globally,
         };
         // SAFETY: the tensors outlive the call, and on success the C++ side has stored two new tensors in `out`.
         let done =
-            unsafe { take_outputs(|out| kernel(grey, weight, &others, step as f32, planes as i32, out)) };
+            unsafe { take_outputs(|out| kernel(gray, weight, &others, step as f32, planes as i32, out)) };
         let [inverse_depths, scores] = done.unwrap_or_else(|error| panic!("{error}"));
         (inverse_depths, scores)
     }
@@ -78,7 +78,7 @@ pub(crate) struct SmallPhoto {
     /// Colors, [3, h, w].
     pub image: Tensor,
     /// Mean over the color channels, [h, w].
-    pub grey: Tensor,
+    pub gray: Tensor,
     /// Weight of each pixel, [h, w]; `None` if every pixel counts.
     pub weight: Option<Tensor>,
 }
@@ -93,14 +93,14 @@ impl SmallPhoto {
         let (height, width) = (resized(camera.height), resized(camera.width));
         let pool = |t: &Tensor| t.unsqueeze(0).adaptive_avg_pool2d([height, width]).squeeze_dim(0);
         let (image, weight) = pool_masked(image, mask, pool);
-        let grey = image.mean_dim([0].as_slice(), false, Kind::Float);
+        let gray = image.mean_dim([0].as_slice(), false, Kind::Float);
         let scale = (width as f64 / side(camera.width), height as f64 / side(camera.height));
         let intrinsics = camera.intrinsics.resized(scale.0, scale.1);
         SmallPhoto {
             name: name.into(),
             camera: Camera { intrinsics, width: width as u32, height: height as u32, ..camera },
             image,
-            grey,
+            gray,
             weight: weight.map(|weight| weight.squeeze_dim(0)),
         }
     }
@@ -126,7 +126,7 @@ impl SmallPhoto {
         let pixels = pixels_of(&self.camera.intrinsics);
         let to_pixels = pixels * rotation * pixels_of(&camera.intrinsics).inverse();
         ComparedPhoto {
-            grey: &self.grey,
+            gray: &self.gray,
             weight: self.weight.as_ref(),
             to_pixels: [
                 to_pixels.x_axis,
@@ -138,7 +138,7 @@ impl SmallPhoto {
     }
 
     /// Returns the camera's position.
-    pub fn centre(&self) -> DVec3 {
+    pub fn center(&self) -> DVec3 {
         self.camera.c2w.w_axis.truncate()
     }
 

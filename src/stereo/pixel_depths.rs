@@ -42,9 +42,9 @@ pub(super) fn inverse_depths(photos: &[SmallPhoto], planes: i64) -> Vec<[Tensor;
     let matched = |(index, scene)| {
         let photo: &SmallPhoto = &photos[index];
         let (others, nearest) = sweep.compared_with(index, scene);
-        let (inverse, sureness) = most_alike(photo, &others, nearest, planes, Search::SemiGlobal);
+        let (inverse, confidence) = most_alike(photo, &others, nearest, planes, Search::SemiGlobal);
         let step = nearest / (planes - 1) as f64;
-        MatchedDepths { photo, inverse, sureness, step, is_measured: !others.is_empty() }
+        MatchedDepths { photo, inverse, confidence, step, is_measured: !others.is_empty() }
     };
     let all: Vec<MatchedDepths> = scenes.iter().enumerate().map(matched).collect();
     let depths = |(index, of): (usize, &MatchedDepths)| {
@@ -73,7 +73,7 @@ struct MatchedDepths<'a> {
     /// Inverse depth of each pixel, [h, w].
     pub inverse: Tensor,
     /// How sure each is by itself, in [0, 1], [h, w].
-    pub sureness: Tensor,
+    pub confidence: Tensor,
     /// Inverse depth between two planes of the search.
     pub step: f64,
     /// `false` if there was no photo to compare with.
@@ -85,8 +85,8 @@ struct MatchedDepths<'a> {
 fn agreement(index: usize, all: &[MatchedDepths]) -> Tensor {
     let this = &all[index];
     let [height, width] = this.photo.size();
-    let centres = |pixels: i64| Tensor::arange(pixels, (Kind::Float, Device::Cpu)) + 0.5;
-    let (x, y) = (centres(width), centres(height).unsqueeze(1));
+    let centers = |pixels: i64| Tensor::arange(pixels, (Kind::Float, Device::Cpu)) + 0.5;
+    let (x, y) = (centers(width), centers(height).unsqueeze(1));
     let (mut agreeing, mut total) =
         (this.inverse.zeros_like() + PRIOR.0, this.inverse.zeros_like() + PRIOR.1);
     for (_, other) in all.iter().enumerate().filter(|(other, _)| *other != index) {
@@ -101,7 +101,7 @@ fn agreement(index: usize, all: &[MatchedDepths]) -> Tensor {
         let is_shown = is_before.logical_and(&inside(&column, width)).logical_and(&inside(&row, height));
         let at = (row.clamp(0, height - 1) * width + column.clamp(0, width - 1)).to_kind(Kind::Int64);
         let (found, expected) = (other.inverse.take(&at), &this.inverse / &z);
-        let weight = other.sureness.take(&at) * is_shown;
+        let weight = other.confidence.take(&at) * is_shown;
         let tolerance =
             (found.maximum(&expected) * RELATIVE_TOLERANCE).clamp_min(PLANE_TOLERANCE * other.step);
         agreeing += &weight * (found - expected).abs().le_tensor(&tolerance);
@@ -173,8 +173,8 @@ mod tests {
             if index == 1 {
                 let _ = inverse.narrow(1, 20, 8).fill_(0.4);
             }
-            let sureness = Tensor::ones([48, 64], options);
-            MatchedDepths { photo: &photos[index], inverse, sureness, step: 0.01, is_measured: true }
+            let confidence = Tensor::ones([48, 64], options);
+            MatchedDepths { photo: &photos[index], inverse, confidence, step: 0.01, is_measured: true }
         });
         let agreement = agreement(1, &all);
         assert!(agreement.narrow(1, 20, 8).max().double_value(&[]) < 0.1);

@@ -205,7 +205,7 @@ fn typical_depth(depths: &[f64], extent: f64) -> f64 {
 
 /// Returns the inverse depth of the nearest plane, chosen so that its pixels move by `LARGEST_MOVE` in the nearest photo.
 fn nearest_of_cameras(this: &SmallPhoto, other: &SmallPhoto) -> f64 {
-    let baseline = other.centre().distance(this.centre());
+    let baseline = other.center().distance(this.center());
     LARGEST_MOVE * f64::from(this.camera.width) / (this.camera.intrinsics.fx * baseline)
 }
 
@@ -232,7 +232,7 @@ pub(super) fn most_alike(
         return (Tensor::full(this.size(), nearest / 2., options), Tensor::zeros(this.size(), options));
     }
     let compared: Vec<ComparedPhoto> = others.iter().map(|other| other.compared_with(&this.camera)).collect();
-    search.run(&this.grey, this.weight.as_ref(), &compared, nearest / (planes - 1) as f64, planes)
+    search.run(&this.gray, this.weight.as_ref(), &compared, nearest / (planes - 1) as f64, planes)
 }
 
 /// Replaces inverse depths of low weight by those of reliable pixels around them, the nearest weighted most.

@@ -170,7 +170,7 @@ fn grid(camera: &Camera, depth: f64) -> Vec<DVec3> {
         .collect()
 }
 
-fn centre(camera: &Camera) -> DVec3 {
+fn center(camera: &Camera) -> DVec3 {
     camera.c2w.w_axis.truncate()
 }
 
@@ -179,7 +179,7 @@ fn axis(camera: &Camera) -> DVec3 {
 }
 
 fn distance(a: &Camera, b: &Camera) -> f64 {
-    centre(a).distance(centre(b))
+    center(a).distance(center(b))
 }
 
 /// Returns the angle between two cameras' axes, in radians.

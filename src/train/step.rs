@@ -52,8 +52,8 @@ pub(super) fn preview(model: &GlobalSplat, batch: &Batch, stage: Stage) -> Resul
     let first = |t: &Tensor| t.select(0, 0).select(0, 0).to_device(Device::Cpu);
     let (photo, ground_truth, rgb) = (first(&shown.images), first(&target.images), first(&pictures.rgb));
     let (depth, alpha) = (first(&pictures.depth), first(&pictures.alpha));
-    let grey = alpha.unsqueeze(0).expand([3, -1, -1], false);
-    Ok(tile_horizontally(&[photo, ground_truth, rgb.clamp(0., 1.), colorize_depth(&depth, &alpha), grey]))
+    let gray = alpha.unsqueeze(0).expand([3, -1, -1], false);
+    Ok(tile_horizontally(&[photo, ground_truth, rgb.clamp(0., 1.), colorize_depth(&depth, &alpha), gray]))
 }
 
 /// Mean scores over all held-out views or scenes.

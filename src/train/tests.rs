@@ -6,7 +6,7 @@ use crate::config::{Config, TrainConfig};
 use crate::data::{Batch, Capture, LoadedScene};
 use crate::device::{Stopwatch, num_threads};
 use crate::distributed::ProcessGroup;
-use crate::distributed::tests::{can_meet, run_on_ranks};
+use crate::distributed::tests::{require_gloo, run_on_ranks};
 use crate::loss::{LossConfig, Losses, PerceptualKind, PerceptualLoss, StepFraction, Term, Vgg19, losses};
 use crate::model::{ModelConfig, Precision, Stage, Streams};
 use crate::render::{DEFAULT_EPS2D, render};
@@ -114,9 +114,9 @@ fn numbers(losses: &Tensor) -> Losses<f64> {
     Losses::unpacked(&Vec::try_from(losses).expect("float64").try_into().expect("all terms"))
 }
 
-/// Returns the losses that `compute` returns for a model that is [`far_from_the_start`], and the gradients that it leaves there.
+/// Returns the losses that `compute` returns for a model that is [`perturbed_trainer`], and the gradients that it leaves there.
 fn of_model(config: &Config, compute: impl FnOnce(&mut Trainer) -> Losses<f64>) -> Step {
-    let mut trainer = far_from_the_start(config);
+    let mut trainer = perturbed_trainer(config);
     let values = compute(&mut trainer);
     let variables = trained(&trainer);
     (values, variables.into_iter().map(|(name, variable)| (name, variable.grad().copy())).collect())
@@ -130,7 +130,7 @@ fn trained(trainer: &Trainer) -> BTreeMap<String, Tensor> {
 }
 
 /// Returns a trainer whose weights are far enough from their initial values for all modules to matter. They are always the same.
-fn far_from_the_start(config: &Config) -> Trainer {
+fn perturbed_trainer(config: &Config) -> Trainer {
     let scenes = Arc::new(Vec::<Capture>::new());
     let mut trainer = Trainer::new(config, scenes, Device::Cpu).expect("a model");
     let mut random = ChaCha8Rng::seed_from_u64(2);
@@ -206,10 +206,10 @@ fn slices_of_a_step_add_up_to_it() {
 /// A step doesn't depend on the colors of masked pixels, neither of the context nor of the targets.
 #[test]
 fn masked_pixels_contribute_nothing_to_a_step() {
-    let _guard = num_threads::keep();
+    let _guard = num_threads::lock_shared();
     let config = config(small(), TrainConfig::default());
-    let [black, grey] = [0, 77].map(|value| Batch::from_scenes(&masked_scenes(value), Device::Cpu).unwrap());
-    assert!(!black.target.images.equal(&grey.target.images));
+    let [black, gray] = [0, 77].map(|value| Batch::from_scenes(&masked_scenes(value), Device::Cpu).unwrap());
+    assert!(!black.target.images.equal(&gray.target.images));
     // The features of a photo's pixels beside its mask depend on those under it.
     let of = |sample: &Batch| {
         of_model(&config, |trainer| {
@@ -217,23 +217,23 @@ fn masked_pixels_contribute_nothing_to_a_step() {
             numbers(&trainer.gradients(sample, STAGE, &mut Stopwatch::default()).expect("a step"))
         })
     };
-    let [(losses_of_black, of_black), (losses_of_grey, of_grey)] = [of(&black), of(&grey)];
-    assert_eq!(losses_of_black.total, losses_of_grey.total);
-    assert!(of_black == of_grey);
+    let [(losses_of_black, of_black), (losses_of_gray, of_gray)] = [of(&black), of(&gray)];
+    assert_eq!(losses_of_black.total, losses_of_gray.total);
+    assert!(of_black == of_gray);
     // Without the masks, it would.
     let unmasked = |sample: &Batch| {
         let mut sample = sample.slice(0, 3);
         (sample.context.masks, sample.target.masks) = (None, None);
         of(&sample).0.total
     };
-    assert_ne!(unmasked(&black), unmasked(&grey));
+    assert_ne!(unmasked(&black), unmasked(&gray));
 }
 
 /// Parallel slices give the same step every time, in one, two and three slices. Only the mean connects the scenes of this step. In bf16,
 /// the gradients of weights are rounded in each slice.
 #[test]
 fn parallel_slices_make_the_same_step_every_time() {
-    let _guard = num_threads::change();
+    let _guard = num_threads::lock_exclusive();
     let sample = sample();
     let threads = tch::get_num_threads();
     for (precision, tolerance) in [(Precision::F32, 1e-5), (Precision::Bf16, 1e-2)] {
@@ -325,9 +325,9 @@ fn a_step_makes_only_expected_device_copies() {
 
 /// Number of scenes in a step of all ranks together.
 const SCENES: usize = 6;
-const STEPS: usize = 6;
+const STEPS: usize = 10;
 /// Variable of the model that no step changes.
-const NOT_TRAINED: &str = "gaussian_decoder.patch_center_bias";
+const FROZEN_VARIABLE: &str = "gaussian_decoder.patch_center_bias";
 
 fn training(train: TrainConfig) -> Config {
     // There is no warm-up, so that the learning rate is about the same in all steps.
@@ -336,13 +336,13 @@ fn training(train: TrainConfig) -> Config {
 
 /// Trains a trainer for some steps on its rank's share of `scenes`, which `perturb` changes before each step. Returns the trainer and its
 /// reports.
-fn trained_on(
+fn train_steps(
     config: &Config,
     group: ProcessGroup,
     perturb: impl Fn(usize, &mut [LoadedScene]),
 ) -> (Trainer, Vec<StepReport>) {
     let (rank, share) = (group.rank(), SCENES / group.world_size());
-    let mut trainer = far_from_the_start(config).with_group(group);
+    let mut trainer = perturbed_trainer(config).with_group(group);
     // L_perc takes most of the time. It is a mean over scenes like L_mse, so the tests don't need it.
     trainer.perceptual = None;
     let step = |step: usize| {
@@ -366,19 +366,19 @@ fn distance(a: &Tensor, b: &Tensor) -> f64 {
 }
 
 /// Compares ranks that train with `config` to a trainer that does the same steps alone, with `alone`. Returns the reports of the latter.
-fn assert_like_one(
+fn assert_matches_single_rank(
     ranks: usize,
     config: &Config,
     alone: &Config,
     tolerance: f64,
     perturb: impl Fn(usize, &mut [LoadedScene]) + Copy + Sync,
 ) -> Vec<StepReport> {
-    let _guard = num_threads::keep();
-    let start = weights(&far_from_the_start(config));
-    let (alone, expected) = trained_on(alone, ProcessGroup::single(), perturb);
+    let _guard = num_threads::lock_shared();
+    let start = weights(&perturbed_trainer(config));
+    let (alone, expected) = train_steps(alone, ProcessGroup::single(), perturb);
     let alone = weights(&alone);
     let found = run_on_ranks(ranks, |group| {
-        let (trainer, reports) = trained_on(config, group, perturb);
+        let (trainer, reports) = train_steps(config, group, perturb);
         (weights(&trainer), reports)
     });
     for (rank, (weights, reports)) in found.iter().enumerate() {
@@ -417,8 +417,8 @@ fn assert_like_one(
 /// Several ranks make the step of one up to rounding, however the step is cut into slices. Adam amplifies gradients that are nothing but
 /// rounding errors.
 #[test]
-fn ranks_make_the_step_of_one() {
-    if !can_meet() {
+fn ranks_match_a_single_process() {
+    if !require_gloo() {
         return;
     }
     let alone = training(TrainConfig::default());
@@ -427,14 +427,14 @@ fn ranks_make_the_step_of_one() {
         // Slices of one scene, with recomputed rounds.
         (3, TrainConfig { micro_batch: 1, checkpoint_rounds: true, ..Default::default() }),
     ] {
-        assert_like_one(ranks, &training(train), &alone, 1e-5, |_, _| {});
+        assert_matches_single_rank(ranks, &training(train), &alone, 1e-5, |_, _| {});
     }
 }
 
 /// A loss of NaN on one rank skips the step on all ranks, which report the scenes of all.
 #[test]
 fn a_nan_loss_on_one_rank_skips_the_step_on_all_ranks() {
-    if !can_meet() {
+    if !require_gloo() {
         return;
     }
     let perturb = |step: usize, scenes: &mut [LoadedScene]| {
@@ -444,11 +444,11 @@ fn a_nan_loss_on_one_rank_skips_the_step_on_all_ranks() {
         }
     };
     let with = |micro_batch| training(TrainConfig { micro_batch, ..Default::default() });
-    let reports = assert_like_one(2, &with(0), &with(3), 0., perturb);
+    let reports = assert_matches_single_rank(2, &with(0), &with(3), 0., perturb);
     assert!(reports.iter().enumerate().all(|(step, report)| report.skipped == (step == 1)));
     let names = |range: std::ops::Range<usize>| range.map(|i| format!("noise_{i}")).collect::<Vec<_>>();
     let found = run_on_ranks(2, |group| {
-        trained_on(&with(0), group, perturb).1.into_iter().map(|report| report.scenes).collect::<Vec<_>>()
+        train_steps(&with(0), group, perturb).1.into_iter().map(|report| report.scenes).collect::<Vec<_>>()
     });
     assert!(found.iter().all(|scenes| scenes[1] == names(0..6)), "{found:?}");
     assert_eq!((&found[0][0], &found[1][0]), (&names(0..3), &names(3..6)));
@@ -456,19 +456,19 @@ fn a_nan_loss_on_one_rank_skips_the_step_on_all_ranks() {
 
 /// All ranks take over the state of the first one: weights, moments, step and position in the data.
 #[test]
-fn ranks_follow_the_first() {
-    if !can_meet() {
+fn broadcast_state_copies_rank_0() {
+    if !require_gloo() {
         return;
     }
     let config = training(TrainConfig::default());
     let found = run_on_ranks(2, |group| {
-        let mut trainer = far_from_the_start(&config);
+        let mut trainer = perturbed_trainer(&config);
         if group.is_main_process() {
             let sample = Batch::from_scenes(&scenes(1), Device::Cpu).unwrap();
             trainer.train_step(&sample, &mut Stopwatch::default(), &mut || true).expect("a step");
             trainer.samples = 7;
             // Weights from elsewhere may have another value here.
-            let _ = trainer.vs.variables()[NOT_TRAINED].shallow_clone().fill_(0.25);
+            let _ = trainer.vs.variables()[FROZEN_VARIABLE].shallow_clone().fill_(0.25);
         }
         let mut trainer = trainer.with_group(group);
         trainer.broadcast_state().expect("the first rank");
@@ -479,7 +479,7 @@ fn ranks_follow_the_first() {
     });
     let [first, second] = &found[..] else { panic!("two ranks") };
     assert!(first.0.iter().all(|(name, value)| *value == second.0[name]), "weights");
-    assert_eq!(second.0[NOT_TRAINED].double_value(&[0, 0, 0]), 0.25);
+    assert_eq!(second.0[FROZEN_VARIABLE].double_value(&[0, 0, 0]), 0.25);
     assert!(first.1.iter().zip(&second.1).all(|(a, b)| a == b), "moments");
     assert!(
         first.1.iter().any(|moment| moment.abs().max().double_value(&[]) > 0.),

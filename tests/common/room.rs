@@ -80,8 +80,8 @@ fn surfaces(random: &mut impl Rng) -> Gaussians {
         checkerboard(&mut patches, corner, along, across, colors());
     }
     for i in (0..4).map(f64::from) {
-        let centre = DVec3::new(-1.2 + 0.8 * i, 0.2 + 0.25 * (i * 1.7).sin(), 2.4 + 0.5 * (i * 2.3).cos());
-        striped_sphere(&mut patches, centre, 0.35, colors());
+        let center = DVec3::new(-1.2 + 0.8 * i, 0.2 + 0.25 * (i * 1.7).sin(), 2.4 + 0.5 * (i * 2.3).cos());
+        striped_sphere(&mut patches, center, 0.35, colors());
     }
     gaussians_of(&patches)
 }
@@ -102,7 +102,7 @@ fn checkerboard(patches: &mut Vec<Patch>, corner: DVec3, along: DVec3, across: D
     }
 }
 
-fn striped_sphere(patches: &mut Vec<Patch>, centre: DVec3, radius: f64, colors: [DVec3; 2]) {
+fn striped_sphere(patches: &mut Vec<Patch>, center: DVec3, radius: f64, colors: [DVec3; 2]) {
     let rings = (std::f64::consts::PI * radius / SPACING) as usize;
     for ring in 0..rings {
         let polar = std::f64::consts::PI * (ring as f64 + 0.5) / rings as f64;
@@ -110,7 +110,7 @@ fn striped_sphere(patches: &mut Vec<Patch>, centre: DVec3, radius: f64, colors: 
         for k in 0..around {
             let azimuth = std::f64::consts::TAU * k as f64 / around as f64;
             let normal = DVec3::new(polar.sin() * azimuth.cos(), polar.cos(), polar.sin() * azimuth.sin());
-            patches.push(Patch { mean: centre + radius * normal, normal, color: colors[ring / 3 % 2] });
+            patches.push(Patch { mean: center + radius * normal, normal, color: colors[ring / 3 % 2] });
         }
     }
 }

@@ -44,8 +44,8 @@ fn fitted_colors_show_held_out_views_better() {
     // Target poses are in the same normalized world as the splat.
     for (pose, view) in fitted.target_poses.iter().zip(&held_out) {
         let Similarity { rotation, translation, scale } = fitted.world_from_normalized;
-        let centre = scale * (rotation * pose.w_axis.truncate()) + translation;
-        assert!(centre.distance(view.camera.c2w.w_axis.truncate()) < 1e-9);
+        let center = scale * (rotation * pose.w_axis.truncate()) + translation;
+        assert!(center.distance(view.camera.c2w.w_axis.truncate()) < 1e-9);
     }
 }
 

@@ -160,14 +160,14 @@ fn synthetic_videos_are_identified_by_version_and_pictures() {
         let name = format!("synth:seed=1,scenes=1{pictures}");
         Dataset::open(Path::new(&name), Split::Test).unwrap().generator().map(String::from)
     };
-    let with_pictures = |grey: f64| {
-        let picture = tch::Tensor::full([3, 16, 16], grey, (tch::Kind::Float, tch::Device::Cpu));
+    let with_pictures = |gray: f64| {
+        let picture = tch::Tensor::full([3, 16, 16], gray, (tch::Kind::Float, tch::Device::Cpu));
         write_png(&folder.path().join("a.png"), &picture).unwrap();
         made_by(&format!(",pictures={}", folder.path().display()))
     };
-    let (black, grey) = (with_pictures(0.), with_pictures(0.5));
-    assert!(black != grey && with_pictures(0.5) == grey, "{black:?} and {grey:?}");
-    assert!(made_by("").is_some_and(|by| by.contains(env!("CARGO_PKG_VERSION")) && Some(by) != grey));
+    let (black, gray) = (with_pictures(0.), with_pictures(0.5));
+    assert!(black != gray && with_pictures(0.5) == gray, "{black:?} and {gray:?}");
+    assert!(made_by("").is_some_and(|by| by.contains(env!("CARGO_PKG_VERSION")) && Some(by) != gray));
 }
 
 /// Returns the largest resident size of this process's terminated children, in bytes.

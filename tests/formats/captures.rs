@@ -79,8 +79,8 @@ fn a_moved_splat_looks_the_same_to_moved_cameras() {
         let moved_cameras: Vec<_> = cameras
             .iter()
             .map(|camera| {
-                let centre = to.scale * (to.rotation * camera.c2w.w_axis.truncate()) + to.translation;
-                let c2w = DMat4::from_mat3_translation(to.rotation * DMat3::from_mat4(camera.c2w), centre);
+                let center = to.scale * (to.rotation * camera.c2w.w_axis.truncate()) + to.translation;
+                let c2w = DMat4::from_mat3_translation(to.rotation * DMat3::from_mat4(camera.c2w), center);
                 Camera { c2w, ..*camera }
             })
             .collect();

@@ -126,9 +126,9 @@ fn cameras_are_in_free_space_and_move() {
         let video = Video::new(2, index, &settings(12, 16));
         let near = video.depth(6).into_iter().fold(f32::INFINITY, f32::min);
         assert!(near > 0.02, "video {index}: something {near} m before the camera");
-        let centres = [0, 11].map(|i| video.cameras()[i].c2w.w_axis.truncate());
-        assert!(centres[0].distance(centres[1]) > 0.01, "video {index} doesn't move");
-        assert!(centres[0].distance(centres[1]) < 12., "video {index} leaves");
+        let centers = [0, 11].map(|i| video.cameras()[i].c2w.w_axis.truncate());
+        assert!(centers[0].distance(centers[1]) > 0.01, "video {index} doesn't move");
+        assert!(centers[0].distance(centers[1]) < 12., "video {index} leaves");
     }
 }
 

@@ -31,8 +31,8 @@ fn write_moved(from: &Path, folder: &Path, to: &Similarity) {
     let capture = open_capture(from).unwrap();
     let names: Vec<String> = capture.names().map(String::from).collect();
     let moved = |camera: Camera| {
-        let centre = to.scale * (to.rotation * camera.c2w.w_axis.truncate()) + to.translation;
-        let c2w = DMat4::from_mat3_translation(to.rotation * DMat3::from_mat4(camera.c2w), centre);
+        let center = to.scale * (to.rotation * camera.c2w.w_axis.truncate()) + to.translation;
+        let c2w = DMat4::from_mat3_translation(to.rotation * DMat3::from_mat4(camera.c2w), center);
         Camera { c2w, ..camera }
     };
     for name in &names {
@@ -191,24 +191,24 @@ fn a_local_origin_keeps_the_detail() {
     assert!(!origin_file(&world).exists());
     assert!(psnr(&local) > psnr(&world) + 10., "{} {}", psnr(&local), psnr(&world));
 
-    // Relative to the capture's centre, in every format; an older splat's origin is replaced.
+    // Relative to the capture's center, in every format; an older splat's origin is replaced.
     for ending in ["ply", "spz"] {
         let copy = of(&format!("copy.{ending}"));
         let convert = ["convert", arg(&local), arg(&copy), "--scene", arg(&scene)];
         let output = globalsplat(&[&convert[..], &["--local-origin"]].concat());
         assert!(output.status.success() && output.stderr.is_empty(), "{output:?}");
-        let centre = LocalFrame::from_cameras(&open_capture(&scene).unwrap().cameras()).origin;
+        let center = LocalFrame::from_cameras(&open_capture(&scene).unwrap().cameras()).origin;
         let written: Value = serde_json::from_slice(&fs::read(origin_file(&copy)).unwrap()).unwrap();
-        assert_eq!(written, json!({"origin": centre.to_array()}));
+        assert_eq!(written, json!({"origin": center.to_array()}));
         assert!(psnr(&copy) > psnr(&local).min(45.) - 12., "{ending}: {}", psnr(&copy));
         let inspected = run_json(&["inspect", arg(&copy), "--json"]);
-        assert_eq!(inspected["local_origin"], json!(centre.to_array()));
+        assert_eq!(inspected["local_origin"], json!(center.to_array()));
         assert!((inspected["x"][1].as_f64().unwrap() - offset.x).abs() < 5., "{inspected}");
         succeed(&convert);
         assert!(!origin_file(&copy).exists(), "{ending}");
     }
 
-    // Without a capture, a splat keeps its origin, and one without an origin gets its own centre.
+    // Without a capture, a splat keeps its origin, and one without an origin gets its own center.
     let copy = of("kept.ply");
     succeed(&["convert", arg(&local), arg(&copy), "--local-origin"]);
     assert_eq!(read_splat(&copy).unwrap().origin, offset);

@@ -308,7 +308,7 @@ fn a_smooth_path_goes_from_the_first_camera_to_the_last() {
 #[test]
 fn all_pictures_have_one_scale_of_depth() {
     let sandbox = Sandbox::new();
-    // Both cameras have one position, and the second has eight times the focal length. The centre has the same depth in both images.
+    // Both cameras have one position, and the second has eight times the focal length. The center has the same depth in both images.
     let mut wide = open_capture(&sandbox.path("room")).unwrap().cameras()[8];
     (wide.intrinsics.cx, wide.intrinsics.cy) = (20., 20.);
     let mut long = wide;
@@ -316,7 +316,7 @@ fn all_pictures_have_one_scale_of_depth() {
     write_cameras_json(&sandbox.path("zoom.json"), &[String::new(), String::new()], &[wide, long]).unwrap();
     sandbox.run("render --splat @room/truth.ply --path @zoom.json --depth --size 320x320 --out @views");
     let [_, wide, _, long] = <[_; 4]>::try_from(pictures(&sandbox.path("views"))).unwrap();
-    // The centre of the one, enlarged, equals the other.
+    // The center of the one, enlarged, equals the other.
     let middle = image::imageops::crop_imm(&wide, 140, 140, 40, 40).to_image();
     let middle = image::imageops::resize(&middle, 320, 320, image::imageops::FilterType::Triangle);
     let likeness = psnr(&middle, &long);

@@ -196,16 +196,16 @@ fn a_page_shows_the_scene_and_can_be_walked_in() {
     shown.key_for("Home", Duration::from_millis(500));
     shown.wait_for("page.walk.at === 0");
 
-    // Depth is shown in the depth colors, centres as points.
+    // Depth is shown in the depth colors, centers as points.
     shown.key("Digit2");
     let depth = shown.picture();
     assert_eq!(shown.value("document.querySelector('[aria-pressed=true]').id"), "depth");
     let [of_depth, of_photo] = [&depth, &picture].map(from_depth_colors);
     println!("{of_depth:.3} from the colors of depth, in color {of_photo:.3}");
     assert!(of_depth < 0.05 && of_photo > 0.15, "{of_depth} {of_photo}");
-    shown.click("#centres");
-    let centres = shown.picture();
-    let black = centres.lt(0.05).to_kind(Kind::Float).mean(Kind::Float).double_value(&[]);
+    shown.click("#centers");
+    let centers = shown.picture();
+    let black = centers.lt(0.05).to_kind(Kind::Float).mean(Kind::Float).double_value(&[]);
     assert!((0.5..0.99).contains(&black), "{black} of the points' picture is black");
     shown.click("#color");
     shown.key("Home");

@@ -1,9 +1,9 @@
-/** A camera with pinhole intrinsics, whose whole image is fitted and centred in a canvas of any aspect ratio. */
+/** A camera with pinhole intrinsics, whose whole image is fitted and centered in a canvas of any aspect ratio. */
 
 import { Matrix4, PerspectiveCamera } from "three";
 
 /**
- * Returns the rectangle of the camera's image in a canvas of `width`×`height`: as large as it fits, centred.
+ * Returns the rectangle of the camera's image in a canvas of `width`×`height`: as large as it fits, centered.
  * `lens` has intrinsics (fx, fy, cx, cy) and the size (width, height) of the photo, in pixels.
  */
 export function frame(lens, width, height) {

@@ -86,7 +86,7 @@ class Page {
   }
 
   addButtons() {
-    for (const mode of ["color", "depth", "centres"]) at(mode).addEventListener("click", () => this.show(mode));
+    for (const mode of ["color", "depth", "centers"]) at(mode).addEventListener("click", () => this.show(mode));
     at("cameras").addEventListener("click", () => this.toggleCameras());
     at("play").addEventListener("click", () => this.togglePlay());
     at("along").addEventListener("input", () => this.walk.seek(at("along").valueAsNumber));
@@ -96,7 +96,7 @@ class Page {
 
   addKeys() {
     const keys = {
-      Digit1: () => this.show("color"), Digit2: () => this.show("depth"), Digit3: () => this.show("centres"),
+      Digit1: () => this.show("color"), Digit2: () => this.show("depth"), Digit3: () => this.show("centers"),
       Space: () => this.togglePlay(), KeyC: () => this.toggleCameras(), KeyH: () => this.toggleControls(),
       Comma: () => this.jumpBy(-1), Period: () => this.jumpBy(1), Home: () => this.jumpTo(0), Slash: () => this.toggleHelp(),
     };
@@ -114,7 +114,7 @@ class Page {
   show(mode) {
     this.stage.show(mode);
     canvas.classList.toggle("depth", mode === "depth");
-    for (const other of ["color", "depth", "centres"]) at(other).setAttribute("aria-pressed", other === mode);
+    for (const other of ["color", "depth", "centers"]) at(other).setAttribute("aria-pressed", other === mode);
   }
 
   toggleCameras() {

@@ -1,4 +1,4 @@
-/** The WebGL scene: the splat, its Gaussians' centres, and the cameras that photographed it. */
+/** The WebGL scene: the splat, its Gaussians' centers, and the cameras that photographed it. */
 
 import { SparkRenderer, SplatMesh, dyno } from "@sparkjsdev/spark";
 import {
@@ -44,16 +44,16 @@ export class Stage {
     this.splat.rotation.x = Math.PI;
     this.world.add(this.splat);
     await this.splat.initialized;
-    this.addCentres();
+    this.addCenters();
     this.addDepth();
     this.addFrustums();
     this.touch();
   }
 
-  addCentres() {
+  addCenters() {
     const [places, colors] = [[], []];
-    this.splat.splats.forEachSplat((_, centre, _scales, _quaternion, _opacity, color) => {
-      places.push(centre.x, centre.y, centre.z);
+    this.splat.splats.forEachSplat((_, center, _scales, _quaternion, _opacity, color) => {
+      places.push(center.x, center.y, center.z);
       colors.push(color.r, color.g, color.b);
     });
     const geometry = new BufferGeometry();
@@ -64,15 +64,15 @@ export class Stage {
     material.onBeforeCompile = (shader) => {
       shader.fragmentShader = shader.fragmentShader.replace("#include <colorspace_fragment>", "");
     };
-    this.centres = new Points(geometry, material);
-    this.centres.rotation.copy(this.splat.rotation);
-    this.centres.visible = false;
-    this.world.add(this.centres);
+    this.centers = new Points(geometry, material);
+    this.centers.rotation.copy(this.splat.rotation);
+    this.centers.visible = false;
+    this.world.add(this.centers);
   }
 
   /**
-   * Prepares the depth view: each Gaussian is grey by its centre's depth, linear in 1/depth, near ones bright. The page's filter maps
-   * greys to colors.
+   * Prepares the depth view: each Gaussian is gray by its center's depth, linear in 1/depth, near ones bright. The page's filter maps
+   * grays to colors.
    */
   addDepth() {
     this.eye = dyno.dynoVec3(new Vector3());
@@ -83,12 +83,12 @@ export class Stage {
     this.depthOf = dyno.dynoBlock({ gsplat: dyno.Gsplat }, { gsplat: dyno.Gsplat }, ({ gsplat }) => {
       const depth = dyno.dot(dyno.sub(dyno.splitGsplat(gsplat).outputs.center, this.eye), this.forward);
       const inverse = dyno.div(number(1), dyno.max(depth, number(1e-6)));
-      const grey = dyno.clamp(dyno.div(dyno.sub(inverse, this.far), this.range), number(0), number(1));
-      return { gsplat: dyno.combineGsplat({ gsplat, r: grey, g: grey, b: grey }) };
+      const gray = dyno.clamp(dyno.div(dyno.sub(inverse, this.far), this.range), number(0), number(1));
+      return { gsplat: dyno.combineGsplat({ gsplat, r: gray, g: gray, b: gray }) };
     });
-    const places = this.centres.geometry.getAttribute("position");
+    const places = this.centers.geometry.getAttribute("position");
     const [eye, forward, place] = [new Vector3(), new Vector3(), new Vector3()];
-    const turned = new Matrix4().makeRotationFromEuler(this.centres.rotation);
+    const turned = new Matrix4().makeRotationFromEuler(this.centers.rotation);
     const inverses = [];
     for (const camera of this.scene.cameras) {
       const matrix = pose(camera.c2w);
@@ -131,11 +131,11 @@ export class Stage {
     this.world.add(this.frustums);
   }
 
-  /** Sets what is shown: `color`, `depth` or `centres`. */
+  /** Sets what is shown: `color`, `depth` or `centers`. */
   show(mode) {
     this.mode = mode;
-    this.splat.visible = mode !== "centres";
-    this.centres.visible = mode === "centres";
+    this.splat.visible = mode !== "centers";
+    this.centers.visible = mode === "centers";
     this.splat.worldModifier = mode === "depth" ? this.depthOf : undefined;
     this.splat.updateGenerator();
     this.touch();
@@ -147,7 +147,7 @@ export class Stage {
     this.isDirty = false;
     this.camera.updateMatrixWorld();
     if (this.mode === "depth" && !this.camera.matrixWorld.equals(this.lookedFrom)) {
-      // The greys hold for one camera pose and are recomputed when it changes, which marks the scene as changed again.
+      // The grays hold for one camera pose and are recomputed when it changes, which marks the scene as changed again.
       this.lookedFrom.copy(this.camera.matrixWorld);
       this.eye.value.setFromMatrixPosition(this.lookedFrom);
       this.forward.value.setFromMatrixColumn(this.lookedFrom, 2).negate();

@@ -6,7 +6,7 @@ use crate::image_source::ImageSource;
 use crate::lens::{Distortion, Lens, LensModel, PhotoPart, PinholeView, Projection, split_into_views};
 use crate::photos::{find_masks_in, format_names, part_name, unique_stems};
 use crate::pixels::{
-    DecodedPhoto, Planes, Undistorter, ViewPixels, decode_photo, encode_photo, grey_to_rgb,
+    DecodedPhoto, Planes, Undistorter, ViewPixels, decode_photo, encode_photo, gray_to_rgb,
     has_alpha_channel, multiply, read_image_size, read_mask, resize_and_crop, source_ranges,
 };
 use glam::DMat4;
@@ -539,7 +539,7 @@ impl Capture {
         Ok(views.iter().map(load).collect())
     }
 
-    /// Returns the depths of view `index` along its camera's axis at the pixel centres, row by row, in the capture's unit. They are
+    /// Returns the depths of view `index` along its camera's axis at the pixel centers, row by row, in the capture's unit. They are
     /// infinite in the sky. Returns `None` unless an [`ImageSource`] computes them.
     pub fn depth(&self, index: usize) -> Option<Vec<f32>> {
         match &self.frames[self.views[index].frame].image {
@@ -578,7 +578,7 @@ impl Capture {
             return Ok((source.image(*index), None));
         }
         let DecodedPhoto { pixels, alpha, .. } = self.decode(frame, &frame.image.read()?)?;
-        let alpha = alpha.map(|alpha| grey_to_rgb(&alpha));
+        let alpha = alpha.map(|alpha| gray_to_rgb(&alpha));
         let Some(file) = &frame.mask else { return Ok((pixels, alpha)) };
         let mut mask = read_mask(file, pixels.dimensions())?;
         if let Some(alpha) = alpha {
@@ -609,7 +609,7 @@ impl Capture {
         let bytes = frame.image.read()?;
         let photo = self.decode(frame, &bytes)?;
         match view_pixels(&photo.pixels, None, view, None, &[]).0 {
-            Cow::Borrowed(_) if photo.as_stored => Ok(bytes.into_owned()),
+            Cow::Borrowed(_) if photo.is_verbatim => Ok(bytes.into_owned()),
             image => encode_photo(&image, photo.is_jpeg),
         }
     }
@@ -650,7 +650,7 @@ fn view_pixels<'a>(
     };
     let ViewPixels { image, mask: shown } = undistorter.apply(photo);
     let shown = shown.and_then(|shown| GrayImage::from_raw(image.width(), image.height(), shown));
-    let mask = match (mask.map(|mask| undistorter.apply(mask).image), shown.map(|shown| grey_to_rgb(&shown)))
+    let mask = match (mask.map(|mask| undistorter.apply(mask).image), shown.map(|shown| gray_to_rgb(&shown)))
     {
         (Some(mut mask), Some(shown)) => {
             multiply(&mut mask, &shown);
@@ -668,18 +668,23 @@ fn views_of_frames(file: &Path, frames: &[Frame], purpose: Purpose) -> Result<(V
         let is_split = !is_path && !matches!(frame.lens, LensModel::Perspective(_));
         is_split.then(|| Lens::new(&frame.camera, frame.lens))
     };
-    // Photos of one camera have the same lens, and mostly follow each other.
-    let groups: Vec<&[Frame]> = frames.chunk_by(|a, b| lens(a) == lens(b)).collect();
-    let split = |frames: &&[Frame]| lens(&frames[0]).map(|lens| (lens, split_into_views(&lens)));
-    let splits: Vec<_> = groups.par_iter().map(split).collect();
+    // Photos of one camera have the same lens.
+    let mut lenses: Vec<Lens> = vec![];
+    let mut lens_index = |lens: Lens| {
+        lenses.iter().rposition(|known| *known == lens).unwrap_or_else(|| {
+            lenses.push(lens);
+            lenses.len() - 1
+        })
+    };
+    let lens_of_frame: Vec<Option<usize>> =
+        frames.iter().map(|frame| lens(frame).map(&mut lens_index)).collect();
+    let splits: Vec<_> = lenses.par_iter().map(split_into_views).collect();
     let mut views = vec![];
     // Numbers of photos and of their views, by kind.
     let mut counts = [(0, 0); 3];
-    let splits =
-        groups.iter().zip(&splits).flat_map(|(frames, split)| std::iter::repeat_n(split, frames.len()));
-    for (index, (frame, split)) in frames.iter().zip(splits).enumerate() {
+    for (index, (frame, lens)) in frames.iter().zip(&lens_of_frame).enumerate() {
         let Frame { name, camera, lens: model, .. } = frame;
-        let Some((lens, parts)) = split else {
+        let Some((lens, parts)) = lens.map(|lens| (&lenses[lens], &splits[lens])) else {
             let distortion = match model {
                 LensModel::Perspective(distortion) => *distortion,
                 LensModel::Equirectangular => {

@@ -12,7 +12,7 @@ pub trait ImageSource: Debug + Send + Sync {
     /// Computes image `index`, at the size of its camera.
     fn image(&self, index: usize) -> RgbImage;
 
-    /// Computes the depths of image `index` along its camera's axis at the pixel centres, row by row, in the unit of the poses. They
+    /// Computes the depths of image `index` along its camera's axis at the pixel centers, row by row, in the unit of the poses. They
     /// are infinite in the sky. Returns `None` if the source doesn't know them.
     fn depth(&self, index: usize) -> Option<Vec<f32>>;
 }

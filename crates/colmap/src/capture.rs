@@ -133,12 +133,12 @@ fn run_steps(
 fn check_output(photos: &Path, out: &Path, is_video: bool, is_new: bool) -> Result<()> {
     let canonical = photos.canonicalize();
     if !is_video {
-        let photos_folder = canonical.as_ref().map_err(|why| Error::read(photos)(why.kind().into()))?;
+        let photos_folder = photos.canonicalize().map_err(Error::read(photos))?;
         let existing = out.ancestors().find_map(|folder| {
             let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
             folder.canonicalize().ok()
         });
-        if existing.is_some_and(|out| out.starts_with(photos_folder)) {
+        if existing.is_some_and(|out| out.starts_with(&photos_folder)) {
             let expected = format!("a folder outside of {}", photos.display());
             return Err(Error::input(out, "the output", "inside the folder of photos", expected));
         }

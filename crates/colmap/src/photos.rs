@@ -2,7 +2,7 @@
 
 use crate::progress::{Interrupt, Reporter, Step};
 use globalsplat_capture::{
-    MASKS_FOLDER, decode_photo, encode_photo, exif_focal, find_masks, find_masks_in, grey_to_rgb,
+    MASKS_FOLDER, decode_photo, encode_photo, exif_focal, find_masks, find_masks_in, gray_to_rgb,
     is_equirectangular, list_photos, read_image_size, read_mask,
 };
 use globalsplat_files::{Error, Result, checksum, parent_of, write_atomically};
@@ -195,7 +195,7 @@ fn inspect(source: &Path, name: &str, mask: Option<&Path>, all_names: &[&str]) -
         (Some(file), _) => check_aspect(file, pixels.dimensions())
             .and_then(|()| read_mask(file, pixels.dimensions()))
             .map(Some),
-        (None, Some(alpha)) if !is_readable => Ok(Some(grey_to_rgb(&alpha))),
+        (None, Some(alpha)) if !is_readable => Ok(Some(gray_to_rgb(&alpha))),
         (None, _) => Ok(None),
     };
     let mask = levels.and_then(|levels| levels.map(|levels| encode_photo(&levels, false)).transpose());
@@ -321,8 +321,12 @@ mod tests {
         fs::write(at("cut.png"), &fs::read(at("a 1.png")).unwrap()[..60]).unwrap();
         fs::write(at("notes.txt"), "no photo").unwrap();
         fs::write(at(".hidden.png"), "no photo").unwrap();
+        folders.write_photo("z.png", 9);
         let is_foreign =
-            fs::copy(at("a_1.png"), folders.source.join(std::ffi::OsStr::from_bytes(b"z\xe9.png"))).is_ok();
+            fs::rename(at("z.png"), folders.source.join(std::ffi::OsStr::from_bytes(b"z\xe9.png"))).is_ok();
+        if !is_foreign {
+            fs::remove_file(at("z.png")).unwrap();
+        }
         let (photos, skipped) = folders.import(None).unwrap();
         assert_eq!(names(&photos), ["a_1.png", "_a_1.png", "b/2.png", "é.png"]);
         assert_eq!((photos[0].width, photos[0].height), (16, 8));

@@ -32,8 +32,8 @@ const MAX_REPROJECTION_ERROR: f64 = 2.;
 
 /// Minimum number of photos with one camera for which the camera has separate focal lengths and tangential distortion.
 const OPENCV_PHOTOS: usize = 10;
-/// Minimum number of photos of a fisheye for which the lens's centre is estimated. Few photos can't tell it from a rotation of the camera.
-const CENTRE_PHOTOS: usize = 10;
+/// Minimum number of photos of a fisheye for which the lens's center is estimated. Few photos can't tell it from a rotation of the camera.
+const CENTER_PHOTOS: usize = 10;
 /// Focal length of photos without EXIF, relative to their longer side: that of a phone's or a camera's wide lens. The estimate may fail if
 /// it is far off.
 const FOCAL: f64 = 0.85;
@@ -216,16 +216,18 @@ impl Estimate<'_, '_> {
         fs::create_dir(&partial).map_err(Error::write(&partial))?;
         let total = self.photos().len();
         let reduction = (f64::from(longest_side(self.photos())) / f64::from(MAX_SIDE)).max(1.);
-        let refines_centre = is_fisheye(self.record.camera_model.as_deref()) && total >= CENTRE_PHOTOS;
+        let refines_center = is_fisheye(self.record.camera_model.as_deref()) && total >= CENTER_PHOTOS;
         let options = json!({
             "image_path": text(self.images),
             "output_path": text(&partial),
             "Mapper.filter_max_reproj_error": MAX_REPROJECTION_ERROR * reduction,
-            "Mapper.ba_refine_principal_point": refines_centre,
+            "Mapper.ba_refine_principal_point": refines_center,
         });
         match self.run("mapper", options, Step::Poses, 0, total) {
             // COLMAP's program fails with this message if it registers no photo, which is reported in other words.
-            Err(Interrupt::Failed(why)) if why.to_string().contains("sparse model") => {}
+            Err(Interrupt::Failed(why))
+                if why.to_string().contains("sparse model")
+                    && read_colmap_models(&partial).is_ok_and(|models| models.is_empty()) => {}
             outcome => outcome?,
         }
         let models = read_colmap_models(&partial)?;
@@ -238,7 +240,7 @@ impl Estimate<'_, '_> {
             let options = json!({
                 "input_path": text(&model.folder),
                 "output_path": text(&model.folder),
-                "refine_principal_point": refines_centre,
+                "refine_principal_point": refines_center,
             });
             self.run("bundle_adjuster", options, Step::Poses, models[0].photos.len(), total)?;
         }
@@ -333,7 +335,7 @@ fn group_by_camera(photos: &[Photo], model: Option<&str>) -> (Vec<Vec<Photo>>, V
 }
 
 /// Returns the parameters at which the estimate of a fisheye lens starts, in COLMAP's notation: the focal length that EXIF tells or
-/// [`FISHEYE_FOCAL`], the photo's centre, and no distortion. Returns `None` for other models.
+/// [`FISHEYE_FOCAL`], the photo's center, and no distortion. Returns `None` for other models.
 ///
 /// COLMAP 4.2 matches no photos of a fisheye whose focal length isn't given.
 fn fisheye_parameters(model: &str, photo: &Photo) -> Option<String> {

@@ -206,6 +206,8 @@ impl Record {
         if keeps_finished && self.report.is_some() {
             return self;
         }
+        // The photos stay frames of their video if the user names their folder.
+        let new = Record { video: new.video.or_else(|| self.video.clone()), ..new };
         if self.masks != new.masks {
             return new;
         }

@@ -127,7 +127,10 @@ pub fn remove_dir(path: &Path, own_entries: &[&str]) -> Result<()> {
         }
     }
     let (temporary, _lock) = claim(path, make_dir).map_err(Error::write(path))?;
-    fs::rename(path, &temporary).map_err(Error::write(path))?;
+    if let Err(error) = fs::rename(path, &temporary) {
+        let _ = fs::remove_dir(&temporary);
+        return Err(Error::write(path)(error));
+    }
     unless_missing(fs::remove_dir_all(&temporary)).map_err(Error::write(&temporary))
 }
 

@@ -7,7 +7,7 @@ use crate::numbers::Scalar;
 use crate::ply::degree_of_rest;
 use crate::ply_table::{Header, Kind};
 use crate::rotations::{from_smallest_three, smallest_three};
-use crate::splat::{color_of_dc, dc_of_color, logit_of_opacity};
+use crate::splat::{color_to_sh0, logit_of_opacity, sh0_to_color};
 use crate::{Error, Result, ShLimits, Splat, WriteOptions};
 use globalsplat_files::write_atomically;
 use std::path::Path;
@@ -26,7 +26,7 @@ const ROTATION_BITS: [u32; 3] = [10, 10, 10];
 const COLOR_BITS: [u32; 4] = [8, 8, 8, 8];
 /// Largest magnitude of a log scale. Larger ones are clamped: they have no visible effect, but would widen the bounds of their chunk.
 const MAX_LOG_SCALE: f32 = 20.;
-/// Width of the range of SH coefficients, which is centred on 0.
+/// Width of the range of SH coefficients, which is centered on 0.
 const SH_RANGE: f64 = 8.;
 
 /// Returns `true` if `bytes` are a compressed PLY.
@@ -85,7 +85,7 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
             _ => [red, green, blue].map(|channel| channel as f32),
         };
         splat.opacity_logits.push(logit_of_opacity(opacity));
-        splat.sh.push(color.map(|channel| dc_of_color(channel.into())));
+        splat.sh.push(color.map(|channel| color_to_sh0(channel.into())));
         let rest = &rest[index * 3 * (bases - 1)..];
         let of_channel = |channel: usize, basis: usize| unpack_sh(rest[channel * (bases - 1) + basis]);
         splat.sh.extend((0..bases - 1).map(|basis| [0, 1, 2].map(|channel| of_channel(channel, basis))));
@@ -142,7 +142,7 @@ pub(crate) fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> 
         let log_scales = Bounded::of(of_chunk(&|index| {
             splat.log_scales[index].map(|log_scale| log_scale.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE))
         }));
-        let colors = Bounded::of(of_chunk(&|index| splat.sh_of(index)[0].map(|dc| color_of_dc(dc) as f32)));
+        let colors = Bounded::of(of_chunk(&|index| splat.sh_of(index)[0].map(|dc| sh0_to_color(dc) as f32)));
         for bounded in [&means, &log_scales, &colors] {
             bounds.extend(bounded.low.iter().chain(&bounded.high).flat_map(|bound| bound.to_le_bytes()));
         }

@@ -3,7 +3,7 @@
 use crate::invalid::{Contents, InvalidGaussians};
 use crate::numbers::f32_at;
 use crate::rotations::normalized;
-use crate::splat::{color_of_dc, dc_of_color, logit_of_opacity};
+use crate::splat::{color_to_sh0, logit_of_opacity, sh0_to_color};
 use crate::{Error, Result, SH_C0, ShLimits, Splat, WriteOptions, gltf, ply, sog, spz};
 use globalsplat_files::write_atomically;
 use std::path::Path;
@@ -27,7 +27,7 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         let fraction = |at: usize| f64::from(gaussian[at]) / 255.;
         splat.means.push([0, 4, 8].map(|at| f32_at(gaussian, at)));
         splat.push_linear_scale([12, 16, 20].map(|at| f32_at(gaussian, at)));
-        splat.sh.push([24, 25, 26].map(|at| dc_of_color(fraction(at))));
+        splat.sh.push([24, 25, 26].map(|at| color_to_sh0(fraction(at))));
         splat.opacity_logits.push(logit_of_opacity(fraction(27)));
         splat.quaternions.push(normalized([28, 29, 30, 31].map(|at| f32::from(gaussian[at]) - 128.)));
     }
@@ -60,7 +60,7 @@ pub(crate) fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> 
             for number in splat.means[index].iter().chain(&splat.scale(index)) {
                 gaussian.extend(number.to_le_bytes());
             }
-            let color = splat.sh_of(index)[0].map(color_of_dc);
+            let color = splat.sh_of(index)[0].map(sh0_to_color);
             gaussian.extend(color.map(|channel| (channel * 255.).round() as u8));
             gaussian.push((splat.opacity(index) * 255.).round() as u8);
             gaussian.extend(splat.unit_quaternion(index).map(|part| (part * 128. + 128.).round() as u8));

@@ -1,9 +1,9 @@
 //! mkkellogg's `.ksplat` format, versions 0.1 and later, which is only read. A header of 4,096 bytes and one of 1,024 bytes per section
-//! are followed by the sections. From compression level 1, positions are relative to the centres of buckets of Gaussians.
+//! are followed by the sections. From compression level 1, positions are relative to the centers of buckets of Gaussians.
 
 use crate::invalid::{Contents, InvalidGaussians};
 use crate::numbers::{f32_at, u16_at, u32_at};
-use crate::splat::{dc_of_color, logit_of_opacity};
+use crate::splat::{color_to_sh0, logit_of_opacity};
 use crate::{Error, Result, Splat};
 use half::f16;
 use std::path::Path;
@@ -11,9 +11,9 @@ use std::path::Path;
 /// Size in bytes of the header, and of the header of each section.
 const HEADER: usize = 4096;
 const SECTION_HEADER: usize = 1024;
-/// Size in bytes of a bucket: its centre, three float32.
+/// Size in bytes of a bucket: its center, three float32.
 const BUCKET: usize = 12;
-/// Position within a bucket that is its centre, if a section doesn't say otherwise.
+/// Position within a bucket that is its center, if a section doesn't say otherwise.
 const DEFAULT_RANGE: u32 = 32767;
 /// Magnitude of the minimum and maximum of SH coefficients of level 2, if the file doesn't say otherwise.
 const DEFAULT_SH_RANGE: f32 = 1.5;
@@ -158,10 +158,10 @@ impl Section<'_> {
         let half_block = f64::from(f32_at(self.header, 16)) / 2.;
         let full = std::iter::repeat_n(number(8), full_buckets);
         let partial = partial_lengths.as_chunks().0.iter().map(|&length| u32::from_le_bytes(length) as usize);
-        let mut centres =
+        let mut centers =
             full.chain(partial).zip(buckets).flat_map(|(length, bucket)| std::iter::repeat_n(bucket, length));
         for (place, gaussian) in gaussians.enumerate() {
-            let Some(bucket) = centres.next() else {
+            let Some(bucket) = centers.next() else {
                 let expected = format!("{count}, as many as in the section");
                 return Err(self.error("the number of Gaussians in the buckets", place, expected));
             };
@@ -181,7 +181,7 @@ impl Section<'_> {
         splat.push_linear_scale([3, 4, 5].map(number));
         splat.quaternions.push([6, 7, 8, 9].map(number));
         let (color, harmonics) = gaussian[10 * number_bytes..].split_at(4);
-        splat.sh.push([0, 1, 2].map(|channel| dc_of_color(f64::from(color[channel]) / 255.)));
+        splat.sh.push([0, 1, 2].map(|channel| color_to_sh0(f64::from(color[channel]) / 255.)));
         splat.opacity_logits.push(logit_of_opacity(f64::from(color[3]) / 255.));
         // Degree by degree, and within a degree channel by channel.
         for degree in 1..bases.isqrt() {

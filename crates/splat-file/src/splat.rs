@@ -19,7 +19,7 @@ pub const OPACITY_MARGIN: f64 = 1e-6;
 /// except for [`Splat::sh`]. [`Splat::check_lengths`] finds lists of other lengths.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Splat {
-    /// Centres relative to `origin`.
+    /// Centers relative to `origin`.
     pub means: Vec<[f32; 3]>,
     /// Natural logarithms of the scales, which are standard deviations along the Gaussian's own axes. A scale of 0 has the logarithm −∞.
     pub log_scales: Vec<[f32; 3]>,
@@ -268,11 +268,11 @@ pub(crate) fn logit_of_opacity(opacity: f64) -> f32 {
 }
 
 /// Returns the color, before it is clamped to [0, 1], for an SH coefficient of degree 0.
-pub(crate) fn color_of_dc(coefficient: f32) -> f64 {
+pub(crate) fn sh0_to_color(coefficient: f32) -> f64 {
     f64::from(coefficient) * SH_C0 + 0.5
 }
 
 /// Returns the SH coefficient of degree 0 for a color.
-pub(crate) fn dc_of_color(color: f64) -> f32 {
+pub(crate) fn color_to_sh0(color: f64) -> f32 {
     ((color - 0.5) / SH_C0) as f32
 }

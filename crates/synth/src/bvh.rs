@@ -331,15 +331,15 @@ mod tests {
     /// A fan of triangles around a point, seen along every edge, has no gaps.
     #[test]
     fn triangles_of_a_fan_have_no_gaps() {
-        let centre = Vec3A::new(0., 0.3, 0.);
+        let center = Vec3A::new(0., 0.3, 0.);
         let point = |i: usize| {
             let (sin, cos) = (i as f32 / 12. * std::f32::consts::TAU).sin_cos();
             Vec3A::new(cos, 0.3, sin)
         };
-        let fan = |i| Triangle { v0: centre, v1: point(i), v2: point(i + 1) };
+        let fan = |i| Triangle { v0: center, v1: point(i), v2: point(i + 1) };
         let (bvh, _) = Bvh::new(&(0..12).map(fan).collect::<Vec<_>>());
         for i in 0..12 * 50 {
-            let at = centre.lerp(point(i / 50), (i % 50) as f32 / 51.);
+            let at = center.lerp(point(i / 50), (i % 50) as f32 / 51.);
             let origin = Vec3::from(at) + Vec3::Y;
             assert!(bvh.is_occluded(origin, Vec3::NEG_Y, 1.1), "a gap at {at}");
             let hit = bvh.closest_hit(origin, Vec3::NEG_Y, 9.).expect("a triangle");

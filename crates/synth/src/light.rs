@@ -14,7 +14,7 @@ pub(super) enum Light {
     /// A ball at `at`, which may be visible and never blocks its own light. `color` is the irradiance at a distance of one metre.
     Ball { at: Vec3, radius: f32, color: Vec3 },
     /// A parallelogram with half sides `right` and `up` around `at`, facing `facing` (unit). `color` is the irradiance at a
-    /// distance of one metre from its centre.
+    /// distance of one metre from its center.
     Panel { at: Vec3, right: Vec3, up: Vec3, facing: Vec3, color: Vec3 },
 }
 
@@ -49,18 +49,18 @@ impl Light {
                 let towards = (towards + offset.x * right + offset.y * up).normalize();
                 IncidentLight { towards, distance: f32::INFINITY, color }
             }
-            Light::Ball { at: centre, radius, color } => {
-                let (right, up) = (centre - point).normalize_or(Vec3::Y).any_orthonormal_pair();
+            Light::Ball { at: center, radius, color } => {
+                let (right, up) = (center - point).normalize_or(Vec3::Y).any_orthonormal_pair();
                 let offset = radius * (at - 0.5);
-                let way = centre + offset.x * right + offset.y * up - point;
+                let way = center + offset.x * right + offset.y * up - point;
                 let distance = way.length().max(1e-3);
                 // Limit the irradiance to that at about a quarter of a metre, to avoid overexposure.
                 let color = color / (distance * distance).max(0.06);
                 IncidentLight { towards: way / distance, distance: (distance - 1.1 * radius).max(0.), color }
             }
-            Light::Panel { at: centre, right, up, facing, color } => {
+            Light::Panel { at: center, right, up, facing, color } => {
                 let offset = 2. * at - 1.;
-                let way = centre + offset.x * right + offset.y * up - point;
+                let way = center + offset.x * right + offset.y * up - point;
                 let distance = way.length().max(1e-3);
                 let towards = way / distance;
                 let color = color * (-towards.dot(facing)).max(0.) / (distance * distance).max(0.25);

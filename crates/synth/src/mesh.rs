@@ -1,5 +1,5 @@
 //! Triangle meshes with texture coordinates, the plain shapes that all objects are made of, and their deformations. The y axis points up.
-//! Each shape is centred or stands on y = 0, as documented.
+//! Each shape is centered or stands on y = 0, as documented.
 
 use super::noise::Noise;
 use glam::{Affine3A, Vec2, Vec3};
@@ -71,15 +71,15 @@ impl Mesh {
         self.positions.iter().fold(empty, |(low, high), &p| (low.min(p), high.max(p)))
     }
 
-    /// Returns one point per vertex: the vertex, moved a fifth of the way to the mean of its triangles' centres. Unlike the vertices
+    /// Returns one point per vertex: the vertex, moved a fifth of the way to the mean of its triangles' centers. Unlike the vertices
     /// themselves, these points don't lie on an edge where another surface begins.
     pub fn inset_vertices(&self) -> Vec<Vec3> {
         let mut sums = vec![(Vec3::ZERO, 0.); self.positions.len()];
         for corners in &self.triangles {
-            let centre = corners.map(|vertex| self.positions[vertex as usize]).iter().sum::<Vec3>() / 3.;
+            let center = corners.map(|vertex| self.positions[vertex as usize]).iter().sum::<Vec3>() / 3.;
             for &vertex in corners {
                 let (sum, count) = &mut sums[vertex as usize];
-                (*sum, *count) = (*sum + centre, *count + 1.);
+                (*sum, *count) = (*sum + center, *count + 1.);
             }
         }
         let inside =
@@ -126,7 +126,7 @@ pub(super) fn cuboid(size: Vec3, round: f32) -> Mesh {
     mesh.warped(|p| p + Vec3::Y * half.y)
 }
 
-/// Creates a centred superellipsoid of `size`. Exponents of 1 give an ellipsoid, towards 0 a box or a cylinder, above 1 a star.
+/// Creates a centered superellipsoid of `size`. Exponents of 1 give an ellipsoid, towards 0 a box or a cylinder, above 1 a star.
 pub(super) fn superellipsoid(size: Vec3, [polar, around]: [f32; 2], cells: usize) -> Mesh {
     let power = |x: f32, e: f32| x.signum() * x.abs().powf(e);
     let texture = Vec2::new(PI * size.x.max(size.z), PI / 2. * size.y);

@@ -345,7 +345,7 @@ pub(super) fn plant(builder: &mut SceneBuilder, transform: Affine3A) {
     leaves(builder, transform * at(0., 0.9 * height, 0.), reach, count);
 }
 
-/// Adds a framed picture on a wall, with its back at z = 0 and its centre at the origin.
+/// Adds a framed picture on a wall, with its back at z = 0 and its center at the origin.
 pub(super) fn picture(builder: &mut SceneBuilder, transform: Affine3A) {
     let size = vec2(builder.log_uniform(0.2, 1.4), builder.log_uniform(0.2, 1.2));
     let poster = builder.picture(size);
@@ -372,7 +372,7 @@ pub(super) fn mirror(builder: &mut SceneBuilder, transform: Affine3A) {
     builder.add_mesh(sheet, &glass, transform);
 }
 
-/// Adds curtains on both sides of a window of `size` whose centre is at the origin.
+/// Adds curtains on both sides of a window of `size` whose center is at the origin.
 pub(super) fn curtains(builder: &mut SceneBuilder, transform: Affine3A, size: Vec2) {
     let cloth = builder.thing();
     let (wide, folds) = (size.x * builder.within(0.2..0.4), builder.within(3. ..7.));

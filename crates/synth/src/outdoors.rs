@@ -13,12 +13,12 @@ pub(super) fn sky(builder: &mut SceneBuilder) -> Sky {
     let evening = builder.within(0. ..1f32).powi(2);
     let overcast = builder.within(0. ..1.);
     let blue = vec3(0.25, 0.45, 0.95).lerp(vec3(0.25, 0.3, 0.6), evening);
-    let grey = Vec3::splat(builder.within(0.5..1.));
+    let gray = Vec3::splat(builder.within(0.5..1.));
     let horizon = vec3(0.8, 0.9, 1.).lerp(vec3(1., 0.6, 0.35), evening * (1. - overcast));
     let brightness = builder.within(0.6..1.2);
     Sky {
-        zenith: brightness * blue.lerp(grey, overcast),
-        horizon: brightness * horizon.lerp(grey, overcast),
+        zenith: brightness * blue.lerp(gray, overcast),
+        horizon: brightness * horizon.lerp(gray, overcast),
         ground: brightness * vec3(0.25, 0.22, 0.18),
         clouds: builder.within(-0.3f32..0.9).max(0.),
         noise: builder.noise(),

@@ -57,8 +57,8 @@ impl Sensor {
     pub fn bytes(&self, radiance: Vec3, exposure: f32, place: Vec2, frame: u32, pixel: u32) -> [u8; 3] {
         let falloff = 1. - self.vignette * place.length_squared() / 2.;
         let light = radiance * self.gain * exposure * falloff;
-        let grey = light.dot(vec3(0.2126, 0.7152, 0.0722));
-        let light = (grey + self.saturation * (light - grey)).max(Vec3::ZERO);
+        let gray = light.dot(vec3(0.2126, 0.7152, 0.0722));
+        let light = (gray + self.saturation * (light - gray)).max(Vec3::ZERO);
         let mut random = PixelRng::new(self.seed, frame, pixel);
         light.to_array().map(|x| {
             let toned = self.tone(x);
@@ -133,20 +133,20 @@ mod tests {
         exposure_noise: Noise::new(0),
         seed: 3,
     };
-    /// Radiance of middle grey: 0.5 in sRGB.
+    /// Radiance of middle gray: 0.5 in sRGB.
     const MIDDLE: f32 = 0.2142;
 
-    fn grey(sensor: Sensor, radiance: f32, exposure: f32, place: Vec2) -> u8 {
+    fn gray(sensor: Sensor, radiance: f32, exposure: f32, place: Vec2) -> u8 {
         sensor.bytes(Vec3::splat(radiance), exposure, place, 0, 0)[1]
     }
 
     #[test]
     fn radiance_is_encoded_as_srgb() {
-        let bytes = [0., MIDDLE, 1., 9.].map(|radiance| grey(PLAIN, radiance, 1., Vec2::ZERO));
+        let bytes = [0., MIDDLE, 1., 9.].map(|radiance| gray(PLAIN, radiance, 1., Vec2::ZERO));
         assert_eq!(bytes, [0, 128, 255, 255]);
-        assert_eq!(grey(PLAIN, MIDDLE / 2., 2., Vec2::ZERO), 128, "half the radiance, twice the exposure");
+        assert_eq!(gray(PLAIN, MIDDLE / 2., 2., Vec2::ZERO), 128, "half the radiance, twice the exposure");
         let corners = Sensor { vignette: 0.3, ..PLAIN };
-        assert_eq!(grey(corners, MIDDLE / 0.7, 1., Vec2::ONE), 128, "vignetting in a corner");
+        assert_eq!(gray(corners, MIDDLE / 0.7, 1., Vec2::ONE), 128, "vignetting in a corner");
         let red = Sensor { saturation: 0., ..PLAIN }.bytes(Vec3::X, 1., Vec2::ZERO, 0, 0);
         assert!(red[0] == red[1] && red[1] == red[2], "{red:?} has a color");
     }

@@ -258,15 +258,15 @@ mod tests {
 
     const DARK: Sky =
         Sky { zenith: Vec3::ZERO, horizon: Vec3::ZERO, ground: Vec3::ZERO, clouds: 0., noise: Noise::new(0) };
-    const CENTRE: SampleChoice = SampleChoice { sample_index: 0, on_light: Vec2::splat(0.5) };
+    const CENTER: SampleChoice = SampleChoice { sample_index: 0, on_light: Vec2::splat(0.5) };
 
     fn sun(towards: Vec3, brightness: f32) -> Light {
         Light::Sun { towards, spread: 0., color: Vec3::splat(brightness) }
     }
 
-    /// Returns a scene under `sky` with a floor of reflectance `grey`, five metres in each direction, and anything that `more` adds.
-    fn floor_scene(sky: Sky, grey: u8, more: impl FnOnce(&mut SceneContents, &Material)) -> Tracer {
-        let image = image::RgbImage::from_pixel(4, 4, image::Rgb([grey; 3]));
+    /// Returns a scene under `sky` with a floor of reflectance `gray`, five metres in each direction, and anything that `more` adds.
+    fn floor_scene(sky: Sky, gray: u8, more: impl FnOnce(&mut SceneContents, &Material)) -> Tracer {
+        let image = image::RgbImage::from_pixel(4, 4, image::Rgb([gray; 3]));
         let material = Material::matte(Arc::new(Texture::from_image(&image)));
         let mut contents = SceneContents::default();
         let floor = Mesh::rectangle(Vec3::new(-5., 0., 5.), Vec3::X * 10., Vec3::Z * -10., 1.);
@@ -280,14 +280,14 @@ mod tests {
         let at = Vec3::new(x, 0., z);
         let eye = at + Vec3::new(0.5, 3., 0.5);
         let trace = |sample_index| {
-            tracer.trace(eye, (at - eye).normalize(), 1e-3, SampleChoice { sample_index, ..CENTRE }).x
+            tracer.trace(eye, (at - eye).normalize(), 1e-3, SampleChoice { sample_index, ..CENTER }).x
         };
         (0..4).map(trace).sum::<f32>() / 4.
     }
 
     /// Returns the linear reflectance of an sRGB byte.
-    fn reflectance(grey: u8) -> f32 {
-        ((f32::from(grey) / 255. + 0.055) / 1.055).powf(2.4)
+    fn reflectance(gray: u8) -> f32 {
+        ((f32::from(gray) / 255. + 0.055) / 1.055).powf(2.4)
     }
 
     /// Radiance follows Lambert's law: reflectance · irradiance · cos / π, whatever the number of lights. Under a uniform sky, a surface
@@ -304,10 +304,10 @@ mod tests {
             assert!((found / expected - 1.).abs() < 0.02, "{lights} lights: {found}, expected {expected}");
         }
         let light = Vec3::splat(0.7);
-        for grey in [90, 186] {
+        for gray in [90, 186] {
             let sky = Sky { zenith: light, horizon: light, ground: light, ..DARK };
-            let found = radiance_at(&floor_scene(sky, grey, |_, _| {}), 0.3, 0.2);
-            assert!((found / (0.7 * reflectance(grey)) - 1.).abs() < 0.02, "{grey}: {found}");
+            let found = radiance_at(&floor_scene(sky, gray, |_, _| {}), 0.3, 0.2);
+            assert!((found / (0.7 * reflectance(gray)) - 1.).abs() < 0.02, "{gray}: {found}");
         }
     }
 
@@ -338,7 +338,7 @@ mod tests {
         });
         // The ray goes from the mirror down to the floor.
         let direction = Vec3::new(2., -0.5, 0.).normalize();
-        let mirrored = tracer.trace(Vec3::new(0., 1., 0.3), direction, 1e-3, CENTRE).x;
+        let mirrored = tracer.trace(Vec3::new(0., 1., 0.3), direction, 1e-3, CENTER).x;
         let floor = radiance_at(&tracer, 0., 0.3);
         assert!(floor > 0.1 && (mirrored / floor - 1.).abs() < 0.02, "{mirrored} {floor}");
     }
@@ -353,7 +353,7 @@ mod tests {
                 let sheet = Mesh::rectangle(Vec3::new(-1., 0.5, 1.), 2. * Vec3::X, -2. * Vec3::Z, 1.);
                 contents.meshes.push((sheet, Material { specular, shininess: 30., ..material.clone() }));
             });
-            tracer.trace(Vec3::new(0.1, 0.5, 0.2) + eye, -eye.normalize(), 1e-3, CENTRE).x
+            tracer.trace(Vec3::new(0.1, 0.5, 0.2) + eye, -eye.normalize(), 1e-3, CENTER).x
         };
         let mirrored = Vec3::new(-1., 1., 0.);
         let expected = 0.5 * 38. / (8. * PI) * towards.y * 2.;
@@ -372,7 +372,7 @@ mod tests {
         let (shadow, lit) = (radiance_at(&tracer, 0.1, 0.1), radiance_at(&tracer, 2., 2.));
         assert!(shadow < 0.3 * lit, "{shadow} {lit}");
         // The lower side of the ball is lit by the floor alone.
-        let below = tracer.trace(Vec3::new(0., 0.2, 0.), Vec3::Y, 1e-3, CENTRE).x;
+        let below = tracer.trace(Vec3::new(0., 0.2, 0.), Vec3::Y, 1e-3, CENTER).x;
         assert!(below > 0.1 * lit && below < lit, "{below} {lit}");
     }
 
@@ -389,6 +389,6 @@ mod tests {
     fn an_empty_scene_shows_the_sky() {
         let sky = Sky { zenith: Vec3::ONE, horizon: Vec3::ONE, ..DARK };
         let tracer = Tracer::new(SceneContents::default(), sky);
-        assert_eq!(tracer.trace(Vec3::ZERO, Vec3::Y, 1e-3, CENTRE), Vec3::ONE);
+        assert_eq!(tracer.trace(Vec3::ZERO, Vec3::Y, 1e-3, CENTER), Vec3::ONE);
     }
 }

@@ -129,7 +129,7 @@ impl Video {
         })
     }
 
-    /// Returns the depths along the camera's axis at the pixel centres of image `index`, row by row, in metres. They are infinite
+    /// Returns the depths along the camera's axis at the pixel centers of image `index`, row by row, in metres. They are infinite
     /// in the sky.
     pub fn depth(&self, index: usize) -> Vec<f32> {
         let camera = &self.cameras[index];
@@ -237,7 +237,7 @@ mod tests {
             .zip(photo.pixels())
             .filter(|(a, b)| a.0.iter().zip(b.0).all(|(a, b)| a.abs_diff(b) <= 1));
         assert!(same.count() >= 24 * 32 * 99 / 100);
-        // The circle of this lens has a radius of 5π pixels; the corners are 20 pixels from the centre.
+        // The circle of this lens has a radius of 5π pixels; the corners are 20 pixels from the center.
         let circle = video.photo_through(1, &lens("SIMPLE_FISHEYE", &[5., 16., 12.]));
         assert!(circle.get_pixel(0, 0).0.iter().all(|value| *value < 8), "{:?}", circle.get_pixel(0, 0));
         assert!(circle.get_pixel(16, 12).0.iter().any(|value| *value > 8));

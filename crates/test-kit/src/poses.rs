@@ -9,11 +9,11 @@ use glam::{DMat3, DMat4, DVec3};
 pub fn pose_errors(found: &[DMat4], truth: &[DMat4]) -> Vec<(f64, f64)> {
     let turns = truth.iter().zip(found).map(|(truth, found)| rotation(truth) * rotation(found).transpose());
     let turn = nearest_rotation(turns.fold(DMat3::ZERO, |sum, turn| sum + turn) * (1. / found.len() as f64));
-    let centres = |poses: &[DMat4]| poses.iter().map(|pose| pose.w_axis.truncate()).collect::<Vec<DVec3>>();
-    let (truths, founds) = (centres(truth), centres(found));
-    let mean = |centres: &[DVec3]| centres.iter().sum::<DVec3>() / centres.len() as f64;
+    let centers = |poses: &[DMat4]| poses.iter().map(|pose| pose.w_axis.truncate()).collect::<Vec<DVec3>>();
+    let (truths, founds) = (centers(truth), centers(found));
+    let mean = |centers: &[DVec3]| centers.iter().sum::<DVec3>() / centers.len() as f64;
     let (mean_truth, mean_found) = (mean(&truths), mean(&founds));
-    let turned: Vec<DVec3> = founds.iter().map(|centre| turn * (*centre - mean_found)).collect();
+    let turned: Vec<DVec3> = founds.iter().map(|center| turn * (*center - mean_found)).collect();
     let products =
         turned.iter().zip(&truths).map(|(found, truth)| found.dot(*truth - mean_truth)).sum::<f64>();
     let scale = products / turned.iter().map(|found| found.length_squared()).sum::<f64>();

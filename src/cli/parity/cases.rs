@@ -65,7 +65,7 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
             request.number("factor")?,
         )),
         "depth_search" => depth_search(request, Search::PatchCorrelation, "correlation"),
-        "semi_global_matching" => depth_search(request, Search::SemiGlobal, "sureness"),
+        "semi_global_matching" => depth_search(request, Search::SemiGlobal, "confidence"),
         "decoder_regularization" => decoder_regularization(request),
         "lpips" => lpips(request),
         "perceptual" => perceptual(request),
@@ -262,18 +262,18 @@ fn scene_normalization(request: &Request) -> Result<Answer> {
 
 /// Runs `search`, whose second result is called `score`.
 fn depth_search(request: &Request, search: Search, score: &'static str) -> Result<Answer> {
-    let (greys, matrices) = (request.input("others")?.unbind(0), request.input("to_pixels")?);
+    let (grays, matrices) = (request.input("others")?.unbind(0), request.input("to_pixels")?);
     let weights = request.inputs.get("other_weights").map(|weights| weights.unbind(0));
-    let compared = |(index, grey)| {
+    let compared = |(index, gray)| {
         let matrix = Vec::<f64>::try_from(matrices.get(index as i64).to_kind(Kind::Double).view([-1]))?;
         let column = |i: usize| DVec3::new(matrix[i], matrix[4 + i], matrix[8 + i]);
         let weight = weights.as_ref().map(|weights| &weights[index]);
-        Ok(ComparedPhoto { grey, weight, to_pixels: std::array::from_fn(column) })
+        Ok(ComparedPhoto { gray, weight, to_pixels: std::array::from_fn(column) })
     };
-    let others = greys.iter().enumerate().map(compared).collect::<Result<Vec<_>>>()?;
+    let others = grays.iter().enumerate().map(compared).collect::<Result<Vec<_>>>()?;
     let (step, planes) = (request.number("step")?, request.number("planes")?);
     let (inverse_depth, scores) =
-        search.run(request.input("grey")?, request.inputs.get("weight"), &others, step, planes);
+        search.run(request.input("gray")?, request.inputs.get("weight"), &others, step, planes);
     let image = |t: Tensor| t.unsqueeze(0).unsqueeze(0);
     outputs([("inverse_depth", image(inverse_depth)), (score, image(scores))])
 }

@@ -24,7 +24,7 @@ const MAX_FRAMES: usize = 1200;
 const FRUSTUM: f64 = 0.06;
 
 /// Contents of the page as JSON, read in web/src. Lengths and positions are in the splat's local frame (spec 2.5), which suits
-/// a browser's float32 and its half-precision centres.
+/// a browser's float32 and its half-precision centers.
 #[derive(Serialize)]
 pub struct Contents {
     pub name: String,

@@ -114,7 +114,7 @@ fn page(contents: &Contents, spz: &[u8]) -> Result<Markup> {
                         div role="group" aria-label="Shown" {
                             button #color type="button" aria-pressed="true" title="1" { "Color" }
                             button #depth type="button" aria-pressed="false" title="2" { "Depth" }
-                            button #centres type="button" aria-pressed="false" title="3" { "Centres" }
+                            button #centers type="button" aria-pressed="false" title="3" { "Centers" }
                         }
                         button #cameras type="button" aria-pressed="false" title="C" { "Cameras" }
                         button #help-button type="button" aria-haspopup="dialog" title="?" { "Help" }
@@ -142,7 +142,7 @@ fn help() -> Markup {
         ("Drag, wheel", "look around, go forward and back; right button or two fingers: aside"),
         (", and .", "jump to the photo before or after"),
         ("Space", "play along the cameras' path"),
-        ("1, 2, 3", "color, depth, the Gaussians' centres"),
+        ("1, 2, 3", "color, depth, the Gaussians' centers"),
         ("C", "cameras with their photos"),
         ("H", "hide the controls"),
         ("?", "this help"),
@@ -156,7 +156,7 @@ fn help() -> Markup {
     }
 }
 
-/// Returns an SVG filter that maps greyscale depth to the colors of `render --depth`, and keeps empty pixels black.
+/// Returns an SVG filter that maps grayscale depth to the colors of `render --depth`, and keeps empty pixels black.
 fn depth_colors() -> Markup {
     let colors = crate::render::depth_colors();
     let table = |channel: usize| -> String {

@@ -329,8 +329,8 @@ impl Shared {
         let config = &self.config;
         let cameras = capture.cameras();
         let (shown, _) = capture.split(config.holdout);
-        let centres: Vec<DVec3> = shown.iter().map(|&view| cameras[view].c2w.w_axis.truncate()).collect();
-        let views = choose_views(config, context_count, &centres, random).ok_or_else(|| {
+        let centers: Vec<DVec3> = shown.iter().map(|&view| cameras[view].c2w.w_axis.truncate()).collect();
+        let views = choose_views(config, context_count, &centers, random).ok_or_else(|| {
             let why = format!("{} training views, expected {} or more", shown.len(), config.window[0]);
             (Fault::Short, format!("{}: {why} (data.window)", capture.file().display()))
         })?;

@@ -130,23 +130,23 @@ pub fn draw_context_count(config: &DataConfig, seed: u64, step: u64) -> usize {
     random.random_range(config.min_context_views..=config.context_views)
 }
 
-/// Draws a random window of the video whose camera centres are `centres`, and from it `context_count` context views and the target views.
+/// Draws a random window of the video whose camera centers are `centers`, and from it `context_count` context views and the target views.
 /// Returns `None` if the video is shorter than the shortest window. The numbers of views must not exceed that window's length.
 pub fn choose_views(
     config: &DataConfig,
     context_count: usize,
-    centres: &[DVec3],
+    centers: &[DVec3],
     random: &mut impl Rng,
 ) -> Option<ChosenViews> {
     let [shortest, longest] = config.window;
-    if centres.len() < shortest {
+    if centers.len() < shortest {
         return None;
     }
-    let length = random.random_range(shortest..=longest).min(centres.len());
-    let start = random.random_range(0..=centres.len() - length);
+    let length = random.random_range(shortest..=longest).min(centers.len());
+    let start = random.random_range(0..=centers.len() - length);
     let context_positions = match config.sampling {
         Sampling::Uniform => sample_uniform(length, context_count, random),
-        Sampling::Farthest => sample_farthest(&centres[start..][..length], context_count, random),
+        Sampling::Farthest => sample_farthest(&centers[start..][..length], context_count, random),
     };
     let target_positions = sample_uniform(length, config.target_views, random);
     let in_video = |mut positions: Vec<usize>| {
@@ -162,22 +162,22 @@ fn sample_uniform(length: usize, count: usize, random: &mut impl Rng) -> Vec<usi
     index::sample(random, length, count).into_vec()
 }
 
-/// Farthest point sampling: draws the first of `count` positions at random; each of the others is the one whose centre is farthest from the
-/// nearest chosen centre.
-fn sample_farthest(centres: &[DVec3], count: usize, random: &mut impl Rng) -> Vec<usize> {
-    assert!(count <= centres.len());
-    let mut chosen = vec![random.random_range(0..centres.len())];
+/// Farthest point sampling: draws the first of `count` positions at random; each of the others is the one whose center is farthest from the
+/// nearest chosen center.
+fn sample_farthest(centers: &[DVec3], count: usize, random: &mut impl Rng) -> Vec<usize> {
+    assert!(count <= centers.len());
+    let mut chosen = vec![random.random_range(0..centers.len())];
     // Squared distance of each frame to the nearest chosen one; below 0 for chosen frames.
-    let mut squared_distances = vec![f64::INFINITY; centres.len()];
+    let mut squared_distances = vec![f64::INFINITY; centers.len()];
     while chosen.len() < count {
         let last = chosen[chosen.len() - 1];
-        for (squared_distance, centre) in squared_distances.iter_mut().zip(centres) {
-            *squared_distance = squared_distance.min(centre.distance_squared(centres[last]));
+        for (squared_distance, center) in squared_distances.iter_mut().zip(centers) {
+            *squared_distance = squared_distance.min(center.distance_squared(centers[last]));
         }
         squared_distances[last] = -1.;
         // Take the first of equally distant frames, so that the result is the same on every machine.
         let farthest = |&a: &usize, &b: &usize| squared_distances[a].total_cmp(&squared_distances[b]);
-        chosen.extend((0..centres.len()).rev().max_by(farthest));
+        chosen.extend((0..centers.len()).rev().max_by(farthest));
     }
     chosen
 }

@@ -1,4 +1,4 @@
-//! COLMAP models: `cameras` and `images`, both `.bin` or both `.txt`, with world-to-camera poses and OpenCV axes. The centre of
+//! COLMAP models: `cameras` and `images`, both `.bin` or both `.txt`, with world-to-camera poses and OpenCV axes. The center of
 //! pixel (0, 0) is at (½, ½), as everywhere in this crate. Points are read separately, on request (spec 10.4).
 
 mod fields;

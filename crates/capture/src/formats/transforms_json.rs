@@ -317,7 +317,7 @@ impl<'a> Fields<'a> {
     }
 
     /// Returns the intrinsics. A missing focal length is computed from the angle of view if possible, otherwise it equals that of
-    /// the other axis. A missing principal point is the image centre.
+    /// the other axis. A missing principal point is the image center.
     fn intrinsics(&self, width: u32, height: u32) -> Result<Intrinsics> {
         let focal = |length: &str, angle: &str, size: u32| match self.number(length)? {
             Some(focal) => Ok(Some(focal)),

@@ -9,7 +9,7 @@ const RIGID_TOLERANCE: f64 = 5e-3;
 /// Maximum deviation of a pose's 3×3 part from the nearest rotation, per entry, for files with more digits.
 const ROUNDING_TOLERANCE: f64 = 1e-3;
 
-/// Intrinsics of a pinhole camera, in pixels of its image. The centre of pixel (i, j) is at (j + ½, i + ½).
+/// Intrinsics of a pinhole camera, in pixels of its image. The center of pixel (i, j) is at (j + ½, i + ½).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Intrinsics {
     /// Focal length along x.

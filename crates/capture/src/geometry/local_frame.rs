@@ -26,15 +26,15 @@ impl LocalFrame {
     /// Typical distance from the origin in local units. The near plane, 0.01 local units (spec 6.2), is 1/1600 of it.
     const TYPICAL_DISTANCE: f64 = 16.;
 
-    /// Returns the frame of a capture, computed from its camera centres. The origin is their median along each axis. A local unit is
+    /// Returns the frame of a capture, computed from its camera centers. The origin is their median along each axis. A local unit is
     /// 1/16 of the median distance of the cameras from it, without those at the origin. If all cameras are at one position, a local
     /// unit is a world unit.
     pub fn from_cameras(cameras: &[Camera]) -> Self {
-        let centres: Vec<DVec3> = cameras.iter().map(|camera| camera.c2w.w_axis.truncate()).collect();
-        Self::from_spheres(&centres, &vec![0.; centres.len()])
+        let centers: Vec<DVec3> = cameras.iter().map(|camera| camera.c2w.w_axis.truncate()).collect();
+        Self::from_spheres(&centers, &vec![0.; centers.len()])
     }
 
-    /// Returns the frame of spheres with centres `points` and `radii`, in world units and of equal length. The origin is the median
+    /// Returns the frame of spheres with centers `points` and `radii`, in world units and of equal length. The origin is the median
     /// along each axis. A local unit is 1/16 of the median reach, a sphere's distance from the origin plus its radius. It is a world unit
     /// if there are no spheres or they have no extent.
     pub fn from_spheres(points: &[DVec3], radii: &[f64]) -> Self {
@@ -84,9 +84,9 @@ mod tests {
     use super::*;
     use crate::Intrinsics;
 
-    fn camera(centre: DVec3) -> Camera {
+    fn camera(center: DVec3) -> Camera {
         let intrinsics = Intrinsics { fx: 1., fy: 1., cx: 0.5, cy: 0.5 };
-        let c2w = DMat4::from_translation(centre) * DMat4::from_rotation_y(0.3);
+        let c2w = DMat4::from_translation(center) * DMat4::from_rotation_y(0.3);
         Camera { intrinsics, c2w, width: 1, height: 1 }
     }
 

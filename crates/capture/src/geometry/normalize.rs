@@ -26,12 +26,12 @@ pub struct Similarity {
 pub struct Normalization {
     /// Camera-to-world poses in the normalized world, in the order of the input.
     pub c2w: Vec<DMat4>,
-    /// Similarity from the normalized world to the capture's world. Its scale is the largest distance between two camera centres in
+    /// Similarity from the normalized world to the capture's world. Its scale is the largest distance between two camera centers in
     /// the capture.
     pub world_from_normalized: Similarity,
 }
 
-/// Moves the mean camera to the origin, looking along z, and scales the largest distance between two camera centres to 1. If the
+/// Moves the mean camera to the origin, looking along z, and scales the largest distance between two camera centers to 1. If the
 /// viewing directions cancel out, as for cameras all around an object, the axes of the first camera are used instead.
 ///
 /// # Errors
@@ -50,26 +50,26 @@ pub fn normalize(c2w: &[DMat4]) -> Result<Normalization> {
     let axes = axes.unwrap_or_else(|| DMat3::from_mat4(c2w[0]));
 
     let (origin, inverse) = (mean(3), axes.inverse());
-    let centre = |pose: &DMat4| pose.w_axis.truncate();
-    // Subtract the origin before multiplying: far from the world's origin, products would lose the digits in which centres differ.
+    let center = |pose: &DMat4| pose.w_axis.truncate();
+    // Subtract the origin before multiplying: far from the world's origin, products would lose the digits in which centers differ.
     let align = |pose: &DMat4| {
-        DMat4::from_mat3_translation(inverse * DMat3::from_mat4(*pose), inverse * (centre(pose) - origin))
+        DMat4::from_mat3_translation(inverse * DMat3::from_mat4(*pose), inverse * (center(pose) - origin))
     };
     let aligned: Vec<DMat4> = c2w.iter().map(align).collect();
     let mut scale = 0f64;
     for (i, a) in aligned.iter().enumerate() {
         for b in &aligned[..i] {
-            scale = scale.max(centre(a).distance(centre(b)));
+            scale = scale.max(center(a).distance(center(b)));
         }
     }
-    let largest = c2w.iter().map(|pose| centre(pose).abs().max_element()).fold(0., f64::max);
+    let largest = c2w.iter().map(|pose| center(pose).abs().max_element()).fold(0., f64::max);
     if !(scale > ROUNDING * largest && scale.is_finite()) {
         scale = 1.;
     }
     let c2w = aligned
         .into_iter()
         .map(|mut pose| {
-            pose.w_axis = (centre(&pose) / scale).extend(1.);
+            pose.w_axis = (center(&pose) / scale).extend(1.);
             pose
         })
         .collect();
@@ -98,8 +98,8 @@ mod tests {
             assert!(world_from_normalized.translation.with_y(0.).length() < 1e-12);
             for (pose, before) in c2w.iter().zip(&ring) {
                 let Similarity { rotation, translation, scale } = world_from_normalized;
-                let (centre, turned) = (pose.w_axis.truncate(), rotation * DMat3::from_mat4(*pose));
-                let back = DMat4::from_mat3_translation(turned, scale * (rotation * centre) + translation);
+                let (center, turned) = (pose.w_axis.truncate(), rotation * DMat3::from_mat4(*pose));
+                let back = DMat4::from_mat3_translation(turned, scale * (rotation * center) + translation);
                 assert!(back.abs_diff_eq(*before, 1e-12));
             }
         }

@@ -4,7 +4,7 @@ use super::invert;
 use glam::DVec2;
 use std::f64::consts::PI;
 
-/// Distortion of the equidistant projection. A ray at the angle θ from the optical axis is at the distance θ from the centre of the
+/// Distortion of the equidistant projection. A ray at the angle θ from the optical axis is at the distance θ from the center of the
 /// undistorted image plane, at q. With r = |q| it is shown at
 ///
 /// ```text
@@ -104,7 +104,7 @@ fn factor(radial: &[f64; 6], r2: f64) -> f64 {
     1. + radial.iter().rev().fold(0., |sum, k| (sum + k) * r2)
 }
 
-/// Returns the angle up to which the distance from the centre grows: where 1 + 3k₁θ² + 5k₂θ⁴ + … first falls to 0, at most π.
+/// Returns the angle up to which the distance from the center grows: where 1 + 3k₁θ² + 5k₂θ⁴ + … first falls to 0, at most π.
 fn max_angle(radial: &[f64; 6]) -> f64 {
     /// Number of angles at which the slope is examined.
     const STEPS: u32 = 720;

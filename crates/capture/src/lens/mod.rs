@@ -39,7 +39,7 @@ pub(crate) const COLMAP_MODELS: [(&str, usize); 18] = [
 const MAX_ANGLE: f64 = 110. * PI / 180.;
 const COS_MAX_ANGLE: f64 = -0.342_020_143_325_668_7;
 
-/// A lens and the size of its photos: how rays in camera axes (x right, y down, z forward) map to pixels. The centre of pixel (i, j)
+/// A lens and the size of its photos: how rays in camera axes (x right, y down, z forward) map to pixels. The center of pixel (i, j)
 /// is at (j + ½, i + ½).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Lens {
@@ -147,13 +147,13 @@ impl Lens {
         self.size
     }
 
-    /// Checks that the intrinsics are valid and that the lens shows the photo's pixels rays of their own.
+    /// Checks that the intrinsics are valid and that most pixels have a unique ray.
     ///
     /// # Errors
     /// Returns (field, what was found, what was expected).
     pub(crate) fn check(&self) -> Result<(), (String, String, String)> {
         /// Smallest fraction of a photo's pixels that have a ray.
-        const LEAST: f64 = 0.1;
+        const MIN_RAY_FRACTION: f64 = 0.1;
         let ImageSize { width, height } = self.size;
         self.intrinsics.check(width, height)?;
         let refuse = |found: String, expected: &str| Err(("the distortion".into(), found, expected.into()));
@@ -190,9 +190,9 @@ impl Lens {
             LensModel::Eucm { alpha, beta } => format!("alpha {alpha}, beta {beta}"),
         };
         let points = self.grid(16);
-        let seen = points.iter().filter(|&&point| self.ray_at(point).is_some()).count() as f64;
+        let seen = points.iter().filter(|&&point| self.unproject_used(point).is_some()).count() as f64;
         let share = seen / points.len() as f64;
-        match share >= LEAST {
+        match share >= MIN_RAY_FRACTION {
             true => Ok(()),
             false => refuse(
                 format!("{parameters}, by which {:.0} % of the photo have a ray", 100. * share),
@@ -217,21 +217,21 @@ impl Lens {
     }
 
     /// Returns `true` if `ray` is within the angle at which photos are used.
-    fn is_used(&self, ray: DVec3) -> bool {
+    fn is_within_max_angle(&self, ray: DVec3) -> bool {
         matches!(self.model, LensModel::Equirectangular) || ray.z >= COS_MAX_ANGLE * ray.length()
     }
 
     /// Returns the position of `ray` in the photo, or `None` if the photo doesn't show it.
-    pub(crate) fn position_of(&self, ray: DVec3) -> Option<DVec2> {
+    pub(crate) fn project_into_photo(&self, ray: DVec3) -> Option<DVec2> {
         let ImageSize { width, height } = self.size;
         let is_inside =
             |p: &DVec2| p.x >= 0. && p.y >= 0. && p.x <= f64::from(width) && p.y <= f64::from(height);
-        self.project(ray).filter(|point| is_inside(point) && self.is_used(ray))
+        self.project(ray).filter(|point| is_inside(point) && self.is_within_max_angle(ray))
     }
 
     /// Returns the ray at a position in the photo, or `None` if nothing is there.
-    fn ray_at(&self, pixel: DVec2) -> Option<DVec3> {
-        self.unproject(pixel).filter(|&ray| self.is_used(ray))
+    fn unproject_used(&self, pixel: DVec2) -> Option<DVec3> {
+        self.unproject(pixel).filter(|&ray| self.is_within_max_angle(ray))
     }
 
     /// Returns the corners of `count` × `count` equal parts of the photo.

@@ -54,8 +54,8 @@ pub(crate) struct PhotoPart {
 
 impl PhotoPart {
     /// Returns the position in the photo of the view's ray `ray`, or `None` if the photo doesn't show it.
-    pub fn position_of(&self, ray: DVec3) -> Option<DVec2> {
-        self.lens.position_of(self.rotation * ray)
+    pub fn project_into_photo(&self, ray: DVec3) -> Option<DVec2> {
+        self.lens.project_into_photo(self.rotation * ray)
     }
 }
 
@@ -87,7 +87,7 @@ impl Bounds {
 /// 3. the faces of a cube of which the photo shows something.
 ///
 /// The focal length is the number of pixels per radian at the photo's optical axis. It is shorter if the views would have more than
-/// 16 times as many pixels as the photo, which only a lens has that enlarges its centre out of all proportion. Every view is cut to
+/// 16 times as many pixels as the photo, which only a lens has that enlarges its center out of all proportion. Every view is cut to
 /// what the photo shows, and contains its own axis.
 pub(crate) fn split_into_views(lens: &Lens) -> Vec<PinholeView> {
     const MAX_PIXELS: f64 = 16.;
@@ -128,7 +128,7 @@ fn outline(lens: &Lens) -> Vec<DVec3> {
         [DVec2::new(at, 0.), DVec2::new(at, 1.), DVec2::new(0., at), DVec2::new(1., at)]
     });
     let points = edges.map(|point| size * point).chain(lens.grid(INSIDE));
-    let mut rays: Vec<DVec3> = points.filter_map(|point| lens.ray_at(point)).collect();
+    let mut rays: Vec<DVec3> = points.filter_map(|point| lens.unproject_used(point)).collect();
     // Where the field ends inside the photo.
     let end = match lens.model {
         LensModel::Fisheye(fisheye) => fisheye.max_angle.min(MAX_ANGLE),
@@ -138,7 +138,7 @@ fn outline(lens: &Lens) -> Vec<DVec3> {
     rays.extend((0..AROUND).filter_map(|i| {
         let (y, x) = (TAU * f64::from(i) / f64::from(AROUND)).sin_cos();
         let ray = DVec3::new(x * sin, y * sin, cos);
-        lens.position_of(ray).map(|_| ray)
+        lens.project_into_photo(ray).map(|_| ray)
     }));
     rays
 }
@@ -182,7 +182,7 @@ fn cube(lens: &Lens, focal: f64) -> Vec<PinholeView> {
     let at = |i: u32| f64::from(i) * part - 1.;
     let view = |(suffix, rotation)| {
         let points = (0..=PARTS).flat_map(|i| (0..=PARTS).map(move |j| DVec2::new(at(j), at(i))));
-        let is_shown = |point: &DVec2| lens.position_of(rotation * point.extend(1.)).is_some();
+        let is_shown = |point: &DVec2| lens.project_into_photo(rotation * point.extend(1.)).is_some();
         let mut bounds = Bounds::new(points.filter(is_shown))?;
         bounds.least = (bounds.least - part).max(DVec2::NEG_ONE);
         bounds.greatest = (bounds.greatest + part).min(DVec2::ONE);
@@ -273,7 +273,7 @@ mod tests {
             let mut count = 0;
             for (x, y) in (0..width).flat_map(|x| (0..height).map(move |y| (x, y))) {
                 let pixel = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
-                let Some(ray) = lens.ray_at(pixel) else { continue };
+                let Some(ray) = lens.unproject_used(pixel) else { continue };
                 count += 1;
                 let seen = views.iter().filter_map(|view| Some((view, position_in(view, ray)?)));
                 let mut seen = seen.peekable();
@@ -283,7 +283,7 @@ mod tests {
                     let Intrinsics { fx, fy, cx, cy } = view.intrinsics;
                     let ray = DVec3::new((point.x - cx) / fx, (point.y - cy) / fy, 1.);
                     let part = PhotoPart { lens, rotation: view.rotation };
-                    let found = part.position_of(ray).unwrap_or_else(|| panic!("{pixel} of {lens:?}"));
+                    let found = part.project_into_photo(ray).unwrap_or_else(|| panic!("{pixel} of {lens:?}"));
                     assert!((found - pixel).length() < 1e-6, "{found} for {pixel} of {lens:?}");
                 }
             }
@@ -320,7 +320,7 @@ mod tests {
                 // Every edge that isn't at the axis or at the end of a face has a pixel that is shown near it.
                 let part = PhotoPart { lens, rotation: view.rotation };
                 let is_shown = |u: f64, v: f64| {
-                    part.position_of(DVec3::new((u - cx) / focal, (v - cy) / focal, 1.)).is_some()
+                    part.project_into_photo(DVec3::new((u - cx) / focal, (v - cy) / focal, 1.)).is_some()
                 };
                 let margin = 2. + focal / 16.;
                 let along = |size: f64| (0..=200).map(move |i| size * f64::from(i) / 200.);

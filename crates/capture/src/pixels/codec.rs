@@ -22,13 +22,13 @@ pub const PHOTO_EXTENSIONS: [&str; 10] =
 /// Description of the supported formats for error messages.
 pub(crate) const SUPPORTED_IMAGES: &str = "a JPEG, PNG, WebP, TIFF, BMP, HEIC or AVIF";
 
-/// Reads any image as 8-bit RGB, with pixels as they are stored: grey is repeated, transparent pixels are composited over black, 16 bits
+/// Reads any image as 8-bit RGB, with pixels as they are stored: gray is repeated, transparent pixels are composited over black, 16 bits
 /// are rounded to 8. HEIC and AVIF are decoded by the ffmpeg on the PATH.
 ///
 /// # Errors
 /// Returns an error if the file is missing, can't be decoded, or is truncated.
 pub fn read_image(path: &Path) -> Result<RgbImage> {
-    // No photo has the size 0×0, for which it would be rotated.
+    // The size 0×0 matches no photo, so the EXIF orientation isn't applied.
     Ok(decode_photo(&std::fs::read(path).map_err(Error::read(path))?, path, (0, 0))?.pixels)
 }
 
@@ -39,8 +39,8 @@ pub struct DecodedPhoto {
     pub pixels: RgbImage,
     /// Opacity of each pixel, 255 where it is opaque; `None` if every pixel is.
     pub alpha: Option<GrayImage>,
-    /// `true` if the file holds exactly these pixels in 8-bit RGB: no palette, grey, CMYK or opacity, not rotated and not converted.
-    pub as_stored: bool,
+    /// `true` if the file holds exactly these pixels in 8-bit RGB: no palette, gray, CMYK or opacity, not rotated and not converted.
+    pub is_verbatim: bool,
     /// `true` if the file is a JPEG.
     pub is_jpeg: bool,
     /// `true` if the file is a PNG.
@@ -60,7 +60,7 @@ pub struct DecodedPhoto {
 pub fn decode_photo(encoded: &[u8], file: &Path, size: (u32, u32)) -> Result<DecodedPhoto> {
     if let Some(header) = HeifHeader::parse(encoded) {
         let (pixels, alpha) = split_alpha(header.decode(encoded, file)?);
-        return Ok(DecodedPhoto { pixels, alpha, as_stored: false, is_jpeg: false, is_png: false });
+        return Ok(DecodedPhoto { pixels, alpha, is_verbatim: false, is_jpeg: false, is_png: false });
     }
     let reader = ImageReader::new(Cursor::new(encoded)).with_guessed_format().map_err(Error::read(file))?;
     let format = reader.format();
@@ -73,7 +73,7 @@ pub fn decode_photo(encoded: &[u8], file: &Path, size: (u32, u32)) -> Result<Dec
         return Err(Error::input(file, "the image", format!("{width}×{height} pixels"), "a photo's size"));
     }
     if matches!(decoder.color_type(), ColorType::Rgb32F | ColorType::Rgba32F) {
-        // Their range and brightness are up to the program that wrote them.
+        // The range of floating-point pixels isn't standardized.
         let found = "with floating-point pixels";
         return Err(Error::input(file, "the image", found, "8 or 16 bits for each of its colors"));
     }
@@ -104,9 +104,9 @@ pub fn decode_photo(encoded: &[u8], file: &Path, size: (u32, u32)) -> Result<Dec
     if turn {
         image.apply_orientation(orientation);
     }
-    let as_stored = !turn && has_rgb && matches!(image, DynamicImage::ImageRgb8(_));
+    let is_verbatim = !turn && has_rgb && matches!(image, DynamicImage::ImageRgb8(_));
     let (pixels, alpha) = split_alpha(image);
-    Ok(DecodedPhoto { pixels, alpha, as_stored, is_jpeg, is_png })
+    Ok(DecodedPhoto { pixels, alpha, is_verbatim, is_jpeg, is_png })
 }
 
 /// Encodes a photo as a JPEG of high quality, or as a PNG.
@@ -139,7 +139,7 @@ pub fn read_image_size(path: &Path) -> Result<(u32, u32)> {
 }
 
 fn image_size(mut reader: impl BufRead + Seek, path: &Path) -> Result<(u32, u32)> {
-    // The decoder would read the whole file.
+    // image's JPEG decoder would read the whole file.
     if let Some(size) = jpeg_size(&mut reader) {
         return Ok(size);
     }
@@ -151,7 +151,8 @@ fn image_size(mut reader: impl BufRead + Seek, path: &Path) -> Result<(u32, u32)
     reader.into_dimensions().map_err(undecodable(path))
 }
 
-/// Returns `true` if the image's header declares an alpha channel, or a transparent color.
+/// Returns `true` if the image's header declares an alpha channel or a transparent color. HEIC and AVIF are decoded without their alpha channel,
+/// so they have none here.
 ///
 /// # Errors
 /// Returns an error if the file is missing or is no image.

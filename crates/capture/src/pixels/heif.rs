@@ -79,9 +79,10 @@ impl HeifHeader {
         let folder = tempfile::tempdir().map_err(given)?;
         let [heif, bmp, png] = ["photo.heif", "photo.bmp", "photo.png"].map(|name| folder.path().join(name));
         std::fs::write(&heif, encoded).map_err(given)?;
-        // The file may refer to no other one.
-        let read =
-            "-v error -xerror -noautorotate -protocol_whitelist file -f mov -i".split(' ').map(OsStr::new);
+        // A malicious file opens neither URLs nor other files.
+        let read = "-v error -xerror -noautorotate -protocol_whitelist file -enable_drefs 0 -f mov -i"
+            .split(' ')
+            .map(OsStr::new);
         let write = "-frames:v 1 -pix_fmt bgr24".split(' ').map(OsStr::new);
         let arguments = read.chain([heif.as_os_str()]).chain(write).chain([bmp.as_os_str()]);
         let by_ffmpeg = run("ffmpeg", arguments, &bmp, self.size);
@@ -93,7 +94,10 @@ impl HeifHeader {
         // libheif's program, which has two names, rotates.
         let by_libheif = || {
             let run = |program| run(program, [heif.as_os_str(), png.as_os_str()], &png, self.rotated_size());
-            ["heif-dec", "heif-convert"].into_iter().find_map(run)
+            ["heif-dec", "heif-convert"]
+                .into_iter()
+                .find_map(run)
+                .map(|image| image.map(|image| image.into_rgb8().into()))
         };
         image.or_else(|why| by_libheif().unwrap_or(Err(why))).map_err(undecodable)
     }

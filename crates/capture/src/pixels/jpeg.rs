@@ -1,4 +1,4 @@
-//! Strict decoding of JPEGs (ITU-T T.81). Lenient decoders don't report missing data: they fill it with grey.
+//! Strict decoding of JPEGs (ITU-T T.81). Lenient decoders don't report missing data: they fill it with gray.
 
 use image::{DynamicImage, GrayImage, RgbImage};
 use std::io::{BufRead, Seek};
@@ -49,7 +49,7 @@ pub(super) fn jpeg_size(mut reader: impl BufRead + Seek) -> Option<(u32, u32)> {
     }
 }
 
-/// Decodes a JPEG, grey or as RGB. Returns `true` with it if the file holds three components: neither grey nor CMYK.
+/// Decodes a JPEG, gray or as RGB. Returns `true` with it if the file holds three components: neither gray nor CMYK.
 ///
 /// # Errors
 /// Returns a description of what is missing or damaged. Without its end marker, a file counts as cut short.
@@ -62,13 +62,13 @@ pub(super) fn decode_jpeg(bytes: &[u8]) -> Result<(DynamicImage, bool), String> 
     let mut decoder = JpegDecoder::new_with_options(ZCursor::new(bytes), options);
     decoder.decode_headers().map_err(|why| why.to_string())?;
     let stored = decoder.input_colorspace().expect("the headers are decoded");
-    let is_grey = stored == ColorSpace::Luma;
-    let target = if is_grey { ColorSpace::Luma } else { ColorSpace::RGB };
+    let is_gray = stored == ColorSpace::Luma;
+    let target = if is_gray { ColorSpace::Luma } else { ColorSpace::RGB };
     decoder.set_options(options.jpeg_set_out_colorspace(target));
     let pixels = decoder.decode().map_err(|why| why.to_string())?;
     let (width, height) =
         decoder.info().map(|info| (info.width.into(), info.height.into())).unwrap_or((0, 0));
-    let image = match is_grey {
+    let image = match is_gray {
         true => GrayImage::from_raw(width, height, pixels).map(DynamicImage::from),
         false => RgbImage::from_raw(width, height, pixels).map(DynamicImage::from),
     };

@@ -9,7 +9,7 @@ use globalsplat_files::{Error, Result};
 use image::{GrayImage, Rgb, RgbImage};
 use std::path::Path;
 
-/// Reads the mask `file` at `size` = (width, height), resized if it has another size. The level of its grey is the weight; a color
+/// Reads the mask `file` at `size` = (width, height), resized if it has another size. The level of its gray is the weight; a color
 /// counts by its luminance, and what is transparent is black. A mask without a level above 1 has levels 0 and 1.
 ///
 /// # Errors
@@ -20,7 +20,7 @@ pub fn read_mask(file: &Path, size: (u32, u32)) -> Result<RgbImage> {
     if mask.pixels().all(|level| level[0] <= 1) {
         mask.pixels_mut().for_each(|level| level[0] *= u8::MAX);
     }
-    let mask = grey_to_rgb(&mask);
+    let mask = gray_to_rgb(&mask);
     if mask.dimensions() == size {
         return Ok(mask);
     }
@@ -33,7 +33,7 @@ pub fn read_mask(file: &Path, size: (u32, u32)) -> Result<RgbImage> {
 }
 
 /// Returns the image whose channels all are `image`.
-pub fn grey_to_rgb(image: &GrayImage) -> RgbImage {
+pub fn gray_to_rgb(image: &GrayImage) -> RgbImage {
     RgbImage::from_fn(image.width(), image.height(), |x, y| Rgb([image.get_pixel(x, y)[0]; 3]))
 }
 

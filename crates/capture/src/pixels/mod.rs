@@ -20,5 +20,5 @@ pub use resample::{Region, Resampler};
 pub use resize_and_crop::{resize_and_crop, source_ranges};
 
 pub(crate) use mask::multiply;
-pub use mask::{grey_to_rgb, read_mask};
+pub use mask::{gray_to_rgb, read_mask};
 pub(crate) use undistort::{Undistorter, ViewPixels};

@@ -14,7 +14,7 @@ use image::RgbImage;
 use std::f64::consts::PI;
 use std::ops::Range;
 
-/// Number of lobes on each side of the filter's centre.
+/// Number of lobes on each side of the filter's center.
 const LOBES: f64 = 3.;
 /// Number of rows that the first pass filters at once.
 const ROWS: usize = 8;
@@ -58,10 +58,10 @@ impl Taps {
         let mut first = Vec::with_capacity(outputs);
         let mut weights = vec![0f32; outputs * count];
         for (output, weights) in weights.chunks_exact_mut(count).enumerate() {
-            let centre = start + (output as f64 + 0.5) * scale;
-            let low = ((centre - support + 0.5).max(0.) as usize).min(inputs - 1);
-            let high = ((centre + support + 0.5) as usize).clamp(low + 1, inputs).min(low + count);
-            let raw = |input: usize| lanczos((input as f64 + 0.5 - centre) / stretch);
+            let center = start + (output as f64 + 0.5) * scale;
+            let low = ((center - support + 0.5).max(0.) as usize).min(inputs - 1);
+            let high = ((center + support + 0.5) as usize).clamp(low + 1, inputs).min(low + count);
+            let raw = |input: usize| lanczos((input as f64 + 0.5 - center) / stretch);
             let sum: f64 = (low..high).map(raw).sum();
             // All windows have `count` inputs. Near the end of the axis they begin earlier, and the additional weights are 0.
             let begin = low.min(inputs - count);

@@ -9,7 +9,7 @@ use std::ops::Range;
 /// The first resize rounds the width to a multiple of this, at least one (spec 9.2).
 const WIDTH_MULTIPLE: f64 = 8.;
 
-/// The largest centred rectangle of a target aspect ratio in a camera's image, and the first resize.
+/// The largest centered rectangle of a target aspect ratio in a camera's image, and the first resize.
 struct Crop {
     /// The rectangle, in pixels of the source image.
     region: Region,
@@ -63,7 +63,7 @@ pub fn source_ranges(camera: &Camera, size: ImageSize) -> [Range<usize>; 2] {
 }
 
 /// Resizes the image to the height of `size` with the aspect ratio kept (width rounded to a multiple of 8), cuts out the largest
-/// centred rectangle with the aspect ratio of `size`, and resizes again if the result doesn't have `size` yet. Returns the planes,
+/// centered rectangle with the aspect ratio of `size`, and resizes again if the result doesn't have `size` yet. Returns the planes,
 /// `[3, H, W]`, and the camera with adjusted intrinsics; an image of `size` already is returned unchanged.
 pub fn resize_and_crop(image: &RgbImage, camera: &Camera, size: ImageSize) -> (Planes, Camera) {
     if has_size(camera, size) {
@@ -104,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn images_are_cut_to_the_aspect_ratio_around_their_centre() {
+    fn images_are_cut_to_the_aspect_ratio_around_their_center() {
         for (width, height, size, [fx, fy]) in [
             // 640×360 → 456×256 (455.1 rounded to a multiple of 8) → 256×256.
             (640, 360, [256, 256], [500. * 456. / 640., 510. * 256. / 360.]),

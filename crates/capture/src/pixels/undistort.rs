@@ -18,7 +18,7 @@ pub(crate) struct ViewPixels {
 /// Takes the pixels of a pinhole view from its photo.
 ///
 /// Pixel (i, j) has the ray x = (j + ½ − cx)/fx, y = (i + ½ − cy)/fy, and takes its color from the position in the photo to which
-/// the projection maps the ray, interpolated linearly between the four surrounding pixel centres. Beyond the photo its border is
+/// the projection maps the ray, interpolated linearly between the four surrounding pixel centers. Beyond the photo its border is
 /// repeated, or, if the view is a part of the photo, pixels are black and masked out.
 #[derive(Debug)]
 pub(crate) struct Undistorter {
@@ -125,7 +125,7 @@ impl<'a> RowLookup<'a> {
         let last = part.lens.size();
         let [last_column, last_row] = [last.width, last.height].map(|count| f64::from(count - 1));
         for (place, &x) in row.iter_mut().zip(&self.across) {
-            *place = match part.position_of(DVec3::new(x, y, 1.)) {
+            *place = match part.project_into_photo(DVec3::new(x, y, 1.)) {
                 Some(position) => {
                     let (left, to_right) = between(position.x, last_column);
                     let (top, to_bottom) = between(position.y, last_row);
@@ -152,7 +152,7 @@ impl<'a> RowLookup<'a> {
     }
 }
 
-/// Returns the index of the last pixel centre, along columns or rows, at or before `position`, and the fractional distance to the
+/// Returns the index of the last pixel center, along columns or rows, at or before `position`, and the fractional distance to the
 /// next one. `position` is in pixels from the image's edge.
 #[inline]
 fn between(position: f64, last: f64) -> (u32, f32) {
@@ -162,7 +162,7 @@ fn between(position: f64, last: f64) -> (u32, f32) {
     // Comparisons instead of max() and min(), which handle NaN and take longer.
     let position = if position > 0. { position } else { 0. };
     let position = if position < last { position } else { last };
-    // Halfway between two centres, either one may be chosen; with a fraction of 0 or 1 the result is the same.
+    // Halfway between two centers, either one may be chosen; with a fraction of 0 or 1 the result is the same.
     let whole = position - 0.5 + WHOLE;
     (whole.to_bits() as u32, (position - (whole - WHOLE)) as f32)
 }

@@ -80,9 +80,9 @@ fn cameras_of(lens: &Lens) -> Vec<Camera> {
 fn write_photos(folder: &Path, lens: &Lens) {
     std::fs::create_dir_all(folder).unwrap();
     let ImageSize { height, width } = lens.size();
-    let centre = lens.project(DVec3::Z).unwrap();
+    let center = lens.project(DVec3::Z).unwrap();
     let ray =
-        |pixel: DVec2| (0..).find_map(|n| lens.unproject(centre.lerp(pixel, 0.995f64.powi(n)))).unwrap();
+        |pixel: DVec2| (0..).find_map(|n| lens.unproject(center.lerp(pixel, 0.995f64.powi(n)))).unwrap();
     let pixel = |i: u32| DVec2::new(f64::from(i % width) + 0.5, f64::from(i / width) + 0.5);
     let rays: Vec<DVec3> = (0..width * height).map(|i| ray(pixel(i))).collect();
     for (name, camera) in names().iter().zip(cameras()) {
@@ -161,8 +161,8 @@ fn views_show_the_colors_of_the_rays_of_the_photo() {
         assert!(share[0] <= mean && mean <= share[1], "{model}: {shares:?}");
         assert_eq!(photos.iter().any(|photo| photo.mask.is_some()), share[0] < 1., "{model}");
         for (index, photo) in photos.iter().enumerate().step_by(7) {
-            let centre = cameras()[index / names].c2w.w_axis;
-            assert!(photo.camera.c2w.w_axis.abs_diff_eq(centre, 1e-9), "{model}");
+            let center = cameras()[index / names].c2w.w_axis;
+            assert!(photo.camera.c2w.w_axis.abs_diff_eq(center, 1e-9), "{model}");
             let (alone, mask) = capture.photo_with_mask(index).unwrap();
             let mask = mask.map(|mask| mask.pixels().map(|weight| weight[0]).collect());
             assert!(alone == photo.image.to_rgb() && mask == photo.mask, "{model}");

@@ -74,28 +74,28 @@ fn exif_orientation_is_applied_if_the_declared_size_matches() {
 #[test]
 fn photos_of_every_color_type_load() {
     let at = |x: u32, y: u32| (x * 10 + y) as u8;
-    let grey = GrayImage::from_fn(WIDTH, HEIGHT, |x, y| Luma([at(x, y)]));
+    let gray = GrayImage::from_fn(WIDTH, HEIGHT, |x, y| Luma([at(x, y)]));
     let alpha = |y: u32| [0, 255, 128][y as usize % 3];
-    let grey_alpha = image::GrayAlphaImage::from_fn(WIDTH, HEIGHT, |x, y| image::LumaA([at(x, y), alpha(y)]));
+    let gray_alpha = image::GrayAlphaImage::from_fn(WIDTH, HEIGHT, |x, y| image::LumaA([at(x, y), alpha(y)]));
     let rgba = image::RgbaImage::from_fn(WIDTH, HEIGHT, |x, y| image::Rgba([at(x, y), 200, 30, alpha(y)]));
     let deep = image::ImageBuffer::<Rgb<u16>, _>::from_fn(WIDTH, HEIGHT, |x, y| {
         Rgb([u16::from(at(x, y)) * 257 + 100, 65_535, 257 * 30 - 100])
     });
-    let deep_grey =
+    let deep_gray =
         image::ImageBuffer::<Luma<u16>, _>::from_fn(WIDTH, HEIGHT, |x, y| Luma([u16::from(at(x, y)) * 257]));
     let over_black = |value: u8, y: u32| (f64::from(value) * f64::from(alpha(y)) / 255.).round() as u8;
     let expect = |rgb: &dyn Fn(u32, u32) -> [u8; 3]| RgbImage::from_fn(WIDTH, HEIGHT, |x, y| Rgb(rgb(x, y)));
     let repeated = expect(&|x, y| [at(x, y); 3]);
     let kinds: [(DynamicImage, RgbImage); 5] = [
-        (grey.clone().into(), repeated.clone()),
-        (grey_alpha.into(), expect(&|x, y| [over_black(at(x, y), y); 3])),
+        (gray.clone().into(), repeated.clone()),
+        (gray_alpha.into(), expect(&|x, y| [over_black(at(x, y), y); 3])),
         (rgba.into(), expect(&|x, y| [at(x, y), 200, 30].map(|value| over_black(value, y)))),
         (deep.into(), expect(&|x, y| [at(x, y), 255, 30])),
-        (deep_grey.into(), repeated.clone()),
+        (deep_gray.into(), repeated.clone()),
     ];
     for (photo, expected) in kinds {
         for (extension, format) in LOSSLESS {
-            // The encoder of TIFFs refuses opacity of grey pixels, and that of BMPs drops it.
+            // The encoder of TIFFs refuses opacity of gray pixels, and that of BMPs drops it.
             if ["bmp", "tif"].contains(&extension) && photo.color() == ColorType::La8 {
                 continue;
             }
@@ -104,10 +104,10 @@ fn photos_of_every_color_type_load() {
             assert!(found == expected, "{extension}, {:?} is {off} off", photo.color());
         }
     }
-    let jpeg = encode(&grey.into(), ImageFormat::Jpeg);
+    let jpeg = encode(&gray.into(), ImageFormat::Jpeg);
     let found = load_photo(&jpeg, "jpeg", WIDTH, HEIGHT).unwrap();
-    let is_grey = found.pixels().all(|pixel| pixel.0[0] == pixel.0[2]);
-    assert!(largest_difference(&found, &repeated) < 13 && is_grey);
+    let is_gray = found.pixels().all(|pixel| pixel.0[0] == pixel.0[2]);
+    assert!(largest_difference(&found, &repeated) < 13 && is_gray);
 }
 
 /// Returns an image of pseudorandom levels. They compress badly, so that every block of a JPEG takes many bytes.
@@ -221,14 +221,14 @@ fn only_photos_of_plain_colors_are_as_stored() {
     assert!(decode_photo(&opaque, "photo".as_ref(), (45, 37)).unwrap().alpha.is_none());
     let mut files = vec![
         ("a palette".to_string(), bytes_of_hex(PALETTE_PNG), false),
-        ("grey".into(), png(image.to_luma8().into()), false),
+        ("gray".into(), png(image.to_luma8().into()), false),
         ("opacity".into(), opaque, false),
         ("16 bits".into(), png(image.to_rgb16().into()), false),
         ("RGB".into(), png(image), true),
     ];
     files.extend(jpegs().into_iter().map(|(kind, jpeg)| (kind.clone(), jpeg, kind.starts_with('3'))));
     for (kind, bytes, expected) in files {
-        let found = decode_photo(&bytes, "photo".as_ref(), (45, 37)).unwrap().as_stored;
+        let found = decode_photo(&bytes, "photo".as_ref(), (45, 37)).unwrap().is_verbatim;
         assert_eq!(found, expected, "{kind}");
     }
 }
@@ -244,7 +244,7 @@ fn lossy_webp_has_colors_and_opacity() {
         let found = photo.pixels.get_pixel(x, 8).0;
         assert!(found.iter().zip(expected).all(|(a, b)| a.abs_diff(b) < 6), "{x}: {found:?}");
     }
-    assert!(!photo.as_stored);
+    assert!(!photo.is_verbatim);
 }
 
 #[test]

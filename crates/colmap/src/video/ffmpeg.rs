@@ -1,6 +1,6 @@
 //! ffmpeg and ffprobe, run as processes.
 
-use super::motion::Grey;
+use super::motion::Gray;
 use globalsplat_files::{Error, Result, is_program_missing};
 use serde_json::Value;
 use std::fs;
@@ -122,7 +122,7 @@ impl<'a> Video<'a> {
         })
     }
 
-    /// Starts the first pass: every frame as a grey image of up to 640 pixels a side.
+    /// Starts the first pass: every frame as a gray image of up to 640 pixels a side.
     pub(super) fn decode_small(&self) -> Result<Pass<'_>> {
         let scale = "scale=w='min(640,iw)':h='min(640,ih)':force_original_aspect_ratio=decrease:flags=area";
         let filter = format!("{}{scale},format=gray", self.deinterlace);
@@ -169,9 +169,9 @@ pub(super) struct Pass<'a> {
 
 impl Pass<'_> {
     /// Returns the next image of [`Video::decode_small`]; `None` at the end of the video.
-    pub(super) fn next_frame(&mut self) -> Result<Option<Grey>> {
+    pub(super) fn next_frame(&mut self) -> Result<Option<Gray>> {
         let context = format!("{}: no frames from ffmpeg", self.video.path.display());
-        Grey::read(&mut self.stdout).map_err(Error::failed_with_context(context))
+        Gray::read(&mut self.stdout).map_err(Error::failed_with_context(context))
     }
 
     /// Waits for the next number of frames that [`Video::write`] has written, twice a second; `None` at the end.

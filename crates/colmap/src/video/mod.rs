@@ -1,15 +1,15 @@
-//! Frames of a video: the sharpest of each stretch of equal motion.
+//! Frames of a video: the sharpest of each segment of equal motion.
 //!
-//! A first pass of ffmpeg decodes small grey images, of which sharpness and motion are measured. The frames are chosen from these, and a
+//! A first pass of ffmpeg decodes small gray images, of which sharpness and motion are measured. The frames are chosen from these, and a
 //! second pass writes them in full size.
 
-mod choice;
 mod ffmpeg;
+mod frame_selection;
 mod motion;
 
 use crate::progress::{Interrupt, Progress, Reporter, Step, unless_stopped};
-use choice::{choose_frames, positions};
 use ffmpeg::Video;
+use frame_selection::{positions, select_frames};
 use globalsplat_files::{Error, Result, replace_dir};
 use motion::MotionTracker;
 use serde::{Deserialize, Serialize};
@@ -23,14 +23,14 @@ const MAX_FRAMES: usize = 2000;
 pub struct VideoFrames {
     /// Index of each frame in the video, from 0.
     pub indices: Vec<usize>,
-    /// Summary, as `240 of 3600 frames, the sharpest of each stretch of equal motion`.
+    /// Summary, as `240 of 3600 frames, the sharpest of each segment of equal motion`.
     pub summary: String,
     /// What the user should know of the video, a sentence each: that nothing moves, that colors or frames are lost.
     pub warnings: Vec<String>,
 }
 
-/// Writes frames of `video` as JPEGs `frame_00001.jpg`, `frame_00002.jpg`, … to `folder`. The video is divided into stretches in which the
-/// picture moves equally far, and the sharpest frame of each is chosen; a camera at rest adds no frames. A cut starts a new stretch.
+/// Writes frames of `video` as JPEGs `frame_00001.jpg`, `frame_00002.jpg`, … to `folder`. The video is divided into segments in which the
+/// picture moves equally far, and the sharpest frame of each is chosen; a camera at rest adds no frames. A cut starts a new segment.
 /// Frames are upright, progressive and with square pixels; HDR becomes SDR. Replaces the frames of an earlier call in `folder`; its
 /// other files stay. The folder changes only when all frames are written.
 ///
@@ -67,7 +67,7 @@ pub(crate) fn write_sharpest_frames(
     if total < 2 {
         return Err(Error::input(video, "the number of frames", total, "2 or more").into());
     }
-    let indices = choose_frames(&positions(&motion, count), &sharpness);
+    let indices = select_frames(&positions(&motion, count), &sharpness);
     let chosen = indices.len();
     let mut warnings = source.warnings.clone();
     if chosen == 1 && count != Some(1) {
@@ -82,7 +82,7 @@ pub(crate) fn write_sharpest_frames(
     let own_names = own_frames(folder)?;
     let own_names: Vec<&str> = own_names.iter().map(String::as_str).collect();
     replace_dir(folder, &own_names, |place| write_frames(&source, &indices, place, reporter))?;
-    let summary = format!("{chosen} of {total} frames, the sharpest of each stretch of equal motion");
+    let summary = format!("{chosen} of {total} frames, the sharpest of each segment of equal motion");
     Ok(VideoFrames { indices, summary, warnings })
 }
 

@@ -1,4 +1,4 @@
-//! Sharpness of small grey images, and motion of the picture from one to the next: the median of the displacements of blocks, which are matched
+//! Sharpness of small gray images, and motion of the picture from one to the next: the median of the displacements of blocks, which are matched
 //! from coarse to fine.
 //!
 //! Blocks are compared by zero-mean normalized cross-correlation, which doesn't depend on exposure and contrast.
@@ -11,7 +11,7 @@ const FINEST: usize = 160;
 const LEVELS: usize = 3;
 /// Number of columns and of rows of blocks.
 const GRID: isize = 8;
-/// Pixels from the centre of a block to its border, at every level.
+/// Pixels from the center of a block to its border, at every level.
 const RADIUS: isize = 5;
 /// Largest displacement of the whole picture that is found, in parts of its sides: more leaves too small an overlap.
 const RANGE: f32 = 0.4;
@@ -28,16 +28,16 @@ const NEXT_REFERENCE: f64 = 0.02;
 /// Motion of a cut, in units of the longer side.
 const CUT: f64 = 1.;
 
-/// A grey image, rows from the top.
+/// A gray image, rows from the top.
 #[derive(Debug, Clone)]
-pub(super) struct Grey {
+pub(super) struct Gray {
     width: usize,
     height: usize,
     /// Values of 0 to 255.
     pixels: Vec<f32>,
 }
 
-impl Grey {
+impl Gray {
     /// Reads a binary PGM as ffmpeg writes it: "P5", the size and the maximum, 255, in a line each. Returns `None` at the end of the data.
     pub(super) fn read(reader: &mut impl BufRead) -> io::Result<Option<Self>> {
         if reader.fill_buf()?.is_empty() {
@@ -53,7 +53,7 @@ impl Grey {
         let (width, height) = (parse(width)?, parse(height)?);
         let mut bytes = vec![0; width * height];
         reader.read_exact(&mut bytes)?;
-        Ok(Some(Grey { width, height, pixels: bytes.into_iter().map(f32::from).collect() }))
+        Ok(Some(Gray { width, height, pixels: bytes.into_iter().map(f32::from).collect() }))
     }
 
     /// Returns the sharpness: the mean square of the Laplacian, relative to the variance of the pixels, which makes it independent of
@@ -95,11 +95,11 @@ impl Grey {
         }
         let scale = 1. / (factor * factor) as f32;
         pixels.iter_mut().for_each(|value| *value *= scale);
-        Grey { width, height, pixels }
+        Gray { width, height, pixels }
     }
 
     /// Returns the image at the sizes at which blocks are matched, from the finest to the coarsest.
-    fn levels(&self) -> [Grey; LEVELS] {
+    fn levels(&self) -> [Gray; LEVELS] {
         let finest = self.reduce(self.width.max(self.height).div_ceil(FINEST));
         let middle = finest.reduce(2);
         let coarsest = middle.reduce(2);
@@ -118,7 +118,7 @@ pub(super) struct MotionTracker {
 impl MotionTracker {
     /// Returns the motion from the last frame to `frame`, in units of the longer side: [`CUT`] if they don't show the same, 0 at the first
     /// frame.
-    pub(super) fn add(&mut self, frame: &Grey) -> f64 {
+    pub(super) fn add(&mut self, frame: &Gray) -> f64 {
         let levels = frame.levels();
         let Some(reference) = &self.reference else {
             self.reference = Some(Reference::new(levels));
@@ -143,24 +143,24 @@ impl MotionTracker {
 
 /// A frame that others are compared to.
 struct Reference {
-    levels: [Grey; LEVELS],
-    /// Centres of the blocks with texture, in pixels of the finest level.
+    levels: [Gray; LEVELS],
+    /// Centers of the blocks with texture, in pixels of the finest level.
     blocks: Vec<[isize; 2]>,
 }
 
 impl Reference {
-    fn new(levels: [Grey; LEVELS]) -> Self {
+    fn new(levels: [Gray; LEVELS]) -> Self {
         let finest = &levels[0];
-        let centre = |index: isize, side: usize| (2 * index + 1) * side as isize / (2 * GRID);
-        let centres =
-            (0..GRID * GRID).map(|i| [centre(i % GRID, finest.width), centre(i / GRID, finest.height)]);
-        let blocks = centres.filter(|centre| Window::around(*centre).variance(finest) >= TEXTURE).collect();
+        let center = |index: isize, side: usize| (2 * index + 1) * side as isize / (2 * GRID);
+        let centers =
+            (0..GRID * GRID).map(|i| [center(i % GRID, finest.width), center(i / GRID, finest.height)]);
+        let blocks = centers.filter(|center| Window::around(*center).variance(finest) >= TEXTURE).collect();
         Reference { levels, blocks }
     }
 
     /// Returns the median displacement of the blocks from this frame to `frame`, in units of the longer side; `None` if too few blocks are
     /// found again.
-    fn displacement(&self, frame: &[Grey; LEVELS]) -> Option<f64> {
+    fn displacement(&self, frame: &[Gray; LEVELS]) -> Option<f64> {
         if self.blocks.len() < MIN_BLOCKS {
             return None;
         }
@@ -176,27 +176,27 @@ impl Reference {
     }
 
     /// Returns the displacement of the whole picture, in pixels of the coarsest level.
-    fn whole_displacement(&self, frame: &[Grey; LEVELS]) -> [isize; 2] {
+    fn whole_displacement(&self, frame: &[Gray; LEVELS]) -> [isize; 2] {
         let (from, to) = (&self.levels[LEVELS - 1], &frame[LEVELS - 1]);
         let range = [from.width, from.height].map(|side| (side as f32 * RANGE) as isize);
         let all = Window { left: 0, top: 0, right: from.width as isize, bottom: from.height as isize };
         best_match([0, 0], range, |shift| all.correlate(from, to, shift, 0.)).0
     }
 
-    /// Returns the length of the displacement of the block at `centre`, in pixels of the finest level. The search starts at `shift`, the
+    /// Returns the length of the displacement of the block at `center`, in pixels of the finest level. The search starts at `shift`, the
     /// displacement of the whole picture. Returns `None` if the block isn't found again.
     fn block_displacement(
         &self,
-        frame: &[Grey; LEVELS],
-        centre: [isize; 2],
+        frame: &[Gray; LEVELS],
+        center: [isize; 2],
         mut shift: [isize; 2],
     ) -> Option<f32> {
         for level in (1..LEVELS).rev() {
-            let window = Window::around(centre.map(|value| value >> level));
+            let window = Window::around(center.map(|value| value >> level));
             let correlate = |shift| window.correlate(&self.levels[level], &frame[level], shift, 0.5);
             shift = best_match(shift, [SEARCH[level]; 2], correlate).0.map(|value| 2 * value);
         }
-        let window = Window::around(centre);
+        let window = Window::around(center);
         let correlate = |shift| window.correlate(&self.levels[0], &frame[0], shift, 0.5);
         let (shift @ [x, y], correlation) = best_match(shift, [SEARCH[0]; 2], correlate);
         // The maximum of a parabola through the correlations around the best pixel.
@@ -248,7 +248,7 @@ impl Window {
     }
 
     /// Returns the part of the window that is in the image `from` and, shifted, in the image `to`.
-    fn clip(self, from: &Grey, to: &Grey, [x, y]: [isize; 2]) -> Self {
+    fn clip(self, from: &Gray, to: &Gray, [x, y]: [isize; 2]) -> Self {
         Window {
             left: self.left.max(0).max(-x),
             top: self.top.max(0).max(-y),
@@ -258,14 +258,14 @@ impl Window {
     }
 
     /// Returns the pixels of each row of the window, shifted, in `image`.
-    fn rows(self, image: &Grey, [x, y]: [isize; 2]) -> impl Iterator<Item = &[f32]> {
+    fn rows(self, image: &Gray, [x, y]: [isize; 2]) -> impl Iterator<Item = &[f32]> {
         let (left, width) = ((self.left + x) as usize, (self.right - self.left) as usize);
         (self.top..self.bottom)
             .map(move |row| &image.pixels[(row + y) as usize * image.width + left..][..width])
     }
 
     /// Returns the variance of the pixels of `image` in the window.
-    fn variance(self, image: &Grey) -> f32 {
+    fn variance(self, image: &Gray) -> f32 {
         let window = self.clip(image, image, [0, 0]);
         let (mut sum, mut squares) = (0., 0.);
         for value in window.rows(image, [0, 0]).flatten() {
@@ -278,7 +278,7 @@ impl Window {
 
     /// Returns the zero-mean normalized cross-correlation, -1 to 1, of the window in the image `from` and the shifted window in the
     /// image `to`. Returns 0 if one of them is blank, or if no more than a `part` of the window is in the images.
-    fn correlate(self, from: &Grey, to: &Grey, shift: [isize; 2], part: f32) -> f32 {
+    fn correlate(self, from: &Gray, to: &Gray, shift: [isize; 2], part: f32) -> f32 {
         let window = self.clip(from, to, shift);
         let count = window.area() as f32;
         if count <= part * self.area() as f32 {
@@ -294,7 +294,7 @@ impl Window {
         }
         let [a, b] = [0, 1].map(|i| squares[i] - sums[i] * sums[i] / count);
         let covariance = products - sums[0] * sums[1] / count;
-        // Less than the variance of a pixel that differs by one grey level in a hundred.
+        // Less than the variance of a pixel that differs by one gray level in a hundred.
         if a.min(b) < 0.01 * count { 0. } else { covariance / (a * b).sqrt() }
     }
 }

@@ -99,7 +99,7 @@ fn view(picture: &GrayImage, x: u32) -> GrayImage {
     imageops::crop_imm(picture, x, 0, WIDTH, HEIGHT).to_image()
 }
 
-/// Returns the mean absolute difference of an image to `expected` in grey levels.
+/// Returns the mean absolute difference of an image to `expected` in gray levels.
 fn difference(image: DynamicImage, expected: &GrayImage) -> f64 {
     let image = image.into_luma8();
     assert_eq!(image.dimensions(), expected.dimensions());
@@ -135,14 +135,14 @@ fn frames_are_equally_far_apart_and_a_pause_adds_none() {
 
     let frames = extract(&video, &folder, Some(14));
     assert!(frames.warnings.is_empty(), "{:?}", frames.warnings);
-    assert_eq!(frames.summary, "14 of 200 frames, the sharpest of each stretch of equal motion");
+    assert_eq!(frames.summary, "14 of 200 frames, the sharpest of each segment of equal motion");
     let expected: BTreeSet<String> = (1..=14).map(|number| format!("frame_{number:05}.jpg")).collect();
     assert_eq!((names(&folder), frames.indices.len()), (expected, 14));
     fs::rename(&folder, fixture.at("frames")).unwrap();
     let length = 420. / 14.;
     for (k, &index) in frames.indices.iter().enumerate() {
         let x = f64::from(xs[index]) / length;
-        // Displacements are measured to a third of a pixel of 160, and the stretches lie between frames.
+        // Displacements are measured to a third of a pixel of 160, and the segments lie between frames.
         assert!((k as f64 - 0.3..=k as f64 + 1.3).contains(&x), "frame {k} at {x}");
         // The file shows this frame and no other.
         assert!(difference(fixture.frame(k), &views[index]) < 3.);
@@ -217,7 +217,7 @@ fn exposure_is_no_motion_and_a_cut_is_one_stretch() {
 fn zoom_and_roll_are_motion() {
     let Some(fixture) = Fixture::new() else { return };
     for (zoom, roll) in [(0.005, 0.), (0., 0.01)] {
-        // The centre of the picture stays.
+        // The center of the picture stays.
         let frame = |index: i32| {
             let ((sin, cos), scale) = ((roll * index as f32).sin_cos(), 1.4 - zoom * index as f32);
             GrayImage::from_fn(WIDTH, HEIGHT, |x, y| {
@@ -295,7 +295,7 @@ fn pixels_become_square_and_colors_stay() {
 #[test]
 fn hdr_is_converted() {
     let Some(fixture) = Fixture::new() else { return };
-    // White of 100 cd/m², the diffuse white of SDR, is 51 % in PQ, a medium grey if it is taken for SDR.
+    // White of 100 cd/m², the diffuse white of SDR, is 51 % in PQ, a medium gray if it is taken for SDR.
     let input = ["-f", "lavfi", "-i", "color=c=0x828282:s=320x180:d=0.2:r=25", "-pix_fmt", "yuv420p10le"];
     let colors = ["-vf", "setparams=color_primaries=bt2020:color_trc=smpte2084:colorspace=bt2020nc"];
     assert!(fixture.ffmpeg(&[&input[..], &colors, &["-c:v", "ffv1", "video.mkv"]].concat(), &[]));
@@ -303,8 +303,8 @@ fn hdr_is_converted() {
     if let [warning] = &frames.warnings[..] {
         return skip("ffmpeg with zscale", warning);
     }
-    let grey = fixture.frame(0).into_luma8()[(160, 90)].0[0];
-    assert!((145..=175).contains(&grey), "{grey}");
+    let gray = fixture.frame(0).into_luma8()[(160, 90)].0[0];
+    assert!((145..=175).contains(&gray), "{gray}");
 }
 
 #[test]

@@ -34,11 +34,11 @@ fn sh_attribute(degree: usize, index: usize) -> String {
 /// Turns the rotation (w, x, y, z) by half a turn about z, from the axes of other formats to those of glTF: the product of the quaternion
 /// (0, 0, 0, 1) and this one, which other programs write, too. [`Axes::rotation`](crate::axes::Axes::rotation) differs by half a turn about
 /// the Gaussian's own z axis, which doesn't change the Gaussian.
-fn turn_rotation([w, x, y, z]: [f32; 4]) -> [f32; 4] {
+fn rotation_to_gltf([w, x, y, z]: [f32; 4]) -> [f32; 4] {
     [-z, -y, x, w]
 }
 
-/// Inverts [`turn_rotation`].
-fn turn_rotation_back([w, x, y, z]: [f32; 4]) -> [f32; 4] {
+/// Inverts [`rotation_to_gltf`].
+fn rotation_from_gltf([w, x, y, z]: [f32; 4]) -> [f32; 4] {
     [z, y, -x, -w]
 }

@@ -1,11 +1,11 @@
 //! Gaussians of a glTF file: the primitives of the scene's nodes, with the numbers of their accessors.
 
 use super::document::{Accessor, Document, Primitive, Splatting, quoted};
-use super::{COLOR_SPACE, EXTENSION, KERNEL, POINTS, sh_attribute, turn_rotation_back};
+use super::{COLOR_SPACE, EXTENSION, KERNEL, POINTS, rotation_from_gltf, sh_attribute};
 use crate::axes::Axes;
 use crate::invalid::{Contents, InvalidGaussians};
 use crate::numbers::Scalar;
-use crate::splat::{dc_of_color, logit_of_opacity};
+use crate::splat::{color_to_sh0, logit_of_opacity};
 use crate::{Error, Result, Splat, spz};
 use glam::{DMat4, DQuat, DVec3};
 use std::path::Path;
@@ -54,7 +54,7 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let mut splat = Splat::concat(&parts.iter().collect::<Vec<_>>());
     splat.antialiased = parts.iter().all(|part| part.antialiased);
     Axes::LUF.convert_without_rotations(&mut splat);
-    splat.quaternions.iter_mut().for_each(|quaternion| *quaternion = turn_rotation_back(*quaternion));
+    splat.quaternions.iter_mut().for_each(|quaternion| *quaternion = rotation_from_gltf(*quaternion));
     splat.warnings = warnings;
     let mut invalid = InvalidGaussians::default();
     for (row, opacity) in opacities.into_iter().enumerate() {
@@ -142,7 +142,7 @@ impl PrimitiveReader<'_> {
         let harmonics = match has(&dc) {
             true => self.numbers(&dc, count, Components::NORMALIZED)?,
             false => {
-                let to_dc = |color: f32| dc_of_color(color.into());
+                let to_dc = |color: f32| color_to_sh0(color.into());
                 colors.iter().map(|&[red, green, blue, _]| [red, green, blue].map(to_dc)).collect()
             }
         };

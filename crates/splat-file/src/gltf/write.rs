@@ -1,8 +1,8 @@
 //! Writes splats as glTF: one primitive with float32 attributes, and colors of bytes for programs that show points only.
 
-use super::{COLOR_SPACE, EXTENSION, KERNEL, MAGIC, POINTS, sh_attribute, turn_rotation};
+use super::{COLOR_SPACE, EXTENSION, KERNEL, MAGIC, POINTS, rotation_to_gltf, sh_attribute};
 use crate::axes::Axes;
-use crate::splat::color_of_dc;
+use crate::splat::sh0_to_color;
 use crate::{Error, Result, Splat, WriteOptions};
 use globalsplat_files::{write_atomically, write_temporary};
 use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
@@ -98,12 +98,12 @@ fn attributes(path: &Path, splat: &Splat) -> Result<Vec<Attribute>> {
     };
     let all = || 0..splat.len();
     let rotation = |index: usize| {
-        let [w, x, y, z] = turn_rotation(unit_quaternion(splat, index));
+        let [w, x, y, z] = rotation_to_gltf(unit_quaternion(splat, index));
         [x, y, z, w]
     };
     let byte = |number: f64| (number * 255.).round() as u8; // clamps to 0 and 255
     let color = |index: usize| {
-        let [red, green, blue] = splat.sh_of(index)[0].map(|dc| byte(color_of_dc(dc)));
+        let [red, green, blue] = splat.sh_of(index)[0].map(|dc| byte(sh0_to_color(dc)));
         [red, green, blue, byte(splat.opacity(index).into())]
     };
     let own = |name: &str| format!("{EXTENSION}:{name}");
@@ -132,7 +132,7 @@ fn attributes(path: &Path, splat: &Splat) -> Result<Vec<Attribute>> {
     Ok(attributes)
 }
 
-/// Returns the quaternion of Gaussian `index` with length 1. One that has this length already, but for rounding, keeps its bits.
+/// Returns the quaternion of Gaussian `index` with length 1. A quaternion that is unit length up to rounding is returned unchanged.
 fn unit_quaternion(splat: &Splat, index: usize) -> [f32; 4] {
     let quaternion = splat.quaternions[index];
     let squared: f64 = quaternion.iter().map(|&part| f64::from(part).powi(2)).sum();

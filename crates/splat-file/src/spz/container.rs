@@ -83,7 +83,7 @@ impl Description {
     }
 
     /// Checks that a file of `length` bytes may decompress to the size that it claims. No memory is allocated before this check.
-    fn check_claim(&self, path: &Path, length: usize) -> Result<()> {
+    fn check_decompressed_size(&self, path: &Path, length: usize) -> Result<()> {
         let bytes = self.widths().iter().sum::<usize>() as u128 * self.count as u128;
         if bytes > MAX_SMALL + MAX_RATIO * length as u128 {
             let found = format!("{}, {bytes} bytes of them in a file of {length}", self.count);
@@ -103,20 +103,25 @@ pub fn read(path: &Path, bytes: &[u8]) -> Result<(Description, Streams)> {
     match recognizes(bytes) {
         true if bytes.starts_with(&MAGIC) => read_plain(path, bytes),
         true => read_gzip(path, bytes),
-        false => Err(Error::input(path, "the file", "no SPZ", "one in gzip, or NGSP")),
+        false => Err(Error::input(
+            path,
+            "the file",
+            "not an SPZ",
+            "a file that starts with gzip's magic number or NGSP",
+        )),
     }
 }
 
 /// Reads versions 1 to 3: header, streams and extensions in one gzip.
 fn read_gzip(path: &Path, bytes: &[u8]) -> Result<(Description, Streams)> {
     let mut decoder = GzDecoder::new(bytes);
-    let mut unfold = |length: u64, what: &str| -> Result<Vec<u8>> {
-        let mut unfolded = vec![];
-        let read = decoder.by_ref().take(length).read_to_end(&mut unfolded);
+    let mut decompress = |length: u64, what: &str| -> Result<Vec<u8>> {
+        let mut decompressed = vec![];
+        let read = decoder.by_ref().take(length).read_to_end(&mut decompressed);
         read.map_err(|why| Error::input(path, what, format!("damaged: {why}"), "a whole gzip"))?;
-        Ok(unfolded)
+        Ok(decompressed)
     };
-    let header = unfold(GZIP_HEADER as u64, "the header")?;
+    let header = decompress(GZIP_HEADER as u64, "the header")?;
     if header.len() < GZIP_HEADER {
         let found = format!("{} bytes", header.len());
         return Err(Error::input(path, "the header", found, format!("{GZIP_HEADER} bytes")));
@@ -125,11 +130,11 @@ fn read_gzip(path: &Path, bytes: &[u8]) -> Result<(Description, Streams)> {
     if description.version > 3 {
         return Err(Error::input(path, "the version in gzip", description.version, "1 to 3"));
     }
-    description.check_claim(path, bytes.len())?;
+    description.check_decompressed_size(path, bytes.len())?;
     let mut streams = Streams::default();
     for (stream, width) in streams.iter_mut().zip(description.widths()) {
         let length = width * description.count;
-        *stream = unfold(length as u64, "the body")?;
+        *stream = decompress(length as u64, "the body")?;
         if stream.len() < length {
             let found = format!("cut short: {} bytes of a stream", stream.len());
             let expected = format!("{length} bytes for {} Gaussians", description.count);
@@ -137,9 +142,9 @@ fn read_gzip(path: &Path, bytes: &[u8]) -> Result<(Description, Streams)> {
         }
     }
     // Reading to the end also verifies gzip's checksum.
-    let extensions = unfold(MAX_EXTENSIONS, "the end")?;
+    let extensions = decompress(MAX_EXTENSIONS, "the end")?;
     if flags & HAS_EXTENSIONS != 0 {
-        description.axes = axes_of(path, &extensions)?;
+        description.axes = parse_axes(path, &extensions)?;
     }
     Ok((description, streams))
 }
@@ -154,7 +159,7 @@ fn read_plain(path: &Path, bytes: &[u8]) -> Result<(Description, Streams)> {
     if description.version < 4 {
         return Err(Error::input(path, "the version outside of gzip", description.version, "4"));
     }
-    description.check_claim(path, bytes.len())?;
+    description.check_decompressed_size(path, bytes.len())?;
     let contents = u32_at(bytes, 16) as usize;
     let stored = usize::from(bytes[15]);
     let end = contents.saturating_add(16 * stored);
@@ -163,7 +168,7 @@ fn read_plain(path: &Path, bytes: &[u8]) -> Result<(Description, Streams)> {
         return Err(Error::input(path, "the table of contents", format!("at {contents}"), expected));
     }
     if flags & HAS_EXTENSIONS != 0 {
-        description.axes = axes_of(path, &bytes[PLAIN_HEADER..contents])?;
+        description.axes = parse_axes(path, &bytes[PLAIN_HEADER..contents])?;
     }
     let mut rest = &bytes[end..];
     let mut entries = bytes[contents..end].as_chunks::<16>().0.iter();
@@ -195,7 +200,7 @@ fn read_plain(path: &Path, bytes: &[u8]) -> Result<(Description, Streams)> {
 }
 
 /// Returns the axes that one of the `extensions` names. Each extension is a type, a length and that many bytes.
-fn axes_of(path: &Path, mut extensions: &[u8]) -> Result<Axes> {
+fn parse_axes(path: &Path, mut extensions: &[u8]) -> Result<Axes> {
     let mut axes = Axes::RUB;
     while let Some((head, rest)) = extensions.split_first_chunk::<8>() {
         let [kind, length] = [0, 4].map(|at| u32_at(head, at));

@@ -33,7 +33,7 @@ fn ksplats_are_read() {
 #[test]
 fn bad_ksplats() {
     let whole = std::fs::read(file("level_1.ksplat")).unwrap();
-    // Three sections, two lengths of partial buckets, four centres and a position precede the first scale.
+    // Three sections, two lengths of partial buckets, four centers and a position precede the first scale.
     const SCALE: usize = HEADER + 3 * SECTION_HEADER + 2 * 4 + 4 * 12 + 6;
     const ALL: [u8; 4] = [255; 4];
     for (at, number, message) in [

@@ -16,15 +16,15 @@ pub(super) struct Canvas {
 }
 
 impl Canvas {
-    /// Creates a canvas from a function of each pixel's centre, in repeats.
+    /// Creates a canvas from a function of each pixel's center, in repeats.
     pub fn from_fn(size: usize, mut color: impl FnMut(Vec2) -> Vec3) -> Canvas {
         let mut canvas = Canvas::filled(size, Vec3::ZERO);
-        canvas.change(|uv, _| color(uv));
+        canvas.map_pixels(|uv, _| color(uv));
         canvas
     }
 
     /// Creates a canvas from a field, value by value.
-    pub fn of_field(field: &Field, color: impl FnMut(f32) -> Vec3) -> Canvas {
+    pub fn from_field(field: &Field, color: impl FnMut(f32) -> Vec3) -> Canvas {
         let pixels = field.values.iter().copied().map(color).collect();
         Canvas { size: field.size, pixels, repeats: true }
     }
@@ -39,8 +39,8 @@ impl Canvas {
         Canvas { repeats: false, ..Canvas::filled(size, color) }
     }
 
-    /// Changes every pixel by a function of its centre and its previous color.
-    pub fn change(&mut self, mut color: impl FnMut(Vec2, Vec3) -> Vec3) {
+    /// Changes every pixel by a function of its center and its previous color.
+    pub fn map_pixels(&mut self, mut color: impl FnMut(Vec2, Vec3) -> Vec3) {
         let scale = 1. / self.size as f32;
         for (y, row) in self.pixels.chunks_exact_mut(self.size).enumerate() {
             for (x, pixel) in row.iter_mut().enumerate() {
@@ -50,7 +50,7 @@ impl Canvas {
     }
 
     /// Changes every pixel by a function of its previous color and of the value of a field of the same size.
-    pub fn change_by(&mut self, field: &Field, color: impl Fn(Vec3, f32) -> Vec3) {
+    pub fn map_with_field(&mut self, field: &Field, color: impl Fn(Vec3, f32) -> Vec3) {
         for (pixel, &value) in self.pixels.iter_mut().zip(&field.values) {
             *pixel = color(*pixel, value);
         }
@@ -58,7 +58,7 @@ impl Canvas {
 
     /// Multiplies each pixel by 1 + `strength` times the value of a field of the same size, at least 0.1.
     pub fn shade(&mut self, field: &Field, strength: f32) {
-        self.change_by(field, |pixel, value| pixel * (1. + strength * value).max(0.1));
+        self.map_with_field(field, |pixel, value| pixel * (1. + strength * value).max(0.1));
     }
 
     /// Multiplies all pixels by `factor`.
@@ -71,20 +71,20 @@ impl Canvas {
         self.pixels.iter().sum::<Vec3>() / self.pixels.len() as f32
     }
 
-    /// Paints over the pixels within `reach` of `centre`. `paint` returns the color and its coverage for the offset from `centre`
+    /// Paints over the pixels within `reach` of `center`. `paint` returns the color and its coverage for the offset from `center`
     /// in repeats.
-    pub fn stamp(&mut self, centre: Vec2, reach: Vec2, paint: impl Fn(Vec2) -> (Vec3, f32)) {
+    pub fn stamp(&mut self, center: Vec2, reach: Vec2, paint: impl Fn(Vec2) -> (Vec3, f32)) {
         let scale = self.size as f32;
         let mask = self.size as i32 - 1;
-        let mut low = ((centre - reach) * scale - 0.5).floor().as_ivec2();
-        let mut high = ((centre + reach) * scale + 0.5).ceil().as_ivec2();
+        let mut low = ((center - reach) * scale - 0.5).floor().as_ivec2();
+        let mut high = ((center + reach) * scale + 0.5).ceil().as_ivec2();
         if !self.repeats {
             low = low.max(IVec2::ZERO);
             high = high.min(IVec2::splat(mask));
         }
         for y in low.y..=high.y {
             for x in low.x..=high.x {
-                let offset = (Vec2::new(x as f32, y as f32) + 0.5) / scale - centre;
+                let offset = (Vec2::new(x as f32, y as f32) + 0.5) / scale - center;
                 let (color, share) = paint(offset);
                 if share > 0. {
                     let pixel = &mut self.pixels[((y & mask) * (mask + 1) + (x & mask)) as usize];
@@ -95,9 +95,9 @@ impl Canvas {
     }
 
     /// Fills a shape given by its signed distance in repeats, with an edge that is one pixel soft.
-    pub fn fill(&mut self, centre: Vec2, reach: Vec2, color: Vec3, distance: impl Fn(Vec2) -> f32) {
+    pub fn fill(&mut self, center: Vec2, reach: Vec2, color: Vec3, distance: impl Fn(Vec2) -> f32) {
         let scale = self.size as f32;
-        self.stamp(centre, reach, |offset| (color, (0.5 - distance(offset) * scale).clamp(0., 1.)));
+        self.stamp(center, reach, |offset| (color, (0.5 - distance(offset) * scale).clamp(0., 1.)));
     }
 
     /// Returns the bilinear interpolation of four pixels at `uv` in repeats.

@@ -53,7 +53,7 @@ impl Layout {
         unequal_rows: f32,
         upright: bool,
     ) -> Layout {
-        let heights: Vec<f32> = (0..rows).map(|_| 1. + unequal_rows * random.between(-0.5, 0.5)).collect();
+        let heights: Vec<f32> = (0..rows).map(|_| 1. + unequal_rows * random.uniform(-0.5, 0.5)).collect();
         let mut tops = vec![0.];
         let sum: f32 = heights.iter().sum();
         tops.extend(heights.iter().scan(0., |top, height| {
@@ -61,11 +61,11 @@ impl Layout {
             Some(*top)
         }));
         let cuts = (0..rows).map(|_| {
-            let pieces = (columns * random.between(0.7, 1.3)).round().max(1.) as usize;
+            let pieces = (columns * random.uniform(0.7, 1.3)).round().max(1.) as usize;
             let start = random.unit();
             let mut cuts: Vec<f32> = (0..pieces)
                 .map(|piece| {
-                    (start + (piece as f32 + random.between(-0.3, 0.3)) / pieces as f32).rem_euclid(1.)
+                    (start + (piece as f32 + random.uniform(-0.3, 0.3)) / pieces as f32).rem_euclid(1.)
                 })
                 .collect();
             cuts.sort_by(f32::total_cmp);

@@ -20,12 +20,12 @@ pub(super) struct Script {
 impl Script {
     /// Draws a random script.
     pub fn draw(random: &mut ChaCha8Rng) -> Script {
-        let aspect = random.between(0.4, 0.8);
-        let rounded = random.happens(0.5);
+        let aspect = random.uniform(0.4, 0.8);
+        let rounded = random.chance(0.5);
         let glyph = |random: &mut ChaCha8Rng| {
             let mut strokes = Vec::new();
             // Most letters have a stem.
-            if random.happens(0.7) {
+            if random.chance(0.7) {
                 strokes.push((Vec2::new(0., -0.5), Vec2::new(0., 0.5)));
             }
             for _ in 0..random.count(1, 3) {
@@ -33,14 +33,14 @@ impl Script {
                     Vec2::new(random.count(0, 2) as f32 / 2. * aspect, random.count(0, 2) as f32 / 2. - 0.5)
                 };
                 let (from, to) = (point(random), point(random));
-                let bend = if rounded { (to - from).perp() * random.between(-0.4, 0.4) } else { Vec2::ZERO };
+                let bend = if rounded { (to - from).perp() * random.uniform(-0.4, 0.4) } else { Vec2::ZERO };
                 let middle = 0.5 * (from + to) + bend;
                 strokes.extend([(from, middle), (middle, to)]);
             }
             strokes
         };
         let glyphs = (0..random.count(10, 26)).map(|_| glyph(random)).collect();
-        Script { glyphs, aspect, weight: random.between(0.05, 0.14) }
+        Script { glyphs, aspect, weight: random.uniform(0.05, 0.14) }
     }
 
     /// Writes a line of random words. The line is `length` long and `height` high, and `start` is the middle of its left edge, all in
@@ -95,12 +95,12 @@ impl Script {
         height: f32,
         color: Vec3,
     ) {
-        let line_spacing = height * random.between(1.5, 2.2);
+        let line_spacing = height * random.uniform(1.5, 2.2);
         let lines = (extent.y / line_spacing) as usize;
         for line in 0..lines {
-            let ends_paragraph = line + 1 == lines || random.happens(0.1);
+            let ends_paragraph = line + 1 == lines || random.chance(0.1);
             let length =
-                extent.x * if ends_paragraph { random.between(0.2, 0.9) } else { random.between(0.93, 1.) };
+                extent.x * if ends_paragraph { random.uniform(0.2, 0.9) } else { random.uniform(0.93, 1.) };
             let start = corner + Vec2::new(0., (line as f32 + 0.5) * line_spacing);
             self.write(random, canvas, start, length, height, color);
         }
@@ -109,12 +109,16 @@ impl Script {
 
 /// Returns a color of paper: white with the probability `white`, or a likely one for `purpose`.
 pub(super) fn paper(random: &mut ChaCha8Rng, purpose: Purpose, white: f32) -> Vec3 {
-    if random.happens(white) { color_of(random, WHITES) } else { Palette::draw(random, purpose, 1).color(0) }
+    if random.chance(white) {
+        random_theme_color(random, WHITES)
+    } else {
+        Palette::draw(random, purpose, 1).color(0)
+    }
 }
 
 /// Returns a color that is legible on `paper`.
 pub(super) fn ink_for(random: &mut ChaCha8Rng, paper: Vec3) -> Vec3 {
-    let ink = color_among(random, &[(GREYS, 4.), (VIVID, 1.), (ACCENTS, 1.)]);
+    let ink = random_color_of_themes(random, &[(GRAYS, 4.), (VIVID, 1.), (ACCENTS, 1.)]);
     if luminance(paper) > 0.3 { ink * 0.35 } else { Vec3::splat(0.75).lerp(ink, 0.3) }
 }
 
@@ -124,14 +128,14 @@ pub(super) fn writing(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let mut canvas = Canvas::filled(SIZE, paper);
     let ink = ink_for(random, paper);
     let columns = random.count(1, 3);
-    let height = random.leaning_low(0.014, 0.1);
+    let height = random.sqrt_uniform(0.014, 0.1);
     let script = Script::draw(random);
     let margin = 0.03;
     for column in 0..columns {
         let width = 1. / columns as f32;
         let mut corner = Vec2::new(column as f32 * width + margin, margin);
         while corner.y < 0.9 {
-            let extent = Vec2::new(width - 2. * margin, (0.97 - corner.y).min(random.between(0.15, 0.8)));
+            let extent = Vec2::new(width - 2. * margin, (0.97 - corner.y).min(random.uniform(0.15, 0.8)));
             match random.count(0, 5) {
                 0 => script.write(random, &mut canvas, corner + Vec2::new(0., 0.05), extent.x, 0.05, ink),
                 1 => {
@@ -145,7 +149,7 @@ pub(super) fn writing(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
             corner.y += extent.y.max(0.1);
         }
     }
-    Surface { canvas, repeat_metres: random.leaning_low(0.2, 1.5) }
+    Surface { canvas, repeat_metres: random.sqrt_uniform(0.2, 1.5) }
 }
 
 /// Draws a texture of curly lines drawn by hand, as with chalk, crayons or spray paint.
@@ -154,12 +158,12 @@ pub(super) fn scribbles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let mut canvas = Canvas::filled(SIZE, palette.color(0));
     for _ in 0..random.count(1, 12) {
         let color = palette.any(random);
-        let width = random.leaning_low(0.8, 5.) / SIZE as f32;
-        let mut at = random.spot();
-        let (mut angle, mut curl) = (random.between(0., 6.), 0.);
-        let step_length = random.between(0.01, 0.04);
+        let width = random.sqrt_uniform(0.8, 5.) / SIZE as f32;
+        let mut at = random.point();
+        let (mut angle, mut curl) = (random.uniform(0., 6.), 0.);
+        let step_length = random.uniform(0.01, 0.04);
         for _ in 0..random.count(10, 120) {
-            curl = 0.8 * curl + 0.3 * random.bell();
+            curl = 0.8 * curl + 0.3 * random.approx_normal();
             angle += curl;
             let step = Vec2::from_angle(angle) * step_length;
             canvas.fill(at + 0.5 * step, 0.5 * step.abs() + width + 1. / SIZE as f32, color, |offset| {
@@ -168,5 +172,5 @@ pub(super) fn scribbles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
             at += step;
         }
     }
-    Surface { canvas, repeat_metres: random.leaning_low(0.3, 3.) }
+    Surface { canvas, repeat_metres: random.sqrt_uniform(0.3, 3.) }
 }

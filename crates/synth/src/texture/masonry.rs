@@ -52,21 +52,21 @@ fn lay(random: &mut ChaCha8Rng, layout: &Layout, finish: &Finish) -> Canvas {
         joint.lerp(color, on_piece)
     });
     let height = Field { size: SIZE, values: heights };
-    canvas.shade(&height.slope(light), random.between(0., 0.6));
+    canvas.shade(&height.slope(light), random.uniform(0., 0.6));
     canvas
 }
 
 fn joint_color(random: &mut ChaCha8Rng, theme: Theme) -> Vec3 {
-    let other = random.weighted(&[(STONES, 4.), (GREYS, 2.), (WHITES, 2.), (theme, 1.)]);
-    color_of(random, other) * random.between(0.5, 1.)
+    let other = random.weighted(&[(STONES, 4.), (GRAYS, 2.), (WHITES, 2.), (theme, 1.)]);
+    random_theme_color(random, other) * random.uniform(0.5, 1.)
 }
 
 /// Draws a texture of courses of bricks.
 pub(super) fn bricks(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
-    let theme = random.weighted(&[(BRICKS, 6.), (STONES, 1.), (WHITES, 1.), (GREYS, 1.)]);
+    let theme = random.weighted(&[(BRICKS, 6.), (STONES, 1.), (WHITES, 1.), (GRAYS, 1.)]);
     let rows = 2 * random.count(3, 8);
-    let columns = (rows as f32 / random.between(2.2, 3.6)).round().max(1.) as usize;
-    let upright = random.happens(0.05);
+    let columns = (rows as f32 / random.uniform(2.2, 3.6)).round().max(1.) as usize;
+    let upright = random.chance(0.05);
     let layout = match random.count(0, 9) {
         0 => Layout::courses(rows, columns, 0., upright),
         1 => Layout::Herringbone { across: rows / 2 * 6, long: 3 },
@@ -78,15 +78,15 @@ pub(super) fn bricks(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let finish = Finish {
         palette: Palette::from_theme(random, theme, count),
         joint: joint_color(random, theme),
-        joint_width: high * random.between(0.03, 0.11),
-        rounding: high * random.between(0.05, 0.2),
-        bulge: random.between(0., 0.25),
-        spread: random.leaning_low(0.05, 0.8),
-        roughness: random.leaning_low(0.03, 0.3),
-        crookedness: high * random.leaning_low(0.005, 0.08),
+        joint_width: high * random.uniform(0.03, 0.11),
+        rounding: high * random.uniform(0.05, 0.2),
+        bulge: random.uniform(0., 0.25),
+        spread: random.sqrt_uniform(0.05, 0.8),
+        roughness: random.sqrt_uniform(0.03, 0.3),
+        crookedness: high * random.sqrt_uniform(0.005, 0.08),
     };
     let canvas = lay(random, &layout, &finish);
-    Surface { canvas, repeat_metres: rows as f32 * random.between(0.065, 0.1) }
+    Surface { canvas, repeat_metres: rows as f32 * random.uniform(0.065, 0.1) }
 }
 
 /// Draws a texture of glazed or stone tiles with grout, as in kitchens, bathrooms and halls.
@@ -94,20 +94,20 @@ pub(super) fn tiles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let theme = random.weighted(&[
         (WHITES, 3.),
         (BEIGES, 2.),
-        (GREYS, 2.),
+        (GRAYS, 2.),
         (STONES, 2.),
         (ACCENTS, 2.),
         (BRICKS, 1.),
     ]);
-    let across = random.leaning_low(1., 14.) as usize;
+    let across = random.sqrt_uniform(1., 14.) as usize;
     let even = 2 * across.div_ceil(2);
     let layout = match random.count(0, 11) {
         0 => Layout::Diamonds { across },
         1 => Layout::Cells(Voronoi::new(random, even * 6 / 7 + 1, even, 0., true)),
         2 => Layout::quilt(random, across + 3, 3),
-        3 | 4 => Layout::courses(2 * even, even, 0.5, random.happens(0.3)),
+        3 | 4 => Layout::courses(2 * even, even, 0.5, random.chance(0.3)),
         5 => Layout::courses(even, even, 0.5, false),
-        6 => Layout::courses(across, (across / 2).max(1), 0., random.happens(0.5)),
+        6 => Layout::courses(across, (across / 2).max(1), 0., random.chance(0.5)),
         7 => Layout::Basket { squares: even, long: 2 },
         _ => Layout::courses(across, across, 0., false),
     };
@@ -116,67 +116,67 @@ pub(super) fn tiles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let finish = Finish {
         palette: Palette::from_theme(random, theme, count),
         joint: joint_color(random, theme),
-        joint_width: (wide * random.leaning_low(0.004, 0.03)).max(0.3 / SIZE as f32),
-        rounding: wide * random.between(0.01, 0.08),
-        bulge: random.between(0., 0.1),
-        spread: random.leaning_low(0., 0.3),
-        roughness: random.leaning_low(0., 0.12),
+        joint_width: (wide * random.sqrt_uniform(0.004, 0.03)).max(0.3 / SIZE as f32),
+        rounding: wide * random.uniform(0.01, 0.08),
+        bulge: random.uniform(0., 0.1),
+        spread: random.sqrt_uniform(0., 0.3),
+        roughness: random.sqrt_uniform(0., 0.12),
         crookedness: 0.,
     };
     let canvas = lay(random, &layout, &finish);
     let tile = match purpose {
-        Purpose::Wall | Purpose::Thing => random.between(0.05, 0.3),
-        _ => random.between(0.15, 0.6),
+        Purpose::Wall | Purpose::Thing => random.uniform(0.05, 0.3),
+        _ => random.uniform(0.15, 0.6),
     };
     Surface { canvas, repeat_metres: (across as f32 * tile).clamp(0.3, 4.) }
 }
 
 /// Draws a texture of stones of all shapes: cobbles, flagstones, dry walls.
 pub(super) fn stones(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
-    let theme = random.weighted(&[(STONES, 5.), (GREYS, 2.), (EARTHS, 2.), (BRICKS, 0.5)]);
-    let across = random.leaning_low(3., 14.) as usize;
+    let theme = random.weighted(&[(STONES, 5.), (GRAYS, 2.), (EARTHS, 2.), (BRICKS, 0.5)]);
+    let across = random.sqrt_uniform(3., 14.) as usize;
     let layout = match random.count(0, 5) {
         0 => Layout::ragged(random, across, across as f32 * 0.7, 0.9, false),
         1 => Layout::quilt(random, across + 2, 3),
         2 => Layout::Cells(Voronoi::new(random, across, 2 * across.div_ceil(2), 0.5, true)),
         3 => Layout::courses(2 * across.div_ceil(2), across, 0.5, false),
         _ => {
-            let jitter = random.between(0.6, 1.);
+            let jitter = random.uniform(0.6, 1.);
             Layout::Cells(Voronoi::new(random, across, across, jitter, false))
         }
     };
     let wide = 1. / across as f32;
-    let joint = if random.happens(0.25) {
-        color_of(random, GREENS) * 0.7
+    let joint = if random.chance(0.25) {
+        random_theme_color(random, GREENS) * 0.7
     } else {
-        joint_color(random, EARTHS) * random.between(0.3, 1.)
+        joint_color(random, EARTHS) * random.uniform(0.3, 1.)
     };
     let count = random.count(1, 4);
     let finish = Finish {
         palette: Palette::from_theme(random, theme, count),
         joint,
-        joint_width: wide * random.between(0.02, 0.09),
-        rounding: wide * random.between(0.05, 0.35),
-        bulge: random.between(0.1, 0.6),
-        spread: random.between(0.1, 0.7),
-        roughness: random.between(0.08, 0.35),
-        crookedness: wide * random.leaning_low(0.01, 0.12),
+        joint_width: wide * random.uniform(0.02, 0.09),
+        rounding: wide * random.uniform(0.05, 0.35),
+        bulge: random.uniform(0.1, 0.6),
+        spread: random.uniform(0.1, 0.7),
+        roughness: random.uniform(0.08, 0.35),
+        crookedness: wide * random.sqrt_uniform(0.01, 0.12),
     };
     let canvas = lay(random, &layout, &finish);
-    Surface { canvas, repeat_metres: across as f32 * random.between(0.08, 0.4) }
+    Surface { canvas, repeat_metres: across as f32 * random.uniform(0.08, 0.4) }
 }
 
 /// Draws a texture of roof tiles or shingles: rows that overlap the one below.
 pub(super) fn shingles(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
-    let theme = random.weighted(&[(BRICKS, 3.), (GREYS, 3.), (WOODS, 2.), (STONES, 1.)]);
+    let theme = random.weighted(&[(BRICKS, 3.), (GRAYS, 3.), (WOODS, 2.), (STONES, 1.)]);
     let count = random.count(1, 4);
     let palette = Palette::from_theme(random, theme, count);
     let rows = 2 * random.count(2, 8);
     let columns = rows * random.count(1, 2);
-    let (seed, scalloped) = (random.seed(), random.between(0., 0.6));
+    let (seed, scalloped) = (random.seed(), random.uniform(0., 0.6));
     let grain = fractal(random, SIZE, [columns * 2, 8], 4, 0.7);
-    let dark = random.between(0.3, 0.7);
-    let roughness = random.between(0.05, 0.25);
+    let dark = random.uniform(0.3, 0.7);
+    let roughness = random.uniform(0.05, 0.25);
     let canvas = Canvas::from_fn(SIZE, |uv| {
         let row = |row: i32| {
             let shift = 0.5 * row.rem_euclid(2) as f32;
@@ -203,7 +203,7 @@ pub(super) fn shingles(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         let tone = palette.ramp(unit_of(seed, id)) * (0.85 + 0.3 * unit_of(seed ^ 1, id));
         tone * shadow * lip * (dark + (1. - dark) * gap) * (1. + roughness * grain.sample(uv)).max(0.2)
     });
-    Surface { canvas, repeat_metres: rows as f32 * random.between(0.1, 0.3) }
+    Surface { canvas, repeat_metres: rows as f32 * random.uniform(0.1, 0.3) }
 }
 
 /// Draws a mosaic of small stones in many colors.
@@ -212,9 +212,9 @@ pub(super) fn mosaic(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 2, 5);
     let drift = smooth(random, SIZE, [4; 2]);
     let seed = random.seed();
-    let joint = joint_color(random, GREYS);
-    let follows = random.between(0., 1.);
-    let layout = if random.happens(0.5) {
+    let joint = joint_color(random, GRAYS);
+    let follows = random.uniform(0., 1.);
+    let layout = if random.chance(0.5) {
         Layout::courses(across, across, 0., false)
     } else {
         Layout::Cells(Voronoi::new(random, across, across, 0.6, false))
@@ -228,30 +228,30 @@ pub(super) fn mosaic(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let shade = if bright { 1. } else { 0.8 + 0.4 * unit_of(seed ^ 1, piece.id) };
         joint.lerp(palette.ramp(tone) * shade, on_piece)
     });
-    Surface { canvas, repeat_metres: across as f32 * random.between(0.02, 0.06) }
+    Surface { canvas, repeat_metres: across as f32 * random.uniform(0.02, 0.06) }
 }
 
 /// Draws marble: thin and wide veins through clouds.
 pub(super) fn marble(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let palette =
-        Palette::among(random, &[(WHITES, 4.), (GREYS, 2.), (BEIGES, 2.), (BROWNS, 1.), (ACCENTS, 1.)], 2);
-    let vein = if random.happens(0.7) {
-        color_of(random, GREYS) * random.between(0.3, 1.)
+        Palette::among(random, &[(WHITES, 4.), (GRAYS, 2.), (BEIGES, 2.), (BROWNS, 1.), (ACCENTS, 1.)], 2);
+    let vein = if random.chance(0.7) {
+        random_theme_color(random, GRAYS) * random.uniform(0.3, 1.)
     } else {
         let theme = random.one_of(&[WHITES, BROWNS, AUTUMN]);
-        color_of(random, theme)
+        random_theme_color(random, theme)
     };
     let cells = random.count(2, 4);
     let clouds = fractal(random, SIZE, [cells; 2], 6, 0.6);
-    let reach = random.between(0.03, 0.15);
+    let reach = random.uniform(0.03, 0.15);
     let cells = [random.count(1, 4), random.count(1, 5)];
     let veins = smooth(random, SIZE, cells);
     let veins = warped(random, &veins, 3, reach);
     let cells = random.count(4, 9);
     let fine = smooth(random, SIZE, [cells; 2]);
     let fine = warped(random, &fine, 6, 0.04);
-    let (width, fine_width) = (random.leaning_low(0.03, 0.35), random.leaning_low(0.02, 0.15));
-    let (share, fine_share) = (random.between(0.3, 1.), random.between(0., 0.6));
+    let (width, fine_width) = (random.sqrt_uniform(0.03, 0.35), random.sqrt_uniform(0.02, 0.15));
+    let (share, fine_share) = (random.uniform(0.3, 1.), random.uniform(0., 0.6));
     let canvas = Canvas::from_fn(SIZE, |uv| {
         let cloud = clouds.value(uv);
         let ground = palette.ramp(0.5 + 0.4 * cloud);
@@ -260,7 +260,7 @@ pub(super) fn marble(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
             + fine_share * thin(fine.value(uv), fine_width) * (0.4 - 0.6 * cloud).clamp(0., 1.);
         ground.lerp(vein, strength.min(0.95))
     });
-    Surface { canvas, repeat_metres: random.between(0.6, 2.5) }
+    Surface { canvas, repeat_metres: random.uniform(0.6, 2.5) }
 }
 
 /// Draws terrazzo: chips of stone in cement.
@@ -270,8 +270,8 @@ pub(super) fn terrazzo(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let palette = Palette::among(random, &[(STONES, 3.), (WHITES, 1.), (ACCENTS, 2.), (BEIGES, 1.)], count);
     let across = random.count(14, 48);
     let voronoi = Voronoi::new(random, across, across, 1., false);
-    let (seed, crowd) = (random.seed(), random.between(0.25, 0.9));
-    let gap = random.between(0.04, 0.2) / across as f32;
+    let (seed, crowd) = (random.seed(), random.uniform(0.25, 0.9));
+    let gap = random.uniform(0.04, 0.2) / across as f32;
     let canvas = Canvas::from_fn(SIZE, |uv| {
         let cell = voronoi.cell(uv);
         let hash = |salt: u32| unit_of(seed ^ salt, cell.id);
@@ -282,14 +282,14 @@ pub(super) fn terrazzo(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let inner = gap * (1. + 2. * hash(3));
         ground.lerp(chip, smoothstep(0., 1.5 / SIZE as f32, cell.edge - inner))
     });
-    Surface { canvas, repeat_metres: across as f32 * random.between(0.01, 0.04) }
+    Surface { canvas, repeat_metres: across as f32 * random.uniform(0.01, 0.04) }
 }
 
 /// Draws granite, sandstone or worktops: grains of a few colors.
 pub(super) fn speckle(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let theme = random.weighted(&[(STONES, 4.), (GREYS, 3.), (BEIGES, 2.), (BROWNS, 1.)]);
-    let base = if random.happens(0.7) {
-        color_of(random, theme)
+    let theme = random.weighted(&[(STONES, 4.), (GRAYS, 3.), (BEIGES, 2.), (BROWNS, 1.)]);
+    let base = if random.chance(0.7) {
+        random_theme_color(random, theme)
     } else {
         Palette::draw(random, purpose, 1).color(0)
     };
@@ -298,42 +298,43 @@ pub(super) fn speckle(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let grain = random.one_of(&[32, 48, 64, 96, 128]);
         let field = smooth(random, SIZE, [grain; 2]);
         let spots = shade(random, base, 0.7);
-        let level = random.between(0., 0.9);
-        let share = random.between(0.3, 1.);
+        let level = random.uniform(0., 0.9);
+        let share = random.uniform(0.3, 1.);
         let share_at = |value| share * smoothstep(level, level + 0.3, value);
-        canvas.change_by(&field, |pixel, value| pixel.lerp(spots, share_at(value)));
+        canvas.map_with_field(&field, |pixel, value| pixel.lerp(spots, share_at(value)));
     }
-    Surface { canvas, repeat_metres: random.between(0.3, 1.2) }
+    Surface { canvas, repeat_metres: random.uniform(0.3, 1.2) }
 }
 
 /// Draws concrete with stains, pores and the joints of its formwork.
 pub(super) fn concrete(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
-    let base = color_among(random, &[(GREYS, 3.), (STONES, 4.), (BEIGES, 1.)]);
+    let base = random_color_of_themes(random, &[(GRAYS, 3.), (STONES, 4.), (BEIGES, 1.)]);
     let mut canvas = Canvas::filled(SIZE, base);
-    canvas.shade(&fractal(random, SIZE, [3; 2], 7, 0.7), random.between(0.05, 0.3));
+    canvas.shade(&fractal(random, SIZE, [3; 2], 7, 0.7), random.uniform(0.05, 0.3));
     let streaks = fractal(random, SIZE, [16, 2], 4, 0.6);
-    canvas.shade(&streaks, random.leaning_low(0., 0.25));
-    canvas.shade(&smooth(random, SIZE, [128; 2]), random.between(0.02, 0.12));
+    canvas.shade(&streaks, random.sqrt_uniform(0., 0.25));
+    canvas.shade(&smooth(random, SIZE, [128; 2]), random.uniform(0.02, 0.12));
     for _ in 0..random.count(0, 250) {
-        let radius = random.leaning_low(0.5, 2.5) / SIZE as f32;
-        let dark = base * random.between(0.3, 0.8);
-        canvas.fill(random.spot(), Vec2::splat(2. * radius), dark, |offset| canvas::disk(offset, radius));
+        let radius = random.sqrt_uniform(0.5, 2.5) / SIZE as f32;
+        let dark = base * random.uniform(0.3, 0.8);
+        canvas.fill(random.point(), Vec2::splat(2. * radius), dark, |offset| canvas::disk(offset, radius));
     }
-    if random.happens(0.4) {
+    if random.chance(0.4) {
         let layout = Layout::courses(random.count(1, 3), random.count(1, 2), 0., false);
-        let width = random.between(0.5, 2.) / SIZE as f32;
-        let dark = random.between(0.3, 0.8);
-        canvas.change(|uv, color| color * (1. - dark * smoothstep(2. * width, 0., layout.piece(uv).edge)));
+        let width = random.uniform(0.5, 2.) / SIZE as f32;
+        let dark = random.uniform(0.3, 0.8);
+        canvas
+            .map_pixels(|uv, color| color * (1. - dark * smoothstep(2. * width, 0., layout.piece(uv).edge)));
     }
-    Surface { canvas, repeat_metres: random.between(1., 4.) }
+    Surface { canvas, repeat_metres: random.uniform(1., 4.) }
 }
 
 /// Draws plaster or stucco: relief lit from the side.
 pub(super) fn plaster(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let color = Palette::draw(random, purpose, 1).color(0);
     let mut canvas = Canvas::filled(SIZE, color);
-    let cells = random.leaning_low(2., 48.) as usize;
-    let gain = random.between(0.5, 0.9);
+    let cells = random.sqrt_uniform(2., 48.) as usize;
+    let gain = random.uniform(0.5, 0.9);
     let relief = match random.count(0, 3) {
         0 => ridged(random, SIZE, [cells; 2], 5, gain),
         1 => fractal(random, SIZE, [cells, 3 * cells], 5, gain),
@@ -343,40 +344,40 @@ pub(super) fn plaster(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         }
         _ => fractal(random, SIZE, [cells; 2], 6, gain),
     };
-    canvas.shade(&relief.slope(random.direction()), random.between(0.1, 0.9));
-    canvas.shade(&relief, random.between(0., 0.08));
-    canvas.shade(&fractal(random, SIZE, [2; 2], 4, 0.5), random.between(0., 0.1));
-    Surface { canvas, repeat_metres: random.between(0.8, 3.) }
+    canvas.shade(&relief.slope(random.direction()), random.uniform(0.1, 0.9));
+    canvas.shade(&relief, random.uniform(0., 0.08));
+    canvas.shade(&fractal(random, SIZE, [2; 2], 4, 0.5), random.uniform(0., 0.1));
+    Surface { canvas, repeat_metres: random.uniform(0.8, 3.) }
 }
 
 /// Draws asphalt, tarmac or worn roads: fine grit, patches and cracks.
 pub(super) fn asphalt(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
-    let base = linear_of(random.one_of(&[0x4a4a4b, 0x5f5e5c, 0x6f6c68, 0x3a3a3c, 0x85817b]));
+    let base = srgb_to_linear(random.one_of(&[0x4a4a4b, 0x5f5e5c, 0x6f6c68, 0x3a3a3c, 0x85817b]));
     let base = shade(random, base, 0.15);
     let mut canvas = Canvas::filled(SIZE, base);
-    canvas.shade(&smooth(random, SIZE, [256; 2]), random.between(0.15, 0.5));
-    canvas.shade(&smooth(random, SIZE, [96; 2]), random.between(0.05, 0.25));
-    canvas.shade(&fractal(random, SIZE, [2; 2], 5, 0.6), random.between(0.05, 0.25));
-    if random.happens(0.5) {
+    canvas.shade(&smooth(random, SIZE, [256; 2]), random.uniform(0.15, 0.5));
+    canvas.shade(&smooth(random, SIZE, [96; 2]), random.uniform(0.05, 0.25));
+    canvas.shade(&fractal(random, SIZE, [2; 2], 5, 0.6), random.uniform(0.05, 0.25));
+    if random.chance(0.5) {
         let cells = random.count(1, 3);
         let voronoi = Voronoi::new(random, cells + 1, cells + 1, 1., false);
         let [right, down] = [(); 2].map(|()| fractal(random, SIZE, [6; 2], 5, 0.65));
-        let width = random.between(0.001, 0.006);
-        let dark = random.between(0.3, 0.9);
-        canvas.change(|uv, color| {
+        let width = random.uniform(0.001, 0.006);
+        let dark = random.uniform(0.3, 0.9);
+        canvas.map_pixels(|uv, color| {
             let push = Vec2::new(right.sample(uv), down.sample(uv)) * 0.04;
             color * (1. - dark * smoothstep(width, 0.2 * width, voronoi.cell(uv + push).edge))
         });
     }
-    if random.happens(0.2) {
-        let paint = linear_of(random.one_of(&[0xe8e6e0, 0xd8b23a]));
-        let (from, half) = (random.unit(), random.between(0.02, 0.05));
+    if random.chance(0.2) {
+        let paint = srgb_to_linear(random.one_of(&[0xe8e6e0, 0xd8b23a]));
+        let (from, half) = (random.unit(), random.uniform(0.02, 0.05));
         let worn = fractal(random, SIZE, [8; 2], 5, 0.8);
-        canvas.change(|uv, color| {
+        canvas.map_pixels(|uv, color| {
             let off = uv.x - from;
             let inside = smoothstep(half, half - 0.006, (off - off.round()).abs());
             color.lerp(paint, inside * (0.8 + worn.sample(uv)).clamp(0., 0.95))
         });
     }
-    Surface { canvas, repeat_metres: random.between(1.5, 4.) }
+    Surface { canvas, repeat_metres: random.uniform(1.5, 4.) }
 }

@@ -167,10 +167,10 @@ fn combined(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let Surface { mut canvas, repeat_metres } = surface(random, purpose);
     let other = surface(random, purpose).canvas;
     let cells = random.count(1, 4);
-    let gain = random.between(0.3, 0.8);
+    let gain = random.uniform(0.3, 0.8);
     let mask = noise::fractal(random, SIZE, [cells; 2], 6, gain);
-    let (level, soft) = (random.between(-0.6, 0.8), random.leaning_low(0.03, 1.));
-    let tints = random.happens(0.35);
+    let (level, soft) = (random.uniform(-0.6, 0.8), random.sqrt_uniform(0.03, 1.));
+    let tints = random.chance(0.35);
     let mean = other.mean();
     for ((pixel, other), value) in canvas.pixels.iter_mut().zip(&other.pixels).zip(&mask.values) {
         *pixel = if tints {
@@ -189,18 +189,18 @@ impl Texture {
             return Texture::from_surface(pictures::picture(random));
         }
         let mut surface =
-            if random.happens(0.12) { combined(random, purpose) } else { surface(random, purpose) };
+            if random.chance(0.12) { combined(random, purpose) } else { surface(random, purpose) };
         plain::weather(random, &mut surface.canvas, purpose);
         Texture::from_surface(surface)
     }
 
-    /// Creates a texture from a photo or image in sRGB: its largest centred square, mirrored to the right and below so that the
+    /// Creates a texture from a photo or image in sRGB: its largest centered square, mirrored to the right and below so that the
     /// texture repeats.
     pub fn from_image(picture: &RgbImage) -> Texture {
         let side = picture.width().min(picture.height());
         let corner = Vec2::new((picture.width() - side) as f32, (picture.height() - side) as f32) * 0.5;
         let step = side as f32 / SIZE as f32;
-        let linear: Vec<f32> = (0..=255).map(palette::linear_of_byte).collect();
+        let linear: Vec<f32> = (0..=255).map(palette::srgb_byte_to_linear).collect();
         let quarter = Canvas::from_fn(SIZE, |uv| {
             // The mean of the photo's pixels that a texel covers, at least one.
             let middle = corner + uv * side as f32;
@@ -250,7 +250,7 @@ impl Texture {
         let texels = self.levels[level].as_slice();
         let mask = (1usize << shift) - 1;
         let texel_bits = PLACE_BITS - shift;
-        // Shift from texel corners to texel centres.
+        // Shift from texel corners to texel centers.
         let half = 1 << (texel_bits - 1);
         let (x, y) = (x.wrapping_sub(half), y.wrapping_sub(half));
         // 2^-texel_bits is built from its exponent, because a division would take as long as everything else.

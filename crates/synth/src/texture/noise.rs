@@ -12,23 +12,23 @@ pub(super) trait RandomValues: Rng {
     }
 
     /// Returns a uniform random value in [low, high).
-    fn between(&mut self, low: f32, high: f32) -> f32 {
+    fn uniform(&mut self, low: f32, high: f32) -> f32 {
         low + (high - low) * self.unit()
     }
 
     /// Returns a random value in [low, high) that favours low values: the square of a uniform draw between the square roots.
-    fn leaning_low(&mut self, low: f32, high: f32) -> f32 {
-        let root = self.between(low.sqrt(), high.sqrt());
+    fn sqrt_uniform(&mut self, low: f32, high: f32) -> f32 {
+        let root = self.uniform(low.sqrt(), high.sqrt());
         root * root
     }
 
     /// Returns a random value in (-2, 2) with a bell-shaped distribution around 0.
-    fn bell(&mut self) -> f32 {
+    fn approx_normal(&mut self) -> f32 {
         self.unit() + self.unit() - self.unit() - self.unit()
     }
 
     /// Returns `true` with the given probability.
-    fn happens(&mut self, probability: f32) -> bool {
+    fn chance(&mut self, probability: f32) -> bool {
         self.unit() < probability
     }
 
@@ -59,7 +59,7 @@ pub(super) trait RandomValues: Rng {
     }
 
     /// Returns a uniformly random position in the repeat.
-    fn spot(&mut self) -> Vec2 {
+    fn point(&mut self) -> Vec2 {
         Vec2::new(self.unit(), self.unit())
     }
 
@@ -96,7 +96,7 @@ pub(super) struct Field {
 }
 
 impl Field {
-    /// Creates a field from a function of the centre of each value's square, in repeats.
+    /// Creates a field from a function of the center of each value's square, in repeats.
     pub fn from_fn(size: usize, mut value: impl FnMut(Vec2) -> f32) -> Field {
         let mut values = Vec::with_capacity(size * size);
         for y in 0..size {
@@ -180,7 +180,7 @@ impl Field {
 pub(super) fn smooth(random: &mut ChaCha8Rng, size: usize, cells: [usize; 2]) -> Field {
     let [columns, rows] = cells.map(|count| count.clamp(1, size));
     // The spline halves the spread of uniform noise. With doubled lattice values, few results leave [-1, 1].
-    let lattice: Vec<f32> = (0..columns * rows).map(|_| random.between(-2., 2.)).collect();
+    let lattice: Vec<f32> = (0..columns * rows).map(|_| random.uniform(-2., 2.)).collect();
     let mut wide = vec![0f32; rows * size];
     for x in 0..size {
         let (first, weights) = spline(x, size, columns);
@@ -290,7 +290,7 @@ pub(super) struct Cell {
 }
 
 impl Voronoi {
-    /// Places points at random offsets from the centres of squares, with `jitter` from 0 to 1 of a square. With `staggered`, every
+    /// Places points at random offsets from the centers of squares, with `jitter` from 0 to 1 of a square. With `staggered`, every
     /// other row is shifted by half a square, which makes hexagons if there is no jitter and requires an even number of rows.
     pub fn new(
         random: &mut ChaCha8Rng,
@@ -303,7 +303,7 @@ impl Voronoi {
         let point = |index: usize, random: &mut ChaCha8Rng| {
             let (x, y) = (index % columns, index / columns);
             let shift = if staggered && y % 2 == 1 { 0.5 } else { 0. };
-            let off = (random.spot() - 0.5) * jitter + 0.5;
+            let off = (random.point() - 0.5) * jitter + 0.5;
             (Vec2::new(x as f32 + shift, y as f32) + off) / count
         };
         let points = (0..columns * rows).map(|index| point(index, random)).collect();

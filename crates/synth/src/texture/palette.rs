@@ -15,7 +15,7 @@ pub(super) const WHITES: Theme =
 /// Colors between white and brown.
 pub(super) const BEIGES: Theme = &[0xd9c8ac, 0xcbb994, 0xe2d3b7, 0xc4ae8b, 0xb9a58a, 0xd8cbb8, 0xc9b7a0];
 /// Colors from nearly white to nearly black.
-pub(super) const GREYS: Theme =
+pub(super) const GRAYS: Theme =
     &[0xb8b6b2, 0x9a9a98, 0x7d7d7b, 0x5f6062, 0xcac9c5, 0x434547, 0x8d9296, 0x2b2c2e, 0xa8a49c];
 /// Colors of leather, dark wood and old fabric.
 pub(super) const BROWNS: Theme = &[0x6b4a32, 0x86613f, 0x4d3524, 0x9c7a55, 0x3b2a1f, 0x7a5a48, 0xa98763];
@@ -53,14 +53,14 @@ pub(super) const VIVID: Theme = &[
 /// Themes and their weights by purpose, in the order of [`Purpose::ALL`].
 #[rustfmt::skip]
 const THEMES: [&[(Theme, f32)]; 8] = [
-    &[(BEIGES, 3.), (GREYS, 3.), (BROWNS, 3.), (WOODS, 3.), (STONES, 2.), (ACCENTS, 2.), (WHITES, 1.)],
-    &[(WHITES, 5.), (BEIGES, 3.), (GREYS, 2.), (ACCENTS, 3.), (STONES, 1.), (VIVID, 0.3)],
-    &[(WHITES, 8.), (BEIGES, 1.5), (GREYS, 1.), (WOODS, 0.7), (ACCENTS, 0.3)],
-    &[(EARTHS, 3.), (STONES, 3.), (GREYS, 2.), (GREENS, 3.), (AUTUMN, 1.), (BRICKS, 1.)],
-    &[(WHITES, 3.), (BEIGES, 2.), (STONES, 2.), (BRICKS, 3.), (GREYS, 2.), (ACCENTS, 1.5), (WOODS, 1.)],
-    &[(WHITES, 2.), (BEIGES, 2.), (GREYS, 3.), (BROWNS, 2.), (WOODS, 3.), (ACCENTS, 4.), (VIVID, 2.)],
+    &[(BEIGES, 3.), (GRAYS, 3.), (BROWNS, 3.), (WOODS, 3.), (STONES, 2.), (ACCENTS, 2.), (WHITES, 1.)],
+    &[(WHITES, 5.), (BEIGES, 3.), (GRAYS, 2.), (ACCENTS, 3.), (STONES, 1.), (VIVID, 0.3)],
+    &[(WHITES, 8.), (BEIGES, 1.5), (GRAYS, 1.), (WOODS, 0.7), (ACCENTS, 0.3)],
+    &[(EARTHS, 3.), (STONES, 3.), (GRAYS, 2.), (GREENS, 3.), (AUTUMN, 1.), (BRICKS, 1.)],
+    &[(WHITES, 3.), (BEIGES, 2.), (STONES, 2.), (BRICKS, 3.), (GRAYS, 2.), (ACCENTS, 1.5), (WOODS, 1.)],
+    &[(WHITES, 2.), (BEIGES, 2.), (GRAYS, 3.), (BROWNS, 2.), (WOODS, 3.), (ACCENTS, 4.), (VIVID, 2.)],
     &[(GREENS, 8.), (AUTUMN, 2.), (EARTHS, 0.5), (ACCENTS, 0.5)],
-    &[(ACCENTS, 4.), (VIVID, 3.), (WHITES, 1.), (BROWNS, 1.), (GREYS, 2.), (GREENS, 1.)],
+    &[(ACCENTS, 4.), (VIVID, 3.), (WHITES, 1.), (BROWNS, 1.), (GRAYS, 2.), (GREENS, 1.)],
 ];
 
 /// A few colors in linear RGB.
@@ -88,18 +88,18 @@ impl Palette {
 
     /// Draws `count` colors of one theme: shades of one color, several colors, one with accents, or rarely arbitrary colors.
     pub fn from_theme(random: &mut ChaCha8Rng, theme: Theme, count: usize) -> Palette {
-        let base = color_of(random, theme);
+        let base = random_theme_color(random, theme);
         let kind = random.unit();
         let mut colors = vec![base];
         while colors.len() < count {
             colors.push(if kind < 0.4 {
                 shade(random, base, 0.35)
             } else if kind < 0.68 {
-                color_of(random, theme)
+                random_theme_color(random, theme)
             } else if kind < 0.94 {
                 let other =
-                    random.weighted(&[(theme, 3.), (ACCENTS, 2.), (GREYS, 1.), (WHITES, 1.), (VIVID, 0.5)]);
-                color_of(random, other)
+                    random.weighted(&[(theme, 3.), (ACCENTS, 2.), (GRAYS, 1.), (WHITES, 1.), (VIVID, 0.5)]);
+                random_theme_color(random, other)
             } else {
                 random_color(random)
             });
@@ -136,34 +136,34 @@ impl Palette {
 }
 
 /// Returns a random color of a theme, slightly varied.
-pub(super) fn color_of(random: &mut ChaCha8Rng, theme: Theme) -> Vec3 {
-    let color = linear_of(random.one_of(theme));
+pub(super) fn random_theme_color(random: &mut ChaCha8Rng, theme: Theme) -> Vec3 {
+    let color = srgb_to_linear(random.one_of(theme));
     shade(random, color, 0.12)
 }
 
 /// Returns a random color of one of the themes with the given weights.
-pub(super) fn color_among(random: &mut ChaCha8Rng, themes: &[(Theme, f32)]) -> Vec3 {
+pub(super) fn random_color_of_themes(random: &mut ChaCha8Rng, themes: &[(Theme, f32)]) -> Vec3 {
     let theme = random.weighted(themes);
-    color_of(random, theme)
+    random_theme_color(random, theme)
 }
 
 /// Returns `color` made brighter or darker by about `spread`, with small random changes of saturation and hue.
 pub(super) fn shade(random: &mut ChaCha8Rng, color: Vec3, spread: f32) -> Vec3 {
-    let grey = Vec3::splat(luminance(color));
-    let saturation = random.between(0.65, 1.2);
-    let hue = Vec3::new(random.bell(), random.bell(), random.bell()) * 0.05 + 1.;
-    let light = random.bell() * 1.8 * spread;
+    let gray = Vec3::splat(luminance(color));
+    let saturation = random.uniform(0.65, 1.2);
+    let hue = Vec3::new(random.approx_normal(), random.approx_normal(), random.approx_normal()) * 0.05 + 1.;
+    let light = random.approx_normal() * 1.8 * spread;
     // Darken and brighten by the same ratio, and never beyond white.
     let factor = if light < 0. { 1. / (1. - light) } else { 1. + light };
-    let shaded = (grey + (color - grey) * saturation) * hue * factor;
+    let shaded = (gray + (color - gray) * saturation) * hue * factor;
     shaded.clamp(Vec3::splat(0.01), Vec3::splat(0.92))
 }
 
 /// Returns a color of random hue, brightness and saturation.
 pub(super) fn random_color(random: &mut ChaCha8Rng) -> Vec3 {
     let color = Vec3::new(random.unit(), random.unit(), random.unit());
-    let grey = Vec3::splat(luminance(color));
-    (grey + (color - grey) * random.between(0.3, 1.3)).clamp(Vec3::splat(0.01), Vec3::splat(0.92))
+    let gray = Vec3::splat(luminance(color));
+    (gray + (color - gray) * random.uniform(0.3, 1.3)).clamp(Vec3::splat(0.01), Vec3::splat(0.92))
 }
 
 /// Returns the luminance of a linear color, with Rec. 709's weights.
@@ -172,13 +172,13 @@ pub(super) fn luminance(color: Vec3) -> f32 {
 }
 
 /// Converts sRGB 0xrrggbb to linear RGB.
-pub(super) fn linear_of(srgb: u32) -> Vec3 {
+pub(super) fn srgb_to_linear(srgb: u32) -> Vec3 {
     let [_, red, green, blue] = srgb.to_be_bytes();
-    Vec3::new(linear_of_byte(red), linear_of_byte(green), linear_of_byte(blue))
+    Vec3::new(srgb_byte_to_linear(red), srgb_byte_to_linear(green), srgb_byte_to_linear(blue))
 }
 
 /// Converts an sRGB byte to a linear value.
-pub(super) fn linear_of_byte(byte: u8) -> f32 {
+pub(super) fn srgb_byte_to_linear(byte: u8) -> f32 {
     let value = f32::from(byte) / 255.;
     if value <= 0.04045 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }
 }

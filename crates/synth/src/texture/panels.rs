@@ -15,18 +15,18 @@ fn grain(random: &mut ChaCha8Rng) -> Field {
     let rings = random.count(2, 14) as f32;
     let cells = [random.count(1, 2), random.count(2, 5)];
     let bend = smooth(random, SIZE, cells);
-    let sway = random.between(0.3, 2.5);
+    let sway = random.uniform(0.3, 2.5);
     let (drawn_out, wide) = (random.count(2, 6), random.count(4, 16));
     let fibres = fractal(random, SIZE, [drawn_out, 64], 3, 0.8);
     let streaks = fractal(random, SIZE, [1, wide], 3, 0.7);
-    let [figure, fibre, streak] = [(); 3].map(|()| random.between(0.1, 1.));
+    let [figure, fibre, streak] = [(); 3].map(|()| random.uniform(0.1, 1.));
     let knots: Vec<(Vec2, f32)> =
-        (0..random.one_of(&[0, 0, 1, 2, 4])).map(|_| (random.spot(), random.between(0.01, 0.035))).collect();
+        (0..random.one_of(&[0, 0, 1, 2, 4])).map(|_| (random.point(), random.uniform(0.01, 0.035))).collect();
     let field = Field::from_fn(SIZE, |uv| {
         let mut phase = uv.y * rings + sway * bend.value(uv);
         let mut dark = 0.;
-        for &(centre, radius) in &knots {
-            let off = uv - centre;
+        for &(center, radius) in &knots {
+            let off = uv - center;
             let off = (off - off.round()) * Vec2::new(0.5, 1.);
             let near = radius * radius / (off.length_squared() + radius * radius);
             phase += 2. * near;
@@ -45,15 +45,15 @@ fn grain(random: &mut ChaCha8Rng) -> Field {
 
 /// Returns two colors of one wood: earlywood and latewood.
 fn tones(random: &mut ChaCha8Rng) -> (Vec3, Vec3) {
-    let light = color_among(random, &[(WOODS, 10.), (GREYS, 1.), (WHITES, 1.), (ACCENTS, 0.7)]);
-    let red = Vec3::new(1., random.between(0.82, 1.), random.between(0.65, 1.));
-    (light, light * red * random.between(0.35, 0.85))
+    let light = random_color_of_themes(random, &[(WOODS, 10.), (GRAYS, 1.), (WHITES, 1.), (ACCENTS, 0.7)]);
+    let red = Vec3::new(1., random.uniform(0.82, 1.), random.uniform(0.65, 1.));
+    (light, light * red * random.uniform(0.35, 0.85))
 }
 
 /// Draws boards or parquet with joints.
 pub(super) fn boards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let upright = random.happens(0.5);
-    let rows = random.leaning_low(3., 16.) as usize;
+    let upright = random.chance(0.5);
+    let rows = random.sqrt_uniform(3., 16.) as usize;
     let long = random.count(2, 6);
     let outdoors = matches!(purpose, Purpose::Facade | Purpose::Ground);
     let kind = if outdoors { 9 } else { random.count(0, 9) };
@@ -65,22 +65,22 @@ pub(super) fn boards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         }
         2 => (Layout::courses(2 * rows.div_ceil(2), 2, 0.5, upright), 1. / rows as f32),
         _ => {
-            let pieces = random.leaning_low(1., 4.);
+            let pieces = random.sqrt_uniform(1., 4.);
             let unequal = random.one_of(&[0., 0., 0.6]);
             (Layout::ragged(random, rows, pieces, unequal, upright), 1. / rows as f32)
         }
     };
     let (light, dark) = tones(random);
     let grain = grain(random);
-    let (seed, spread) = (random.seed(), random.leaning_low(0.02, 0.9));
-    let contrast = random.between(0.3, 1.1);
-    let joint = wide * random.leaning_low(0.005, 0.06);
-    let depth = random.between(0.3, 0.9);
-    let bevel = random.between(0., 0.3);
-    let other = color_of(random, WOODS);
-    let mixed = if random.happens(0.25) { random.between(0.2, 1.) } else { 0. };
+    let (seed, spread) = (random.seed(), random.sqrt_uniform(0.02, 0.9));
+    let contrast = random.uniform(0.3, 1.1);
+    let joint = wide * random.sqrt_uniform(0.005, 0.06);
+    let depth = random.uniform(0.3, 0.9);
+    let bevel = random.uniform(0., 0.3);
+    let other = random_theme_color(random, WOODS);
+    let mixed = if random.chance(0.25) { random.uniform(0.2, 1.) } else { 0. };
     // With fewer boards, the grain appears larger.
-    let scale = random.between(0.6, 1.6);
+    let scale = random.uniform(0.6, 1.6);
     let canvas = Canvas::from_fn(SIZE, |uv| {
         let piece = layout.piece(uv);
         let hash = |salt: u32| unit_of(seed ^ salt, piece.id);
@@ -92,20 +92,20 @@ pub(super) fn boards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let rounded = 1. - bevel * smoothstep(3., 0., near);
         base * lightness * groove * rounded
     });
-    Surface { canvas, repeat_metres: random.between(0.07, 0.2) * (1. / wide).min(16.) }
+    Surface { canvas, repeat_metres: random.uniform(0.07, 0.2) * (1. / wide).min(16.) }
 }
 
 /// Draws grain without joints, as on doors and tables.
 pub(super) fn veneer(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let (light, dark) = tones(random);
     let grain = grain(random);
-    let contrast = random.between(0.3, 1.2);
-    let upright = random.happens(0.5);
+    let contrast = random.uniform(0.3, 1.2);
+    let upright = random.chance(0.5);
     let canvas = Canvas::from_fn(SIZE, |uv| {
         let value = grain.sample(if upright { uv.yx() } else { uv });
         light.lerp(dark, (0.4 + contrast * value).clamp(0., 1.))
     });
-    Surface { canvas, repeat_metres: random.between(0.4, 1.6) }
+    Surface { canvas, repeat_metres: random.uniform(0.4, 1.6) }
 }
 
 /// Paints a raised rectangle. Along its edges, over a width of `bevel` repeats, `relief` brightens the left and upper sides and darkens the
@@ -127,14 +127,14 @@ pub(super) fn windows(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let mut canvas = wall.canvas;
     let (rows, columns) = (random.count(1, 5), random.count(1, 6));
     let cell = Vec2::new(1. / columns as f32, 1. / rows as f32);
-    let share = Vec2::new(random.between(0.35, 0.95), random.between(0.4, 0.95));
-    let frame = color_among(random, &[(WHITES, 4.), (GREYS, 2.), (BROWNS, 2.), (ACCENTS, 1.)]);
+    let share = Vec2::new(random.uniform(0.35, 0.95), random.uniform(0.4, 0.95));
+    let frame = random_color_of_themes(random, &[(WHITES, 4.), (GRAYS, 2.), (BROWNS, 2.), (ACCENTS, 1.)]);
     let (panes_x, panes_y) = (random.count(1, 3), random.count(1, 4));
-    let border = random.between(0.02, 0.07) * cell.min_element();
-    let sill = random.happens(0.5);
-    let sky = Vec3::new(0.35, 0.45, 0.6) * random.between(0.4, 1.2);
-    let dark = Vec3::splat(random.between(0.02, 0.1));
-    let curtains = random.between(0., 0.5);
+    let border = random.uniform(0.02, 0.07) * cell.min_element();
+    let sill = random.chance(0.5);
+    let sky = Vec3::new(0.35, 0.45, 0.6) * random.uniform(0.4, 1.2);
+    let dark = Vec3::splat(random.uniform(0.02, 0.1));
+    let curtains = random.uniform(0., 0.5);
     for index in 0..rows * columns {
         let middle = (Vec2::new((index % columns) as f32, (index / columns) as f32) + 0.5) * cell;
         let half = 0.5 * share * cell;
@@ -143,10 +143,10 @@ pub(super) fn windows(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
             let below = middle + Vec2::new(0., half.y);
             paint_panel(&mut canvas, below, Vec2::new(1.1 * half.x, border), frame * 0.8, border, 0.4);
         }
-        let curtain = random.happens(curtains).then(|| color_of(random, BEIGES) * 0.6);
-        let slant = random.between(-1., 1.);
-        let level = random.between(-0.8, 0.8);
-        let drawn = random.between(0.2, 1.);
+        let curtain = random.chance(curtains).then(|| random_theme_color(random, BEIGES) * 0.6);
+        let slant = random.uniform(-1., 1.);
+        let level = random.uniform(-0.8, 0.8);
+        let drawn = random.uniform(0.2, 1.);
         for pane in 0..panes_x * panes_y {
             let count = Vec2::new(panes_x as f32, panes_y as f32);
             let place = (Vec2::new((pane % panes_x) as f32, (pane / panes_x) as f32) + 0.5) / count * 2. - 1.;
@@ -167,33 +167,33 @@ pub(super) fn windows(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
             });
         }
     }
-    Surface { canvas, repeat_metres: rows as f32 * random.between(2.5, 3.5) }
+    Surface { canvas, repeat_metres: rows as f32 * random.uniform(2.5, 3.5) }
 }
 
 /// Draws a texture of shelves with upright books, folders or boxes.
 pub(super) fn shelves(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
-    let wood = color_among(random, &[(WOODS, 4.), (WHITES, 2.), (GREYS, 1.)]);
-    let mut canvas = Canvas::filled(SIZE, wood * random.between(0.15, 0.5));
+    let wood = random_color_of_themes(random, &[(WOODS, 4.), (WHITES, 2.), (GRAYS, 1.)]);
+    let mut canvas = Canvas::filled(SIZE, wood * random.uniform(0.15, 0.5));
     let rows = random.count(2, 6);
     let row_height = 1. / rows as f32;
-    let board = row_height * random.between(0.05, 0.12);
-    let covers = [ACCENTS, VIVID, WHITES, BROWNS, GREYS];
+    let board = row_height * random.uniform(0.05, 0.12);
+    let covers = [ACCENTS, VIVID, WHITES, BROWNS, GRAYS];
     let weights = covers.map(|theme| (theme, random.unit() * random.unit() + 0.05));
-    let (thin, thick) = (random.between(0.012, 0.025), random.between(0.03, 0.08));
-    let fill_probability = random.between(0.5, 1.);
+    let (thin, thick) = (random.uniform(0.012, 0.025), random.uniform(0.03, 0.08));
+    let fill_probability = random.uniform(0.5, 1.);
     let script = Script::draw(random);
     for row in 0..rows {
         let floor = (row + 1) as f32 * row_height - board;
         let mut x = 0.01;
         while x < 0.99 {
-            let width = random.leaning_low(thin, thick).min(0.995 - x).max(0.005);
-            if random.happens(fill_probability) {
-                let height = (row_height - board) * random.between(0.6, 0.96);
+            let width = random.sqrt_uniform(thin, thick).min(0.995 - x).max(0.005);
+            if random.chance(fill_probability) {
+                let height = (row_height - board) * random.uniform(0.6, 0.96);
                 let theme = random.weighted(&weights);
-                let color = color_of(random, theme);
+                let color = random_theme_color(random, theme);
                 let middle = Vec2::new(x + 0.5 * width, floor - 0.5 * height);
                 let half = 0.5 * Vec2::new(width, height);
-                let roundness = random.between(0.2, 0.6);
+                let roundness = random.uniform(0.2, 0.6);
                 canvas.stamp(middle, half, |offset| {
                     let across = offset.x / half.x;
                     let edge_distance = (half - offset.abs()).min_element();
@@ -202,8 +202,8 @@ pub(super) fn shelves(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
                 });
                 let label = ink_for(random, color);
                 for _ in 0..random.count(0, 3) {
-                    let band = random.between(0.3, 2.) / SIZE as f32;
-                    let place = middle + Vec2::new(0., half.y * random.between(-0.85, 0.85));
+                    let band = random.uniform(0.3, 2.) / SIZE as f32;
+                    let place = middle + Vec2::new(0., half.y * random.uniform(-0.85, 0.85));
                     let half_band = Vec2::new(0.9 * half.x, band);
                     canvas.fill(place, half_band, label, |offset| canvas::rectangle(offset, half_band, 0.));
                 }
@@ -218,30 +218,30 @@ pub(super) fn shelves(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         paint_panel(&mut canvas, middle, half, wood, 0.3 * board, 0.3);
     }
     paint_panel(&mut canvas, Vec2::new(0., 0.5), Vec2::new(0.012, 0.52), wood, 0.004, 0.3);
-    Surface { canvas, repeat_metres: rows as f32 * random.between(0.25, 0.4) }
+    Surface { canvas, repeat_metres: rows as f32 * random.uniform(0.25, 0.4) }
 }
 
 /// Draws a texture of doors and drawers with handles and inset panels in relief.
 pub(super) fn cupboards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let theme = random.weighted(&[(WHITES, 4.), (WOODS, 3.), (GREYS, 2.), (ACCENTS, 2.)]);
-    let color = color_of(random, theme);
-    let mut canvas = Canvas::filled(SIZE, color * random.between(0.15, 0.6));
+    let theme = random.weighted(&[(WHITES, 4.), (WOODS, 3.), (GRAYS, 2.), (ACCENTS, 2.)]);
+    let color = random_theme_color(random, theme);
+    let mut canvas = Canvas::filled(SIZE, color * random.uniform(0.15, 0.6));
     let (columns, rows) = (random.count(1, 4), random.count(1, 5));
     let cell = Vec2::new(1. / columns as f32, 1. / rows as f32);
-    let gap = random.between(0.004, 0.012);
-    let bevel = random.between(0.006, 0.02);
-    let relief = random.between(0.1, 0.5);
+    let gap = random.uniform(0.004, 0.012);
+    let bevel = random.uniform(0.006, 0.02);
+    let relief = random.uniform(0.1, 0.5);
     let insets = random.count(0, 2);
-    let metal = color_of(random, GREYS);
+    let metal = random_theme_color(random, GRAYS);
     let handle = random.count(0, 3);
-    let handle_length = random.between(0.1, 0.4);
+    let handle_length = random.uniform(0.1, 0.4);
     for index in 0..rows * columns {
         let middle = (Vec2::new((index % columns) as f32, (index / columns) as f32) + 0.5) * cell;
         let mut half = 0.5 * cell - gap;
-        let tone = color * random.between(0.95, 1.05);
+        let tone = color * random.uniform(0.95, 1.05);
         paint_panel(&mut canvas, middle, half, tone, bevel, relief);
         for inset in 0..insets {
-            half -= random.between(0.1, 0.25) * cell.min_element();
+            half -= random.uniform(0.1, 0.25) * cell.min_element();
             if half.min_element() > 2. * bevel {
                 // The first inset panel is sunk, and the second one is raised.
                 let relief = if inset == 0 { -relief } else { relief };
@@ -262,31 +262,31 @@ pub(super) fn cupboards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     }
     if theme == WOODS {
         let cells = if matches!(purpose, Purpose::Wall) { [2, 48] } else { [48, 2] };
-        canvas.shade(&fractal(random, SIZE, cells, 3, 0.7), random.between(0.05, 0.25));
+        canvas.shade(&fractal(random, SIZE, cells, 3, 0.7), random.uniform(0.05, 0.25));
     }
-    Surface { canvas, repeat_metres: columns as f32 * random.between(0.35, 0.7) }
+    Surface { canvas, repeat_metres: columns as f32 * random.uniform(0.35, 0.7) }
 }
 
 /// Draws a texture of keys, switches, buttons or vents: small rounded boxes in rows, some of them labelled.
 pub(super) fn keys(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let ground = Palette::draw(random, purpose, 1).color(0);
     let palette = Palette::draw_between(random, Purpose::Thing, 1, 3);
-    let mut canvas = Canvas::filled(SIZE, ground * random.between(0.3, 1.));
+    let mut canvas = Canvas::filled(SIZE, ground * random.uniform(0.3, 1.));
     let (columns, rows) = (random.count(2, 16), random.count(2, 12));
     let cell = Vec2::new(1. / columns as f32, 1. / rows as f32);
-    let share = Vec2::new(random.between(0.4, 0.95), random.between(0.4, 0.95));
-    let relief = random.between(0., 0.5);
+    let share = Vec2::new(random.uniform(0.4, 0.95), random.uniform(0.4, 0.95));
+    let relief = random.uniform(0., 0.5);
     let label_probability = random.unit();
     let script = Script::draw(random);
     for row in 0..rows {
         let mut column = 0;
         while column < columns {
-            let span = if random.happens(0.12) { 2.min(columns - column) } else { 1 };
+            let span = if random.chance(0.12) { 2.min(columns - column) } else { 1 };
             let middle = Vec2::new(column as f32 + 0.5 * span as f32, row as f32 + 0.5) * cell;
             let half = 0.5 * (Vec2::new(span as f32, 1.) * cell - (1. - share) * cell.min_element());
             let color = palette.any(random);
             paint_panel(&mut canvas, middle, half, color, 0.3 * half.min_element(), relief);
-            if random.happens(label_probability) {
+            if random.chance(label_probability) {
                 let ink = ink_for(random, color);
                 let height = 0.8 * half.y;
                 let start = middle - Vec2::new(0.6 * half.x, 0.);
@@ -295,17 +295,17 @@ pub(super) fn keys(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
             column += span;
         }
     }
-    Surface { canvas, repeat_metres: random.leaning_low(0.2, 2.) }
+    Surface { canvas, repeat_metres: random.sqrt_uniform(0.2, 2.) }
 }
 
 /// Draws a texture of parallel strips with the same profile: blinds, shutters, siding, radiators, corrugated sheets.
 pub(super) fn slats(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let color = Palette::draw(random, purpose, 1).color(0);
-    let count = random.leaning_low(4., 40.).floor();
-    let upright = random.happens(0.5);
+    let count = random.sqrt_uniform(4., 40.).floor();
+    let upright = random.chance(0.5);
     let profile = random.count(0, 2);
-    let (depth, gap) = (random.between(0.1, 0.7), random.between(0.02, 0.25));
-    let seam = random.between(0.2, 0.9);
+    let (depth, gap) = (random.uniform(0.1, 0.7), random.uniform(0.02, 0.25));
+    let seam = random.uniform(0.2, 0.9);
     let uneven = smooth(random, SIZE, if upright { [64, 2] } else { [2, 64] });
     let canvas = Canvas::from_fn(SIZE, |uv| {
         let part = (if upright { uv.x } else { uv.y } * count).fract();
@@ -318,30 +318,30 @@ pub(super) fn slats(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let joint = 1. - seam * smoothstep(0.5 * gap + soft, 0.5 * gap, part.min(1. - part));
         color * light * joint * (1. + 0.06 * uneven.value(uv))
     });
-    Surface { canvas, repeat_metres: count * random.leaning_low(0.02, 0.15) }
+    Surface { canvas, repeat_metres: count * random.sqrt_uniform(0.02, 0.15) }
 }
 
 /// Draws a texture of a suspended ceiling: a grid of boards, which may have specks, with some lamps.
 pub(super) fn ceiling_boards(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
-    let board = color_of(random, WHITES);
-    let rail = board * random.between(0.7, 1.1);
+    let board = random_theme_color(random, WHITES);
+    let rail = board * random.uniform(0.7, 1.1);
     let mut canvas = Canvas::filled(SIZE, rail);
     let (columns, rows) = random.one_of(&[(2, 2), (3, 3), (4, 4), (2, 4), (1, 2)]);
     let cell = Vec2::new(1. / columns as f32, 1. / rows as f32);
-    let speck = random.between(0., 0.5);
-    let lamps = random.between(0., 0.2);
-    let relief = random.between(0.05, 0.3);
+    let speck = random.uniform(0., 0.5);
+    let lamps = random.uniform(0., 0.2);
+    let relief = random.uniform(0.05, 0.3);
     let cells = random.one_of(&[64, 128]);
     let rough = smooth(random, SIZE, [cells; 2]);
     for index in 0..columns * rows {
         let middle = (Vec2::new((index % columns) as f32, (index / columns) as f32) + 0.5) * cell;
-        let tone = board * random.between(0.96, 1.02);
+        let tone = board * random.uniform(0.96, 1.02);
         paint_panel(&mut canvas, middle, 0.5 * cell - 0.008, tone, 0.008, relief);
-        if random.happens(lamps) {
+        if random.chance(lamps) {
             paint_panel(&mut canvas, middle, 0.4 * cell, Vec3::splat(0.93), 0.006, relief);
         }
     }
-    canvas.change_by(&rough, |pixel, value| pixel * (1. - speck * smoothstep(0.5, 0.9, value)));
+    canvas.map_with_field(&rough, |pixel, value| pixel * (1. - speck * smoothstep(0.5, 0.9, value)));
     Surface { canvas, repeat_metres: columns as f32 * 0.6 }
 }
 
@@ -349,13 +349,13 @@ pub(super) fn ceiling_boards(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 pub(super) fn grids(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 2, 3);
     let behind = fractal(random, SIZE, [3; 2], 4, 0.6);
-    let dark = random.between(0.1, 0.8);
+    let dark = random.uniform(0.1, 0.8);
     let bar = palette.color(1);
     let bars = Vec2::new(random.count(2, 20) as f32, random.count(2, 20) as f32);
-    let bars = if random.happens(0.6) { Vec2::splat(bars.x) } else { bars };
-    let oblique = random.happens(0.4);
-    let width = random.between(0.05, 0.35);
-    let has_crossbars = random.happens(0.7);
+    let bars = if random.chance(0.6) { Vec2::splat(bars.x) } else { bars };
+    let oblique = random.chance(0.4);
+    let width = random.uniform(0.05, 0.35);
+    let has_crossbars = random.chance(0.7);
     let canvas = Canvas::from_fn(SIZE, |uv| {
         let at = if oblique { Vec2::new(uv.x + uv.y, uv.x - uv.y) * bars.x } else { uv * bars };
         let part = (at - at.floor() - 0.5).abs() * 2.;
@@ -367,5 +367,5 @@ pub(super) fn grids(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let ground = palette.color(0) * dark * (1. + 0.3 * behind.value(uv));
         ground.lerp(bar * (0.6 + 0.4 * smoothstep(1. - width, 1., nearness)), across.max(along))
     });
-    Surface { canvas, repeat_metres: random.leaning_low(0.3, 2.) }
+    Surface { canvas, repeat_metres: random.sqrt_uniform(0.3, 2.) }
 }

@@ -14,10 +14,10 @@ pub(super) fn stripes(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 2, 5);
     let bands = bands(random, &palette);
     let (across, along) = random.one_of(&[(1., 0.), (1., 0.), (0., 1.), (1., 1.), (1., -1.), (2., 1.)]);
-    let times = random.leaning_low(1., 12.).floor();
+    let times = random.sqrt_uniform(1., 12.).floor();
     let (wave, waves) =
-        (if random.happens(0.2) { random.between(0.02, 0.3) } else { 0. }, random.count(1, 6) as f32);
-    let zigzag = random.happens(0.5);
+        (if random.chance(0.2) { random.uniform(0.02, 0.3) } else { 0. }, random.count(1, 6) as f32);
+    let zigzag = random.chance(0.5);
     let canvas = Canvas::from_fn(SIZE, |uv| {
         let phase = (uv.x * along + uv.y * across) * waves;
         let swing = if zigzag {
@@ -28,31 +28,31 @@ pub(super) fn stripes(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let at = (uv.x * across + uv.y * along) * times + wave * swing;
         band_at(&bands, at, times * across.abs().max(along.abs()))
     });
-    Surface { canvas, repeat_metres: random.leaning_low(0.3, 3.) }
+    Surface { canvas, repeat_metres: random.sqrt_uniform(0.3, 3.) }
 }
 
 /// Draws stripes in both directions, woven into each other.
 pub(super) fn plaid(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 2, 4);
     let bands_across = bands(random, &palette);
-    let bands_along = if random.happens(0.7) { bands_across.clone() } else { bands(random, &palette) };
-    let times = random.leaning_low(1., 8.).floor();
+    let bands_along = if random.chance(0.7) { bands_across.clone() } else { bands(random, &palette) };
+    let times = random.sqrt_uniform(1., 8.).floor();
     let threads = random.one_of(&[32., 64., 128.]);
-    let twill = random.between(0., 0.5);
+    let twill = random.uniform(0., 0.5);
     let canvas = Canvas::from_fn(SIZE, |uv| {
         let warp = band_at(&bands_across, uv.x * times, times);
         let weft = band_at(&bands_along, uv.y * times, times);
         let over = ((uv.x + uv.y) * threads).fract() < 0.5;
         warp.lerp(weft, if over { 0.5 + twill } else { 0.5 - twill })
     });
-    Surface { canvas, repeat_metres: random.leaning_low(0.2, 1.5) }
+    Surface { canvas, repeat_metres: random.sqrt_uniform(0.2, 1.5) }
 }
 
 /// A sequence of stripes: the end of each in [0, 1], and its color.
 type Bands = Vec<(f32, Vec3)>;
 
 fn bands(random: &mut ChaCha8Rng, palette: &Palette) -> Bands {
-    let widths: Vec<f32> = (0..random.count(2, 7)).map(|_| random.leaning_low(0.05, 1.)).collect();
+    let widths: Vec<f32> = (0..random.count(2, 7)).map(|_| random.sqrt_uniform(0.05, 1.)).collect();
     let sum: f32 = widths.iter().sum();
     let mut end = 0.;
     let band = |(index, width): (usize, &f32)| {
@@ -76,7 +76,7 @@ pub(super) fn pieces(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(2, 5);
     let palette = Palette::draw(random, purpose, count);
     let fine = random.count(1, 6);
-    let checks = random.happens(0.35);
+    let checks = random.chance(0.35);
     let layout = if checks {
         Layout::courses(2 * fine, 2 * fine, 0., false)
     } else {
@@ -89,10 +89,10 @@ pub(super) fn pieces(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         }
     };
     let seed = random.seed();
-    let line = if random.happens(0.4) { random.leaning_low(0.001, 0.012) } else { 0. };
-    let ink = palette.any(random) * random.between(0.3, 1.);
-    let halved = random.happens(0.25);
-    let inset = if random.happens(0.3) { random.between(0.1, 0.4) } else { 1. };
+    let line = if random.chance(0.4) { random.sqrt_uniform(0.001, 0.012) } else { 0. };
+    let ink = palette.any(random) * random.uniform(0.3, 1.);
+    let halved = random.chance(0.25);
+    let inset = if random.chance(0.3) { random.uniform(0.1, 0.4) } else { 1. };
     let canvas = Canvas::from_fn(SIZE, |uv| {
         let piece = layout.piece(uv);
         let mut number = (unit_of(seed, piece.id) * count as f32) as usize;
@@ -109,28 +109,28 @@ pub(super) fn pieces(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let on_line = if line > 0. { ((line - piece.edge) * SIZE as f32 + 0.5).clamp(0., 1.) } else { 0. };
         palette.color(number).lerp(ink, on_line)
     });
-    Surface { canvas, repeat_metres: random.leaning_low(0.3, 3.) }
+    Surface { canvas, repeat_metres: random.sqrt_uniform(0.3, 3.) }
 }
 
 /// Draws dots, rings, stars, flowers and polygons on a straight, staggered or loose grid.
 pub(super) fn motifs(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 2, 5);
     let mut canvas = Canvas::filled(SIZE, palette.color(0));
-    let rows = 2 * random.leaning_low(1., 8.) as usize;
+    let rows = 2 * random.sqrt_uniform(1., 8.) as usize;
     let cell = 1. / rows as f32;
-    let staggered = random.happens(0.6);
-    let loose = if random.happens(0.3) { random.between(0.1, 0.8) } else { 0. };
+    let staggered = random.chance(0.6);
+    let loose = if random.chance(0.3) { random.uniform(0.1, 0.8) } else { 0. };
     let kinds: Vec<Motif> = (0..random.count(1, 2)).map(|_| Motif::draw(random, &palette)).collect();
     for row in 0..rows {
         for column in 0..rows {
             let shift = if staggered && row % 2 == 1 { 0.5 } else { 0. };
-            let off = (random.spot() - 0.5) * loose;
-            let centre = (Vec2::new(column as f32 + 0.5 + shift, row as f32 + 0.5) + off) * cell;
+            let off = (random.point() - 0.5) * loose;
+            let center = (Vec2::new(column as f32 + 0.5 + shift, row as f32 + 0.5) + off) * cell;
             let turn = if loose > 0. { random.direction() } else { Vec2::X };
-            kinds[(row + column) % kinds.len()].paint(&mut canvas, centre, cell, turn);
+            kinds[(row + column) % kinds.len()].paint(&mut canvas, center, cell, turn);
         }
     }
-    Surface { canvas, repeat_metres: random.leaning_low(0.3, 3.) }
+    Surface { canvas, repeat_metres: random.sqrt_uniform(0.3, 3.) }
 }
 
 /// Nested figures, the outermost first.
@@ -150,28 +150,28 @@ enum Figure {
 impl Motif {
     /// Draws one to four figures whose radii are fractions of the cell's width.
     pub fn draw(random: &mut ChaCha8Rng, palette: &Palette) -> Motif {
-        let mut radius = random.between(0.15, 0.5);
+        let mut radius = random.uniform(0.15, 0.5);
         let mut layers = Vec::new();
         for index in 0..random.count(1, 4) {
             let figure = match random.count(0, 4) {
                 0 => Figure::Disk,
                 1 => Figure::Polygon(random.count(3, 8)),
-                2 => Figure::Flower(random.count(3, 12), random.between(0.2, 0.8)),
-                3 => Figure::Leaf(random.between(0.2, 0.8)),
-                _ => Figure::Box(random.between(0.3, 1.)),
+                2 => Figure::Flower(random.count(3, 12), random.uniform(0.2, 0.8)),
+                3 => Figure::Leaf(random.uniform(0.2, 0.8)),
+                _ => Figure::Box(random.uniform(0.3, 1.)),
             };
             layers.push((figure, radius, palette.color(index + 1)));
-            radius *= random.between(0.4, 0.85);
+            radius *= random.uniform(0.4, 0.85);
         }
         Motif { layers }
     }
 
     /// Paints the motif into a cell of width `cell`, rotated by `turn`.
-    pub fn paint(&self, canvas: &mut Canvas, centre: Vec2, cell: f32, turn: Vec2) {
+    pub fn paint(&self, canvas: &mut Canvas, center: Vec2, cell: f32, turn: Vec2) {
         for &(figure, share, color) in &self.layers {
             let radius = share * cell;
             // A triangle's corners are at twice its inner radius.
-            canvas.fill(centre, Vec2::splat(2. * radius), color, |offset| {
+            canvas.fill(center, Vec2::splat(2. * radius), color, |offset| {
                 let offset = turn.rotate(offset);
                 match figure {
                     Figure::Disk => canvas::disk(offset, radius),
@@ -192,16 +192,16 @@ pub(super) fn ornament(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let columns = random.one_of(&[1usize, 2, 2, 3, 4]);
     let cell = 1. / columns as f32;
     let flower = Motif::draw(random, &palette);
-    let width = random.between(0.01, 0.03) * cell;
-    let leaf = Vec2::new(random.between(0.1, 0.25), random.between(0.3, 0.7));
+    let width = random.uniform(0.01, 0.03) * cell;
+    let leaf = Vec2::new(random.uniform(0.1, 0.25), random.uniform(0.3, 0.7));
     let steps = random.count(6, 14);
     let mut tendrils = Vec::new();
     for _ in 0..random.count(1, 3) {
-        let (mut at, mut angle, curl) = (Vec2::ZERO, random.between(-1.5, 1.5), random.between(-0.6, 0.6));
+        let (mut at, mut angle, curl) = (Vec2::ZERO, random.uniform(-1.5, 1.5), random.uniform(-0.6, 0.6));
         for step in 0..steps {
             let next = at + Vec2::from_angle(angle) * 0.5 / steps as f32;
             tendrils.push((at, next, angle, step));
-            angle += curl + 0.3 * random.bell();
+            angle += curl + 0.3 * random.approx_normal();
             at = next;
         }
     }
@@ -210,20 +210,20 @@ pub(super) fn ornament(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         // The second half of the ornaments lies between the first half.
         let half = if index >= columns * columns { 0.5 } else { 0. };
         let place = Vec2::new((index % columns) as f32, (index / columns % columns) as f32) + half + 0.25;
-        let centre = place * cell;
+        let center = place * cell;
         for &(from, to, angle, step) in &tendrils {
             for side in [1., -1.] {
                 let mirror = Vec2::new(side, 1.);
                 let (from, to) = (from * mirror * cell, to * mirror * cell);
                 let middle = 0.5 * (from + to);
                 let reach = (to - from).abs() * 0.5 + width;
-                canvas.fill(centre + middle, reach, palette.color(1), |offset| {
+                canvas.fill(center + middle, reach, palette.color(1), |offset| {
                     canvas::stroke(offset, from - middle, to - middle, width)
                 });
                 if step % every == 1 {
                     let length = leaf.x * cell;
                     let turn = Vec2::from_angle(-angle - 0.8) * mirror;
-                    let tip = centre + to + Vec2::new(turn.x, -turn.y) * 0.5 * length;
+                    let tip = center + to + Vec2::new(turn.x, -turn.y) * 0.5 * length;
                     canvas.fill(tip, Vec2::splat(length), palette.color(2), |offset| {
                         let offset = Vec2::from_angle(-angle - 0.8).rotate(offset * mirror);
                         canvas::leaf(offset, length, length * leaf.y)
@@ -231,9 +231,9 @@ pub(super) fn ornament(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
                 }
             }
         }
-        flower.paint(&mut canvas, centre, 0.5 * cell, Vec2::X);
+        flower.paint(&mut canvas, center, 0.5 * cell, Vec2::X);
     }
-    Surface { canvas, repeat_metres: random.between(0.4, 1.6) * columns as f32 * 0.5 }
+    Surface { canvas, repeat_metres: random.uniform(0.4, 1.6) * columns as f32 * 0.5 }
 }
 
 /// Draws threads that pass over and under each other.
@@ -241,9 +241,9 @@ pub(super) fn weave(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 1, 3);
     let threads = random.one_of(&[24, 32, 40, 48, 64]);
     let twill = random.one_of(&[1, 1, 2, 3]);
-    let (seed, spread) = (random.seed(), random.between(0.05, 0.5));
+    let (seed, spread) = (random.seed(), random.uniform(0.05, 0.5));
     let uneven = smooth(random, SIZE, [6; 2]);
-    let (round, drift) = (random.between(0.2, 0.7), random.between(0., 0.15));
+    let (round, drift) = (random.uniform(0.2, 0.7), random.uniform(0., 0.15));
     let scale = threads as f32;
     let canvas = Canvas::from_fn(SIZE, |uv| {
         let at = uv * scale;
@@ -254,7 +254,7 @@ pub(super) fn weave(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let tone = palette.ramp(if over { 0. } else { 1. }) * (1. + spread * (unit_of(seed, thread) - 0.5));
         tone * (1. - round * 4. * across * across) * (1. + drift * uneven.sample(uv))
     });
-    Surface { canvas, repeat_metres: random.between(0.15, 0.8) }
+    Surface { canvas, repeat_metres: random.uniform(0.15, 0.8) }
 }
 
 /// Draws knitted rows of loops.
@@ -262,7 +262,7 @@ pub(super) fn knit(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 1, 3);
     let columns = random.one_of(&[12, 16, 24, 32]);
     let seed = random.seed();
-    let banded = random.happens(0.4);
+    let banded = random.chance(0.4);
     let canvas = Canvas::from_fn(SIZE, |uv| {
         let at = uv * columns as f32;
         let side = (at.x.fract() - 0.5).abs();
@@ -274,7 +274,7 @@ pub(super) fn knit(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let id = if banded { row / 3 } else { row * 64 + at.x as u32 };
         palette.ramp(unit_of(seed, id)) * (0.25 + 0.75 * thick.max(0.))
     });
-    Surface { canvas, repeat_metres: random.between(0.1, 0.6) }
+    Surface { canvas, repeat_metres: random.uniform(0.1, 0.6) }
 }
 
 /// Draws carpet pile, felt or fur: fine and soft, brushed in some places.
@@ -284,28 +284,28 @@ pub(super) fn pile(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let stretch = random.one_of(&[[1, 1], [1, 1], [1, 3], [3, 1]]);
     let tufts = fractal(random, SIZE, stretch.map(|share| fine / share), 2, 0.8);
     let brushed = fractal(random, SIZE, [3; 2], 3, 0.5);
-    let mixed = random.between(0.1, 0.6);
-    let mut canvas = Canvas::of_field(&tufts, |value| palette.ramp(0.5 + mixed * value));
-    canvas.shade(&tufts, random.between(0.05, 0.35));
-    canvas.shade(&brushed, random.leaning_low(0., 0.25));
-    Surface { canvas, repeat_metres: random.between(0.4, 1.6) }
+    let mixed = random.uniform(0.1, 0.6);
+    let mut canvas = Canvas::from_field(&tufts, |value| palette.ramp(0.5 + mixed * value));
+    canvas.shade(&tufts, random.uniform(0.05, 0.35));
+    canvas.shade(&brushed, random.sqrt_uniform(0., 0.25));
+    Surface { canvas, repeat_metres: random.uniform(0.4, 1.6) }
 }
 
 /// Draws cloth hanging in folds along v.
 pub(super) fn folds(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 1, 3);
-    let depth = random.between(0.15, 0.7);
+    let depth = random.uniform(0.15, 0.7);
     let (coarse, fine) = (random.count(4, 10), random.count(12, 28));
     let folds =
-        smooth(random, SIZE, [coarse, 1]).plus(&smooth(random, SIZE, [fine, 2]), random.between(0.1, 0.7));
-    let printed = random.happens(0.3);
+        smooth(random, SIZE, [coarse, 1]).plus(&smooth(random, SIZE, [fine, 2]), random.uniform(0.1, 0.7));
+    let printed = random.chance(0.3);
     let bands = random.count(2, 8) as f32;
     let canvas = Canvas::from_fn(SIZE, |uv| {
         let fold = folds.value(uv);
         let tone = if printed { (uv.y * bands).fract() } else { 0.5 + 0.3 * fold };
         palette.ramp(tone) * (1. + depth * fold).clamp(0.2, 1.6)
     });
-    Surface { canvas, repeat_metres: random.between(0.8, 2.) }
+    Surface { canvas, repeat_metres: random.uniform(0.8, 2.) }
 }
 
 /// Draws padded leather or cloth, buttoned in diamonds or stitched in channels.
@@ -313,7 +313,7 @@ pub(super) fn quilted(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let color = Palette::draw(random, purpose, 1).color(0);
     let across = random.count(2, 8) as f32;
     let kind = random.count(0, 2);
-    let (deep, light) = (random.between(0.3, 0.8), random.direction());
+    let (deep, light) = (random.uniform(0.3, 0.8), random.direction());
     let height = Field::from_fn(SIZE, |uv| {
         let at = match kind {
             0 => Vec2::new(uv.x + uv.y, uv.x - uv.y) * across,
@@ -323,10 +323,10 @@ pub(super) fn quilted(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let part = (at - at.floor() - 0.5) * 2.;
         ((1. - part.x.powi(4)) * (1. - part.y.powi(4))).sqrt()
     });
-    let mut canvas = Canvas::of_field(&height, |value| color * (1. - deep + deep * value));
-    canvas.shade(&height.slope(light), random.between(1., 5.));
-    canvas.shade(&fractal(random, SIZE, [24; 2], 4, 0.8), random.between(0.01, 0.12));
-    Surface { canvas, repeat_metres: across * random.between(0.06, 0.2) }
+    let mut canvas = Canvas::from_field(&height, |value| color * (1. - deep + deep * value));
+    canvas.shade(&height.slope(light), random.uniform(1., 5.));
+    canvas.shade(&fractal(random, SIZE, [24; 2], 4, 0.8), random.uniform(0.01, 0.12));
+    Surface { canvas, repeat_metres: across * random.uniform(0.06, 0.2) }
 }
 
 /// Draws a whole carpet: borders around a field of small figures, with a medallion in the middle.
@@ -334,7 +334,7 @@ pub(super) fn carpet(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let count = random.count(3, 5);
     let palette = Palette::among(
         random,
-        &[(ACCENTS, 5.), (BROWNS, 2.), (BEIGES, 2.), (GREYS, 1.), (VIVID, 0.5)],
+        &[(ACCENTS, 5.), (BROWNS, 2.), (BEIGES, 2.), (GRAYS, 1.), (VIVID, 0.5)],
         count,
     );
     let mut canvas = Canvas::filled(SIZE, palette.color(0));
@@ -342,32 +342,32 @@ pub(super) fn carpet(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     // Paint the middle first, so that the borders cover what extends too far.
     let cells = random.count(4, 14);
     let small = Motif::draw(random, &palette);
-    let crowd = random.between(0.3, 1.);
+    let crowd = random.uniform(0.3, 1.);
     for index in 0..cells * cells {
         let place = Vec2::new((index % cells) as f32, (index / cells) as f32) + 0.5;
-        if random.happens(crowd) {
+        if random.chance(crowd) {
             small.paint(&mut canvas, place / cells as f32, 1. / cells as f32, Vec2::X);
         }
     }
-    if random.happens(0.65) {
+    if random.chance(0.65) {
         let petals = 2 * random.count(2, 9);
-        let (mut radius, depth) = (random.between(0.15, 0.38), random.between(0., 0.6));
-        let squeeze = Vec2::new(1., random.between(0.7, 1.4));
+        let (mut radius, depth) = (random.uniform(0.15, 0.38), random.uniform(0., 0.6));
+        let squeeze = Vec2::new(1., random.uniform(0.7, 1.4));
         for layer in 0..random.count(2, 7) {
             let color = palette.color(layer + 1);
             canvas.fill(middle, Vec2::splat(0.5), color, |offset| {
                 canvas::flower(offset * squeeze, radius, petals, depth)
             });
-            radius *= random.between(0.6, 0.9);
+            radius *= random.uniform(0.6, 0.9);
         }
         Motif::draw(random, &palette).paint(&mut canvas, middle, 2. * radius, Vec2::X);
     }
     let mut inset = 0.;
     for border in 0..random.count(1, 6) {
-        let width = random.leaning_low(0.005, 0.07);
+        let width = random.sqrt_uniform(0.005, 0.07);
         let (color, other) = (palette.color(border + 1), palette.color(border + 2));
         let teeth = random.one_of(&[0., 0., 12., 20., 32., 48.]);
-        canvas.change(|uv, below| {
+        canvas.map_pixels(|uv, below| {
             let from_edge = uv.min(1. - uv).min_element();
             let share = smoothstep(-1., 1., (inset + width - from_edge) * SIZE as f32);
             let outside = smoothstep(-1., 1., (inset - from_edge) * SIZE as f32);
@@ -378,6 +378,6 @@ pub(super) fn carpet(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         });
         inset += width;
     }
-    canvas.shade(&smooth(random, SIZE, [128; 2]), random.between(0.03, 0.2));
-    Surface { canvas, repeat_metres: random.between(1.5, 3.5) }
+    canvas.shade(&smooth(random, SIZE, [128; 2]), random.uniform(0.03, 0.2));
+    Surface { canvas, repeat_metres: random.uniform(1.5, 3.5) }
 }

@@ -26,10 +26,10 @@ pub(super) fn picture(random: &mut ChaCha8Rng) -> Surface {
         (screen as _, 1.),
     ]);
     let mut canvas = kind(random);
-    if random.happens(0.55) {
+    if random.chance(0.55) {
         frame(random, &mut canvas);
     }
-    Surface { canvas, repeat_metres: random.leaning_low(0.25, 1.4) }
+    Surface { canvas, repeat_metres: random.sqrt_uniform(0.25, 1.4) }
 }
 
 /// Draws a landscape: sky over hills, water or roofs.
@@ -41,18 +41,18 @@ fn landscape(random: &mut ChaCha8Rng) -> Canvas {
         [0xb9a58a, 0xeee2c8],
         [0x22304a, 0x6d87a0],
     ];
-    let [zenith, haze] = random.one_of(&skies).map(linear_of).map(|color| shade(random, color, 0.2));
+    let [zenith, haze] = random.one_of(&skies).map(srgb_to_linear).map(|color| shade(random, color, 0.2));
     let clouds = fractal(random, SIZE, [2, 5], 7, 0.6);
-    let (level, cover) = (random.between(-0.5, 1.), random.between(0., 0.9));
-    let horizon = random.between(0.35, 0.75);
+    let (level, cover) = (random.uniform(-0.5, 1.), random.uniform(0., 0.9));
+    let horizon = random.uniform(0.35, 0.75);
     let mut canvas = Canvas::from_fn(SIZE, |uv| {
         let sky = zenith.lerp(haze, (uv.y / horizon).min(1.));
         let cloud = cover * smoothstep(level, level + 0.8, clouds.value(uv));
         sky.lerp(Vec3::splat(0.85).lerp(haze, 0.3), cloud)
     });
     canvas.repeats = false;
-    if random.happens(0.4) {
-        let (sun, radius) = (Vec2::new(random.unit(), horizon * random.unit()), random.between(0.02, 0.09));
+    if random.chance(0.4) {
+        let (sun, radius) = (Vec2::new(random.unit(), horizon * random.unit()), random.uniform(0.02, 0.09));
         canvas.fill(sun, Vec2::splat(2. * radius), haze.lerp(Vec3::ONE, 0.7), |offset| {
             canvas::disk(offset, radius)
         });
@@ -61,14 +61,14 @@ fn landscape(random: &mut ChaCha8Rng) -> Canvas {
     let ranges = random.count(2, 6);
     for range in 0..ranges {
         let near = (range + 1) as f32 / ranges as f32;
-        let (hills, jagged) = (random.count(1, 4), random.between(0.3, 0.65));
+        let (hills, jagged) = (random.count(1, 4), random.uniform(0.3, 0.65));
         let profile = fractal(random, SIZE, [hills, 1], 6, jagged);
-        let ground = color_of(random, theme).lerp(haze, 0.75 * (1. - near));
-        let water = random.happens(0.12);
+        let ground = random_theme_color(random, theme).lerp(haze, 0.75 * (1. - near));
+        let water = random.chance(0.12);
         let texture = fractal(random, SIZE, [4, 16], 5, 0.8);
         let base = horizon + (1. - horizon) * (near - 0.5 / ranges as f32) * 0.8;
-        let height = if water { 0. } else { random.between(0.03, 0.18) };
-        canvas.change(|uv, below| {
+        let height = if water { 0. } else { random.uniform(0.03, 0.18) };
+        canvas.map_pixels(|uv, below| {
             let top = base - height * (1. + profile.values[(uv.x * SIZE as f32) as usize]);
             let value = texture.value(uv);
             let color = if water {
@@ -78,13 +78,13 @@ fn landscape(random: &mut ChaCha8Rng) -> Canvas {
             };
             below.lerp(color, (0.5 + (uv.y - top) * SIZE as f32).clamp(0., 1.))
         });
-        if !water && random.happens(0.5) {
+        if !water && random.chance(0.5) {
             for _ in 0..random.count(2, 40) {
                 let x = random.unit();
-                let size = near * random.between(0.01, 0.07);
+                let size = near * random.uniform(0.01, 0.07);
                 let top = base - height * (1. + profile.values[((x * SIZE as f32) as usize).min(SIZE - 1)]);
-                let color = ground * random.between(0.3, 0.9);
-                let slim = random.between(0.4, 1.);
+                let color = ground * random.uniform(0.3, 0.9);
+                let slim = random.uniform(0.4, 1.);
                 let lobes = random.count(3, 9);
                 canvas.fill(Vec2::new(x, top - 0.3 * size), Vec2::splat(1.2 * size), color, |offset| {
                     canvas::flower(offset / Vec2::new(slim, 1.), size, lobes, 0.25)
@@ -101,14 +101,14 @@ fn portrait(random: &mut ChaCha8Rng) -> Canvas {
     let drift = smooth(random, SIZE, [2, 2]);
     let backdrop = |uv: Vec2| backdrop.ramp(0.3 * uv.y + 0.35 + 0.3 * drift.value(uv)) * 0.7;
     let mut canvas = Canvas { repeats: false, ..Canvas::from_fn(SIZE, backdrop) };
-    let skin = linear_of(random.one_of(&[0xe6b998, 0xc98f6b, 0x8d5a3c, 0x5c3a28, 0xf0d0b8]));
+    let skin = srgb_to_linear(random.one_of(&[0xe6b998, 0xc98f6b, 0x8d5a3c, 0x5c3a28, 0xf0d0b8]));
     let skin = shade(random, skin, 0.1);
-    let hair = color_of(random, BROWNS) * random.between(0.2, 1.);
-    let cloth = color_among(random, &[(ACCENTS, 3.), (GREYS, 2.), (VIVID, 1.)]);
+    let hair = random_theme_color(random, BROWNS) * random.uniform(0.2, 1.);
+    let cloth = random_color_of_themes(random, &[(ACCENTS, 3.), (GRAYS, 2.), (VIVID, 1.)]);
     for _ in 0..random.one_of(&[1, 1, 1, 2, 3]) {
-        let head = Vec2::new(random.between(0.3, 0.7), random.between(0.3, 0.5));
-        let size = random.between(0.1, 0.24);
-        let light = Vec2::new(random.between(-1., 1.), -0.4);
+        let head = Vec2::new(random.uniform(0.3, 0.7), random.uniform(0.3, 0.5));
+        let size = random.uniform(0.1, 0.24);
+        let light = Vec2::new(random.uniform(-1., 1.), -0.4);
         let mut blob = |place: Vec2, radii: Vec2, color: Vec3, shading: f32| {
             let (place, radii) = (place * size, radii * size);
             canvas.stamp(head + place, radii + 0.004, |offset| {
@@ -116,7 +116,7 @@ fn portrait(random: &mut ChaCha8Rng) -> Canvas {
                 (color * lit.max(0.2), (0.5 - canvas::ellipse(offset, radii) * SIZE as f32).clamp(0., 1.))
             });
         };
-        let long = random.between(0., 1.);
+        let long = random.uniform(0., 1.);
         blob(Vec2::new(0., 0.25 * long - 0.15), Vec2::new(1., 1.2 + 0.5 * long), hair, 0.3);
         blob(Vec2::new(0., 3.1), Vec2::new(2.2, 1.8), cloth, 0.35);
         blob(Vec2::new(0., 1.2), Vec2::new(0.38, 0.7), skin * 0.8, 0.3);
@@ -137,13 +137,13 @@ fn portrait(random: &mut ChaCha8Rng) -> Canvas {
 fn shapes(random: &mut ChaCha8Rng) -> Canvas {
     let palette = Palette::draw_between(random, Purpose::Poster, 3, 5);
     let mut canvas = Canvas::bounded(SIZE, palette.color(0));
-    let straight = random.happens(0.4);
-    let line = if random.happens(0.4) { random.between(0.003, 0.015) } else { 0. };
+    let straight = random.chance(0.4);
+    let line = if random.chance(0.4) { random.uniform(0.003, 0.015) } else { 0. };
     for _ in 0..random.count(3, 40) {
-        let size = random.leaning_low(0.03, 0.45);
-        let half = Vec2::new(1., random.between(0.1, 1.)) * size;
+        let size = random.sqrt_uniform(0.03, 0.45);
+        let half = Vec2::new(1., random.uniform(0.1, 1.)) * size;
         let turn = if straight { random.one_of(&[Vec2::X, Vec2::Y]) } else { random.direction() };
-        let (kind, corners, depth) = (random.count(0, 4), random.count(3, 6), random.between(0., 0.7));
+        let (kind, corners, depth) = (random.count(0, 4), random.count(3, 6), random.uniform(0., 0.7));
         let distance = |offset: Vec2| {
             let local = turn.rotate(offset);
             match kind {
@@ -154,11 +154,11 @@ fn shapes(random: &mut ChaCha8Rng) -> Canvas {
                 _ => canvas::rectangle(local, half, 0.),
             }
         };
-        let centre = random.spot();
+        let center = random.point();
         let reach = Vec2::splat(1.42 * size);
-        canvas.fill(centre, reach, palette.any(random), distance);
+        canvas.fill(center, reach, palette.any(random), distance);
         if line > 0. {
-            canvas.fill(centre, reach, Vec3::splat(0.02), |offset| distance(offset).abs() - line);
+            canvas.fill(center, reach, Vec3::splat(0.02), |offset| distance(offset).abs() - line);
         }
     }
     canvas
@@ -175,16 +175,16 @@ fn print(random: &mut ChaCha8Rng) -> Canvas {
         let left = 0.94 - top;
         match random.count(0, 3) {
             0 => {
-                let height = random.leaning_low(0.05, 0.3).min(left);
+                let height = random.sqrt_uniform(0.05, 0.3).min(left);
                 let start = Vec2::new(0.07, top + 0.5 * height);
                 script.write(random, &mut canvas, start, 0.88, 0.8 * height, ink);
                 top += height;
             }
             1 => {
-                let height = random.between(0.15, 0.6).min(left);
+                let height = random.uniform(0.15, 0.6).min(left);
                 let inner = random.one_of(&[landscape, shapes, portrait, dead_leaves])(random);
                 let (low, extent) = (Vec2::new(0.06, top), Vec2::new(0.88, height));
-                canvas.change(|uv, below| {
+                canvas.map_pixels(|uv, below| {
                     let at = (uv - low) / extent;
                     let inside = at.cmpge(Vec2::ZERO).all() && at.cmplt(Vec2::ONE).all();
                     // Crop instead of squeezing, keeping the aspect ratio.
@@ -193,14 +193,14 @@ fn print(random: &mut ChaCha8Rng) -> Canvas {
                 top += height + 0.03;
             }
             2 => {
-                let height = random.between(0.1, 0.4).min(left);
-                let letters = random.leaning_low(0.014, 0.05);
+                let height = random.uniform(0.1, 0.4).min(left);
+                let letters = random.sqrt_uniform(0.014, 0.05);
                 let (corner, extent) = (Vec2::new(0.07, top), Vec2::new(0.86, height));
                 script.paragraph(random, &mut canvas, corner, extent, letters, ink);
                 top += height + 0.02;
             }
             _ => {
-                let height = random.between(0.03, 0.2).min(left);
+                let height = random.uniform(0.03, 0.2).min(left);
                 let color = Palette::draw(random, Purpose::Poster, 1).color(0);
                 let half = Vec2::new(random.one_of(&[0.5, 0.43, 0.2]), 0.5 * height);
                 canvas.fill(Vec2::new(0.5, top + half.y), half + 0.01, color, |offset| {
@@ -219,15 +219,15 @@ fn painting(random: &mut ChaCha8Rng) -> Canvas {
     let flow = smooth(random, SIZE, [3; 2]);
     let mut canvas = model.clone();
     canvas.repeats = false;
-    let length = random.between(0.015, 0.06);
-    let width = length * random.between(0.15, 0.4);
+    let length = random.uniform(0.015, 0.06);
+    let width = length * random.uniform(0.15, 0.4);
     let count = (0.8 / (length * width)) as usize;
-    let turns = random.between(0.5, 3.);
-    let spread = random.between(0.1, 0.6);
+    let turns = random.uniform(0.5, 3.);
+    let spread = random.uniform(0.1, 0.6);
     for _ in 0..count.min(3000) {
-        let spot = random.spot();
+        let spot = random.point();
         let along = Vec2::from_angle(turns * flow.sample(spot)) * 0.5 * length;
-        let color = model.sample(spot) * (1. + spread * random.bell()).max(0.2);
+        let color = model.sample(spot) * (1. + spread * random.approx_normal()).max(0.2);
         canvas.fill(spot, along.abs() + width, color, |offset| {
             canvas::stroke(offset, -along, along, 0.5 * width)
         });
@@ -241,16 +241,16 @@ fn dead_leaves(random: &mut ChaCha8Rng) -> Canvas {
     let other = Palette::draw(random, Purpose::Poster, 3);
     let mut canvas = Canvas::bounded(SIZE, palette.color(0));
     let light = random.direction();
-    let decline = random.leaning_low(0.02, 0.3);
+    let decline = random.sqrt_uniform(0.02, 0.3);
     for step in 0..random.count(40, 250) {
         // Large shapes first, so that they don't hide everything.
-        let size = 0.4 / (1. + decline * step as f32) * random.between(0.6, 1.5);
-        let own = if random.happens(0.8) { palette.ramp(random.unit()) } else { other.any(random) };
-        let color = own * random.between(0.5, 1.3);
+        let size = 0.4 / (1. + decline * step as f32) * random.uniform(0.6, 1.5);
+        let own = if random.chance(0.8) { palette.ramp(random.unit()) } else { other.any(random) };
+        let color = own * random.uniform(0.5, 1.3);
         let (turn, kind) = (random.direction(), random.count(0, 2));
-        let half = Vec2::new(1., random.between(0.3, 1.)) * size;
-        let shading = random.between(0., 0.5);
-        canvas.stamp(random.spot(), Vec2::splat(1.42 * size), |offset| {
+        let half = Vec2::new(1., random.uniform(0.3, 1.)) * size;
+        let shading = random.uniform(0., 0.5);
+        canvas.stamp(random.point(), Vec2::splat(1.42 * size), |offset| {
             let local = turn.rotate(offset);
             let distance = match kind {
                 0 => canvas::ellipse(local, half),
@@ -268,24 +268,24 @@ fn dead_leaves(random: &mut ChaCha8Rng) -> Canvas {
 fn flowers(random: &mut ChaCha8Rng) -> Canvas {
     let ground = Palette::draw(random, Purpose::Wall, 1).color(0);
     let mut canvas = Canvas::bounded(SIZE, ground);
-    let foot = Vec2::new(random.between(0.4, 0.6), random.between(0.8, 1.1));
+    let foot = Vec2::new(random.uniform(0.4, 0.6), random.uniform(0.8, 1.1));
     let green = Palette::from_theme(random, GREENS, 3);
     for _ in 0..random.count(3, 16) {
-        let head = Vec2::new(random.between(0.12, 0.88), random.between(0.1, 0.6));
+        let head = Vec2::new(random.uniform(0.12, 0.88), random.uniform(0.1, 0.6));
         let stem = palette_shade(random, &green);
         let half = 0.5 * (foot - head);
         canvas
             .fill(head + half, half.abs() + 0.01, stem, |offset| canvas::stroke(offset, -half, half, 0.005));
         for _ in 0..random.count(0, 3) {
-            let (place, turn) = (head.lerp(foot, random.between(0.2, 0.9)), random.direction());
-            let (length, leaf) = (random.between(0.08, 0.2), palette_shade(random, &green));
+            let (place, turn) = (head.lerp(foot, random.uniform(0.2, 0.9)), random.direction());
+            let (length, leaf) = (random.uniform(0.08, 0.2), palette_shade(random, &green));
             canvas.fill(place, Vec2::splat(0.6 * length), leaf, |offset| {
                 canvas::leaf(turn.rotate(offset), length, 0.35 * length)
             });
         }
-        let petals = color_among(random, &[(VIVID, 2.), (ACCENTS, 3.), (WHITES, 1.)]);
-        let (count, depth) = (random.count(4, 14), random.between(0.2, 0.7));
-        let mut radius = random.between(0.04, 0.14);
+        let petals = random_color_of_themes(random, &[(VIVID, 2.), (ACCENTS, 3.), (WHITES, 1.)]);
+        let (count, depth) = (random.count(4, 14), random.uniform(0.2, 0.7));
+        let mut radius = random.uniform(0.04, 0.14);
         for layer in 0..random.count(2, 4) {
             let color = petals * (1. - 0.2 * layer as f32);
             let turn = random.direction();
@@ -294,28 +294,28 @@ fn flowers(random: &mut ChaCha8Rng) -> Canvas {
             });
             radius *= 0.65;
         }
-        let heart = color_of(random, AUTUMN);
+        let heart = random_theme_color(random, AUTUMN);
         canvas.fill(head, Vec2::splat(radius), heart, |offset| canvas::disk(offset, 0.6 * radius));
     }
     canvas
 }
 
 fn palette_shade(random: &mut ChaCha8Rng, palette: &Palette) -> Vec3 {
-    palette.ramp(random.unit()) * random.between(0.5, 1.1)
+    palette.ramp(random.unit()) * random.uniform(0.5, 1.1)
 }
 
 /// Draws a window and the view through it, in bright light.
 fn window(random: &mut ChaCha8Rng) -> Canvas {
     let mut canvas = landscape(random);
-    let light = random.between(1., 1.8);
+    let light = random.uniform(1., 1.8);
     canvas.pixels.iter_mut().for_each(|pixel| *pixel = (*pixel * light).min(Vec3::ONE));
-    let frame = color_among(random, &[(WHITES, 5.), (WOODS, 2.), (GREYS, 2.)]);
+    let frame = random_color_of_themes(random, &[(WHITES, 5.), (WOODS, 2.), (GRAYS, 2.)]);
     let panes = Vec2::new(random.count(1, 4) as f32, random.count(1, 4) as f32);
-    let (bar, edge) = (random.between(0.005, 0.02), random.between(0.02, 0.06));
-    let [left, right] = [(); 2].map(|()| if random.happens(0.3) { random.between(0.1, 0.35) } else { 0. });
-    let cloth = color_of(random, WHITES);
-    let folds = random.between(60., 160.);
-    canvas.change(|uv, outside| {
+    let (bar, edge) = (random.uniform(0.005, 0.02), random.uniform(0.02, 0.06));
+    let [left, right] = [(); 2].map(|()| if random.chance(0.3) { random.uniform(0.1, 0.35) } else { 0. });
+    let cloth = random_theme_color(random, WHITES);
+    let folds = random.uniform(60., 160.);
+    canvas.map_pixels(|uv, outside| {
         let part = (uv * panes - (uv * panes).round()).abs() / panes;
         let near = (part - bar).min_element().min((uv.min(1. - uv) - edge).min_element());
         let seen = outside
@@ -328,9 +328,9 @@ fn window(random: &mut ChaCha8Rng) -> Canvas {
 
 /// Draws the screen of a television or a monitor: windows, or only a faint reflection.
 fn screen(random: &mut ChaCha8Rng) -> Canvas {
-    if random.happens(0.35) {
-        let glimmer = random.between(0.02, 0.12);
-        let slant = random.between(-1., 1.);
+    if random.chance(0.35) {
+        let glimmer = random.uniform(0.02, 0.12);
+        let slant = random.uniform(-1., 1.);
         let mut canvas = Canvas::from_fn(SIZE, |uv| {
             Vec3::splat(0.02 + glimmer * smoothstep(0.3, -0.3, uv.y - 0.5 + slant * (uv.x - 0.5)))
         });
@@ -341,9 +341,9 @@ fn screen(random: &mut ChaCha8Rng) -> Canvas {
     let mut canvas = Canvas { repeats: false, ..ground };
     let script = Script::draw(random);
     for _ in 0..random.count(0, 4) {
-        let paper = if random.happens(0.6) { Vec3::splat(0.85) } else { Vec3::splat(0.04) };
-        let half = Vec2::new(random.between(0.12, 0.45), random.between(0.12, 0.45));
-        let middle = Vec2::new(random.between(0.2, 0.8), random.between(0.2, 0.8));
+        let paper = if random.chance(0.6) { Vec3::splat(0.85) } else { Vec3::splat(0.04) };
+        let half = Vec2::new(random.uniform(0.12, 0.45), random.uniform(0.12, 0.45));
+        let middle = Vec2::new(random.uniform(0.2, 0.8), random.uniform(0.2, 0.8));
         canvas.fill(middle, half, paper, |offset| canvas::rectangle(offset, half, 0.01));
         let bar = Palette::draw(random, Purpose::Poster, 1).color(0);
         let half_bar = Vec2::new(half.x, 0.02);
@@ -359,15 +359,15 @@ fn screen(random: &mut ChaCha8Rng) -> Canvas {
 
 /// Adds a mat and a frame around the picture.
 fn frame(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
-    let wood = color_among(random, &[(WOODS, 3.), (GREYS, 2.), (WHITES, 2.), (AUTUMN, 1.)]);
-    let wood = wood * random.between(0.3, 1.);
-    let mat = color_among(random, &[(WHITES, 4.), (ACCENTS, 1.)]);
-    let bar = random.between(0.015, 0.07);
-    let margin = if random.happens(0.6) { random.between(0.03, 0.2) } else { 0. };
-    let relief = random.between(0.1, 0.5);
+    let wood = random_color_of_themes(random, &[(WOODS, 3.), (GRAYS, 2.), (WHITES, 2.), (AUTUMN, 1.)]);
+    let wood = wood * random.uniform(0.3, 1.);
+    let mat = random_color_of_themes(random, &[(WHITES, 4.), (ACCENTS, 1.)]);
+    let bar = random.uniform(0.015, 0.07);
+    let margin = if random.chance(0.6) { random.uniform(0.03, 0.2) } else { 0. };
+    let relief = random.uniform(0.1, 0.5);
     let inner = canvas.clone();
     let all = bar + margin;
-    canvas.change(|uv, _| {
+    canvas.map_pixels(|uv, _| {
         let from_edge = uv.min(1. - uv);
         let near = from_edge.min_element();
         if near >= all {

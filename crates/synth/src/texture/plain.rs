@@ -13,13 +13,13 @@ pub(super) fn paint(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let color = Palette::draw(random, purpose, 1).color(0);
     let mut canvas = Canvas::filled(SIZE, color);
     let cells = random.count(1, 4);
-    canvas.shade(&fractal(random, SIZE, [cells; 2], 4, 0.5), random.leaning_low(0.005, 0.12));
-    if random.happens(0.6) {
+    canvas.shade(&fractal(random, SIZE, [cells; 2], 4, 0.5), random.sqrt_uniform(0.005, 0.12));
+    if random.chance(0.6) {
         let grain = random.one_of(&[48, 96, 128]);
         let coat = smooth(random, SIZE, [grain; 2]);
-        canvas.shade(&coat.slope(random.direction()), random.leaning_low(0.02, 0.25));
+        canvas.shade(&coat.slope(random.direction()), random.sqrt_uniform(0.02, 0.25));
     }
-    Surface { canvas, repeat_metres: random.between(2., 4.) }
+    Surface { canvas, repeat_metres: random.uniform(2., 4.) }
 }
 
 /// Draws a soft gradient from one color to others and back.
@@ -28,31 +28,31 @@ pub(super) fn gradient(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let (across, along) = random.one_of(&[(0., 1.), (1., 0.), (1., 1.), (1., -1.), (0., 2.)]);
     let cells = random.count(1, 3);
     let drift = smooth(random, SIZE, [cells; 2]);
-    let strength = random.leaning_low(0.001, 0.25);
+    let strength = random.sqrt_uniform(0.001, 0.25);
     let canvas = Canvas::from_fn(SIZE, |uv| {
         let turns = uv.x * across + uv.y * along + strength * drift.sample(uv);
         palette.ramp(0.5 - 0.5 * (turns * std::f32::consts::TAU).cos())
     });
-    Surface { canvas, repeat_metres: random.between(1., 4.) }
+    Surface { canvas, repeat_metres: random.uniform(1., 4.) }
 }
 
 /// Draws metal brushed in one direction.
 pub(super) fn brushed(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let color = color_among(random, &[(GREYS, 4.), (BEIGES, 1.), (ACCENTS, 0.5)]);
+    let color = random_color_of_themes(random, &[(GRAYS, 4.), (BEIGES, 1.), (ACCENTS, 0.5)]);
     let mut canvas = Canvas::filled(SIZE, color);
     let cells = random.one_of(&[[2, 128], [128, 2], [4, 64], [64, 4], [1, 256]]);
-    canvas.shade(&fractal(random, SIZE, cells, 2, 0.7), random.between(0.04, 0.2));
-    canvas.shade(&smooth(random, SIZE, cells.map(|count| count.div_ceil(24))), random.between(0., 0.25));
+    canvas.shade(&fractal(random, SIZE, cells, 2, 0.7), random.uniform(0.04, 0.2));
+    canvas.shade(&smooth(random, SIZE, cells.map(|count| count.div_ceil(24))), random.uniform(0., 0.25));
     // Rust, mostly outdoors.
-    if matches!(purpose, Purpose::Facade | Purpose::Ground) || random.happens(0.15) {
-        let rust = linear_of(random.one_of(&[0x7a4426, 0x8f5a33, 0x5b3a2a]));
+    if matches!(purpose, Purpose::Facade | Purpose::Ground) || random.chance(0.15) {
+        let rust = srgb_to_linear(random.one_of(&[0x7a4426, 0x8f5a33, 0x5b3a2a]));
         let patches = fractal(random, SIZE, [3; 2], 6, 0.65);
-        let level = random.between(0.1, 0.9);
-        canvas.change_by(&patches, |pixel, value| {
+        let level = random.uniform(0.1, 0.9);
+        canvas.map_with_field(&patches, |pixel, value| {
             pixel.lerp(rust * (1. + 0.4 * value), ((value - level) * 5.).clamp(0., 0.9))
         });
     }
-    Surface { canvas, repeat_metres: random.between(0.5, 1.5) }
+    Surface { canvas, repeat_metres: random.uniform(0.5, 1.5) }
 }
 
 /// Draws bright and dull spots as on polished or wet surfaces.
@@ -60,40 +60,40 @@ pub(super) fn glossy(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let color = Palette::draw(random, purpose, 1).color(0);
     let cells = [random.count(1, 3), random.count(1, 3)];
     let lights = fractal(random, SIZE, cells, 2, 0.4);
-    let level = random.between(0.1, 0.6);
-    let light = Vec3::splat(random.between(0.5, 0.9));
-    let share = random.between(0.15, 0.5);
-    let canvas = Canvas::of_field(&lights, |value| {
+    let level = random.uniform(0.1, 0.6);
+    let light = Vec3::splat(random.uniform(0.5, 0.9));
+    let share = random.uniform(0.15, 0.5);
+    let canvas = Canvas::from_field(&lights, |value| {
         (color * (1. + 0.15 * value)).lerp(light, share * smoothstep(level, level + 0.5, value))
     });
-    Surface { canvas, repeat_metres: random.between(0.6, 2.) }
+    Surface { canvas, repeat_metres: random.uniform(0.6, 2.) }
 }
 
 /// Draws a texture of a random kind of noise.
 pub(super) fn clouds(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 2, 5);
     let mut field = raw(random);
-    if random.happens(0.4) {
-        let (cells, reach) = (random.count(1, 6), random.leaning_low(0.01, 0.2));
+    if random.chance(0.4) {
+        let (cells, reach) = (random.count(1, 6), random.sqrt_uniform(0.01, 0.2));
         field = warped(random, &field, cells, reach);
     }
     let mut field = field.stretched();
-    if random.happens(0.2) {
+    if random.chance(0.2) {
         // Flat patches, like camouflage or flaking paint.
         let steps = random.count(2, 6) as f32;
         let patch = |value: f32| smoothstep(0.42, 0.58, (value * steps).fract()) + (value * steps).floor();
         field = field.map(patch).stretched();
     }
-    let contrast = random.between(0.6, 1.6);
-    let canvas = Canvas::of_field(&field, |value| palette.ramp(0.5 + (value - 0.5) * contrast));
-    Surface { canvas, repeat_metres: random.leaning_low(0.4, 4.) }
+    let contrast = random.uniform(0.6, 1.6);
+    let canvas = Canvas::from_field(&field, |value| palette.ramp(0.5 + (value - 0.5) * contrast));
+    Surface { canvas, repeat_metres: random.sqrt_uniform(0.4, 4.) }
 }
 
 fn raw(random: &mut ChaCha8Rng) -> Field {
-    let cells = random.leaning_low(1., 24.) as usize;
-    let stretch = if random.happens(0.25) { random.one_of(&[[1, 4], [4, 1], [1, 8]]) } else { [1, 1] };
+    let cells = random.sqrt_uniform(1., 24.) as usize;
+    let stretch = if random.chance(0.25) { random.one_of(&[[1, 4], [4, 1], [1, 8]]) } else { [1, 1] };
     let cells = stretch.map(|factor| cells * factor);
-    let gain = random.between(0.4, 0.85);
+    let gain = random.uniform(0.4, 0.85);
     match random.count(0, 5) {
         0 | 1 => fractal(random, SIZE, cells, 7, gain),
         2 => ridged(random, SIZE, cells, 6, gain),
@@ -104,7 +104,7 @@ fn raw(random: &mut ChaCha8Rng) -> Field {
                 let seed = random.seed();
                 return Field::from_fn(SIZE, |uv| unit_of(seed, voronoi.cell(uv).id));
             }
-            let (scale, hollow) = (count as f32, random.happens(0.5));
+            let (scale, hollow) = (count as f32, random.chance(0.5));
             Field::from_fn(SIZE, |uv| {
                 let cell = voronoi.cell(uv);
                 if hollow { cell.offset.length() * scale } else { (cell.edge * scale * 3.).min(1.) }
@@ -118,43 +118,46 @@ fn raw(random: &mut ChaCha8Rng) -> Field {
 pub(super) fn weather(random: &mut ChaCha8Rng, canvas: &mut Canvas, purpose: Purpose) {
     let outdoors = matches!(purpose, Purpose::Ground | Purpose::Facade | Purpose::Foliage);
     let often = if outdoors { 1.5 } else { 1. };
-    if random.happens(0.18 * often) {
+    if random.chance(0.18 * often) {
         dirt(random, canvas);
     }
-    if random.happens(0.07 * often) {
+    if random.chance(0.07 * often) {
         scratches(random, canvas);
     }
-    if random.happens(0.25) {
+    if random.chance(0.25) {
         let cells = random.count(1, 3);
-        canvas.shade(&fractal(random, SIZE, [cells; 2], 2, 0.5), random.between(0.03, 0.2));
+        canvas.shade(&fractal(random, SIZE, [cells; 2], 2, 0.5), random.uniform(0.03, 0.2));
     }
-    if random.happens(0.3) {
+    if random.chance(0.3) {
         let grain = random.one_of(&[64, 128, 256]);
-        canvas.shade(&smooth(random, SIZE, [grain; 2]), random.leaning_low(0.01, 0.15));
+        canvas.shade(&smooth(random, SIZE, [grain; 2]), random.sqrt_uniform(0.01, 0.15));
     }
-    if random.happens(0.3) {
-        let tint = Vec3::new(random.bell(), random.bell(), random.bell()) * random.between(0.03, 0.15);
+    if random.chance(0.3) {
+        let tint = Vec3::new(random.approx_normal(), random.approx_normal(), random.approx_normal())
+            * random.uniform(0.03, 0.15);
         canvas.tint(1. + tint);
     }
-    if random.happens(0.25) {
-        let contrast = if random.happens(0.6) { random.between(0.25, 0.9) } else { random.between(1.1, 1.5) };
+    if random.chance(0.25) {
+        let contrast = if random.chance(0.6) { random.uniform(0.25, 0.9) } else { random.uniform(1.1, 1.5) };
         let mean = canvas.mean();
         canvas.pixels.iter_mut().for_each(|pixel| *pixel = mean + (*pixel - mean) * contrast);
     }
-    if random.happens(0.2) {
-        canvas.tint(Vec3::splat(random.between(0.5, 1.3)));
+    if random.chance(0.2) {
+        canvas.tint(Vec3::splat(random.uniform(0.5, 1.3)));
     }
 }
 
 /// Adds patches of dust, moss or soot.
 fn dirt(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
-    let color = color_among(random, &[(EARTHS, 4.), (GREYS, 2.), (GREENS, 1.)]) * random.between(0.2, 1.);
+    let color =
+        random_color_of_themes(random, &[(EARTHS, 4.), (GRAYS, 2.), (GREENS, 1.)]) * random.uniform(0.2, 1.);
     let cells = random.one_of(&[[2, 2], [3, 3], [5, 5], [8, 2]]);
-    let gain = random.between(0.5, 0.85);
+    let gain = random.uniform(0.5, 0.85);
     let patches = fractal(random, SIZE, cells, 6, gain);
-    let (level, most) = (random.between(-0.3, 0.9), random.between(0.1, 0.6));
-    canvas
-        .change_by(&patches, |pixel, value| pixel.lerp(color, most * smoothstep(level, level + 0.9, value)));
+    let (level, most) = (random.uniform(-0.3, 0.9), random.uniform(0.1, 0.6));
+    canvas.map_with_field(&patches, |pixel, value| {
+        pixel.lerp(color, most * smoothstep(level, level + 0.9, value))
+    });
 }
 
 /// Adds thin brighter or darker lines.
@@ -162,9 +165,9 @@ fn scratches(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
     let cells = random.count(2, 6);
     let lines = ridged(random, SIZE, [cells; 2], 3, 0.6);
     let patches = smooth(random, SIZE, [4; 2]);
-    let change = if random.happens(0.5) { random.between(0.1, 0.4) } else { -random.between(0.1, 0.5) };
-    let width = random.between(0.05, 0.2);
-    canvas.change(|uv, pixel| {
+    let change = if random.chance(0.5) { random.uniform(0.1, 0.4) } else { -random.uniform(0.1, 0.5) };
+    let width = random.uniform(0.05, 0.2);
+    canvas.map_pixels(|uv, pixel| {
         let strength = smoothstep(1. - width, 1., lines.value(uv)) * patches.value(uv).clamp(0., 1.);
         pixel * (1. + change * strength)
     });

@@ -46,7 +46,7 @@ fn textures_of_all_purposes_are_plausible() {
         // Both the single texel and the texels that it is compared with are rounded to bytes.
         assert!((found - mean).abs().max_element() < 0.006, "{purpose:?}: {found} for {mean}");
         for footprint in [1., 3., f32::INFINITY] {
-            assert_eq!(texture.sample(random.spot() * 9. - 4., footprint), found);
+            assert_eq!(texture.sample(random.point() * 9. - 4., footprint), found);
         }
     }
 }
@@ -56,7 +56,7 @@ fn samples_are_periodic_and_continuous_in_footprint() {
     let texture = Texture::draw(&mut ChaCha8Rng::seed_from_u64(8), Purpose::Floor);
     let mut random = ChaCha8Rng::seed_from_u64(9);
     for _ in 0..100 {
-        let uv = random.spot();
+        let uv = random.point();
         let here = texture.sample(uv, 0.01);
         assert!((texture.sample(uv + Vec2::new(2., -3.), 0.01) - here).abs().max_element() < 1e-3);
         assert!((texture.sample(uv, 0.0101) - here).abs().max_element() < 0.01);
@@ -74,7 +74,7 @@ fn pictures_are_mirrored_at_their_edges() {
             assert!((mirrored - here).abs().max_element() < 0.01);
         }
         // The middle 200 columns, repeated twice per unit because of the mirror image.
-        let expected = palette::linear_of_byte((50. + 400. * u) as u8);
+        let expected = palette::srgb_byte_to_linear((50. + 400. * u) as u8);
         assert!((here.x - expected.max(0.02)).abs() < 0.02, "{} for {expected}", here.x);
     }
 }
