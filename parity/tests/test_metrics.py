@@ -5,8 +5,8 @@ import os
 
 import numpy as np
 import pytest
+from command_line import succeed
 from PIL import Image
-from program import succeed
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 SIZES = [(11, 11), (48, 37), (64, 96)]

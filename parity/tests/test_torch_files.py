@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from program import make_rooms, refuse, run, succeed
+from command_line import make_rooms, refuse, run, succeed
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
