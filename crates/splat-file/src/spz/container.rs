@@ -103,12 +103,7 @@ pub fn read(path: &Path, bytes: &[u8]) -> Result<(Description, Streams)> {
     match recognizes(bytes) {
         true if bytes.starts_with(&MAGIC) => read_plain(path, bytes),
         true => read_gzip(path, bytes),
-        false => Err(Error::input(
-            path,
-            "the file",
-            "not an SPZ",
-            "a file that starts with gzip's magic number or NGSP",
-        )),
+        false => Err(Error::input(path, "the file", "no SPZ", "one in gzip, or NGSP")),
     }
 }
 
