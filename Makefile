@@ -86,7 +86,7 @@ check-tests:
 SELF_TEST ?= 0/8
 parity: build
 	$(CARGO) build $(ALL) --example make_rooms
-	.venv/bin/python -m pytest -q parity
+	.venv/bin/python -m pytest -q -n 2 parity
 	.venv/bin/python -m parity --self-test $(SELF_TEST)
 	.venv/bin/python -m parity --only '[pr][ra]*_float32,photometric,ssim,depth_smoothness' --cuda-on-cpu 1 --self-test $(SELF_TEST)
 
