@@ -126,9 +126,10 @@ pub fn reconstruct<'a>(
     let start = Instant::now();
     let (poses, target_poses) = normalization.c2w.split_at(photos.len());
     let depths = data.depths.then(|| depths_of(photos, poses, data.image_size));
-    let mut gaussians = run_model(model, photos, poses, depths.as_ref())?;
+    let depths = depths.map(|depths| depths.unsqueeze(0).to_device(model.device));
+    let batch = ViewBatch { depths, ..view_batch(photos, poses, model.device) };
+    let mut gaussians = run_model(model, &batch)?;
     if data.color_steps > 0 {
-        let batch = view_batch(photos, poses, model.device);
         gaussians = fit_colors(&gaussians, &batch, data.color_steps)?;
     }
     // The results are written to files later. This copy waits for a GPU.
@@ -150,13 +151,10 @@ fn depths_of(photos: &[View], poses: &[DMat4], size: ImageSize) -> Tensor {
     if depths.size()[2..] == size { depths } else { depths.upsample_bilinear2d(size, false, None, None) }
 }
 
-/// Runs the model on its device over `photos` with `poses` in a normalized world. `depths` [V, 2, H, W] are those of [`pixel_depths`], in
-/// units of the normalized world.
-fn run_model(model: Model, photos: &[View], poses: &[DMat4], depths: Option<&Tensor>) -> Result<Gaussians> {
-    let Model { network, config, stage, device } = model;
-    let depths = depths.map(|depths| depths.unsqueeze(0).to_device(device));
-    let batch = ViewBatch { depths, ..view_batch(photos, poses, device) };
-    let input = batch.model_input();
+/// Runs the model over `views`, which are on its device and in a normalized world.
+fn run_model(model: Model, views: &ViewBatch) -> Result<Gaussians> {
+    let Model { network, config, stage, .. } = model;
+    let input = views.model_input();
     config.model.check_image(input.images.size()[3], input.images.size()[4])?;
     Ok(tch::no_grad(|| network.forward(&input, stage)).gaussians)
 }

@@ -137,11 +137,6 @@ impl SmallPhoto {
         }
     }
 
-    /// Returns the camera's position.
-    pub fn center(&self) -> DVec3 {
-        self.camera.c2w.w_axis.truncate()
-    }
-
     /// Returns height and width.
     pub fn size(&self) -> [i64; 2] {
         [i64::from(self.camera.height), i64::from(self.camera.width)]

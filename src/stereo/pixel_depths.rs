@@ -69,15 +69,15 @@ const LEAST_DEPTH: f64 = 1e-6;
 
 /// Depths of a photo.
 struct MatchedDepths<'a> {
-    pub photo: &'a SmallPhoto,
+    photo: &'a SmallPhoto,
     /// Inverse depth of each pixel, [h, w].
-    pub inverse: Tensor,
+    inverse: Tensor,
     /// How sure each is by itself, in [0, 1], [h, w].
-    pub confidence: Tensor,
+    confidence: Tensor,
     /// Inverse depth between two planes of the search.
-    pub step: f64,
+    step: f64,
     /// `false` if there was no photo to compare with.
-    pub is_measured: bool,
+    is_measured: bool,
 }
 
 /// Returns the fraction of the other photos that agree on each pixel's depth, of those that show its point, [h, w]. Photos that are

@@ -3,7 +3,7 @@
 
 use super::depth_search::{ComparedPhoto, Search, SmallPhoto};
 use super::view_selection::{
-    are_near_duplicates, at_octaves, extent, farthest_first, neighbours, projection,
+    are_near_duplicates, at_octaves, distance, extent, farthest_first, neighbours, projection,
 };
 use crate::scene::Camera;
 use globalsplat_capture::Point;
@@ -205,7 +205,7 @@ fn typical_depth(depths: &[f64], extent: f64) -> f64 {
 
 /// Returns the inverse depth of the nearest plane, chosen so that its pixels move by `LARGEST_MOVE` in the nearest photo.
 fn nearest_of_cameras(this: &SmallPhoto, other: &SmallPhoto) -> f64 {
-    let baseline = other.center().distance(this.center());
+    let baseline = distance(&other.camera, &this.camera);
     LARGEST_MOVE * f64::from(this.camera.width) / (this.camera.intrinsics.fx * baseline)
 }
 

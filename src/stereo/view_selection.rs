@@ -178,7 +178,8 @@ fn axis(camera: &Camera) -> DVec3 {
     camera.c2w.z_axis.truncate()
 }
 
-fn distance(a: &Camera, b: &Camera) -> f64 {
+/// Returns the distance between two cameras' positions.
+pub fn distance(a: &Camera, b: &Camera) -> f64 {
     center(a).distance(center(b))
 }
 

@@ -131,14 +131,18 @@ fn run_steps(
 /// folder of photos may contain the capture, which would then be found among the photos. If `is_new`, the folder `out` may only contain
 /// hidden files and these photos, or what a call left that was killed before it had recorded the frames of a video.
 fn check_output(photos: &Path, out: &Path, is_video: bool, is_new: bool) -> Result<()> {
-    let canonical = photos.canonicalize();
-    if !is_video {
-        let photos_folder = photos.canonicalize().map_err(Error::read(photos))?;
+    let canonical = match photos.canonicalize() {
+        Ok(folder) => Some(folder),
+        // The frames of a video are written later.
+        Err(_) if is_video => None,
+        Err(error) => return Err(Error::read(photos)(error)),
+    };
+    if let Some(photos_folder) = canonical.as_ref().filter(|_| !is_video) {
         let existing = out.ancestors().find_map(|folder| {
             let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
             folder.canonicalize().ok()
         });
-        if existing.is_some_and(|out| out.starts_with(&photos_folder)) {
+        if existing.is_some_and(|out| out.starts_with(photos_folder)) {
             let expected = format!("a folder outside of {}", photos.display());
             return Err(Error::input(out, "the output", "inside the folder of photos", expected));
         }
@@ -147,7 +151,7 @@ fn check_output(photos: &Path, out: &Path, is_video: bool, is_new: bool) -> Resu
     let starts_with =
         |entry: &DirEntry, start: &str| entry.file_name().as_encoded_bytes().starts_with(start.as_bytes());
     let are_photos = |folder: &Path| {
-        folder.canonicalize().is_ok_and(|folder| canonical.as_ref().is_ok_and(|photos| *photos == folder))
+        folder.canonicalize().is_ok_and(|folder| canonical.as_ref() == Some(&folder))
             && (!is_video || entries(folder).all(|frame| starts_with(&frame, "frame_")))
     };
     let other = entries(out).find(|entry| !starts_with(entry, ".") && !are_photos(&entry.path()));

@@ -6,7 +6,8 @@
 use crate::invalid::{Contents, InvalidGaussians};
 use crate::numbers::Scalar;
 use crate::ply_table::{Header, Kind};
-use crate::{Error, MIN_SCALE, OPACITY_MARGIN, Result, SH_C0, Splat, WriteOptions};
+use crate::splat::color_to_sh0;
+use crate::{Error, MIN_SCALE, OPACITY_MARGIN, Result, Splat, WriteOptions};
 use globalsplat_files::write_atomically;
 use std::path::Path;
 
@@ -88,7 +89,7 @@ fn harmonics_from_colors(kind: Kind, width: usize, values: &mut [f32]) {
         _ => 1.,
     };
     for color in values.chunks_exact_mut(width).flat_map(|vertex| &mut vertex[3..6]) {
-        *color = ((f64::from(*color) / white - 0.5) / SH_C0) as f32;
+        *color = color_to_sh0(f64::from(*color) / white);
     }
 }
 

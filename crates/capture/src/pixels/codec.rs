@@ -6,8 +6,7 @@ use globalsplat_files::{Error, Result, panic_message};
 use image::codecs::jpeg::JpegEncoder;
 use image::metadata::Orientation;
 use image::{
-    ColorType, DynamicImage, GrayImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Limits, Luma,
-    Rgb, RgbImage,
+    ColorType, DynamicImage, GrayImage, ImageDecoder, ImageFormat, ImageReader, Limits, Luma, Rgb, RgbImage,
 };
 use std::any::Any;
 use std::fs::File;
@@ -81,16 +80,16 @@ pub fn decode_photo(encoded: &[u8], file: &Path, size: (u32, u32)) -> Result<Dec
     // Unreadable EXIF data isn't an error, because the pixels may still be usable.
     let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
     let (is_jpeg, is_png) = (format == Some(ImageFormat::Jpeg), format == Some(ImageFormat::Png));
-    let refuse = |why| Error::input(file, "the image", format!("undecodable ({why})"), SUPPORTED_IMAGES);
     // The decoders of some rare formats panic.
     let image = panic::catch_unwind(AssertUnwindSafe(|| match is_jpeg {
-        true => decode_jpeg(encoded).map_err(refuse),
+        true => decode_jpeg(encoded).map_err(undecodable(file)),
         false => {
             let has_rgb = is_png && encoded.get(PNG_COLOR_TYPE) == Some(&PNG_RGB);
             DynamicImage::from_decoder(decoder).map(|image| (image, has_rgb)).map_err(undecodable(file))
         }
     }));
-    let panicked = |why: Box<dyn Any + Send>| refuse(format!("the decoder failed: {}", panic_message(&*why)));
+    let panicked =
+        |why: Box<dyn Any + Send>| undecodable(file)(format!("the decoder failed: {}", panic_message(&*why)));
     let (mut image, has_rgb) = image.map_err(panicked)??;
     let stored = (image.width(), image.height());
     let turned = match orientation {
@@ -182,7 +181,7 @@ const PNG_COLOR_TYPE: usize = 25;
 /// Color type of red, green and blue, without a palette.
 const PNG_RGB: u8 = 2;
 
-fn undecodable(path: &Path) -> impl FnOnce(ImageError) -> Error {
+fn undecodable<E: std::fmt::Display>(path: &Path) -> impl FnOnce(E) -> Error {
     move |e| Error::input(path, "the image", format!("undecodable ({e})"), SUPPORTED_IMAGES)
 }
 
