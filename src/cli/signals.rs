@@ -9,20 +9,18 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 /// Message if the user stops the program before there is a splat.
 const NOTHING_YET: &str = "stopped before there was a splat: nothing is written";
 
-/// Number of requests to stop so far, and of the request that ends the process immediately. Both are the process's, as signals are.
+/// Number of requests to stop so far, and of the request that ends the process immediately, at first none. Both are the process's, as
+/// signals are.
 static REQUESTS: AtomicUsize = AtomicUsize::new(0);
-static LAST_REQUEST: AtomicUsize = AtomicUsize::new(NEVER);
-
-/// Never end the process immediately.
-pub const NEVER: usize = usize::MAX;
+static LAST_REQUEST: AtomicUsize = AtomicUsize::new(usize::MAX);
 
 /// Returns `true` once the user or the system has asked the program to stop.
 pub fn is_stop_requested() -> bool {
     REQUESTS.load(Ordering::Relaxed) > 0
 }
 
-/// Makes the request to stop with this `number` end the process immediately: 1 as long as there is nothing to keep, 2 if the work ends by
-/// itself after the first, or [`NEVER`]. Files are written whole or not at all.
+/// Makes the request to stop with this `number` end the process immediately: 1 as long as there is nothing to keep, or 2 if the work ends
+/// by itself after the first. Files are written whole or not at all.
 pub fn end_at_request(number: usize) {
     LAST_REQUEST.store(number, Ordering::Relaxed);
 }

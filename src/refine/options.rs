@@ -108,7 +108,7 @@ pub struct RefineOptions {
     #[cfg_attr(feature = "cli", arg(skip))]
     pub started: Option<Instant>,
     /// Device of the depth estimation and the optimization.
-    #[serde(skip, default = "cpu")]
+    #[serde(skip)]
     #[cfg_attr(feature = "cli", arg(skip = Device::Cpu))]
     pub device: Device,
 }
@@ -152,10 +152,6 @@ impl MaskBackground {
             MaskBackground::Random => random.random(),
         }
     }
-}
-
-fn cpu() -> Device {
-    Device::Cpu
 }
 
 /// Parses a number of Gaussians; `None` stands for `auto`.

@@ -63,6 +63,11 @@ pub fn succeed(arguments: &[&str]) -> String {
     out.into_owned()
 }
 
+/// Runs the program and returns the JSON that it prints.
+pub fn run_json(arguments: &[&str]) -> Value {
+    serde_json::from_str(&succeed(arguments)).expect("JSON")
+}
+
 /// Returns the one-sentence error of a run that must be refused with exit code 2.
 pub fn refuse(arguments: &[&str]) -> String {
     fail(arguments, 2)
@@ -240,9 +245,15 @@ impl Sandbox {
     /// Returns the standard output of a process that must succeed.
     #[track_caller]
     pub fn succeed(&self, line: &str) -> String {
+        self.succeed_with_messages(line).0
+    }
+
+    /// Returns the standard output and the standard error of a process that must succeed.
+    #[track_caller]
+    pub fn succeed_with_messages(&self, line: &str) -> (String, String) {
         let (code, out, err) = self.output(line);
         assert_eq!(code, Some(0), "{line}: {err}");
-        out
+        (out, err)
     }
 
     /// Returns the one JSON object that a process prints with `--json`.
@@ -285,6 +296,11 @@ fn contents(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
         }
     }
     files
+}
+
+/// Returns the number at the JSON pointer `path`.
+pub fn number(value: &Value, path: &str) -> f64 {
+    value.pointer(path).and_then(Value::as_f64).unwrap_or_else(|| panic!("{path} in {value}"))
 }
 
 /// Asserts that `message` contains each of `parts`.

@@ -33,14 +33,6 @@ fn dataset() -> Sandbox {
 const SPLATS: &str = "eval --splat @splats --render-height 64 --index @re10k_3v.json --out @out --data";
 const MODEL: &str = "eval --weights @tiny.safetensors --index @re10k_3v.json --data";
 
-/// Runs an evaluation that must succeed, and returns its standard output and error.
-#[track_caller]
-fn run(sandbox: &Sandbox, line: &str) -> (String, String) {
-    let (code, out, err) = sandbox.output(line);
-    assert_eq!(code, Some(0), "{line}: {err}");
-    (out, err)
-}
-
 fn read(sandbox: &Sandbox, folder: &str) -> Evaluation {
     read_evaluation(&sandbox.path(folder)).unwrap()
 }
@@ -49,7 +41,7 @@ fn read(sandbox: &Sandbox, folder: &str) -> Evaluation {
 fn splats_are_scored_by_an_index_from_chunks_and_captures_alike() {
     let sandbox = dataset();
     for data in ["chunks", "captures"] {
-        let (out, err) = run(&sandbox, &format!("{SPLATS} @{data}"));
+        let (out, err) = sandbox.succeed_with_messages(&format!("{SPLATS} @{data}"));
         assert_says(&out, &["2 of 3 scenes", "LPIPS-VGG absent"]);
         assert_says(&err, &["left out: lpips_vgg and lpips_alex", "make weights"]);
         let evaluation = read(&sandbox, "out");
@@ -74,7 +66,7 @@ fn splats_are_scored_by_an_index_from_chunks_and_captures_alike() {
 fn an_interrupted_evaluation_resumes() {
     let sandbox = dataset();
     let eval = format!("{MODEL} @chunks --precision f32 --out @out");
-    run(&sandbox, &eval);
+    sandbox.succeed(&eval);
     let first = read(&sandbox, "out");
     let efficiency = first.efficiency.expect("a model's cost");
     assert_eq!(efficiency.timed_scenes, 1, "the first scene warms up");
@@ -84,7 +76,7 @@ fn an_interrupted_evaluation_resumes() {
     // One scene's scores are incomplete, as if it hadn't been done yet; those of the other are reused unchecked.
     sandbox.change_json("out/scenes/room_000.json", |scores| scores["psnr"] = json!(99.5));
     sandbox.write("out/scenes/room_002.json", "{\"scene\": \"room_002\", \"psn");
-    run(&sandbox, &eval);
+    sandbox.succeed(&eval);
     let second = read(&sandbox, "out");
     assert_eq!(second.scenes[0].scores.mean.psnr, 99.5);
     assert_eq!(second.scenes[1].scores.mean.psnr, first.scenes[1].scores.mean.psnr);
@@ -94,7 +86,7 @@ fn an_interrupted_evaluation_resumes() {
     for line in [format!("{SPLATS} @chunks"), format!("{half} --out @out")] {
         assert_says(&sandbox.refuse(&line), &["evaluation.json: the evaluation is of tiny.safetensors"]);
     }
-    run(&sandbox, &format!("{half} --out @half"));
+    sandbox.succeed(&format!("{half} --out @half"));
     let half = read(&sandbox, "half");
     assert_eq!(half.method, "tiny bf16");
     let [ours, theirs] = [&half, &first].map(|evaluation| evaluation.scenes[1].scores.mean.psnr);
@@ -124,7 +116,7 @@ fn changes_of_same_size_and_time_are_scored_again() {
     let photo = "captures/room_000/images/001.png";
     sandbox.write(photo, [sandbox.read(photo), vec![0; 1 << 20]].concat());
     let psnr = || {
-        run(&sandbox, &format!("{SPLATS} @captures"));
+        sandbox.succeed(&format!("{SPLATS} @captures"));
         let scenes = read(&sandbox, "out").scenes;
         <[f64; 2]>::try_from(scenes.iter().map(|scene| scene.scores.mean.psnr).collect::<Vec<_>>()).unwrap()
     };
@@ -205,8 +197,8 @@ fn photos_are_scored_one_at_a_time() {
         "w": width, "h": height, "fl_x": 1300., "fl_y": 1300., "cx": 816., "cy": 612., "frames": frames,
     });
     sandbox.write("transforms.json", capture.to_string());
-    let (out, err) =
-        run(&sandbox, "eval --splat @room/truth.ply --contact-sheet @sheet.png --scene @ --json");
+    let (out, err) = sandbox
+        .succeed_with_messages("eval --splat @room/truth.ply --contact-sheet @sheet.png --scene @ --json");
     let scores: Value = serde_json::from_str(&out).unwrap();
     assert_eq!(scores["views"].as_array().unwrap().len() as u64, PHOTOS);
     assert_says(&err, &["sheet.png: pictures are shrunk to 1/2"]);
@@ -239,7 +231,7 @@ fn several_indices_make_one_report() {
     let index = json!({"room_001": {"context": [0, 4], "target": [2]}}).to_string();
     ["acid_2v.json", "other/acid_2v.json"].iter().for_each(|name| sandbox.write(name, &index));
     let eval = format!("{SPLATS} @chunks --index @acid_2v.json");
-    run(&sandbox, &eval);
+    sandbox.succeed(&eval);
     assert_says(&sandbox.text("out/report.html"), &["room_001", "room_002"]);
     assert_eq!(read(&sandbox, "out/acid_2v").dataset, "acid");
     let error = sandbox.refuse(&format!("{eval} --index @other/acid_2v.json"));
@@ -251,7 +243,7 @@ fn several_indices_make_one_report() {
     let error = sandbox.refuse(&format!("{eval} @chunks"));
     assert_says(&error, &["acid_from_re10k_2v.json: ", "acid or re10k", "--dataset"]);
     assert!(!sandbox.path("named").exists(), "nothing was begun");
-    run(&sandbox, &format!("{eval} @chunks --dataset ACID"));
+    sandbox.succeed(&format!("{eval} @chunks --dataset ACID"));
     assert_eq!(read(&sandbox, "named").dataset, "acid");
 }
 
@@ -316,7 +308,7 @@ fn a_scene_that_fails_is_named_and_the_first_of_the_others_warms_up() {
 
     // Once the photo is repaired, the same command does the rest.
     sandbox.write(photo, bytes);
-    run(&sandbox, &eval);
+    sandbox.succeed(&eval);
     let evaluation = read(&sandbox, "out");
     assert_eq!((evaluation.scenes.len(), evaluation.failures.len()), (3, 0));
 }

@@ -4,7 +4,7 @@
 mod pickles;
 
 use crate::common::formats::{HEIGHT, WIDTH, assert_same_cameras, cameras, names, transforms};
-use crate::common::program::{arg, refuse, succeed};
+use crate::common::program::{arg, refuse, run_json};
 use crate::common::room::write_room;
 use globalsplat::data::{Chunk, ChunkWriter, Dataset, Split, open_capture};
 use image::RgbImage;
@@ -150,8 +150,7 @@ fn pack_and_inspect_report_their_results() {
     let folder = tempfile::tempdir().unwrap();
     write_room(&folder.path().join("room"), 1, 3, [24, 24].into()).unwrap();
     let (room, out) = (folder.path().join("room"), folder.path().join("out"));
-    let report: Value =
-        serde_json::from_str(&succeed(&["pack", arg(&room), "--out", arg(&out), "--json"])).unwrap();
+    let report = run_json(&["pack", arg(&room), "--out", arg(&out), "--json"]);
     assert_eq!(
         (report["scenes"].as_u64(), report["views"].as_u64(), report["chunks"].as_u64()),
         (Some(1), Some(3), Some(1))
@@ -159,7 +158,7 @@ fn pack_and_inspect_report_their_results() {
     let chunk = out.join("000000.torch");
     for (path, kind, field, count) in [(&chunk, "chunk", "/views/room", 3), (&out, "data set", "/scenes", 1)]
     {
-        let report: Value = serde_json::from_str(&succeed(&["inspect", arg(path), "--json"])).unwrap();
+        let report = run_json(&["inspect", arg(path), "--json"]);
         let found = (report["kind"].as_str(), report.pointer(field).and_then(Value::as_u64));
         assert_eq!(found, (Some(kind), Some(count)));
     }
@@ -410,7 +409,7 @@ fn a_scene_is_opened_whatever_signs_its_key_has() {
     for name in names {
         let named = format!("{}#{name}", chunks.join("000000.torch").display());
         assert_eq!(open_capture(Path::new(&named)).unwrap().name, name);
-        let report: Value = serde_json::from_str(&succeed(&["inspect", &named, "--json"])).unwrap();
+        let report = run_json(&["inspect", &named, "--json"]);
         assert_eq!((report["kind"].as_str(), report["name"].as_str()), (Some("capture"), Some(name)));
     }
 }

@@ -4,7 +4,7 @@
 #[path = "../../crates/splat-file/tests/splats/common.rs"]
 mod splat_files;
 
-use crate::common::program::{arg, refuse, room, succeed};
+use crate::common::program::{arg, refuse, room, run_json, succeed};
 use globalsplat::io::{ShLimits, fit_splat, read_splat, write_splat};
 use globalsplat::scene::{Gaussians, RawGaussians};
 use serde_json::Value;
@@ -86,8 +86,7 @@ fn convert_edits_in_the_given_order() {
     let original = room.join("truth.ply");
     let to = folder.path().join("edited.ply");
     let convert = |options: &[&str]| -> Value {
-        serde_json::from_str(&succeed(&[&["convert", arg(&original), arg(&to), "--json"], options].concat()))
-            .unwrap()
+        run_json(&[&["convert", arg(&original), arg(&to), "--json"], options].concat())
     };
     let counts = |report: &Value| -> Vec<u64> {
         report["edits"].as_array().unwrap().iter().map(|edit| edit["gaussians"].as_u64().unwrap()).collect()

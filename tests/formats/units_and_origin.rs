@@ -1,7 +1,7 @@
 //! Units and origins of captures don't matter: renders are the same in millimetres and kilometres, at the origin and in UTM
 //! coordinates, and bit-identical if the unit changes by a power of two (spec 2.5).
 
-use crate::common::program::{arg, globalsplat, refuse, room, succeed};
+use crate::common::program::{arg, globalsplat, refuse, room, run_json, succeed};
 use crate::common::{captures, has_viewer};
 use glam::{DMat3, DMat4, DVec3};
 use globalsplat::data::{open_capture, write_cameras_json};
@@ -47,11 +47,6 @@ fn write_moved(from: &Path, folder: &Path, to: &Similarity) {
 fn moved_splat(splat: &Splat, to: &Similarity) -> Splat {
     let about_origin = Similarity { translation: DVec3::ZERO, ..*to };
     transform(&Gaussians::from_splat(splat), &about_origin).to_splat(to.translation).unwrap()
-}
-
-/// Runs the program and returns the JSON that it prints.
-fn run_json(arguments: &[&str]) -> Value {
-    serde_json::from_str(&succeed(arguments)).expect("JSON")
 }
 
 /// Returns the minimum PSNR of the PNGs of folder `a` compared with those of `b`.

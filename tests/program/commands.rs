@@ -1,12 +1,8 @@
 //! Every command, run as a user runs it.
 
-use crate::common::program::{Sandbox, TINY_CONFIG, WAIT_PASSIVELY, assert_says, rooms};
+use crate::common::program::{Sandbox, TINY_CONFIG, WAIT_PASSIVELY, assert_says, number, rooms};
 use crate::common::{has_lpips, skip};
 use serde_json::{Value, json};
-
-fn number(value: &Value, path: &str) -> f64 {
-    value.pointer(path).and_then(Value::as_f64).unwrap_or_else(|| panic!("{path} in {value}"))
-}
 
 /// Returns the names of a report's sections, all of which take time.
 fn names(sections: &Value) -> Vec<&str> {
