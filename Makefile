@@ -30,7 +30,7 @@ poses:
 ALL := --release --locked --workspace
 
 build: setup
-	@scripts/heartbeat.sh building $(CARGO) build $(ALL)
+	$(CARGO) build $(ALL)
 
 # Reconstructs a splat from photos, refines it, and writes an interactive viewer page: at most 3 minutes once the program is built.
 demo: build
@@ -158,8 +158,8 @@ book:
 	mdbook build docs --dest-dir $(CURDIR)/target/book
 
 docker:
-	docker build -f docker/cpu.Dockerfile -t globalsplat:cpu .
-	docker build -f docker/cuda.Dockerfile -t globalsplat:cuda .
+	docker build -f docker/Dockerfile -t globalsplat:cpu .
+	docker build -f docker/Dockerfile --build-arg KIND=cuda -t globalsplat:cuda .
 
 clean:
 	$(CARGO) clean

@@ -1,27 +1,21 @@
 #!/usr/bin/env python3
 """Compares the full model with its ablations and additions, and with bf16, with equal small budgets and several seeds.
 
-Prints mean ± standard deviation.
-
     .venv/bin/python scripts/ablations.py [--out OUT] [--seeds 3] [--only VARIANT ...]
 
 Renders four synthetic scenes, and trains each variant on two thirds of every video's frames; the held-out third scores
 it. The model is that of configs/tiny.toml, with larger patches, fewer scene tokens and the paper's consistency loss.
-Runs are in OUT (by default runs/ablations), as many in parallel as there are cores. Prints a Markdown table of the
-scores. The same command resumes where it was stopped, and does not repeat completed runs. After a
-change to configs/tiny.toml, or to the settings, variants or scenes in this file, OUT must be another folder.
+Prints a Markdown table of mean scores ± standard deviation. Runs are in OUT, as many in parallel as there are cores. The
+same command resumes where it was stopped.
 """
 
 import argparse
-import json
 import os
 import statistics
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from program import PROGRAM, REPOSITORY, row
+from program import REPOSITORY, digest, row, run_once, with_deviation
 
 CONFIG = REPOSITORY / "configs/tiny.toml"
 # Settings of all variants. Small patches, many scene tokens and Muon only suit weights trained with large patches and
@@ -67,29 +61,16 @@ VARIANTS = {
 }
 
 
-def train(run, settings, scenes):
-    """Trains a run on one core and returns its JSON result, cached in `result.json`."""
-    result = run / "result.json"
-    if not result.is_file():
-        command = [PROGRAM, "train", "--config", CONFIG, "--out", run, "--json"]
-        command += [argument for setting in settings for argument in ("--set", setting)]
-        environment = dict(os.environ, OMP_NUM_THREADS="1", GLOBALSPLAT_WORLDS=str(scenes))
-        output = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True).stdout
-        partial = result.with_suffix(".partial")
-        partial.write_bytes(output)
-        partial.rename(result)
-    return json.loads(result.read_text())
-
-
-def run_folder(out, name, seed):
-    return out / f"{name.replace(' ', '_').replace(',', '')}_{seed}"
-
-
-def format_recipe():
-    """Returns the text that determines every result: the configuration, with the other settings as comments."""
-    variants = [f"{name}: {settings}" for name, settings in VARIANTS.items()]
-    lines = [*SETTINGS, *variants, f"synth {' '.join(SYNTH_OPTIONS)}"]
-    return CONFIG.read_text() + "".join(f"# {line}\n" for line in lines)
+def train(out, scenes, name, seed):
+    """Trains a variant on one core and returns the result, in a folder whose name depends on all settings."""
+    settings = [*SETTINGS, *VARIANTS[name], f"train.seed={seed}"]
+    identity = digest(CONFIG.read_text(), SYNTH_OPTIONS, settings)
+    folder = out / f"{name.replace(' ', '_').replace(',', '')}_{seed}_{identity}"
+    folder.mkdir(exist_ok=True)
+    command = ["train", "--config", CONFIG, "--out", folder]
+    command += [argument for setting in settings for argument in ("--set", setting)]
+    environment = dict(os.environ, OMP_NUM_THREADS="1", GLOBALSPLAT_WORLDS=str(scenes))
+    return run_once(folder / "result.json", *command, env=environment)
 
 
 def main():
@@ -98,35 +79,25 @@ def main():
     parser.add_argument("--seeds", type=int, default=3, help="runs of each variant")
     parser.add_argument("--only", nargs="+", choices=VARIANTS, default=list(VARIANTS), metavar="VARIANT")
     arguments = parser.parse_args()
-    out, seeds = arguments.out.absolute(), arguments.seeds
+    out = arguments.out.absolute()
     out.mkdir(parents=True, exist_ok=True)
-    recipe, saved_recipe = format_recipe(), out / "recipe.toml"
-    if saved_recipe.exists() and saved_recipe.read_text() != recipe:
-        sys.exit(f"{saved_recipe} differs from the current recipe: choose another OUT")
-    saved_recipe.write_text(recipe)
-    scenes = out / "scenes"
-    if not (scenes / "evaluation_index.json").is_file():
-        subprocess.run([PROGRAM, "synth", "--out", scenes, *SYNTH_OPTIONS], check=True, stdout=sys.stderr)
+    scenes = out / f"scenes_{digest(SYNTH_OPTIONS)}"
+    run_once(scenes.with_suffix(".json"), "synth", "--out", scenes, *SYNTH_OPTIONS)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-
-        def run(name, seed):
-            return train(run_folder(out, name, seed), [*SETTINGS, *VARIANTS[name], f"train.seed={seed}"], scenes)
-
-        results = {name: [pool.submit(run, name, seed) for seed in range(seeds)] for name in arguments.only}
+        seeds = range(arguments.seeds)
+        results = {name: [pool.submit(train, out, scenes, name, seed) for seed in seeds] for name in arguments.only}
         row("variant", "held-out PSNR, dB", "SSIM")
         row(*["---"] * 3)
         for name in arguments.only:
             try:
-                runs = [result.result() for result in results[name]]
+                held_out = [result.result()["held_out"] for result in results[name]]
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
-            psnr, ssim = ([run["held_out"][key] for run in runs] for key in ("psnr", "ssim"))
-            spread = f"{statistics.mean(psnr):.2f} ± {statistics.stdev(psnr):.2f}" if seeds > 1 else f"{psnr[0]:.2f}"
-            row(name, spread, f"{statistics.mean(ssim):.4f}")
+            psnr, ssim = ([scores[key] for scores in held_out] for key in ("psnr", "ssim"))
+            row(name, with_deviation(psnr), f"{statistics.mean(ssim):.4f}")
     # All runs have the same values, because the baseline depends on the photos alone.
-    held_out = runs[0]["held_out"]
-    psnr, ssim = held_out["nearest_photo_psnr"], held_out["nearest_photo_ssim"]
+    psnr, ssim = held_out[0]["nearest_photo_psnr"], held_out[0]["nearest_photo_ssim"]
     row("nearest context photo (baseline)", f"{psnr:.2f}", f"{ssim:.4f}")
 
 

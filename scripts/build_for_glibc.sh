@@ -7,11 +7,11 @@ cd "$(dirname "$0")/.."
 target="${CARGO_TARGET_DIR:-target}"
 build=("${CARGO:-cargo}" build --release --locked --workspace)
 
-scripts/heartbeat.sh building "${build[@]}"
+"${build[@]}"
 mkdir -p "$target/linker"
 printf '#!/bin/sh\nCC="%s" exec "%s" "$@"\n' "$(command -v cc)" "$PWD/scripts/link_for_glibc.sh" >"$target/linker/cc"
 chmod +x "$target/linker/cc"
 scripts/link_for_glibc.sh --check "$target/release/globalsplat" 2>/dev/null && exit # already linked so
 find "$target/release/deps" -samefile "$target/release/globalsplat" -delete
-PATH="$(realpath "$target")/linker:$PATH" scripts/heartbeat.sh linking "${build[@]}"
+PATH="$(realpath "$target")/linker:$PATH" "${build[@]}"
 scripts/link_for_glibc.sh --check "$target/release/globalsplat"

@@ -10,75 +10,60 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 repository=$PWD
+
+as_ordinary() {
+    local other_user=()
+    [ "$(id -u)" -ne 0 ] || other_user=(setpriv --reuid=65534 --regid=65534 --clear-groups)
+    cd "$CLONE"
+    umask 077
+    # A locale whose letters and numbers differ most from English, if it is installed.
+    exec env -u HOME -u TERM -u XDG_CACHE_HOME LC_ALL="$(locale -a 2>/dev/null | grep -im1 '^tr_TR' || echo C)" TZ=Pacific/Kiritimati \
+        NO_COLOR=1 TMPDIR="$CLONE/../tmp" GLOBALSPLAT_SIMD=avx2 "${other_user[@]}" "$@" <&-
+}
+
+as_small() {
+    local core
+    core="$(taskset -cp $$ | sed -E 's/.*[ ,-]([0-9]+)$/\1/')"
+    GLOBALSPLAT_SIMD=portable OMP_NUM_THREADS=1 exec taskset -c "$core" "$@"
+}
+
+# Cargo runs this script in place of each test binary.
+if [ "${1:-}" = --as ]; then
+    "as_$2" "${@:3}"
+fi
+
 # `make test` checks that no requirement is missing. Tests whose requirements that user can't access are skipped here, and reported.
 unset GLOBALSPLAT_NO_SKIPS
-
 folder="$(mktemp -d)"
-clone="$folder/a folder/globalsplat"
-export GLOBALSPLAT_SKIPPED="$folder/skipped"
+export CLONE="$folder/a folder/globalsplat" GLOBALSPLAT_SKIPPED="$folder/skipped"
 opened=()
 end() {
     [ ${#opened[@]} -eq 0 ] || chmod o-x "${opened[@]}"
     rm -rf "$folder"
 }
 trap end EXIT
+failed=0
 
-built="$("${CARGO:-cargo}" test --release --locked --workspace --no-run 2>&1)" || {
-    echo "$built" >&2
-    exit 1
-}
-# Paths of the test binaries, those with unit tests first.
-unit_tests="$(sed -nE 's#^ *Executable unittests src/[^ ]+ \((.*)\)$#\1#p' <<<"$built")"
-integration_tests="$(sed -nE 's#^ *Executable tests/[^ ]+ \((.*)\)$#\1#p' <<<"$built")"
-
-failed=()
-# Runs the test binaries $2 with the command $1 and the arguments $3…, and prints the missing requirements of skipped tests.
+# Runs tests as $1: the targets that the array `targets` names, with the arguments $2….
+targets=(--lib --bins --tests)
 run() {
-    local as=$1 binaries=$2 binary
-    shift 2
     : >"$GLOBALSPLAT_SKIPPED"
     chmod a+rw "$GLOBALSPLAT_SKIPPED"
-    for binary in $binaries; do
-        echo "$as: ${binary##*/} $*"
-        "$as" "$(realpath "$binary")" --quiet "$@" </dev/null || failed+=("$as: ${binary##*/}")
-    done
-    [ ! -s "$GLOBALSPLAT_SKIPPED" ] || echo "$as: skipped, missing: $(sort -u "$GLOBALSPLAT_SKIPPED" | paste -sd , | sed 's/,/, /g')"
-}
-
-# A locale whose letters and numbers differ most from English, if it is installed.
-language="$(locale -a 2>/dev/null | grep -im1 '^tr_TR' || echo C)"
-as_ordinary() {
-    local other_user=()
-    [ "$(id -u)" -ne 0 ] || other_user=(setpriv --reuid=65534 --regid=65534 --clear-groups)
-    (
-        cd "$clone"
-        umask 077
-        exec env -u HOME -u TERM -u XDG_CACHE_HOME LC_ALL="$language" TZ=Pacific/Kiritimati NO_COLOR=1 TMPDIR="$folder/a folder/tmp" \
-            GLOBALSPLAT_SIMD=avx2 "${other_user[@]}" "$@" <&-
-    )
-}
-
-as_small() {
-    local core
-    core="$(taskset -cp $$ | sed -E 's/.*[ ,-]([0-9]+)$/\1/')"
-    GLOBALSPLAT_SIMD=portable OMP_NUM_THREADS=1 taskset -c "$core" "$@"
+    "${CARGO:-cargo}" test --release --locked --workspace --no-fail-fast "${targets[@]}" \
+        --config "target.'cfg(unix)'.runner = ['$repository/scripts/other_machines.sh', '--as', '$1']" -- --quiet "${@:2}" || failed=1
+    [ ! -s "$GLOBALSPLAT_SKIPPED" ] || echo "$1: skipped, missing: $(sort -u "$GLOBALSPLAT_SKIPPED" | paste -sd , | sed 's/,/, /g')"
 }
 
 # Copies the files that git tracks, and links what was built and installed.
 make_clone() {
-    local made
-    mkdir -p "$clone" "$folder/a folder/tmp"
-    git ls-files -z | xargs -0 cp --parents -t "$clone"
+    local made above=$repository
+    mkdir -p "$CLONE" "$CLONE/../tmp"
+    git ls-files -z | xargs -0 cp --parents -t "$CLONE"
     for made in target weights .venv web/dist parity/npm/node_modules; do
-        [ ! -e "$made" ] || ln -s "$repository/$made" "$clone/$made"
+        [ ! -e "$made" ] || ln -s "$repository/$made" "$CLONE/$made"
     done
     chmod -R a+rX,go-w "$folder"
-    chmod 1777 "$folder/a folder/tmp"
-}
-
-run_ordinary() {
-    local above=$repository
-    make_clone
+    chmod 1777 "$CLONE/../tmp"
     while [ "$(id -u)" -eq 0 ] && [ "$above" != / ]; do
         if (((8#$(stat -c %a "$above") & 1) == 0)); then
             chmod o+x "$above"
@@ -86,25 +71,30 @@ run_ordinary() {
         fi
         above="$(dirname "$above")"
     done
+}
+
+run_ordinary() {
+    make_clone
     # Tests that need torchrun are skipped if Python is in a folder that user can't access, such as root's home. The check runs Python
     # through `env`, because the first program that setpriv starts can access more than the programs after it.
-    as_ordinary env .venv/bin/python -c '' 2>/dev/null || {
-        echo "as_ordinary: without torchrun, because this user can't run .venv/bin/python"
+    (as_ordinary env .venv/bin/python -c '') 2>/dev/null || {
+        echo "ordinary: without torchrun, because this user can't run .venv/bin/python"
         local -x TORCHRUN=/nonexistent
     }
     if [ $# -gt 0 ]; then
-        run as_ordinary "$unit_tests $integration_tests" "$@"
+        run ordinary "$@"
         return
     fi
     # Slow tests that don't depend on these conditions are left out: output of compilers and other programs, reductions across processes.
-    run as_ordinary "$unit_tests $integration_tests" --skip cuda:: --skip distributed:: --skip viewers::
-    echo "as_ordinary: demo"
-    OUT="$folder/a folder/tmp/demo" CAPTURES=none as_ordinary scripts/demo.sh --dry-run || failed+=("as_ordinary: demo")
+    run ordinary --skip cuda:: --skip distributed:: --skip viewers::
+    (OUT="$CLONE/../tmp/demo" CAPTURES=none as_ordinary scripts/demo.sh --dry-run) || failed=1
 }
 
 run_small() {
-    run as_small "$unit_tests"
-    run as_small "$integration_tests" splat:: model:: refine:: examples::
+    targets=(--lib)
+    run small
+    targets=(--tests)
+    run small splat:: model:: refine:: examples::
 }
 
 case "${1:-all}" in
@@ -118,7 +108,5 @@ all)
     exit 2
     ;;
 esac
-[ ${#failed[@]} -eq 0 ] || {
-    printf 'other_machines: failed: %s\n' "${failed[@]}" >&2
-    exit 1
-}
+[ "$failed" -eq 0 ] || echo "other_machines: tests failed" >&2
+exit "$failed"

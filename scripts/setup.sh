@@ -21,7 +21,7 @@ weights() {
         [ "${1:-}" = --if-possible ] || missing "no Python found, which is needed to download the LPIPS weights"
         return 0
     fi
-    scripts/heartbeat.sh --always weights "$python" scripts/lpips_weights.py "$@"
+    "$python" scripts/lpips_weights.py "$@"
 }
 
 # Makes .venv, unless it is there, and checks the version of the Python that it needs.
@@ -45,8 +45,7 @@ page() {
         return
     fi
     echo "setup: bundling the viewer that web/ pins" >&2
-    if ! { scripts/heartbeat.sh --always "setup: bundling" "${npm_ci[@]}" --prefix web >/dev/null \
-        && npm run --prefix web --silent build; }; then
+    if ! { "${npm_ci[@]}" --prefix web >/dev/null && npm run --prefix web --silent build; }; then
         echo "setup: npm failed; the program is built without the interactive viewer" >&2
     fi
 }
@@ -84,8 +83,7 @@ if ! cmp -s requirements.txt .venv/requirements.txt; then
         trap 'kill "$early" 2>/dev/null || true' EXIT
     fi
     # --no-compile: Python compiles modules when they are first imported.
-    scripts/heartbeat.sh --always "setup: installing" \
-        .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-compile -r requirements.txt \
+    .venv/bin/python -m pip install --disable-pip-version-check --no-compile -r requirements.txt \
         || missing "requirements.txt can't be installed; see pip's message above"
     cp requirements.txt .venv/requirements.txt
 fi
@@ -101,7 +99,7 @@ ln -sfn "$(.venv/bin/python -c 'import importlib.util, os; print(os.path.dirname
 if [ "$(node -p 'process.versions.node.split(".")[0] >= 20' 2>/dev/null)" = true ] && command -v npm >/dev/null \
     && ! cmp -s parity/npm/package-lock.json parity/npm/node_modules/.installed; then
     echo "setup: installing what parity/npm pins" >&2
-    if scripts/heartbeat.sh --always "setup: installing" "${npm_ci[@]}" --prefix parity/npm >/dev/null; then
+    if "${npm_ci[@]}" --prefix parity/npm >/dev/null; then
         cp parity/npm/package-lock.json parity/npm/node_modules/.installed
     else
         rm -rf parity/npm/node_modules
@@ -112,8 +110,6 @@ fi
 weights --if-possible
 if [ -n "${early:-}" ]; then
     echo "setup: compiling the crates that don't need libtorch" >&2
-    # shellcheck disable=SC2016
-    scripts/heartbeat.sh --always "setup: compiling" bash -c 'while kill -0 "$0" 2>/dev/null; do sleep 0.2; done' "$early"
     wait "$early" || true
     trap - EXIT
 fi

@@ -10,8 +10,7 @@ scripts/build_for_glibc.sh
 rm -f "$target"/release/lib_native.so "$target"/release/deps/lib_native.so
 built="$(mktemp -d)"
 trap 'rm -rf "$built"' EXIT
-PATH="$(realpath "$target")/linker:$PATH" scripts/heartbeat.sh "packing the wheel" \
-    .venv/bin/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir "$built" ./python
+PATH="$(realpath "$target")/linker:$PATH" .venv/bin/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir "$built" ./python
 # Refuses a tag that the symbols of the files contradict. libtorch comes from the wheel of PyTorch.
 rm -rf "$target/wheels"
 if ! said="$(PATH="$PWD/.venv/bin:$PATH" .venv/bin/python -m auditwheel repair --plat "manylinux_2_28_$(uname -m)" \

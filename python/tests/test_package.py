@@ -162,11 +162,9 @@ def test_splats_that_do_not_fit_are_refused(splat, tmp_path):
         globalsplat.save_splat(tmp_path / "room.foo", splat)
     with pytest.raises(ValueError, match="the splat has no quats"):
         globalsplat.save_splat(tmp_path / "room.ply", {"means": splat["means"]})
-    with pytest.raises(ValueError, match="means has values that aren't finite"):
-        globalsplat.save_splat(tmp_path / "room.ply", {**splat, "means": splat["means"] * float("nan")})
-    with pytest.raises(ValueError, match="5 spherical harmonics"):
-        globalsplat.save_splat(tmp_path / "room.ply", {**splat, "colors": torch.zeros(16384, 5, 3)})
     for name, value, expected in (
+        ("means", splat["means"] * float("nan"), "means has values that aren't finite"),
+        ("colors", torch.zeros(16384, 5, 3), "5 spherical harmonics"),
         ("scales", splat["scales"][:5], r"scales has shape \[5, 3\], expected \[16384, 3\]"),
         ("quats", splat["quats"].T, r"quats has shape \[4, 16384\], expected \[16384, 4\]"),
         ("scales", -splat["scales"], r"scales has -.*, expected 0 or more"),
