@@ -1,7 +1,6 @@
 """Compares the speed of the program's forward pass with the same model in PyTorch, on the CPU, in one run.
 
-    python parity/model_speed.py                       24 views of 256x256, 16,384 Gaussians, in f32 and in bf16
-    python parity/model_speed.py --views 4 --rounds 2
+    python parity/model_speed.py [--views 24]    views of 256x256, 16,384 Gaussians, in f32 and in bf16
 
 The PyTorch model is the parity checks' reference with PyTorch's fused functions for its layers: linear, layer_norm,
 gelu, scaled_dot_product_attention; bf16 uses torch.autocast. Weights and photos are random. The program is measured
@@ -12,7 +11,6 @@ import argparse
 import json
 import statistics
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -26,6 +24,7 @@ from parity.reference.model import forward
 
 PROGRAM = Path(__file__).resolve().parents[1] / "target" / "release" / "globalsplat"
 SIZE = 256
+ROUNDS = 3  # alternating measurements
 
 
 def linear(params, name, x):
@@ -77,39 +76,24 @@ def torch_model(views):
     return seconds
 
 
-def program(binary, views, precision):
-    command = [binary, "bench", "model", "--views", str(views), "--precision", precision, "--repeats", "1", "--json"]
-    return json.loads(subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout)
+def program_seconds(views, precision):
+    command = [PROGRAM, "bench", "model", "--views", str(views), "--precision", precision, "--repeats", "1", "--json"]
+    done = subprocess.run(command, stdout=subprocess.PIPE, check=True)
+    return json.loads(done.stdout)["milliseconds"]["median"] * 1e-3
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    option = parser.add_argument
-    option("--views", metavar="N", type=int, default=24, help="number of photos (default: 24)")
-    option("--rounds", metavar="N", type=int, default=3, help="alternating measurements (default: 3)")
-    option("--precision", choices=["f32", "bf16"], nargs="+", default=["f32", "bf16"], help="(default: both)")
-    option("--binary", metavar="PATH", default=PROGRAM)
-    options = parser.parse_args()
+    parser.add_argument("--views", metavar="N", type=int, default=24, help="number of photos (default: 24)")
+    views = parser.parse_args().views
     use_fused_layers()
-    seconds, results = torch_model(options.views), {}
-    for precision in options.precision:
-        seconds(precision)
-        ours, theirs = [], []
-        for _ in range(options.rounds):
-            report = program(options.binary, options.views, precision)
-            ours.append(report["milliseconds"]["median"] * 1e-3)
-            theirs.append(seconds(precision))
-            print(f"{precision}: program {ours[-1]:.2f} s, PyTorch {theirs[-1]:.2f} s", file=sys.stderr)
-        ratios = [a / b for a, b in zip(ours, theirs, strict=True)]
-        results[precision] = {
-            "program_seconds": statistics.median(ours),
-            "torch_seconds": statistics.median(theirs),
-            "ratio": statistics.median(ratios),
-            "ratios": ratios,
-            "program_gflop": sum(part["gflop"] for part in report["parts"]),
-            "program_peak_gflops": report["peak_gflops"],
-        }
-    print(json.dumps(results))
+    torch_seconds = torch_model(views)
+    for precision in ("f32", "bf16"):
+        torch_seconds(precision)
+        times = [(program_seconds(views, precision), torch_seconds(precision)) for _ in range(ROUNDS)]
+        ours, theirs = (statistics.median(column) for column in zip(*times, strict=True))
+        ratios = [a / b for a, b in times]
+        print(f"{precision}: program {ours:.2f} s, PyTorch {theirs:.2f} s, ratio {min(ratios):.2f} to {max(ratios):.2f}")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ Exits with 1 if a comparison fails, and with 2 if the request is wrong.
 
 import argparse
 import os
-import shutil
 import sys
 import time
 from fnmatch import fnmatchcase
@@ -48,17 +47,7 @@ def arguments(argv):
     option("--cuda-on-cpu", metavar="N", type=int, help=emulated)
     perturb = "perturb correct results and check detection, of all cases, or of those whose index modulo N is K"
     option("--self-test", metavar="K/N", type=sample, nargs="?", const=(0, 1), help=perturb)
-    option(
-        "--binary", metavar="PATH", type=Path, default=PROGRAM, help="the program (default: target/release/globalsplat)"
-    )
     return parser.parse_args(argv)
-
-
-def progress(text):
-    """Overwrites the progress line, if standard error is a terminal."""
-    if sys.stderr.isatty():
-        width = shutil.get_terminal_size().columns - 1
-        print(f"\r\x1b[2K{text[:width]}", end="", file=sys.stderr, flush=True)
 
 
 def main(argv=None):
@@ -67,8 +56,8 @@ def main(argv=None):
     if not names:
         print(f"--only {options.only}: no such case, there are {', '.join(CASES)}", file=sys.stderr)
         return WRONG_REQUEST
-    if not options.binary.is_file():
-        print(f"{options.binary} doesn't exist: run make build, or name another with --binary", file=sys.stderr)
+    if not PROGRAM.is_file():
+        print(f"{PROGRAM} doesn't exist: run make build", file=sys.stderr)
         return WRONG_REQUEST
 
     if options.cuda_on_cpu is not None:
@@ -78,12 +67,10 @@ def main(argv=None):
     started, results = time.perf_counter(), []
     try:
         for seed in range(options.seed, options.seed + options.repeat):
-            results += run_cases(names, seed, options.binary, options.device, self_tested, progress)
+            results += run_cases(names, seed, PROGRAM, options.device, self_tested)
     except ProgramError as error:
-        progress("")
         print(error, file=sys.stderr)
         return 1
-    progress("")
 
     print(table(results))
     failed = sum(not result.passed for result in results)

@@ -66,7 +66,7 @@ def attention_draw(rng, batch, queries, keys, heads, width, scale=1.0):
     return Draw({"q": np.float32(scale) * q, "k": k, "v": v}, {"heads": heads}, differentiate=("q", "k", "v"))
 
 
-@case(attend, "seen")
+@case(attend, "out")
 def attention(rng):
     """Attention of sizes around the kernel's block sizes, from one query and one key on.
 
@@ -100,7 +100,7 @@ ATTENTION_LARGE = Tolerance(
 )
 
 
-@case(attend, "seen", module="attention", tolerance=ATTENTION_LARGE)
+@case(attend, "out", module="attention", tolerance=ATTENTION_LARGE)
 def attention_large(rng):
     """Extreme scores: about ±80, whose exponentials overflow float32; all below zero, where they would underflow; and
     one key that gets nearly all attention of half of the queries."""
@@ -121,7 +121,7 @@ ATTENTION_BF16 = Tolerance(
 )
 
 
-@case(attend, "seen", module="attention", tolerance=ATTENTION_BF16)
+@case(attend, "out", module="attention", tolerance=ATTENTION_BF16)
 def attention_bf16(rng):
     """Attention in bfloat16. The reference gets the same bfloat16 values and computes with its usual precision.
 

@@ -9,18 +9,32 @@ from ..reference import losses
 from ..reference import perceptual as networks
 
 
+def masks(rng, *shape):
+    """Returns weights of 0 on the left, 1 on the right, and random ones between; those of the first image are 0."""
+    weights = np.clip(np.linspace(-1.0, 2.0, shape[-1]) + uniform(rng, -0.2, 0.2, *shape), 0.0, 1.0)
+    if shape[0] > 1:
+        weights[0] = 0.0
+    return weights.astype(np.float32)
+
+
 @case(losses.mse)
 def mse(rng):
-    """Mean squared error of batches and of a single pixel."""
-    for shape in [(1, 1, 3, 1, 1), (2, 3, 3, 7, 12)]:
-        images = {"rendered": uniform(rng, 0.0, 1.0, *shape), "truth": uniform(rng, 0.0, 1.0, *shape)}
-        yield Draw(images, differentiate=("rendered",))
+    """Mean squared error of batches and of a single pixel, without masks and with one that leaves out an image as a whole."""
+    for shape, is_masked in [
+        ((1, 1, 3, 1, 1), False),
+        ((2, 3, 3, 7, 12), False),
+        ((1, 1, 3, 5, 4), True),
+        ((2, 3, 3, 7, 12), True),
+    ]:
+        images = {name: uniform(rng, 0.0, 1.0, *shape) for name in ("image", "ground_truth")}
+        mask = {"mask": masks(rng, *shape[:-3], 1, *shape[-2:])} if is_masked else {}
+        yield Draw(images | mask, differentiate=("image",))
 
 
 @case(losses.frustum)
 def frustum(rng):
     """Points around the cameras, none within 0.05 of a camera's plane, where pixel coordinates lose all precision."""
-    for batch, count, points, image in [(1, 1, 40, (16, 16)), (2, 3, 60, (24, 40)), (3, 4, 25, (31, 17))]:
+    for batch, count, points, size in [(1, 1, 40, (16, 16)), (2, 3, 60, (24, 40)), (3, 4, 25, (31, 17))]:
         w2c = draw.inverse(draw.poses(rng, batch, count))
         means = rng.uniform(-4.0, 4.0, (batch, points, 3)) + np.array([0.0, 0.0, 2.0])
         depth = np.einsum("bvc,bnc->bvn", w2c[..., 2, :3], means) + w2c[..., 2, 3, None]
@@ -28,11 +42,11 @@ def frustum(rng):
         inputs = {
             "means": means,
             "w2c": w2c,
-            "intrinsics": draw.intrinsics(rng, batch, count, height=image[0], width=image[1]),
+            "intrinsics": draw.intrinsics(rng, batch, count, height=size[0], width=size[1]),
             "far": rng.uniform(2.0, 5.0, batch),
         }
         inputs = {name: value.astype(np.float32) for name, value in inputs.items()}
-        yield Draw(inputs, {"image": image}, differentiate=("means",))
+        yield Draw(inputs, {"image_size": size}, differentiate=("means",))
 
 
 @case(losses.decoder_regularization)
@@ -71,8 +85,8 @@ def half_alike(rng, *shape):
 
     The SSIM of unrelated images is nearly 0 and has no precision.
     """
-    truth = uniform(rng, 0.0, 1.0, *shape)
-    return {"picture": 0.5 * truth + uniform(rng, 0.0, 0.5, *shape), "truth": truth}
+    ground_truth = uniform(rng, 0.0, 1.0, *shape)
+    return {"image": 0.5 * ground_truth + uniform(rng, 0.0, 0.5, *shape), "ground_truth": ground_truth}
 
 
 @case(losses.ssim, "ssim")
@@ -82,16 +96,16 @@ def ssim(rng):
     An identical pair has no gradient, so one is tested together with another pair.
     """
     for shape in [(1, 3, 11, 11), (1, 3, 13, 20), (3, 3, 25, 17)]:
-        yield Draw(half_alike(rng, *shape), differentiate=("picture",))
+        yield Draw(half_alike(rng, *shape), differentiate=("image",))
     dark = {name: np.float32(0.05) * value for name, value in half_alike(rng, 1, 3, 14, 13).items()}
-    yield Draw(dark, differentiate=("picture",), label="1×3×14×13, dark")
-    truth = uniform(rng, 0.2, 0.8, 1, 3, 15, 18)
-    pair = {"picture": truth + uniform(rng, -0.02, 0.02, *truth.shape), "truth": truth}
-    yield Draw(pair, differentiate=("picture",), label="1×3×15×18, nearly equal")
+    yield Draw(dark, differentiate=("image",), label="1×3×14×13, dark")
+    ground_truth = uniform(rng, 0.2, 0.8, 1, 3, 15, 18)
+    pair = {"image": ground_truth + uniform(rng, -0.02, 0.02, *ground_truth.shape), "ground_truth": ground_truth}
+    yield Draw(pair, differentiate=("image",), label="1×3×15×18, nearly equal")
     pair = half_alike(rng, 2, 3, 12, 16)
-    pair["picture"][1] = pair["truth"][1]
-    yield Draw(pair, differentiate=("picture",), label="2×3×12×16, one pair identical")
-    yield Draw({"picture": pair["truth"], "truth": pair["truth"]}, label="2×3×12×16, identical")
+    pair["image"][1] = pair["ground_truth"][1]
+    yield Draw(pair, differentiate=("image",), label="2×3×12×16, one pair identical")
+    yield Draw({"image": pair["ground_truth"], "ground_truth": pair["ground_truth"]}, label="2×3×12×16, identical")
 
 
 # The kernels process sixteen rows and a vector of columns at a time; the sizes are around multiples of these. The weights
@@ -101,10 +115,13 @@ PHOTOMETRIC = [((1, 3, 11, 40), 1.0, 0.0), ((2, 3, 26, 27), 0.8, 0.2), ((1, 2, 3
 
 @case(losses.photometric)
 def photometric(rng):
-    """L1 and SSIM in one pass, alone and combined."""
-    for shape, absolute, similar in [*PHOTOMETRIC, ((1, 3, 33, 16), 0.1, -0.9)]:
-        config = {"absolute": absolute, "similar": similar}
-        yield Draw(half_alike(rng, *shape), config, differentiate=("picture",))
+    """L1 and SSIM in one pass, alone and combined, without masks and with one that leaves out an image as a whole."""
+    for other, is_masked in [(((1, 3, 33, 16), 0.1, -0.9), False), (((2, 3, 33, 16), 0.6, -0.4), True)]:
+        for shape, l1_weight, ssim_weight in [*PHOTOMETRIC, other]:
+            inputs = half_alike(rng, *shape)
+            if is_masked:
+                inputs["mask"] = masks(rng, *shape[:-3], 1, *shape[-2:])
+            yield Draw(inputs, {"l1_weight": l1_weight, "ssim_weight": ssim_weight}, differentiate=("image",))
 
 
 def photos_with_depth(rng, *shape):
@@ -116,42 +133,12 @@ def photos_with_depth(rng, *shape):
 
 @case(losses.depth_smoothness)
 def depth_smoothness(rng):
-    """Depths of a pixel and more, with sizes around multiples of the kernel's."""
+    """Depths of a pixel and more, with sizes around multiples of the kernel's, and some with masked pixels."""
     for shape, factor in [((1, 1, 1), 1.0), ((2, 17, 43), 0.7), ((1, 2, 33, 16), 3.0), ((1, 40, 1), 1.0)]:
         yield Draw(photos_with_depth(rng, *shape), {"factor": factor}, differentiate=("depth",))
-
-
-def masks(rng, *shape):
-    """Returns weights of 0 on the left, 1 on the right, and random ones between; those of the first image are 0."""
-    weights = np.clip(np.linspace(-1.0, 2.0, shape[-1]) + uniform(rng, -0.2, 0.2, *shape), 0.0, 1.0)
-    if shape[0] > 1:
-        weights[0] = 0.0
-    return weights.astype(np.float32)
-
-
-@case(losses.masked_mse)
-def masked_mse(rng):
-    """Mean squared error of images of which parts are masked out, and one as a whole."""
-    for shape in [(1, 1, 3, 5, 4), (2, 3, 3, 7, 12)]:
-        images = {"rendered": uniform(rng, 0.0, 1.0, *shape), "truth": uniform(rng, 0.0, 1.0, *shape)}
-        images["mask"] = masks(rng, *shape[:-3], 1, *shape[-2:])
-        yield Draw(images, differentiate=("rendered",))
-
-
-@case(losses.masked_photometric)
-def masked_photometric(rng):
-    """L1 and SSIM of images of which parts are masked out, and one as a whole."""
-    for shape, absolute, similar in [*PHOTOMETRIC, ((2, 3, 33, 16), 0.6, -0.4)]:
-        inputs = half_alike(rng, *shape) | {"mask": masks(rng, *shape[:-3], 1, *shape[-2:])}
-        yield Draw(inputs, {"absolute": absolute, "similar": similar}, differentiate=("picture",))
-
-
-@case(losses.masked_depth_smoothness)
-def masked_depth_smoothness(rng):
-    """Depth steps, some at masked pixels. No weight is near the threshold of one half."""
     for shape, factor in [((2, 17, 43), 0.7), ((1, 2, 33, 16), 3.0)]:
         mask = masks(rng, *shape)
-        mask[np.abs(mask - 0.5) < 0.05] = 0.75
+        mask[np.abs(mask - 0.5) < 0.05] = 0.75  # away from the threshold of one half
         yield Draw(photos_with_depth(rng, *shape) | {"mask": mask}, {"factor": factor}, differentiate=("depth",))
 
 
@@ -176,7 +163,7 @@ def lpips_draws(rng, network, shapes, dead=()):
     for name in dead:
         params[f"{name}.bias"] -= np.float32(100.0)
     for shape in shapes:
-        inputs = {name: uniform(rng, 0.0, 1.0, *shape) for name in ("picture", "truth")}
+        inputs = {name: uniform(rng, 0.0, 1.0, *shape) for name in ("image", "ground_truth")}
         label = by(*shape) + "".join(f", {name} dead" for name in dead)
         yield from in_both_precisions(inputs, {"network": network}, params, tuple(inputs), label)
 
@@ -207,8 +194,8 @@ def perceptual(rng):
         ("lpips_alex", alex, 1, (31, 31)),
     ]:
         inputs = {
-            "rendered": uniform(rng, 0.0, 1.0, 2, targets, 3, *size),
-            "truth": uniform(rng, 0.0, 1.0, 1, targets, 3, *size),
+            "image": uniform(rng, 0.0, 1.0, 2, targets, 3, *size),
+            "ground_truth": uniform(rng, 0.0, 1.0, 1, targets, 3, *size),
         }
         label = f"{kind}, {by(targets, 3, *size)}"
-        yield from in_both_precisions(inputs | weights, {"kind": kind}, {}, ("rendered",), label)
+        yield from in_both_precisions(inputs | weights, {"kind": kind}, {}, ("image",), label)

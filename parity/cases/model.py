@@ -21,7 +21,7 @@ def tokens(rng):
     """The tokens of images of one patch and more, with and without the camera code."""
     for code in (True, True, True, False, False):
         config = draw.model_config(rng, camera_code=code)
-        inputs = draw.pictures(rng, config, integer(rng, 1, 3), integer(rng, 1, 4))
+        inputs = draw.images(rng, config, integer(rng, 1, 3), integer(rng, 1, 4))
         params = draw.parameters(rng, config, "rgb_patch_embeds", "ray_patch_embeds", "view_pe")
         label = f"{by(*inputs['images'].shape)}, patch {config['patch_size']}{'' if code else ', no camera code'}"
         yield Draw(inputs, config, params, ("images",), label=label)
@@ -62,7 +62,7 @@ def model(rng):
         (1, 0.0, {"camera_code": False}),
     ]:
         config = draw.model_config(rng, **fixed)
-        inputs = draw.pictures(rng, config, integer(rng, 1, 2), integer(rng, 1, 3))
+        inputs = draw.images(rng, config, integer(rng, 1, 2), integer(rng, 1, 3))
         label = ", ".join([by(*inputs["images"].shape), f"stage {stage}, λ {mix}", *map(str, fixed.values())])
         yield Draw(
             inputs, config | {"stage": stage, "mix": mix}, draw.parameters(rng, config), ("images",), label=label

@@ -22,7 +22,7 @@ PROJECTION_THIN_FLOAT32 = Tolerance(
 RASTERIZER_FLOAT32 = Tolerance(
     1e-5,
     3e-4,
-    pictures=1e-4,
+    images=1e-4,
     why="a gradient sums terms of both signs over all pixels of a Gaussian, and 1 - T has few digits where little is "
     "covered; 2.4e-4 is the largest over 8 seeds",
 )

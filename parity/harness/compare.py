@@ -10,13 +10,13 @@ import numpy as np
 class Tolerance:
     """Maximum relative L2 errors of outputs and gradients.
 
-    `pictures` replaces `outputs` by a maximum absolute difference (relative to the largest value if that is below 1).
+    `images` replaces `outputs` by a maximum absolute difference (relative to the largest value if that is below 1).
     `why` explains a tolerance larger than FLOAT32 or FLOAT64.
     """
 
     outputs: float
     gradients: float
-    pictures: float | None = None
+    images: float | None = None
     why: str = ""
 
 
@@ -98,8 +98,8 @@ def compare_tensor(name, ours, expected, tolerance, scale, doubtful=None):
     elif is_gradient(name) and (length <= NEGLIGIBLE * scale or name.endswith(ZERO_IN_EXACT_ARITHMETIC)):
         finding.measure, finding.tolerance, finding.relative = "zero", ZERO_TOLERANCE, None
         finding.error = norm(ours) / (scale or 1.0)
-    elif tolerance.pictures is not None and not is_gradient(name):
-        finding.measure, finding.tolerance = "absolute", tolerance.pictures
+    elif tolerance.images is not None and not is_gradient(name):
+        finding.measure, finding.tolerance = "absolute", tolerance.images
         peak = float(np.abs(expected).max(initial=0.0))
         finding.error = finding.largest / min(1.0, peak or 1.0)
     elif finding.relative is None:

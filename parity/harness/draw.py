@@ -240,7 +240,7 @@ def views(rng, batch, count, height, width):
     }
 
 
-def pictures(rng, config, batch, count):
+def images(rng, config, batch, count):
     """Returns random images of one patch and more, whose sides are multiples of the patch size, with cameras."""
     patch = config["patch_size"]
     rows = integer(rng, 1, 4)

@@ -1,69 +1,47 @@
 """Report of the results on the terminal."""
 
 from .compare import is_gradient
+from .registry import CASES
 
-MOST_FAILURES = 5  # maximum number of failures shown per draw
-
-HEADER = ("case", "draws", "of", "worst draw", "worst tensor", "max abs", "rel L2", "tolerance", "verdict")
-RIGHT = (1, 5, 6, 7)
-LONGEST_LABEL = 48
+MAX_FAILURES = 5  # maximum number of failures shown per draw
+HEADER = ("case", "draws", "of", "worst tensor", "max abs", "rel L2", "tolerance", "verdict")
 
 
 def table(results):
-    """Returns a table with two rows per case, for outputs and gradients: the worst tensor of all draws."""
-    whys, rows, lines = [], [HEADER], []
-    for case, found in by_case(results).items():
-        why, note = found[0].tolerance.why, ""
-        if why:
-            whys += [] if why in whys else [why]
-            note = f" [{whys.index(why) + 1}]"
-        first = case, str(len(found))
+    """Returns a table of the worst tensor of each case, of outputs and of gradients, followed by notes and failures."""
+    rows, notes = [HEADER], []
+    for case in dict.fromkeys(result.case for result in results):
+        of_case = [result for result in results if result.case == case]
         for kind, of_gradients in (("outputs", False), ("gradients", True)):
-            pairs = [(result, f) for result in found for f in result.findings if is_gradient(f.tensor) == of_gradients]
-            if pairs:
-                rows.append((*first, kind, *worst(pairs, note)))
-                first = "", ""
-        doubtful = sum(result.doubtful for result in found)
+            found = [f for result in of_case for f in result.findings if is_gradient(f.tensor) == of_gradients]
+            if found:
+                worst = max(found, key=lambda finding: finding.share)
+                relative = "" if worst.relative is None else f"{worst.relative:.1e}"
+                tolerance = "exact" if worst.measure == "exact" else f"{worst.tolerance:.0e} {worst.measure}"
+                verdict = "ok" if all(finding.passed for finding in found) else "FAIL"
+                tensor = worst.tensor.split(".", 1)[-1]
+                rows.append(
+                    (case, str(len(of_case)), kind, tensor, f"{worst.largest:.1e}", relative, tolerance, verdict)
+                )
+        if CASES[case].tolerance.why:
+            notes.append(f"{case}: {CASES[case].tolerance.why}")
+        doubtful = sum(result.doubtful for result in of_case)
         if doubtful:
-            lines.append(f"{case}: {doubtful} pixels within rounding of a threshold are left out")
-    notes = [f"[{number}] {why}" for number, why in enumerate(whys, start=1)]
-    return "\n".join([*layout(rows), *notes, *lines, *failures(results)])
-
-
-def by_case(results):
-    found = {}
-    for result in results:
-        found.setdefault(result.case, []).append(result)
-    return found
-
-
-def worst(pairs, note):
-    result, finding = max(pairs, key=lambda pair: pair[1].share)
-    relative = "" if finding.relative is None else f"{finding.relative:.1e}"
-    tolerance = "exact" if finding.measure == "exact" else f"{finding.tolerance:.0e} {finding.measure}"
-    verdict = "ok" if all(other.passed for _, other in pairs) else "FAIL"
-    tensor = finding.tensor.split(".", 1)[-1]
-    return result.label[:LONGEST_LABEL], tensor, f"{finding.largest:.1e}", relative, tolerance, verdict + note
-
-
-def layout(rows):
-    widths = [max(len(row[k]) for row in rows) for k in range(len(HEADER))]
-    lines = []
-    for row in rows:
-        cells = zip(range(len(row)), row, widths, strict=True)
-        lines.append("  ".join(cell.rjust(w) if k in RIGHT else cell.ljust(w) for k, cell, w in cells).rstrip())
-    return [lines[0], "─" * max(map(len, lines)), *lines[1:]]
+            notes.append(f"{case}: {doubtful} pixels within rounding of a threshold are left out")
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return "\n".join([*lines, *notes, *failures(results)])
 
 
 def failures(results):
     lines = []
     for result in results:
         failed = [finding for finding in result.findings if not finding.passed]
-        for finding in sorted(failed, key=lambda finding: -finding.share)[:MOST_FAILURES]:
+        for finding in sorted(failed, key=lambda finding: -finding.share)[:MAX_FAILURES]:
             what = finding.problem or f"{finding.measure} error {finding.error:.2e}, tolerance {finding.tolerance:.0e}"
             lines.append(f"FAIL {result.case} (seed {result.seed}), {result.label}: {finding.tensor}: {what}")
-        if len(failed) > MOST_FAILURES:
-            lines.append(f"     and {len(failed) - MOST_FAILURES} more tensors of it")
+        if len(failed) > MAX_FAILURES:
+            lines.append(f"     and {len(failed) - MAX_FAILURES} more tensors of it")
     return lines
 
 

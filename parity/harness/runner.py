@@ -8,7 +8,6 @@ cotangents, grad.param.X and grad.in.X, the gradients of sum over Y of sum(cot.Y
 import json
 import subprocess
 import tempfile
-import time
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,8 +16,8 @@ import numpy as np
 import torch
 from safetensors.numpy import load_file, save_file
 
-from .compare import Tolerance, compare, find_undetected
-from .registry import CASES, Draw
+from .compare import compare, find_undetected
+from .registry import CASES
 
 THREADS = 2  # for large draws; small ones are faster on one thread
 
@@ -28,36 +27,14 @@ class ProgramError(Exception):
 
 
 @dataclass
-class Question:
-    """A draw of a case with the reference's results and the cotangents of its outputs."""
-
-    case: str
-    drawn: Draw
-    expected: dict
-    cotangents: dict
-    seconds: float
-
-    def write(self, path):
-        drawn = self.drawn
-        about = {"case": CASES[self.case].module, "config": drawn.config, "differentiate": list(drawn.differentiate)}
-        arrays = {"case": np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)}
-        params = {name.removeprefix(drawn.prefix): value for name, value in drawn.params.items()}
-        for kind, group in (("param", params), ("in", drawn.inputs), ("cot", self.cotangents)):
-            arrays |= {f"{kind}.{name}": np.ascontiguousarray(value) for name, value in group.items()}
-        save_file(arrays, path)
-
-
-@dataclass
 class Result:
     """The comparison of one draw of one case."""
 
     case: str
     label: str
     seed: int
-    tolerance: Tolerance
     findings: list
     doubtful: int  # number of pixels excluded from the comparison
-    seconds: float  # time of the reference
     tried: int = 0  # number of perturbed results
     missed: list = field(default_factory=list)  # perturbed results that pass
 
@@ -66,21 +43,19 @@ class Result:
         return all(finding.passed for finding in self.findings)
 
 
-def questions(names, seed):
-    """Yields the draws of the named cases with the reference's results."""
-    for name in names:
-        # A case's numbers don't depend on the other cases that are run.
-        rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-        for drawn in CASES[name].draws(rng):
-            started = time.perf_counter()
-            torch.set_num_threads(THREADS if drawn.is_large else 1)
-            expected, cotangents = evaluate(name, drawn, rng)
-            yield Question(name, drawn, expected, cotangents, time.perf_counter() - started)
+def write_request(path, name, drawn, cotangents):
+    about = {"case": CASES[name].module, "config": drawn.config, "differentiate": list(drawn.differentiate)}
+    arrays = {"case": np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)}
+    params = {key.removeprefix(drawn.prefix): value for key, value in drawn.params.items()}
+    for kind, group in (("param", params), ("in", drawn.inputs), ("cot", cotangents)):
+        arrays |= {f"{kind}.{key}": np.ascontiguousarray(value) for key, value in group.items()}
+    save_file(arrays, path)
 
 
 def evaluate(name, drawn, rng):
     """Returns the reference's outputs and gradients as arrays, with the names of an answer, and the cotangents of the outputs."""
     dtype = torch.float32 if drawn.is_large else torch.float64
+    torch.set_num_threads(THREADS if drawn.is_large else 1)
 
     def tensors(group, differentiated):
         values = {}
@@ -120,18 +95,12 @@ def draw_cotangents(rng, drawn, outputs):
     return found
 
 
-def run_program(binary, device, requests, answers, on_progress):
-    """Runs the program on a folder of requests. `on_progress` gets the number of answers."""
+def run_program(binary, device, requests, answers):
+    """Runs the program on a folder of requests."""
     command = [binary, "parity", "--requests", requests, "--responses", answers, "--device", device]
-    with tempfile.TemporaryFile() as messages:
-        process = subprocess.Popen([str(word) for word in command], stdout=messages, stderr=messages)
-        while process.poll() is None:
-            on_progress(sum(1 for _ in answers.iterdir()))
-            time.sleep(0.1)
-        if process.returncode != 0:
-            messages.seek(0)
-            said = messages.read().decode(errors="replace").strip()
-            raise ProgramError(f"{binary} parity ended with {process.returncode}: {said[-2000:]}")
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, errors="replace")
+    if done.returncode != 0:
+        raise ProgramError(f"{binary} parity ended with {done.returncode}: {done.stdout.strip()[-2000:]}")
 
 
 def read_answer(path):
@@ -144,31 +113,27 @@ def read_answer(path):
     return arrays
 
 
-def run_cases(names, seed, binary, device, self_test, on_progress):
+def run_cases(names, seed, binary, device, self_test):
     """Yields a Result for every draw of the named cases. The cases `self_test` also check that wrong results are detected."""
     with tempfile.TemporaryDirectory(prefix="globalsplat-parity-") as folder:
         requests, answers = Path(folder, "requests"), Path(folder, "answers")
         requests.mkdir()
         answers.mkdir()
-        asked = []
-        for question in questions(names, seed):
-            name = f"{len(asked):04}_{question.case}.safetensors"
-            question.write(requests / name)
-            asked.append((name, question))
-            on_progress(f"reference, {len(asked)} draws: {question.case}, {question.drawn.label}")
-
-        def on_answers(done):
-            at = asked[min(done, len(asked) - 1)][1]
-            on_progress(f"program, {done} of {len(asked)} draws: {at.case}, {at.drawn.label}")
-
-        run_program(binary, device, requests, answers, on_answers)
-        for done, (name, question) in enumerate(asked, start=1):
-            drawn, tolerance = question.drawn, CASES[question.case].tolerance
-            on_progress(f"comparison, {done} of {len(asked)} draws: {question.case}, {drawn.label}")
-            answer = read_answer(answers / name)
-            findings = compare(answer, question.expected, tolerance, drawn.doubtful)
+        evaluated = []
+        for name in names:
+            # A case's numbers don't depend on the other cases that are run.
+            rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+            for drawn in CASES[name].draws(rng):
+                expected, cotangents = evaluate(name, drawn, rng)
+                file = f"{len(evaluated):04}_{name}.safetensors"
+                write_request(requests / file, name, drawn, cotangents)
+                evaluated.append((name, drawn, expected, file))
+        run_program(binary, device, requests, answers)
+        for name, drawn, expected, file in evaluated:
+            answer, tolerance = read_answer(answers / file), CASES[name].tolerance
+            findings = compare(answer, expected, tolerance, drawn.doubtful)
             doubtful = 0 if drawn.doubtful is None else int(drawn.doubtful.sum())
-            result = Result(question.case, drawn.label, seed, tolerance, findings, doubtful, question.seconds)
-            if question.case in self_test and result.passed:
-                result.tried, result.missed = find_undetected(answer, question.expected, tolerance, drawn.doubtful)
+            result = Result(name, drawn.label, seed, findings, doubtful)
+            if name in self_test and result.passed:
+                result.tried, result.missed = find_undetected(answer, expected, tolerance, drawn.doubtful)
             yield result

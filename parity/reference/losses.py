@@ -12,9 +12,15 @@ C1 = 0.01**2
 C2 = 0.03**2
 
 
-def mse(rendered, truth):
-    """Returns the mean squared error over all elements."""
-    return ((rendered - truth) ** 2).mean()
+def mean_weight(mask):
+    """Returns the mean of a mask, 1e-6 at least."""
+    return mask.mean().clamp_min(1e-6)
+
+
+def mse(image, ground_truth, mask=None):
+    """Returns the mean squared error over all elements, weighted by the mask if there is one."""
+    squares = (image - ground_truth) ** 2
+    return squares.mean() if mask is None else (mask * squares).mean() / mean_weight(mask)
 
 
 def window_weights(like):
@@ -25,12 +31,12 @@ def window_weights(like):
     return gaussian / gaussian.sum()
 
 
-def windows(pictures):
+def windows(images):
     """Extracts all windows that lie inside images [B, C, H, W]. Returns [B, C, windows, 121]."""
-    return pictures.unfold(2, WINDOW, 1).unfold(3, WINDOW, 1).flatten(4).flatten(2, 3)
+    return images.unfold(2, WINDOW, 1).unfold(3, WINDOW, 1).flatten(4).flatten(2, 3)
 
 
-def ssim(picture, truth):
+def ssim(image, ground_truth):
     """Returns the SSIM (Wang et al. 2004) of two images [B, C, H, W] in [0, 1], at least 11 pixels high and wide: the mean of
 
     (2 mx my + C1) (2 cov + C2) / ((mx^2 + my^2 + C1) (var_x + var_y + C2))
@@ -38,9 +44,9 @@ def ssim(picture, truth):
     with the window's weighted means, and its variances and covariance as unbiased estimates from 121 samples: times
     121 / 120. The mean is over images, channels and windows.
     """
-    w = window_weights(picture)
+    w = window_weights(image)
     sample = WINDOW**2 / (WINDOW**2 - 1)
-    x, y = windows(picture), windows(truth)
+    x, y = windows(image), windows(ground_truth)
     mx, my = (x * w).sum(-1), (y * w).sum(-1)
     dx, dy = x - mx[..., None], y - my[..., None]
     var_x, var_y, cov = (sample * (w * product).sum(-1) for product in (dx * dx, dy * dy, dx * dy))
@@ -48,34 +54,19 @@ def ssim(picture, truth):
     return (alike / ((mx**2 + my**2 + C1) * (var_x + var_y + C2))).mean()
 
 
-def photometric(picture, truth, absolute, similar):
-    """Returns absolute L1 + similar SSIM of images [..., C, H, W]."""
-    picture, truth = picture.flatten(0, -4), truth.flatten(0, -4)
-    return absolute * (picture - truth).abs().mean() + similar * ssim(picture, truth)
+def photometric(image, ground_truth, l1_weight, ssim_weight, mask=None):
+    """Returns l1_weight L1 + ssim_weight SSIM of images [..., C, H, W], weighted by the mask [..., 1, H, W] if there is one.
 
-
-# ---- images of which a mask excludes parts: pixels with a weight of 0 contribute nothing -------------------------------
-
-
-def mean_weight(mask):
-    """Returns the mean of a mask, 1e-6 at least."""
-    return mask.mean().clamp_min(1e-6)
-
-
-def masked_mse(rendered, truth, mask):
-    """Returns the mean squared error, weighted by the mask."""
-    return (mask * (rendered - truth) ** 2).mean() / mean_weight(mask)
-
-
-def masked_photometric(picture, truth, mask, absolute, similar):
-    """Returns absolute L1 + similar SSIM of images [..., C, H, W], weighted by the mask [..., 1, H, W].
-
-    SSIM is 1 - (1 - SSIM) / mean weight for the picture filled with the photo's pixels where the mask is 0.
+    Masked SSIM is 1 - (1 - SSIM) / mean weight of the image filled with the ground truth where the mask is 0.
     """
-    picture, truth, mask = (t.flatten(0, -4) for t in (picture, truth, mask))
-    difference = (mask * (picture - truth).abs()).mean() / mean_weight(mask)
-    filled = mask * picture + (1.0 - mask) * truth
-    return absolute * difference + similar * (1.0 - (1.0 - ssim(filled, truth)) / mean_weight(mask))
+    image, ground_truth = image.flatten(0, -4), ground_truth.flatten(0, -4)
+    difference = (image - ground_truth).abs()
+    if mask is None:
+        return l1_weight * difference.mean() + ssim_weight * ssim(image, ground_truth)
+    mask = mask.flatten(0, -4)
+    filled = mask * image + (1.0 - mask) * ground_truth
+    similarity = 1.0 - (1.0 - ssim(filled, ground_truth)) / mean_weight(mask)
+    return l1_weight * (mask * difference).mean() / mean_weight(mask) + ssim_weight * similarity
 
 
 # ---- depths ----------------------------------------------------------------------------------------------------------
@@ -84,12 +75,16 @@ EDGE = 10.0
 SUPPORT = 0.01  # depth is compared where both accumulated opacities exceed this
 
 
-def depth_smoothness(depth, photo, factor):
+def depth_smoothness(depth, photo, factor, mask=None):
     """Returns the edge-aware smoothness of depth [..., H, W], 0 at pixels without depth, and photo [..., 3, H, W].
 
     The loss is `factor` times the mean over all pairs of adjacent pixels of 2 |a - b| / (a + b) exp(-10 |g - h|), where a
-    and b are their depths and g and h their gray levels; it is 0 for pairs with a = 0 or b = 0.
+    and b are their depths and g and h their gray levels; it is 0 for pairs with a = 0 or b = 0. Pixels with a weight below
+    one half in the mask count as pixels without depth, and the loss is divided by the fraction of the others.
     """
+    if mask is not None:
+        counts = (mask >= 0.5).to(depth.dtype)
+        return depth_smoothness(depth * counts, photo, factor) / mean_weight(counts)
     gray = photo.mean(-3)
     total, pairs = depth.sum() * 0.0, 0
     for axis in (-1, -2):
@@ -100,12 +95,6 @@ def depth_smoothness(depth, photo, factor):
         total = total + torch.where(seen, uneven * torch.exp(-EDGE * (g - h).abs()), 0.0).sum()
         pairs += a.numel()
     return factor * total / max(pairs, 1)
-
-
-def masked_depth_smoothness(depth, photo, mask, factor):
-    """Returns the smoothness of the depths at pixels with a weight of one half and more."""
-    counts = (mask >= 0.5).to(depth.dtype)
-    return depth_smoothness(depth * counts, photo, factor) / mean_weight(counts)
 
 
 def symmetric_l1(x, y):
@@ -136,16 +125,16 @@ LARGEST_OPACITY = 0.2
 REGULARIZATION = 1e-2
 
 
-def frustum(means, w2c, intrinsics, far, image):
+def frustum(means, w2c, intrinsics, far, image_size):
     """Returns the frustum loss: every Gaussian center should lie in the frustum of at least one input view.
 
-    Its inputs are means [B, N, 3], w2c [B, V, 4, 4], intrinsics [B, V, 3, 3] in pixels, far [B], and the image's (H, W).
+    Its inputs are means [B, N, 3], w2c [B, V, 4, 4], intrinsics [B, V, 3, 3] in pixels, far [B], and the image size (H, W).
 
     (u, v)    = (fx x + cx z, fy y + cy z) / max(z, 1e-6)
     violation = relu(-u) + relu(u - (W - 1)) + relu(-v) + relu(v - (H - 1)) + relu(near - z) + relu(z - far)
     loss      = mean log(1 + min over views of violation / 10)
     """
-    height, width = image
+    height, width = image_size
     camera = torch.einsum("bvrc,bnc->bvnr", w2c[..., :3, :3], means) + w2c[..., None, :3, 3]  # [B, V, N, 3]
     x, y, z = camera.unbind(-1)
     divisor = z.clamp(min=SMALLEST_DIVISOR)

@@ -36,10 +36,10 @@ def unit(x):
     return x / (torch.linalg.vector_norm(x, dim=1, keepdim=True) + EPSILON)
 
 
-def lpips_features(network, params, pictures):
+def lpips_features(network, params, images):
     """Returns the compared features, divided by their norms, of images [B, 3, H, W] in [0, 1]."""
-    shift, scale = (torch.tensor(c, dtype=pictures.dtype).reshape(3, 1, 1) for c in (SHIFT, SCALE))
-    x, found = ((2.0 * pictures - 1.0) - shift) / scale, []
+    shift, scale = (torch.tensor(c, dtype=images.dtype).reshape(3, 1, 1) for c in (SHIFT, SCALE))
+    x, found = ((2.0 * images - 1.0) - shift) / scale, []
     for index, row in enumerate(NETWORKS[network]):
         if index > 0:
             x = F.max_pool2d(x, POOLING[network], stride=2)
@@ -50,10 +50,10 @@ def lpips_features(network, params, pictures):
     return found
 
 
-def lpips(network, params, picture, truth):
+def lpips(network, params, image, ground_truth):
     """Returns the distances [B] of images [B, 3, H, W]: sum over layers of mean over pixels of sum over channels of
     w (a - b)^2."""
-    pairs = zip(lpips_features(network, params, picture), lpips_features(network, params, truth), strict=True)
+    pairs = zip(lpips_features(network, params, image), lpips_features(network, params, ground_truth), strict=True)
     return sum((params[f"lin{i}.weight"] * (a - b) ** 2).sum(1).mean((1, 2)) for i, (a, b) in enumerate(pairs))
 
 
@@ -72,9 +72,9 @@ BLOCKS = [
 FACTORS = {2: 1 / 2.6, 7: 1 / 4.8, 12: 1 / 3.7, 21: 1 / 5.6, 30: 10 / 1.5}
 
 
-def vgg19_features(params, pictures):
+def vgg19_features(params, images):
     """Returns the compared features of images [B, 3, H, W] in [0, 1], each with its weight: the network's input, and layers."""
-    x = 255.0 * pictures - torch.tensor(MEANS, dtype=pictures.dtype).reshape(3, 1, 1)
+    x = 255.0 * images - torch.tensor(MEANS, dtype=images.dtype).reshape(3, 1, 1)
     found = [(1.0, x)]
     for block, (places, _) in enumerate(BLOCKS):
         if block > 0:
@@ -86,16 +86,16 @@ def vgg19_features(params, pictures):
     return found
 
 
-def vgg19(params, picture, truth):
+def vgg19(params, image, ground_truth):
     """Returns the loss of two images [B, 3, H, W]: the weighted sum of the mean absolute differences."""
-    pairs = zip(vgg19_features(params, picture), vgg19_features(params, truth), strict=True)
+    pairs = zip(vgg19_features(params, image), vgg19_features(params, ground_truth), strict=True)
     return sum(factor * (ours - theirs).abs().mean() for (factor, ours), (_, theirs) in pairs) / 255.0
 
 
-def perceptual(kind, inputs, rendered, truth):
+def perceptual(kind, inputs, image, ground_truth):
     """Returns the mean loss of two renderings [2 B, V, 3, H, W] of images [B, V, 3, H, W]; `inputs` has the weights."""
-    truth = truth.flatten(0, 1)
-    halves = [half.flatten(0, 1) for half in rendered.chunk(2)]
+    ground_truth = ground_truth.flatten(0, 1)
+    halves = [half.flatten(0, 1) for half in image.chunk(2)]
     if kind == "vgg19":
-        return sum(vgg19(inputs, half, truth) for half in halves) / 2.0
-    return sum(lpips(kind, inputs, half, truth).mean() for half in halves) / 2.0
+        return sum(vgg19(inputs, half, ground_truth) for half in halves) / 2.0
+    return sum(lpips(kind, inputs, half, ground_truth).mean() for half in halves) / 2.0

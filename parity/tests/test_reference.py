@@ -5,10 +5,11 @@ import math
 import numpy as np
 import pytest
 import torch
+from skimage.metrics import structural_similarity
 
 from parity.harness import scenes
 from parity.harness.draw import lpips_parameters
-from parity.reference import muon, perceptual, splat
+from parity.reference import losses, muon, perceptual, splat
 
 torch.set_num_threads(1)
 
@@ -25,9 +26,9 @@ def test_lpips(network):
     generator = torch.Generator().manual_seed(0)
     drawn = lpips_parameters(np.random.default_rng(0), network)
     params = {name: torch.tensor(value) for name, value in drawn.items()}
-    pictures = torch.rand(2, 3, 48, 40, generator=generator)
+    images = torch.rand(2, 3, 48, 40, generator=generator)
     mean, deviation = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
-    x, expected, compared = ((2 * pictures.movedim(1, -1) - 1 - mean) / deviation).movedim(-1, 1), 0.0, 0
+    x, expected, compared = ((2 * images.movedim(1, -1) - 1 - mean) / deviation).movedim(-1, 1), 0.0, 0
     names = iter(
         [name.removesuffix(".weight") for name in params if name.startswith("conv") and name.endswith(".weight")]
     )
@@ -41,11 +42,21 @@ def test_lpips(network):
             x = layer(x).detach().relu()
             if network == "lpips_alex" or j == len(row) - 1:
                 linear = params[f"lin{compared}.weight"].flatten()
-                a, b = (picture.flatten(1).T / (picture.flatten(1).T.norm(dim=1)[:, None] + 1e-10) for picture in x)
+                a, b = (image.flatten(1).T / (image.flatten(1).T.norm(dim=1)[:, None] + 1e-10) for image in x)
                 expected += sum((linear * (p - q) ** 2).sum().item() for p, q in zip(a, b, strict=True)) / len(a)
                 compared += 1
-    found = perceptual.lpips(network, params, pictures[:1], pictures[1:]).item()
+    found = perceptual.lpips(network, params, images[:1], images[1:]).item()
     assert compared == 5 and found == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("size", [(11, 11), (48, 37), (64, 96)])
+def test_ssim_against_scikit_image(size):
+    rng = np.random.default_rng(size[0])
+    a = rng.random((*size, 3))
+    for b in (np.clip(a + rng.normal(0, 0.1, a.shape), 0, 1), np.roll(a, 2, axis=1), 0.6 * a):
+        ours = losses.ssim(*(torch.tensor(image).movedim(-1, 0)[None] for image in (a, b))).item()
+        window = {"gaussian_weights": True, "sigma": 1.5, "win_size": 11}
+        assert ours == pytest.approx(structural_similarity(a, b, data_range=1.0, channel_axis=-1, **window), abs=1e-9)
 
 
 def test_muon_against_torch():

@@ -33,37 +33,34 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
         "color_fit" => color_fit(request),
         "projection" => projection(request),
         "rasterizer" => rasterizer(request),
-        "mse" => loss_of(loss::mse(request.input("rendered")?, request.input("truth")?)),
+        "mse" => {
+            let [image, ground_truth] = request.image_pair()?;
+            loss_of(match request.inputs.get("mask") {
+                None => loss::mse(image, ground_truth),
+                Some(mask) => loss::masked_mse(image, ground_truth, mask),
+            })
+        }
         "frustum" => frustum(request),
         "ssim" => {
-            outputs([("ssim", loss::ssim(request.input("picture")?, request.input("truth")?).view([1]))])
+            let [image, ground_truth] = request.image_pair()?;
+            outputs([("ssim", loss::ssim(image, ground_truth).view([1]))])
         }
-        "photometric" => loss_of(loss::photometric(
-            request.input("picture")?,
-            request.input("truth")?,
-            request.number("absolute")?,
-            request.number("similar")?,
-        )),
-        "masked_mse" => {
-            let [rendered, truth, mask] = request.images("rendered")?;
-            loss_of(loss::masked_mse(rendered, truth, mask))
+        "photometric" => {
+            let [image, ground_truth] = request.image_pair()?;
+            let (l1_weight, ssim_weight) = (request.number("l1_weight")?, request.number("ssim_weight")?);
+            loss_of(match request.inputs.get("mask") {
+                None => loss::photometric(image, ground_truth, l1_weight, ssim_weight),
+                Some(mask) => loss::masked_photometric(image, ground_truth, mask, l1_weight, ssim_weight),
+            })
         }
-        "masked_photometric" => {
-            let [picture, truth, mask] = request.images("picture")?;
-            let (absolute, similar) = (request.number("absolute")?, request.number("similar")?);
-            loss_of(loss::masked_photometric(picture, truth, mask, absolute, similar))
+        "depth_smoothness" => {
+            let (depth, photo, factor) =
+                (request.input("depth")?, request.input("photo")?, request.number("factor")?);
+            loss_of(match request.inputs.get("mask") {
+                None => loss::depth_smoothness(depth, photo, factor),
+                Some(mask) => loss::masked_depth_smoothness(depth, photo, mask, factor),
+            })
         }
-        "masked_depth_smoothness" => loss_of(loss::masked_depth_smoothness(
-            request.input("depth")?,
-            request.input("photo")?,
-            request.input("mask")?,
-            request.number("factor")?,
-        )),
-        "depth_smoothness" => loss_of(loss::depth_smoothness(
-            request.input("depth")?,
-            request.input("photo")?,
-            request.number("factor")?,
-        )),
         "depth_search" => depth_search(request, Search::PatchCorrelation, "correlation"),
         "semi_global_matching" => depth_search(request, Search::SemiGlobal, "confidence"),
         "decoder_regularization" => decoder_regularization(request),
@@ -84,9 +81,9 @@ impl Request {
         self.inputs.get(name).ok_or_else(|| Error::request(format!("{}: no input {name}", self.case)))
     }
 
-    /// Returns the rendered image called `name`, the photo that it has to match, and the photo's mask.
-    fn images(&self, name: &str) -> Result<[&Tensor; 3]> {
-        Ok([self.input(name)?, self.input("truth")?, self.input("mask")?])
+    /// Returns an image and the one that it has to match.
+    fn image_pair(&self) -> Result<[&Tensor; 2]> {
+        Ok([self.input("image")?, self.input("ground_truth")?])
     }
 
     /// Returns the value of `key` in the case's configuration, such as a number or a list.
@@ -117,7 +114,7 @@ impl Request {
 
     /// Returns the image size, `[height, width]`.
     fn image(&self) -> Result<[i64; 2]> {
-        self.number("image")
+        self.number("image_size")
     }
 
     /// Builds a module and loads the request's parameters into it, whose names must be those of the module.
@@ -200,8 +197,8 @@ fn attention(request: &Request) -> Result<Answer> {
     };
     let kind = precision(request).kind();
     let [q, k, v] = [0, 1, 2].map(|n| inputs[n].to_kind(kind));
-    let seen = model::attention(&q, &k, &v, request.number("heads")?);
-    outputs([("seen", seen.to_kind(inputs[0].kind()))])
+    let out = model::attention(&q, &k, &v, request.number("heads")?);
+    outputs([("out", out.to_kind(inputs[0].kind()))])
 }
 
 fn encoder(request: &Request) -> Result<Answer> {
@@ -368,7 +365,8 @@ fn lpips(request: &Request) -> Result<Answer> {
     let network = loss::LpipsNetwork::ALL.into_iter().find(|network| network.metric() == name);
     let network = network.ok_or_else(|| Error::request(format!("{}: no network {name}", request.case)))?;
     let (lpips, params) = request.build(|vs| loss::Lpips::new(vs, network))?;
-    with_params([("distance", lpips.distance(request.input("picture")?, request.input("truth")?))], params)
+    let [image, ground_truth] = request.image_pair()?;
+    with_params([("distance", lpips.distance(image, ground_truth))], params)
 }
 
 /// Computes the loss between two renderings of the same targets, as training does. The network's weights are the inputs with a dot in their
@@ -386,7 +384,8 @@ fn perceptual(request: &Request) -> Result<Answer> {
     }
     Weights { tensors, metadata: Default::default() }.load_into(&vs, Path::new(&request.case))?;
     vs.freeze();
-    loss_of(network.loss(request.input("rendered")?, request.input("truth")?))
+    let [image, ground_truth] = request.image_pair()?;
+    loss_of(network.loss(image, ground_truth))
 }
 
 fn resample(request: &Request) -> Result<Answer> {
