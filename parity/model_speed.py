@@ -93,7 +93,9 @@ def main():
         times = [(program_seconds(views, precision), torch_seconds(precision)) for _ in range(ROUNDS)]
         ours, theirs = (statistics.median(column) for column in zip(*times, strict=True))
         ratios = [a / b for a, b in times]
-        print(f"{precision}: program {ours:.2f} s, PyTorch {theirs:.2f} s, ratio {min(ratios):.2f} to {max(ratios):.2f}")
+        print(
+            f"{precision}: program {ours:.2f} s, PyTorch {theirs:.2f} s, ratio {min(ratios):.2f} to {max(ratios):.2f}"
+        )
 
 
 if __name__ == "__main__":

@@ -16,14 +16,8 @@ for package in "$(.venv/bin/python -c 'import site; print(site.getsitepackages()
     *) ln -s "$package" "$packages/" ;;
     esac
 done
-begin=$SECONDS
 .venv/bin/python -m pip --python "$environment/bin/python" install --quiet --disable-pip-version-check --no-deps --no-index "$target"/wheels/*.whl
 GLOBALSPLAT_CAPTURES="${GLOBALSPLAT_CAPTURES:-$(realpath -m ../shared/data)}"
 export GLOBALSPLAT_CAPTURES
 export -n PYTHONPATH LD_LIBRARY_PATH
-scene="$GLOBALSPLAT_CAPTURES/re10k/322261824c4a3003"
-if [ -e "$scene" ]; then
-    "$environment/bin/globalsplat" reconstruct --scene "$scene" --out "$environment/splat.ply"
-    echo "wheel: $((SECONDS - begin)) s from pip install to a splat of a capture"
-fi
 "$environment/bin/python" -P -m pytest -q -p no:cacheprovider python/tests "$@"

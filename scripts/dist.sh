@@ -53,16 +53,11 @@ licenses=(--out "$out/share/doc/globalsplat/LICENSES-THIRD-PARTY.txt")
 [ "$kind" = cpu ] || licenses+=(--cuda)
 python3 scripts/licenses.py "${licenses[@]}" >/dev/null
 run="$out/bin/globalsplat"
-if "$run" completions --help >/dev/null 2>&1; then
-    mkdir -p "$out"/share/{bash-completion/completions,zsh/site-functions,fish/vendor_completions.d}
-    "$run" completions bash >"$out/share/bash-completion/completions/globalsplat"
-    "$run" completions zsh >"$out/share/zsh/site-functions/_globalsplat"
-    "$run" completions fish >"$out/share/fish/vendor_completions.d/globalsplat.fish"
-fi
-if "$run" man --help >/dev/null 2>&1; then
-    mkdir -p "$out/share/man/man1"
-    "$run" man "$out/share/man/man1"
-fi
+mkdir -p "$out"/share/{bash-completion/completions,zsh/site-functions,fish/vendor_completions.d,man/man1}
+"$run" completions bash >"$out/share/bash-completion/completions/globalsplat"
+"$run" completions zsh >"$out/share/zsh/site-functions/_globalsplat"
+"$run" completions fish >"$out/share/fish/vendor_completions.d/globalsplat.fish"
+"$run" man "$out/share/man/man1"
 
 scripts/link_for_glibc.sh --check "$run" "$out"/lib/*
 # Every library comes with the archive, or with glibc and GCC; zlib for NVIDIA's libraries.

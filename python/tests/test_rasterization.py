@@ -8,11 +8,11 @@ import torch
 from globalsplat.reference import splat as reference
 
 WIDTH, HEIGHT = 45, 37
-# Maximum difference, relative to the largest value of a tensor.
-TOLERANCE = 1e-4
+# Maximum difference in float64, relative to the largest value of a tensor. The parity checks compare float32.
+TOLERANCE = 1e-7
 
 
-def cameras(count, dtype):
+def cameras(count, dtype=torch.float64):
     """Returns cameras around the z axis that look at (0, 0, 4): viewmats and Ks."""
     generator = torch.Generator().manual_seed(1)
     viewmats = torch.eye(4, dtype=dtype).repeat(count, 1, 1)
@@ -27,7 +27,7 @@ def cameras(count, dtype):
     return viewmats, Ks
 
 
-def gaussians(kind, dtype, count=60):
+def gaussians(dtype=torch.float64, count=60):
     """Returns means, quats, scales, opacities of a scene."""
     generator = torch.Generator().manual_seed(7)
 
@@ -37,14 +37,8 @@ def gaussians(kind, dtype, count=60):
     def uniform(*shape):
         return torch.rand(*shape, generator=generator, dtype=dtype)
 
-    count = 600 if kind == "crowded" else count
     means = normal(count, 3) * torch.tensor([1.2, 1.0, 0.8], dtype=dtype) + torch.tensor([0.0, 0.0, 4.0], dtype=dtype)
-    scales = 0.03 + 0.3 * uniform(count, 3)
-    if kind == "thin":
-        scales = scales * torch.tensor([1.0, 0.02, 0.001], dtype=dtype)
-    if kind == "behind":
-        means = means * torch.tensor([1.0, 1.0, 2.0], dtype=dtype) - torch.tensor([0.0, 0.0, 8.0], dtype=dtype)
-    return means, normal(count, 4), scales, uniform(count)
+    return means, normal(count, 4), 0.03 + 0.3 * uniform(count, 3), uniform(count)
 
 
 def normals(seed, *shape):
@@ -81,32 +75,21 @@ def reference_rasterization(
 
 def assert_close(name, ours, theirs):
     assert ours.shape == theirs.shape, name
-    difference, scale = (ours.double() - theirs).abs().max(), theirs.abs().max().clamp(min=1e-6)
+    difference, scale = (ours - theirs).abs().max(), theirs.abs().max().clamp(min=1e-6)
     assert difference <= TOLERANCE * scale, f"{name}: {difference:.2e} of {scale:.2e}"
 
 
-def compare(monkeypatch, inputs, Ks, **options):
-    """Compares images, alphas, projected means and all gradients. Pixels that rounding may decide are left out."""
-    near = []
-    for factor in (1 - 1e-4, 1 + 1e-4):
-        with monkeypatch.context() as moved:
-            moved.setattr(reference, "SMALLEST_ALPHA", factor / 255)
-            moved.setattr(reference, "SMALLEST_TRANSMITTANCE", factor * 1e-4)
-            near.append(reference_rasterization(*(tensor.double() for tensor in inputs), Ks.double(), **options))
-    is_certain = ((near[0][0] - near[1][0]).abs().amax(-1) < 1e-7) & ((near[0][1] - near[1][1]).abs()[..., 0] < 1e-7)
-    assert is_certain.float().mean() > 0.9
-    is_certain = is_certain[..., None]
-    expected, ours = leaves(tensor.double() for tensor in inputs), leaves(inputs)
-    theirs = reference_rasterization(*expected, Ks.double(), **options)
-    if "backgrounds" in options:
-        options["backgrounds"] = options["backgrounds"].to(inputs[0].dtype)
+def compare(inputs, Ks, **options):
+    """Compares images, alphas, projected means and all gradients."""
+    expected, ours = leaves(inputs), leaves(inputs)
+    theirs = reference_rasterization(*expected, Ks, **options)
     image, alpha, meta = globalsplat.rasterization(*ours, Ks, WIDTH, HEIGHT, **options)
-    assert_close("image", image * is_certain, theirs[0] * is_certain)
-    assert_close("alpha", alpha * is_certain, theirs[1] * is_certain)
+    assert_close("image", image, theirs[0])
+    assert_close("alpha", alpha, theirs[1])
     is_visible = (meta["radii"] > 0).all(-1)
     assert is_visible.any()
     assert_close("means2d", meta["means2d"][is_visible], torch.stack(theirs[2])[is_visible])
-    weights = normals(3, *image.shape) * is_certain, normals(4, *alpha.shape) * is_certain
+    weights = normals(3, *image.shape), normals(4, *alpha.shape)
     gradients = [
         torch.autograd.grad((image * weights[0]).sum() + (alpha * weights[1]).sum(), tensors)
         for image, alpha, tensors in ((image, alpha, [*ours, meta["means2d"]]), (*theirs[:2], [*expected, *theirs[2]]))
@@ -119,35 +102,24 @@ def compare(monkeypatch, inputs, Ks, **options):
         assert_close(f"gradient of {name}", our, their)
 
 
-@pytest.mark.parametrize(
-    "kind, dtype, rasterize_mode",
-    [
-        ("random", torch.float32, "classic"),
-        ("thin", torch.float64, "antialiased"),
-        ("crowded", torch.float32, "antialiased"),
-        ("behind", torch.float64, "classic"),
-    ],
-)
-def test_scenes_equal_the_reference(monkeypatch, kind, dtype, rasterize_mode):
-    viewmats, Ks = cameras(3, dtype)
-    scene = gaussians(kind, dtype)
-    colors = normals(2, len(scene[0]), 3).abs().to(dtype)
-    compare(monkeypatch, [*scene, colors, viewmats], Ks, render_mode="RGB+ED", rasterize_mode=rasterize_mode)
+@pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
+def test_renders_equal_the_reference(rasterize_mode):
+    viewmats, Ks = cameras(3)
+    compare([*gaussians(), normals(2, 60, 3).abs(), viewmats], Ks, render_mode="RGB+ED", rasterize_mode=rasterize_mode)
 
 
 @pytest.mark.parametrize("sh_degree", [0, 3])
-def test_spherical_harmonics_equal_the_reference(monkeypatch, sh_degree):
-    viewmats, Ks = cameras(2, torch.float64)
-    scene = gaussians("random", torch.float64)
-    compare(monkeypatch, [*scene, 0.5 * normals(2, 60, 16, 3), viewmats], Ks, sh_degree=sh_degree)
+def test_spherical_harmonics_equal_the_reference(sh_degree):
+    viewmats, Ks = cameras(2)
+    compare([*gaussians(), 0.5 * normals(2, 60, 16, 3), viewmats], Ks, sh_degree=sh_degree)
 
 
 @pytest.mark.parametrize("channels, render_mode", [(1, "RGB"), (4, "RGB+D"), (7, "RGB+ED")])
-def test_features_depths_and_backgrounds_equal_the_reference(monkeypatch, channels, render_mode):
-    viewmats, Ks = cameras(2, torch.float64)
-    inputs = [*gaussians("random", torch.float64), normals(2, 60, channels), viewmats]
+def test_features_depths_and_backgrounds_equal_the_reference(channels, render_mode):
+    viewmats, Ks = cameras(2)
+    inputs = [*gaussians(), normals(2, 60, channels), viewmats]
     options = {"near_plane": 3.4, "far_plane": 4.9, "eps2d": 0.1, "backgrounds": normals(5, 2, channels)}
-    compare(monkeypatch, inputs, Ks, render_mode=render_mode, **options)
+    compare(inputs, Ks, render_mode=render_mode, **options)
     del options["backgrounds"]
     for mode in ("D", "ED"):
         ours, _, _ = globalsplat.rasterization(*inputs, Ks, WIDTH, HEIGHT, render_mode=mode, **options)
@@ -156,7 +128,7 @@ def test_features_depths_and_backgrounds_equal_the_reference(monkeypatch, channe
 
 def test_batches_and_colors_of_each_camera_equal_separate_calls():
     viewmats, Ks = cameras(2, torch.float32)
-    scenes = [list(gaussians("random", torch.float32)) for _ in range(3)]
+    scenes = [list(gaussians(torch.float32)) for _ in range(3)]
     for index, scene in enumerate(scenes):
         scene[0] = scene[0] + 0.1 * index
     stacked = [torch.stack(tensors) for tensors in zip(*scenes, strict=True)]
@@ -174,7 +146,7 @@ def test_batches_and_colors_of_each_camera_equal_separate_calls():
 @pytest.mark.parametrize("dtype, bases", [(torch.float32, 4), (torch.float64, 1)])
 def test_the_ops_pass_opcheck(dtype, bases):
     viewmats, Ks = cameras(2, dtype)
-    tensors = [*gaussians("random", dtype, 12), torch.rand(12, bases, 3, dtype=dtype), viewmats]
+    tensors = [*gaussians(dtype, 12), torch.rand(12, bases, 3, dtype=dtype), viewmats]
     tensors = [tensor[None].clone().requires_grad_() for tensor in tensors]
     arguments = [*tensors, Ks[None], 12, 9, 0.3, 0.01, 1e10, False, bases == 1]
     means2d = torch.zeros(1, 2, 12, 2, dtype=dtype, requires_grad=True)
@@ -185,7 +157,7 @@ def test_the_ops_pass_opcheck(dtype, bases):
 
 def test_compiled_functions_give_the_same_bits():
     viewmats, Ks = cameras(2, torch.float32)
-    scene = leaves([*gaussians("random", torch.float32), torch.rand(60, 3)])
+    scene = leaves([*gaussians(torch.float32), torch.rand(60, 3)])
 
     def loss(means, quats, scales, opacities, colors):
         image, alpha, _ = globalsplat.rasterization(
@@ -201,7 +173,7 @@ def test_compiled_functions_give_the_same_bits():
 
 def test_saved_tensors_may_be_moved_and_second_derivatives_are_refused():
     viewmats, Ks = cameras(1, torch.float32)
-    scene = leaves([*gaussians("random", torch.float32), torch.rand(60, 3)])
+    scene = leaves([*gaussians(torch.float32), torch.rand(60, 3)])
 
     def gradients(**options):
         image, _, _ = globalsplat.rasterization(*scene, viewmats, Ks, WIDTH, HEIGHT)
@@ -219,7 +191,7 @@ def test_saved_tensors_may_be_moved_and_second_derivatives_are_refused():
 
 def test_half_precision_renders_in_float32():
     viewmats, Ks = cameras(1, torch.float32)
-    scene = [tensor.half().requires_grad_() for tensor in (*gaussians("random", torch.float32), torch.rand(60, 3))]
+    scene = [tensor.half().requires_grad_() for tensor in (*gaussians(torch.float32), torch.rand(60, 3))]
     image, _, _ = globalsplat.rasterization(*scene, viewmats, Ks, WIDTH, HEIGHT)
     assert image.dtype == torch.float32
     image.sum().backward()
@@ -237,7 +209,7 @@ def test_no_gaussians_render_the_background():
 
 def test_invalid_arguments_are_named():
     viewmats, Ks = cameras(1, torch.float32)
-    means, quats, scales, opacities = gaussians("random", torch.float32)
+    means, quats, scales, opacities = gaussians(torch.float32)
     arguments = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     arguments |= {"colors": torch.rand(60, 4, 3), "viewmats": viewmats, "Ks": Ks, "width": WIDTH, "height": HEIGHT}
     for error, match, options in [

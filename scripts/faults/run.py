@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Injects faults into every writing system call of every command that writes files, and checks the files afterwards.
 
-    .venv/bin/python scripts/faults/run.py [--binary PROGRAM] [--short] [--most N] [--only OPERATION ...]
+    .venv/bin/python scripts/faults/run.py [--short] [--only OPERATION ...]
 
 Each operation runs without faults first, under inject.c, which records its calls. Then, for every call and every kind
 of fault, it runs again from the same state, in which older files exist where it writes. Afterwards
@@ -33,6 +33,7 @@ from tensorboard.compat.tensorflow_stub.pywrap_tensorflow import PyRecordReader_
 
 HERE = Path(__file__).resolve().parent
 REPOSITORY = HERE.parents[1]
+PROGRAM = REPOSITORY / "target/release/globalsplat"
 # (kind, sticky) of the faults of each group of calls, as in inject.c. A persistent error of all calls ("any", a lost
 # disk) leaves the same state as a crash.
 REFUSED = [("ENOSPC", 0), ("ENOSPC", 1), ("EIO", 0), ("EIO", 1), ("EINTR", 0)]
@@ -49,6 +50,8 @@ FAULTS = {
 }
 # Calls that must be repeated after EINTR. Linux doesn't interrupt the others on a local disk.
 INTERRUPTIBLE = {"write", "truncate", "fsync", "open"}
+# Maximum number of failing calls per group and operation, evenly spaced.
+MAX_CALLS = 60
 # Number of faults with --short: of an operation that waits for free disk space, and of any other.
 SHORT_OF_RUNS, SHORT_OF_OTHERS = 10, 3
 # Timeout of a command, in seconds.
@@ -202,7 +205,7 @@ class Operation:
         """Starts from older files with other contents where the command writes; keeps `keep` and removes `drop`."""
         self.reset()
         done = self.bench.run(self.arguments, into=self.into)
-        assert done.code == 0, done.said
+        assert done.code == 0, done.errors
         for path in [path for path in self.bench.out.rglob("*") if path.is_file()]:
             name = path.relative_to(self.bench.out).as_posix()
             if name in drop:
@@ -227,8 +230,8 @@ class Operation:
         self.reset()
         old = Tree(self.bench.out)
         done = self.bench.run(self.arguments, into=self.into)
-        assert done.code == 0 and not done.sentence, done.said
-        self.new, self.told, self.calls = Tree(self.bench.out), done.told, done.calls
+        assert done.code == 0 and not done.sentence, done.errors
+        self.new, self.output, self.calls = Tree(self.bench.out), done.output, done.calls
         self.trees = [old, *self.between, self.new]
         assert not self.new.differs(self.new) and self.new.files != old.files, self.name
         self.ends = {}
@@ -242,16 +245,15 @@ class Operation:
         names += [of for group, file in hit if group == "remove" for of in file.parents if self.bench.out in of.parents]
         return any(plain(str(name)) in plain(done.sentence) for name in names)
 
-    def faults(self, most=None):
-        """Returns (group, n, kind, sticky) for every call, or for at most `most` evenly spaced calls of each group."""
+    def faults(self):
+        """Returns (group, n, kind, sticky) for every kind of fault of evenly spaced calls of each group."""
         count = Counter(group for _, group, _ in self.calls)
         count["any"] = len(self.calls)
-
-        def chosen(of):
-            return range(1, of + 1) if not most or of <= most else [1 + i * (of - 1) // (most - 1) for i in range(most)]
-
+        numbers = {
+            group: sorted({1 + i * (n - 1) // (MAX_CALLS - 1) for i in range(MAX_CALLS)}) for group, n in count.items()
+        }
         return [
-            (group, n, *fault) for group, faults in FAULTS.items() for n in chosen(count[group]) for fault in faults
+            (group, n, *fault) for group, faults in FAULTS.items() for n in numbers.get(group, []) for fault in faults
         ]
 
     def again(self):
@@ -261,30 +263,29 @@ class Operation:
             done = self.bench.run(self.arguments, into=self.into)
             wrong = Tree(self.bench.out).differs(self.new)
             if done.code != 0:
-                wrong.append(f"it ends with {done.code}: {done.said.strip()}")
+                wrong.append(f"it ends with {done.code}: {done.errors.strip()}")
             self.ends[state] = wrong
         return [f"second run: {what}" for what in self.ends[state]]
 
 
 class Done:
-    """Result of a run: exit code or None, standard output (`told`) and error (`said`), calls (failed, group, file)."""
+    """Result of a run: exit code or None, standard output and error, calls (failed, group, file)."""
 
-    def __init__(self, code, told, said, calls):
-        self.code, self.said, self.calls = code, said, calls
-        lines = [line for line in said.splitlines() if not NOTICE.match(line)]
-        self.sentence = "\n".join(lines)
+    def __init__(self, code, output, errors, calls):
+        self.code, self.errors, self.calls = code, errors, calls
+        self.sentence = "\n".join(line for line in errors.splitlines() if not NOTICE.match(line))
         try:
-            self.told = steady(json.loads(told))
+            self.output = steady(json.loads(output))
         except ValueError:
-            self.told = told
+            self.output = output
         self.hit = [file for failed, _, file in calls if failed]
 
 
 class Bench:
     """The working folder: in/ is only read, and faults are injected in out/."""
 
-    def __init__(self, program, folder):
-        self.program, self.folder = program, folder
+    def __init__(self, folder):
+        self.folder = folder
         self.inputs, self.out, self.log = folder / "in", folder / "out", folder / "calls"
         self.library = folder / "inject.so"
         flags = ["-Wall", "-Wextra", "-O1", "-shared", "-fPIC"]
@@ -300,7 +301,7 @@ class Bench:
         self.environment = {**os.environ, **ours}
 
     def make(self, *arguments):
-        subprocess.run([self.program, *map(str, arguments)], check=True, capture_output=True, env=self.environment)
+        subprocess.run([PROGRAM, *map(str, arguments)], check=True, capture_output=True, env=self.environment)
 
     def run(self, arguments, fault=None, stop_when_waiting=False, into=None):
         """Runs the program. `fault` is (group, n, kind, sticky); `into` is a file that gets standard output."""
@@ -311,12 +312,12 @@ class Bench:
             environment.update(
                 zip(["FAULT_CALL", "FAULT_N", "FAULT_KIND", "FAULT_STICKY"], map(str, fault), strict=True)
             )
-        told, said = self.folder / "told", self.folder / "said"
-        with (into or told).open("wb") as out, said.open("wb") as err:
-            process = subprocess.Popen([self.program, *arguments], stdout=out, stderr=err, env=environment)
+        output, errors = self.folder / "output", self.folder / "errors"
+        with (into or output).open("wb") as out, errors.open("wb") as err:
+            process = subprocess.Popen([PROGRAM, *arguments], stdout=out, stderr=err, env=environment)
             begun, code = time.monotonic(), None
             while code is None and time.monotonic() - begun < TIMEOUT:
-                if stop_when_waiting and b"training paused" in said.read_bytes():
+                if stop_when_waiting and b"training paused" in errors.read_bytes():
                     process.send_signal(signal.SIGTERM)
                     stop_when_waiting = False
                 with suppress(subprocess.TimeoutExpired):
@@ -326,7 +327,7 @@ class Bench:
                 process.wait()
         lines = self.log.read_text().splitlines() if self.log.exists() else []
         calls = [(line[0] == "!", *line[2:].split(" ", 1)) for line in lines]
-        return Done(code, "" if into else told.read_text(), said.read_text(), calls)
+        return Done(code, "" if into else output.read_text(), errors.read_text(), calls)
 
 
 def make_rooms(folder, scenes, frames, size):
@@ -376,8 +377,8 @@ def operations(bench, only):
     def training(name, stopped):
         """Trains from the start, or resumes a run that failed in its fourth step, with a checkpoint of step 2."""
         op = Operation(bench, name, train, whole_checkpoint, waits=True)
-        told = [file.endswith("/metrics.jsonl") for _, group, file in bench.run(op.arguments).calls if group == "write"]
-        at = [n for n, ours in enumerate(told, 1) if ours]
+        written = [file for _, group, file in bench.run(op.arguments).calls if group == "write"]
+        at = [n for n, file in enumerate(written, 1) if file.endswith("/metrics.jsonl")]
         for line in (5, 8):
             op.reset()
             assert bench.run(op.arguments, ("write", at[line - 1], "EIO", 0)).code == 1
@@ -453,108 +454,89 @@ def operations(bench, only):
 
 
 def check(op, fault):
-    """Injects one fault. Returns the outcome ("right", "refused", None if no call was hit), the errors and the run."""
+    """Injects one fault. Returns the run and the errors, or None if no call was hit."""
     group, _, kind, sticky = fault
     op.reset()
-    room_never_comes = op.waits and sticky and kind in ("ENOSPC", "torn")
-    done = op.bench.run(op.arguments, fault, stop_when_waiting=room_never_comes, into=op.into)
+    waits_forever = op.waits and sticky and kind in ("ENOSPC", "torn")
+    done = op.bench.run(op.arguments, fault, stop_when_waiting=waits_forever, into=op.into)
     if not done.hit:
-        return None, [], done
+        return done, None
     tree, wrong = Tree(op.bench.out), []
     if done.code is None:
         wrong.append(f"it hasn't ended after {TIMEOUT} s")
-    elif done.code not in (0, 1, 2) or "panicked" in done.said or "internal error" in done.said:
+    elif done.code not in (0, 1, 2) or "panicked" in done.errors or "internal error" in done.errors:
         wrong.append(f"it ended with {done.code}, by a signal or a panic")
     elif done.code == 0:
         wrong += tree.differs(op.new)
         if done.sentence:
-            wrong.append("it complains, and says that it is done")
-        if done.told != op.told:
-            wrong.append("it tells something else")
+            wrong.append("it reports an error, and succeeds")
+        if done.output != op.output:
+            wrong.append("its output differs")
     else:
         if not re.fullmatch(r"globalsplat: [^\n]+", done.sentence):
             wrong.append("it doesn't say why in one sentence")
         elif not op.names(done):
             wrong.append(f"it doesn't name {plain(done.hit[0])}")
-        if done.told:
-            wrong.append("it tells a result, and fails")
+        if done.output:
+            wrong.append("it prints a result, and fails")
         if kind == "short" or (kind == "EINTR" and group in INTERRUPTIBLE):
             wrong.append("it doesn't go on")
         # The program waits for space on a full disk, but not when it checks that the folder is writable and not locked.
-        looks = re.search(r"/out(/\.globalsplat-probe\.globalsplat-partial|/\.lock)?$", done.hit[0])
-        if op.waits and not sticky and kind in ("ENOSPC", "torn") and not looks:
-            wrong.append("it doesn't wait for room")
+        is_probe = re.search(r"/out(/\.globalsplat-probe\.globalsplat-partial|/\.lock)?$", done.hit[0])
+        if op.waits and not sticky and kind in ("ENOSPC", "torn") and not is_probe:
+            wrong.append("it doesn't wait for space")
         # If renames fail persistently (all, or those onto this file), a rename can't be undone; the next run repairs
         # it.
         crashed = sticky and group in ("rename", "any")
         wrong += tree.mixes(op.trees, op.unit_of, crashed)
-    return "right" if done.code == 0 else "refused", wrong, done
+    return done, wrong
 
 
-def told_of(op, fault, done, wrong):
+def describe(op, fault, done, wrong):
     """Describes a failure, with the options that reproduce it."""
+    errors = done.errors.strip().replace("\n", "\n    ") or "no message"
     how = " ".join(map(str, fault))
-    said = done.said.strip().replace("\n", "\n    ") or "nothing said"
-    return f'\n--only "{op.name}" --fault {how}, {done.hit[0]}\n  exit code {done.code}: {said}\n  ' + "\n  ".join(
-        wrong
-    )
+    head = f'\n--only "{op.name}" --fault {how}, {done.hit[0]}\n  exit code {done.code}: {errors}'
+    return "\n  ".join([head, *wrong])
 
 
-def inject(operations, most, short, one):
-    """Injects all faults and prints the table. Returns the failures."""
-    columns = ["operation", "calls", "faults injected", "ended right at once", "refused, with one sentence"]
-    columns += ["second run right", "failures"]
-    print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
-    failures, total = [], Counter()
+def inject(operations, short, one):
+    """Injects all faults and prints the table. Returns descriptions of the failures."""
+    print("| operation | calls | faults injected | failures |\n|---|---|---|---|")
+    failures = []
     for op in operations:
-        every, faults = op.faults(), op.faults(most)
-        if short:
-            sample = random.Random(0).sample(every, SHORT_OF_RUNS if op.waits else SHORT_OF_OTHERS)
-            faults = sorted(sample, key=every.index)
+        faults = op.faults()
         if one:
             faults = [(one[0], int(one[1]), one[2], int(one[3]))]
-        count = Counter()
+        elif short:
+            faults = random.Random(0).sample(faults, SHORT_OF_RUNS if op.waits else SHORT_OF_OTHERS)
+        injected, earlier = 0, len(failures)
         for fault in faults:
-            became, wrong, done = check(op, fault)
-            if became is None:
+            done, wrong = check(op, fault)
+            if wrong is None:
                 continue
-            count["injected"] += 1
-            count[became] += not wrong
+            injected += 1
             # Chunks are never overwritten: the command fails on a folder that is complete.
-            again = [] if op.once and done.code == 0 else op.again()
-            count["again"] += not again
-            if wrong or again:
-                count["failures"] += 1
-                failures.append((op, fault, done, wrong + again))
-                print(told_of(op, fault, done, wrong + again), file=sys.stderr, flush=True)
+            wrong += [] if op.once and done.code == 0 else op.again()
+            if wrong:
+                failures.append(describe(op, fault, done, wrong))
+                print(failures[-1], file=sys.stderr, flush=True)
         calls = Counter(group for _, group, _ in op.calls)
-        shown = ", ".join(f"{group} {calls[group]}" for group in FAULTS if calls[group])
-        part = "" if len(faults) == len(every) else f" of {len(every)}"
-        total.update(count)
-        total["calls"] += len(op.calls)
-        keys = ("right", "refused", "again", "failures")
-        print(f"| {op.name} | {shown} | {count['injected']}{part} | {' | '.join(str(count[key]) for key in keys)} |")
-        sys.stdout.flush()
-    print(f"| all | {total['calls']} | {total['injected']} | {' | '.join(str(total[key]) for key in keys)} |")
+        counts = ", ".join(f"{group} {calls[group]}" for group in FAULTS if calls[group])
+        print(f"| {op.name} | {counts} | {injected} | {len(failures) - earlier} |", flush=True)
     return failures
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--binary", type=Path, default=REPOSITORY / "target/release/globalsplat")
     parser.add_argument("--short", action="store_true", help="run a fixed sample, in about a minute")
-    most = "maximum number of failing calls per group and operation, evenly spaced"
-    parser.add_argument("--most", type=int, default=60, metavar="N", help=most)
     parser.add_argument("--only", nargs="+", metavar="OPERATION")
     one = ("CALL", "N", "KIND", "STICKY")
     parser.add_argument("--fault", nargs=4, metavar=one, help="inject only this fault, as printed with a failure")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="faults-") as folder:
-        bench = Bench(arguments.binary.resolve(), Path(folder).resolve())
-        failures = inject(operations(bench, arguments.only), arguments.most, arguments.short, arguments.fault)
-        for failure in failures:
-            print(told_of(*failure))
-        return 1 if failures else 0
+        failures = inject(operations(Bench(Path(folder).resolve()), arguments.only), arguments.short, arguments.fault)
+    return 1 if failures else 0
 
 
 if __name__ == "__main__":
