@@ -1,10 +1,9 @@
 """Compares the speed of the program's forward pass with the same model in PyTorch, on the CPU, in one run.
 
-    python parity/model_speed.py [--views 24]    views of 256x256, 16,384 Gaussians, in f32 and in bf16
+    python -m parity.model_speed [--views 24]    views of 256x256, 16,384 Gaussians, in f32 and in bf16
 
-The PyTorch model is the parity checks' reference with PyTorch's fused functions for its layers: linear, layer_norm,
-gelu, scaled_dot_product_attention; bf16 uses torch.autocast. Weights and photos are random. The program is measured
-with `globalsplat bench model`. Both warm up, and are measured alternately, so that other load affects both.
+The PyTorch model is the parity checks' reference; bf16 uses torch.autocast. Weights and photos are random. The program
+is measured with `globalsplat bench model`. Both warm up, and are measured alternately, so that other load affects both.
 """
 
 import argparse
@@ -16,48 +15,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch.nn import functional
 
 from parity.harness import draw
-from parity.reference import decoder, encoder, layers, tokens
 from parity.reference.model import forward
 
 PROGRAM = Path(__file__).resolve().parents[1] / "target" / "release" / "globalsplat"
 SIZE = 256
 ROUNDS = 3  # alternating measurements
-
-
-def linear(params, name, x):
-    return functional.linear(x, params[f"{name}.weight"], params.get(f"{name}.bias"))
-
-
-def layer_norm(params, name, x):
-    weight = params[f"{name}.weight"]
-    return functional.layer_norm(x, weight.shape, weight, params[f"{name}.bias"], layers.LAYER_NORM_EPS)
-
-
-def attention(q, k, v, heads):
-    q, k, v = (x.unflatten(-1, (heads, -1)).transpose(1, 2) for x in (q, k, v))
-    return functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
-
-
-def in_float32(function):
-    """Wraps a function to compute in float32 even under autocast; used for rays and camera codes."""
-
-    def computed(*inputs):
-        with torch.autocast("cpu", enabled=False):
-            return function(*inputs)
-
-    return computed
-
-
-def use_fused_layers():
-    fused = {"linear": linear, "layer_norm": layer_norm, "attention": attention, "gelu": functional.gelu}
-    for module in (layers, tokens, encoder, decoder):
-        for name in fused.keys() & vars(module).keys():
-            setattr(module, name, fused[name])
-    for name in ("plucker_rays", "camera_code"):
-        setattr(tokens, name, in_float32(getattr(tokens, name)))
 
 
 def torch_model(views):
@@ -86,7 +50,6 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--views", metavar="N", type=int, default=24, help="number of photos (default: 24)")
     views = parser.parse_args().views
-    use_fused_layers()
     torch_seconds = torch_model(views)
     for precision in ("f32", "bf16"):
         torch_seconds(precision)

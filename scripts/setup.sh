@@ -87,11 +87,6 @@ if ! cmp -s requirements.txt .venv/requirements.txt; then
         || missing "requirements.txt can't be installed; see pip's message above"
     cp requirements.txt .venv/requirements.txt
 fi
-# Scripts of parity/ import it as an installed package. -I: only from there, not from this folder.
-if [ "$(.venv/bin/python -I -c 'import parity; print(parity.__path__[0])' 2>/dev/null)" != "$PWD/parity" ]; then
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e parity \
-        || missing "parity/ can't be installed in .venv; see pip's message above"
-fi
 # Cargo looks for libtorch at this path (.cargo/config.toml), which does not depend on the Python version.
 ln -sfn "$(.venv/bin/python -c 'import importlib.util, os; print(os.path.dirname(importlib.util.find_spec("torch").origin))')" .venv/libtorch
 

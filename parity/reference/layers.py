@@ -1,34 +1,24 @@
 """Basic layers of the model. `params` maps published names to tensors; `name` is the prefix of a layer's names."""
 
-import math
-
-import torch
+from torch.nn import functional
 
 LAYER_NORM_EPS = 1e-5
 
 
 def linear(params, name, x):
     """Returns x W^T + b, with weight [out, in]; the bias is omitted if `params` has none."""
-    y = x @ params[f"{name}.weight"].T
-    bias = params.get(f"{name}.bias")
-    return y if bias is None else y + bias
+    return functional.linear(x, params[f"{name}.weight"], params.get(f"{name}.bias"))
 
 
 def layer_norm(params, name, x):
     """Returns (x - mean) / sqrt(var + eps) * weight + bias over the last axis; the variance is the biased one."""
-    centered = x - x.mean(-1, keepdim=True)
-    variance = (centered * centered).mean(-1, keepdim=True)
-    return centered / torch.sqrt(variance + LAYER_NORM_EPS) * params[f"{name}.weight"] + params[f"{name}.bias"]
-
-
-def gelu(x):
-    """Returns the exact GELU, x Phi(x)."""
-    return 0.5 * x * (1.0 + torch.erf(x / math.sqrt(2.0)))
+    weight = params[f"{name}.weight"]
+    return functional.layer_norm(x, weight.shape, weight, params[f"{name}.bias"], LAYER_NORM_EPS)
 
 
 def mlp(params, first, second, x):
-    """Returns W2 GELU(W1 x + b1) + b2."""
-    return linear(params, second, gelu(linear(params, first, x)))
+    """Returns W2 GELU(W1 x + b1) + b2, with the exact GELU."""
+    return linear(params, second, functional.gelu(linear(params, first, x)))
 
 
 def attention(q, k, v, heads):
@@ -36,14 +26,8 @@ def attention(q, k, v, heads):
 
     Each head computes softmax(q k^T / sqrt(d / heads)) v.
     """
-
-    def split(x):  # [B, L, d] -> [B, heads, L, d / heads]
-        return x.reshape(x.shape[0], x.shape[1], heads, -1).transpose(1, 2)
-
-    q, k, v = split(q), split(k), split(v)
-    scores = q @ k.transpose(-1, -2) / math.sqrt(q.shape[-1])
-    mixed = torch.softmax(scores, dim=-1) @ v
-    return mixed.transpose(1, 2).flatten(2)
+    q, k, v = (x.unflatten(-1, (heads, -1)).transpose(1, 2) for x in (q, k, v))
+    return functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
 
 
 def layer_scale(params, name, x):

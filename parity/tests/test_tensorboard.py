@@ -32,7 +32,7 @@ PARTS = ["decoder_opacity", "decoder_scale", "decoder_rotation", "decoder_sh"]
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
+def run(tmp_path_factory):
     """Returns a run that was killed after step 10, and then resumed from the checkpoint before step 8."""
     folder = tmp_path_factory.mktemp("tensorboard")
     make_rooms(folder / "captures", 1, 9, 40)
@@ -44,67 +44,56 @@ def trained(tmp_path_factory):
     return folder / "run"
 
 
-def lines(run):
-    return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-
-
+@pytest.fixture(scope="module")
 def events(run):
     # 0: keep all events
-    found = EventAccumulator(str(run / "tensorboard"), size_guidance={"scalars": 0, "images": 0})
-    return found.Reload()
+    return EventAccumulator(str(run / "tensorboard"), size_guidance={"scalars": 0, "images": 0}).Reload()
 
 
-def test_every_start_has_a_file_of_its_own(trained):
-    names = sorted(path.name for path in (trained / "tensorboard").iterdir())
+def test_every_start_has_a_file_of_its_own(run):
+    names = sorted(path.name for path in (run / "tensorboard").iterdir())
     assert names == ["events.out.tfevents.0000000000", "events.out.tfevents.0000000001"]
     starts = []
     for name in names:
-        found = list(EventFileLoader(str(trained / "tensorboard" / name)).Load())
+        found = list(EventFileLoader(str(run / "tensorboard" / name)).Load())
         assert found[0].file_version == "brain.Event:2"
         starts += [event.step for event in found if event.HasField("session_log")]
         assert all(a.wall_time <= b.wall_time for a, b in pairwise(found))
     assert starts == [0, 8]
 
 
-def test_scalars_are_those_of_metrics_jsonl(trained):
-    found, logged = events(trained), lines(trained)
+def test_scalars_are_those_of_metrics_jsonl(run, events):
+    logged = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     steps = [line for line in logged if "validation" not in line]
     assert [line["step"] for line in steps] == list(range(12))
-    tags = {f"train/{name}": name for name in PROGRESS} | {f"loss/{name}": name for name in TERMS + PARTS}
-    assert set(found.Tags()["scalars"]) == set(tags) | {"validation/psnr", "validation/ssim", "validation/stage"}
-    for tag, name in tags.items():
-        events_of = found.Scalars(tag)
-        assert [event.step for event in events_of] == [0, 3, 6, 9], tag
-        expected = [steps[event.step][name] for event in events_of]
-        np.testing.assert_allclose([event.value for event in events_of], expected, rtol=1e-6, err_msg=tag)
     for line in steps:
-        parts = sum(line[part] for part in PARTS)
-        np.testing.assert_allclose(line["decoder"], 1e-2 * parts, rtol=1e-5)
+        np.testing.assert_allclose(line["decoder"], 1e-2 * sum(line[part] for part in PARTS), rtol=1e-5)
         np.testing.assert_allclose(line["psnr"], -10 * np.log10(line["mse"]), rtol=1e-9)
         assert line["decoder_opacity"] > 0 and line["samples_per_second"] > 0
-
     validations = [line for line in logged if "validation" in line]
+
+    expected = {f"train/{name}": [(step, steps[step][name]) for step in (0, 3, 6, 9)] for name in PROGRESS}
+    expected |= {f"loss/{name}": [(step, steps[step][name]) for step in (0, 3, 6, 9)] for name in TERMS + PARTS}
+    for name in ("psnr", "ssim", "stage"):
+        expected[f"validation/{name}"] = [(line["step"], line["validation"][name]) for line in validations]
     assert [line["step"] for line in validations] == [3, 7, 11]
-    for name in ["psnr", "ssim"]:
-        events_of = found.Scalars(f"validation/{name}")
-        assert [event.step for event in events_of] == [3, 7, 11]
-        expected = [line["validation"][name] for line in validations]
-        np.testing.assert_allclose([event.value for event in events_of], expected, rtol=1e-6)
+    assert set(events.Tags()["scalars"]) == set(expected)
+    for tag, values in expected.items():
+        found = [(event.step, event.value) for event in events.Scalars(tag)]
+        np.testing.assert_allclose(found, values, rtol=1e-6, err_msg=tag)
 
 
-def test_pictures_are_strips_of_five(trained):
-    found = events(trained)
-    assert found.Tags()["images"] == ["train/views"]
-    pictures = found.Images("train/views")
-    assert [picture.step for picture in pictures] == [0, 5, 10]
-    seen = []
-    for picture in pictures:
-        assert (picture.width, picture.height) == (5 * SIZE + 4 * GAP, SIZE)
-        decoded = np.asarray(Image.open(io.BytesIO(picture.encoded_image_string)))
-        assert decoded.shape == (SIZE, 5 * SIZE + 4 * GAP, 3)
+def test_images_are_strips_of_five(events):
+    assert events.Tags()["images"] == ["train/views"]
+    images = events.Images("train/views")
+    assert [image.step for image in images] == [0, 5, 10]
+    rendered = []
+    for image in images:
+        decoded = np.asarray(Image.open(io.BytesIO(image.encoded_image_string)))
+        assert decoded.shape == (image.height, image.width, 3) == (SIZE, 5 * SIZE + 4 * GAP, 3)
         photo, truth, render, depth, alpha = (decoded[:, i * (SIZE + GAP) : i * (SIZE + GAP) + SIZE] for i in range(5))
         assert photo.std() > 5 and truth.std() > 5 and not np.array_equal(photo, truth)
         assert (alpha == alpha[..., :1]).all(), "gray"
-        seen.append([render.any(), depth.any(), alpha.any()])
+        rendered.append([render.any(), depth.any(), alpha.any()])
     # An untrained model renders some images black.
-    assert np.any(seen, axis=0).all()
+    assert np.any(rendered, axis=0).all()

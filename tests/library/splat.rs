@@ -1,4 +1,4 @@
-//! The splat op, as far as parity/run.py doesn't compare it: instruction sets, threads, kernels for GPUs, and invalid input.
+//! The splat op, as far as `parity/` doesn't compare it: instruction sets, threads, kernels for GPUs, and invalid input.
 
 use crate::common::{Random, exit_code_of_test, largest_error, relative_error};
 use globalsplat::render::cpu::simd_level;

@@ -1,4 +1,4 @@
-//! Rust side of `parity/run.py`: runs any module on given weights and inputs, and returns its outputs and gradients.
+//! Rust side of `python -m parity`: runs any module on given weights and inputs, and returns its outputs and gradients.
 //!
 //! Nothing is implemented here: every case calls the code that training runs.
 
@@ -12,7 +12,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use tch::{Device, Kind, Tensor};
 
-/// Answer the requests of parity/run.py.
+/// Answer the requests of `python -m parity`.
 #[derive(Args)]
 pub struct Parity {
     /// Folder of request files
@@ -129,5 +129,5 @@ fn read_request(file: &Path, device: Device) -> Result<Request> {
 }
 
 fn unknown(file: &Path, what: &str, name: &str) -> Error {
-    Error::input(file, format!("{what} {name}"), "out of place", "what parity/run.py writes")
+    Error::input(file, format!("{what} {name}"), "out of place", "what parity/harness writes")
 }
