@@ -5,10 +5,9 @@ mod array;
 mod pickle;
 mod write;
 
-pub use archive::Archive;
 pub use array::{Array, row_major};
 pub use globalsplat_files::{Error, Result};
-pub use pickle::{Id, Value, Values, unpickle};
+pub use pickle::{Id, Value, Values};
 pub use safetensors::Dtype;
 pub use write::{TensorView, write_checkpoint};
 
@@ -42,10 +41,10 @@ impl<'a> TorchFile<'a> {
     /// Returns an error if `torch.save` didn't write the file, if the file is damaged, or if Python would call a function to load it that
     /// isn't known to only assemble data.
     pub fn parse(file: &Path, bytes: &'a [u8]) -> Result<Self> {
-        let Archive { pickle, storages } = Archive::parse(file, bytes)?;
+        let (pickle, storages) = archive::find_parts(file, bytes)?;
         let expected = "numbers, strings and tensors, as in a checkpoint that runs nothing; nothing was run";
-        let values =
-            unpickle(&bytes[pickle]).map_err(|found| Error::input(file, "the pickle", found, expected))?;
+        let values = pickle::unpickle(&bytes[pickle])
+            .map_err(|found| Error::input(file, "the pickle", found, expected))?;
         Ok(TorchFile { values, storages })
     }
 }

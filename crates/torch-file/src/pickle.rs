@@ -169,7 +169,7 @@ fn is_plain_constructor(module: &str, name: &str) -> bool {
 ///
 /// # Errors
 /// Returns a description of what the pickle requests but may not, or of what is broken in it.
-pub fn unpickle(bytes: &[u8]) -> Result<Values<'_>, String> {
+pub(crate) fn unpickle(bytes: &[u8]) -> Result<Values<'_>, String> {
     let (values, stack, marks, memo) = (vec![], vec![], vec![], vec![]);
     let mut machine = Machine { rest: bytes, values, stack, marks, memo };
     loop {
@@ -203,36 +203,36 @@ impl<'a> Machine<'a> {
         Ok(self.take(bytes)?.iter().rev().fold(0, |number, &byte| number << 8 | usize::from(byte)))
     }
 
-    /// Reads a little-endian number of up to eight bytes, in two's complement.
+    /// Reads a little-endian number in two's complement, which is kept if it has at most eight bytes.
     fn signed(&mut self, bytes: usize) -> Result<Value<'a>, String> {
         let taken = self.take(bytes)?;
         let mut wide = [if taken.last().is_some_and(|&byte| byte >= 0x80) { 0xff } else { 0 }; 8];
-        wide[..bytes].copy_from_slice(taken);
+        let Some(low) = wide.get_mut(..bytes) else { return Ok(Value::Object(vec![])) };
+        low.copy_from_slice(taken);
         Ok(Value::Int(i64::from_le_bytes(wide)))
     }
 
-    fn text(&mut self, bytes: usize) -> Result<&'a str, String> {
-        std::str::from_utf8(self.take(bytes)?).map_err(|_| "a pickle with a string that is no UTF-8".into())
+    /// Reads the length in the argument of `opcode`, and as many bytes.
+    fn counted(&mut self, opcode: u8) -> Result<&'a [u8], String> {
+        let length = match opcode {
+            0x8c | b'C' => self.unsigned(1)?,
+            b'X' | b'B' => self.unsigned(4)?,
+            _ => self.unsigned(8)?,
+        };
+        self.take(length)
     }
 
     fn line(&mut self) -> Result<&'a str, String> {
         let end = self.rest.iter().position(|&byte| byte == b'\n').ok_or("a pickle that was cut off")?;
-        let line = self.text(end)?;
+        let line = text(self.take(end)?)?;
         self.take(1)?;
         Ok(line)
     }
 
-    fn push(&mut self, value: Value<'a>) {
-        self.stack.push(self.values.len());
-        self.values.push(value);
-    }
-
     fn pop(&mut self) -> Result<Id, String> {
         // An instruction may not pop values below the last mark.
-        if self.marks.last().is_some_and(|&mark| self.stack.len() <= mark) {
-            return Err("a pickle that pops from an empty stack".into());
-        }
-        self.stack.pop().ok_or("a pickle that pops from an empty stack".into())
+        let is_empty = self.marks.last().is_some_and(|&mark| self.stack.len() <= mark);
+        self.stack.pop().filter(|_| !is_empty).ok_or("a pickle that pops from an empty stack".into())
     }
 
     /// Pops the values above the last mark.
@@ -244,49 +244,42 @@ impl<'a> Machine<'a> {
     /// Appends `values` to the list on top of the stack.
     fn append(&mut self, values: &[Id]) -> Result<(), String> {
         let list = self.pop()?;
+        self.stack.push(list);
         match &mut self.values[list] {
             Value::List(items) => items.extend_from_slice(values),
             // An instance of a subclass of list, or a set.
             Value::Object(_) => {}
             other => return Err(format!("a pickle that appends to {}", other.type_name())),
         }
-        self.stack.push(list);
         Ok(())
     }
 
     /// Adds `values`, alternating keys and values, to the dict on top of the stack.
     fn set_items(&mut self, values: &[Id]) -> Result<(), String> {
-        let (pairs, rest) = values.as_chunks();
-        if !rest.is_empty() {
+        let (pairs, []) = values.as_chunks() else {
             return Err("a pickle with a key without a value".into());
-        }
+        };
         let dict = self.pop()?;
+        self.stack.push(dict);
         match &mut self.values[dict] {
-            Value::Dict(items) | Value::Object(items) => {
-                items.extend(pairs.iter().map(|&[key, value]| (key, value)));
-            }
+            Value::Dict(items) | Value::Object(items) => items.extend(pairs.iter().map(|&[k, v]| (k, v))),
             other => return Err(format!("a pickle that sets items of {}", other.type_name())),
         }
-        self.stack.push(dict);
         Ok(())
     }
 
     fn memoize(&mut self, id: usize) -> Result<(), String> {
         let &top = self.stack.last().ok_or("a pickle that pops from an empty stack")?;
-        match id.cmp(&self.memo.len()) {
-            std::cmp::Ordering::Less => self.memo[id] = top,
-            std::cmp::Ordering::Equal => self.memo.push(top),
-            std::cmp::Ordering::Greater => {
-                return Err(format!("a pickle with memo {id} after {}", self.memo.len()));
-            }
+        if id > self.memo.len() {
+            return Err(format!("a pickle with memo {id} after {}", self.memo.len()));
         }
+        self.memo.splice(id..(id + 1).min(self.memo.len()), [top]);
         Ok(())
     }
 
     fn push_memo(&mut self, id: usize) -> Result<(), String> {
-        let value =
-            self.memo.get(id).ok_or_else(|| format!("a pickle that recalls memo {id}, which is missing"));
-        self.stack.push(*value?);
+        let value = self.memo.get(id);
+        self.stack.push(*value.ok_or_else(|| format!("a pickle that recalls memo {id}, which is missing"))?);
         Ok(())
     }
 
@@ -297,19 +290,29 @@ impl<'a> Machine<'a> {
         }
     }
 
+    /// Returns the module and the name of a class or function that is used for `what`.
+    fn global(&self, id: Id, what: &str) -> Result<(&'a str, &'a str), String> {
+        match &self.values[id] {
+            Value::Global { module, name } => Ok((module, name)),
+            other => Err(format!("a pickle {what} {}", other.type_name())),
+        }
+    }
+
     /// Returns the storage of a persistent id: ("storage", its type, its key, the device, its number of elements).
     fn storage(&self, id: Id) -> Result<Value<'a>, String> {
-        let unsupported = || "a pickle with a persistent id that is no storage".to_string();
-        let &[tag, class, key, device, length] = self.tuple(id) else { return Err(unsupported()) };
-        let of = |id: Id| &self.values[id];
-        let (Value::Str("storage"), Value::Global { module, name }, Value::Str(key)) =
-            (of(tag), of(class), of(key))
+        let parts: Vec<&Value> = self.tuple(id).iter().map(|&part| &self.values[part]).collect();
+        let &[
+            Value::Str("storage"),
+            &Value::Global { module, name },
+            &Value::Str(key),
+            Value::Str(_),
+            Value::Int(_),
+        ] = &parts[..]
         else {
-            return Err(unsupported());
+            return Err("a pickle with a persistent id that is no storage".into());
         };
-        let (Value::Str(_), Value::Int(_)) = (of(device), of(length)) else { return Err(unsupported()) };
-        let stored = STORAGES.iter().find(|(_, class)| *module == "torch" && class == name);
-        Ok(match (stored, *name) {
+        let stored = STORAGES.iter().find(|(_, class)| module == "torch" && *class == name);
+        Ok(match (stored, name) {
             (Some(&(dtype, _)), _) => Value::Storage { dtype, key },
             (None, "UntypedStorage") => Value::Storage { dtype: Dtype::U8, key },
             // Quantized numbers, for example.
@@ -317,213 +320,78 @@ impl<'a> Machine<'a> {
         })
     }
 
-    /// Returns the result of `function` for the tuple `arguments`.
+    /// Returns the result of `function` for the tuple `arguments`. More arguments than those that are used may follow, such as
+    /// `requires_grad` and hooks.
     fn call(&self, function: Id, arguments: Id) -> Result<Value<'a>, String> {
-        let &Value::Global { module, name } = &self.values[function] else {
-            return Err(format!("a pickle that calls {}", self.values[function].type_name()));
-        };
-        let arguments = self.tuple(arguments);
-        if let Some(made) = self.rebuild(module, name, arguments) {
-            return made;
+        let (mut module, mut name) = self.global(function, "that calls")?;
+        let mut arguments = self.tuple(arguments);
+        // A function that creates a tensor, a class, the arguments of the function, and attributes.
+        if let ("torch._tensor", "_rebuild_from_type_v2", &[inner, _class, inner_arguments, ..]) =
+            (module, name, arguments)
+        {
+            (module, name) = self.global(inner, "that calls")?;
+            arguments = self.tuple(inner_arguments);
         }
-        match (module, name, arguments) {
-            ("collections", "OrderedDict", []) => Ok(Value::Dict(vec![])),
-            // A function that creates a tensor, a class, the arguments of the function, and attributes.
-            ("torch._tensor", "_rebuild_from_type_v2", &[function, _class, arguments, ..]) => {
-                let &Value::Global { module, name } = &self.values[function] else {
-                    return Err(NO_TENSOR.into());
-                };
-                let made = self.rebuild(module, name, self.tuple(arguments));
-                made.unwrap_or(Ok(Value::Object(vec![])))
-            }
-            _ if is_plain_constructor(module, name) => Ok(Value::Object(vec![])),
-            _ => Err(format!("a pickle that calls {module}.{name}")),
-        }
-    }
-
-    /// Returns the result of a function that creates a tensor or parameter, or `None` if it is another function. More arguments than those
-    /// that are used may follow, such as `requires_grad` and hooks.
-    fn rebuild(&self, module: &str, name: &str, arguments: &[Id]) -> Option<Result<Value<'a>, String>> {
         let of = |id: Id| &self.values[id];
-        let made = match (module, name, arguments) {
-            (
-                "torch._utils",
-                "_rebuild_tensor" | "_rebuild_tensor_v2",
-                &[storage, offset, size, stride, ..],
-            ) => match (of(storage), of(offset), of(size), of(stride)) {
-                (Value::Storage { .. }, Value::Int(_), Value::Tuple(_), Value::Tuple(_)) => {
-                    Some(Value::Tensor { storage, offset, size, stride })
+        Ok(match (module, name, arguments) {
+            ("collections", "OrderedDict", []) => Value::Dict(vec![]),
+            ("torch._utils", "_rebuild_tensor" | "_rebuild_tensor_v2", arguments) => {
+                let &[storage, offset, size, stride, ..] = arguments else { return Err(NO_TENSOR.into()) };
+                match (of(storage), of(offset), of(size), of(stride)) {
+                    (Value::Storage { .. }, Value::Int(_), Value::Tuple(_), Value::Tuple(_)) => {
+                        Value::Tensor { storage, offset, size, stride }
+                    }
+                    (Value::Object(_), ..) => Value::Object(vec![]),
+                    _ => return Err(NO_TENSOR.into()),
                 }
-                (Value::Object(_), ..) => Some(Value::Object(vec![])),
-                _ => None,
-            },
-            ("torch._utils", "_rebuild_parameter" | "_rebuild_parameter_with_state", &[data, ..]) => {
-                Some(of(data).clone()).filter(|data| matches!(data, Value::Tensor { .. } | Value::Object(_)))
             }
-            ("torch._utils", "_rebuild_tensor" | "_rebuild_tensor_v2" | "_rebuild_parameter", _) => None,
-            _ => return None,
-        };
-        Some(made.ok_or(NO_TENSOR.into()))
-    }
-
-    /// Pushes an instance of `class`, which Python creates by `__new__` alone.
-    fn instance(&mut self, class: Id) -> Result<(), String> {
-        let made = match &self.values[class] {
-            Value::Global { module: "collections", name: "OrderedDict" } => Value::Dict(vec![]),
-            Value::Global { .. } => Value::Object(vec![]),
-            other => return Err(format!("a pickle with an instance of {}", other.type_name())),
-        };
-        self.push(made);
-        Ok(())
+            ("torch._utils", "_rebuild_parameter" | "_rebuild_parameter_with_state", &[data, ..]) => {
+                match of(data) {
+                    tensor @ (Value::Tensor { .. } | Value::Object(_)) => tensor.clone(),
+                    _ => return Err(NO_TENSOR.into()),
+                }
+            }
+            _ if is_plain_constructor(module, name) => Value::Object(vec![]),
+            _ => return Err(format!("a pickle that calls {module}.{name}")),
+        })
     }
 
     /// Executes one instruction. At the end of the pickle, returns the index of its result.
     fn instruction(&mut self) -> Result<Option<Id>, String> {
-        // Instructions are named as in Python's pickletools.
-        match self.take(1)?[0] {
+        // Instructions are named as in Python's pickletools. First those that don't push a new value.
+        let opcode = self.take(1)?[0];
+        match opcode {
             // PROTO
             0x80 => match self.unsigned(1)? {
                 2..=5 => {}
                 other => return Err(format!("a pickle of protocol {other}")),
             },
             // FRAME: ignored, because instructions are read one by one anyway.
-            0x95 => {
-                self.take(8)?;
-            }
-            // EMPTY_LIST, EMPTY_DICT, EMPTY_TUPLE, EMPTY_SET, MARK
-            b']' => self.push(Value::List(vec![])),
-            b'}' => self.push(Value::Dict(vec![])),
-            b')' => self.push(Value::Tuple(vec![])),
-            0x8f => self.push(Value::Object(vec![])),
+            0x95 => drop(self.take(8)?),
+            // MARK, POP, POP_MARK, DUP
             b'(' => self.marks.push(self.stack.len()),
-            // POP, POP_MARK, DUP
-            b'0' => {
-                self.pop()?;
-            }
-            b'1' => {
-                self.pop_to_mark()?;
-            }
+            b'0' => drop(self.pop()?),
+            b'1' => drop(self.pop_to_mark()?),
             b'2' => {
                 let top = self.pop()?;
                 self.stack.extend([top, top]);
             }
-            // NONE, NEWTRUE, NEWFALSE
-            b'N' => self.push(Value::None),
-            opcode @ (0x88 | 0x89) => self.push(Value::Bool(opcode == 0x88)),
-            // BININT1, BININT2, BININT
-            opcode @ (b'K' | b'M') => {
-                let number = self.unsigned(if opcode == b'K' { 1 } else { 2 })?;
-                self.push(Value::Int(number as i64));
-            }
-            b'J' => {
-                let number = self.signed(4)?;
-                self.push(number);
-            }
-            // LONG1
-            0x8a => match self.unsigned(1)? {
-                bytes @ 0..=8 => {
-                    let number = self.signed(bytes)?;
-                    self.push(number);
-                }
-                bytes => {
-                    self.take(bytes)?;
-                    self.push(Value::Object(vec![]));
-                }
-            },
-            // BINFLOAT
-            b'G' => {
-                let bytes = self.take(8)?.try_into().expect("eight bytes");
-                self.push(Value::Float(f64::from_be_bytes(bytes)));
-            }
-            // SHORT_BINUNICODE, BINUNICODE, BINUNICODE8
-            opcode @ (0x8c | b'X' | 0x8d) => {
-                let length = self.unsigned(length_bytes(opcode))?;
-                let text = self.text(length)?;
-                self.push(Value::Str(text));
-            }
-            // SHORT_BINBYTES, BINBYTES, BINBYTES8, BYTEARRAY8
-            opcode @ (b'C' | b'B' | 0x8e | 0x96) => {
-                let length = self.unsigned(length_bytes(opcode))?;
-                self.take(length)?;
-                self.push(Value::Object(vec![]));
-            }
-            // GLOBAL
-            b'c' => {
-                let (module, name) = (self.line()?, self.line()?);
-                self.push(Value::Global { module, name });
-            }
-            // STACK_GLOBAL
-            0x93 => {
-                let (name, module) = (self.pop()?, self.pop()?);
-                let (&Value::Str(module), &Value::Str(name)) = (&self.values[module], &self.values[name])
-                else {
-                    return Err("a pickle with a name that is no string".into());
-                };
-                self.push(Value::Global { module, name });
-            }
-            // BINPUT, LONG_BINPUT, BINGET, LONG_BINGET
+            // BINPUT, LONG_BINPUT, MEMOIZE, BINGET, LONG_BINGET
             b'q' => self.unsigned(1).and_then(|id| self.memoize(id))?,
             b'r' => self.unsigned(4).and_then(|id| self.memoize(id))?,
+            0x94 => self.memoize(self.memo.len())?,
             b'h' => self.unsigned(1).and_then(|id| self.push_memo(id))?,
             b'j' => self.unsigned(4).and_then(|id| self.push_memo(id))?,
-            // MEMOIZE
-            0x94 => self.memoize(self.memo.len())?,
-            // TUPLE, TUPLE1, TUPLE2, TUPLE3
-            b't' => {
-                let values = self.pop_to_mark()?;
-                self.push(Value::Tuple(values));
-            }
-            opcode @ 0x85..=0x87 => {
-                let mut values = (0..opcode - 0x84).map(|_| self.pop()).collect::<Result<Vec<_>, _>>()?;
-                values.reverse();
-                self.push(Value::Tuple(values));
-            }
-            // FROZENSET
-            0x91 => {
-                self.pop_to_mark()?;
-                self.push(Value::Object(vec![]));
-            }
             // APPEND; APPENDS, ADDITEMS; SETITEM; SETITEMS
-            b'a' => {
-                let value = self.pop()?;
-                self.append(&[value])?;
-            }
-            b'e' | 0x90 => {
-                let values = self.pop_to_mark()?;
-                self.append(&values)?;
-            }
+            b'a' => self.pop().and_then(|value| self.append(&[value]))?,
+            b'e' | 0x90 => self.pop_to_mark().and_then(|values| self.append(&values))?,
             b's' => {
                 let (value, key) = (self.pop()?, self.pop()?);
                 self.set_items(&[key, value])?;
             }
-            b'u' => {
-                let values = self.pop_to_mark()?;
-                self.set_items(&values)?;
-            }
-            // REDUCE
-            b'R' => {
-                let (arguments, function) = (self.pop()?, self.pop()?);
-                let made = self.call(function, arguments)?;
-                self.push(made);
-            }
-            // NEWOBJ, NEWOBJ_EX
-            opcode @ (0x81 | 0x92) => {
-                if opcode == 0x92 {
-                    self.pop()?;
-                }
-                let (_arguments, class) = (self.pop()?, self.pop()?);
-                self.instance(class)?;
-            }
+            b'u' => self.pop_to_mark().and_then(|values| self.set_items(&values))?,
             // BUILD, which sets the fields of an object
-            b'b' => {
-                self.pop()?;
-            }
-            // BINPERSID
-            b'Q' => {
-                let id = self.pop()?;
-                let storage = self.storage(id)?;
-                self.push(storage);
-            }
+            b'b' => drop(self.pop()?),
             // STOP
             b'.' => {
                 return match (self.stack.as_slice(), self.marks.len()) {
@@ -531,17 +399,82 @@ impl<'a> Machine<'a> {
                     (values, _) => Err(format!("a pickle that ends with {} values", values.len())),
                 };
             }
-            opcode => return Err(format!("a pickle with instruction {opcode:#04x}, which no tensors need")),
+            _ => {
+                let value = self.new_value(opcode)?;
+                self.stack.push(self.values.len());
+                self.values.push(value);
+            }
         }
         Ok(None)
     }
+
+    /// Returns the value that the instruction `opcode` pushes.
+    fn new_value(&mut self, opcode: u8) -> Result<Value<'a>, String> {
+        Ok(match opcode {
+            // EMPTY_LIST, EMPTY_DICT, EMPTY_TUPLE, EMPTY_SET
+            b']' => Value::List(vec![]),
+            b'}' => Value::Dict(vec![]),
+            b')' => Value::Tuple(vec![]),
+            0x8f => Value::Object(vec![]),
+            // NONE, NEWTRUE, NEWFALSE
+            b'N' => Value::None,
+            0x88 | 0x89 => Value::Bool(opcode == 0x88),
+            // BININT1, BININT2, BININT, LONG1
+            b'K' => Value::Int(self.unsigned(1)? as i64),
+            b'M' => Value::Int(self.unsigned(2)? as i64),
+            b'J' => self.signed(4)?,
+            0x8a => self.unsigned(1).and_then(|bytes| self.signed(bytes))?,
+            // BINFLOAT
+            b'G' => Value::Float(f64::from_be_bytes(self.take(8)?.try_into().expect("eight bytes"))),
+            // SHORT_BINUNICODE, BINUNICODE, BINUNICODE8
+            0x8c | b'X' | 0x8d => Value::Str(text(self.counted(opcode)?)?),
+            // SHORT_BINBYTES, BINBYTES, BINBYTES8, BYTEARRAY8
+            b'C' | b'B' | 0x8e | 0x96 => self.counted(opcode).map(|_| Value::Object(vec![]))?,
+            // GLOBAL
+            b'c' => Value::Global { module: self.line()?, name: self.line()? },
+            // STACK_GLOBAL
+            0x93 => {
+                let (name, module) = (self.pop()?, self.pop()?);
+                match (&self.values[module], &self.values[name]) {
+                    (Value::Str(module), Value::Str(name)) => Value::Global { module, name },
+                    _ => return Err("a pickle with a name that is no string".into()),
+                }
+            }
+            // TUPLE, TUPLE1, TUPLE2, TUPLE3
+            b't' => Value::Tuple(self.pop_to_mark()?),
+            0x85..=0x87 => {
+                let mut values = (0..opcode - 0x84).map(|_| self.pop()).collect::<Result<Vec<_>, _>>()?;
+                values.reverse();
+                Value::Tuple(values)
+            }
+            // FROZENSET
+            0x91 => self.pop_to_mark().map(|_| Value::Object(vec![]))?,
+            // REDUCE
+            b'R' => {
+                let (arguments, function) = (self.pop()?, self.pop()?);
+                self.call(function, arguments)?
+            }
+            // NEWOBJ, NEWOBJ_EX: instances of classes, which Python creates by `__new__` alone
+            0x81 | 0x92 => {
+                if opcode == 0x92 {
+                    self.pop()?;
+                }
+                let (_arguments, class) = (self.pop()?, self.pop()?);
+                match self.global(class, "with an instance of")? {
+                    ("collections", "OrderedDict") => Value::Dict(vec![]),
+                    _ => Value::Object(vec![]),
+                }
+            }
+            // BINPERSID
+            b'Q' => {
+                let id = self.pop()?;
+                self.storage(id)?
+            }
+            opcode => return Err(format!("a pickle with instruction {opcode:#04x}, which no tensors need")),
+        })
+    }
 }
 
-/// Returns the number of bytes of the length that precedes a string or bytes.
-fn length_bytes(opcode: u8) -> usize {
-    match opcode {
-        0x8c | b'C' => 1,
-        b'X' | b'B' => 4,
-        _ => 8,
-    }
+fn text(bytes: &[u8]) -> Result<&str, String> {
+    std::str::from_utf8(bytes).map_err(|_| "a pickle with a string that is no UTF-8".into())
 }

@@ -7,7 +7,7 @@ use crate::geometry::{Camera, Intrinsics};
 use crate::pixels::{SUPPORTED_IMAGES, encoded_image_size};
 use glam::{DMat4, DVec4};
 use globalsplat_files::{Error, Result, split_keyed_path};
-use globalsplat_torch_file::{Archive, Array, Dtype, Id, Value, Values, unpickle};
+use globalsplat_torch_file::{Array, Dtype, Id, TorchFile, Value};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -72,10 +72,11 @@ impl Chunk {
     /// # Errors
     /// Fails like [`Chunk::read`], except for errors of reading the file.
     pub fn parse(file: &Path, bytes: Vec<u8>) -> Result<Self> {
-        let archive = Archive::parse(file, &bytes)?;
-        let expected = "a list of scenes, of tensors, lists, dicts, strings and numbers alone";
-        let scenes =
-            read_scenes(&bytes, &archive).map_err(|found| Error::input(file, "data.pkl", found, expected))?;
+        let max_views = ALWAYS_ALLOWED_VIEWS + bytes.len() / MIN_BYTES_PER_VIEW;
+        let scenes = list_scenes(&TorchFile::parse(file, &bytes)?, max_views).map_err(|why| {
+            let expected = "a list of scenes, of tensors, lists, dicts, strings and numbers alone";
+            Error::input(file, "data.pkl", format!("unusable ({why})"), expected)
+        })?;
         Ok(Chunk { file: file.to_owned(), bytes: Arc::new(bytes), scenes })
     }
 
@@ -173,17 +174,12 @@ pub fn camera_numbers(camera: &Camera) -> [f32; CAMERA_NUMBERS] {
     numbers
 }
 
-/// Returns the scenes in `archive`, whose file contents are `bytes`.
+/// Returns the scenes in a chunk.
 ///
 /// # Errors
-/// Fails if the pickle uses anything that isn't allowed, or is not a list of scenes.
-fn read_scenes(bytes: &[u8], archive: &Archive) -> Result<Vec<Scene>, String> {
-    let values = unpickle(&bytes[archive.pickle.clone()])?;
-    let max_views = ALWAYS_ALLOWED_VIEWS + bytes.len() / MIN_BYTES_PER_VIEW;
-    list_scenes(&values, archive, max_views).map_err(|why| format!("unusable ({why})"))
-}
-
-fn list_scenes(values: &Values, archive: &Archive, max_views: usize) -> Result<Vec<Scene>, String> {
+/// Fails if the chunk isn't a list of scenes, or if they have more than `max_views` views together.
+fn list_scenes(chunk: &TorchFile, max_views: usize) -> Result<Vec<Scene>, String> {
+    let values = &chunk.values;
     let Value::List(list) = values.get(values.root) else {
         return Err(format!("{}, expected a list of scenes", values.get(values.root).type_name()));
     };
@@ -193,7 +189,7 @@ fn list_scenes(values: &Values, archive: &Archive, max_views: usize) -> Result<V
             Value::Dict(items) => items,
             other => return Err(format!("scene {index} is {}, expected a dict", other.type_name())),
         };
-        let fields = Fields { values, archive, dict, index };
+        let fields = Fields { chunk, dict, index };
         let images = fields.images()?;
         views += images.len();
         if views > max_views {
@@ -206,8 +202,7 @@ fn list_scenes(values: &Values, archive: &Archive, max_views: usize) -> Result<V
 
 /// Entries of a scene. Every error message names the scene and the field.
 struct Fields<'v, 'a> {
-    values: &'v Values<'a>,
-    archive: &'v Archive,
+    chunk: &'v TorchFile<'a>,
     dict: &'v [(Id, Id)],
     index: usize,
 }
@@ -218,7 +213,7 @@ impl<'v, 'a> Fields<'v, 'a> {
     }
 
     fn get(&self, field: &str) -> Result<&'v Value<'a>, String> {
-        self.values.find(self.dict, field).ok_or_else(|| format!("scene {} has no {field}", self.index))
+        self.chunk.values.find(self.dict, field).ok_or_else(|| format!("scene {} has no {field}", self.index))
     }
 
     fn images(&self) -> Result<&'v [Id], String> {
@@ -232,7 +227,7 @@ impl<'v, 'a> Fields<'v, 'a> {
 
     /// Returns `value`, which is in `field`, as an array of one or two dimensions.
     fn array(&self, field: &str, value: &Value) -> Result<Array, String> {
-        let array = Array::locate(self.values, &self.archive.storages, value)
+        let array = Array::locate(&self.chunk.values, &self.chunk.storages, value)
             .map_err(|why| format!("{} {why}", self.name(field)))?;
         match array.shape.len() <= 2 {
             true => Ok(array),
@@ -248,7 +243,7 @@ impl<'v, 'a> Fields<'v, 'a> {
             let expected = format!("F32 [{views}, {CAMERA_NUMBERS}] for as many images");
             return Err(format!("{field} is {found}, expected {expected}"));
         }
-        let timestamps = self.values.find(self.dict, "timestamps");
+        let timestamps = self.chunk.values.find(self.dict, "timestamps");
         let timestamps = timestamps.map(|value| self.array("timestamps", value)).transpose()?;
         if let Some(Array { shape, .. }) = timestamps.filter(|timestamps| timestamps.shape != [views]) {
             let field = self.name("timestamps");
@@ -258,7 +253,7 @@ impl<'v, 'a> Fields<'v, 'a> {
             Value::Str(key) => key.to_string(),
             other => return Err(format!("{} is {}, expected a string", self.name("key"), other.type_name())),
         };
-        let image = |&id: &Id| match self.array("images", self.values.get(id))? {
+        let image = |&id: &Id| match self.array("images", self.chunk.values.get(id))? {
             array if !array.is_contiguous() => Err(format!("{} is no plain tensor", self.name("images"))),
             Array { dtype: Dtype::U8, shape, bytes, .. } if shape.len() == 1 => Ok(bytes),
             Array { dtype, shape, .. } => {
