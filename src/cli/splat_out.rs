@@ -2,8 +2,8 @@
 
 use crate::error::{Error, Result};
 use crate::io::{
-    ShLimits, Splat, WriteOptions, can_mark_antialiased, check_writable_origin, fit_splat, rounding_warning,
-    splat_files, write_local_splat_with,
+    ShLimits, Splat, WriteOptions, check_writable_file, fit_splat, origin_file, output_format,
+    rounding_warning, splat_files, write_local_splat,
 };
 use crate::scene::Camera;
 use glam::DVec3;
@@ -14,7 +14,7 @@ use std::path::Path;
 /// # Errors
 /// A request error that names the file.
 pub fn check_origin(path: &Path, is_local: bool) -> Result<()> {
-    if is_local { Ok(check_writable_origin(path)?) } else { Ok(()) }
+    if is_local { Ok(check_writable_file(&origin_file(path))?) } else { Ok(()) }
 }
 
 /// Returns the size of the splat at `path` with all its files, such as the images of a SOG's `meta.json`.
@@ -42,15 +42,15 @@ pub fn write_with(
     local_origin: Option<DVec3>,
     options: &WriteOptions,
 ) -> Result<()> {
-    if splat.antialiased && !can_mark_antialiased(path)? {
+    if splat.antialiased && !output_format(path)?.marks_antialiased {
         let line = "the format can't say that the splat is antialiased, and viewers show it slightly wrong";
         eprintln!("{}: {line}", path.display());
     }
     if let Some(origin) = local_origin {
-        return Ok(write_local_splat_with(path, &splat.with_origin(origin), options)?);
+        return Ok(write_local_splat(path, &splat.with_origin(origin), options)?);
     }
     if let Some(loss) = rounding_warning(splat) {
         eprintln!("{}: {loss}; --local-origin keeps them exact", path.display());
     }
-    Ok(write_local_splat_with(path, &splat.with_origin(DVec3::ZERO), options)?)
+    Ok(write_local_splat(path, &splat.with_origin(DVec3::ZERO), options)?)
 }

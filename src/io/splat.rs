@@ -4,7 +4,7 @@ use crate::error::Result;
 use crate::render::{compensate_mean_color, fit_harmonics, shrink_harmonics};
 use crate::scene::{Camera, Gaussians, RawGaussians, splat_frame};
 use glam::DVec3;
-use globalsplat_splat_file::{ShLimits, Splat, limits_of, sh_rounding_of};
+use globalsplat_splat_file::{ShLimits, Splat, output_format};
 use std::path::Path;
 use tch::Tensor;
 
@@ -17,8 +17,9 @@ const MAX_SPACING_RATIO: f64 = 1e-4;
 /// # Errors
 /// Returns an error for an unknown extension.
 pub fn fit_splat(path: &Path, splat: &Splat, limits: &ShLimits, cameras: &[Camera]) -> Result<Splat> {
-    let limits = limits.intersect(&limits_of(path)?);
-    let round_sh = if cameras.is_empty() { None } else { sh_rounding_of(path)? };
+    let format = output_format(path)?;
+    let limits = limits.intersect(&(format.limits)());
+    let round_sh = format.round_sh.filter(|_| !cameras.is_empty());
     let gaussians = Gaussians::from_splat(splat);
     let frame = gaussians.local_frame(splat.origin);
     let cameras = frame.cameras_to_local(cameras);

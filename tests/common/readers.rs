@@ -6,7 +6,7 @@ use globalsplat::config::Config;
 use globalsplat::data::{Capture, Chunk, Dataset, Split, open_capture, read_camera_path, read_points};
 use globalsplat::eval::{EvaluationIndex, read_evaluation, write_report};
 use globalsplat::io::{
-    decode_photo, origin_file, read_splat, read_splat_without_invalid, read_weights, rounding_warning,
+    WriteOptions, decode_photo, origin_file, read_splat, read_splat_without_invalid, read_weights, rounding_warning,
     write_local_splat, write_splat,
 };
 use globalsplat::reconstruct::load_model;
@@ -199,7 +199,7 @@ fn splat_origin(bytes: &[u8]) {
     std::fs::write(origin_file(&splat), bytes).unwrap();
     let Ok(splat) = read_splat(&splat) else { return };
     let copy = file("splat_origin", "copy.splat", b"");
-    write_local_splat(&copy, &splat).unwrap();
+    write_local_splat(&copy, &splat, &WriteOptions::default()).unwrap();
     assert_eq!(read_splat(&copy).unwrap().origin, splat.origin);
     let _ = write_splat(&copy, &splat);
     let _ = rounding_warning(&splat);

@@ -6,7 +6,7 @@ use crate::common::{captures, has_viewer};
 use glam::{DMat3, DMat4, DVec3};
 use globalsplat::data::{open_capture, write_cameras_json};
 use globalsplat::io::{
-    Splat, origin_file, read_image, read_splat, tensor_from_rgb, write_local_splat, write_splat,
+    Splat, WriteOptions, origin_file, read_image, read_splat, tensor_from_rgb, write_local_splat, write_splat,
 };
 use globalsplat::metrics::psnr;
 use globalsplat::render::{SplatRenderer, transform};
@@ -111,7 +111,7 @@ fn a_splat_looks_the_same_in_any_unit_and_place() {
     for place in PLACES {
         let to = to_place(place);
         write_moved(&room, &scene, &to);
-        write_local_splat(&splat, &moved_splat(&read, &to)).unwrap();
+        write_local_splat(&splat, &moved_splat(&read, &to), &WriteOptions::default()).unwrap();
         assert_eq!(origin_file(&splat).is_file(), to.translation != DVec3::ZERO);
         let [psnr, loss] = render_and_score(&splat, &scene, &pictures);
         let least = least_psnr(&plain, &pictures);
@@ -172,7 +172,7 @@ fn a_local_origin_keeps_the_detail() {
     let offset = to.translation;
     let (scene, local, world) = (of("scene"), of("local.ply"), of("world.ply"));
     write_moved(&room, &scene, &to);
-    write_local_splat(&local, &moved_splat(&ground_truth, &to)).unwrap();
+    write_local_splat(&local, &moved_splat(&ground_truth, &to), &WriteOptions::default()).unwrap();
     let psnr = |splat: &Path| {
         run_json(&["eval", "--splat", arg(splat), "--scene", arg(&scene), "--json"])["psnr"].as_f64().unwrap()
     };

@@ -1,13 +1,12 @@
 //! PlayCanvas' compressed PLY (spec 10.12). Each Gaussian has four words of 32 bits, and a byte for each SH coefficient above degree 0.
 //! Positions, scales and colors are quantized between the bounds of a chunk of 256 Gaussians.
 
-use crate::invalid::{Contents, InvalidGaussians};
 use crate::morton::morton_order;
 use crate::numbers::Scalar;
 use crate::ply::degree_of_rest;
-use crate::ply_table::{Header, Kind};
+use crate::ply_table::Header;
 use crate::rotations::{from_smallest_three, smallest_three};
-use crate::splat::{color_to_sh0, logit_of_opacity, sh0_to_color};
+use crate::splat::{bounds, color_to_sh0, logit_of_opacity, sh0_to_color};
 use crate::{Error, Result, ShLimits, Splat, WriteOptions};
 use globalsplat_files::write_atomically;
 use std::path::Path;
@@ -37,26 +36,17 @@ pub(crate) fn recognizes(bytes: &[u8]) -> bool {
 }
 
 /// Reads a compressed PLY of any SH degree. In older files, which have no bounds of colors, the bounds are 0 and 1.
-pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
+pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
     let header = Header::parse(path, bytes)?;
-    let words = WORDS.map(String::from);
-    expect_type(path, &header, "vertex", &words, Scalar::U32)?;
-    let words = header.columns(path, bytes, "vertex", &words, |number| number as u32)?;
+    let uint = Some(Scalar::U32);
+    let words =
+        header.columns(path, bytes, "vertex", &WORDS.map(String::from), uint, |number| number as u32)?;
     let (words, _) = words.as_chunks::<{ WORDS.len() }>();
 
     let has_color_bounds = header.element("chunk").is_some_and(|chunk| chunk.property("min_r").is_some());
     let bounded = if has_color_bounds { &BOUNDED[..] } else { &BOUNDED[..2] };
     let names = bounded.iter().flat_map(bound_names).collect::<Vec<_>>();
-    let bounds = header.columns(path, bytes, "chunk", &names, |number| number as f32)?;
-    let mut invalid = InvalidGaussians::default();
-    for (chunk, bounds) in bounds.chunks_exact(names.len()).enumerate() {
-        for (bad, name) in bounds.iter().zip(&names).filter(|(bound, _)| !bound.is_finite()) {
-            for row in chunk * CHUNK..words.len().min((chunk + 1) * CHUNK) {
-                let field = || format!("{name} of chunk {chunk}");
-                invalid.add(row, name, field, *bad, "a finite number");
-            }
-        }
-    }
+    let bounds = header.columns(path, bytes, "chunk", &names, None, |number| number as f32)?;
     let chunks: Vec<&[f32]> = bounds.chunks_exact(names.len()).collect();
     if chunks.len() < words.len().div_ceil(CHUNK) {
         let expected = format!("{} for {} Gaussians", words.len().div_ceil(CHUNK), words.len());
@@ -90,7 +80,7 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         let of_channel = |channel: usize, basis: usize| unpack_sh(rest[channel * (bases - 1) + basis]);
         splat.sh.extend((0..bases - 1).map(|basis| [0, 1, 2].map(|channel| of_channel(channel, basis))));
     }
-    Ok((splat, invalid))
+    Ok(splat)
 }
 
 /// Returns the bytes of the SH coefficients above degree 0, `[count, 3, bases - 1]`, and the degree.
@@ -103,21 +93,7 @@ fn read_rest(path: &Path, bytes: &[u8], header: &Header, count: usize) -> Result
         let field = "the number of rows of the element sh";
         return Err(Error::input(path, field, element.count, format!("{count}, as many as Gaussians")));
     }
-    expect_type(path, header, "sh", &names, Scalar::U8)?;
-    Ok((header.columns(path, bytes, "sh", &names, |number| number as u8)?, degree))
-}
-
-/// Checks that the properties `names` of `element` have the type `scalar`, if they exist.
-fn expect_type(path: &Path, header: &Header, element: &str, names: &[String], scalar: Scalar) -> Result<()> {
-    let mut properties = header.element(element).into_iter().flat_map(|element| &element.properties);
-    match properties.find(|property| names.contains(&property.name) && property.kind != Kind::Number(scalar))
-    {
-        Some(property) => {
-            let expected = if scalar == Scalar::U8 { "uchar" } else { "uint" };
-            Err(Error::input(path, format!("the type of {}", property.name), "another", expected))
-        }
-        None => Ok(()),
-    }
+    Ok((header.columns(path, bytes, "sh", &names, Some(Scalar::U8), |number| number as u8)?, degree))
 }
 
 /// Returns the names of the lower bounds of three values, followed by those of the upper bounds.
@@ -133,28 +109,33 @@ pub(crate) fn limits() -> ShLimits {
 /// Writes a compressed PLY. The Gaussians are in Morton order, so that those of a chunk are close together and the bounds are narrow.
 pub(crate) fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
     let order = morton_order(&splat.means);
-    let (mut bounds, mut words) = (vec![], vec![]);
+    let (mut limits, mut words) = (vec![], vec![]);
     for chunk in order.chunks(CHUNK) {
-        let of_chunk = |value_of: &dyn Fn(usize) -> [f32; 3]| -> Vec<[f32; 3]> {
-            chunk.iter().map(|&index| value_of(index)).collect()
+        // Returns the positions of the values of all Gaussians between the chunk's bounds: 0 at the lower bound, 1 at the upper bound.
+        let mut quantize = |value_of: &dyn Fn(usize) -> [f32; 3]| -> Vec<[f64; 3]> {
+            let values: Vec<[f32; 3]> = chunk.iter().map(|&index| value_of(index)).collect();
+            let [low, high] = bounds(&values);
+            limits.extend([low, high].as_flattened().iter().flat_map(|bound| bound.to_le_bytes()));
+            let [low, width] =
+                [low.map(f64::from), [0, 1, 2].map(|axis| f64::from(high[axis]) - f64::from(low[axis]))];
+            let fraction = |value: f32, axis: usize| match width[axis] {
+                0. => 0.,
+                width => (f64::from(value) - low[axis]) / width,
+            };
+            values.iter().map(|value| [0, 1, 2].map(|axis| fraction(value[axis], axis))).collect()
         };
-        let means = Bounded::of(of_chunk(&|index| splat.means[index]));
-        let log_scales = Bounded::of(of_chunk(&|index| {
-            splat.log_scales[index].map(|log_scale| log_scale.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE))
-        }));
-        let colors = Bounded::of(of_chunk(&|index| splat.sh_of(index)[0].map(|dc| sh0_to_color(dc) as f32)));
-        for bounded in [&means, &log_scales, &colors] {
-            bounds.extend(bounded.low.iter().chain(&bounded.high).flat_map(|bound| bound.to_le_bytes()));
-        }
+        let means = quantize(&|index| splat.means[index]);
+        let log_scales =
+            quantize(&|index| splat.log_scales[index].map(|log| log.clamp(-MAX_LOG_SCALE, MAX_LOG_SCALE)));
+        let colors = quantize(&|index| splat.sh_of(index)[0].map(|dc| sh0_to_color(dc) as f32));
         for (row, &index) in chunk.iter().enumerate() {
             let (largest, others) = smallest_three(splat.unit_quaternion(index));
-            let [red, green, blue] = colors.fractions(row);
-            let color = [red, green, blue, f64::from(splat.opacity(index))];
+            let [red, green, blue] = colors[row];
             let packed = [
-                pack(means.fractions(row), POSITION_BITS),
+                pack(means[row], POSITION_BITS),
                 (largest as u32) << 30 | pack(others, ROTATION_BITS),
-                pack(log_scales.fractions(row), POSITION_BITS),
-                pack(color, COLOR_BITS),
+                pack(log_scales[row], POSITION_BITS),
+                pack([red, green, blue, splat.opacity(index).into()], COLOR_BITS),
             ];
             words.extend(packed.iter().flat_map(|word| word.to_le_bytes()));
         }
@@ -166,7 +147,7 @@ pub(crate) fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> 
     let rest: Vec<u8> = rest.collect();
     let header = header(splat);
     write_atomically(path, |writer| {
-        let parts = [header.as_bytes(), &bounds, &words, &rest];
+        let parts = [header.as_bytes(), &limits, &words, &rest];
         parts.iter().try_for_each(|part| writer.write_all(part)).map_err(Error::write(path))
     })
 }
@@ -184,32 +165,6 @@ fn header(splat: &Splat) -> String {
     }
     lines.push("end_header\n".into());
     lines.join("\n")
-}
-
-/// Vectors of a chunk's Gaussians, and the bounds of each component.
-struct Bounded {
-    values: Vec<[f32; 3]>,
-    low: [f32; 3],
-    high: [f32; 3],
-}
-
-impl Bounded {
-    fn of(values: Vec<[f32; 3]>) -> Self {
-        let extreme = |choose: fn(f32, f32) -> f32| -> [f32; 3] {
-            std::array::from_fn(|axis| {
-                values.iter().map(|value| value[axis]).reduce(choose).expect("a chunk has a Gaussian")
-            })
-        };
-        Bounded { low: extreme(f32::min), high: extreme(f32::max), values }
-    }
-
-    /// Returns the position of each component of vector `row` between its bounds: 0 at the lower bound, 1 at the upper bound.
-    fn fractions(&self, row: usize) -> [f64; 3] {
-        std::array::from_fn(|axis| {
-            let (low, high) = (f64::from(self.low[axis]), f64::from(self.high[axis]));
-            if high > low { (f64::from(self.values[row][axis]) - low) / (high - low) } else { 0. }
-        })
-    }
 }
 
 /// Packs values in [0, 1] into a word. The first value is in the highest bits, and each value has as many bits as `bits` says.

@@ -1,6 +1,5 @@
 //! antimatter15's `.splat` format: 32 bytes per Gaussian and nothing else (spec 10.14).
 
-use crate::invalid::{Contents, InvalidGaussians};
 use crate::numbers::f32_at;
 use crate::rotations::normalized;
 use crate::splat::{color_to_sh0, logit_of_opacity, sh0_to_color};
@@ -16,7 +15,7 @@ const MAGICS: [fn(&[u8]) -> bool; 4] =
     [ply::recognizes, sog::recognizes, spz::recognizes, gltf::recognizes_glb];
 
 /// Reads a `.splat`, whose colors don't depend on the view direction.
-pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
+pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
     let (gaussians, rest) = bytes.as_chunks::<BYTES>();
     if gaussians.is_empty() || !rest.is_empty() {
         let found = format!("{} bytes", bytes.len());
@@ -31,7 +30,7 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         splat.opacity_logits.push(logit_of_opacity(fraction(27)));
         splat.quaternions.push(normalized([28, 29, 30, 31].map(|at| f32::from(gaussian[at]) - 128.)));
     }
-    Ok((splat, InvalidGaussians::default()))
+    Ok(splat)
 }
 
 /// Returns the limits of coefficients: colors that a screen shows, independent of the view direction.

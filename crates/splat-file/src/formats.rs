@@ -1,7 +1,7 @@
 //! File formats of splats: a module for each format, and an entry in [`FORMATS`]. The extension determines the format that is written; a
 //! file that is read is recognized by its contents, where that is possible.
 
-use crate::invalid::Contents;
+use crate::invalid::InvalidGaussians;
 use crate::origin::{origin_file, read_origin, write_with_origin};
 use crate::rotations::drop_missing_rotations;
 use crate::{Error, Result, ShLimits, Splat, compressed_ply, dot_splat, gltf, ksplat, ply, sog, spz};
@@ -22,110 +22,103 @@ impl Default for WriteOptions {
     }
 }
 
-/// A splat file format.
-struct Format {
+/// A splat file format: what it can represent, and the functions that read and write it.
+pub struct SplatFormat {
     /// Suffix of file names, in lower case, or a whole file name if it doesn't begin with a dot.
     ending: &'static str,
     /// Function that returns `true` if bytes are certainly in this format.
     recognizes: fn(&[u8]) -> bool,
     /// `true` if a file can say that the splat is antialiased.
-    marks_antialiased: bool,
-    read: fn(&Path, &[u8]) -> Result<Contents>,
-    /// Functions that write the format, or `None` if it is only read.
-    writer: Option<Writer>,
-}
-
-/// Functions that write a format.
-struct Writer {
+    pub marks_antialiased: bool,
+    read: fn(&Path, &[u8]) -> Result<Splat>,
+    find_invalid: fn(&Splat) -> InvalidGaussians,
     write: fn(&Path, &Splat, &WriteOptions) -> Result<()>,
-    limits: fn() -> ShLimits,
-    /// Function that rounds SH coefficients above degree 0 as the format does, if it has a palette of them.
-    round_sh: Option<RoundSh>,
-}
-
-/// Function that returns a splat with rounded SH coefficients.
-pub type RoundSh = fn(&Splat) -> Splat;
-
-impl Writer {
-    /// Creates the functions of a format without a palette.
-    const fn new(write: fn(&Path, &Splat, &WriteOptions) -> Result<()>, limits: fn() -> ShLimits) -> Self {
-        Writer { write, limits, round_sh: None }
-    }
+    /// Function that returns the limits of the spherical harmonics.
+    pub limits: fn() -> ShLimits,
+    /// Function that returns a splat with SH coefficients above degree 0 rounded as in a file, if the format has a palette of them, which
+    /// depends on all Gaussians. Writing the rounded splat doesn't change them.
+    pub round_sh: Option<fn(&Splat) -> Splat>,
 }
 
 /// Name of the file that describes an unbundled SOG.
 const SOG_META: &str = "meta.json";
 
-/// Returns the limits of a format that holds any number.
-fn unlimited() -> ShLimits {
-    ShLimits::up_to(3)
-}
+/// mkkellogg's format, which is only read. The other formats state what differs from it.
+const KSPLAT: SplatFormat = SplatFormat {
+    ending: ".ksplat",
+    recognizes: |_| false,
+    marks_antialiased: false,
+    read: ksplat::read,
+    find_invalid: InvalidGaussians::find,
+    write: |path, _, _| Err(only_read(path)),
+    limits: || ShLimits::up_to(3),
+    round_sh: None,
+};
+
+/// PlayCanvas' format, in one file.
+const SOG: SplatFormat = SplatFormat {
+    ending: ".sog",
+    recognizes: sog::recognizes,
+    marks_antialiased: true,
+    read: sog::read_bundle,
+    write: sog::write_bundle,
+    round_sh: Some(sog::round_sh),
+    ..KSPLAT
+};
 
 /// All formats. The first one whose suffix matches, or that recognizes a file, is used.
-const FORMATS: [Format; 9] = [
-    Format {
+static FORMATS: [SplatFormat; 9] = [
+    SplatFormat {
         ending: ".compressed.ply",
         recognizes: compressed_ply::recognizes,
         marks_antialiased: true,
         read: compressed_ply::read,
-        writer: Some(Writer::new(compressed_ply::write, compressed_ply::limits)),
+        write: compressed_ply::write,
+        limits: compressed_ply::limits,
+        ..KSPLAT
     },
-    Format {
+    SplatFormat {
         ending: ".ply",
         recognizes: ply::recognizes,
         marks_antialiased: true,
         read: ply::read,
-        writer: Some(Writer::new(ply::write, unlimited)),
+        find_invalid: ply::find_invalid,
+        write: ply::write,
+        ..KSPLAT
     },
-    Format {
-        ending: ".sog",
-        recognizes: sog::recognizes,
-        marks_antialiased: true,
-        read: sog::read_bundle,
-        writer: Some(Writer { round_sh: Some(sog::round_sh), ..Writer::new(sog::write_bundle, unlimited) }),
-    },
-    Format {
+    SOG,
+    SplatFormat {
         ending: SOG_META,
         recognizes: |_| false,
-        marks_antialiased: true,
         read: sog::read_folder,
-        writer: Some(Writer { round_sh: Some(sog::round_sh), ..Writer::new(sog::write_folder, unlimited) }),
+        write: sog::write_folder,
+        ..SOG
     },
-    Format {
+    SplatFormat {
         ending: ".spz",
         recognizes: spz::recognizes,
         marks_antialiased: true,
         read: spz::read,
-        writer: Some(Writer::new(spz::write, spz::limits)),
+        write: spz::write,
+        limits: spz::limits,
+        ..KSPLAT
     },
-    Format {
+    SplatFormat {
         ending: ".splat",
-        recognizes: |_| false,
-        marks_antialiased: false,
         read: dot_splat::read,
-        writer: Some(Writer::new(dot_splat::write, dot_splat::limits)),
+        write: dot_splat::write,
+        limits: dot_splat::limits,
+        ..KSPLAT
     },
-    Format {
+    SplatFormat {
         ending: ".glb",
         recognizes: gltf::recognizes_glb,
-        marks_antialiased: false,
         read: gltf::read,
-        writer: Some(Writer::new(gltf::write_glb, unlimited)),
+        write: gltf::write_glb,
+        ..KSPLAT
     },
-    Format {
-        ending: ".gltf",
-        recognizes: |_| false,
-        marks_antialiased: false,
-        read: gltf::read,
-        writer: Some(Writer::new(gltf::write_gltf, unlimited)),
-    },
-    Format {
-        ending: ".ksplat",
-        recognizes: |_| false,
-        marks_antialiased: false,
-        read: ksplat::read,
-        writer: None,
-    },
+    SplatFormat { ending: ".gltf", read: gltf::read, write: gltf::write_gltf, ..KSPLAT },
+    KSPLAT,
 ];
 
 /// Extensions of the formats that are written, for messages.
@@ -133,12 +126,7 @@ const WRITTEN_ENDINGS: &str = ".ply, .compressed.ply, .sog, .spz, .splat, .glb, 
 /// Extensions of all formats, for messages.
 const ENDINGS: &str = ".ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf, .ksplat or meta.json";
 
-impl Format {
-    /// Returns `true` if a file with this name, in lower case, is in this format.
-    fn is_named(&self, name: &str) -> bool {
-        if self.ending.starts_with('.') { name.ends_with(self.ending) } else { name == self.ending }
-    }
-
+impl SplatFormat {
     /// Returns the paths of the other files that the splat at `path` is written to.
     fn other_files(&self, path: &Path) -> Vec<PathBuf> {
         match self.ending {
@@ -150,20 +138,29 @@ impl Format {
 }
 
 /// Returns the format that belongs to the extension of `path`.
-fn format_of(path: &Path) -> Result<&'static Format> {
+fn format_of(path: &Path) -> Result<&'static SplatFormat> {
     let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
-    FORMATS.iter().find(|format| format.is_named(&name)).ok_or_else(|| {
+    let is_named =
+        |ending: &str| if ending.starts_with('.') { name.ends_with(ending) } else { name == ending };
+    FORMATS.iter().find(|format| is_named(format.ending)).ok_or_else(|| {
         let found = path.extension().map_or("missing".into(), |ending| format!(".{}", ending.display()));
         Error::input(path, "the ending", found, ENDINGS)
     })
 }
 
-/// Returns the functions that write the format that belongs to the extension of `path`.
-fn writer_of(path: &Path) -> Result<&'static Writer> {
-    let Format { ending, writer, .. } = format_of(path)?;
-    writer.as_ref().ok_or_else(|| {
-        Error::input(path, "the format", format!("{ending}, which is only read"), WRITTEN_ENDINGS)
-    })
+/// Returns the format in which a splat is written at `path`, which the extension selects.
+///
+/// # Errors
+/// Returns an error for an unknown extension, or a format that is only read.
+pub fn output_format(path: &Path) -> Result<&'static SplatFormat> {
+    match format_of(path)? {
+        format if format.ending == KSPLAT.ending => Err(only_read(path)),
+        format => Ok(format),
+    }
+}
+
+fn only_read(path: &Path) -> Error {
+    Error::input(path, "the format", format!("{}, which is only read", KSPLAT.ending), WRITTEN_ENDINGS)
 }
 
 /// Returns `true` if `path` has the extension of a splat format.
@@ -191,8 +188,7 @@ pub fn find_splat(folder: &Path, name: &str) -> PathBuf {
 /// Returns an error for an unknown extension or a format that is only read, a request error that names the path, or an error if a
 /// new splat would replace a file that belongs to something else, such as the buffer of a `.gltf`.
 pub fn check_writable_splat(path: &Path) -> Result<()> {
-    writer_of(path)?;
-    for file in format_of(path)?.other_files(path) {
+    for file in output_format(path)?.other_files(path) {
         check_writable_file(&file)?;
         if file.exists() && !path.exists() {
             let found = format!("{}, which would be replaced", file.display());
@@ -200,31 +196,6 @@ pub fn check_writable_splat(path: &Path) -> Result<()> {
         }
     }
     check_writable_file(path)
-}
-
-/// Returns `true` if the format that the extension of `path` selects can say that a splat is antialiased.
-///
-/// # Errors
-/// Returns an error for an unknown extension.
-pub fn can_mark_antialiased(path: &Path) -> Result<bool> {
-    Ok(format_of(path)?.marks_antialiased)
-}
-
-/// Returns the limits of the spherical harmonics in the format that the extension of `path` selects.
-///
-/// # Errors
-/// Returns an error for an unknown extension, or a format that is only read.
-pub fn limits_of(path: &Path) -> Result<ShLimits> {
-    Ok((writer_of(path)?.limits)())
-}
-
-/// Returns the function that rounds SH coefficients above degree 0 as a file at `path` would, if its format has a palette of them, which
-/// depends on all Gaussians. Writing the rounded splat doesn't change them.
-///
-/// # Errors
-/// Returns an error for an unknown extension, or a format that is only read.
-pub fn sh_rounding_of(path: &Path) -> Result<Option<RoundSh>> {
-    Ok(writer_of(path)?.round_sh)
 }
 
 /// Reads a splat in the format that is recognized by its contents, or else in the format of its extension. Gaussians whose quaternion has
@@ -260,12 +231,12 @@ pub fn read_splat_without_invalid(path: &Path) -> Result<Splat> {
     drawable(path, splat.len(), invalid.leave_out(path, splat))
 }
 
-fn read_contents(path: &Path) -> Result<Contents> {
+fn read_contents(path: &Path) -> Result<(Splat, InvalidGaussians)> {
     let named = format_of(path)?;
     let bytes = std::fs::read(path).map_err(Error::read(path))?;
     let format = FORMATS.iter().find(|format| (format.recognizes)(&bytes)).unwrap_or(named);
-    let (splat, mut invalid) = (format.read)(path, &bytes)?;
-    invalid.add_all(&splat);
+    let splat = (format.read)(path, &bytes)?;
+    let invalid = (format.find_invalid)(&splat);
     Ok((splat, invalid))
 }
 
@@ -287,31 +258,20 @@ fn drawable(path: &Path, all: usize, valid: Splat) -> Result<Splat> {
 /// Returns an error for an unknown extension, or if a list of the splat has the wrong length, or the format can't hold the Gaussians, for
 /// example because a value isn't finite, or the file can't be written.
 pub fn write_splat(path: &Path, splat: &Splat) -> Result<()> {
-    match splat.origin == DVec3::ZERO {
-        true => write_local_splat(path, splat),
-        false => write_local_splat(path, &splat.with_origin(DVec3::ZERO)),
-    }
+    write_local_splat(path, &splat.with_origin(DVec3::ZERO), &WriteOptions::default())
 }
 
 /// Writes a splat like [`write_splat`], but with coordinates relative to its origin, which is written to
 /// [`origin_file`](crate::origin_file) unless it is zero.
 ///
 /// # Errors
-/// Returns the errors of [`write_splat`].
-pub fn write_local_splat(path: &Path, splat: &Splat) -> Result<()> {
-    write_local_splat_with(path, splat, &WriteOptions::default())
-}
-
-/// Writes a splat like [`write_local_splat`], with `options`.
-///
-/// # Errors
 /// Returns the errors of [`write_splat`], or an error if the format doesn't allow the options.
-pub fn write_local_splat_with(path: &Path, splat: &Splat, options: &WriteOptions) -> Result<()> {
-    let writer = writer_of(path)?;
+pub fn write_local_splat(path: &Path, splat: &Splat, options: &WriteOptions) -> Result<()> {
+    let format = output_format(path)?;
     splat.check_lengths()?;
     let (rotated, _) = drop_missing_rotations(splat);
     write_with_origin(path, splat.origin, || {
         rotated.check_finite(path)?;
-        (writer.write)(path, &rotated, options)
+        (format.write)(path, &rotated, options)
     })
 }

@@ -7,10 +7,6 @@ use std::path::Path;
 /// Maximum number of properties that a warning names.
 const NAMED: usize = 6;
 
-/// Splat as a file has it, and its Gaussians that are invalid. A reader may leave values that aren't finite to
-/// [`InvalidGaussians::add_all`].
-pub(crate) type Contents = (Splat, InvalidGaussians);
-
 /// Gaussians of a file that have an invalid value, one that isn't finite or is out of its range.
 #[derive(Debug, Default)]
 pub(crate) struct InvalidGaussians {
@@ -21,6 +17,25 @@ pub(crate) struct InvalidGaussians {
 }
 
 impl InvalidGaussians {
+    /// Finds the Gaussians of `splat` that have a value that isn't finite, or a negative scale.
+    pub fn find(splat: &Splat) -> Self {
+        let mut invalid = Self::default();
+        for row in 0..splat.len() {
+            let mut check = |property: &str, values: &[f32], min: f32| {
+                if let Some(&bad) = values.iter().find(|&&value| !(value.is_finite() && value >= min)) {
+                    let expected = if bad.is_finite() { "0 or more" } else { "finite numbers" };
+                    invalid.add(row, property, || format!("the {property} of Gaussian {row}"), bad, expected);
+                }
+            };
+            check("position", &splat.means[row], f32::MIN);
+            check("scale", &splat.scale(row), 0.);
+            check("rotation", &splat.quaternions[row], f32::MIN);
+            check("opacity", &[splat.opacity(row)], 0.);
+            check("color", splat.sh_of(row).as_flattened(), f32::MIN);
+        }
+        invalid
+    }
+
     /// Adds Gaussian `row`, whose `property` is `found`; `field` is its name in errors.
     pub fn add(
         &mut self,
@@ -37,35 +52,11 @@ impl InvalidGaussians {
         self.first.get_or_insert_with(|| [field(), found.to_string(), expected.into()]);
     }
 
-    /// Adds the Gaussians of `splat` that have a value that isn't finite, or a negative scale. Gaussians that are invalid already are
-    /// skipped.
-    pub fn add_all(&mut self, splat: &Splat) {
-        for row in 0..splat.len() {
-            if self.rows.contains(&row) {
-                continue;
-            }
-            let mut check = |property: &str, values: &[f32], min: f32| {
-                if let Some(&bad) = values.iter().find(|&&value| !(value.is_finite() && value >= min)) {
-                    let expected = if bad.is_finite() { "0 or more" } else { "finite numbers" };
-                    self.add(row, property, || format!("the {property} of Gaussian {row}"), bad, expected);
-                }
-            };
-            check("position", &splat.means[row], f32::MIN);
-            check("scale", &splat.scale(row), 0.);
-            check("rotation", &splat.quaternions[row], f32::MIN);
-            check("color", splat.sh_of(row).as_flattened(), f32::MIN);
-        }
-    }
-
     /// Refuses the file at `path` if it has invalid Gaussians, with an error that names the first one and the command that leaves them out.
     pub fn refuse(self, path: &Path) -> Result<()> {
-        match self.first {
-            Some([field, found, expected]) => {
-                let expected = format!("{expected}; `globalsplat convert` leaves out such Gaussians");
-                Err(Error::input(path, field, found, expected))
-            }
-            None => Ok(()),
-        }
+        let Some([field, found, expected]) = self.first else { return Ok(()) };
+        let expected = format!("{expected}; `globalsplat convert` leaves out such Gaussians");
+        Err(Error::input(path, field, found, expected))
     }
 
     /// Returns `splat`, which was read from `path`, without the invalid ones, and reports them in its warnings.

@@ -54,11 +54,6 @@ pub(crate) fn u32_at(bytes: &[u8], at: usize) -> u32 {
 }
 
 /// Returns the number at byte `at` of `bytes`, which must be long enough.
-pub(crate) fn u64_at(bytes: &[u8], at: usize) -> u64 {
-    u64::from_le_bytes(bytes_at(bytes, at))
-}
-
-/// Returns the number at byte `at` of `bytes`, which must be long enough.
 pub(crate) fn f32_at(bytes: &[u8], at: usize) -> f32 {
-    f32::from_bits(u32_at(bytes, at))
+    f32::from_le_bytes(bytes_at(bytes, at))
 }

@@ -2,11 +2,10 @@
 
 use crate::{Error, Result};
 use glam::DVec3;
-use globalsplat_files::{PartialFile, check_writable_file};
+use globalsplat_files::write_temporary;
 use serde::{Deserialize, Serialize};
 use std::ffi::OsString;
 use std::fs;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 /// Suffix that is added to the splat's name.
@@ -22,14 +21,6 @@ pub fn origin_file(path: &Path) -> PathBuf {
     let mut name = OsString::from(path);
     name.push(ENDING);
     name.into()
-}
-
-/// Checks that the origin file of a splat at `path`, whose name is longer, could be written. Call it before the work starts.
-///
-/// # Errors
-/// Returns a request error that names the file.
-pub fn check_writable_origin(path: &Path) -> Result<()> {
-    check_writable_file(&origin_file(path))
 }
 
 /// Returns the origin of the splat at `path`, or zero if it has no origin file.
@@ -57,9 +48,8 @@ pub(crate) fn write_with_origin(
         write()?;
         return if file.is_file() { fs::remove_file(&file).map_err(Error::write(&file)) } else { Ok(()) };
     }
-    let mut partial = PartialFile::create(&file)?;
     let json = serde_json::to_vec_pretty(&Contents { origin: origin.to_array() }).expect("numbers");
-    partial.file.write_all(&json).map_err(Error::write(&file))?;
+    let partial = write_temporary(&file, |writer| writer.write_all(&json).map_err(Error::write(&file)))?;
     write()?;
     partial.persist()
 }

@@ -3,7 +3,7 @@
 //! A vertex has x y z, nx ny nz (zeros), f_dc_0..2, f_rest_*, opacity (a logit), scale_0..2 (logs), rot_0..3 (w, x, y, z). f_rest is
 //! channel-major: all reds, all greens, all blues. Files are written as float32, binary, little-endian.
 
-use crate::invalid::{Contents, InvalidGaussians};
+use crate::invalid::InvalidGaussians;
 use crate::numbers::Scalar;
 use crate::ply_table::{Header, Kind};
 use crate::splat::color_to_sh0;
@@ -26,7 +26,7 @@ pub(crate) fn recognizes(bytes: &[u8]) -> bool {
 /// Reads a 3DGS splat of any SH degree, in text or binary of either byte order. Properties are found by name, so their order doesn't
 /// matter, and others may be present. Without `scale_2`, as in 2DGS, Gaussians are flat in their third direction; without `f_dc_*` their
 /// colors are those of `red`, `green` and `blue`.
-pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
+pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
     let header = Header::parse(path, bytes)?;
     let vertex = header.element("vertex");
     let has = |name: &str| vertex.is_some_and(|vertex| vertex.property(name).is_some());
@@ -38,11 +38,11 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
     let sh_degree = degree_of_rest(path, rest)?;
     let mut splat = Splat { sh_degree, antialiased: header.antialiased, ..Splat::default() };
     let bases = splat.bases();
-    let mut names: Vec<String> = [owned(["x", "y", "z"]), sh_names(bases), shape_names()].concat();
+    let mut names = property_names(bases);
     let colors = COLORS.into_iter().find(|names| names.iter().all(|name| has(name)));
     let colors = colors.filter(|_| !["f_dc_0", "f_dc_1", "f_dc_2"].into_iter().any(has));
     if let Some(colors) = colors {
-        names[3..6].clone_from_slice(&owned(colors));
+        names[3..6].clone_from_slice(&colors.map(String::from));
         let said = format!("colors are those of {}, because f_dc_* is missing", colors.join(", "));
         splat.warnings.push(format!("{}: {said}", path.display()));
     }
@@ -52,12 +52,10 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         let said = "Gaussians are flat in their third direction, because scale_2 is missing";
         splat.warnings.push(format!("{}: {said}", path.display()));
     }
-    let mut values = header.columns(path, bytes, "vertex", &names, |number| number as f32)?;
+    let mut values = header.columns(path, bytes, "vertex", &names, None, |number| number as f32)?;
     if let Some(red) = colors.zip(vertex).and_then(|(colors, vertex)| vertex.property(colors[0])) {
         harmonics_from_colors(red.kind, names.len(), &mut values);
     }
-    let invalid = find_invalid(&names, &values);
-
     for vertex in values.chunks_exact(names.len()) {
         let (means, vertex) = vertex.split_at(3);
         let (dc, vertex) = vertex.split_at(3);
@@ -74,7 +72,7 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         let quaternion = &vertex[vertex.len() - 4..];
         splat.quaternions.push([0, 1, 2, 3].map(|part| quaternion[part]));
     }
-    Ok((splat, invalid))
+    Ok(splat)
 }
 
 /// Converts the colors in columns 3 to 5 of a table, which are of type `kind` in the file, to spherical harmonics of degree 0. White is 255
@@ -103,10 +101,11 @@ pub(crate) fn degree_of_rest(path: &Path, rest: usize) -> Result<usize> {
 
 /// Finds Gaussians with values that aren't finite or scales that are too large. Logits of 0 and 1 and the logarithm of 0, which other
 /// programs write, are valid.
-fn find_invalid(names: &[String], values: &[f32]) -> InvalidGaussians {
+pub(crate) fn find_invalid(splat: &Splat) -> InvalidGaussians {
     let mut invalid = InvalidGaussians::default();
-    for (row, vertex) in values.chunks_exact(names.len()).enumerate() {
-        for (name, &value) in names.iter().zip(vertex) {
+    let names = property_names(splat.bases());
+    for row in 0..splat.len() {
+        for (name, value) in names.iter().zip(values_of(splat, row)) {
             let is_scale = name.starts_with("scale_");
             let may_be_infinite =
                 (name == "opacity" && !value.is_nan()) || (is_scale && value == f32::NEG_INFINITY);
@@ -128,21 +127,18 @@ pub(crate) fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> 
         true => number,
         false => number.clamp(min, max),
     };
-    let header = header(splat);
     write_atomically(path, |writer| {
-        writer.write_all(header.as_bytes()).map_err(Error::write(path))?;
-        let mut row = vec![];
+        writer.write_all(header(splat).as_bytes()).map_err(Error::write(path))?;
         for index in 0..splat.len() {
-            let sh = splat.sh_of(index);
-            row.clear();
-            row.extend(splat.means[index]);
-            row.extend([0.; 3]);
-            row.extend(sh[0]);
-            row.extend((0..3).flat_map(|channel| sh[1..].iter().map(move |of_basis| of_basis[channel])));
-            row.push(finite(splat.opacity_logits[index], -max_logit, max_logit));
-            row.extend(splat.log_scales[index].map(|log| finite(log, MIN_SCALE.ln() as f32, MAX_LOG_SCALE)));
-            row.extend(splat.quaternions[index]);
-            row.iter().try_for_each(|v| writer.write_all(&v.to_le_bytes())).map_err(Error::write(path))?;
+            let mut row = values_of(splat, index);
+            let [.., opacity, scale_0, scale_1, scale_2, _, _, _, _] = &mut row[..] else { unreachable!() };
+            *opacity = finite(*opacity, -max_logit, max_logit);
+            for scale in [scale_0, scale_1, scale_2] {
+                *scale = finite(*scale, MIN_SCALE.ln() as f32, MAX_LOG_SCALE);
+            }
+            row.splice(3..3, [0.; 3]); // the normal
+            let bytes: Vec<u8> = row.into_iter().flat_map(f32::to_le_bytes).collect();
+            writer.write_all(&bytes).map_err(Error::write(path))?;
         }
         Ok(())
     })
@@ -150,28 +146,34 @@ pub(crate) fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> 
 
 /// Returns the header that [`write`] writes before the values of the Gaussians.
 fn header(splat: &Splat) -> String {
-    let names = [owned(["x", "y", "z", "nx", "ny", "nz"]), sh_names(splat.bases()), shape_names()].concat();
+    let mut names = property_names(splat.bases());
+    names.splice(3..3, ["nx", "ny", "nz"].map(String::from));
     let properties: String = names.iter().map(|name| format!("property float {name}\n")).collect();
     let first = Header::first_lines(splat.antialiased);
     format!("{first}element vertex {}\n{properties}end_header\n", splat.len())
 }
 
-fn owned<const N: usize>(names: [&str; N]) -> Vec<String> {
-    names.map(String::from).into()
+/// Returns the names of a Gaussian's properties, without the normal: position, spherical harmonics, opacity, scale and rotation.
+fn property_names(bases: usize) -> Vec<String> {
+    let rest: Vec<String> = (0..3 * (bases - 1)).map(|k| format!("f_rest_{k}")).collect();
+    let first = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2"].map(String::from);
+    let last =
+        ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"].map(String::from);
+    [&first[..], &rest, &last].concat()
 }
 
-fn sh_names(bases: usize) -> Vec<String> {
-    let dc = (0..3).map(|k| format!("f_dc_{k}"));
-    dc.chain((0..3 * (bases - 1)).map(|k| format!("f_rest_{k}"))).collect()
-}
-
-fn shape_names() -> Vec<String> {
-    owned(["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"])
+/// Returns the values of the properties of [`property_names`] of a Gaussian.
+fn values_of(splat: &Splat, index: usize) -> Vec<f32> {
+    let (dc, rest) = splat.sh_of(index).split_at(1);
+    let mut values = [splat.means[index], dc[0]].concat();
+    values.extend((0..3).flat_map(|channel| rest.iter().map(move |of_basis| of_basis[channel])));
+    values.push(splat.opacity_logits[index]);
+    values.extend(splat.log_scales[index].iter().chain(&splat.quaternions[index]));
+    values
 }
 
 /// Returns the size in bytes of the file that [`write`] would write.
 pub(crate) fn size(splat: &Splat) -> u64 {
-    /// Number of values of position, normal, opacity, scale and rotation.
-    const NUMBERS: usize = 14;
-    header(splat).len() as u64 + (splat.len() * (NUMBERS + 3 * splat.bases()) * 4) as u64
+    let numbers = property_names(splat.bases()).len() + 3;
+    header(splat).len() as u64 + (splat.len() * numbers * size_of::<f32>()) as u64
 }

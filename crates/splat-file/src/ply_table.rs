@@ -122,18 +122,18 @@ impl Header {
         self.elements.iter().find(|element| element.name == name)
     }
 
-    /// Returns the numbers of the properties `names` of an element, row by row, each converted by `convert`. Other elements and properties
-    /// are skipped. `bytes` are the contents of the file at `path`.
+    /// Returns the numbers of the properties `names` of an element, row by row, each converted by `convert`. They must be of type `scalar`, if
+    /// it is given. Other elements and properties are skipped. `bytes` are the contents of the file at `path`.
     pub fn columns<T>(
         &self,
         path: &Path,
         bytes: &[u8],
         element: &str,
         names: &[String],
+        scalar: Option<Scalar>,
         convert: impl Fn(f64) -> T,
     ) -> Result<Vec<T>> {
-        let rest = &bytes[self.length..];
-        let mut body = Body { path, rest, encoding: self.encoding };
+        let mut body = Body { path, rest: &bytes[self.length..], encoding: self.encoding };
         for before in self.elements.iter().take_while(|before| before.name != element) {
             body.read_rows(before, |_, _| ())?;
         }
@@ -143,15 +143,22 @@ impl Header {
         // Index in `names` of each property of the element.
         let mut places: Vec<Option<usize>> = vec![None; element.properties.len()];
         for (place, name) in names.iter().enumerate() {
-            let field = || format!("property {name}");
-            let Some(at) = element.properties.iter().position(|property| property.name == *name) else {
-                let expected = "one of a 3D Gaussian splat's properties";
-                return Err(Error::input(path, field(), "missing", expected));
+            let refuse = |found: &str, expected: &str| {
+                Err(Error::input(path, format!("property {name}"), found, expected))
             };
-            if let Kind::List(..) = element.properties[at].kind {
-                return Err(Error::input(path, field(), "a list", "numbers"));
+            let at = element.properties.iter().position(|property| property.name == *name);
+            match at.map(|at| element.properties[at].kind) {
+                None => return refuse("missing", "one of a 3D Gaussian splat's properties"),
+                Some(Kind::List(..)) => return refuse("a list", "numbers"),
+                Some(Kind::Number(found)) if scalar.is_some_and(|scalar| scalar != found) => {
+                    return refuse(
+                        "of another type",
+                        if scalar == Some(Scalar::U8) { "uchar" } else { "uint" },
+                    );
+                }
+                Some(Kind::Number(_)) => {}
             }
-            places[at] = Some(place);
+            at.into_iter().for_each(|at| places[at] = Some(place));
         }
         let mut values = vec![];
         let mut row = vec![0.; names.len()];
@@ -199,38 +206,27 @@ struct Body<'a> {
     encoding: Encoding,
 }
 
-/// A number's place in a file, for messages.
-struct Place<'a> {
-    element: &'a Element,
-    row: usize,
-    property: &'a str,
-}
-
-impl std::fmt::Display for Place<'_> {
-    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
-        write!(f, "{} in row {} of {}", self.property, self.row, self.element.name)
-    }
-}
-
 impl Body<'_> {
     /// Reads the rows of an element. Calls `visit` with the index of each property and its number, which is its length for a list.
     fn read_rows(&mut self, element: &Element, mut visit: impl FnMut(usize, f64)) -> Result<()> {
-        self.check_length(element)?;
         if element.properties.is_empty() {
             return Ok(()); // however many rows there are
         }
+        let path = self.path;
         for row in 0..element.count {
             for (index, Property { name, kind }) in element.properties.iter().enumerate() {
-                let place = Place { element, row, property: name };
+                let refuse = |found: String| {
+                    let field = format!("{name} in row {row} of {}", element.name);
+                    Error::input(path, field, found, format!("numbers in {} rows", element.count))
+                };
                 let (Kind::Number(scalar) | Kind::List(scalar, _)) = *kind;
-                let number = self.number(scalar, &place)?;
+                let number = self.number(scalar).map_err(refuse)?;
                 if let Kind::List(_, item) = *kind {
                     if number < 0. || number.fract() != 0. {
-                        let field = format!("the length of the list {place}");
-                        return Err(Error::input(self.path, field, number, "a whole number"));
+                        return Err(refuse(format!("a list of the length {number}")));
                     }
                     for _ in 0..number as u64 {
-                        self.number(item, &place)?;
+                        self.number(item).map_err(refuse)?;
                     }
                 }
                 visit(index, number);
@@ -239,50 +235,25 @@ impl Body<'_> {
         Ok(())
     }
 
-    /// Checks that the file is long enough for the rows that the header claims. No memory is allocated for them before this check.
-    fn check_length(&self, element: &Element) -> Result<()> {
-        let smallest = |kind: Kind| match (self.encoding, kind) {
-            (Encoding::Ascii, _) => 2, // a digit and a separator
-            (_, Kind::Number(scalar) | Kind::List(scalar, _)) => scalar.size(),
-        };
-        let row: usize = element.properties.iter().map(|property| smallest(property.kind)).sum();
-        let needed = row as u128 * element.count as u128;
-        // The separator after the last number may be missing.
-        let there = self.rest.len() as u128 + u128::from(self.encoding == Encoding::Ascii);
-        if there < needed {
-            let found = format!("cut short: {} bytes of the element {}", self.rest.len(), element.name);
-            let expected = format!("{needed} bytes at least for its {} rows", element.count);
-            return Err(Error::input(self.path, "the body", found, expected));
-        }
-        Ok(())
-    }
-
-    fn number(&mut self, scalar: Scalar, place: &Place) -> Result<f64> {
-        let cut_short = || {
-            let expected = format!("{} rows", place.element.count);
-            Error::input(self.path, "the body", format!("cut short: at {place}"), expected)
-        };
+    /// Reads a number, or returns what is there instead.
+    fn number(&mut self, scalar: Scalar) -> Result<f64, String> {
         if self.encoding == Encoding::Ascii {
             let text = self.rest.trim_ascii_start();
             let length = text.iter().position(u8::is_ascii_whitespace).unwrap_or(text.len());
             let (word, rest) = text.split_at(length);
             if word.is_empty() {
-                return Err(cut_short());
+                return Err("cut short".into());
             }
             self.rest = rest;
-            return std::str::from_utf8(word).ok().and_then(|word| word.parse().ok()).ok_or_else(|| {
-                let found = String::from_utf8_lossy(&word[..word.len().min(20)]).into_owned();
-                Error::input(self.path, place.to_string(), format!("{found:?}"), "a number")
-            });
+            let found = || format!("{:?}", String::from_utf8_lossy(&word[..word.len().min(20)]));
+            return std::str::from_utf8(word).ok().and_then(|word| word.parse().ok()).ok_or_else(found);
         }
-        let (number, rest) = self.rest.split_at_checked(scalar.size()).ok_or_else(cut_short)?;
+        let (number, rest) = self.rest.split_at_checked(scalar.size()).ok_or("cut short")?;
         self.rest = rest;
         if self.encoding == Encoding::LittleEndian {
             return Ok(scalar.read(number));
         }
-        let mut bytes = [0; 8];
-        bytes[..number.len()].copy_from_slice(number);
-        bytes[..number.len()].reverse();
-        Ok(scalar.read(&bytes))
+        let reversed: Vec<u8> = number.iter().rev().copied().collect();
+        Ok(scalar.read(&reversed))
     }
 }

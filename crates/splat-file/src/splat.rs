@@ -133,7 +133,7 @@ impl Splat {
     }
 
     /// Returns the splat without the Gaussians whose quaternion has length 0, and with a warning about them that calls the splat `name`.
-    /// Quaternions whose length is far from 1 are brought near it by a power of two.
+    /// Quaternions whose length is far from 1 are normalized.
     pub fn without_missing_rotations(self, name: impl Display) -> Self {
         let all = self.len();
         let (rotated, left_out) = drop_missing_rotations(&self);
@@ -175,21 +175,15 @@ impl Splat {
         if self.origin == DVec3::ZERO && other.origin != DVec3::ZERO {
             return self.with_origin(other.origin).merged(other);
         }
-        let has_linear_scales = self.linear_scales.is_some() && other.linear_scales.is_some();
         let joined = Splat::concat(&[self, &other.with_origin(self.origin)]);
-        Splat {
-            linear_scales: joined.linear_scales.filter(|_| has_linear_scales),
-            antialiased: self.antialiased,
-            origin: self.origin,
-            ..joined
-        }
+        Splat { antialiased: self.antialiased, origin: self.origin, ..joined }
     }
 
-    /// Returns the Gaussians of all `parts`, with spherical harmonics of the highest degree, and linear scales if a part has them. Their means
+    /// Returns the Gaussians of all `parts`, with spherical harmonics of the highest degree, and linear scales if all have them. Their means
     /// stay as they are.
     pub(crate) fn concat(parts: &[&Splat]) -> Self {
         let sh_degree = parts.iter().map(|part| part.sh_degree).max().unwrap_or(0);
-        let is_linear = parts.iter().any(|part| part.linear_scales.is_some());
+        let is_linear = parts.iter().all(|part| part.linear_scales.is_some());
         let mut all = Splat { sh_degree, linear_scales: is_linear.then(Vec::new), ..Splat::default() };
         let bases = all.bases();
         for part in parts {
@@ -260,6 +254,13 @@ impl Splat {
     pub(crate) fn unit_quaternion(&self, index: usize) -> [f32; 4] {
         normalized(self.quaternions[index])
     }
+}
+
+/// Returns the lower and the upper bounds of the components of `vectors`, which are 0 if there are none.
+pub(crate) fn bounds(vectors: &[[f32; 3]]) -> [[f32; 3]; 2] {
+    [f32::min as fn(f32, f32) -> f32, f32::max].map(|choose| {
+        [0, 1, 2].map(|axis| vectors.iter().map(|vector| vector[axis]).reduce(choose).unwrap_or(0.))
+    })
 }
 
 /// Returns the logit of an opacity in [0, 1], which is infinite for 0 and 1.

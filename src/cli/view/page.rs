@@ -4,7 +4,7 @@ use super::contents::Contents;
 use crate::data::Capture;
 use crate::error::Error;
 use crate::io::{
-    ShLimits, Splat, WriteOptions, check_writable_file, fit_splat, write_atomically, write_local_splat_with,
+    ShLimits, Splat, WriteOptions, check_writable_file, fit_splat, write_atomically, write_local_splat,
 };
 use crate::scene::{Camera, Gaussians};
 use anyhow::Result;
@@ -76,7 +76,7 @@ fn spz(splat: &Splat, cameras: &[Camera]) -> Result<Vec<u8>> {
     let file = folder.path().join("scene.spz");
     let fitted = fit_splat(&file, splat, &ShLimits::of_viewers(splat.sh_degree), cameras)?;
     // Spark doesn't read newer versions.
-    write_local_splat_with(&file, &fitted, &WriteOptions { spz_version: 3 })?;
+    write_local_splat(&file, &fitted, &WriteOptions { spz_version: 3 })?;
     Ok(std::fs::read(file)?)
 }
 

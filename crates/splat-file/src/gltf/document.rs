@@ -1,39 +1,30 @@
 //! Files of glTF: the JSON, as far as splats need it; the chunks of a `.glb`; and the buffers, which are a chunk, a file or a data URI.
 
-use super::recognizes_glb;
-use crate::numbers::u32_at;
+use super::{EXTENSION, SPZ_EXTENSION, recognizes_glb};
+use crate::numbers::{Scalar, u32_at};
 use crate::{Error, Result};
-use base64::engine::{DecodePaddingMode, GeneralPurpose, GeneralPurposeConfig};
-use base64::{Engine, alphabet};
+use base64::prelude::{BASE64_STANDARD, Engine};
 use glam::{DMat4, DQuat, DVec3};
-use globalsplat_files::parent_of;
+use globalsplat_files::{check_regular, parent_of};
 use percent_encoding::percent_decode_str;
 use serde::Deserialize;
+use serde_json::Value;
 use std::borrow::Cow;
-use std::cell::OnceCell;
 use std::collections::BTreeMap;
-use std::fs;
-use std::io::Read;
-use std::path::{Component, Path, PathBuf};
+use std::path::Path;
 
 #[derive(Default, Deserialize)]
 #[serde(default, rename_all = "camelCase")]
 pub struct Gltf {
-    asset: Asset,
+    asset: Value,
     extensions_required: Vec<String>,
-    pub scene: Option<usize>,
+    pub scene: usize,
     pub scenes: Vec<Scene>,
     pub nodes: Vec<Node>,
     pub meshes: Vec<Mesh>,
-    pub accessors: Vec<Accessor>,
+    accessors: Vec<Accessor>,
     buffer_views: Vec<BufferView>,
     buffers: Vec<Buffer>,
-}
-
-#[derive(Default, Deserialize)]
-#[serde(default)]
-struct Asset {
-    version: String,
 }
 
 #[derive(Default, Deserialize)]
@@ -64,49 +55,23 @@ pub struct Mesh {
 pub struct Primitive {
     pub attributes: BTreeMap<String, usize>,
     pub mode: Option<u32>,
-    pub extensions: PrimitiveExtensions,
-}
-
-#[derive(Default, Deserialize)]
-pub struct PrimitiveExtensions {
-    #[serde(rename = "KHR_gaussian_splatting")]
-    pub splatting: Option<Splatting>,
-}
-
-#[derive(Default, Deserialize)]
-#[serde(default, rename_all = "camelCase")]
-pub struct Splatting {
-    pub kernel: Option<String>,
-    pub color_space: Option<String>,
-    pub extensions: SplattingExtensions,
-}
-
-#[derive(Default, Deserialize)]
-pub struct SplattingExtensions {
-    #[serde(rename = "KHR_gaussian_splatting_compression_spz_2")]
-    pub spz: Option<Spz>,
-}
-
-#[derive(Deserialize)]
-#[serde(rename_all = "camelCase")]
-pub struct Spz {
-    pub buffer_view: usize,
+    pub extensions: BTreeMap<String, Value>,
 }
 
 #[derive(Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub struct Accessor {
-    pub buffer_view: Option<usize>,
+    buffer_view: Option<usize>,
     #[serde(default)]
-    pub byte_offset: usize,
-    pub component_type: u32,
+    byte_offset: usize,
+    component_type: u32,
     #[serde(default)]
-    pub normalized: bool,
+    normalized: bool,
     pub count: usize,
     /// Number of components: SCALAR, VEC2, VEC3, …
     #[serde(rename = "type")]
-    pub shape: String,
-    pub sparse: Option<serde::de::IgnoredAny>,
+    shape: String,
+    sparse: Option<serde::de::IgnoredAny>,
 }
 
 #[derive(Deserialize)]
@@ -127,66 +92,49 @@ struct Buffer {
     byte_length: usize,
 }
 
-/// Base64 with the standard alphabet, whose padding may be absent.
-const BASE64: GeneralPurpose = GeneralPurpose::new(
-    &alphabet::STANDARD,
-    GeneralPurposeConfig::new().with_decode_padding_mode(DecodePaddingMode::Indifferent),
-);
-/// Version of glTF, and of the container `.glb`.
-const VERSION: &str = "2.0";
+/// Version of the container `.glb`.
 const GLB_VERSION: u32 = 2;
 /// Size in bytes of the header of a `.glb`, and of each chunk's header.
 const HEADER: usize = 12;
 const CHUNK_HEADER: usize = 8;
-/// Types of chunks.
-const JSON: [u8; 4] = *b"JSON";
-const BIN: [u8; 4] = *b"BIN\0";
 /// Extensions that a file may require: those whose contents are read, and those that don't concern Gaussians.
-const KNOWN: [&str; 4] =
-    [super::EXTENSION, super::SPZ_EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit"];
+const KNOWN: [&str; 4] = [EXTENSION, SPZ_EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit"];
 
-/// Parsed file with its buffers, which are read when they are used.
+/// Parsed file with its buffers.
 pub struct Document<'a> {
     pub path: &'a Path,
     pub gltf: Gltf,
-    /// Size of the file in bytes.
-    length: usize,
-    /// Contents of the binary chunk.
-    bin: Option<&'a [u8]>,
-    buffers: Vec<OnceCell<Cow<'a, [u8]>>>,
+    buffers: Vec<Cow<'a, [u8]>>,
+    /// Size in bytes of the file and of the buffers in other files.
+    pub size: usize,
 }
 
 impl<'a> Document<'a> {
-    /// Parses the file at `path`, a `.glb` or a `.gltf`.
+    /// Parses the file at `path`, a `.glb` or a `.gltf`, and reads its buffers.
     pub fn parse(path: &'a Path, bytes: &'a [u8]) -> Result<Self> {
         let (json, bin) = if recognizes_glb(bytes) { chunks(path, bytes)? } else { (bytes, None) };
         let gltf: Gltf = serde_json::from_slice(json)
             .map_err(|why| Error::input(path, "the JSON", format!("invalid: {why}"), "glTF 2.0"))?;
-        let version = &gltf.asset.version;
+        let version = gltf.asset["version"].as_str().unwrap_or_default();
         if !version.starts_with("2.") {
-            return Err(Error::input(path, "the version", quoted(version), VERSION));
+            return Err(Error::input(path, "the version", quoted(version), "2.0"));
         }
         if let Some(unknown) = gltf.extensions_required.iter().find(|name| !KNOWN.contains(&name.as_str())) {
             let expected = format!("{} or none", KNOWN.join(", "));
             return Err(Error::input(path, "a required extension", quoted(unknown), expected));
         }
-        let buffers = gltf.buffers.iter().map(|_| OnceCell::new()).collect();
-        Ok(Document { path, gltf, length: bytes.len(), bin, buffers })
-    }
-
-    /// Returns the size in bytes of the file and of the buffers that have been read from other files.
-    pub fn size(&self) -> usize {
-        let buffers = self.buffers.iter().filter_map(|buffer| match buffer.get() {
-            Some(Cow::Owned(bytes)) => Some(bytes.len()),
-            _ => None,
-        });
-        self.length.saturating_add(buffers.sum())
+        let read = |(index, buffer)| read_buffer(path, index, buffer, bin.filter(|_| index == 0));
+        let buffers = gltf.buffers.iter().enumerate().map(read).collect::<Result<Vec<_>>>()?;
+        let is_owned = |buffer: &&Cow<[u8]>| matches!(buffer, Cow::Owned(_));
+        let size = bytes.len() + buffers.iter().filter(is_owned).map(|buffer| buffer.len()).sum::<usize>();
+        Ok(Document { path, gltf, buffers, size })
     }
 
     /// Returns the bytes of a buffer view, and its stride if it has one.
     pub fn view(&self, index: usize) -> Result<(&[u8], Option<usize>)> {
         let view = self.get(&self.gltf.buffer_views, "buffer view", index)?;
-        let buffer = self.buffer(view.buffer)?;
+        let buffer = self.get(&self.buffers, "buffer", view.buffer)?;
+        let buffer = &buffer[..self.gltf.buffers[view.buffer].byte_length];
         let bytes = buffer.get(view.byte_offset..).and_then(|bytes| bytes.get(..view.byte_length));
         let bytes = bytes.ok_or_else(|| {
             let found = format!("{} bytes at {}", view.byte_length, view.byte_offset);
@@ -204,66 +152,106 @@ impl<'a> Document<'a> {
         })
     }
 
-    fn buffer(&self, index: usize) -> Result<&[u8]> {
-        let cell = self.get(&self.buffers, "buffer", index)?;
-        match cell.get() {
-            Some(bytes) => Ok(bytes),
-            None => {
-                let bytes = self.read_buffer(index)?;
-                Ok(cell.get_or_init(|| bytes))
-            }
-        }
+    /// Returns accessor `index`, that of the attribute `name`.
+    pub fn accessor(&self, index: usize, name: &str) -> Result<&Accessor> {
+        self.get(&self.gltf.accessors, &format!("the accessor of {name},"), index)
     }
 
-    fn read_buffer(&self, index: usize) -> Result<Cow<'a, [u8]>> {
-        let Buffer { uri, byte_length } = &self.gltf.buffers[index];
-        let field = format!("buffer {index}");
-        let error = |found: &str, expected: &str| Error::input(self.path, &field, found, expected);
-        let mut path = self.path.to_owned();
-        let mut bytes = match uri.as_deref().map(|uri| (uri, uri.strip_prefix("data:"))) {
-            None => {
-                let bin = self.bin.filter(|_| index == 0);
-                Cow::Borrowed(
-                    bin.ok_or_else(|| error("without a uri", "one, or the binary chunk of a .glb"))?,
-                )
-            }
-            Some((_, Some(data))) => {
-                let bytes = data.split_once(";base64,").and_then(|(_, text)| BASE64.decode(text).ok());
-                Cow::Owned(bytes.ok_or_else(|| error("another or a damaged data URI", "one in base64"))?)
-            }
-            Some((uri, None)) => {
-                path = self.relative_path(&field, uri)?;
-                Cow::Owned(read_file(&path, *byte_length)?)
+    /// Reads accessor `index`, that of the attribute `name`, which must have `count` elements of `N` numbers.
+    pub fn numbers<const N: usize>(&self, index: usize, name: &str, count: usize) -> Result<Vec<[f32; N]>> {
+        let accessor = self.accessor(index, name)?;
+        let error = |field: &str, found: String, expected: &str| {
+            Error::input(self.path, format!("{field} of accessor {index} ({name})"), found, expected)
+        };
+        let shape = if N == 1 { "SCALAR".to_string() } else { format!("VEC{N}") };
+        if accessor.shape != shape {
+            return Err(error("the type", quoted(&accessor.shape), &shape));
+        }
+        // The largest number of a type is 1 if numbers are normalized.
+        let (scalar, largest) = match accessor.component_type {
+            5120 => (Scalar::I8, f64::from(i8::MAX)),
+            5121 => (Scalar::U8, f64::from(u8::MAX)),
+            5122 => (Scalar::I16, f64::from(i16::MAX)),
+            5123 => (Scalar::U16, f64::from(u16::MAX)),
+            5126 => (Scalar::F32, 1.),
+            other => {
+                let expected = "float (5126), or numbers of one or two bytes (5120 to 5123)";
+                return Err(error("the component type", other.to_string(), expected));
             }
         };
-        if bytes.len() < *byte_length {
-            let found = format!("cut short: {} bytes", bytes.len());
-            return Err(Error::input(path, field, found, format!("{byte_length} bytes")));
+        if accessor.count != count {
+            let expected = format!("{count}, as many as positions");
+            return Err(error("the number of elements", accessor.count.to_string(), &expected));
         }
-        match &mut bytes {
-            Cow::Borrowed(bytes) => *bytes = &bytes[..*byte_length],
-            Cow::Owned(bytes) => bytes.truncate(*byte_length),
+        if accessor.sparse.is_some() {
+            return Err(error("the storage", "sparse".into(), "all elements in a buffer view"));
         }
-        Ok(bytes)
+        let missing = || error("the buffer view", "missing".into(), "one");
+        let view = accessor.buffer_view.ok_or_else(missing)?;
+        let (bytes, stride) = self.view(view)?;
+        let size = N * scalar.size();
+        let stride = stride.unwrap_or(size);
+        if stride < size {
+            return Err(error("the stride", stride.to_string(), &format!("{size} bytes or more")));
+        }
+        let end =
+            accessor.byte_offset as u128 + count.saturating_sub(1) as u128 * stride as u128 + size as u128;
+        if count == 0 || end > bytes.len() as u128 {
+            let found = format!("{count} elements, which end at byte {end}");
+            let expected = format!("1 or more, within the {} bytes of buffer view {view}", bytes.len());
+            return Err(error("the extent", found, &expected));
+        }
+        let is_fraction = accessor.normalized && scalar != Scalar::F32;
+        let number = |bytes: &[u8]| match scalar.read(bytes) {
+            number if is_fraction => (number / largest).max(-1.) as f32,
+            number => number as f32,
+        };
+        let element = |index: usize| -> [f32; N] {
+            let bytes = &bytes[accessor.byte_offset + index * stride..];
+            std::array::from_fn(|part| number(&bytes[part * scalar.size()..]))
+        };
+        Ok((0..count).map(element).collect())
     }
+}
 
-    /// Returns the path of the file that a URI refers to.
-    fn relative_path(&self, field: &str, uri: &str) -> Result<PathBuf> {
-        // A colon after the first slash, or in percent-encoding, is part of a name.
-        let is_url = uri.split_once(':').is_some_and(|(scheme, _)| !scheme.contains('/'));
-        let name = percent_decode_str(uri).decode_utf8().ok().filter(|name| {
-            let is_absolute = name.starts_with(['/', '\\'])
-                || Path::new(&**name).components().any(|part| matches!(part, Component::Prefix(_)));
-            !(name.is_empty() || is_url || is_absolute || name.contains('\0'))
-        });
-        match name {
-            Some(name) => Ok(parent_of(self.path).join(&*name)),
-            None => {
-                let expected = "a data URI, or a path relative to the file's folder";
-                Err(Error::input(self.path, format!("the uri of {field}"), quoted(uri), expected))
-            }
+/// Reads buffer `index` of the file at `path`, which is in the chunk `bin` if it has no URI.
+fn read_buffer<'a>(
+    path: &Path,
+    index: usize,
+    buffer: &Buffer,
+    bin: Option<&'a [u8]>,
+) -> Result<Cow<'a, [u8]>> {
+    let Buffer { uri, byte_length } = buffer;
+    let error = |path: &Path, field: &str, found: &str, expected: &str| {
+        Error::input(path, format!("{field} {index}"), found, expected)
+    };
+    let mut file = path.to_owned();
+    let contents = match uri.as_deref() {
+        None => {
+            let missing = || error(path, "buffer", "without a uri", "one, or the binary chunk of a .glb");
+            Cow::Borrowed(bin.ok_or_else(missing)?)
         }
+        Some(uri) if uri.starts_with("data:") => {
+            let bytes = uri.split_once(";base64,").and_then(|(_, text)| BASE64_STANDARD.decode(text).ok());
+            let damaged = || error(path, "buffer", "another or a damaged data URI", "one in base64");
+            Cow::Owned(bytes.ok_or_else(damaged)?)
+        }
+        Some(uri) => {
+            let is_relative =
+                |name: &Cow<str>| !(name.is_empty() || uri.contains("://") || Path::new(&**name).has_root());
+            let expected = "a data URI, or a path relative to the file's folder";
+            let name = percent_decode_str(uri).decode_utf8().ok().filter(is_relative);
+            let name = name.ok_or_else(|| error(path, "the uri of buffer", &quoted(uri), expected))?;
+            file = parent_of(path).join(&*name);
+            check_regular(&file)?;
+            Cow::Owned(std::fs::read(&file).map_err(Error::read(&file))?)
+        }
+    };
+    if contents.len() < *byte_length {
+        let found = format!("cut short: {} bytes", contents.len());
+        return Err(error(&file, "buffer", &found, &format!("{byte_length} bytes")));
     }
+    Ok(contents)
 }
 
 /// Returns the beginning of a text from a file, in quotes and on one line.
@@ -271,7 +259,7 @@ pub fn quoted(text: &str) -> String {
     format!("{:?}", text.chars().take(60).collect::<String>())
 }
 
-/// Returns the JSON and the binary chunk of a `.glb`.
+/// Returns the JSON and the binary chunk of a `.glb`: its first chunk, and its second one if it has that type.
 fn chunks<'a>(path: &Path, bytes: &'a [u8]) -> Result<(&'a [u8], Option<&'a [u8]>)> {
     if bytes.len() < HEADER {
         let found = format!("{} bytes", bytes.len());
@@ -281,44 +269,26 @@ fn chunks<'a>(path: &Path, bytes: &'a [u8]) -> Result<(&'a [u8], Option<&'a [u8]
     if version != GLB_VERSION {
         return Err(Error::input(path, "the version of the .glb", version, GLB_VERSION.to_string()));
     }
-    let Some(mut rest) = usize::try_from(length).ok().and_then(|length| bytes.get(HEADER..length)) else {
+    let Some(chunks) = bytes.get(HEADER..length as usize) else {
         let expected = format!("{HEADER} to {}, the size of the file", bytes.len());
         return Err(Error::input(path, "the length in the header", length, expected));
     };
-    let (mut json, mut bin) = (None, None);
-    while !rest.is_empty() {
-        let chunk = rest.split_at_checked(CHUNK_HEADER).and_then(|(header, contents)| {
-            Some((header, contents.split_at_checked(u32_at(header, 0) as usize)?))
+    // Type and contents of a chunk, and the bytes after it.
+    let split = |bytes: &'a [u8]| {
+        let chunk = bytes.split_at_checked(CHUNK_HEADER).and_then(|(header, contents)| {
+            let (contents, rest) = contents.split_at_checked(u32_at(header, 0) as usize)?;
+            Some((&header[4..], contents, rest))
         });
-        let Some((header, (contents, after))) = chunk else {
-            let found = format!("cut short: {} bytes", rest.len());
-            return Err(Error::input(path, "a chunk", found, "its header and as many bytes as it says"));
-        };
-        if json.is_none() {
-            if header[4..] != JSON {
-                let found = format!("of type {:?}", String::from_utf8_lossy(&header[4..]));
-                return Err(Error::input(path, "the first chunk", found, "of type \"JSON\""));
-            }
-            json = Some(contents);
-        } else if header[4..] == BIN {
-            bin = bin.or(Some(contents));
-        }
-        rest = after;
+        chunk.ok_or_else(|| {
+            let found = format!("cut short: {} bytes", bytes.len());
+            Error::input(path, "a chunk", found, "its header and as many bytes as it says")
+        })
+    };
+    let (kind, json, rest) = split(chunks)?;
+    if kind != b"JSON" {
+        let found = format!("of type {:?}", String::from_utf8_lossy(kind));
+        return Err(Error::input(path, "the first chunk", found, "of type \"JSON\""));
     }
-    match json {
-        Some(json) => Ok((json, bin)),
-        None => Err(Error::input(path, "the JSON chunk", "missing", "one after the header")),
-    }
-}
-
-/// Reads at most `length` bytes of the regular file at `path`.
-fn read_file(path: &Path, length: usize) -> Result<Vec<u8>> {
-    let is_file = fs::metadata(path).map_err(Error::read(path))?.is_file();
-    if !is_file {
-        return Err(Error::input(path, "the buffer", "no regular file", "one"));
-    }
-    let mut bytes = vec![];
-    let file = fs::File::open(path).map_err(Error::read(path))?;
-    file.take(length as u64).read_to_end(&mut bytes).map_err(Error::read(path))?;
-    Ok(bytes)
+    let second = if rest.is_empty() { None } else { Some(split(rest)?) };
+    Ok((json, second.filter(|(kind, ..)| *kind == b"BIN\0").map(|(_, bin, _)| bin)))
 }

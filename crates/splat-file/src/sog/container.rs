@@ -2,7 +2,7 @@
 
 use super::IMAGES;
 use crate::{Error, Result};
-use globalsplat_files::{PartialFile, check_regular, parent_of, write_atomically};
+use globalsplat_files::{PartialFile, check_regular, parent_of, write_atomically, write_temporary};
 use image_webp::{ColorType, EncoderParams, WebPDecoder, WebPEncoder};
 use rayon::prelude::*;
 use std::io::{Cursor, Read, Write};
@@ -136,9 +136,8 @@ pub fn write_files(path: &Path, meta: &[u8], images: &[(&'static str, Vec<u8>)])
     let beside = images.iter().map(|(name, file)| (parent_of(path).join(name), &file[..]));
     let mut partials = vec![];
     for (path, contents) in beside.chain([(path.to_owned(), meta)]) {
-        let mut partial = PartialFile::create(&path)?;
-        partial.file.write_all(contents).map_err(Error::write(&path))?;
-        partials.push(partial);
+        let write = |writer: &mut dyn Write| writer.write_all(contents).map_err(Error::write(&path));
+        partials.push(write_temporary(&path, write)?);
     }
     partials.into_iter().try_for_each(PartialFile::persist)?;
     // Images of an older splat of a higher SH degree.

@@ -5,10 +5,9 @@
 mod container;
 mod palette;
 
-use crate::invalid::{Contents, InvalidGaussians};
 use crate::morton::morton_order;
 use crate::rotations::{from_smallest_three, smallest_three};
-use crate::splat::logit_of_opacity;
+use crate::splat::{bounds, logit_of_opacity};
 use crate::{Error, Result, Splat, WriteOptions};
 use container::{Image, Reader, encode_all, write_files, write_zip};
 use palette::{Codebook, Palette};
@@ -100,18 +99,18 @@ pub(crate) fn recognizes(bytes: &[u8]) -> bool {
 }
 
 /// Reads a `.sog`.
-pub(crate) fn read_bundle(path: &Path, bytes: &[u8]) -> Result<Contents> {
+pub(crate) fn read_bundle(path: &Path, bytes: &[u8]) -> Result<Splat> {
     let mut reader = Reader::open_zip(path, bytes)?;
     let meta = reader.file("meta.json")?;
     read(path, reader, &meta)
 }
 
 /// Reads the `meta.json` of a folder, and the images beside it.
-pub(crate) fn read_folder(path: &Path, bytes: &[u8]) -> Result<Contents> {
+pub(crate) fn read_folder(path: &Path, bytes: &[u8]) -> Result<Splat> {
     read(path, Reader::open_folder(path), bytes)
 }
 
-fn read(path: &Path, mut reader: Reader, meta: &[u8]) -> Result<Contents> {
+fn read(path: &Path, mut reader: Reader, meta: &[u8]) -> Result<Splat> {
     let refuse = |field: &str, found: String, expected: &str| Err(Error::input(path, field, found, expected));
     let bad_json = |what: &str, why, expected: &str| {
         Error::input(path, "meta.json", format!("{what} ({why})"), expected)
@@ -142,41 +141,35 @@ fn read(path: &Path, mut reader: Reader, meta: &[u8]) -> Result<Contents> {
     let [scales, rotations, colors] =
         [image(&meta.scales.files[0])?, image(&meta.quats.files[0])?, image(&meta.sh0.files[0])?];
     let labels = meta.sh_rest.as_ref().map(|rest| image(&rest.files[1])).transpose()?;
-
     let mut splat = Splat { antialiased: meta.antialias, ..Splat::default() };
-    let look_up = |codebook: &[f32], name: &str, index: u8| {
-        codebook.get(usize::from(index)).copied().ok_or_else(|| {
-            let expected = format!("less than {}, the length of the codebook", codebook.len());
-            Error::input(path, format!("an index in {name}"), index, expected)
-        })
+    // Values of the three indices in a pixel of the image `name`.
+    let look_up = |codebook: &[f32], name: &str, pixel: [u8; 4]| -> Result<[f32; 3]> {
+        let mut values = [0.; 3];
+        for (value, index) in values.iter_mut().zip(pixel) {
+            *value = *codebook.get(usize::from(index)).ok_or_else(|| {
+                let expected = format!("less than {}, the length of the codebook", codebook.len());
+                Error::input(path, format!("an index in {name}"), index, expected)
+            })?;
+        }
+        Ok(values)
     };
     let coordinate = |axis: usize, lower: u8, upper: u8| {
         let (min, max) = (meta.means.mins[axis], meta.means.maxs[axis]);
         let value = min + (max - min) * f64::from(u16::from_le_bytes([lower, upper])) / f64::from(u16::MAX);
         (value.signum() * value.abs().exp_m1()) as f32
     };
-    let mut invalid = InvalidGaussians::default();
     for index in 0..meta.count {
         let (lower, upper) = (lower.pixels[index], upper.pixels[index]);
         splat.means.push([0, 1, 2].map(|axis| coordinate(axis, lower[axis], upper[axis])));
-        let [x, y, z, _] = scales.pixels[index];
-        let scale = |index: u8| look_up(&meta.scales.codebook, &meta.scales.files[0], index);
-        splat.log_scales.push([scale(x)?, scale(y)?, scale(z)?]);
+        splat.log_scales.push(look_up(&meta.scales.codebook, &meta.scales.files[0], scales.pixels[index])?);
         let [a, b, c, mode] = rotations.pixels[index];
-        let Some(largest) = mode.checked_sub(FIRST_MODE) else {
-            let field = || format!("the alpha of pixel {index} in {}", meta.quats.files[0]);
-            invalid.add(index, "rotation", field, mode.into(), "252 to 255");
-            splat.quaternions.push([1., 0., 0., 0.]);
-            splat.opacity_logits.push(0.);
-            splat.sh.push([0.; 3]);
-            continue;
-        };
         let fractions = [a, b, c].map(|byte| f64::from(byte) / 255.);
-        splat.quaternions.push(from_smallest_three(largest.into(), fractions));
-        let [red, green, blue, opacity] = colors.pixels[index];
-        let color = |index: u8| look_up(&meta.sh0.codebook, &meta.sh0.files[0], index);
-        splat.sh.push([color(red)?, color(green)?, color(blue)?]);
-        splat.opacity_logits.push(logit_of_opacity(f64::from(opacity) / 255.));
+        splat.quaternions.push(match mode.checked_sub(FIRST_MODE) {
+            Some(largest) => from_smallest_three(largest.into(), fractions),
+            None => [f32::NAN; 4],
+        });
+        splat.sh.push(look_up(&meta.sh0.codebook, &meta.sh0.files[0], colors.pixels[index])?);
+        splat.opacity_logits.push(logit_of_opacity(f64::from(colors.pixels[index][3]) / 255.));
     }
     if let (Some(rest), Some(labels)) = (&meta.sh_rest, labels) {
         if !(1..=3).contains(&rest.bands) {
@@ -205,14 +198,13 @@ fn read(path: &Path, mut reader: Reader, meta: &[u8]) -> Result<Contents> {
                 return refuse(&format!("an index in {}", rest.files[1]), label.to_string(), &expected);
             }
             sh.push(*color);
-            for pixel in &centroids.pixels[label * coefficients..][..coefficients] {
-                let value = |channel: usize| look_up(&rest.codebook, name, pixel[channel]);
-                sh.push([value(0)?, value(1)?, value(2)?]);
+            for &pixel in &centroids.pixels[label * coefficients..][..coefficients] {
+                sh.push(look_up(&rest.codebook, name, pixel)?);
             }
         }
         (splat.sh, splat.sh_degree) = (sh, rest.bands);
     }
-    Ok((splat, invalid))
+    Ok(splat)
 }
 
 /// Writes a `.sog`.
@@ -263,19 +255,12 @@ fn encode(splat: &Splat) -> (Vec<u8>, Vec<(&'static str, Image)>) {
         pixels.resize(splat.len().div_ceil(width).max(1) * width, [0, 0, 0, 255]);
         Image { width, pixels }
     };
-    let logs: Vec<[f64; 3]> = splat
-        .means
-        .iter()
-        .map(|mean| mean.map(|x| f64::from(x).signum() * f64::from(x).abs().ln_1p()))
-        .collect();
-    let bound = |choose: fn(f64, f64) -> f64| -> [f64; 3] {
-        std::array::from_fn(|axis| logs.iter().map(|log| log[axis]).reduce(choose).unwrap_or(0.))
-    };
-    let (mins, maxs) = (bound(f64::min), bound(f64::max));
+    let log = |coordinate: f32| f64::from(coordinate).signum() * f64::from(coordinate).abs().ln_1p();
+    let [mins, maxs] = bounds(&splat.means).map(|bound| bound.map(log));
     let position = |index: usize| {
         [0, 1, 2].map(|axis| {
             let range = (maxs[axis] - mins[axis]).max(f64::MIN_POSITIVE);
-            ((logs[index][axis] - mins[axis]) / range * f64::from(u16::MAX)).round() as u16
+            ((log(splat.means[index][axis]) - mins[axis]) / range * f64::from(u16::MAX)).round() as u16
         })
     };
     let bytes_of_position = |index: usize, byte: usize| {

@@ -8,10 +8,10 @@ const CODEBOOK: usize = 256;
 /// Number of iterations over a codebook's values, and over vectors.
 const VALUE_ITERATIONS: usize = 20;
 const VECTOR_ITERATIONS: usize = 8;
+/// Number of vectors that a thread assigns to clusters at a time.
+const PART: usize = 1 << 12;
 /// Maximum number of vectors from which the first of the two levels of centroids is computed.
 const SAMPLE: usize = 1 << 15;
-/// Number of centroids whose distances are computed together.
-const LANES: usize = 8;
 
 /// Numbers that stand for all values of a property, ascending.
 pub struct Codebook {
@@ -86,7 +86,9 @@ impl Palette {
         let coarse = (size as f64).sqrt() as usize;
         let sample: Vec<f32> =
             vectors.chunks_exact(dim).step_by(count.div_ceil(SAMPLE)).flatten().copied().collect();
-        let coarse_of = assign(vectors, dim, &means_of_clusters(&sample, dim, coarse));
+        let first = means_of_clusters(&sample, dim, coarse);
+        let coarse_of: Vec<u32> =
+            vectors.par_chunks(PART * dim).flat_map_iter(|part| assign(part, dim, &first)).collect();
         let mut members = vec![vec![]; coarse];
         coarse_of.iter().enumerate().for_each(|(index, &cluster)| members[cluster as usize].push(index));
         members.retain(|members| !members.is_empty());
@@ -95,7 +97,7 @@ impl Palette {
                 members.iter().flat_map(|&index| &vectors[index * dim..][..dim]).copied().collect();
             let share = (members.len() * (size - coarse) / count + 1).min(members.len());
             let centroids = means_of_clusters(&own, dim, share);
-            let labels = assign_serially(&own, dim, &Lanes::new(&centroids, dim));
+            let labels = assign(&own, dim, &centroids);
             (centroids, labels)
         };
         let parts: Vec<_> = members.par_iter().map(divide).collect();
@@ -135,7 +137,7 @@ fn means_of_clusters(vectors: &[f32], dim: usize, count: usize) -> Vec<f32> {
     let mut centroids: Vec<f32> =
         (0..count).flat_map(|k| &vectors[k * total / count * dim..][..dim]).copied().collect();
     for _ in 0..VECTOR_ITERATIONS {
-        let labels = assign_serially(vectors, dim, &Lanes::new(&centroids, dim));
+        let labels = assign(vectors, dim, &centroids);
         let mut sums = vec![0f64; count * dim];
         let mut sizes = vec![0usize; count];
         for (vector, &label) in vectors.chunks_exact(dim).zip(&labels) {
@@ -152,56 +154,27 @@ fn means_of_clusters(vectors: &[f32], dim: usize, count: usize) -> Vec<f32> {
     centroids
 }
 
-/// Centroids in groups of `LANES`, number by number, and half of their squared lengths.
-struct Lanes {
-    values: Vec<[f32; LANES]>,
-    halves: Vec<[f32; LANES]>,
-    count: usize,
-}
-
-impl Lanes {
-    fn new(centroids: &[f32], dim: usize) -> Self {
-        let count = centroids.len() / dim;
-        let (mut values, mut halves) = (vec![], vec![]);
-        for group in centroids.chunks(LANES * dim) {
-            let lane = |lane: usize| group.get(lane * dim..(lane + 1) * dim);
-            values.extend(
-                (0..dim).map(|d| std::array::from_fn(|k| lane(k).map_or(0., |centroid| centroid[d]))),
-            );
-            halves.push(std::array::from_fn(|k| {
-                lane(k)
-                    .map_or(f32::INFINITY, |centroid| centroid.iter().map(|value| value * value / 2.).sum())
-            }));
-        }
-        Lanes { values, halves, count }
-    }
-}
-
 /// Returns the index of the centroid next to each vector.
-fn assign_serially(vectors: &[f32], dim: usize, lanes: &Lanes) -> Vec<u32> {
-    let nearest = |vector: &[f32]| {
+fn assign(vectors: &[f32], dim: usize, centroids: &[f32]) -> Vec<u32> {
+    let count = centroids.len() / dim;
+    // Number by number, so that the compiler vectorizes over centroids.
+    let columns: Vec<f32> = (0..dim).flat_map(|d| centroids.iter().skip(d).step_by(dim)).copied().collect();
+    let halves: Vec<f32> =
+        centroids.chunks_exact(dim).map(|centroid| centroid.iter().map(|c| c * c / 2.).sum()).collect();
+    let mut distances = vec![0.; count];
+    let mut nearest = |vector: &[f32]| {
         // |x − c|² / 2 without the term that all centroids have in common.
+        distances.copy_from_slice(&halves);
+        for (value, column) in vector.iter().zip(columns.chunks_exact(count)) {
+            distances.iter_mut().zip(column).for_each(|(distance, c)| *distance -= value * c);
+        }
         let (mut nearest, mut least) = (0, f32::INFINITY);
-        for (group, (values, halves)) in lanes.values.chunks_exact(dim).zip(&lanes.halves).enumerate() {
-            let mut distances = *halves;
-            for (value, centroids) in vector.iter().zip(values) {
-                distances.iter_mut().zip(centroids).for_each(|(distance, c)| *distance -= value * c);
-            }
-            for (lane, &distance) in distances.iter().enumerate() {
-                if distance < least {
-                    (nearest, least) = (group * LANES + lane, distance);
-                }
+        for (index, &distance) in distances.iter().enumerate() {
+            if distance < least {
+                (nearest, least) = (index as u32, distance);
             }
         }
-        nearest.min(lanes.count - 1) as u32
+        nearest
     };
-    vectors.chunks_exact(dim).map(nearest).collect()
-}
-
-/// Calls [`assign_serially`] on all cores.
-fn assign(vectors: &[f32], dim: usize, centroids: &[f32]) -> Vec<u32> {
-    const PART: usize = 1 << 12;
-    let lanes = Lanes::new(centroids, dim);
-    let labels = vectors.par_chunks(PART * dim).map(|part| assign_serially(part, dim, &lanes));
-    labels.collect::<Vec<_>>().concat()
+    vectors.chunks_exact(dim).map(&mut nearest).collect()
 }

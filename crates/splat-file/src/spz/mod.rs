@@ -6,11 +6,10 @@ mod container;
 pub(crate) use container::recognizes;
 
 use crate::axes::Axes;
-use crate::invalid::{Contents, InvalidGaussians};
 use crate::rotations::normalized;
 use crate::splat::logit_of_opacity;
 use crate::{Error, Result, ShLimits, Splat, WriteOptions};
-use container::Description;
+use container::Header;
 use half::f16;
 use std::f64::consts::FRAC_1_SQRT_2;
 use std::ops::RangeInclusive;
@@ -34,9 +33,9 @@ const MAX_PART: u32 = (1 << 9) - 1;
 const SH_BITS: [u32; 2] = [8, 7];
 
 /// Reads an SPZ.
-pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
-    let (description, streams) = container::read(path, bytes)?;
-    let Description { version, sh_degree, fractional_bits, antialiased, axes, .. } = description;
+pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
+    let (header, axes, streams) = container::read(path, bytes)?;
+    let Header { version, sh_degree, fractional_bits, antialiased, .. } = header;
     let [positions, opacities, colors, scales, rotations, harmonics] = streams;
     let fixed = |bytes: [u8; 3]| {
         let shifted = i32::from_le_bytes([0, bytes[0], bytes[1], bytes[2]]); // moves the sign to the highest bit
@@ -70,7 +69,7 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Contents> {
         ..Splat::default()
     };
     axes.convert(&mut splat);
-    Ok((splat, InvalidGaussians::default()))
+    Ok(splat)
 }
 
 /// Returns the limits of coefficients that a byte can represent.
@@ -131,15 +130,15 @@ pub(crate) fn write(path: &Path, splat: &Splat, options: &WriteOptions) -> Resul
         let (path, limit) = (path.display(), format!("at most {MAX_FIXED} in an SPZ"));
         return Err(Error::failed(format!("{path}: a coordinate is {farthest}, expected {limit}")));
     };
-    let axes = Axes::RUB;
     let mut turned = splat.clone();
-    axes.convert(&mut turned);
+    Axes::RUB.convert(&mut turned);
     let all = 0..splat.len();
     let byte = |number: f64| number.round() as u8; // values outside of the range become 0 or 255
     let fixed = |&coordinate: &f32| {
         let fixed = (f64::from(coordinate) * f64::from(1u32 << fractional_bits)).round() as i32;
         fixed.to_le_bytes().into_iter().take(3)
     };
+    let log_scales = splat.log_scales.as_flattened().iter();
     let rotations = all.clone().map(|index| turned.unit_quaternion(index));
     let harmonics = all.clone().flat_map(|index| {
         let rest = turned.sh_of(index)[1..].iter().enumerate();
@@ -154,22 +153,14 @@ pub(crate) fn write(path: &Path, splat: &Splat, options: &WriteOptions) -> Resul
         all.flat_map(|index| splat.sh_of(index)[0])
             .map(|dc| byte((f64::from(dc) * COLOR_SCALE + 0.5) * 255.))
             .collect(),
-        splat
-            .log_scales
-            .as_flattened()
-            .iter()
-            .map(|&log| byte((f64::from(log) - LOG_SCALE_BEGIN) * LOG_SCALE_STEPS))
-            .collect(),
+        log_scales.map(|&log| byte((f64::from(log) - LOG_SCALE_BEGIN) * LOG_SCALE_STEPS)).collect(),
         match version {
             2 => rotations.flat_map(pack_first_three).collect(),
             _ => rotations.flat_map(pack_smallest_three).collect(),
         },
         harmonics.collect(),
     ];
-    let Splat { sh_degree, antialiased, .. } = *splat;
-    let description =
-        Description { version, count: splat.len(), sh_degree, fractional_bits, antialiased, axes };
-    container::write(path, &description, streams)
+    container::write(path, &Header::new(version, splat, fractional_bits), streams)
 }
 
 /// Rounds to the nearest of 2^`bits` values, one of which is 0.

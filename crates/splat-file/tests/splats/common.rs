@@ -78,19 +78,13 @@ fn rotation_error(a: &Splat, b: &Splat) -> f64 {
 pub fn matched(from: &Splat, to: &Splat) -> Splat {
     let distance =
         |a: &[f32; 3], b: &[f32; 3]| -> f32 { a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum() };
-    let nearest: Vec<usize> = from
-        .means
-        .iter()
-        .map(|mean| {
-            let nearer = |a: &usize, b: &usize| {
-                distance(mean, &to.means[*a]).total_cmp(&distance(mean, &to.means[*b]))
-            };
-            (0..to.len()).min_by(nearer).expect("a Gaussian")
-        })
-        .collect();
-    let mut distinct = nearest.clone();
-    distinct.sort_unstable();
-    distinct.dedup();
+    let nearest_to = |mean| {
+        let nearer =
+            |a: &usize, b: &usize| distance(mean, &to.means[*a]).total_cmp(&distance(mean, &to.means[*b]));
+        (0..to.len()).min_by(nearer).expect("a Gaussian")
+    };
+    let nearest: Vec<usize> = from.means.iter().map(nearest_to).collect();
+    let distinct: std::collections::HashSet<_> = nearest.iter().collect();
     assert_eq!(distinct.len(), nearest.len(), "each to another");
     to.select(&nearest)
 }
@@ -226,25 +220,18 @@ pub fn small_gaussians() -> Columns {
     ]
 }
 
-/// Writes a binary PLY of `columns`, whose values are float unless `types` says otherwise.
+/// Writes a PLY of `columns` as text, whose values are float unless `types` says otherwise.
 pub fn write_ply(path: &Path, columns: &[(&str, [f64; 3])], types: &[(&str, &str)]) {
-    let type_of = |name: &str| types.iter().find(|(own, _)| *own == name).map_or("float", |(_, of)| of);
-    let mut bytes = b"ply\nformat binary_little_endian 1.0\nelement vertex 3\n".to_vec();
+    let mut text = "ply\nformat ascii 1.0\nelement vertex 3\n".to_string();
     for (name, _) in columns {
-        bytes.extend(format!("property {} {name}\n", type_of(name)).bytes());
+        let kind = types.iter().find(|(own, _)| own == name).map_or("float", |(_, kind)| kind);
+        text += &format!("property {kind} {name}\n");
     }
-    bytes.extend(b"end_header\n");
+    text += "end_header\n";
     for row in 0..3 {
-        for (name, values) in columns {
-            match type_of(name) {
-                "uchar" => bytes.push(values[row] as u8),
-                "ushort" => bytes.extend((values[row] as u16).to_le_bytes()),
-                "double" => bytes.extend(values[row].to_le_bytes()),
-                _ => bytes.extend((values[row] as f32).to_le_bytes()),
-            }
-        }
+        columns.iter().for_each(|(_, values)| text += &format!("{} ", values[row]));
     }
-    std::fs::write(path, bytes).unwrap();
+    std::fs::write(path, text).unwrap();
 }
 
 /// Cases of three Gaussians, each with an invalid value: the file, the field that its error names, and the property that a warning names.
@@ -285,10 +272,9 @@ pub fn files_with_invalid_values(folder: &Path) -> Vec<(PathBuf, &'static str, &
 /// Writes files as of other programs in which the second of three Gaussians has a rotation of length 0: values that underflow, in a PLY;
 /// the middle of the byte range, in a .splat.
 pub fn files_without_a_rotation(folder: &Path) -> [PathBuf; 2] {
-    let ply = folder.join("zero.ply");
-    let mut columns = small_gaussians();
-    columns.iter_mut().filter(|(name, _)| name.starts_with("rot")).for_each(|(_, values)| values[1] = 1e-40);
-    write_ply(&ply, &columns, &[]);
+    let ply = write_changed_ply(folder, "zero.ply", |columns| {
+        (0..4).for_each(|part| set(columns, &format!("rot_{part}"), 1, 1e-40));
+    });
     let dot_splat = folder.join("zero.splat");
     let mut bytes = bytes_of("splat", &random_splat(3, 0, 1));
     bytes[32 + 28..64].fill(128);

@@ -3,7 +3,7 @@
 //! a range of coefficients, each beside a PLY of the same Gaussians.
 
 use super::common::{assert_bytes_refused, assert_says, largest_error, random_splat, read_bytes, refusal};
-use globalsplat_splat_file::{check_writable_splat, is_splat_name, limits_of, read_splat, write_splat};
+use globalsplat_splat_file::{check_writable_splat, is_splat_name, output_format, read_splat, write_splat};
 use std::path::{Path, PathBuf};
 
 /// Size of the header of a file, and of a section.
@@ -72,7 +72,7 @@ fn ksplats_are_not_written() {
     let errors = [
         write_splat(&path, &random_splat(3, 0, 1)).unwrap_err(),
         check_writable_splat(&path).unwrap_err(),
-        limits_of(&path).unwrap_err(),
+        output_format(&path).err().unwrap(),
     ];
     for error in errors {
         assert!(error.is_invalid_request());

@@ -1,16 +1,17 @@
 //! SPZ: its bytes, older versions, and invalid files.
 
 use super::common::{
-    assert_bytes_refused, assert_says, bytes_of, largest_error, random_splat, read_bytes, round_trip,
+    assert_bytes_refused, assert_says, assert_within, bytes_of, largest_error, random_splat, read_bytes,
+    round_trip,
 };
-use globalsplat_splat_file::{Splat, WriteOptions, write_local_splat_with, write_splat};
+use globalsplat_splat_file::{Splat, WriteOptions, write_local_splat, write_splat};
 use std::io::{Read, Write};
 
 /// Returns the bytes of an SPZ of a version.
 fn bytes_of_version(spz_version: u32, splat: &Splat) -> Vec<u8> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.spz");
-    write_local_splat_with(&path, splat, &WriteOptions { spz_version }).unwrap();
+    write_local_splat(&path, splat, &WriteOptions { spz_version }).unwrap();
     std::fs::read(path).unwrap()
 }
 
@@ -34,28 +35,17 @@ fn an_spz_is_as_documented() {
     assert_eq!(unfolded[25..36], hex("9f83878b908070de52aac4")[..]);
     // Bytes of the coefficients: −0.1·128 + 128 and so on; y and z change their sign.
     assert_eq!(unfolded[36..], hex("73665a4d4033dae6f3"));
-    let fixed = |at: usize| i32::from_le_bytes([0, unfolded[at], unfolded[at + 1], unfolded[at + 2]]) >> 8;
-    assert_eq!([16, 19, 22].map(fixed), [1 << 21, -(2 << 21), -(3 << 21)]);
+    assert_eq!(unfolded[16..25], hex("0000200000c00000a0")[..], "1 << 21, −2 << 21 and −3 << 21");
     // Version 2 differs in its rotations, a byte for each of x, y and z.
     let older = ungzip(&bytes_of_version(2, &splat));
     assert_eq!(older[4], 2);
     assert_eq!(older[5..32], unfolded[5..32]);
     assert_eq!(older[32..35], hex("8d6558"));
     assert_eq!(older[35..], unfolded[36..]);
-    // Version 4 has the same streams, each by itself in Zstandard, after a header of 32 bytes and a table of contents.
+    // Version 4 has a header of 32 bytes and a table of contents.
     let newest = bytes_of("spz", &splat);
     assert_eq!(newest[..16], [&unfolded[..4], &[4, 0, 0, 0], &unfolded[8..15], &[6]].concat());
     assert_eq!(newest[16..32], [&[32u8][..], &[0; 15]].concat());
-    let word = |at: usize| u64::from_le_bytes(newest[at..at + 8].try_into().unwrap()) as usize;
-    let mut at = 32 + 6 * 16;
-    let mut streams = vec![];
-    for entry in (0..6).map(|stream| 32 + stream * 16) {
-        let stream = zstd::decode_all(&newest[at..at + word(entry)]).unwrap();
-        assert_eq!(stream.len(), word(entry + 8));
-        streams.extend(stream);
-        at += word(entry);
-    }
-    assert_eq!((at, &streams[..]), (newest.len(), &unfolded[16..]));
     let flat = bytes_of("spz", &splat.with_sh_degree(0));
     assert_eq!(flat[15], 5, "no stream of coefficients");
 }
@@ -67,13 +57,12 @@ fn all_versions_are_written() {
     let [two, three, four] =
         [2, 3, 4].map(|version| read_bytes("spz", &bytes_of_version(version, &splat)).unwrap());
     assert_eq!(three, four);
-    let product = |(a, b): (&[f32; 4], &[f32; 4])| a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>().abs();
-    let closeness = two.quaternions.iter().zip(&four.quaternions).map(product).fold(1f32, f32::min);
-    assert!(closeness > 0.995 && closeness < 1., "{closeness}");
-    assert_eq!(Splat { quaternions: four.quaternions.clone(), ..two }, four);
+    let mut max_errors = [0.; 7];
+    max_errors[2] = 0.1;
+    assert_within("version 2", &four, &two, max_errors);
     for spz_version in [1, 5] {
         let path = std::path::Path::new("none.spz");
-        let error = write_local_splat_with(path, &splat, &WriteOptions { spz_version }).unwrap_err();
+        let error = write_local_splat(path, &splat, &WriteOptions { spz_version }).unwrap_err();
         assert_says(&error.to_string(), &["the version of SPZ", "expected 2 to 4"]);
         assert!(!path.exists());
     }
@@ -144,12 +133,11 @@ fn the_axes_of_an_spz_are_applied() {
     let [rub, rdf] = [4, 6].map(|number| read_bytes("spz", &with_axes(number)).unwrap());
     let [x, y, z] = rub.means[0];
     assert_eq!(rdf.means[0], [x, -y, -z]);
-    // The order of degree 1 is y, z, x.
-    let signs = [1f32, -1., -1., 1.];
-    let turned = rub.sh.iter().zip(signs).map(|(color, sign)| color.map(|channel| sign * channel));
-    assert_eq!(rdf.sh, turned.collect::<Vec<_>>());
     let [w, x, y, z] = rub.quaternions[0];
     assert_eq!(rdf.quaternions[0], [w, x, -y, -z]);
+    // The order of degree 1 is y, z, x.
+    let signed = [(0, 1f32), (1, -1.), (2, -1.), (3, 1.)];
+    assert_eq!(rdf.sh, signed.map(|(basis, sign)| rub.sh[basis].map(|channel| sign * channel)));
     assert_bytes_refused("spz", &with_axes(9), &["the coordinate system is 9", "1 to 8"]);
 }
 
@@ -159,8 +147,7 @@ fn bad_spzs() {
     let unfolded = ungzip(&gzipped);
     for (at, byte, message) in [
         (0, b'n', "the first bytes is"),
-        (4, 5, "the version is 5, expected 1 to 4"),
-        (4, 4, "the version in gzip is 4, expected 1 to 3"),
+        (4, 4, "the version is 4, expected 1 to 3 in gzip"),
         (12, 4, "the SH degree is 4, expected 0 to 3"),
         (13, 31, "fractional bits is 31, expected 0 to 30"),
         (8, 45, "the body is cut short"),
@@ -174,8 +161,7 @@ fn bad_spzs() {
     let mut bomb = unfolded.clone();
     bomb[8..12].copy_from_slice(&200_000u32.to_le_bytes());
     bomb.resize(6_000_000, 0);
-    let message = ["the number of Gaussians is 200000", "256 times the file's bytes"];
-    assert_bytes_refused("spz", &gzip(&bomb), &message);
+    assert_bytes_refused("spz", &gzip(&bomb), &["the number of Gaussians is 200000"]);
     let mut extended = [unfolded, vec![3, 0, 0xbe, 0xad, 9, 0, 0, 0, 6]].concat();
     extended[14] = 2;
     let message = ["an extension is cut short: 1 bytes, expected 9 bytes"];
@@ -183,7 +169,7 @@ fn bad_spzs() {
     assert_bytes_refused("spz", &gzipped[..100], &["damaged", "a whole gzip"]);
     let mut damaged = gzipped.clone();
     *damaged.last_mut().unwrap() ^= 1;
-    assert_bytes_refused("spz", &damaged, &["the end is damaged"]);
+    assert_bytes_refused("spz", &damaged, &["the file is damaged"]);
     assert_bytes_refused("spz", b"no gzip", &["the file is no SPZ"]);
 }
 
@@ -196,7 +182,7 @@ fn bad_spzs_of_version_4() {
     let whole = [head, entries.collect(), streams.concat()].concat();
     assert_bytes_refused("spz", &whole[..20], &["the header is 20 bytes, expected 32"]);
     for (at, bytes, message) in [
-        (4, &[3][..], "the version outside of gzip is 3, expected 4"),
+        (4, &[3][..], "the version is 3, expected 1 to 3 in gzip, 4 outside of it"),
         (15, &[200], "the table of contents is at 32, expected 200 entries"),
         (16, &[255; 4], "the table of contents is at 4294967295"),
         (15, &[4], "stream"),
@@ -225,15 +211,4 @@ fn positions_have_24_bits() {
     far.means[1] = [-8_388_000.; 3];
     let near = round_trip("spz", &far);
     assert!(largest_error(near.means.as_flattened(), far.means.as_flattened()) <= 0.5);
-}
-
-/// The oldest version has half-precision floats, which needn't be finite.
-#[test]
-fn positions_of_version_1_are_checked() {
-    let head = [b"NGSP", &[1, 0, 0, 0, 3, 0, 0, 0, 0, 12, 0, 0][..]].concat();
-    let halves = [0x3c00u16, 0x3c00, 0x4400, 0x3c00, 0x7e00, 0x4400, 0xbc00, 0x3c00, 0x4400];
-    let rest = [vec![200; 3], vec![128; 9], vec![130; 9], vec![128; 9]].concat();
-    let bytes = gzip(&[head, halves.map(u16::to_le_bytes).concat(), rest].concat());
-    let message = ["the position of Gaussian 1 is NaN", "`globalsplat convert` leaves out"];
-    assert_bytes_refused("spz", &bytes, &message);
 }

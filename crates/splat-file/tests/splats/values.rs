@@ -72,28 +72,13 @@ fn infinite_logits_are_opacities_of_0_and_1() {
         let copy = round_trip("ply", &splat);
         assert!((f64::from(copy.opacity(0) - opacity).abs() - OPACITY_MARGIN).abs() < 1e-7);
         assert_eq!(copy.log_scales[0][0], MIN_SCALE.ln() as f32);
-        let copy = round_trip("splat", &splat);
-        assert_eq!((copy.opacity_logits[0], copy.log_scales[0][0]), (logit, f32::NEG_INFINITY));
+        for ending in ["splat", "glb"] {
+            let copy = round_trip(ending, &splat);
+            assert_eq!((copy.opacity_logits[0], copy.log_scales[0][0]), (logit, f32::NEG_INFINITY));
+        }
     }
     set(&mut bytes, 10, 89.);
     assert_bytes_refused("ply", &bytes, &["scale_0 of vertex 0 is 89", "at most 88"]);
-}
-
-/// Linear scales and opacities are those of the logarithms and logits, rounded once.
-#[test]
-fn scales_and_opacities_are_rounded_once() {
-    let splat = random_splat(100, 0, 5);
-    for index in 0..splat.len() {
-        let scale = f64::from(splat.log_scales[index][1]).exp();
-        assert_eq!(splat.scale(index)[1], scale as f32);
-        let logit = f64::from(splat.opacity_logits[index]);
-        assert!((f64::from(splat.opacity(index)) - logit.exp() / (1. + logit.exp())).abs() < 3e-8);
-    }
-    let importance = |index: &usize| {
-        splat.scale(*index).iter().map(|&s| f64::from(s)).product::<f64>() * f64::from(splat.opacity(*index))
-    };
-    let first = (0..100).max_by(|a, b| importance(a).total_cmp(&importance(b))).unwrap();
-    assert_eq!(bytes_of("splat", &splat)[12..16], splat.scale(first)[0].to_le_bytes());
 }
 
 /// Bytes are the colors themselves in older files, without bounds of colors.
@@ -132,29 +117,29 @@ fn colors_are_harmonics_of_degree_0() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("colors.ply");
     let bytes = [[0., 255., 10.], [128., 3., 20.], [255., 77., 30.]];
-    for names in [["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"]]
-    {
-        for (of, whole) in
-            [("uchar", 255.), ("ushort", 65535.), ("float", 1.), ("float", 255.), ("double", 1.)]
-        {
-            let mut columns = small_gaussians();
-            columns.retain(|(name, _)| !name.starts_with("f_dc"));
-            columns
-                .extend(names.into_iter().zip(bytes.map(|of_rows| of_rows.map(|byte| byte / 255. * whole))));
-            write_ply(&path, &columns, &names.map(|name| (name, of)));
-            let splat = read_splat(&path).unwrap();
-            assert_says(&splat.warnings[0], &[&names.join(", "), "f_dc_*"]);
-            let expected: Vec<f32> = (0..3)
-                .flat_map(|row| bytes.map(|of_rows| ((of_rows[row] / 255. - 0.5) / SH_C0) as f32))
-                .collect();
-            let step = if of == "ushort" { 1e-4 } else { 1e-6 };
-            let error = largest_error(splat.sh.as_flattened(), &expected);
-            assert!(error < step, "{of} {names:?} of {whole}: {error}");
-            // If there are coefficients as well, another program derived the colors from them, and they are ignored.
-            columns.extend(small_gaussians().into_iter().filter(|(name, _)| name.starts_with("f_dc")));
-            write_ply(&path, &columns, &names.map(|name| (name, of)));
-            let splat = read_splat(&path).unwrap();
-            assert!(splat.warnings.is_empty() && splat.sh[0][0] == 1.);
-        }
+    let (plain, diffuse) = (["red", "green", "blue"], ["diffuse_red", "diffuse_green", "diffuse_blue"]);
+    for (names, kind, white, step) in [
+        (plain, "uchar", 255., 1e-6),
+        (["r", "g", "b"], "float", 1., 1e-6),
+        (diffuse, "float", 255., 1e-6),
+        (plain, "ushort", 65535., 1e-4),
+        (plain, "double", 1., 1e-6),
+    ] {
+        let whole =
+            |byte: f64| if kind == "ushort" { (byte / 255. * white).round() } else { byte / 255. * white };
+        let mut columns = small_gaussians();
+        columns.retain(|(name, _)| !name.starts_with("f_dc"));
+        columns.extend(names.into_iter().zip(bytes.map(|of_rows| of_rows.map(whole))));
+        write_ply(&path, &columns, &names.map(|name| (name, kind)));
+        let splat = read_splat(&path).unwrap();
+        assert_says(&splat.warnings[0], &[&names.join(", "), "f_dc_*"]);
+        let color = |row: usize| bytes.map(|of_rows| ((of_rows[row] / 255. - 0.5) / SH_C0) as f32);
+        let error = largest_error(splat.sh.as_flattened(), [0, 1, 2].map(color).as_flattened());
+        assert!(error < step, "{kind} {names:?}: {error}");
+        // If there are coefficients as well, another program derived the colors from them, and they are ignored.
+        columns.extend(small_gaussians().into_iter().filter(|(name, _)| name.starts_with("f_dc")));
+        write_ply(&path, &columns, &names.map(|name| (name, kind)));
+        let splat = read_splat(&path).unwrap();
+        assert!(splat.warnings.is_empty() && splat.sh[0][0] == 1.);
     }
 }
