@@ -16,8 +16,8 @@ pub use globalsplat_files::{
     InputFiles, check_regular, check_writable_dir, check_writable_file, checksum, parent_of, write_atomically,
 };
 pub use globalsplat_splat_file::{
-    ShLimits, Splat, WriteOptions, check_writable_splat, find_splat, is_splat_name, origin_file, output_format,
-    read_splat, read_splat_without_invalid, splat_files, write_local_splat, write_splat,
+    ShLimits, Splat, WriteOptions, check_writable_splat, find_splat, is_splat_name, origin_file,
+    output_format, read_splat, read_splat_without_invalid, splat_files, write_local_splat, write_splat,
 };
 
 pub use globalsplat_capture::{decode_photo, encode_photo, read_image};

@@ -6,8 +6,8 @@ use globalsplat::config::Config;
 use globalsplat::data::{Capture, Chunk, Dataset, Split, open_capture, read_camera_path, read_points};
 use globalsplat::eval::{EvaluationIndex, read_evaluation, write_report};
 use globalsplat::io::{
-    WriteOptions, decode_photo, origin_file, read_splat, read_splat_without_invalid, read_weights, rounding_warning,
-    write_local_splat, write_splat,
+    WriteOptions, decode_photo, origin_file, read_splat, read_splat_without_invalid, read_weights,
+    rounding_warning, write_local_splat, write_splat,
 };
 use globalsplat::reconstruct::load_model;
 use globalsplat::scene::Gaussians;
