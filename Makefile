@@ -7,7 +7,7 @@ export PYTHONUTF8 := 1
 .NOTPARALLEL:
 CARGO ?= cargo
 
-.PHONY: setup venv weights poses build demo gpu-bundle test bench docker clean
+.PHONY: setup venv weights poses build demo demo-training gpu-bundle test bench docker clean
 .DEFAULT_GOAL := build
 
 # Checks the build requirements and reports what is missing; creates .venv with libtorch unless LIBTORCH names another libtorch.
@@ -35,6 +35,10 @@ build: setup
 # Reconstructs a splat from photos, refines it, and writes an interactive viewer page: at most 3 minutes once the program is built.
 demo: build
 	@scripts/demo.sh
+
+# Fine-tunes the shipped weights on synthetic scenes, and compares views before and after: about 10 minutes.
+demo-training: build
+	@scripts/demo_training.sh
 
 # Packs the program without debug information and the repository's files, for scripts/on_a_gpu.sh on a machine that can't build it.
 BUNDLE := target/gpu-bundle
@@ -128,9 +132,10 @@ check-robustness: build
 # The tests under the conditions of other machines: AVX2 only, no bf16, another user, a folder with a space; one core with SSE2.
 check-machines: build
 	scripts/other_machines.sh
-# The demo on a synthetic scene, and the script for a GPU at a reduced size on the CPU.
+# The demos on synthetic scenes, and the script for a GPU at a reduced size on the CPU.
 check-demos: build
 	CAPTURES=none OUT=target/demo scripts/demo.sh --dry-run
+	OUT=target/demo_training scripts/demo_training.sh --dry-run
 	DEVICE=cpu OUT=target/on_a_gpu scripts/on_a_gpu.sh --dry-run
 # Packs the program with all that it needs to run on another Linux without a GPU, into target/dist. See docs/start.md.
 .PHONY: dist

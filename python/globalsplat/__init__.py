@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 from ._torch import torch_folder as _torch_folder
 
 if TYPE_CHECKING:
+    from ._models import Model as Model
+    from ._models import load_model as load_model
     from ._native import Capture as Capture
     from ._native import simd_level as simd_level
     from ._rasterization import rasterization as rasterization
@@ -30,9 +32,11 @@ __version__ = "0.1.0"
 
 _MODULES = {
     "Capture": "_reconstruction",
+    "Model": "_models",
     "Parameters": "_splats",
     "Splat": "_splats",
     "load_capture": "_reconstruction",
+    "load_model": "_models",
     "load_splat": "_splats",
     "rasterization": "_rasterization",
     "reconstruct": "_reconstruction",

@@ -52,5 +52,6 @@ def refine(
     cuda: int | None,
     progress: Callable[[int, float | None], object] | None,
 ) -> tuple[dict[str, Any], list[str]]: ...
+def read_model(weights: Path | None) -> tuple[dict[str, Floats], str, int, float]: ...
 def simd_level() -> str:
     """Returns the instruction set of the rasterizer's CPU kernels: avx512, avx2, neon or portable."""

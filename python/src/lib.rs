@@ -17,7 +17,7 @@ mod _native {
     #[pymodule_export]
     use super::capture::{Capture, capture_from_images, open_capture};
     #[pymodule_export]
-    use super::models::reconstruct;
+    use super::models::{read_model, reconstruct};
     #[pymodule_export]
     use super::refine::refine;
     #[pymodule_export]

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from globalsplat import _torch
+from globalsplat.reference.normalize import normalize_scene
 from globalsplat.reference.splat import sh_color
 
 # Formats, and the PSNR in dB that a render may lose in each. A .splat has one color of each Gaussian, and is compared with the mean colors.
@@ -193,3 +194,22 @@ def test_refinement_improves_a_splat(splat, capture):
             globalsplat.refine(capture, steps=1, device="cuda")
     with pytest.raises(ValueError, match="unknown field `nothing`"):
         globalsplat.refine(capture, splat, settings={"nothing": 1})
+
+
+def test_the_model_in_pytorch_gives_the_program_s_gaussians(capture, tmp_path):
+    model = globalsplat.load_model()
+    assert sum(parameter.numel() for parameter in model.parameters()) == 2_031_523
+    size = 96
+    images, Ks = [], torch.from_numpy(capture.Ks[:4]).clone()
+    for index in range(4):
+        image = torch.from_numpy(capture.image(index)).permute(2, 0, 1)[None].float() / 255.0
+        images.append(torch.nn.functional.interpolate(image, (size, size), mode="area"))
+    Ks[:, :2] *= size / capture.sizes[0][0]
+    c2w, _, _ = normalize_scene(torch.from_numpy(capture.viewmats[:4]).inverse())
+    gaussians = model(torch.cat(images)[None], c2w[None].float(), Ks[None].float())
+    assert gaussians["means"].shape == (1, 16384, 3) and gaussians["colors"].shape == (1, 16384, 4, 3)
+    scene = {name: value.detach()[0] for name, value in gaussians.items()}
+    image, _, _ = globalsplat.rasterization(
+        **scene, viewmats=c2w[:1].inverse().float(), Ks=Ks[:1].float(), width=size, height=size, sh_degree=1, eps2d=0.05
+    )
+    assert psnr(image[0].clamp(0.0, 1.0), images[0][0].permute(1, 2, 0)) > 15.0

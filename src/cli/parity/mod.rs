@@ -1,4 +1,4 @@
-//! Rust side of `python -m parity`: runs any module on given weights and inputs, and returns its outputs and gradients.
+//! Rust side of `python parity/run.py`: runs any module on given weights and inputs, and returns its outputs and gradients.
 //!
 //! Nothing is implemented here: every case calls the code that training runs.
 
@@ -12,7 +12,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use tch::{Device, Kind, Tensor};
 
-/// Answer the requests of `python -m parity`.
+/// Answer the requests of `python parity/run.py`.
 #[derive(Args)]
 pub struct Parity {
     /// Folder of request files
