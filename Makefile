@@ -148,7 +148,7 @@ wheel: venv
 check-wheel: wheel
 	scripts/check_wheel.sh
 
-# Benchmarks the loading of training data, and the rasterizer: its speed, and how its time grows with Gaussians and pixels.
+# Benchmarks the rasterizer and the forward pass.
 bench: build
 	@target/release/globalsplat bench raster
 	@target/release/globalsplat bench model
