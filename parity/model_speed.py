@@ -1,6 +1,6 @@
 """Compares the speed of the program's forward pass with the same model in PyTorch, on the CPU, in one run.
 
-    python -m parity.model_speed [--views 24]    views of 256x256, 16,384 Gaussians, in f32 and in bf16
+    python parity/model_speed.py [--views 24]    views of 256x256, 16,384 Gaussians, in f32 and in bf16
 
 The PyTorch model is the parity checks' reference; bf16 uses torch.autocast. Weights and photos are random. The program
 is measured with `globalsplat bench model`. Both warm up, and are measured alternately, so that other load affects both.
@@ -10,11 +10,15 @@ import argparse
 import json
 import statistics
 import subprocess
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import torch
+
+# The folder of the package parity.
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # noqa: TID251
 
 from parity.harness import draw
 from parity.reference.model import forward
