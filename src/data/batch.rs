@@ -36,12 +36,7 @@ pub fn view_batch<V: Borrow<View>>(views: &[V], poses: &[DMat4], device: Device)
         let masks: Vec<Pixels> = views.iter().map(|view| view.borrow().mask_or_ones()).collect();
         stack(&masks.iter().collect::<Vec<_>>())
     });
-    ViewBatch::with_images(stack(&images), masks, None, &[view_matrices(&cameras_at(views, poses), device)])
-}
-
-/// Returns the mask of `images` [.., 3, H, W] whose every pixel counts, [.., 1, H, W].
-fn ones_like_mask(images: &Tensor) -> Tensor {
-    images.narrow(-3, 0, 1).ones_like()
+    ViewBatch::with_images(stack(&images), masks, &[view_matrices(&cameras_at(views, poses), device)])
 }
 
 /// Returns the views at `positions` of a tensor `[B, V, …]`.
@@ -69,17 +64,12 @@ pub(crate) fn view_matrices(cameras: &[Camera], device: Device) -> [Tensor; 3] {
 }
 
 impl ViewBatch {
-    /// Builds a batch from `images` `[B, V, 3, H, W]`, their `masks` `[B, V, 1, H, W]` and `depths` `[B, V, 2, H, W]`, and the `matrices` of
-    /// B scenes, one result of [`view_matrices`] per scene.
-    pub(super) fn with_images(
-        images: Tensor,
-        masks: Option<Tensor>,
-        depths: Option<Tensor>,
-        matrices: &[[Tensor; 3]],
-    ) -> Self {
+    /// Builds a batch without depths from `images` `[B, V, 3, H, W]`, their `masks` `[B, V, 1, H, W]`, and the `matrices` of B scenes, one
+    /// result of [`view_matrices`] per scene.
+    pub(super) fn with_images(images: Tensor, masks: Option<Tensor>, matrices: &[[Tensor; 3]]) -> Self {
         let cat =
             |which: usize| Tensor::cat(&matrices.iter().map(|scene| &scene[which]).collect::<Vec<_>>(), 0);
-        ViewBatch { images, masks, depths, c2w: cat(0), w2c: cat(1), intrinsics: cat(2) }
+        ViewBatch { images, masks, depths: None, c2w: cat(0), w2c: cat(1), intrinsics: cat(2) }
     }
 
     /// Applies `f` to every tensor.
@@ -134,11 +124,12 @@ impl ViewBatch {
             Tensor::cat(&scenes.iter().map(|scene| field(scene.borrow())).collect::<Vec<_>>(), 0)
         };
         let masks = scenes.iter().any(|scene| scene.borrow().masks.is_some()).then(|| {
-            let masks = |scene: &ViewBatch| match &scene.masks {
+            // Every pixel of a scene without masks counts.
+            let masks = scenes.iter().map(|scene| match &scene.borrow().masks {
                 Some(masks) => masks.shallow_clone(),
-                None => ones_like_mask(&scene.images),
-            };
-            Tensor::cat(&scenes.iter().map(|scene| masks(scene.borrow())).collect::<Vec<_>>(), 0)
+                None => scene.borrow().images.narrow(-3, 0, 1).ones_like(),
+            });
+            Tensor::cat(&masks.collect::<Vec<_>>(), 0)
         });
         // Scenes of a batch come from one loader: all have depths, or none.
         let depths: Option<Vec<&Tensor>> =

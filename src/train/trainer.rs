@@ -180,9 +180,9 @@ impl Trainer {
 
     fn batch_shard(&self) -> BatchShard {
         BatchShard {
-            batch: self.config.train.batch_size,
-            number: self.group.rank(),
-            parts: self.group.world_size(),
+            batch_size: self.config.train.batch_size,
+            rank: self.group.rank(),
+            world_size: self.group.world_size(),
         }
     }
 

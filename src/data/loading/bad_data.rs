@@ -33,7 +33,7 @@ pub struct BadData {
     pub too_short: u64,
     /// Number of scenes with images that can't be read.
     pub with_broken_images: u64,
-    /// Error of the first skipped scene that wasn't merely too short.
+    /// Error of the first skipped scene, or of the first one that wasn't merely too short.
     pub first: Option<String>,
 }
 
@@ -82,22 +82,8 @@ pub(crate) struct BadDataLog {
 struct Entries {
     counts: BadData,
     seen: BTreeSet<SceneIndex>,
-    /// Error of the most recent bad scene.
-    last: Option<String>,
     /// Bad scenes found by this process since the last [`BadDataLog::take_bad_scene_reports`].
     reports: Vec<BadSceneReport>,
-}
-
-/// Formats the counts and the last error in one line.
-impl fmt::Display for Entries {
-    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        write!(f, "{}", self.counts)?;
-        match &self.last {
-            // The counts already include the first error of a broken scene.
-            Some(last) if self.counts.first.is_none() => write!(f, "; the last: {last}"),
-            _ => Ok(()),
-        }
-    }
 }
 
 impl BadDataLog {
@@ -142,10 +128,13 @@ impl BadDataLog {
         entries: &mut Entries,
         BadSceneReport { fault, scene_indices, why }: BadSceneReport,
     ) -> Result<()> {
-        let Entries { counts, seen, last, .. } = entries;
+        let Entries { counts, seen, .. } = entries;
         let new = scene_indices.into_iter().filter(|&scene_index| seen.insert(scene_index)).count() as u64;
         if new == 0 {
             return Ok(());
+        }
+        if counts.first.is_none() || (fault != Fault::Short && counts.total() == counts.too_short) {
+            counts.first = Some(why);
         }
         *match fault {
             Fault::Group => &mut counts.in_broken_files,
@@ -153,13 +142,9 @@ impl BadDataLog {
             Fault::Short => &mut counts.too_short,
             Fault::Image => &mut counts.with_broken_images,
         } += new;
-        if fault != Fault::Short {
-            counts.first.get_or_insert_with(|| why.clone());
-        }
-        *last = Some(why);
         if counts.total() as f64 > self.largest_share * counts.scenes as f64 {
             let share = self.largest_share;
-            return Err(Error::failed(format!("{entries}; data.max_bad_share allows {share} of them")));
+            return Err(Error::failed(format!("{counts}; data.max_bad_share allows {share} of them")));
         }
         Ok(())
     }
@@ -176,8 +161,7 @@ impl BadDataLog {
 
     /// Returns the error for the case that no usable scene is left.
     pub fn exhausted(&self) -> Error {
-        let entries = self.entries.lock().expect("no thread panics here");
-        Error::failed(format!("no scene can be trained on: {entries}"))
+        Error::failed(format!("no scene can be trained on: {}", self.counts()))
     }
 
     pub fn counts(&self) -> BadData {

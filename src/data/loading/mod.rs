@@ -28,7 +28,7 @@ use rand::seq::SliceRandom;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use sample::PendingBatch;
-use sampler::{Order, SceneIndex, choose_views, draw_context_count};
+use sampler::{SceneIndex, SceneSampler, choose_views, draw_context_count};
 use scenes::GroupCache;
 use std::collections::HashMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -56,16 +56,9 @@ pub struct DataLoader {
     /// Number of samples taken from the threads.
     taken: u64,
     upload: Option<Upload>,
-    prefetched: Option<PrefetchedBatch>,
-}
-
-/// A prefetched batch.
-#[derive(Debug)]
-struct PrefetchedBatch {
-    /// Index of its first sample.
-    first: u64,
-    /// Batch that is being copied, or the loading error to return when the batch is requested.
-    sample: Result<PendingBatch>,
+    /// Index of the first sample of the prefetched batch, and the batch that is being copied, or the loading error to return when the
+    /// batch is requested.
+    prefetched: Option<(u64, Result<PendingBatch>)>,
 }
 
 /// Decoded photo, and its mask in equal channels, which is cropped and resized in the same way.
@@ -79,7 +72,7 @@ type DecodedPhotos = HashMap<(SceneIndex, usize), Arc<MaskedPhoto>>;
 struct Shared {
     config: DataConfig,
     seed: u64,
-    order: Order,
+    sampler: SceneSampler,
     groups: GroupCache,
     bad_data_log: BadDataLog,
     /// Photo cache, if there is memory for all photos.
@@ -115,12 +108,12 @@ impl DataLoader {
         let fits = scenes
             .decoded_bytes()
             .is_some_and(|bytes| bytes <= config.photo_cache_mb.saturating_mul(1_000_000));
-        let order = Order::new(sizes, seed);
+        let sampler = SceneSampler::new(sizes, seed);
         let shared = Arc::new(Shared {
             config: config.clone(),
             seed,
-            bad_data_log: BadDataLog::new(order.scenes(), config.max_bad_share),
-            order,
+            bad_data_log: BadDataLog::new(sampler.scenes(), config.max_bad_share),
+            sampler,
             groups: GroupCache::new(scenes),
             photos: fits.then(Default::default),
             stopped: AtomicBool::new(false),
@@ -172,14 +165,9 @@ impl DataLoader {
         Ok(loader)
     }
 
-    /// Returns the number of loader threads.
-    pub fn threads(&self) -> usize {
-        self.threads.len()
-    }
-
     /// Returns the index of the next sample. A prefetched batch counts as not delivered.
     pub fn position(&self) -> u64 {
-        self.prefetched.as_ref().map_or(self.next(), |batch| batch.first)
+        self.prefetched.as_ref().map_or(self.next(), |&(first, _)| first)
     }
 
     /// Returns the index of the sample that the threads deliver next.
@@ -211,7 +199,7 @@ impl DataLoader {
     /// Fails like [`DataLoader::next_scene`] and [`Batch::from_scenes`].
     pub fn next_batch(&mut self, batch: usize, device: Device) -> Result<Batch> {
         match self.prefetched.take() {
-            Some(ahead) => ahead.sample?.wait(),
+            Some((_, batch)) => batch?.wait(),
             None => {
                 let scenes = self.next_scenes(batch)?;
                 Batch::from_scenes_with(&scenes, self.upload(device)?)
@@ -225,8 +213,8 @@ impl DataLoader {
         if self.prefetched.is_none() {
             let first = self.next();
             let scenes = self.next_scenes(batch);
-            let sample = scenes.and_then(|scenes| PendingBatch::begin(&scenes, self.upload(device)?));
-            self.prefetched = Some(PrefetchedBatch { first, sample });
+            let pending = scenes.and_then(|scenes| PendingBatch::begin(&scenes, self.upload(device)?));
+            self.prefetched = Some((first, pending));
         }
     }
 
@@ -272,18 +260,19 @@ impl Shared {
         let mut random = ChaCha8Rng::seed_from_u64(self.seed);
         random.set_stream(sample);
         let context_count = draw_context_count(&self.config, self.seed, step);
-        let (first, groups) = self.order.locate(sample);
+        let (first, groups) = self.sampler.locate(sample);
         for group in groups {
             let opened = self.groups.open(group);
             let scenes = match &*opened {
                 Ok(scenes) => scenes,
                 Err(why) => {
-                    let scene_indices = (0..self.order.size(group)).map(|scene| SceneIndex { group, scene });
+                    let scene_indices =
+                        (0..self.sampler.size(group)).map(|scene| SceneIndex { group, scene });
                     self.bad_data_log.add(Fault::Group, scene_indices, why)?;
                     continue;
                 }
             };
-            let mut turns: Vec<usize> = (0..self.order.size(group)).collect();
+            let mut turns: Vec<usize> = (0..self.sampler.size(group)).collect();
             if group == first.group {
                 turns.swap_remove(first.scene);
                 turns.insert(0, first.scene);
@@ -296,13 +285,8 @@ impl Shared {
                     shuffled = usize::MAX;
                 }
                 let scene_index = SceneIndex { group, scene: turns[turn] };
-                match self.load_scene(
-                    scene_index,
-                    scenes.get(scene_index.scene),
-                    context_count,
-                    &mut random,
-                    state,
-                ) {
+                let capture = scenes.get(scene_index.scene);
+                match self.load_scene(scene_index, capture, context_count, &mut random, state) {
                     Ok(scene) => return Ok(scene),
                     Err((fault, why)) => self.bad_data_log.add(fault, std::iter::once(scene_index), why)?,
                 }

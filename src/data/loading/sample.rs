@@ -6,6 +6,7 @@ use crate::error::Result;
 use crate::scene::{Camera, ImageSize};
 use globalsplat_capture::CHANNELS;
 use std::ops::Range;
+use tch::kind::Element;
 use tch::{Device, Kind, Tensor};
 
 /// A scene of a training sample: N photos, each of them context, target or both.
@@ -31,17 +32,6 @@ pub struct LoadedScene {
     /// Far plane of the frusta in normalized world coordinates.
     pub far: f64,
 }
-
-impl LoadedScene {
-    /// Returns the depths as a tensor, `[C, 2, H, W]`.
-    pub(super) fn depth_tensor(&self) -> Option<Tensor> {
-        let [height, width] = [self.size.height, self.size.width].map(i64::from);
-        self.depths.as_ref().map(|depths| Tensor::from_slice(depths).view([-1, 2, height, width]))
-    }
-}
-
-/// Largest value of a byte.
-const LEVELS: f32 = 255.;
 
 /// Views of one training step for B scenes.
 #[derive(Debug)]
@@ -70,7 +60,12 @@ impl Batch {
     /// Builds a batch like [`Batch::from_scenes`], reusing an existing [`Upload`].
     pub(crate) fn from_scenes_with(scenes: &[LoadedScene], upload: &Upload) -> Result<Self> {
         match upload.device() {
-            Device::Cpu => Batch::on_host(scenes, |images, shape| Ok(floats(images, shape))),
+            // Converting in one pass avoids libtorch's threads, which would spin while waiting for each other whenever loading keeps
+            // all cores busy.
+            Device::Cpu => Batch::on_host(scenes, |images, shape| {
+                let floats = Tensor::empty(shape, (Kind::Float, Device::Cpu));
+                Ok(fill(floats, images, |byte| f32::from(byte) / 255.))
+            }),
             _ => PendingBatch::begin(scenes, upload)?.wait(),
         }
     }
@@ -108,9 +103,12 @@ impl Batch {
                 });
                 images(&masks, &shape)
             });
-            Ok(ViewBatch::with_images(photos, masks.transpose()?, None, &matrices.collect::<Vec<_>>()))
+            Ok(ViewBatch::with_images(photos, masks.transpose()?, &matrices.collect::<Vec<_>>()))
         };
-        let depths: Option<Vec<Tensor>> = scenes.iter().map(LoadedScene::depth_tensor).collect();
+        let [height, width] = [scenes[0].size.height, scenes[0].size.width].map(i64::from);
+        let depths = scenes.iter().map(|scene| scene.depths.as_ref());
+        let depths = depths.map(|depths| Some(Tensor::from_slice(depths?).view([-1, 2, height, width])));
+        let depths: Option<Vec<Tensor>> = depths.collect();
         let context = batch(|scene| &scene.context)?;
         Ok(Batch {
             names: scenes.iter().map(|scene| scene.name.clone()).collect(),
@@ -172,7 +170,8 @@ pub(super) struct PendingBatch {
 impl PendingBatch {
     /// Starts to copy the batch that [`Batch::from_scenes`] builds from `scenes`.
     pub fn begin(scenes: &[LoadedScene], upload: &Upload) -> Result<Self> {
-        let host = Batch::on_host(scenes, |images, shape| Ok(bytes(images, upload.bytes(shape)?)))?;
+        let host =
+            Batch::on_host(scenes, |images, shape| Ok(fill(upload.bytes(shape)?, images, |byte| byte)))?;
         let mut tensors = vec![];
         host.map(|t| {
             tensors.push(t.shallow_clone());
@@ -187,7 +186,7 @@ impl PendingBatch {
         Ok(self.host.map(|_| {
             let copy = copies.next().expect("a copy of every tensor");
             match copy.kind() {
-                Kind::Uint8 => copy.to_kind(Kind::Float).g_div_scalar_(f64::from(LEVELS)),
+                Kind::Uint8 => copy.to_kind(Kind::Float).g_div_scalar_(255.),
                 _ => copy,
             }
         }))
@@ -214,31 +213,16 @@ fn chosen_planes<'a>(
     (images, shape.map(|n| n as i64))
 }
 
-/// Copies `images` one after the other into `memory`, a byte tensor on the CPU.
-fn bytes(images: &[&[u8]], memory: Tensor) -> Tensor {
+/// Fills `tensor`, a new one on the CPU, with the converted bytes of `images`, one image after the other.
+fn fill<T: Element>(tensor: Tensor, images: &[&[u8]], convert: impl Fn(u8) -> T) -> Tensor {
     let image_bytes = images[0].len();
-    assert_eq!(memory.numel(), images.len() * image_bytes, "scenes of one kind");
-    // SAFETY: `memory` is a new contiguous tensor in CPU memory with exactly this many bytes, and nothing else refers to it yet.
-    let places = unsafe { std::slice::from_raw_parts_mut(memory.data_ptr().cast::<u8>(), memory.numel()) };
-    for (place, image) in places.chunks_exact_mut(image_bytes).zip(images) {
-        place.copy_from_slice(image);
-    }
-    memory
-}
-
-/// Converts `images` to floats in [0, 1] in one pass, directly into the tensor's memory. It avoids libtorch's threads, which would
-/// spin while waiting for each other whenever loading keeps all cores busy.
-fn floats(images: &[&[u8]], shape: &[i64]) -> Tensor {
-    let image_bytes = images[0].len();
-    let floats = Tensor::empty(shape, (Kind::Float, Device::Cpu));
-    assert_eq!(floats.numel(), images.len() * image_bytes, "scenes of one kind");
-    // SAFETY: `floats` is a new contiguous tensor in CPU memory with exactly this many float32 values, and nothing else refers to
+    assert_eq!(tensor.kind(), T::KIND);
+    assert_eq!(tensor.numel(), images.len() * image_bytes, "scenes of one kind");
+    // SAFETY: `tensor` is a new contiguous tensor in CPU memory with exactly this many elements of this type, and nothing else refers to
     // it yet.
-    let places = unsafe { std::slice::from_raw_parts_mut(floats.data_ptr().cast::<f32>(), floats.numel()) };
-    for (place, image) in places.chunks_exact_mut(image_bytes).zip(images) {
-        for (float, &byte) in place.iter_mut().zip(*image) {
-            *float = f32::from(byte) / LEVELS;
-        }
+    let elements = unsafe { std::slice::from_raw_parts_mut(tensor.data_ptr().cast::<T>(), tensor.numel()) };
+    for (elements, image) in elements.chunks_exact_mut(image_bytes).zip(images) {
+        elements.iter_mut().zip(*image).for_each(|(element, &byte)| *element = convert(byte));
     }
-    floats
+    tensor
 }

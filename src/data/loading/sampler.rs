@@ -8,7 +8,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-/// Seed modifier that separates the order's random numbers from those of the samples.
+/// Seed modifier that separates the sampler's random numbers from those of the samples.
 const ORDER_KEY: u64 = 0x6f72_6465_725f_6f66;
 
 /// Location of a scene in the data: the index of its group, and its index in that group.
@@ -20,20 +20,20 @@ pub struct SceneIndex {
     pub scene: usize,
 }
 
-/// A random order of groups of scenes that changes with every epoch.
+/// Sampler of scenes in a random order that changes with every epoch and keeps the scenes of a group together.
 #[derive(Debug, Clone)]
-pub struct Order {
+pub struct SceneSampler {
     sizes: Vec<usize>,
     scenes: u64,
     seed: u64,
 }
 
-impl Order {
-    /// Creates an order of groups with `sizes` scenes each. At least one size must be above 0.
+impl SceneSampler {
+    /// Creates a sampler of groups with `sizes` scenes each. At least one size must be above 0.
     pub fn new(sizes: Vec<usize>, seed: u64) -> Self {
         let scenes = sizes.iter().sum::<usize>() as u64;
-        assert!(scenes > 0, "an order of nothing");
-        Order { sizes, scenes, seed }
+        assert!(scenes > 0, "a sampler of nothing");
+        SceneSampler { sizes, scenes, seed }
     }
 
     /// Returns the number of scenes of an epoch.
@@ -71,40 +71,40 @@ impl Order {
     }
 }
 
-/// One of the equal parts of every step. Together, the parts of a step are the samples that a single process would load.
+/// The samples that one rank loads of every step. Together, the ranks load the samples that a single process would load.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct BatchShard {
-    /// Number of samples of a step in this part.
-    pub batch: usize,
-    /// Index of this part, starting at 0.
-    pub number: usize,
-    /// Number of parts.
-    pub parts: usize,
+    /// Number of samples per step of each rank.
+    pub batch_size: usize,
+    /// Index of this rank, starting at 0.
+    pub rank: usize,
+    /// Number of ranks.
+    pub world_size: usize,
 }
 
 impl BatchShard {
-    /// Returns the number of samples of a step in all parts.
+    /// Returns the number of samples of a step on all ranks.
     pub fn global_batch_size(self) -> u64 {
-        (self.batch * self.parts) as u64
+        (self.batch_size * self.world_size) as u64
     }
 
-    /// Returns the index of this part's sample number `turn`, where the first step begins with sample `first`.
+    /// Returns the index of this rank's sample number `turn`, where the first step begins with sample `first`.
     pub fn sample(self, first: u64, turn: u64) -> u64 {
-        let (step, within) = (turn / self.batch as u64, turn % self.batch as u64);
-        first + step * self.global_batch_size() + (self.batch * self.number) as u64 + within
+        let (step, within) = (turn / self.batch_size as u64, turn % self.batch_size as u64);
+        first + step * self.global_batch_size() + (self.batch_size * self.rank) as u64 + within
     }
 
     /// Returns the index of the step of sample number `turn`, computed from the step's first sample. All samples of a step get the
     /// same index, even if a resumed run uses another batch size.
     pub(super) fn step(self, first: u64, turn: u64) -> u64 {
-        (first + turn / self.batch as u64 * self.global_batch_size()) / self.global_batch_size()
+        (first + turn / self.batch_size as u64 * self.global_batch_size()) / self.global_batch_size()
     }
 }
 
 /// Converts a batch size to whole steps of that many samples.
 impl From<usize> for BatchShard {
-    fn from(batch: usize) -> Self {
-        BatchShard { batch, number: 0, parts: 1 }
+    fn from(batch_size: usize) -> Self {
+        BatchShard { batch_size, rank: 0, world_size: 1 }
     }
 }
 
@@ -189,8 +189,8 @@ mod tests {
 
     #[test]
     fn every_epoch_shows_every_scene_once_and_keeps_groups_together() {
-        let order = Order::new(vec![3, 0, 5, 1, 4], 7);
-        let epoch = |e: u64| (0..13).map(|i| order.locate(13 * e + i).0).collect::<Vec<_>>();
+        let sampler = SceneSampler::new(vec![3, 0, 5, 1, 4], 7);
+        let epoch = |e: u64| (0..13).map(|i| sampler.locate(13 * e + i).0).collect::<Vec<_>>();
         for e in 0..20 {
             let shown = epoch(e);
             assert_eq!(shown.iter().collect::<BTreeSet<_>>().len(), 13);
@@ -198,7 +198,7 @@ mod tests {
             assert_eq!(changes, 3, "{shown:?}");
         }
         assert_ne!(epoch(0), epoch(1));
-        let other = Order::new(vec![3, 0, 5, 1, 4], 8);
+        let other = SceneSampler::new(vec![3, 0, 5, 1, 4], 8);
         assert_ne!(epoch(0), (0..13).map(|i| other.locate(i).0).collect::<Vec<_>>());
     }
 
@@ -208,8 +208,8 @@ mod tests {
         assert_eq!((0..12).map(|turn| whole.step(12, turn)).collect::<Vec<_>>(), [[2; 6], [3; 6]].concat());
         // Resumed after steps of 4 samples.
         assert_eq!((0..12).map(|turn| whole.step(8, turn)).collect::<Vec<_>>(), [[1; 6], [2; 6]].concat());
-        for number in 0..3 {
-            let shard = BatchShard { batch: 2, number, parts: 3 };
+        for rank in 0..3 {
+            let shard = BatchShard { batch_size: 2, rank, world_size: 3 };
             assert_eq!((0..4).map(|turn| shard.step(8, turn)).collect::<Vec<_>>(), [1, 1, 2, 2]);
         }
     }
