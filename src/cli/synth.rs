@@ -1,10 +1,8 @@
 use super::{print_json, progress};
 use crate::Error;
-use crate::data::{Capture, ChunkWriter, SyntheticDataset, load_views, read_pictures};
+use crate::data::{Capture, ChunkWriter, SyntheticDataset, load_views};
 use crate::eval::{EvaluationIndex, SceneFrames};
-use crate::io::{
-    InputFiles, Mosaic, check_writable_dir, check_writable_png, tile_horizontally, write_atomically,
-};
+use crate::io::{Mosaic, check_writable_dir, check_writable_png, tile_horizontally, write_atomically};
 use crate::scene::ImageSize;
 use crate::synth::VideoSettings;
 use anyhow::Result;
@@ -48,9 +46,6 @@ pub struct Synth {
     /// Side of a photo in pixels
     #[arg(long, value_name = "PIXELS", default_value_t = 128, value_parser = clap::value_parser!(u64).range(SyntheticDataset::SIZE))]
     size: u64,
-    /// Folder of PNG and JPEG files to use as textures of walls and objects
-    #[arg(long, value_name = "DIR")]
-    pictures: Option<PathBuf>,
     /// Also write depth/SCENE.npy: exact depths [photos, rows, columns] in metres, infinite in the sky
     #[arg(long)]
     depth: bool,
@@ -70,15 +65,9 @@ impl Synth {
         if let Some(sheet) = &self.contact_sheet {
             check_writable_png(sheet)?;
         }
-        let pictures = self.pictures.as_deref().map(read_pictures).transpose()?.unwrap_or_default();
         check_writable_dir(&self.out)?;
-        let mut inputs = InputFiles::default();
-        let on_walls = self.pictures.iter().filter_map(|folder| folder.read_dir().ok()).flatten().flatten();
-        on_walls.for_each(|picture| inputs.add_photo(&picture.path()));
-        inputs.check_folder(&self.out)?;
-        self.contact_sheet.iter().try_for_each(|sheet| inputs.check_file(sheet))?;
         let size = ImageSize { height: self.size as u32, width: self.size as u32 };
-        let settings = VideoSettings { frames: self.frames as usize, size, pictures };
+        let settings = VideoSettings { frames: self.frames as usize, size };
         let videos = SyntheticDataset::new(self.seed, self.first, self.scenes, settings);
         let mut writer = ChunkWriter::new(&self.out, CHUNK_BYTES)?;
         let depths = self.out.join("depth");
@@ -104,11 +93,7 @@ impl Synth {
                 if self.depth && !file.exists() {
                     self.write_depths(&file, &videos.capture(number)?)?;
                 }
-                // A sheet shows images as they were rendered, not the JPEGs of a chunk.
-                match self.contact_sheet.is_some() && number < SHEET.0 {
-                    true => note(&videos.capture(number)?),
-                    false => note(capture),
-                }
+                note(capture)
             },
         )?;
         let numbers: Vec<usize> = (made_before..self.scenes as usize).collect();

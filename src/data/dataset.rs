@@ -20,17 +20,11 @@ pub enum Split {
 }
 
 impl Split {
-    fn folder(self) -> &'static str {
+    /// Returns the name of the folder of this part, and of the folder of the other one.
+    fn folders(self) -> [&'static str; 2] {
         match self {
-            Split::Train => "train",
-            Split::Test => "test",
-        }
-    }
-
-    fn other(self) -> Self {
-        match self {
-            Split::Train => Split::Test,
-            Split::Test => Split::Train,
+            Split::Train => ["train", "test"],
+            Split::Test => ["test", "train"],
         }
     }
 }
@@ -64,7 +58,6 @@ pub struct Dataset {
     pub name: String,
     groups: Vec<SceneGroup>,
     warnings: Vec<String>,
-    generator: Option<String>,
 }
 
 /// A group in memory, with images still encoded.
@@ -89,24 +82,19 @@ impl Dataset {
     /// looked for until they are opened.
     pub fn open(root: &Path, split: Split) -> Result<Self> {
         if let Some(videos) = SyntheticDataset::named(root)? {
-            let generator = Some(videos.generator());
             let name = root.to_string_lossy().into_owned();
-            return Ok(Dataset { name, groups: synthetic_groups(videos), warnings: vec![], generator });
+            return Ok(Dataset { name, groups: synthetic_groups(videos), warnings: vec![] });
         }
         let name = folder_name(root);
-        let indexed = [root.to_owned(), root.join(split.folder())]
-            .into_iter()
-            .find(|f| f.join(CHUNK_INDEX_FILE).is_file());
+        let [part, other] = split.folders().map(|folder| root.join(folder));
+        let indexed = [root, &part].into_iter().find(|folder| folder.join(CHUNK_INDEX_FILE).is_file());
         let (groups, warnings) = match indexed {
-            Some(folder) => (chunk_groups(&folder)?, vec![]),
-            None => {
-                // A capture may keep its photos in a folder of that name.
-                let part =
-                    Some(root.join(split.folder())).filter(|folder| folder.is_dir() && !is_capture(root));
-                capture_groups(&part.unwrap_or(root.to_owned()), &root.join(split.other().folder()))?
-            }
+            Some(folder) => (chunk_groups(folder)?, vec![]),
+            // A capture may keep its photos in a folder of that name.
+            None if part.is_dir() && !is_capture(root) => capture_groups(&part, &other)?,
+            None => capture_groups(root, &other)?,
         };
-        Ok(Dataset { name, groups, warnings, generator: None })
+        Ok(Dataset { name, groups, warnings })
     }
 
     /// Returns a line for each folder that couldn't be read.
@@ -119,10 +107,10 @@ impl Dataset {
         &self.groups
     }
 
-    /// Returns what synthetic videos depend on besides their name: the program's version, and the images that appear in them.
-    /// Returns `None` for other datasets.
+    /// Returns what synthetic videos depend on besides their name: the version of their generator. Returns `None` for other datasets.
     pub fn generator(&self) -> Option<&str> {
-        self.generator.as_deref()
+        let is_synthetic = matches!(self.groups.first()?.source, Source::SyntheticDataset(..));
+        is_synthetic.then_some(SyntheticDataset::GENERATOR)
     }
 
     /// Adds to `inputs` the files of the dataset that writing below the folder `output` could overwrite.

@@ -19,7 +19,7 @@ pub use globalsplat_capture::{
     Point, find_captures, open_capture, read_camera_path, read_points, resize_and_crop, write_cameras_json,
     write_transforms_json,
 };
-pub use globalsplat_synth::{SyntheticDataset, read_pictures};
+pub use globalsplat_synth::SyntheticDataset;
 pub use loading::{BadData, Batch, BatchShard, DataLoader, LoadedScene, SceneGroups, TrainingScenes};
 pub(crate) use view::MIN_SHORTER_SIDE;
 pub use view::{MIN_SIDE, PhotoSize, Pixels, View, load_all_views, load_views, tensor_from_planes};

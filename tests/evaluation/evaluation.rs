@@ -146,20 +146,9 @@ fn changes_of_same_size_and_time_are_scored_again() {
 }
 
 #[test]
-fn synthetic_videos_are_identified_by_version_and_pictures() {
-    let folder = tempfile::tempdir().unwrap();
-    let made_by = |pictures: &str| {
-        let name = format!("synth:seed=1,scenes=1{pictures}");
-        Dataset::open(Path::new(&name), Split::Test).unwrap().generator().map(String::from)
-    };
-    let with_pictures = |gray: f64| {
-        let picture = tch::Tensor::full([3, 16, 16], gray, (tch::Kind::Float, tch::Device::Cpu));
-        write_png(&folder.path().join("a.png"), &picture).unwrap();
-        made_by(&format!(",pictures={}", folder.path().display()))
-    };
-    let (black, gray) = (with_pictures(0.), with_pictures(0.5));
-    assert!(black != gray && with_pictures(0.5) == gray, "{black:?} and {gray:?}");
-    assert!(made_by("").is_some_and(|by| by.contains(env!("CARGO_PKG_VERSION")) && Some(by) != gray));
+fn synthetic_videos_are_identified_by_version() {
+    let videos = Dataset::open(Path::new("synth:seed=1,scenes=1"), Split::Test).unwrap();
+    assert!(videos.generator().unwrap().contains(env!("CARGO_PKG_VERSION")));
 }
 
 /// Returns the largest resident size of this process's terminated children, in bytes.

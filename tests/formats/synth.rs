@@ -2,7 +2,7 @@
 
 use crate::common::program::{arg, command, refuse, succeed, tiny_config};
 use glam::{DMat3, DVec3};
-use globalsplat::data::{Dataset, SceneGroup, Split, SyntheticDataset, load_all_views, load_views};
+use globalsplat::data::{Dataset, Split, SyntheticDataset, load_all_views};
 use globalsplat::scene::{Camera, ImageSize};
 use globalsplat::synth::{Video, VideoSettings};
 use npyz::NpyFile;
@@ -10,7 +10,7 @@ use std::fs::File;
 use std::path::Path;
 
 fn settings(frames: usize, side: u32) -> VideoSettings {
-    VideoSettings { frames, size: ImageSize { height: side, width: side }, pictures: vec![] }
+    VideoSettings { frames, size: ImageSize { height: side, width: side } }
 }
 
 /// A seed determines the bytes, whatever the number of threads; another seed gives others.
@@ -200,30 +200,6 @@ fn videos_are_data_like_any_other() {
     }
 }
 
-/// A user's images are visible in some of the scenes.
-#[test]
-fn pictures_that_a_user_names_are_seen() {
-    let folder = tempfile::tempdir().unwrap();
-    let pictures = folder.path().join("pictures");
-    std::fs::create_dir(&pictures).unwrap();
-    image::RgbImage::from_pixel(8, 8, image::Rgb([255, 0, 255])).save(pictures.join("pink.png")).unwrap();
-    // Returns the number of pink pixels in the first view of each scene.
-    let pink = |more: &str| -> Vec<usize> {
-        let name = format!("synth:scenes=8,frames=3,size=24{more}");
-        let data = Dataset::open(name.as_ref(), Split::Test).unwrap();
-        let first = |group: &SceneGroup, key: &String| {
-            let capture = group.open().unwrap().capture(key).unwrap();
-            let view = load_views(&capture, &[0], None).unwrap().remove(0).image.to_float();
-            let excess = view.get(0).minimum(&view.get(2)) - view.get(1) * 2.;
-            excess.gt(0.1).sum(tch::Kind::Int64).int64_value(&[]) as usize
-        };
-        data.groups().iter().flat_map(|group| group.keys.iter().map(|key| first(group, key))).collect()
-    };
-    let (plain, named) = (pink(""), pink(&format!(",pictures={}", arg(&pictures))));
-    let more = named.iter().zip(&plain).filter(|(with, without)| **with > *without + 5).count();
-    assert!(more >= 2, "{named:?}, {plain:?} without");
-}
-
 #[test]
 fn names_of_synthetic_videos_are_checked() {
     let named = |name: &str| SyntheticDataset::named(Path::new(name));
@@ -241,8 +217,6 @@ fn names_of_synthetic_videos_are_checked() {
         ("synth:scenes=1,color=red", r#"a field is "color", expected"#),
         ("synth:scenes=1,size=8", "size is 8, expected 16 to 8192"),
         ("synth:scenes=1,frames=2", "frames is 2, expected 3 to 10000"),
-        ("synth:scenes=1,pictures=nowhere", "nowhere can't be read"),
-        ("synth:scenes=1,pictures=", "pictures is nothing, expected"),
     ] {
         let error = named(name).unwrap_err().to_string();
         assert!(error.contains(found), "{name}: {error}");

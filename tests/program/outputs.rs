@@ -61,8 +61,6 @@ fn pictures_replace_nothing_that_is_read() {
             "eval --splat @room/truth.ply --scene @room --contact-sheet @link.png",
             "eval --weights @tiny.safetensors --scene @room --contact-sheet @hard.png",
             "refine --splat @room/truth.ply --scene @room --out @room/truth.ply --contact-sheet @room/images/000.png",
-            "synth --out @worlds --pictures @room/images --contact-sheet @room/images/000.png",
-            "synth --out @room/images --pictures @room/images",
         ],
     );
 }

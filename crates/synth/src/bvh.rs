@@ -72,6 +72,16 @@ impl Bvh {
 
     /// Returns the first triangle along the ray from `origin` in `direction` (unit) that is nearer than `limit`.
     pub fn closest_hit(&self, origin: Vec3, direction: Vec3, limit: f32) -> Option<Hit> {
+        self.traverse::<false>(origin, direction, limit)
+    }
+
+    /// Returns `true` if the ray hits any triangle before `limit`.
+    pub fn is_occluded(&self, origin: Vec3, direction: Vec3, limit: f32) -> bool {
+        self.traverse::<true>(origin, direction, limit).is_some()
+    }
+
+    /// Returns the first triangle along the ray before `limit`, or with `ANY` one that the ray hits before `limit`.
+    fn traverse<const ANY: bool>(&self, origin: Vec3, direction: Vec3, limit: f32) -> Option<Hit> {
         let ray = Ray::new(origin, direction);
         let mut found = Hit { slot: usize::MAX, distance: limit };
         let mut stack = [(0., self.root); STACK];
@@ -90,6 +100,9 @@ impl Bvh {
                         found = Hit { slot: WIDTH * leaf + lane, distance: distances[lane] };
                     }
                 }
+                if ANY && mask != 0 {
+                    break;
+                }
                 continue;
             }
             let node = &self.nodes[child as usize];
@@ -98,7 +111,7 @@ impl Bvh {
             for lane in lanes(mask) {
                 // Keep the stack sorted with the nearest box last, because it is popped first.
                 let mut at = count;
-                while at > first && stack[at - 1].0 < entries[lane] {
+                while !ANY && at > first && stack[at - 1].0 < entries[lane] {
                     stack[at] = stack[at - 1];
                     at -= 1;
                 }
@@ -107,29 +120,6 @@ impl Bvh {
             }
         }
         (found.slot != usize::MAX).then_some(found)
-    }
-
-    /// Returns `true` if the ray hits any triangle before `limit`.
-    pub fn is_occluded(&self, origin: Vec3, direction: Vec3, limit: f32) -> bool {
-        let ray = Ray::new(origin, direction);
-        let mut stack = [self.root; STACK];
-        let mut count = 1;
-        while count > 0 {
-            count -= 1;
-            let child = stack[count];
-            if child & LEAF != 0 {
-                if self.leaves[(child ^ LEAF) as usize].intersect(&ray, limit).1 != 0 {
-                    return true;
-                }
-                continue;
-            }
-            let node = &self.nodes[child as usize];
-            for lane in lanes(node.intersect(&ray, limit).1) {
-                stack[count] = node.children[lane];
-                count += 1;
-            }
-        }
-        false
     }
 }
 

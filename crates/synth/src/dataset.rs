@@ -1,8 +1,7 @@
 //! Synthetic videos. They are named in place of a dataset path: `synth:seed=1,scenes=10000`.
 
-use super::{Texture, Video, VideoSettings};
-use globalsplat_capture::{Capture, ImageSize, ImageSource, PHOTO_EXTENSIONS, read_image};
-use globalsplat_files::{Error, Result, checksum};
+use super::{Video, VideoSettings};
+use globalsplat_capture::{Capture, Error, ImageSize, ImageSource, Result};
 use image::RgbImage;
 use std::collections::BTreeSet;
 use std::ops::RangeInclusive;
@@ -10,8 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// Description of the expected name for error messages.
-const EXPECTED: &str =
-    "synth:seed=S,scenes=N and, if need be, first=I, frames=F, size=PIXELS, pictures=FOLDER";
+const EXPECTED: &str = "synth:seed=S,scenes=N and, if need be, first=I, frames=F, size=PIXELS";
 
 /// Synthetic videos of one seed, each generated on request.
 #[derive(Debug, Clone)]
@@ -23,13 +21,13 @@ pub struct SyntheticDataset {
     first: u64,
     scenes: u64,
     settings: VideoSettings,
-    /// Checksum of the image files that are shown on surfaces, if there are any.
-    pictures_checksum: Option<u32>,
 }
 
 impl SyntheticDataset {
     /// Prefix of the name of synthetic videos.
     pub const PREFIX: &str = "synth:";
+    /// What the videos depend on besides their name: the version of this crate.
+    pub const GENERATOR: &str = concat!("globalsplat ", env!("CARGO_PKG_VERSION"));
 
     /// Allowed number of videos.
     pub const SCENES: RangeInclusive<u64> = 1..=1_000_000;
@@ -43,7 +41,7 @@ impl SyntheticDataset {
     /// Creates `scenes` videos of `seed`, starting at index `first`.
     pub fn new(seed: u64, first: u64, scenes: u64, settings: VideoSettings) -> SyntheticDataset {
         let name = format!("{}seed={seed},first={first},scenes={scenes}", Self::PREFIX);
-        SyntheticDataset { name, seed, first, scenes, settings, pictures_checksum: None }
+        SyntheticDataset { name, seed, first, scenes, settings }
     }
 
     /// Parses `path` as the name of synthetic videos. Returns `None` if it is an ordinary path.
@@ -56,7 +54,6 @@ impl SyntheticDataset {
         };
         let refuse = |field: &str, found: &str| Error::input(path, field, found, EXPECTED);
         let (mut seed, mut scenes, mut first, mut frames, mut size) = (0, None, 0, 24, 128);
-        let (mut pictures, mut pictures_checksum) = (vec![], None);
         let mut said = BTreeSet::new();
         for field in fields.split(',') {
             let (name, value) = field.split_once('=').unwrap_or((field, ""));
@@ -70,11 +67,6 @@ impl SyntheticDataset {
                 "first" => first = number()?,
                 "frames" => frames = number()?,
                 "size" => size = number()?,
-                "pictures" if value.is_empty() => return Err(refuse(name, "nothing")),
-                "pictures" => {
-                    pictures = read_pictures(Path::new(value))?;
-                    pictures_checksum = Some(checksum(picture_files(Path::new(value))?)?);
-                }
                 _ => return Err(refuse("a field", &format!("{name:?}"))),
             }
         }
@@ -90,16 +82,10 @@ impl SyntheticDataset {
                 return Err(Error::input(path, name, value, expected));
             }
         }
-        let (frames, size) = (frames as usize, ImageSize { height: size as u32, width: size as u32 });
-        let settings = VideoSettings { frames, size, pictures };
+        let size = ImageSize { height: size as u32, width: size as u32 };
+        let settings = VideoSettings { frames: frames as usize, size };
         let name = path.to_string_lossy().into_owned();
-        Ok(Some(SyntheticDataset { name, seed, first, scenes, settings, pictures_checksum }))
-    }
-
-    /// Returns what the videos depend on besides their name: the version of this crate, and the checksum of the user's images.
-    pub fn generator(&self) -> String {
-        let pictures = self.pictures_checksum.map(|checksum| format!(", pictures {checksum:08x}"));
-        format!("globalsplat {}{}", env!("CARGO_PKG_VERSION"), pictures.unwrap_or_default())
+        Ok(Some(SyntheticDataset { name, seed, first, scenes, settings }))
     }
 
     /// Returns the names of the scenes.
@@ -136,31 +122,4 @@ impl ImageSource for Video {
     fn depth(&self, index: usize) -> Option<Vec<f32>> {
         Some(Video::depth(self, index))
     }
-}
-
-/// Reads the images to show on surfaces: all image files in `folder`.
-///
-/// # Errors
-/// Fails if the folder doesn't exist or contains no image, or if an image can't be read.
-pub fn read_pictures(folder: &Path) -> Result<Vec<Arc<Texture>>> {
-    let files = picture_files(folder)?;
-    files.iter().map(|file| Ok(Arc::new(Texture::from_image(&read_image(file)?)))).collect()
-}
-
-/// Lists the image files in `folder`, at least one, sorted by name.
-fn picture_files(folder: &Path) -> Result<Vec<PathBuf>> {
-    let entries = std::fs::read_dir(folder).map_err(Error::read(folder))?;
-    let mut files = vec![];
-    for entry in entries {
-        let path = entry.map_err(Error::read(folder))?.path();
-        let extension = path.extension().map(|e| e.to_ascii_lowercase());
-        if extension.is_some_and(|e| PHOTO_EXTENSIONS.iter().any(|known| e == *known)) {
-            files.push(path);
-        }
-    }
-    if files.is_empty() {
-        return Err(Error::input(folder, "the pictures", "none", "files of photos, such as PNG or JPEG"));
-    }
-    files.sort();
-    Ok(files)
 }

@@ -15,7 +15,6 @@ mod tracer;
 mod video;
 mod walk;
 
-pub use dataset::{SyntheticDataset, read_pictures};
+pub use dataset::SyntheticDataset;
 pub use globalsplat_capture::{Error, Result};
-pub use texture::Texture;
 pub use video::{Video, VideoSettings};

@@ -7,15 +7,21 @@ use std::sync::Arc;
 
 /// A light source. Light is linear RGB, where 1 is the light reflected by a well-lit white wall.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Light {
-    /// The sun, infinitely far away in the direction `towards` (unit), with an angular width of `spread` radians. `color` is the
-    /// irradiance perpendicular to it.
-    Sun { towards: Vec3, spread: f32, color: Vec3 },
-    /// A ball at `at`, which may be visible and never blocks its own light. `color` is the irradiance at a distance of one metre.
-    Ball { at: Vec3, radius: f32, color: Vec3 },
-    /// A parallelogram with half sides `right` and `up` around `at`, facing `facing` (unit). `color` is the irradiance at a
-    /// distance of one metre from its center.
-    Panel { at: Vec3, right: Vec3, up: Vec3, facing: Vec3, color: Vec3 },
+pub(super) struct Light {
+    /// Irradiance perpendicular to the light: everywhere for the sun, and at a distance of one metre from other sources.
+    pub color: Vec3,
+    pub source: LightSource,
+}
+
+/// Shape and place of a light source.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum LightSource {
+    /// The sun, infinitely far away in the direction `towards` (unit), with an angular width of `spread` radians.
+    Sun { towards: Vec3, spread: f32 },
+    /// A ball, which may be visible and never blocks its own light.
+    Ball { center: Vec3, radius: f32 },
+    /// A parallelogram with half sides `right` and `up` around `center`, facing `facing` (unit).
+    Panel { center: Vec3, right: Vec3, up: Vec3, facing: Vec3 },
 }
 
 /// Light that arrives at a point.
@@ -29,27 +35,17 @@ pub(super) struct IncidentLight {
 }
 
 impl Light {
-    /// Returns the light source with its light multiplied by `factor`.
-    pub fn dimmed(self, factor: f32) -> Light {
-        match self {
-            Light::Sun { towards, spread, color } => Light::Sun { towards, spread, color: factor * color },
-            Light::Ball { at, radius, color } => Light::Ball { at, radius, color: factor * color },
-            Light::Panel { at, right, up, facing, color } => {
-                Light::Panel { at, right, up, facing, color: factor * color }
-            }
-        }
-    }
-
     /// Returns the light that reaches `point` from the position on the light source given by `at` in [0, 1)².
     pub fn incident_at(&self, point: Vec3, at: Vec2) -> IncidentLight {
-        match *self {
-            Light::Sun { towards, spread, color } => {
+        let color = self.color;
+        match self.source {
+            LightSource::Sun { towards, spread } => {
                 let (right, up) = towards.any_orthonormal_pair();
                 let offset = spread * (at - 0.5);
                 let towards = (towards + offset.x * right + offset.y * up).normalize();
                 IncidentLight { towards, distance: f32::INFINITY, color }
             }
-            Light::Ball { at: center, radius, color } => {
+            LightSource::Ball { center, radius } => {
                 let (right, up) = (center - point).normalize_or(Vec3::Y).any_orthonormal_pair();
                 let offset = radius * (at - 0.5);
                 let way = center + offset.x * right + offset.y * up - point;
@@ -58,7 +54,7 @@ impl Light {
                 let color = color / (distance * distance).max(0.06);
                 IncidentLight { towards: way / distance, distance: (distance - 1.1 * radius).max(0.), color }
             }
-            Light::Panel { at: center, right, up, facing, color } => {
+            LightSource::Panel { center, right, up, facing } => {
                 let offset = 2. * at - 1.;
                 let way = center + offset.x * right + offset.y * up - point;
                 let distance = way.length().max(1e-3);

@@ -115,7 +115,7 @@ pub(super) fn cuboid(size: Vec3, round: f32) -> Mesh {
             let up = normal.cross(right);
             let (along, across) = ((right * size).length(), (up * size).length());
             // Cells are finer at the rounded edges.
-            let place = |t: f32| if round > 0. { 2. * smooth(t) - 1. } else { 2. * t - 1. };
+            let place = |t: f32| if round > 0. { 2. * (t * t * (3. - 2. * t)) - 1. } else { 2. * t - 1. };
             mesh.join(Mesh::grid(cells, cells, Vec2::new(along, across), |u, v| {
                 let flat = (normal + place(u) * right + place(v) * up) * half;
                 let inner = flat.clamp(-half + round, half - round);
@@ -232,10 +232,6 @@ pub(super) fn taper(mesh: Mesh, slope: f32) -> Mesh {
         let scale = (1. + slope * p.y).max(0.05);
         Vec3::new(scale * p.x, p.y, scale * p.z)
     })
-}
-
-fn smooth(t: f32) -> f32 {
-    t * t * (3. - 2. * t)
 }
 
 #[cfg(test)]

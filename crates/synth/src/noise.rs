@@ -41,14 +41,16 @@ impl Noise {
     /// Returns the random value of the lattice point `cell`, in [-1, 1].
     fn corner(&self, cell: IVec3) -> f32 {
         let [x, y, z] = cell.to_array().map(|i| i as u32);
-        // Hash the coordinates: every bit of them affects every bit of the result.
-        let mut bits = self.seed
-            ^ x.wrapping_mul(0x8da6_b343)
-            ^ y.wrapping_mul(0xd816_3841)
-            ^ z.wrapping_mul(0xcb1a_b31f);
-        for factor in [0x7feb_352d, 0x846c_a68b] {
-            bits = (bits ^ (bits >> 16)).wrapping_mul(factor);
-        }
+        let place = x.wrapping_mul(0x8da6_b343) ^ y.wrapping_mul(0xd816_3841) ^ z.wrapping_mul(0xcb1a_b31f);
+        let bits = hash(self.seed ^ place);
         (bits ^ (bits >> 16)) as f32 * (2. / u32::MAX as f32) - 1.
     }
+}
+
+/// Hashes `bits`, so that every bit of them affects every higher bit of the result.
+pub(super) fn hash(mut bits: u32) -> u32 {
+    for factor in [0x7feb_352d, 0x846c_a68b] {
+        bits = (bits ^ (bits >> 16)).wrapping_mul(factor);
+    }
+    bits
 }

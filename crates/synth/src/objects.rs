@@ -20,20 +20,11 @@ pub(super) fn plain(builder: &mut SceneBuilder, size: Vec3) -> Mesh {
     let half = size / 2.;
     let mut mesh = match builder.within(0..9) {
         0 => cuboid(size, 0.),
-        1 => {
-            let round = builder.within(0.05..0.5) * size.min_element();
-            cuboid(size, round)
-        }
+        1 => cuboid(size, builder.within(0.05..0.5) * size.min_element()),
         2 => superellipsoid(size, [1., 1.], 10),
-        3 => {
-            let powers = [builder.within(0.2..1.6), builder.within(0.2..1.6)];
-            superellipsoid(size, powers, 10)
-        }
+        3 => superellipsoid(size, [builder.within(0.2..1.6), builder.within(0.2..1.6)], 10),
         4 => cone(0.5, 0.5, 1., 20).warped(|p| p * size),
-        5 => {
-            let above = builder.within(0. ..0.4);
-            cone(0.5, above, 1., 20).warped(|p| p * size)
-        }
+        5 => cone(0.5, builder.within(0. ..0.4), 1., 20).warped(|p| p * size),
         6 => {
             let thick = builder.within(0.12..0.35f32);
             let ring = move |t: f32| vec3((1. - thick) * (TAU * t).cos(), 0., (1. - thick) * (TAU * t).sin());
@@ -225,12 +216,8 @@ pub(super) fn chair(builder: &mut SceneBuilder, transform: Affine3A) {
     let [wide, deep, seat] = builder.vector([(0.38, 0.6), (0.38, 0.6), (0.38, 0.5)]).into();
     let (cloth, wood) = (builder.thing(), builder.thing());
     let thick = builder.within(0.02..0.12);
-    builder.add_rounded_box(
-        vec3(wide, thick, deep),
-        0.4 * thick,
-        &cloth,
-        transform * at(0., seat - thick, 0.),
-    );
+    let cushion = transform * at(0., seat - thick, 0.);
+    builder.add_rounded_box(vec3(wide, thick, deep), 0.4 * thick, &cloth, cushion);
     let leg = builder.within(0.012..0.03);
     for (x, z) in [(-0.45, -0.45), (-0.45, 0.45), (0.45, -0.45), (0.45, 0.45)] {
         builder.add_mesh(cone(leg, leg, seat - thick, 7), &wood, transform * at(x * wide, 0., z * deep));
@@ -246,12 +233,8 @@ pub(super) fn chair(builder: &mut SceneBuilder, transform: Affine3A) {
                     let bar = cone(0.01, 0.01, height, 6);
                     builder.add_mesh(bar, &wood, back * at((i as f32 / 4. - 0.5) * 0.9 * wide, 0., 0.));
                 }
-                builder.add_rounded_box(
-                    vec3(wide, 0.07, 0.03),
-                    0.01,
-                    &wood,
-                    back * at(0., height - 0.05, 0.),
-                );
+                let rail = back * at(0., height - 0.05, 0.);
+                builder.add_rounded_box(vec3(wide, 0.07, 0.03), 0.01, &wood, rail);
             }
         }
     }
@@ -281,12 +264,8 @@ pub(super) fn bed(builder: &mut SceneBuilder, transform: Affine3A) {
     let (wide, long, high) = (builder.within(0.9..2.), 2.1, builder.within(0.35..0.6));
     let (wood, sheet, cover) = (builder.thing(), builder.thing(), builder.thing());
     builder.add_rounded_box(vec3(wide + 0.06, 0.6 * high, long), 0.01, &wood, transform);
-    builder.add_rounded_box(
-        vec3(wide, 0.5 * high, long - 0.06),
-        0.08,
-        &sheet,
-        transform * at(0., 0.6 * high, 0.),
-    );
+    let mattress = transform * at(0., 0.6 * high, 0.);
+    builder.add_rounded_box(vec3(wide, 0.5 * high, long - 0.06), 0.08, &sheet, mattress);
     let board = builder.within(0.8..1.3);
     builder.add_rounded_box(vec3(wide + 0.06, board, 0.06), 0.02, &wood, transform * at(0., 0., -0.5 * long));
     let noise = builder.noise();
@@ -351,25 +330,31 @@ pub(super) fn picture(builder: &mut SceneBuilder, transform: Affine3A) {
     let poster = builder.picture(size);
     let frame = builder.thing();
     let edge = builder.within(0.01..0.08);
-    let outer = size + 2. * edge;
-    builder.add_box(vec3(outer.x, outer.y, 0.03), &frame, transform * at(0., -0.5 * outer.y, 0.015));
-    let sheet = Mesh::rectangle((-0.5 * size).extend(0.032), vec3(size.x, 0., 0.), vec3(0., size.y, 0.), 0.5);
-    builder.add_mesh(sheet, &poster, transform);
+    framed_sheet(builder, size, &poster, edge, &frame, transform);
 }
 
 /// Adds a framed mirror, placed like a picture.
 pub(super) fn mirror(builder: &mut SceneBuilder, transform: Affine3A) {
     let size = vec2(builder.within(0.4..1.2), builder.within(0.5..1.6));
     let frame = builder.thing();
-    builder.add_box(
-        vec3(size.x + 0.08, size.y + 0.08, 0.03),
-        &frame,
-        transform * at(0., -0.5 * size.y - 0.04, 0.015),
-    );
     let mut glass = builder.material(Purpose::Ceiling);
     (glass.mirror_reflectance, glass.specular) = (0.9, 0.);
-    let sheet = Mesh::rectangle((-0.5 * size).extend(0.032), vec3(size.x, 0., 0.), vec3(0., size.y, 0.), 0.5);
-    builder.add_mesh(sheet, &glass, transform);
+    framed_sheet(builder, size, &glass, 0.04, &frame, transform);
+}
+
+/// Adds a flat `sheet` of `size` in a frame that is `edge` metres wide.
+fn framed_sheet(
+    builder: &mut SceneBuilder,
+    size: Vec2,
+    sheet: &Material,
+    edge: f32,
+    frame: &Material,
+    transform: Affine3A,
+) {
+    let outer = size + 2. * edge;
+    builder.add_box(vec3(outer.x, outer.y, 0.03), frame, transform * at(0., -0.5 * outer.y, 0.015));
+    let mesh = Mesh::rectangle((-0.5 * size).extend(0.032), vec3(size.x, 0., 0.), vec3(0., size.y, 0.), 0.5);
+    builder.add_mesh(mesh, sheet, transform);
 }
 
 /// Adds curtains on both sides of a window of `size` whose center is at the origin.
@@ -496,11 +481,8 @@ pub(super) fn fence(builder: &mut SceneBuilder, transform: Affine3A, length: f32
     let (height, gap) = (builder.within(0.7..1.8), builder.within(0.08..0.5f32));
     let board = (0.5 * gap).min(0.12);
     for i in 0..(length / gap) as usize {
-        builder.add_box(
-            vec3(board, height, 0.03),
-            &wood,
-            transform * at(i as f32 * gap - 0.5 * length, 0., 0.),
-        );
+        let spot = transform * at(i as f32 * gap - 0.5 * length, 0., 0.);
+        builder.add_box(vec3(board, height, 0.03), &wood, spot);
     }
     for y in [0.3, 0.8] {
         builder.add_box(vec3(length, 0.08, 0.03), &wood, transform * at(0., y * height, -0.03));

@@ -1,6 +1,6 @@
 //! Outdoor scenes: ground, and objects on it under the sky.
 
-use super::light::{Light, Sky};
+use super::light::{Light, LightSource, Sky};
 use super::mesh::{Mesh, height_field};
 use super::objects;
 use super::scene_builder::{SceneBuilder, standing};
@@ -122,5 +122,5 @@ fn sun(builder: &mut SceneBuilder, sky: &Sky) {
     let warm = vec3(1., 0.95, 0.88).lerp(vec3(1., 0.7, 0.45), (1. - towards.y).powi(3));
     let color = builder.within(1. ..4.5) * (1.1 - cover) * warm;
     let spread = if cover > 0.5 { 0.3 } else { 0.02 };
-    builder.contents.lights.push(Light::Sun { towards, spread, color });
+    builder.contents.lights.push(Light { color, source: LightSource::Sun { towards, spread } });
 }

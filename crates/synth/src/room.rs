@@ -1,6 +1,6 @@
 //! Rooms: floor, ceiling, walls with openings, and furnishings.
 
-use super::light::{Light, Material, Sky};
+use super::light::{Light, LightSource, Material, Sky};
 use super::mesh::{Mesh, cone, superellipsoid};
 use super::objects;
 use super::outdoors::outside;
@@ -264,15 +264,11 @@ fn light(builder: &mut SceneBuilder, size: Vec3, sky: &mut Sky, has_openings: bo
         if builder.chance(0.5) {
             let half = vec2(builder.within(0.1..0.6), builder.within(0.1..0.4));
             let (right, up) = (half.x * Vec3::X, half.y * Vec3::Z);
-            let color = strength * tone;
-            let (middle, facing) = (at - 0.05 * Vec3::Y, Vec3::NEG_Y);
-            builder.contents.lights.push(Light::Panel { at: middle, right, up, facing, color });
+            let source = LightSource::Panel { center: at - 0.05 * Vec3::Y, right, up, facing: Vec3::NEG_Y };
+            builder.contents.lights.push(Light { color: strength * tone, source });
             let glass = lamp_glass(builder);
-            builder.add_box(
-                vec3(2. * half.x, 0.03, 2. * half.y),
-                &glass,
-                Affine3A::from_translation(at - 0.03 * Vec3::Y),
-            );
+            let below = Affine3A::from_translation(at - 0.03 * Vec3::Y);
+            builder.add_box(vec3(2. * half.x, 0.03, 2. * half.y), &glass, below);
         } else {
             let below = builder.within(0.2..(0.35 * size.y));
             let (radius, at) = (builder.within(0.05..0.2), at - below * Vec3::Y);
@@ -282,13 +278,15 @@ fn light(builder: &mut SceneBuilder, size: Vec3, sky: &mut Sky, has_openings: bo
             let cord = builder.thing();
             let top = Affine3A::from_translation(at + radius * Vec3::Y);
             builder.add_mesh(cone(0.006, 0.006, below - radius, 5), &cord, top);
-            builder.contents.lights.push(Light::Ball { at, radius, color: 0.8 * strength * tone });
+            let source = LightSource::Ball { center: at, radius };
+            builder.contents.lights.push(Light { color: 0.8 * strength * tone, source });
         }
     }
     if has_openings && builder.chance(0.7) {
         let (turn, height) = (builder.angle(), builder.within(0.2..1.));
         let towards = vec3(turn.cos(), height, turn.sin()).normalize();
-        builder.contents.lights.push(Light::Sun { towards, spread: 0.02, color: 8. * vec3(1., 0.93, 0.82) });
+        let source = LightSource::Sun { towards, spread: 0.02 };
+        builder.contents.lights.push(Light { color: 8. * vec3(1., 0.93, 0.82), source });
     }
     if has_openings {
         // The outdoors is brighter than rooms in daytime.

@@ -19,14 +19,12 @@ const SHARED: usize = 6;
 pub(super) struct SceneBuilder {
     pub random: ChaCha8Rng,
     pub contents: SceneContents,
-    /// Images that the user wants to appear on surfaces.
-    pub pictures: Vec<Arc<Texture>>,
     textures: Vec<(Purpose, Arc<Texture>)>,
 }
 
 impl SceneBuilder {
-    pub fn new(random: ChaCha8Rng, pictures: Vec<Arc<Texture>>) -> Self {
-        SceneBuilder { random, contents: SceneContents::default(), pictures, textures: vec![] }
+    pub fn new(random: ChaCha8Rng) -> Self {
+        SceneBuilder { random, contents: SceneContents::default(), textures: vec![] }
     }
 
     pub fn within<T: SampleUniform>(&mut self, range: impl SampleRange<T>) -> T {
@@ -72,16 +70,12 @@ impl SceneBuilder {
     }
 
     pub fn texture(&mut self, purpose: Purpose) -> Arc<Texture> {
-        let is_picture = matches!(purpose, Purpose::Poster | Purpose::Thing);
-        if is_picture && !self.pictures.is_empty() && self.chance(0.5) {
-            let index = self.within(0..self.pictures.len());
-            return self.pictures[index].clone();
-        }
-        let there: Vec<&Arc<Texture>> =
-            self.textures.iter().filter(|(of, _)| *of == purpose).map(|(_, texture)| texture).collect();
         let turn = self.random.random_range(0..SHARED);
-        if purpose != Purpose::Poster && turn < there.len() {
-            return there[turn].clone();
+        let mut shared = self.textures.iter().filter(|(other, _)| *other == purpose);
+        if let Some((_, texture)) = shared.nth(turn)
+            && purpose != Purpose::Poster
+        {
+            return texture.clone();
         }
         let texture = Arc::new(Texture::draw(&mut self.random, purpose));
         self.textures.push((purpose, texture.clone()));
@@ -121,10 +115,6 @@ impl SceneBuilder {
     pub fn picture(&mut self, size: Vec2) -> Material {
         let mut material = Material::matte(self.texture(Purpose::Poster));
         material.repeats = Affine2::from_scale(1. / size);
-        if self.pictures.iter().any(|picture| Arc::ptr_eq(picture, &material.texture)) {
-            // A user's image occupies the upper left quarter of its texture.
-            material.repeats = Affine2::from_scale_angle_translation(0.5 / size, 0., Vec2::new(0., 0.5));
-        }
         material
     }
 
@@ -156,29 +146,4 @@ pub(super) fn at(x: f32, y: f32, z: f32) -> Affine3A {
 /// Returns the transform of an upright object at `spot`, rotated by `turn` about y.
 pub(super) fn standing(spot: Vec3, turn: f32) -> Affine3A {
     Affine3A::from_rotation_translation(Quat::from_rotation_y(turn), spot)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use image::{Rgb, RgbImage};
-    use rand::SeedableRng;
-
-    #[test]
-    fn a_users_picture_hangs_upright_and_whole() {
-        let corners = RgbImage::from_fn(64, 64, |x, y| {
-            Rgb([if x < 32 { 255 } else { 0 }, if y < 32 { 255 } else { 0 }, 0])
-        });
-        let picture = Arc::new(Texture::from_image(&corners));
-        let mut builder = SceneBuilder::new(ChaCha8Rng::seed_from_u64(1), vec![picture.clone()]);
-        let size = Vec2::new(2., 3.);
-        let hung =
-            (0..32).map(|_| builder.picture(size)).find(|material| Arc::ptr_eq(&material.texture, &picture));
-        let seen = |x: f32, y: f32| hung.as_ref().unwrap().reflectance(Vec2::new(x, y) * size, 0.01).round();
-        // Surface coordinates go from bottom to top.
-        assert_eq!(seen(0.2, 0.9), Vec3::new(1., 1., 0.));
-        assert_eq!(seen(0.8, 0.9), Vec3::new(0., 1., 0.));
-        assert_eq!(seen(0.2, 0.1), Vec3::new(1., 0., 0.));
-        assert_eq!(seen(0.8, 0.1), Vec3::ZERO);
-    }
 }

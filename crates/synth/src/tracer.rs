@@ -241,9 +241,8 @@ impl Tracer {
 fn balance_lights(mut lights: Vec<Light>) -> Vec<Light> {
     lights.truncate(4);
     if lights.len() == 3 {
-        let half = lights[2].dimmed(0.5);
-        lights[2] = half;
-        lights.push(half);
+        lights[2].color *= 0.5;
+        lights.push(lights[2]);
     }
     lights
 }
@@ -251,6 +250,7 @@ fn balance_lights(mut lights: Vec<Light>) -> Vec<Light> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::light::LightSource;
     use crate::mesh::superellipsoid;
     use crate::noise::Noise;
     use crate::texture::Texture;
@@ -261,13 +261,12 @@ mod tests {
     const CENTER: SampleChoice = SampleChoice { sample_index: 0, on_light: Vec2::splat(0.5) };
 
     fn sun(towards: Vec3, brightness: f32) -> Light {
-        Light::Sun { towards, spread: 0., color: Vec3::splat(brightness) }
+        Light { color: Vec3::splat(brightness), source: LightSource::Sun { towards, spread: 0. } }
     }
 
-    /// Returns a scene under `sky` with a floor of reflectance `gray`, five metres in each direction, and anything that `more` adds.
-    fn floor_scene(sky: Sky, gray: u8, more: impl FnOnce(&mut SceneContents, &Material)) -> Tracer {
-        let image = image::RgbImage::from_pixel(4, 4, image::Rgb([gray; 3]));
-        let material = Material::matte(Arc::new(Texture::from_image(&image)));
+    /// Returns a scene under `sky` with a floor of the given reflectance, five metres in each direction, and anything that `more` adds.
+    fn floor_scene(sky: Sky, reflectance: f32, more: impl FnOnce(&mut SceneContents, &Material)) -> Tracer {
+        let material = Material::matte(Arc::new(Texture::uniform(Vec3::splat(reflectance))));
         let mut contents = SceneContents::default();
         let floor = Mesh::rectangle(Vec3::new(-5., 0., 5.), Vec3::X * 10., Vec3::Z * -10., 1.);
         contents.meshes.push((floor, material.clone()));
@@ -285,52 +284,47 @@ mod tests {
         (0..4).map(trace).sum::<f32>() / 4.
     }
 
-    /// Returns the linear reflectance of an sRGB byte.
-    fn reflectance(gray: u8) -> f32 {
-        ((f32::from(gray) / 255. + 0.055) / 1.055).powf(2.4)
-    }
-
     /// Radiance follows Lambert's law: reflectance · irradiance · cos / π, whatever the number of lights. Under a uniform sky, a surface
     /// is as bright as the sky times its reflectance.
     #[test]
     fn matte_floors_reflect_suns_and_the_sky() {
         for lights in 1..=4 {
             let towards = |i: i32| Vec3::new(0.1 * i as f32, 1., 0.).normalize();
-            let tracer = floor_scene(DARK, 186, |contents, _| {
+            let tracer = floor_scene(DARK, 0.5, |contents, _| {
                 contents.lights.extend((0..lights).map(|i| sun(towards(i), 2.)));
             });
-            let expected = reflectance(186) * 2. * (0..lights).map(|i| towards(i).y).sum::<f32>() / PI;
+            let expected = 0.5 * 2. * (0..lights).map(|i| towards(i).y).sum::<f32>() / PI;
             let found = radiance_at(&tracer, 0.3, 0.2);
             assert!((found / expected - 1.).abs() < 0.02, "{lights} lights: {found}, expected {expected}");
         }
         let light = Vec3::splat(0.7);
-        for gray in [90, 186] {
+        for reflectance in [0.1, 0.5] {
             let sky = Sky { zenith: light, horizon: light, ground: light, ..DARK };
-            let found = radiance_at(&floor_scene(sky, gray, |_, _| {}), 0.3, 0.2);
-            assert!((found / (0.7 * reflectance(gray)) - 1.).abs() < 0.02, "{gray}: {found}");
+            let found = radiance_at(&floor_scene(sky, reflectance, |_, _| {}), 0.3, 0.2);
+            assert!((found / (0.7 * reflectance) - 1.).abs() < 0.02, "{reflectance}: {found}");
         }
     }
 
     #[test]
     fn light_falls_with_distance_and_angle() {
-        let at = Vec3::new(0., 2., 0.);
-        let panel =
-            Light::Panel { at, right: Vec3::ZERO, up: Vec3::ZERO, facing: Vec3::NEG_Y, color: Vec3::ONE };
-        for (name, light, expected) in [
+        let center = Vec3::new(0., 2., 0.);
+        let panel = LightSource::Panel { center, right: Vec3::ZERO, up: Vec3::ZERO, facing: Vec3::NEG_Y };
+        for (source, expected) in [
             // Twice the squared distance, and the cosine of the angle.
-            ("ball", Light::Ball { at, radius: 0., color: Vec3::ONE }, 2. * 2f32.sqrt()),
+            (LightSource::Ball { center, radius: 0. }, 2. * 2f32.sqrt()),
             // Also the cosine of the angle at which light leaves the panel.
-            ("panel", panel, 4.),
+            (panel, 4.),
         ] {
-            let tracer = floor_scene(DARK, 255, |contents, _| contents.lights.push(light));
+            let light = Light { color: Vec3::ONE, source };
+            let tracer = floor_scene(DARK, 0.9, |contents, _| contents.lights.push(light));
             let ratio = radiance_at(&tracer, 0.02, 0.01) / radiance_at(&tracer, 2., 0.01);
-            assert!((ratio / expected - 1.).abs() < 0.0175, "{name}: {ratio}");
+            assert!((ratio / expected - 1.).abs() < 0.0175, "{source:?}: {ratio}");
         }
     }
 
     #[test]
     fn mirrors_reflect_the_scene() {
-        let tracer = floor_scene(DARK, 186, |contents, material| {
+        let tracer = floor_scene(DARK, 0.5, |contents, material| {
             contents.lights.push(sun(Vec3::Y, 2.));
             let mirror = Mesh::rectangle(Vec3::new(2., 0., -1.), 2. * Vec3::Z, 2. * Vec3::Y, 1.);
             let silver = Material { mirror_reflectance: 1., tint: Vec3::ZERO, ..material.clone() };
@@ -348,7 +342,7 @@ mod tests {
     fn glossy_things_have_highlights() {
         let towards = Vec3::new(1., 1., 0.).normalize();
         let trace = |specular: f32, eye: Vec3| {
-            let tracer = floor_scene(DARK, 0, |contents, material| {
+            let tracer = floor_scene(DARK, 0.02, |contents, material| {
                 contents.lights.push(sun(towards, 2.));
                 let sheet = Mesh::rectangle(Vec3::new(-1., 0.5, 1.), 2. * Vec3::X, -2. * Vec3::Z, 1.);
                 contents.meshes.push((sheet, Material { specular, shininess: 30., ..material.clone() }));
@@ -364,7 +358,7 @@ mod tests {
 
     #[test]
     fn objects_cast_shadows_and_receive_bounced_light() {
-        let tracer = floor_scene(DARK, 186, |contents, material| {
+        let tracer = floor_scene(DARK, 0.5, |contents, material| {
             contents.lights.push(sun(Vec3::Y, 3.));
             let ball = superellipsoid(Vec3::ONE, [1., 1.], 16).warped(|p| p + 1.5 * Vec3::Y);
             contents.meshes.push((ball, material.clone()));
@@ -378,7 +372,7 @@ mod tests {
 
     #[test]
     fn free_distance_ends_at_surfaces() {
-        let tracer = floor_scene(DARK, 128, |_, _| {});
+        let tracer = floor_scene(DARK, 0.2, |_, _| {});
         assert!((tracer.free_distance(Vec3::new(0.2, 3., 0.1), Vec3::NEG_Y, 10.) - 3.).abs() < 1e-5);
         for limit in [7., f32::INFINITY] {
             assert_eq!(tracer.free_distance(Vec3::Y, Vec3::Y, limit), limit);

@@ -3,7 +3,6 @@
 use super::light::Sky;
 use super::scene_builder::SceneBuilder;
 use super::sensor::{PixelRng, Sensor};
-use super::texture::Texture;
 use super::tracer::{SampleChoice, Tracer};
 use super::walk::{CameraSpace, OrbitTarget, walk};
 use super::{objects, outdoors, room};
@@ -13,7 +12,6 @@ use image::RgbImage;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::fmt;
-use std::sync::Arc;
 
 /// Rays per pixel along each side.
 const RAYS: u32 = 2;
@@ -25,14 +23,12 @@ const HUNG: f64 = 0.35;
 const WORLDS: u64 = 20;
 
 /// Settings common to all videos of a dataset.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Copy)]
 pub struct VideoSettings {
     /// Number of images per video.
     pub frames: usize,
     /// Size of an image.
     pub size: ImageSize,
-    /// Images of the user that are shown on some of the objects.
-    pub pictures: Vec<Arc<Texture>>,
 }
 
 /// A scene and its cameras. Images are rendered on request.
@@ -60,7 +56,7 @@ impl Video {
     }
 
     fn attempt(random: ChaCha8Rng, settings: &VideoSettings) -> Option<Video> {
-        let mut builder = SceneBuilder::new(random, settings.pictures.clone());
+        let mut builder = SceneBuilder::new(random);
         let (place, orbit_target, sky) = world(&mut builder);
         let tracer = Tracer::new(std::mem::take(&mut builder.contents), sky);
         let poses = walk(&mut builder, &tracer, place, orbit_target, settings.frames)?;
@@ -225,7 +221,7 @@ mod tests {
 
     #[test]
     fn a_pinhole_lens_shows_the_photo_and_no_light_comes_from_outside_a_lens() {
-        let settings = VideoSettings { frames: 2, size: [24, 32].into(), pictures: vec![] };
+        let settings = VideoSettings { frames: 2, size: [24, 32].into() };
         let video = Video::new(1, 3, &settings);
         let Intrinsics { fx, fy, cx, cy } = video.cameras[1].intrinsics;
         let lens = |model, parameters: &[f64]| Lens::from_colmap(model, parameters, settings.size).unwrap();

@@ -103,9 +103,7 @@ pub(super) fn walk(
         // Paths get shorter with every attempt.
         let patience = 1. - attempt as f32 / TRIES as f32;
         let path = match orbit_target {
-            Some(orbit_target) if builder.chance(0.85) => {
-                Some(orbit_path(builder, orbit_target, place, patience))
-            }
+            Some(target) if builder.chance(0.85) => Some(orbit_path(builder, target, place, patience)),
             _ => walk_path(builder, tracer, place, patience),
         };
         if path.is_some_and(|path| is_free(&path, tracer, place, patience)) {
@@ -135,12 +133,11 @@ fn orbit_path(
         }
         None => (builder.angle(), side * builder.log_uniform(0.8, 6.)),
     };
-    let wander = |builder: &mut SceneBuilder| builder.within(-0.3..0.3) * patience * away;
     Path {
         start: (middle + away * turned(front.unwrap_or(Vec3::X), from)).with_y(height),
         target: middle,
         target_motion: 0.2 * radius * builder.direction(),
-        motion: vec3(wander(builder), wander(builder), wander(builder)),
+        motion: builder.vector([(-0.3, 0.3); 3]) * patience * away,
         orbit: patience * orbit,
         // Some paths also view the object from below and from above.
         swing: (Vec3::Y * away * patience * builder.log_uniform(0.02, 0.7), builder.within(2. ..9.)),
@@ -283,7 +280,7 @@ mod tests {
 
     #[test]
     fn orbits_show_objects_from_below_above_and_in_front() {
-        let mut builder = SceneBuilder::new(ChaCha8Rng::seed_from_u64(1), vec![]);
+        let mut builder = SceneBuilder::new(ChaCha8Rng::seed_from_u64(1));
         let (min, max) = (Vec3::splat(-9.), Vec3::splat(9.));
         let place = CameraSpace { min, max, eye_heights: (1., 2.), clearance: 0.3, walls: Some(0.3) };
         let (mut up_and_down, mut before) = (0, 0);

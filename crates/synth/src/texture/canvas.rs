@@ -1,6 +1,7 @@
 //! Pixel buffer that texture families paint on, and the shapes that they paint.
 
 use glam::{IVec2, Vec2, Vec3};
+use std::f32::consts::TAU;
 
 use super::noise::Field;
 
@@ -11,8 +12,8 @@ pub(super) struct Canvas {
     pub size: usize,
     /// Pixels row by row, the top row first.
     pub pixels: Vec<Vec3>,
-    /// `true` if shapes that leave the canvas on one side enter it on the other.
-    pub repeats: bool,
+    /// `true` if shapes that leave the canvas on one side enter it on the other side; otherwise, the border clips them.
+    wraps_around: bool,
 }
 
 impl Canvas {
@@ -26,17 +27,17 @@ impl Canvas {
     /// Creates a canvas from a field, value by value.
     pub fn from_field(field: &Field, color: impl FnMut(f32) -> Vec3) -> Canvas {
         let pixels = field.values.iter().copied().map(color).collect();
-        Canvas { size: field.size, pixels, repeats: true }
+        Canvas { size: field.size, pixels, wraps_around: true }
     }
 
     /// Creates a canvas of one color.
     pub fn filled(size: usize, color: Vec3) -> Canvas {
-        Canvas { size, pixels: vec![color; size * size], repeats: true }
+        Canvas { size, pixels: vec![color; size * size], wraps_around: true }
     }
 
-    /// Creates a canvas of one color whose edges clip shapes.
-    pub fn bounded(size: usize, color: Vec3) -> Canvas {
-        Canvas { repeats: false, ..Canvas::filled(size, color) }
+    /// Returns the canvas with a border that clips shapes.
+    pub fn without_wrapping(self) -> Canvas {
+        Canvas { wraps_around: false, ..self }
     }
 
     /// Changes every pixel by a function of its center and its previous color.
@@ -78,7 +79,7 @@ impl Canvas {
         let mask = self.size as i32 - 1;
         let mut low = ((center - reach) * scale - 0.5).floor().as_ivec2();
         let mut high = ((center + reach) * scale + 0.5).ceil().as_ivec2();
-        if !self.repeats {
+        if !self.wraps_around {
             low = low.max(IVec2::ZERO);
             high = high.min(IVec2::splat(mask));
         }
@@ -94,10 +95,23 @@ impl Canvas {
         }
     }
 
-    /// Fills a shape given by its signed distance in repeats, with an edge that is one pixel soft.
-    pub fn fill(&mut self, center: Vec2, reach: Vec2, color: Vec3, distance: impl Fn(Vec2) -> f32) {
+    /// Fills a shape around `center` with an edge that is one pixel soft.
+    pub fn fill(&mut self, center: Vec2, shape: Shape, color: Vec3) {
+        self.fill_turned(center, Vec2::X, shape, color);
+    }
+
+    /// Fills a shape like [`Canvas::fill`], after rotating it from the direction `turn` (unit) to the x axis.
+    pub fn fill_turned(&mut self, center: Vec2, turn: Vec2, shape: Shape, color: Vec3) {
         let scale = self.size as f32;
-        self.stamp(center, reach, |offset| (color, (0.5 - distance(offset) * scale).clamp(0., 1.)));
+        let reach = shape.reach(scale);
+        let reach = if turn == Vec2::X { reach } else { Vec2::splat(reach.length()) };
+        self.stamp(center, reach, |offset| (color, shape.coverage(turn.rotate(offset), scale)));
+    }
+
+    /// Draws a line from `origin + from` to `origin + to`, of half the width `radius`.
+    pub fn draw_line(&mut self, origin: Vec2, from: Vec2, to: Vec2, radius: f32, color: Vec3) {
+        let middle = 0.5 * (from + to);
+        self.fill(origin + middle, Shape::Stroke { from: from - middle, to: to - middle, radius }, color);
     }
 
     /// Returns the bilinear interpolation of four pixels at `uv` in repeats.
@@ -121,45 +135,122 @@ pub(super) fn smoothstep(low: f32, high: f32, value: f32) -> f32 {
     t * t * (3. - 2. * t)
 }
 
-/// Returns the signed distance to a disk.
-pub(super) fn disk(offset: Vec2, radius: f32) -> f32 {
-    offset.length() - radius
+/// Returns the share of a pixel that a shape covers, whose edge is at the signed distance `distance` in repeats from the pixel's center.
+/// A repeat has `pixels` pixels.
+pub(super) fn coverage(distance: f32, pixels: f32) -> f32 {
+    (0.5 - distance * pixels).clamp(0., 1.)
 }
 
-/// Returns the signed distance to an ellipse, exact on its edge and approximate elsewhere.
-pub(super) fn ellipse(offset: Vec2, radii: Vec2) -> f32 {
-    ((offset / radii).length() - 1.) * radii.min_element()
+/// A shape around the origin; lengths in repeats.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Shape {
+    Disk {
+        radius: f32,
+    },
+    Ellipse {
+        radii: Vec2,
+    },
+    /// A rectangle of half the size `half`, with corners rounded by `rounding`.
+    Rectangle {
+        half: Vec2,
+        rounding: f32,
+    },
+    /// A line with round ends.
+    Stroke {
+        from: Vec2,
+        to: Vec2,
+        radius: f32,
+    },
+    /// A regular polygon whose inscribed circle has radius `radius`.
+    Polygon {
+        radius: f32,
+        corners: usize,
+    },
+    /// A flower whose notches are `depth` times the radius deep.
+    Flower {
+        radius: f32,
+        petals: usize,
+        depth: f32,
+    },
+    /// A leaf along the x axis.
+    Leaf {
+        length: f32,
+        width: f32,
+    },
 }
 
-/// Returns the signed distance to a rectangle with corners rounded by `rounding`.
-pub(super) fn rectangle(offset: Vec2, half: Vec2, rounding: f32) -> f32 {
-    let beyond = offset.abs() - half + Vec2::splat(rounding);
-    beyond.max(Vec2::ZERO).length() + beyond.max_element().min(0.) - rounding
-}
+impl Shape {
+    /// Creates a rectangle with sharp corners.
+    pub fn rectangle(half: Vec2) -> Shape {
+        Shape::Rectangle { half, rounding: 0. }
+    }
 
-/// Returns the signed distance to a stroke with round ends.
-pub(super) fn stroke(offset: Vec2, from: Vec2, to: Vec2, radius: f32) -> f32 {
-    let along = to - from;
-    let t = ((offset - from).dot(along) / along.length_squared().max(1e-12)).clamp(0., 1.);
-    (offset - from - along * t).length() - radius
-}
+    /// Returns the signed distance of `offset` from the edge. It is approximate for ellipses, flowers and leaves.
+    pub fn distance(self, offset: Vec2) -> f32 {
+        match self {
+            Shape::Disk { radius } => offset.length() - radius,
+            Shape::Ellipse { radii } => ((offset / radii).length() - 1.) * radii.min_element(),
+            Shape::Rectangle { half, rounding } => {
+                let beyond = offset.abs() - half + Vec2::splat(rounding);
+                beyond.max(Vec2::ZERO).length() + beyond.max_element().min(0.) - rounding
+            }
+            Shape::Stroke { from, to, radius } => {
+                let along = to - from;
+                let t = ((offset - from).dot(along) / along.length_squared().max(1e-12)).clamp(0., 1.);
+                (offset - from - along * t).length() - radius
+            }
+            Shape::Polygon { radius, corners } => {
+                let turn = TAU / corners as f32;
+                let angle = offset.to_angle() / turn;
+                offset.length() * ((angle - angle.round()) * turn).cos() - radius
+            }
+            Shape::Flower { radius, petals, depth } => {
+                let wave = (offset.to_angle() * petals as f32).cos();
+                offset.length() - radius * (1. - depth * (0.5 - 0.5 * wave))
+            }
+            Shape::Leaf { length, width } => {
+                let t = (offset.x / length + 0.5).clamp(0., 1.);
+                let half = 2. * width * t * (1. - t);
+                (offset.y.abs() - half).max(offset.x.abs() - 0.5 * length)
+            }
+        }
+    }
 
-/// Returns the signed distance to a regular polygon with `corners` corners whose inscribed circle has radius `radius`.
-pub(super) fn polygon(offset: Vec2, radius: f32, corners: usize) -> f32 {
-    let turn = std::f32::consts::TAU / corners as f32;
-    let angle = offset.to_angle() / turn;
-    offset.length() * ((angle - angle.round()) * turn).cos() - radius
-}
+    /// Returns the shape enlarged by `factor`.
+    pub fn scaled(self, factor: f32) -> Shape {
+        let f = factor;
+        match self {
+            Shape::Disk { radius } => Shape::Disk { radius: f * radius },
+            Shape::Ellipse { radii } => Shape::Ellipse { radii: f * radii },
+            Shape::Rectangle { half, rounding } => {
+                Shape::Rectangle { half: f * half, rounding: f * rounding }
+            }
+            Shape::Stroke { from, to, radius } => {
+                Shape::Stroke { from: f * from, to: f * to, radius: f * radius }
+            }
+            Shape::Polygon { radius, corners } => Shape::Polygon { radius: f * radius, corners },
+            Shape::Flower { radius, petals, depth } => Shape::Flower { radius: f * radius, petals, depth },
+            Shape::Leaf { length, width } => Shape::Leaf { length: f * length, width: f * width },
+        }
+    }
 
-/// Returns the approximate signed distance to a flower with `petals` petals, whose notches are `depth` times the radius deep.
-pub(super) fn flower(offset: Vec2, radius: f32, petals: usize, depth: f32) -> f32 {
-    let wave = (offset.to_angle() * petals as f32).cos();
-    offset.length() - radius * (1. - depth * (0.5 - 0.5 * wave))
-}
+    /// Returns the share of the pixel at `offset` that the shape covers, if a repeat has `pixels` pixels.
+    pub fn coverage(self, offset: Vec2, pixels: f32) -> f32 {
+        coverage(self.distance(offset), pixels)
+    }
 
-/// Returns the approximate signed distance to a leaf between two points on the x axis, `length` apart and `width` across.
-pub(super) fn leaf(offset: Vec2, length: f32, width: f32) -> f32 {
-    let t = (offset.x / length + 0.5).clamp(0., 1.);
-    let half = 2. * width * t * (1. - t);
-    (offset.y.abs() - half).max(offset.x.abs() - 0.5 * length)
+    /// Returns half the size of a box that contains the shape and its soft edge, if a repeat has `pixels` pixels.
+    fn reach(self, pixels: f32) -> Vec2 {
+        let extent = match self {
+            Shape::Disk { radius } | Shape::Flower { radius, .. } => Vec2::splat(radius),
+            // The approximate distance grows more slowly along the longer axis.
+            Shape::Ellipse { radii } => radii * (1. + 1. / (pixels * radii.min_element())),
+            Shape::Rectangle { half, .. } => half,
+            Shape::Stroke { from, to, radius } => from.abs().max(to.abs()) + radius,
+            // A triangle's corners are at twice its inner radius.
+            Shape::Polygon { radius, .. } => Vec2::splat(2. * radius),
+            Shape::Leaf { length, width } => Vec2::new(0.5 * length, 0.5 * width),
+        };
+        extent + 1. / pixels
+    }
 }

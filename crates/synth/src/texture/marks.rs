@@ -3,7 +3,7 @@
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
 
-use super::canvas;
+use super::canvas::Shape;
 use super::noise::RandomValues;
 use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
@@ -73,12 +73,7 @@ impl Script {
                     Vec2::new(x, 0.)
                         + (point * Vec2::new(1., scale) + Vec2::new(0., 0.5 - 0.5 * scale)) * height
                 };
-                let (from, to) = (place(from), place(to));
-                let middle = 0.5 * (from + to);
-                let reach = (to - from).abs() * 0.5 + weight + 1. / canvas.size as f32;
-                canvas.fill(start + middle, reach, color, |offset| {
-                    canvas::stroke(offset, from - middle, to - middle, weight)
-                });
+                canvas.draw_line(start, place(from), place(to), weight, color);
             }
             x += advance;
         }
@@ -142,7 +137,7 @@ pub(super) fn writing(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
                     let block = Palette::draw(random, Purpose::Poster, 1).color(0);
                     let half = Vec2::new(0.5 * extent.x, 0.45 * extent.y);
                     let middle = corner + half;
-                    canvas.fill(middle, half, block, |offset| canvas::rectangle(offset, half, 0.));
+                    canvas.fill(middle, Shape::rectangle(half), block);
                 }
                 _ => script.paragraph(random, &mut canvas, corner, extent, height, ink),
             }
@@ -166,9 +161,8 @@ pub(super) fn scribbles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
             curl = 0.8 * curl + 0.3 * random.approx_normal();
             angle += curl;
             let step = Vec2::from_angle(angle) * step_length;
-            canvas.fill(at + 0.5 * step, 0.5 * step.abs() + width + 1. / SIZE as f32, color, |offset| {
-                canvas::stroke(offset, -0.5 * step, 0.5 * step, width)
-            });
+            let line = Shape::Stroke { from: -0.5 * step, to: 0.5 * step, radius: width };
+            canvas.fill(at + 0.5 * step, line, color);
             at += step;
         }
     }

@@ -3,9 +3,9 @@
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
 
-use super::canvas::{self, smoothstep};
+use super::canvas::{Shape, smoothstep};
 use super::layout::Layout;
-use super::noise::{Field, RandomValues, Voronoi, fractal, ridged, smooth, unit_of, warped};
+use super::noise::{Field, RandomValues, Voronoi, folded_fractal, fractal, ridge, smooth, unit_of, warped};
 use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
 
@@ -317,7 +317,7 @@ pub(super) fn concrete(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     for _ in 0..random.count(0, 250) {
         let radius = random.sqrt_uniform(0.5, 2.5) / SIZE as f32;
         let dark = base * random.uniform(0.3, 0.8);
-        canvas.fill(random.point(), Vec2::splat(2. * radius), dark, |offset| canvas::disk(offset, radius));
+        canvas.fill(random.point(), Shape::Disk { radius }, dark);
     }
     if random.chance(0.4) {
         let layout = Layout::courses(random.count(1, 3), random.count(1, 2), 0., false);
@@ -336,7 +336,7 @@ pub(super) fn plaster(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let cells = random.sqrt_uniform(2., 48.) as usize;
     let gain = random.uniform(0.5, 0.9);
     let relief = match random.count(0, 3) {
-        0 => ridged(random, SIZE, [cells; 2], 5, gain),
+        0 => folded_fractal(random, SIZE, [cells; 2], 5, gain, ridge),
         1 => fractal(random, SIZE, [cells, 3 * cells], 5, gain),
         2 => {
             let strokes = fractal(random, SIZE, [cells, 2 * cells], 4, gain);

@@ -16,7 +16,6 @@ mod plain;
 mod scatter;
 
 use glam::{Vec2, Vec3};
-use image::RgbImage;
 use rand_chacha::ChaCha8Rng;
 
 use canvas::Canvas;
@@ -35,7 +34,7 @@ const PLACE_BITS: u32 = 24;
 ///
 /// The coordinate u points right and v down, as in an image; (0, 0) is the upper left corner.
 #[derive(Debug)]
-pub struct Texture {
+pub(super) struct Texture {
     /// Mipmap levels, each half as wide as the previous one, down to a single texel. A texel holds the square roots of red, green
     /// and blue in bytes, and a fourth byte that is 0.
     levels: Vec<Vec<[u8; 4]>>,
@@ -45,7 +44,7 @@ pub struct Texture {
 
 /// Kind of surface that a texture covers. The probabilities of the families depend on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Purpose {
+pub(super) enum Purpose {
     /// Indoor floor.
     Floor,
     /// Indoor wall.
@@ -64,20 +63,6 @@ pub enum Purpose {
     Poster,
 }
 
-impl Purpose {
-    /// All purposes, pictures last.
-    pub const ALL: [Purpose; 8] = [
-        Purpose::Floor,
-        Purpose::Wall,
-        Purpose::Ceiling,
-        Purpose::Ground,
-        Purpose::Facade,
-        Purpose::Thing,
-        Purpose::Foliage,
-        Purpose::Poster,
-    ];
-}
-
 /// Output of a family: the painted canvas and its width in metres.
 struct Surface {
     canvas: Canvas,
@@ -87,7 +72,7 @@ struct Surface {
 /// A family of textures: a function that paints a surface.
 type Family = fn(&mut ChaCha8Rng, Purpose) -> Surface;
 
-/// All families and their weights by purpose, in the order of [`Purpose::ALL`] without pictures.
+/// All families and their weights by purpose, in the order of [`Purpose`] without pictures.
 #[rustfmt::skip]
 const FAMILIES: [(Family, [f32; 7]); 41] = [
     //                            floor wall ceil grnd faca thing leaf
@@ -194,34 +179,10 @@ impl Texture {
         Texture::from_surface(surface)
     }
 
-    /// Creates a texture from a photo or image in sRGB: its largest centered square, mirrored to the right and below so that the
-    /// texture repeats.
-    pub fn from_image(picture: &RgbImage) -> Texture {
-        let side = picture.width().min(picture.height());
-        let corner = Vec2::new((picture.width() - side) as f32, (picture.height() - side) as f32) * 0.5;
-        let step = side as f32 / SIZE as f32;
-        let linear: Vec<f32> = (0..=255).map(palette::srgb_byte_to_linear).collect();
-        let quarter = Canvas::from_fn(SIZE, |uv| {
-            // The mean of the photo's pixels that a texel covers, at least one.
-            let middle = corner + uv * side as f32;
-            let [low, high] = [-0.5, 0.5].map(|half| (middle + half * step).max(Vec2::ZERO).as_uvec2());
-            let mut sum = Vec3::ZERO;
-            let mut count = 0.;
-            for y in low.y..high.y.max(low.y + 1) {
-                for x in low.x..high.x.max(low.x + 1) {
-                    let pixel = picture.get_pixel(x.min(picture.width() - 1), y.min(picture.height() - 1));
-                    sum += Vec3::from(pixel.0.map(|byte| linear[byte as usize]));
-                    count += 1.;
-                }
-            }
-            sum / count
-        });
-        let canvas = Canvas::from_fn(2 * SIZE, |uv| {
-            let folded = 1. - (2. * uv - 1.).abs();
-            let at = (folded * SIZE as f32).as_uvec2().min(glam::UVec2::splat(SIZE as u32 - 1));
-            quarter.pixels[at.y as usize * SIZE + at.x as usize]
-        });
-        Texture::from_surface(Surface { canvas, repeat_metres: 2. })
+    /// Creates a texture of one color.
+    #[cfg(test)]
+    pub fn uniform(color: Vec3) -> Texture {
+        Texture::from_surface(Surface { canvas: Canvas::filled(1, color), repeat_metres: 1. })
     }
 
     /// Samples trilinearly at `uv` in repeats, for a footprint of width `footprint` in repeats.
@@ -236,11 +197,6 @@ impl Texture {
         let (x, y) = (place(uv.x), place(uv.y));
         let fine = self.bilinear(finer, x, y);
         if part == 0. { fine } else { fine.lerp(self.bilinear(finer + 1, x, y), part) }
-    }
-
-    /// Returns the mean reflectance.
-    pub fn mean(&self) -> Vec3 {
-        self.bilinear(self.levels.len() - 1, 0, 0)
     }
 
     /// Interpolates four texels of a level bilinearly, at a position in units of 2⁻²⁴ repeats.

@@ -4,6 +4,8 @@ use glam::{IVec2, Vec2};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
+use crate::noise::hash;
+
 /// Random draws that texture families need from a generator.
 pub(super) trait RandomValues: Rng {
     /// Returns a uniform random value in [0, 1).
@@ -78,12 +80,8 @@ impl RandomValues for ChaCha8Rng {}
 
 /// Returns a pseudo-random value in [0, 1) determined by `seed` and `id`, for pieces that are visited in no fixed order.
 pub(super) fn unit_of(seed: u32, id: u32) -> f32 {
-    let mut bits = seed ^ id.wrapping_mul(0x9e37_79b9);
-    for multiplier in [0x7feb_352d_u32, 0x846c_a68b] {
-        bits = (bits ^ (bits >> 16)).wrapping_mul(multiplier);
-    }
-    bits ^= bits >> 15;
-    (bits >> 8) as f32 / (1 << 24) as f32
+    let bits = hash(seed ^ id.wrapping_mul(0x9e37_79b9));
+    ((bits ^ (bits >> 15)) >> 8) as f32 / (1 << 24) as f32
 }
 
 /// A square of values whose width is a power of two. It repeats in both directions.
@@ -225,27 +223,17 @@ pub(super) fn fractal(
     octaves: usize,
     gain: f32,
 ) -> Field {
-    octaves_of(random, size, cells, octaves, gain, |value| value)
+    folded_fractal(random, size, cells, octaves, gain, |value| value)
 }
 
-/// Sums octaves like [`fractal`], each folded at 0: ridges of 1 between valleys.
-pub(super) fn ridged(
+/// Sums octaves like [`fractal`], each of whose values is mapped by `fold`.
+pub(super) fn folded_fractal(
     random: &mut ChaCha8Rng,
     size: usize,
     cells: [usize; 2],
     octaves: usize,
     gain: f32,
-) -> Field {
-    octaves_of(random, size, cells, octaves, gain, |value| 1. - 2. * value.abs().min(1.))
-}
-
-fn octaves_of(
-    random: &mut ChaCha8Rng,
-    size: usize,
-    cells: [usize; 2],
-    octaves: usize,
-    gain: f32,
-    fold: impl Fn(f32) -> f32,
+    fold: fn(f32) -> f32,
 ) -> Field {
     let mut sum = Field { size, values: vec![0.; size * size] };
     let mut strength = 1.;
@@ -255,12 +243,17 @@ fn octaves_of(
         if finer.iter().any(|&count| count > size) {
             break;
         }
-        sum = sum.plus(&smooth(random, size, finer).map(&fold), strength);
+        sum = sum.plus(&smooth(random, size, finer).map(fold), strength);
         power += strength * strength;
         strength *= gain;
     }
     let scale = 1. / f32::sqrt(power.max(1e-6));
     sum.map(|value| value * scale)
+}
+
+/// Folds noise at 0: ridges of 1 between valleys.
+pub(super) fn ridge(value: f32) -> f32 {
+    1. - 2. * value.abs().min(1.)
 }
 
 /// Returns a field whose positions are displaced by about `reach` repeats, in patches of which `cells` fit into a repeat.

@@ -50,7 +50,7 @@ pub(super) const VIVID: Theme = &[
     0x7ac143, 0x0b3c7d,
 ];
 
-/// Themes and their weights by purpose, in the order of [`Purpose::ALL`].
+/// Themes and their weights by purpose, in the order of [`Purpose`].
 #[rustfmt::skip]
 const THEMES: [&[(Theme, f32)]; 8] = [
     &[(BEIGES, 3.), (GRAYS, 3.), (BROWNS, 3.), (WOODS, 3.), (STONES, 2.), (ACCENTS, 2.), (WHITES, 1.)],

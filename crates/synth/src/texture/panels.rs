@@ -3,7 +3,7 @@
 use glam::{Vec2, Vec2Swizzles, Vec3};
 use rand_chacha::ChaCha8Rng;
 
-use super::canvas::{self, smoothstep};
+use super::canvas::{Shape, coverage, smoothstep};
 use super::layout::Layout;
 use super::marks::{Script, ink_for};
 use super::noise::{Field, RandomValues, fractal, smooth, unit_of};
@@ -117,7 +117,7 @@ fn paint_panel(canvas: &mut Canvas, middle: Vec2, half: Vec2, color: Vec3, bevel
         let edge_distance = inside.min_element();
         let side = if inside.x < inside.y { offset.x.signum() } else { offset.y.signum() };
         let edge = smoothstep(bevel, 0.3 * bevel, edge_distance);
-        (color * (1. - relief * side * edge), (0.5 + edge_distance * pixels).clamp(0., 1.))
+        (color * (1. - relief * side * edge), coverage(-edge_distance, pixels))
     });
 }
 
@@ -162,8 +162,7 @@ pub(super) fn windows(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
                 {
                     color = color.lerp(curtain * (0.8 + 0.2 * (position.x * 40.).sin()), 0.7);
                 }
-                let edge_distance = (half_pane - offset.abs()).min_element();
-                (color, (0.5 + edge_distance * SIZE as f32).clamp(0., 1.))
+                (color, coverage((offset.abs() - half_pane).max_element(), SIZE as f32))
             });
         }
     }
@@ -196,16 +195,15 @@ pub(super) fn shelves(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
                 let roundness = random.uniform(0.2, 0.6);
                 canvas.stamp(middle, half, |offset| {
                     let across = offset.x / half.x;
-                    let edge_distance = (half - offset.abs()).min_element();
-                    let share = (edge_distance * SIZE as f32 + 0.5).clamp(0., 1.);
-                    (color * (1. - roundness * across * across), share)
+                    let distance = (offset.abs() - half).max_element();
+                    (color * (1. - roundness * across * across), coverage(distance, SIZE as f32))
                 });
                 let label = ink_for(random, color);
                 for _ in 0..random.count(0, 3) {
                     let band = random.uniform(0.3, 2.) / SIZE as f32;
                     let place = middle + Vec2::new(0., half.y * random.uniform(-0.85, 0.85));
                     let half_band = Vec2::new(0.9 * half.x, band);
-                    canvas.fill(place, half_band, label, |offset| canvas::rectangle(offset, half_band, 0.));
+                    canvas.fill(place, Shape::rectangle(half_band), label);
                 }
                 if width > 0.04 {
                     let start = Vec2::new(x + 0.15 * width, middle.y);
@@ -255,10 +253,9 @@ pub(super) fn cupboards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
             _ => continue,
         };
         let at = middle + place * cell;
-        canvas.fill(at + 0.006, knob + 0.01, color * 0.35, |offset| {
-            canvas::rectangle(offset, knob, knob.min_element())
-        });
-        canvas.fill(at, knob + 0.01, metal, |offset| canvas::rectangle(offset, knob, knob.min_element()));
+        let knob = Shape::Rectangle { half: knob, rounding: knob.min_element() };
+        canvas.fill(at + 0.006, knob, color * 0.35);
+        canvas.fill(at, knob, metal);
     }
     if theme == WOODS {
         let cells = if matches!(purpose, Purpose::Wall) { [2, 48] } else { [48, 2] };

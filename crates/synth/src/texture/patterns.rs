@@ -3,7 +3,7 @@
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
 
-use super::canvas::{self, smoothstep};
+use super::canvas::{Shape, coverage, smoothstep};
 use super::layout::Layout;
 use super::noise::{Field, RandomValues, Voronoi, fractal, smooth, unit_of};
 use super::palette::*;
@@ -106,7 +106,7 @@ pub(super) fn pieces(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         if piece.edge > inset * piece.extent.y {
             number += 1;
         }
-        let on_line = if line > 0. { ((line - piece.edge) * SIZE as f32 + 0.5).clamp(0., 1.) } else { 0. };
+        let on_line = if line > 0. { coverage(piece.edge - line, SIZE as f32) } else { 0. };
         palette.color(number).lerp(ink, on_line)
     });
     Surface { canvas, repeat_metres: random.sqrt_uniform(0.3, 3.) }
@@ -133,54 +133,35 @@ pub(super) fn motifs(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.sqrt_uniform(0.3, 3.) }
 }
 
-/// Nested figures, the outermost first.
-pub(super) struct Motif {
-    layers: Vec<(Figure, f32, Vec3)>,
-}
-
-#[derive(Clone, Copy)]
-enum Figure {
-    Disk,
-    Polygon(usize),
-    Flower(usize, f32),
-    Leaf(f32),
-    Box(f32),
-}
+/// Nested shapes of radius 1, the outermost first; the radius of each as a fraction of the cell's width, and its color.
+pub(super) struct Motif(Vec<(Shape, f32, Vec3)>);
 
 impl Motif {
-    /// Draws one to four figures whose radii are fractions of the cell's width.
+    /// Draws one to four shapes.
     pub fn draw(random: &mut ChaCha8Rng, palette: &Palette) -> Motif {
         let mut radius = random.uniform(0.15, 0.5);
-        let mut layers = Vec::new();
-        for index in 0..random.count(1, 4) {
-            let figure = match random.count(0, 4) {
-                0 => Figure::Disk,
-                1 => Figure::Polygon(random.count(3, 8)),
-                2 => Figure::Flower(random.count(3, 12), random.uniform(0.2, 0.8)),
-                3 => Figure::Leaf(random.uniform(0.2, 0.8)),
-                _ => Figure::Box(random.uniform(0.3, 1.)),
+        let layers = (0..random.count(1, 4)).map(|index| {
+            let shape = match random.count(0, 4) {
+                0 => Shape::Disk { radius: 1. },
+                1 => Shape::Polygon { radius: 0.8, corners: random.count(3, 8) },
+                2 => {
+                    let petals = random.count(3, 12);
+                    Shape::Flower { radius: 1., petals, depth: random.uniform(0.2, 0.8) }
+                }
+                3 => Shape::Leaf { length: 2., width: random.uniform(0.2, 0.8) },
+                _ => Shape::rectangle(Vec2::new(1., random.uniform(0.3, 1.))),
             };
-            layers.push((figure, radius, palette.color(index + 1)));
+            let layer = (shape, radius, palette.color(index + 1));
             radius *= random.uniform(0.4, 0.85);
-        }
-        Motif { layers }
+            layer
+        });
+        Motif(layers.collect())
     }
 
     /// Paints the motif into a cell of width `cell`, rotated by `turn`.
     pub fn paint(&self, canvas: &mut Canvas, center: Vec2, cell: f32, turn: Vec2) {
-        for &(figure, share, color) in &self.layers {
-            let radius = share * cell;
-            // A triangle's corners are at twice its inner radius.
-            canvas.fill(center, Vec2::splat(2. * radius), color, |offset| {
-                let offset = turn.rotate(offset);
-                match figure {
-                    Figure::Disk => canvas::disk(offset, radius),
-                    Figure::Polygon(corners) => canvas::polygon(offset, 0.8 * radius, corners),
-                    Figure::Flower(petals, depth) => canvas::flower(offset, radius, petals, depth),
-                    Figure::Leaf(width) => canvas::leaf(offset, 2. * radius, width * radius),
-                    Figure::Box(aspect) => canvas::rectangle(offset, Vec2::new(radius, aspect * radius), 0.),
-                }
-            });
+        for &(shape, radius, color) in &self.0 {
+            canvas.fill_turned(center, turn, shape.scaled(radius * cell), color);
         }
     }
 }
@@ -215,18 +196,15 @@ pub(super) fn ornament(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
             for side in [1., -1.] {
                 let mirror = Vec2::new(side, 1.);
                 let (from, to) = (from * mirror * cell, to * mirror * cell);
-                let middle = 0.5 * (from + to);
-                let reach = (to - from).abs() * 0.5 + width;
-                canvas.fill(center + middle, reach, palette.color(1), |offset| {
-                    canvas::stroke(offset, from - middle, to - middle, width)
-                });
+                canvas.draw_line(center, from, to, width, palette.color(1));
                 if step % every == 1 {
                     let length = leaf.x * cell;
                     let turn = Vec2::from_angle(-angle - 0.8) * mirror;
                     let tip = center + to + Vec2::new(turn.x, -turn.y) * 0.5 * length;
-                    canvas.fill(tip, Vec2::splat(length), palette.color(2), |offset| {
-                        let offset = Vec2::from_angle(-angle - 0.8).rotate(offset * mirror);
-                        canvas::leaf(offset, length, length * leaf.y)
+                    let leaf = Shape::Leaf { length, width: length * leaf.y };
+                    canvas.stamp(tip, Vec2::splat(length), |offset| {
+                        let local = Vec2::from_angle(-angle - 0.8).rotate(offset * mirror);
+                        (palette.color(2), leaf.coverage(local, SIZE as f32))
                     });
                 }
             }
@@ -355,8 +333,9 @@ pub(super) fn carpet(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         let squeeze = Vec2::new(1., random.uniform(0.7, 1.4));
         for layer in 0..random.count(2, 7) {
             let color = palette.color(layer + 1);
-            canvas.fill(middle, Vec2::splat(0.5), color, |offset| {
-                canvas::flower(offset * squeeze, radius, petals, depth)
+            let flower = Shape::Flower { radius, petals, depth };
+            canvas.stamp(middle, Vec2::splat(0.5), |offset| {
+                (color, flower.coverage(offset * squeeze, SIZE as f32))
             });
             radius *= random.uniform(0.6, 0.9);
         }

@@ -3,7 +3,7 @@
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
 
-use super::canvas::{self, smoothstep};
+use super::canvas::{Shape, coverage, smoothstep};
 use super::marks::{Script, ink_for, paper};
 use super::noise::{RandomValues, fractal, smooth};
 use super::palette::*;
@@ -49,13 +49,11 @@ fn landscape(random: &mut ChaCha8Rng) -> Canvas {
         let sky = zenith.lerp(haze, (uv.y / horizon).min(1.));
         let cloud = cover * smoothstep(level, level + 0.8, clouds.value(uv));
         sky.lerp(Vec3::splat(0.85).lerp(haze, 0.3), cloud)
-    });
-    canvas.repeats = false;
+    })
+    .without_wrapping();
     if random.chance(0.4) {
         let (sun, radius) = (Vec2::new(random.unit(), horizon * random.unit()), random.uniform(0.02, 0.09));
-        canvas.fill(sun, Vec2::splat(2. * radius), haze.lerp(Vec3::ONE, 0.7), |offset| {
-            canvas::disk(offset, radius)
-        });
+        canvas.fill(sun, Shape::Disk { radius }, haze.lerp(Vec3::ONE, 0.7));
     }
     let theme = random.weighted(&[(GREENS, 4.), (AUTUMN, 2.), (ACCENTS, 1.), (STONES, 1.)]);
     let ranges = random.count(2, 6);
@@ -76,7 +74,7 @@ fn landscape(random: &mut ChaCha8Rng) -> Canvas {
             } else {
                 ground * (1. + 0.35 * near * value)
             };
-            below.lerp(color, (0.5 + (uv.y - top) * SIZE as f32).clamp(0., 1.))
+            below.lerp(color, coverage(top - uv.y, SIZE as f32))
         });
         if !water && random.chance(0.5) {
             for _ in 0..random.count(2, 40) {
@@ -85,9 +83,9 @@ fn landscape(random: &mut ChaCha8Rng) -> Canvas {
                 let top = base - height * (1. + profile.values[((x * SIZE as f32) as usize).min(SIZE - 1)]);
                 let color = ground * random.uniform(0.3, 0.9);
                 let slim = random.uniform(0.4, 1.);
-                let lobes = random.count(3, 9);
-                canvas.fill(Vec2::new(x, top - 0.3 * size), Vec2::splat(1.2 * size), color, |offset| {
-                    canvas::flower(offset / Vec2::new(slim, 1.), size, lobes, 0.25)
+                let crown = Shape::Flower { radius: size, petals: random.count(3, 9), depth: 0.25 };
+                canvas.stamp(Vec2::new(x, top - 0.3 * size), Vec2::splat(1.2 * size), |offset| {
+                    (color, crown.coverage(offset / Vec2::new(slim, 1.), SIZE as f32))
                 });
             }
         }
@@ -100,7 +98,7 @@ fn portrait(random: &mut ChaCha8Rng) -> Canvas {
     let backdrop = Palette::draw(random, Purpose::Poster, 2);
     let drift = smooth(random, SIZE, [2, 2]);
     let backdrop = |uv: Vec2| backdrop.ramp(0.3 * uv.y + 0.35 + 0.3 * drift.value(uv)) * 0.7;
-    let mut canvas = Canvas { repeats: false, ..Canvas::from_fn(SIZE, backdrop) };
+    let mut canvas = Canvas::from_fn(SIZE, backdrop).without_wrapping();
     let skin = srgb_to_linear(random.one_of(&[0xe6b998, 0xc98f6b, 0x8d5a3c, 0x5c3a28, 0xf0d0b8]));
     let skin = shade(random, skin, 0.1);
     let hair = random_theme_color(random, BROWNS) * random.uniform(0.2, 1.);
@@ -113,7 +111,7 @@ fn portrait(random: &mut ChaCha8Rng) -> Canvas {
             let (place, radii) = (place * size, radii * size);
             canvas.stamp(head + place, radii + 0.004, |offset| {
                 let lit = 1. + shading * (offset / radii).dot(light);
-                (color * lit.max(0.2), (0.5 - canvas::ellipse(offset, radii) * SIZE as f32).clamp(0., 1.))
+                (color * lit.max(0.2), Shape::Ellipse { radii }.coverage(offset, SIZE as f32))
             });
         };
         let long = random.uniform(0., 1.);
@@ -136,7 +134,7 @@ fn portrait(random: &mut ChaCha8Rng) -> Canvas {
 /// Draws an abstract picture of large flat shapes.
 fn shapes(random: &mut ChaCha8Rng) -> Canvas {
     let palette = Palette::draw_between(random, Purpose::Poster, 3, 5);
-    let mut canvas = Canvas::bounded(SIZE, palette.color(0));
+    let mut canvas = Canvas::filled(SIZE, palette.color(0)).without_wrapping();
     let straight = random.chance(0.4);
     let line = if random.chance(0.4) { random.uniform(0.003, 0.015) } else { 0. };
     for _ in 0..random.count(3, 40) {
@@ -144,21 +142,24 @@ fn shapes(random: &mut ChaCha8Rng) -> Canvas {
         let half = Vec2::new(1., random.uniform(0.1, 1.)) * size;
         let turn = if straight { random.one_of(&[Vec2::X, Vec2::Y]) } else { random.direction() };
         let (kind, corners, depth) = (random.count(0, 4), random.count(3, 6), random.uniform(0., 0.7));
+        let shape = match kind {
+            1 => Shape::Polygon { radius: 0.6 * size, corners },
+            2 => Shape::Flower { radius: size, petals: corners, depth },
+            4 => Shape::rectangle(half),
+            _ => Shape::Disk { radius: size },
+        };
         let distance = |offset: Vec2| {
             let local = turn.rotate(offset);
-            match kind {
-                0 => canvas::disk(local, size),
-                1 => canvas::polygon(local, 0.6 * size, corners),
-                2 => canvas::flower(local, size, corners, depth),
-                3 => canvas::disk(local, size).max(local.y),
-                _ => canvas::rectangle(local, half, 0.),
-            }
+            // Kind 3 is half a disk.
+            if kind == 3 { shape.distance(local).max(local.y) } else { shape.distance(local) }
         };
-        let center = random.point();
-        let reach = Vec2::splat(1.42 * size);
-        canvas.fill(center, reach, palette.any(random), distance);
+        let (center, reach) = (random.point(), Vec2::splat(1.42 * size));
+        let color = palette.any(random);
+        canvas.stamp(center, reach, |offset| (color, coverage(distance(offset), SIZE as f32)));
         if line > 0. {
-            canvas.fill(center, reach, Vec3::splat(0.02), |offset| distance(offset).abs() - line);
+            canvas.stamp(center, reach, |offset| {
+                (Vec3::splat(0.02), coverage(distance(offset).abs() - line, SIZE as f32))
+            });
         }
     }
     canvas
@@ -167,7 +168,7 @@ fn shapes(random: &mut ChaCha8Rng) -> Canvas {
 /// Draws a poster or a sign: a heading, a picture, paragraphs.
 fn print(random: &mut ChaCha8Rng) -> Canvas {
     let paper = paper(random, Purpose::Poster, 0.5);
-    let mut canvas = Canvas::bounded(SIZE, paper);
+    let mut canvas = Canvas::filled(SIZE, paper).without_wrapping();
     let ink = ink_for(random, paper);
     let script = Script::draw(random);
     let mut top = 0.06;
@@ -203,9 +204,7 @@ fn print(random: &mut ChaCha8Rng) -> Canvas {
                 let height = random.uniform(0.03, 0.2).min(left);
                 let color = Palette::draw(random, Purpose::Poster, 1).color(0);
                 let half = Vec2::new(random.one_of(&[0.5, 0.43, 0.2]), 0.5 * height);
-                canvas.fill(Vec2::new(0.5, top + half.y), half + 0.01, color, |offset| {
-                    canvas::rectangle(offset, half, 0.)
-                });
+                canvas.fill(Vec2::new(0.5, top + half.y), Shape::rectangle(half), color);
                 top += height + 0.02;
             }
         }
@@ -218,7 +217,6 @@ fn painting(random: &mut ChaCha8Rng) -> Canvas {
     let model = random.one_of(&[landscape, portrait, dead_leaves, flowers, shapes])(random);
     let flow = smooth(random, SIZE, [3; 2]);
     let mut canvas = model.clone();
-    canvas.repeats = false;
     let length = random.uniform(0.015, 0.06);
     let width = length * random.uniform(0.15, 0.4);
     let count = (0.8 / (length * width)) as usize;
@@ -228,9 +226,7 @@ fn painting(random: &mut ChaCha8Rng) -> Canvas {
         let spot = random.point();
         let along = Vec2::from_angle(turns * flow.sample(spot)) * 0.5 * length;
         let color = model.sample(spot) * (1. + spread * random.approx_normal()).max(0.2);
-        canvas.fill(spot, along.abs() + width, color, |offset| {
-            canvas::stroke(offset, -along, along, 0.5 * width)
-        });
+        canvas.fill(spot, Shape::Stroke { from: -along, to: along, radius: 0.5 * width }, color);
     }
     canvas
 }
@@ -239,7 +235,7 @@ fn painting(random: &mut ChaCha8Rng) -> Canvas {
 fn dead_leaves(random: &mut ChaCha8Rng) -> Canvas {
     let palette = Palette::draw_between(random, Purpose::Thing, 3, 5);
     let other = Palette::draw(random, Purpose::Poster, 3);
-    let mut canvas = Canvas::bounded(SIZE, palette.color(0));
+    let mut canvas = Canvas::filled(SIZE, palette.color(0)).without_wrapping();
     let light = random.direction();
     let decline = random.sqrt_uniform(0.02, 0.3);
     for step in 0..random.count(40, 250) {
@@ -250,15 +246,14 @@ fn dead_leaves(random: &mut ChaCha8Rng) -> Canvas {
         let (turn, kind) = (random.direction(), random.count(0, 2));
         let half = Vec2::new(1., random.uniform(0.3, 1.)) * size;
         let shading = random.uniform(0., 0.5);
+        let leaf = match kind {
+            0 => Shape::Ellipse { radii: half },
+            1 => Shape::Rectangle { half, rounding: 0.2 * half.y },
+            _ => Shape::Polygon { radius: 0.7 * size, corners: 3 },
+        };
         canvas.stamp(random.point(), Vec2::splat(1.42 * size), |offset| {
-            let local = turn.rotate(offset);
-            let distance = match kind {
-                0 => canvas::ellipse(local, half),
-                1 => canvas::rectangle(local, half, 0.2 * half.y),
-                _ => canvas::polygon(local, 0.7 * size, 3),
-            };
             let lit = 1. + shading * offset.dot(light) / size;
-            (color * lit.max(0.1), (0.5 - distance * SIZE as f32).clamp(0., 1.))
+            (color * lit.max(0.1), leaf.coverage(turn.rotate(offset), SIZE as f32))
         });
     }
     canvas
@@ -267,35 +262,30 @@ fn dead_leaves(random: &mut ChaCha8Rng) -> Canvas {
 /// Draws flowers with stems and leaves in front of a plain background.
 fn flowers(random: &mut ChaCha8Rng) -> Canvas {
     let ground = Palette::draw(random, Purpose::Wall, 1).color(0);
-    let mut canvas = Canvas::bounded(SIZE, ground);
+    let mut canvas = Canvas::filled(SIZE, ground).without_wrapping();
     let foot = Vec2::new(random.uniform(0.4, 0.6), random.uniform(0.8, 1.1));
     let green = Palette::from_theme(random, GREENS, 3);
     for _ in 0..random.count(3, 16) {
         let head = Vec2::new(random.uniform(0.12, 0.88), random.uniform(0.1, 0.6));
         let stem = palette_shade(random, &green);
         let half = 0.5 * (foot - head);
-        canvas
-            .fill(head + half, half.abs() + 0.01, stem, |offset| canvas::stroke(offset, -half, half, 0.005));
+        canvas.fill(head + half, Shape::Stroke { from: -half, to: half, radius: 0.005 }, stem);
         for _ in 0..random.count(0, 3) {
             let (place, turn) = (head.lerp(foot, random.uniform(0.2, 0.9)), random.direction());
             let (length, leaf) = (random.uniform(0.08, 0.2), palette_shade(random, &green));
-            canvas.fill(place, Vec2::splat(0.6 * length), leaf, |offset| {
-                canvas::leaf(turn.rotate(offset), length, 0.35 * length)
-            });
+            canvas.fill_turned(place, turn, Shape::Leaf { length, width: 0.35 * length }, leaf);
         }
         let petals = random_color_of_themes(random, &[(VIVID, 2.), (ACCENTS, 3.), (WHITES, 1.)]);
         let (count, depth) = (random.count(4, 14), random.uniform(0.2, 0.7));
         let mut radius = random.uniform(0.04, 0.14);
         for layer in 0..random.count(2, 4) {
             let color = petals * (1. - 0.2 * layer as f32);
-            let turn = random.direction();
-            canvas.fill(head, Vec2::splat(radius + 0.01), color, |offset| {
-                canvas::flower(turn.rotate(offset), radius, count, depth)
-            });
+            let flower = Shape::Flower { radius, petals: count, depth };
+            canvas.fill_turned(head, random.direction(), flower, color);
             radius *= 0.65;
         }
         let heart = random_theme_color(random, AUTUMN);
-        canvas.fill(head, Vec2::splat(radius), heart, |offset| canvas::disk(offset, 0.6 * radius));
+        canvas.fill(head, Shape::Disk { radius: 0.6 * radius }, heart);
     }
     canvas
 }
@@ -318,8 +308,7 @@ fn window(random: &mut ChaCha8Rng) -> Canvas {
     canvas.map_pixels(|uv, outside| {
         let part = (uv * panes - (uv * panes).round()).abs() / panes;
         let near = (part - bar).min_element().min((uv.min(1. - uv) - edge).min_element());
-        let seen = outside
-            .lerp(frame * (0.75 + 10. * near.clamp(-0.025, 0.)), (0.5 - near * SIZE as f32).clamp(0., 1.));
+        let seen = outside.lerp(frame * (0.75 + 10. * near.clamp(-0.025, 0.)), coverage(near, SIZE as f32));
         let curtain = uv.x < left || uv.x > 1. - right;
         if curtain { cloth * (0.75 + 0.2 * (uv.x * folds).sin()) } else { seen }
     });
@@ -331,25 +320,20 @@ fn screen(random: &mut ChaCha8Rng) -> Canvas {
     if random.chance(0.35) {
         let glimmer = random.uniform(0.02, 0.12);
         let slant = random.uniform(-1., 1.);
-        let mut canvas = Canvas::from_fn(SIZE, |uv| {
+        return Canvas::from_fn(SIZE, |uv| {
             Vec3::splat(0.02 + glimmer * smoothstep(0.3, -0.3, uv.y - 0.5 + slant * (uv.x - 0.5)))
         });
-        canvas.repeats = false;
-        return canvas;
     }
-    let ground = random.one_of(&[landscape, shapes])(random);
-    let mut canvas = Canvas { repeats: false, ..ground };
+    let mut canvas = random.one_of(&[landscape, shapes])(random);
     let script = Script::draw(random);
     for _ in 0..random.count(0, 4) {
         let paper = if random.chance(0.6) { Vec3::splat(0.85) } else { Vec3::splat(0.04) };
         let half = Vec2::new(random.uniform(0.12, 0.45), random.uniform(0.12, 0.45));
         let middle = Vec2::new(random.uniform(0.2, 0.8), random.uniform(0.2, 0.8));
-        canvas.fill(middle, half, paper, |offset| canvas::rectangle(offset, half, 0.01));
+        canvas.fill(middle, Shape::Rectangle { half, rounding: 0.01 }, paper);
         let bar = Palette::draw(random, Purpose::Poster, 1).color(0);
-        let half_bar = Vec2::new(half.x, 0.02);
-        canvas.fill(middle - Vec2::new(0., half.y - 0.02), half_bar, bar, |offset| {
-            canvas::rectangle(offset, half_bar, 0.)
-        });
+        let title = Shape::rectangle(Vec2::new(half.x, 0.02));
+        canvas.fill(middle - Vec2::new(0., half.y - 0.02), title, bar);
         let ink = ink_for(random, paper);
         let corner = middle - half + Vec2::new(0.02, 0.06);
         script.paragraph(random, &mut canvas, corner, 2. * half - Vec2::new(0.04, 0.08), 0.018, ink);

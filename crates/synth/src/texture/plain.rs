@@ -4,7 +4,7 @@ use glam::Vec3;
 use rand_chacha::ChaCha8Rng;
 
 use super::canvas::smoothstep;
-use super::noise::{Field, RandomValues, Voronoi, fractal, ridged, smooth, unit_of, warped};
+use super::noise::{Field, RandomValues, Voronoi, folded_fractal, fractal, ridge, smooth, unit_of, warped};
 use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
 
@@ -96,7 +96,7 @@ fn raw(random: &mut ChaCha8Rng) -> Field {
     let gain = random.uniform(0.4, 0.85);
     match random.count(0, 5) {
         0 | 1 => fractal(random, SIZE, cells, 7, gain),
-        2 => ridged(random, SIZE, cells, 6, gain),
+        2 => folded_fractal(random, SIZE, cells, 6, gain, ridge),
         kind @ (3 | 4) => {
             let count = cells[0].max(3);
             let voronoi = Voronoi::new(random, count, count, 0.95, false);
@@ -163,7 +163,7 @@ fn dirt(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
 /// Adds thin brighter or darker lines.
 fn scratches(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
     let cells = random.count(2, 6);
-    let lines = ridged(random, SIZE, [cells; 2], 3, 0.6);
+    let lines = folded_fractal(random, SIZE, [cells; 2], 3, 0.6, ridge);
     let patches = smooth(random, SIZE, [4; 2]);
     let change = if random.chance(0.5) { random.uniform(0.1, 0.4) } else { -random.uniform(0.1, 0.5) };
     let width = random.uniform(0.05, 0.2);

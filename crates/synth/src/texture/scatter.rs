@@ -3,7 +3,7 @@
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
 
-use super::canvas::{self, smoothstep};
+use super::canvas::{Shape, coverage, smoothstep};
 use super::noise::{RandomValues, fractal};
 use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
@@ -48,12 +48,12 @@ pub(super) fn leaves(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let width = size * slim * random.uniform(0.6, 1.1);
         let tilt = random.uniform(-0.35, 0.35);
         let pixels = SIZE as f32;
+        let leaf = Shape::Leaf { length: size, width };
         canvas.stamp(random.point(), Vec2::splat(0.55 * size), |offset| {
             let local = turn.rotate(offset);
-            let cover = (0.5 - canvas::leaf(local, size, width) * pixels).clamp(0., 1.);
             let vein = 1. + veined * (1. - local.y.abs() * pixels).max(0.);
             let side = 1. + tilt * local.y.signum() * (local.y.abs() * pixels).min(1.) + 0.3 * local.x / size;
-            (color * vein * side, cover)
+            (color * vein * side, leaf.coverage(local, pixels))
         });
     }
     Surface { canvas, repeat_metres: random.uniform(0.06, 0.15) / length * 0.6 }
@@ -83,17 +83,14 @@ pub(super) fn grass(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         if patch < bare {
             continue;
         }
-        canvas.fill(root, half.abs() + width + 1. / SIZE as f32, green * light, |offset| {
-            canvas::stroke(offset, -half, half, width)
-        });
+        canvas.fill(root, Shape::Stroke { from: -half, to: half, radius: width }, green * light);
     }
     if random.chance(0.2) {
         let petals = [VIVID, WHITES, ACCENTS].map(|theme| random_theme_color(random, theme));
         for _ in 0..random.count(10, 150) {
             let radius = random.uniform(1., 3.) / SIZE as f32;
             let color = random.one_of(&petals);
-            canvas
-                .fill(random.point(), Vec2::splat(2. * radius), color, |offset| canvas::disk(offset, radius));
+            canvas.fill(random.point(), Shape::Disk { radius }, color);
         }
     }
     Surface { canvas, repeat_metres: random.uniform(0.8, 3.) }
@@ -120,18 +117,19 @@ pub(super) fn gravel(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         let turn = random.direction();
         let tone = palette.ramp(random.unit()) * (1. + spread * random.approx_normal()).max(0.2);
         let corners = random.count(3, 6);
-        let distance = |offset: Vec2| {
-            let local = turn.rotate(offset) * size / radii;
-            if angular { canvas::polygon(local, 0.75 * size, corners) } else { canvas::disk(local, size) }
+        let outline = match angular {
+            true => Shape::Polygon { radius: 0.75 * size, corners },
+            false => Shape::Disk { radius: size },
         };
+        let distance = |offset: Vec2| outline.distance(turn.rotate(offset) * size / radii);
         let reach = Vec2::splat(1.5 * size);
         let pixels = SIZE as f32;
         canvas.stamp(center - light * 0.35 * size, reach, |offset| {
-            (Vec3::splat(0.01), shadow * (0.5 - distance(offset) * pixels * 0.5).clamp(0., 1.))
+            (Vec3::splat(0.01), shadow * coverage(distance(offset), 0.5 * pixels))
         });
         canvas.stamp(center, reach, |offset| {
             let lit = 1. + strength * offset.dot(light) / size;
-            (tone * lit.max(0.1), (0.5 - distance(offset) * pixels).clamp(0., 1.))
+            (tone * lit.max(0.1), coverage(distance(offset), pixels))
         });
     }
     Surface { canvas, repeat_metres: random.uniform(0.008, 0.05) / radius }
@@ -169,16 +167,14 @@ pub(super) fn confetti(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let color = palette.any(random);
         let turn = random.direction();
         let size = length * random.uniform(0.3, 1.2);
-        let pixels = SIZE as f32;
+        let bit = match kind {
+            0 => Shape::Ellipse { radii: Vec2::new(0.5, 0.5 * slim + 0.1) * size },
+            1 => Shape::rectangle(Vec2::new(0.5, 0.5 * slim) * size),
+            2 => Shape::Polygon { radius: 0.3 * size, corners: 3 },
+            _ => Shape::Flower { radius: 0.5 * size, petals: 5, depth: slim },
+        };
         canvas.stamp(random.point(), Vec2::splat(0.8 * size), |offset| {
-            let local = turn.rotate(offset);
-            let distance = match kind {
-                0 => canvas::ellipse(local, Vec2::new(0.5, 0.5 * slim + 0.1) * size),
-                1 => canvas::rectangle(local, Vec2::new(0.5, 0.5 * slim) * size, 0.),
-                2 => canvas::polygon(local, 0.3 * size, 3),
-                _ => canvas::flower(local, 0.5 * size, 5, slim),
-            };
-            (color, clear * (0.5 - distance * pixels).clamp(0., 1.))
+            (color, clear * bit.coverage(turn.rotate(offset), SIZE as f32))
         });
     }
     Surface { canvas, repeat_metres: random.sqrt_uniform(0.4, 3.) }

@@ -1,6 +1,9 @@
 use rand_chacha::rand_core::SeedableRng;
 
 use super::*;
+use Purpose::*;
+
+const PURPOSES: [Purpose; 8] = [Floor, Wall, Ceiling, Ground, Facade, Thing, Foliage, Poster];
 
 /// Returns the mean differences between adjacent columns and between adjacent rows. The last ones are those across the border.
 fn steps(canvas: &Canvas) -> [Vec<f32>; 2] {
@@ -17,7 +20,7 @@ fn steps(canvas: &Canvas) -> [Vec<f32>; 2] {
 fn families_paint_plausible_surfaces_without_seams() {
     for (index, (family, weights)) in FAMILIES.iter().enumerate() {
         let likely = weights.iter().copied().fold(0., f32::max);
-        let purpose = Purpose::ALL[weights.iter().position(|&weight| weight == likely).expect("its own")];
+        let purpose = PURPOSES[weights.iter().position(|&weight| weight == likely).expect("its own")];
         for seed in 0..4 {
             let Surface { canvas, repeat_metres } = family(&mut ChaCha8Rng::seed_from_u64(seed), purpose);
             assert!(canvas.pixels.iter().all(|pixel| pixel.is_finite()), "family {index}");
@@ -36,13 +39,13 @@ fn families_paint_plausible_surfaces_without_seams() {
 #[test]
 fn textures_of_all_purposes_are_plausible() {
     let mut random = ChaCha8Rng::seed_from_u64(6);
-    for purpose in [Purpose::ALL; 3].concat() {
+    for purpose in [PURPOSES; 3].concat() {
         let texture = Texture::draw(&mut random, purpose);
         let within = |texel: &[u8; 4]| texel[..3].iter().all(|byte| (36..=249).contains(byte));
         assert!(texture.levels.iter().flatten().all(within), "{purpose:?}");
         let texels = &texture.levels[0];
         let sum: Vec3 = texels.iter().map(|&texel| linear_of_texel(texel).truncate()).sum();
-        let (found, mean) = (texture.mean(), sum / texels.len() as f32);
+        let (found, mean) = (texture.sample(Vec2::ZERO, 1.), sum / texels.len() as f32);
         // Both the single texel and the texels that it is compared with are rounded to bytes.
         assert!((found - mean).abs().max_element() < 0.006, "{purpose:?}: {found} for {mean}");
         for footprint in [1., 3., f32::INFINITY] {
@@ -60,21 +63,5 @@ fn samples_are_periodic_and_continuous_in_footprint() {
         let here = texture.sample(uv, 0.01);
         assert!((texture.sample(uv + Vec2::new(2., -3.), 0.01) - here).abs().max_element() < 1e-3);
         assert!((texture.sample(uv, 0.0101) - here).abs().max_element() < 0.01);
-    }
-}
-
-#[test]
-fn pictures_are_mirrored_at_their_edges() {
-    let picture = RgbImage::from_fn(300, 200, |x, y| image::Rgb([x.min(255) as u8, y as u8, 128]));
-    let texture = Texture::from_image(&picture);
-    let at = |u, v| texture.sample(Vec2::new(u, v), 0.);
-    for (u, v) in [(0.1, 0.2), (0.3, 0.45), (0.01, 0.02)] {
-        let here = at(u, v);
-        for mirrored in [at(1. - u, v), at(u, 1. - v)] {
-            assert!((mirrored - here).abs().max_element() < 0.01);
-        }
-        // The middle 200 columns, repeated twice per unit because of the mirror image.
-        let expected = palette::srgb_byte_to_linear((50. + 400. * u) as u8);
-        assert!((here.x - expected.max(0.02)).abs() < 0.02, "{} for {expected}", here.x);
     }
 }
