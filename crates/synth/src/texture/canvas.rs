@@ -96,22 +96,15 @@ impl Canvas {
     }
 
     /// Fills a shape around `center` with an edge that is one pixel soft.
-    pub fn fill(&mut self, center: Vec2, shape: Shape, color: Vec3) {
-        self.fill_turned(center, Vec2::X, shape, color);
+    pub fn fill(&mut self, center: Vec2, shape: &Shape, color: Vec3) {
+        let pixels = self.size as f32;
+        self.stamp(center, shape.reach + 1. / pixels, |offset| (color, shape.coverage(offset, pixels)));
     }
 
-    /// Fills a shape like [`Canvas::fill`], after rotating it from the direction `turn` (unit) to the x axis.
-    pub fn fill_turned(&mut self, center: Vec2, turn: Vec2, shape: Shape, color: Vec3) {
-        let scale = self.size as f32;
-        let reach = shape.reach(scale);
-        let reach = if turn == Vec2::X { reach } else { Vec2::splat(reach.length()) };
-        self.stamp(center, reach, |offset| (color, shape.coverage(turn.rotate(offset), scale)));
-    }
-
-    /// Draws a line from `origin + from` to `origin + to`, of half the width `radius`.
+    /// Draws a line with round ends from `origin + from` to `origin + to`, of half the width `radius`.
     pub fn draw_line(&mut self, origin: Vec2, from: Vec2, to: Vec2, radius: f32, color: Vec3) {
         let middle = 0.5 * (from + to);
-        self.fill(origin + middle, Shape::Stroke { from: from - middle, to: to - middle, radius }, color);
+        self.fill(origin + middle, &Shape::stroke(from - middle, to - middle, radius), color);
     }
 
     /// Returns the bilinear interpolation of four pixels at `uv` in repeats.
@@ -142,115 +135,84 @@ pub(super) fn coverage(distance: f32, pixels: f32) -> f32 {
 }
 
 /// A shape around the origin; lengths in repeats.
-#[derive(Debug, Clone, Copy)]
-pub(super) enum Shape {
-    Disk {
-        radius: f32,
-    },
-    Ellipse {
-        radii: Vec2,
-    },
-    /// A rectangle of half the size `half`, with corners rounded by `rounding`.
-    Rectangle {
-        half: Vec2,
-        rounding: f32,
-    },
-    /// A line with round ends.
-    Stroke {
-        from: Vec2,
-        to: Vec2,
-        radius: f32,
-    },
-    /// A regular polygon whose inscribed circle has radius `radius`.
-    Polygon {
-        radius: f32,
-        corners: usize,
-    },
-    /// A flower whose notches are `depth` times the radius deep.
-    Flower {
-        radius: f32,
-        petals: usize,
-        depth: f32,
-    },
-    /// A leaf along the x axis.
-    Leaf {
-        length: f32,
-        width: f32,
-    },
+pub(super) struct Shape {
+    /// Half the size of a box that contains the shape.
+    reach: Vec2,
+    distance: Box<dyn Fn(Vec2) -> f32>,
 }
 
 impl Shape {
-    /// Creates a rectangle with sharp corners.
-    pub fn rectangle(half: Vec2) -> Shape {
-        Shape::Rectangle { half, rounding: 0. }
+    /// Creates a shape from the signed distance of an offset to its edge, within a box of half the size `reach`.
+    pub fn new(reach: Vec2, distance: impl Fn(Vec2) -> f32 + 'static) -> Shape {
+        Shape { reach, distance: Box::new(distance) }
     }
 
-    /// Returns the signed distance of `offset` from the edge. It is approximate for ellipses, flowers and leaves.
-    pub fn distance(self, offset: Vec2) -> f32 {
-        match self {
-            Shape::Disk { radius } => offset.length() - radius,
-            Shape::Ellipse { radii } => ((offset / radii).length() - 1.) * radii.min_element(),
-            Shape::Rectangle { half, rounding } => {
-                let beyond = offset.abs() - half + Vec2::splat(rounding);
-                beyond.max(Vec2::ZERO).length() + beyond.max_element().min(0.) - rounding
-            }
-            Shape::Stroke { from, to, radius } => {
-                let along = to - from;
-                let t = ((offset - from).dot(along) / along.length_squared().max(1e-12)).clamp(0., 1.);
-                (offset - from - along * t).length() - radius
-            }
-            Shape::Polygon { radius, corners } => {
-                let turn = TAU / corners as f32;
-                let angle = offset.to_angle() / turn;
-                offset.length() * ((angle - angle.round()) * turn).cos() - radius
-            }
-            Shape::Flower { radius, petals, depth } => {
-                let wave = (offset.to_angle() * petals as f32).cos();
-                offset.length() - radius * (1. - depth * (0.5 - 0.5 * wave))
-            }
-            Shape::Leaf { length, width } => {
-                let t = (offset.x / length + 0.5).clamp(0., 1.);
-                let half = 2. * width * t * (1. - t);
-                (offset.y.abs() - half).max(offset.x.abs() - 0.5 * length)
-            }
-        }
+    pub fn disk(radius: f32) -> Shape {
+        Shape::new(Vec2::splat(radius), move |offset| offset.length() - radius)
     }
 
-    /// Returns the shape enlarged by `factor`.
-    pub fn scaled(self, factor: f32) -> Shape {
-        let f = factor;
-        match self {
-            Shape::Disk { radius } => Shape::Disk { radius: f * radius },
-            Shape::Ellipse { radii } => Shape::Ellipse { radii: f * radii },
-            Shape::Rectangle { half, rounding } => {
-                Shape::Rectangle { half: f * half, rounding: f * rounding }
-            }
-            Shape::Stroke { from, to, radius } => {
-                Shape::Stroke { from: f * from, to: f * to, radius: f * radius }
-            }
-            Shape::Polygon { radius, corners } => Shape::Polygon { radius: f * radius, corners },
-            Shape::Flower { radius, petals, depth } => Shape::Flower { radius: f * radius, petals, depth },
-            Shape::Leaf { length, width } => Shape::Leaf { length: f * length, width: f * width },
-        }
+    /// Creates an ellipse whose distances are exact on its edge and approximate elsewhere.
+    pub fn ellipse(radii: Vec2) -> Shape {
+        Shape::new(radii, move |offset| ((offset / radii).length() - 1.) * radii.min_element())
+    }
+
+    /// Creates a rectangle of half the size `half`, with corners rounded by `rounding`.
+    pub fn rectangle(half: Vec2, rounding: f32) -> Shape {
+        Shape::new(half, move |offset| {
+            let beyond = offset.abs() - half + Vec2::splat(rounding);
+            beyond.max(Vec2::ZERO).length() + beyond.max_element().min(0.) - rounding
+        })
+    }
+
+    /// Creates a line with round ends.
+    pub fn stroke(from: Vec2, to: Vec2, radius: f32) -> Shape {
+        let along = to - from;
+        Shape::new(from.abs().max(to.abs()) + radius, move |offset| {
+            let t = ((offset - from).dot(along) / along.length_squared().max(1e-12)).clamp(0., 1.);
+            (offset - from - along * t).length() - radius
+        })
+    }
+
+    /// Creates a regular polygon with `corners` corners whose inscribed circle has radius `radius`.
+    pub fn polygon(radius: f32, corners: usize) -> Shape {
+        let turn = TAU / corners as f32;
+        // A triangle's corners are at twice its inner radius.
+        Shape::new(Vec2::splat(2. * radius), move |offset| {
+            let angle = offset.to_angle() / turn;
+            offset.length() * ((angle - angle.round()) * turn).cos() - radius
+        })
+    }
+
+    /// Creates a flower whose notches are `depth` times the radius deep, with approximate distances.
+    pub fn flower(radius: f32, petals: usize, depth: f32) -> Shape {
+        Shape::new(Vec2::splat(radius), move |offset| {
+            let wave = (offset.to_angle() * petals as f32).cos();
+            offset.length() - radius * (1. - depth * (0.5 - 0.5 * wave))
+        })
+    }
+
+    /// Creates a leaf between two points on the x axis, `length` apart and `width` across, with approximate distances.
+    pub fn leaf(length: f32, width: f32) -> Shape {
+        Shape::new(0.5 * Vec2::new(length, width), move |offset| {
+            let t = (offset.x / length + 0.5).clamp(0., 1.);
+            let half = 2. * width * t * (1. - t);
+            (offset.y.abs() - half).max(offset.x.abs() - 0.5 * length)
+        })
+    }
+
+    /// Returns the shape rotated by the negative angle of the unit vector `turn`.
+    pub fn turned(self, turn: Vec2) -> Shape {
+        let reach = if turn == Vec2::X { self.reach } else { Vec2::splat(self.reach.length()) };
+        Shape::new(reach, move |offset| (self.distance)(turn.rotate(offset)))
+    }
+
+    /// Returns the signed distance of `offset` to the edge.
+    pub fn distance(&self, offset: Vec2) -> f32 {
+        (self.distance)(offset)
     }
 
     /// Returns the share of the pixel at `offset` that the shape covers, if a repeat has `pixels` pixels.
-    pub fn coverage(self, offset: Vec2, pixels: f32) -> f32 {
+    pub fn coverage(&self, offset: Vec2, pixels: f32) -> f32 {
         coverage(self.distance(offset), pixels)
-    }
-
-    /// Returns half the size of a box that contains the shape and its soft edge, if a repeat has `pixels` pixels.
-    fn reach(self, pixels: f32) -> Vec2 {
-        let extent = match self {
-            Shape::Disk { radius } | Shape::Flower { radius, .. } => Vec2::splat(radius),
-            // The approximate distance grows more slowly along the longer axis.
-            Shape::Ellipse { radii } => radii * (1. + 1. / (pixels * radii.min_element())),
-            Shape::Rectangle { half, .. } => half,
-            Shape::Stroke { from, to, radius } => from.abs().max(to.abs()) + radius,
-            // A triangle's corners are at twice its inner radius.
-            Shape::Polygon { radius, .. } => Vec2::splat(2. * radius),
-            Shape::Leaf { length, width } => Vec2::new(0.5 * length, 0.5 * width),
-        };
-        extent + 1. / pixels
     }
 }

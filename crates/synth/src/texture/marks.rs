@@ -137,7 +137,7 @@ pub(super) fn writing(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
                     let block = Palette::draw(random, Purpose::Poster, 1).color(0);
                     let half = Vec2::new(0.5 * extent.x, 0.45 * extent.y);
                     let middle = corner + half;
-                    canvas.fill(middle, Shape::rectangle(half), block);
+                    canvas.fill(middle, &Shape::rectangle(half, 0.), block);
                 }
                 _ => script.paragraph(random, &mut canvas, corner, extent, height, ink),
             }
@@ -161,8 +161,7 @@ pub(super) fn scribbles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
             curl = 0.8 * curl + 0.3 * random.approx_normal();
             angle += curl;
             let step = Vec2::from_angle(angle) * step_length;
-            let line = Shape::Stroke { from: -0.5 * step, to: 0.5 * step, radius: width };
-            canvas.fill(at + 0.5 * step, line, color);
+            canvas.fill(at + 0.5 * step, &Shape::stroke(-0.5 * step, 0.5 * step, width), color);
             at += step;
         }
     }

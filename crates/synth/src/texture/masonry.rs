@@ -317,7 +317,7 @@ pub(super) fn concrete(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     for _ in 0..random.count(0, 250) {
         let radius = random.sqrt_uniform(0.5, 2.5) / SIZE as f32;
         let dark = base * random.uniform(0.3, 0.8);
-        canvas.fill(random.point(), Shape::Disk { radius }, dark);
+        canvas.fill(random.point(), &Shape::disk(radius), dark);
     }
     if random.chance(0.4) {
         let layout = Layout::courses(random.count(1, 3), random.count(1, 2), 0., false);

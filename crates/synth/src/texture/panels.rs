@@ -203,7 +203,7 @@ pub(super) fn shelves(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
                     let band = random.uniform(0.3, 2.) / SIZE as f32;
                     let place = middle + Vec2::new(0., half.y * random.uniform(-0.85, 0.85));
                     let half_band = Vec2::new(0.9 * half.x, band);
-                    canvas.fill(place, Shape::rectangle(half_band), label);
+                    canvas.fill(place, &Shape::rectangle(half_band, 0.), label);
                 }
                 if width > 0.04 {
                     let start = Vec2::new(x + 0.15 * width, middle.y);
@@ -253,9 +253,9 @@ pub(super) fn cupboards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
             _ => continue,
         };
         let at = middle + place * cell;
-        let knob = Shape::Rectangle { half: knob, rounding: knob.min_element() };
-        canvas.fill(at + 0.006, knob, color * 0.35);
-        canvas.fill(at, knob, metal);
+        let knob = Shape::rectangle(knob, knob.min_element());
+        canvas.fill(at + 0.006, &knob, color * 0.35);
+        canvas.fill(at, &knob, metal);
     }
     if theme == WOODS {
         let cells = if matches!(purpose, Purpose::Wall) { [2, 48] } else { [48, 2] };

@@ -133,35 +133,49 @@ pub(super) fn motifs(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.sqrt_uniform(0.3, 3.) }
 }
 
-/// Nested shapes of radius 1, the outermost first; the radius of each as a fraction of the cell's width, and its color.
-pub(super) struct Motif(Vec<(Shape, f32, Vec3)>);
+/// Nested shapes, the outermost first.
+pub(super) struct Motif {
+    layers: Vec<MotifLayer>,
+}
+
+/// A shape as a function of its radius, its radius as a fraction of the cell's width, and its color.
+type MotifLayer = (Box<dyn Fn(f32) -> Shape>, f32, Vec3);
 
 impl Motif {
     /// Draws one to four shapes.
     pub fn draw(random: &mut ChaCha8Rng, palette: &Palette) -> Motif {
-        let mut radius = random.uniform(0.15, 0.5);
-        let layers = (0..random.count(1, 4)).map(|index| {
-            let shape = match random.count(0, 4) {
-                0 => Shape::Disk { radius: 1. },
-                1 => Shape::Polygon { radius: 0.8, corners: random.count(3, 8) },
-                2 => {
-                    let petals = random.count(3, 12);
-                    Shape::Flower { radius: 1., petals, depth: random.uniform(0.2, 0.8) }
+        let mut share = random.uniform(0.15, 0.5);
+        let mut layers: Vec<MotifLayer> = Vec::new();
+        for index in 0..random.count(1, 4) {
+            let shape: Box<dyn Fn(f32) -> Shape> = match random.count(0, 4) {
+                0 => Box::new(Shape::disk),
+                1 => {
+                    let corners = random.count(3, 8);
+                    Box::new(move |radius| Shape::polygon(0.8 * radius, corners))
                 }
-                3 => Shape::Leaf { length: 2., width: random.uniform(0.2, 0.8) },
-                _ => Shape::rectangle(Vec2::new(1., random.uniform(0.3, 1.))),
+                2 => {
+                    let (petals, depth) = (random.count(3, 12), random.uniform(0.2, 0.8));
+                    Box::new(move |radius| Shape::flower(radius, petals, depth))
+                }
+                3 => {
+                    let width = random.uniform(0.2, 0.8);
+                    Box::new(move |radius| Shape::leaf(2. * radius, width * radius))
+                }
+                _ => {
+                    let aspect = random.uniform(0.3, 1.);
+                    Box::new(move |radius| Shape::rectangle(Vec2::new(radius, aspect * radius), 0.))
+                }
             };
-            let layer = (shape, radius, palette.color(index + 1));
-            radius *= random.uniform(0.4, 0.85);
-            layer
-        });
-        Motif(layers.collect())
+            layers.push((shape, share, palette.color(index + 1)));
+            share *= random.uniform(0.4, 0.85);
+        }
+        Motif { layers }
     }
 
     /// Paints the motif into a cell of width `cell`, rotated by `turn`.
     pub fn paint(&self, canvas: &mut Canvas, center: Vec2, cell: f32, turn: Vec2) {
-        for &(shape, radius, color) in &self.0 {
-            canvas.fill_turned(center, turn, shape.scaled(radius * cell), color);
+        for (shape, share, color) in &self.layers {
+            canvas.fill(center, &shape(share * cell).turned(turn), *color);
         }
     }
 }
@@ -201,10 +215,9 @@ pub(super) fn ornament(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
                     let length = leaf.x * cell;
                     let turn = Vec2::from_angle(-angle - 0.8) * mirror;
                     let tip = center + to + Vec2::new(turn.x, -turn.y) * 0.5 * length;
-                    let leaf = Shape::Leaf { length, width: length * leaf.y };
+                    let leaf = Shape::leaf(length, length * leaf.y).turned(Vec2::from_angle(-angle - 0.8));
                     canvas.stamp(tip, Vec2::splat(length), |offset| {
-                        let local = Vec2::from_angle(-angle - 0.8).rotate(offset * mirror);
-                        (palette.color(2), leaf.coverage(local, SIZE as f32))
+                        (palette.color(2), leaf.coverage(offset * mirror, SIZE as f32))
                     });
                 }
             }
@@ -333,7 +346,7 @@ pub(super) fn carpet(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         let squeeze = Vec2::new(1., random.uniform(0.7, 1.4));
         for layer in 0..random.count(2, 7) {
             let color = palette.color(layer + 1);
-            let flower = Shape::Flower { radius, petals, depth };
+            let flower = Shape::flower(radius, petals, depth);
             canvas.stamp(middle, Vec2::splat(0.5), |offset| {
                 (color, flower.coverage(offset * squeeze, SIZE as f32))
             });

@@ -53,7 +53,7 @@ fn landscape(random: &mut ChaCha8Rng) -> Canvas {
     .without_wrapping();
     if random.chance(0.4) {
         let (sun, radius) = (Vec2::new(random.unit(), horizon * random.unit()), random.uniform(0.02, 0.09));
-        canvas.fill(sun, Shape::Disk { radius }, haze.lerp(Vec3::ONE, 0.7));
+        canvas.fill(sun, &Shape::disk(radius), haze.lerp(Vec3::ONE, 0.7));
     }
     let theme = random.weighted(&[(GREENS, 4.), (AUTUMN, 2.), (ACCENTS, 1.), (STONES, 1.)]);
     let ranges = random.count(2, 6);
@@ -83,7 +83,7 @@ fn landscape(random: &mut ChaCha8Rng) -> Canvas {
                 let top = base - height * (1. + profile.values[((x * SIZE as f32) as usize).min(SIZE - 1)]);
                 let color = ground * random.uniform(0.3, 0.9);
                 let slim = random.uniform(0.4, 1.);
-                let crown = Shape::Flower { radius: size, petals: random.count(3, 9), depth: 0.25 };
+                let crown = Shape::flower(size, random.count(3, 9), 0.25);
                 canvas.stamp(Vec2::new(x, top - 0.3 * size), Vec2::splat(1.2 * size), |offset| {
                     (color, crown.coverage(offset / Vec2::new(slim, 1.), SIZE as f32))
                 });
@@ -109,9 +109,10 @@ fn portrait(random: &mut ChaCha8Rng) -> Canvas {
         let light = Vec2::new(random.uniform(-1., 1.), -0.4);
         let mut blob = |place: Vec2, radii: Vec2, color: Vec3, shading: f32| {
             let (place, radii) = (place * size, radii * size);
+            let ellipse = Shape::ellipse(radii);
             canvas.stamp(head + place, radii + 0.004, |offset| {
                 let lit = 1. + shading * (offset / radii).dot(light);
-                (color * lit.max(0.2), Shape::Ellipse { radii }.coverage(offset, SIZE as f32))
+                (color * lit.max(0.2), ellipse.coverage(offset, SIZE as f32))
             });
         };
         let long = random.uniform(0., 1.);
@@ -143,22 +144,20 @@ fn shapes(random: &mut ChaCha8Rng) -> Canvas {
         let turn = if straight { random.one_of(&[Vec2::X, Vec2::Y]) } else { random.direction() };
         let (kind, corners, depth) = (random.count(0, 4), random.count(3, 6), random.uniform(0., 0.7));
         let shape = match kind {
-            1 => Shape::Polygon { radius: 0.6 * size, corners },
-            2 => Shape::Flower { radius: size, petals: corners, depth },
-            4 => Shape::rectangle(half),
-            _ => Shape::Disk { radius: size },
+            0 => Shape::disk(size),
+            1 => Shape::polygon(0.6 * size, corners),
+            2 => Shape::flower(size, corners, depth),
+            // Half a disk.
+            3 => Shape::new(Vec2::splat(size), move |offset| (offset.length() - size).max(offset.y)),
+            _ => Shape::rectangle(half, 0.),
         };
-        let distance = |offset: Vec2| {
-            let local = turn.rotate(offset);
-            // Kind 3 is half a disk.
-            if kind == 3 { shape.distance(local).max(local.y) } else { shape.distance(local) }
-        };
+        let shape = shape.turned(turn);
         let (center, reach) = (random.point(), Vec2::splat(1.42 * size));
         let color = palette.any(random);
-        canvas.stamp(center, reach, |offset| (color, coverage(distance(offset), SIZE as f32)));
+        canvas.stamp(center, reach, |offset| (color, shape.coverage(offset, SIZE as f32)));
         if line > 0. {
             canvas.stamp(center, reach, |offset| {
-                (Vec3::splat(0.02), coverage(distance(offset).abs() - line, SIZE as f32))
+                (Vec3::splat(0.02), coverage(shape.distance(offset).abs() - line, SIZE as f32))
             });
         }
     }
@@ -204,7 +203,7 @@ fn print(random: &mut ChaCha8Rng) -> Canvas {
                 let height = random.uniform(0.03, 0.2).min(left);
                 let color = Palette::draw(random, Purpose::Poster, 1).color(0);
                 let half = Vec2::new(random.one_of(&[0.5, 0.43, 0.2]), 0.5 * height);
-                canvas.fill(Vec2::new(0.5, top + half.y), Shape::rectangle(half), color);
+                canvas.fill(Vec2::new(0.5, top + half.y), &Shape::rectangle(half, 0.), color);
                 top += height + 0.02;
             }
         }
@@ -226,7 +225,7 @@ fn painting(random: &mut ChaCha8Rng) -> Canvas {
         let spot = random.point();
         let along = Vec2::from_angle(turns * flow.sample(spot)) * 0.5 * length;
         let color = model.sample(spot) * (1. + spread * random.approx_normal()).max(0.2);
-        canvas.fill(spot, Shape::Stroke { from: -along, to: along, radius: 0.5 * width }, color);
+        canvas.fill(spot, &Shape::stroke(-along, along, 0.5 * width), color);
     }
     canvas
 }
@@ -247,13 +246,14 @@ fn dead_leaves(random: &mut ChaCha8Rng) -> Canvas {
         let half = Vec2::new(1., random.uniform(0.3, 1.)) * size;
         let shading = random.uniform(0., 0.5);
         let leaf = match kind {
-            0 => Shape::Ellipse { radii: half },
-            1 => Shape::Rectangle { half, rounding: 0.2 * half.y },
-            _ => Shape::Polygon { radius: 0.7 * size, corners: 3 },
+            0 => Shape::ellipse(half),
+            1 => Shape::rectangle(half, 0.2 * half.y),
+            _ => Shape::polygon(0.7 * size, 3),
         };
+        let leaf = leaf.turned(turn);
         canvas.stamp(random.point(), Vec2::splat(1.42 * size), |offset| {
             let lit = 1. + shading * offset.dot(light) / size;
-            (color * lit.max(0.1), leaf.coverage(turn.rotate(offset), SIZE as f32))
+            (color * lit.max(0.1), leaf.coverage(offset, SIZE as f32))
         });
     }
     canvas
@@ -269,23 +269,23 @@ fn flowers(random: &mut ChaCha8Rng) -> Canvas {
         let head = Vec2::new(random.uniform(0.12, 0.88), random.uniform(0.1, 0.6));
         let stem = palette_shade(random, &green);
         let half = 0.5 * (foot - head);
-        canvas.fill(head + half, Shape::Stroke { from: -half, to: half, radius: 0.005 }, stem);
+        canvas.fill(head + half, &Shape::stroke(-half, half, 0.005), stem);
         for _ in 0..random.count(0, 3) {
             let (place, turn) = (head.lerp(foot, random.uniform(0.2, 0.9)), random.direction());
             let (length, leaf) = (random.uniform(0.08, 0.2), palette_shade(random, &green));
-            canvas.fill_turned(place, turn, Shape::Leaf { length, width: 0.35 * length }, leaf);
+            canvas.fill(place, &Shape::leaf(length, 0.35 * length).turned(turn), leaf);
         }
         let petals = random_color_of_themes(random, &[(VIVID, 2.), (ACCENTS, 3.), (WHITES, 1.)]);
         let (count, depth) = (random.count(4, 14), random.uniform(0.2, 0.7));
         let mut radius = random.uniform(0.04, 0.14);
         for layer in 0..random.count(2, 4) {
             let color = petals * (1. - 0.2 * layer as f32);
-            let flower = Shape::Flower { radius, petals: count, depth };
-            canvas.fill_turned(head, random.direction(), flower, color);
+            let flower = Shape::flower(radius, count, depth).turned(random.direction());
+            canvas.fill(head, &flower, color);
             radius *= 0.65;
         }
         let heart = random_theme_color(random, AUTUMN);
-        canvas.fill(head, Shape::Disk { radius: 0.6 * radius }, heart);
+        canvas.fill(head, &Shape::disk(0.6 * radius), heart);
     }
     canvas
 }
@@ -330,10 +330,10 @@ fn screen(random: &mut ChaCha8Rng) -> Canvas {
         let paper = if random.chance(0.6) { Vec3::splat(0.85) } else { Vec3::splat(0.04) };
         let half = Vec2::new(random.uniform(0.12, 0.45), random.uniform(0.12, 0.45));
         let middle = Vec2::new(random.uniform(0.2, 0.8), random.uniform(0.2, 0.8));
-        canvas.fill(middle, Shape::Rectangle { half, rounding: 0.01 }, paper);
+        canvas.fill(middle, &Shape::rectangle(half, 0.01), paper);
         let bar = Palette::draw(random, Purpose::Poster, 1).color(0);
-        let title = Shape::rectangle(Vec2::new(half.x, 0.02));
-        canvas.fill(middle - Vec2::new(0., half.y - 0.02), title, bar);
+        let title = Shape::rectangle(Vec2::new(half.x, 0.02), 0.);
+        canvas.fill(middle - Vec2::new(0., half.y - 0.02), &title, bar);
         let ink = ink_for(random, paper);
         let corner = middle - half + Vec2::new(0.02, 0.06);
         script.paragraph(random, &mut canvas, corner, 2. * half - Vec2::new(0.04, 0.08), 0.018, ink);

@@ -48,7 +48,7 @@ pub(super) fn leaves(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let width = size * slim * random.uniform(0.6, 1.1);
         let tilt = random.uniform(-0.35, 0.35);
         let pixels = SIZE as f32;
-        let leaf = Shape::Leaf { length: size, width };
+        let leaf = Shape::leaf(size, width);
         canvas.stamp(random.point(), Vec2::splat(0.55 * size), |offset| {
             let local = turn.rotate(offset);
             let vein = 1. + veined * (1. - local.y.abs() * pixels).max(0.);
@@ -83,14 +83,14 @@ pub(super) fn grass(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         if patch < bare {
             continue;
         }
-        canvas.fill(root, Shape::Stroke { from: -half, to: half, radius: width }, green * light);
+        canvas.fill(root, &Shape::stroke(-half, half, width), green * light);
     }
     if random.chance(0.2) {
         let petals = [VIVID, WHITES, ACCENTS].map(|theme| random_theme_color(random, theme));
         for _ in 0..random.count(10, 150) {
             let radius = random.uniform(1., 3.) / SIZE as f32;
             let color = random.one_of(&petals);
-            canvas.fill(random.point(), Shape::Disk { radius }, color);
+            canvas.fill(random.point(), &Shape::disk(radius), color);
         }
     }
     Surface { canvas, repeat_metres: random.uniform(0.8, 3.) }
@@ -118,8 +118,8 @@ pub(super) fn gravel(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         let tone = palette.ramp(random.unit()) * (1. + spread * random.approx_normal()).max(0.2);
         let corners = random.count(3, 6);
         let outline = match angular {
-            true => Shape::Polygon { radius: 0.75 * size, corners },
-            false => Shape::Disk { radius: size },
+            true => Shape::polygon(0.75 * size, corners),
+            false => Shape::disk(size),
         };
         let distance = |offset: Vec2| outline.distance(turn.rotate(offset) * size / radii);
         let reach = Vec2::splat(1.5 * size);
@@ -168,13 +168,14 @@ pub(super) fn confetti(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let turn = random.direction();
         let size = length * random.uniform(0.3, 1.2);
         let bit = match kind {
-            0 => Shape::Ellipse { radii: Vec2::new(0.5, 0.5 * slim + 0.1) * size },
-            1 => Shape::rectangle(Vec2::new(0.5, 0.5 * slim) * size),
-            2 => Shape::Polygon { radius: 0.3 * size, corners: 3 },
-            _ => Shape::Flower { radius: 0.5 * size, petals: 5, depth: slim },
+            0 => Shape::ellipse(Vec2::new(0.5, 0.5 * slim + 0.1) * size),
+            1 => Shape::rectangle(Vec2::new(0.5, 0.5 * slim) * size, 0.),
+            2 => Shape::polygon(0.3 * size, 3),
+            _ => Shape::flower(0.5 * size, 5, slim),
         };
+        let bit = bit.turned(turn);
         canvas.stamp(random.point(), Vec2::splat(0.8 * size), |offset| {
-            (color, clear * bit.coverage(turn.rotate(offset), SIZE as f32))
+            (color, clear * bit.coverage(offset, SIZE as f32))
         });
     }
     Surface { canvas, repeat_metres: random.sqrt_uniform(0.4, 3.) }
