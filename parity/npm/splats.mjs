@@ -1,15 +1,13 @@
 // Reads or writes a splat with a third-party library, for parity/tests/test_splat_formats.py.
 //
-//     node splats.mjs read  adobe|spz-js|babylon FILE NUMBERS.json
-//     node splats.mjs write adobe|spz-js NUMBERS.json FILE [VERSION]
+//     node splats.mjs read  adobe|babylon FILE NUMBERS.json
+//     node splats.mjs write adobe NUMBERS.json FILE VERSION
 //
 // NUMBERS.json has one flat list per property, with the values of a 3DGS PLY for all Gaussians; rotations are x, y, z, w.
 
-import { createReadStream, readFileSync, writeFileSync } from "node:fs";
+import { readFileSync, writeFileSync } from "node:fs";
 import { dirname, extname, join } from "node:path";
-import { Readable } from "node:stream";
 import createSpz from "@adobe/spz";
-import * as spzJs from "spz-js";
 
 const LISTS = ["positions", "scales", "rotations", "alphas", "colors", "sh"];
 
@@ -19,24 +17,12 @@ async function adobe() {
   const axes = spz.CoordinateSystem.RDF;
   return {
     read: (file) => spz.loadSpzFromBuffer(new Uint8Array(readFileSync(file)), { to: axes }),
-    write: (cloud, file, version) => {
+    write: (cloud, version) => {
       const options = { version: Number(version), from: axes, sh1Bits: 5, shRestBits: 4 };
       return spz.saveSpzToBuffer({ ...cloud, extensions: [] }, options);
     },
   };
 }
-
-/** spz-js, an implementation of the same formats in JavaScript, which does not convert axes. */
-const inJavaScript = {
-  read: (file) => {
-    const stream = Readable.toWeb(createReadStream(file));
-    return file.endsWith(".compressed.ply") ? spzJs.loadCompressedPly(stream) : spzJs.loadPly(stream);
-  },
-  write: (cloud, file) => {
-    if (file.endsWith(".spz")) return spzJs.serializeSpz(cloud);
-    return file.endsWith(".compressed.ply") ? spzJs.serializeCompressedPly(cloud) : spzJs.serializePly(cloud);
-  },
-};
 
 /**
  * Loads Babylon.js' glTF loader, with an engine that renders nothing. The loader rounds all values to bytes, except for positions and
@@ -92,8 +78,8 @@ async function babylon() {
   return { read };
 }
 
-const [verb, program, from, to, ...more] = process.argv.slice(2);
-const { read, write } = await { adobe, babylon, "spz-js": () => inJavaScript }[program]();
+const [verb, program, from, to, version] = process.argv.slice(2);
+const { read, write } = await { adobe, babylon }[program]();
 if (verb === "read") {
   const cloud = await read(from);
   const lists = LISTS.map((name) => [name, Array.from(cloud[name])]);
@@ -101,5 +87,5 @@ if (verb === "read") {
 } else {
   const cloud = JSON.parse(readFileSync(from));
   LISTS.forEach((name) => (cloud[name] = new Float32Array(cloud[name])));
-  writeFileSync(to, Buffer.from(await write(cloud, to, ...more)));
+  writeFileSync(to, Buffer.from(write(cloud, version)));
 }

@@ -117,10 +117,9 @@ fn convert_edits_in_the_given_order() {
         assert_says(&error, &["expected another name"]);
     }
     let back =
-        "--translate 4,-5,6 --scale 0.333333333333333 --rotate 0,0,-100 --rotate 0,40,0 --rotate -20,0,0";
-    let back: Vec<&str> = back.split(' ').collect();
+        ["--translate", "4,-5,6", "--scale", "0.333333333333333", "--rotate=0,0,-100", "--rotate=0,40,0"];
     let again = folder.path().join("again.ply");
-    succeed(&[&["convert", arg(&to), arg(&again)][..], &back].concat());
+    succeed(&[&["convert", arg(&to), arg(&again)][..], &back, &["--rotate=-20,0,0"]].concat());
     let again = read_splat(&again).unwrap();
     let farthest = splat_files::largest_error(again.means.as_flattened(), splat.means.as_flattened());
     assert!(farthest < 1e-5, "{farthest}");
@@ -147,16 +146,8 @@ fn convert_edits_in_the_given_order() {
         stray.means[0] = [0., 0., -500.];
         written(folder.path(), "stray.ply", &stray)
     };
-    let seen = convert(&[
-        "--merge",
-        arg(&stray),
-        "--scale",
-        "2",
-        "--prune-unseen",
-        arg(&room),
-        "--scene",
-        arg(&room),
-    ]);
+    let seen = ["--merge", arg(&stray), "--scale", "2", "--prune-unseen", arg(&room), "--scene", arg(&room)];
+    let seen = convert(&seen);
     assert_eq!(counts(&seen)[..2], [all + 1, all + 1]);
     assert!(counts(&seen)[2] <= all && seen["psnr"].as_f64().unwrap() > 35., "{seen}");
     assert!(read_splat(&to).unwrap().means.iter().all(|mean| mean[2] > -100.), "the stray one is gone");
@@ -197,19 +188,15 @@ fn convert_preserves_the_views_of_a_capture() {
             succeed(&[&["convert", arg(&strong), arg(&to)], options, always].concat());
             let copy = read_splat(&to).unwrap();
             if !always.is_empty() {
-                let largest = |numbers: &[[f32; 3]]| {
-                    numbers.as_flattened().iter().fold(0f32, |largest, number| largest.max(number.abs()))
+                let limits = ShLimits::of_viewers(3);
+                let is_within = |index: usize| {
+                    copy.sh_of(index).iter().enumerate().all(|(basis, color)| {
+                        let (low, high) = limits.range_of(basis);
+                        // Formats round to steps of 0.03 or less.
+                        color.iter().all(|&value| (low - 0.02..high + 0.02).contains(&value.into()))
+                    })
                 };
-                let beyond = (0..copy.len()).map(|index| {
-                    let (dc, rest) = copy.sh_of(index).split_at(1);
-                    [largest(dc) * 0.28209479 - 0.5, largest(rest) - 1.]
-                });
-                // SPZ's quantization step is 0.03.
-                let beyond = beyond.fold([0f32; 2], |a, b| [a[0].max(b[0]), a[1].max(b[1])]);
-                assert!(
-                    beyond.iter().all(|&beyond| beyond < 0.02),
-                    "{ending}: {beyond:?} beyond what viewers hold"
-                );
+                assert!((0..copy.len()).all(is_within), "{ending}: beyond what viewers hold");
             }
             globalsplat::metrics::psnr_between(&splat, &copy, &cameras).unwrap().unwrap()
         };
@@ -218,14 +205,10 @@ fn convert_preserves_the_views_of_a_capture() {
     }
     // A message appears only without a capture.
     let (out, own) = (folder.path().join("b.spz"), folder.path().join("b.ply"));
-    let said = |more: &[&str]| {
-        let done =
-            crate::common::program::globalsplat(&[&["convert", arg(&strong), arg(&out)], more].concat());
-        String::from_utf8(done.stderr).unwrap()
-    };
-    assert!(said(&[]).contains("beyond what the format holds"), "{}", said(&[]));
-    assert!(said(&["--clamp-sh"]).contains("beyond what viewers hold"), "{}", said(&["--clamp-sh"]));
-    assert_eq!(said(&["--scene", arg(&room)]), "");
+    let convert = |more: &[&str]| said(&[&["convert", arg(&strong), arg(&out)], more].concat()).0;
+    assert_says(&convert(&[]), &["beyond what the format holds"]);
+    assert_says(&convert(&["--clamp-sh"]), &["beyond what viewers hold"]);
+    assert_eq!(convert(&["--scene", arg(&room)]), "");
     for to in [&out, &own] {
         let refine = ["refine", "--splat", arg(&strong), "--scene", arg(&room), "--steps", "1", "--out"];
         succeed(&[&refine[..], &[arg(to)]].concat());

@@ -76,12 +76,12 @@ impl<'a> Reader<'a> {
             let expected = "about as many pixels as Gaussians, and at most 256 times the bytes of the file";
             return Err(Error::input(self.path, name, found, expected));
         }
-        let bytes_per_pixel = if decoder.has_alpha() { 4 } else { 3 };
-        let mut bytes = vec![0; count * bytes_per_pixel];
+        let has_alpha = decoder.has_alpha();
+        let mut bytes = vec![0; count * if has_alpha { 4 } else { 3 }];
         decoder.read_image(&mut bytes).map_err(damaged)?;
-        let pixels = match bytes_per_pixel {
-            4 => bytes.as_chunks().0.to_vec(),
-            _ => bytes.as_chunks().0.iter().map(|&[red, green, blue]| [red, green, blue, 255]).collect(),
+        let pixels = match has_alpha {
+            true => bytes.as_chunks().0.to_vec(),
+            false => bytes.as_chunks().0.iter().map(|&[red, green, blue]| [red, green, blue, 255]).collect(),
         };
         Ok(Image { width: width as usize, pixels })
     }
@@ -99,22 +99,22 @@ pub fn encode_all(path: &Path, images: Vec<(&'static str, Image)>) -> Result<Vec
 
 /// Encodes an image with and without prediction of pixels from their neighbours, and returns the smaller file.
 fn encode_webp(image: &Image) -> std::result::Result<Vec<u8>, image_webp::EncodingError> {
-    let is_opaque = image.pixels.iter().all(|pixel| pixel[3] == 255);
-    let color = if is_opaque { ColorType::Rgb8 } else { ColorType::Rgba8 };
-    let channels = if is_opaque { 3 } else { 4 };
+    let (color, channels) = match image.pixels.iter().all(|pixel| pixel[3] == 255) {
+        true => (ColorType::Rgb8, 3),
+        false => (ColorType::Rgba8, 4),
+    };
     let bytes: Vec<u8> = image.pixels.iter().flat_map(|pixel| &pixel[..channels]).copied().collect();
     let height = image.pixels.len() / image.width;
-    let mut smallest: Option<Vec<u8>> = None;
-    for use_predictor_transform in [false, true] {
+    let encode = |use_predictor_transform| {
         let mut file = vec![];
         let mut encoder = WebPEncoder::new(&mut file);
         let mut params = EncoderParams::default();
         params.use_predictor_transform = use_predictor_transform;
         encoder.set_params(params);
-        encoder.encode(&bytes, image.width as u32, height as u32, color)?;
-        smallest = smallest.filter(|smallest| smallest.len() <= file.len()).or(Some(file));
-    }
-    Ok(smallest.expect("two files"))
+        encoder.encode(&bytes, image.width as u32, height as u32, color).map(|()| file)
+    };
+    let (plain, predicted) = (encode(false)?, encode(true)?);
+    Ok(if plain.len() <= predicted.len() { plain } else { predicted })
 }
 
 /// Writes `meta.json` and the images to a ZIP archive.

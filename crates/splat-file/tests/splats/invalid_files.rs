@@ -198,19 +198,6 @@ fn invalid_values_are_refused_or_left_out() {
     assert_says(&error, &["the number of Gaussians is 3, none of which"]);
 }
 
-/// An invalid bound of a chunk of a compressed PLY makes all of the chunk's Gaussians invalid.
-#[test]
-fn compressed_gaussians_without_bounds_are_left_out() {
-    let mut bytes = bytes_of("compressed.ply", &random_splat(300, 0, 4));
-    let body = body_of_ply(&bytes);
-    bytes[body + 4..][..4].copy_from_slice(&f32::NAN.to_le_bytes());
-    let file = tempfile::NamedTempFile::with_suffix(".ply").unwrap();
-    std::fs::write(&file, bytes).unwrap();
-    let repaired = read_splat_without_invalid(file.path()).unwrap();
-    assert_eq!(repaired.len(), 44);
-    assert_says(&repaired.warnings[0], &["256 of 300 Gaussians are left out", ": position"]);
-}
-
 /// A PLY without the properties that make Gaussians of points is reported as a point cloud.
 #[test]
 fn point_clouds_are_refused() {

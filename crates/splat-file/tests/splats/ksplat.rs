@@ -33,8 +33,6 @@ fn ksplats_are_read() {
 #[test]
 fn bad_ksplats() {
     let whole = std::fs::read(file("level_1.ksplat")).unwrap();
-    // Three sections, two lengths of partial buckets, four centers and a position precede the first scale.
-    const SCALE: usize = HEADER + 3 * SECTION_HEADER + 2 * 4 + 4 * 12 + 6;
     const ALL: [u8; 4] = [255; 4];
     for (at, number, message) in [
         (0, &[1][..], "the version is 1.1, expected 0.1"),
@@ -50,10 +48,6 @@ fn bad_ksplats() {
         (HEADER + 20, &[10], "the size of a bucket of section 0 is 10, expected 12 bytes"),
         (HEADER + 8, &[3], "the number of Gaussians in the buckets of section 0 is 9, expected 11"),
         (HEADER + SECTION_HEADER + 40, &[4], "the SH degree is 4, expected 0 to 3"),
-        (HEADER + 16, &[0, 0, 128, 127], "the position of Gaussian 0 is"),
-        (SCALE, &[0, 0x7c], "the scale of Gaussian 0 is inf,"),
-        (SCALE, &[0, 0xbc], "the scale of Gaussian 0 is -1,"),
-        (SCALE + 6, &[0, 0x7e], "the rotation of Gaussian 0 is NaN,"),
     ] {
         let mut bytes = whole.clone();
         bytes[at..at + number.len()].copy_from_slice(number);

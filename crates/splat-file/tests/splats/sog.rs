@@ -1,23 +1,11 @@
-//! SOG: the values of its images, and invalid files.
+//! SOG: its files, and invalid ones. PlayCanvas' splat-transform reads what is written in parity/tests/test_splat_formats.py.
 
-use super::common::{
-    Random, assert_bytes_refused, assert_refused, assert_says, bytes_of, largest_error, written,
-};
+use super::common::{Random, assert_bytes_refused, assert_refused, assert_says, bytes_of, written};
 use globalsplat_splat_file::{Splat, read_splat, read_splat_without_invalid, splat_files};
-use image_webp::{ColorType, WebPDecoder, WebPEncoder};
+use image_webp::{ColorType, WebPEncoder};
 use serde_json::{Value, json};
 use std::fs;
-use std::io::Cursor;
 use std::path::{Path, PathBuf};
-
-fn pixels(path: &Path) -> (u32, Vec<[u8; 4]>) {
-    let mut decoder = WebPDecoder::new(Cursor::new(fs::read(path).unwrap())).unwrap();
-    let channels = if decoder.has_alpha() { 4 } else { 3 };
-    let mut bytes = vec![0; decoder.output_buffer_size().unwrap()];
-    decoder.read_image(&mut bytes).unwrap();
-    let pixel = |pixel: &[u8]| [pixel[0], pixel[1], pixel[2], pixel.get(3).copied().unwrap_or(255)];
-    (decoder.dimensions().0, bytes.chunks_exact(channels).map(pixel).collect())
-}
 
 fn write_pixels(path: &Path, width: u32, pixels: &[[u8; 4]]) {
     let mut file = vec![];
@@ -39,51 +27,6 @@ fn three(folder: &Path) -> (Splat, PathBuf) {
     .unwrap();
     let path = written(folder, "meta.json", &splat);
     (splat, path)
-}
-
-/// The images have the values that the format's description says, for each Gaussian in the same pixel.
-#[test]
-fn a_sog_is_as_documented() {
-    let folder = tempfile::tempdir().unwrap();
-    let (splat, path) = three(folder.path());
-    let meta: Value = serde_json::from_slice(&fs::read(&path).unwrap()).unwrap();
-    assert_eq!([&meta["version"], &meta["count"], &meta["antialias"]], [&json!(2), &json!(3), &json!(false)]);
-    let image = |name: &str| pixels(&folder.path().join(name));
-    let (width, quats) = image("quats.webp");
-    assert_eq!((width, quats.len()), (2, 4));
-    // Gaussians by their second coordinate of the position, from 0 at the lower bound to 65,535 at the upper bound.
-    let [low, high] = ["means_l.webp", "means_u.webp"].map(|name| image(name).1);
-    let y = |pixel: usize| u16::from_le_bytes([low[pixel][1], high[pixel][1]]);
-    let pixel_of: Vec<usize> = [0u16, 32_768, 65_535]
-        .iter()
-        .map(|expected| (0..3).find(|&pixel| y(pixel) == *expected).unwrap())
-        .collect();
-    assert_eq!(meta["means"]["mins"][1], json!(-(2f64.ln())));
-    assert_eq!(meta["means"]["maxs"][2], json!(31f64.ln()));
-    let length = 0.95f64.sqrt();
-    let byte = |part: f64| ((part / length / 2f64.sqrt() + 0.5) * 255.).round() as u8;
-    let [a, b, c] = [0.1, 0.2, 0.3].map(byte);
-    assert_eq!(quats[pixel_of[0]], [a, b, c, 252]);
-    assert_eq!(quats[pixel_of[1]], [byte(-0.1), byte(-0.2), byte(-0.3), 253], "the sign of x is positive");
-    assert_eq!(quats[pixel_of[2]], [a, b, c, 255]);
-    let codebook = |entry: &Value| -> Vec<f32> { serde_json::from_value(entry["codebook"].clone()).unwrap() };
-    let (scales, colors, rest) = (codebook(&meta["scales"]), codebook(&meta["sh0"]), codebook(&meta["shN"]));
-    assert_eq!([scales.len(), colors.len(), rest.len()], [256; 3]);
-    let (scale_pixels, color_pixels) = (image("scales.webp").1, image("sh0.webp").1);
-    let (labels, centroids) = (image("shN_labels.webp").1, image("shN_centroids.webp"));
-    assert_eq!(centroids.0, 64 * 3);
-    for (index, &pixel) in pixel_of.iter().enumerate() {
-        let values = |codebook: &[f32], pixel: [u8; 4]| [0, 1, 2].map(|k| codebook[usize::from(pixel[k])]);
-        assert_eq!(values(&scales, scale_pixels[pixel]), splat.log_scales[index]);
-        assert_eq!(values(&colors, color_pixels[pixel]), splat.sh_of(index)[0]);
-        assert_eq!(color_pixels[pixel][3], [128, 225, 0][index], "opacity");
-        let label = usize::from(u16::from_le_bytes([labels[pixel][0], labels[pixel][1]]));
-        for k in 0..3 {
-            assert_eq!(values(&rest, centroids.1[label * 3 + k]), splat.sh_of(index)[1 + k]);
-        }
-    }
-    let files = splat_files(&path);
-    assert!(files.contains(&folder.path().join("quats.webp")) && files.len() == 9, "{files:?}");
 }
 
 /// The archive holds the same files, and archives with compressed entries are read, too.
@@ -109,7 +52,7 @@ fn bundles_hold_the_same_files() {
     }
     compressed.finish().unwrap();
     assert_eq!(read_splat(&folder.path().join("b.sog")).unwrap(), unbundled);
-    assert!(largest_error(unbundled.means.as_flattened(), splat.means.as_flattened()) < 25.);
+    assert!(splat_files(&path).contains(&folder.path().join("quats.webp")) && splat_files(&path).len() == 9);
 }
 
 /// Changes the `meta.json` at `path`.
@@ -153,9 +96,7 @@ fn bad_images_and_archives() {
     let folder = tempfile::tempdir().unwrap();
     let (splat, path) = three(folder.path());
     let file = folder.path().join("quats.webp");
-    let (width, mut quats) = pixels(&file);
-    quats[1][3] = 251;
-    write_pixels(&file, width, &quats);
+    write_pixels(&file, 2, &[252, 251, 255, 252].map(|mode| [128, 128, 128, mode]));
     assert_refused(&path, &["the rotation of Gaussian 1 is NaN"]);
     assert_eq!(read_splat_without_invalid(&path).unwrap().len(), 2);
     write_pixels(&file, 1000, &vec![[9; 4]; 1_000_000]);

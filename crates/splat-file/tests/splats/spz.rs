@@ -1,4 +1,4 @@
-//! SPZ: its bytes, older versions, and invalid files.
+//! SPZ: all versions, and invalid files. Niantic's library reads what is written in parity/tests/test_splat_formats.py.
 
 use super::common::{
     assert_bytes_refused, assert_says, assert_within, bytes_of, largest_error, random_splat, read_bytes,
@@ -13,41 +13,6 @@ fn bytes_of_version(spz_version: u32, splat: &Splat) -> Vec<u8> {
     let path = folder.path().join("a.spz");
     write_local_splat(&path, splat, &WriteOptions { spz_version }).unwrap();
     std::fs::read(path).unwrap()
-}
-
-/// An SPZ file has the values of the first Gaussian at the offsets of SPZ's documentation.
-#[test]
-fn an_spz_is_as_documented() {
-    let splat = Splat::new(
-        1,
-        vec![[1., 2., 3.]],
-        vec![[-1., -2., -3.]],
-        vec![[0.9, 0.1, 0.2, 0.3]],
-        vec![0.5],
-        vec![[0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]],
-    )
-    .unwrap();
-    let unfolded = ungzip(&bytes_of_version(3, &splat));
-    assert_eq!(unfolded[..4], *b"NGSP");
-    assert_eq!(unfolded[4..16], [3, 0, 0, 0, 1, 0, 0, 0, 1, 21, 0, 0], "version, Gaussians, degree, bits");
-    // Niantic's library gives these bytes for these values, except for positions, which it stores with 12 fractional bits, and
-    // coefficients.
-    assert_eq!(unfolded[25..36], hex("9f83878b908070de52aac4")[..]);
-    // Bytes of the coefficients: −0.1·128 + 128 and so on; y and z change their sign.
-    assert_eq!(unfolded[36..], hex("73665a4d4033dae6f3"));
-    assert_eq!(unfolded[16..25], hex("0000200000c00000a0")[..], "1 << 21, −2 << 21 and −3 << 21");
-    // Version 2 differs in its rotations, a byte for each of x, y and z.
-    let older = ungzip(&bytes_of_version(2, &splat));
-    assert_eq!(older[4], 2);
-    assert_eq!(older[5..32], unfolded[5..32]);
-    assert_eq!(older[32..35], hex("8d6558"));
-    assert_eq!(older[35..], unfolded[36..]);
-    // Version 4 has a header of 32 bytes and a table of contents.
-    let newest = bytes_of("spz", &splat);
-    assert_eq!(newest[..16], [&unfolded[..4], &[4, 0, 0, 0], &unfolded[8..15], &[6]].concat());
-    assert_eq!(newest[16..32], [&[32u8][..], &[0; 15]].concat());
-    let flat = bytes_of("spz", &splat.with_sh_degree(0));
-    assert_eq!(flat[15], 5, "no stream of coefficients");
 }
 
 /// Each version that is written gives the same Gaussians when it is read, up to version 2's rotations.

@@ -12,15 +12,12 @@ const DTYPES: [Dtype; 11] = {
 fn checkpoints_are_read_as_they_were_written() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("model.ckpt");
-    let names: Vec<String> = DTYPES.iter().map(|dtype| format!("a {dtype}")).collect();
-    let contents: Vec<Vec<u8>> =
-        DTYPES.iter().map(|dtype| (0..6 * dtype.bitsize() / 8).map(|i| i as u8).collect()).collect();
-    let mut tensors: Vec<TensorView> = names
-        .iter()
-        .zip(DTYPES)
-        .zip(&contents)
-        .map(|((name, dtype), bytes)| TensorView { name, dtype, shape: &[2, 3], bytes })
-        .collect();
+    let contents = DTYPES.map(|dtype| (0..6 * dtype.bitsize() / 8).map(|i| i as u8).collect::<Vec<_>>());
+    let names = DTYPES.map(|dtype| format!("a {dtype}"));
+    let tensor = |(name, (dtype, bytes))| TensorView { name, dtype, shape: &[2, 3], bytes };
+    let names = names.iter().map(String::as_str);
+    let mut tensors: Vec<TensorView> =
+        names.zip(DTYPES.into_iter().zip(contents.iter().map(Vec::as_slice))).map(tensor).collect();
     tensors.push(TensorView { name: "scalar", dtype: Dtype::F32, shape: &[], bytes: &[0, 0, 128, 63] });
     tensors.push(TensorView { name: "empty", dtype: Dtype::F32, shape: &[4, 0], bytes: &[] });
     let metadata = HashMap::from([("settings".to_string(), "a = \"ä\"\n".to_string())]);
