@@ -1,8 +1,7 @@
 //! SPZ: all versions, and invalid files. Niantic's library reads what is written in parity/tests/test_splat_formats.py.
 
 use super::common::{
-    assert_bytes_refused, assert_says, assert_within, bytes_of, largest_error, random_splat, read_bytes,
-    round_trip,
+    assert_bytes_refused, assert_says, assert_within, largest_error, random_splat, read_bytes, round_trip,
 };
 use globalsplat_splat_file::{Splat, WriteOptions, write_local_splat, write_splat};
 use std::io::{Read, Write};
