@@ -89,7 +89,7 @@ fn replace_in_header(ply: &mut Vec<u8>, from: &str, to: &str) {
 fn invalid_splats() {
     type Change = fn(&mut Vec<u8>);
     let cases: [(Change, &[&str]); 6] = [
-        (|ply| ply.truncate(ply.len() - 10), &["the body", "cut short"]),
+        (|ply| ply.truncate(ply.len() - 10), &[" in row ", " of vertex is cut short"]),
         (|ply| ply.truncate(100), &["the header", "end_header"]),
         (
             |ply| replace_in_header(ply, "property float opacity", "property float glow"),
