@@ -107,7 +107,7 @@ def decode(config, params, geometry, appearance, stage, mix):
     flat = {key: value.flatten(1, 2) for key, value in merged.items()}
 
     def constant(values):
-        return torch.tensor(values, dtype=geometry.dtype)
+        return torch.tensor(values, dtype=geometry.dtype, device=geometry.device)
 
     six = flat["rotation"] + constant(ROTATION_OFFSET)
     six = torch.cat([normalize(six[..., :3], 1e-8), normalize(six[..., 3:], 1e-8)], dim=-1)

@@ -74,7 +74,7 @@ def encode(config, params, tokens):
     memory = torch.cat([repeat(params["slot_encoder.mem_regs"]), tokens], dim=1)
 
     # Registers do not attend to the memory: only self-attention (and the mixer) updates them.
-    update_mask = torch.ones(slots.shape[1], 1, dtype=slots.dtype)
+    update_mask = torch.ones(slots.shape[1], 1, dtype=slots.dtype, device=slots.device)
     update_mask[-registers.shape[1] :] = 0.0
 
     def start(name):

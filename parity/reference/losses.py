@@ -25,7 +25,7 @@ def mse(image, ground_truth, mask=None):
 
 def window_weights(like):
     """Returns a Gaussian over the pixels of SSIM's window, [121], with sum 1."""
-    offset = torch.arange(WINDOW, dtype=like.dtype) - WINDOW // 2
+    offset = torch.arange(WINDOW, dtype=like.dtype, device=like.device) - WINDOW // 2
     squared_distance = offset[:, None] ** 2 + offset[None, :] ** 2
     gaussian = torch.exp(-squared_distance / (2.0 * SIGMA**2)).flatten()
     return gaussian / gaussian.sum()

@@ -48,7 +48,7 @@ def project(means, scales, quaternions, w2c, intrinsic, width, height, eps2d=EPS
     )  # [N, 2, 3]
     jw = jacobian @ rotation
     unfiltered = jw @ covariance(scales, quaternions) @ jw.transpose(-1, -2)
-    cov2d = unfiltered + eps2d * torch.eye(2, dtype=means.dtype)
+    cov2d = unfiltered + eps2d * torch.eye(2, dtype=means.dtype, device=means.device)
 
     det = cov2d[:, 0, 0] * cov2d[:, 1, 1] - cov2d[:, 0, 1] * cov2d[:, 1, 0]
     invertible = det > 0
@@ -115,9 +115,11 @@ def sh_color(means, sh, w2c):
     return torch.where(color > 0, color, 0.0)
 
 
-def pixel_centers(width, height, dtype=torch.float32):
+def pixel_centers(width, height, dtype=torch.float32, device=None):
     """Returns pixel centers [H W, 2] as (j + 0.5, i + 0.5), row-major."""
-    i, j = torch.meshgrid(torch.arange(height, dtype=dtype), torch.arange(width, dtype=dtype), indexing="ij")
+    i, j = torch.meshgrid(
+        torch.arange(height, dtype=dtype, device=device), torch.arange(width, dtype=dtype, device=device), indexing="ij"
+    )
     return torch.stack([j + 0.5, i + 0.5], dim=-1).reshape(-1, 2)
 
 
@@ -166,7 +168,7 @@ def render(means, scales, quaternions, opacities, sh, w2c, intrinsic, width, hei
     """
     projected = project(means, scales, quaternions, w2c, intrinsic, width, height, eps2d, antialiased)
     colors = sh_color(means, sh, w2c)
-    pixels = pixel_centers(width, height, means.dtype)
+    pixels = pixel_centers(width, height, means.dtype, means.device)
     rgb, accumulated, depth = composite(projected, opacities * projected["compensation"], colors, pixels)
     return rgb.reshape(height, width, 3), accumulated.reshape(height, width), depth.reshape(height, width)
 
@@ -175,7 +177,7 @@ def pixel_weights(means, scales, quaternions, opacities, w2c, intrinsic, width, 
     """Returns the weights of the Gaussians in the pixels of a camera, [H W, N]: each channel of a render is its product
     with their colors."""
     projected = project(means, scales, quaternions, w2c, intrinsic, width, height)
-    pixels = pixel_centers(width, height, means.dtype)
+    pixels = pixel_centers(width, height, means.dtype, means.device)
     one_hot = torch.eye(len(means), dtype=means.dtype)
     return composite(projected, opacities * projected["compensation"], one_hot, pixels)[0]
 

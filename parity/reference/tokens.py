@@ -26,8 +26,8 @@ def plucker_rays(c2w, intrinsics, height, width):
 
 def pixel_directions(c2w, intrinsics, height, width):
     """Returns the world directions of the pixels, [B, V, H, W, 3], with length 1 along the camera's axis."""
-    j = torch.arange(width, dtype=c2w.dtype) + 0.5
-    i = torch.arange(height, dtype=c2w.dtype) + 0.5
+    j = torch.arange(width, dtype=c2w.dtype, device=c2w.device) + 0.5
+    i = torch.arange(height, dtype=c2w.dtype, device=c2w.device) + 0.5
     fx, fy = intrinsics[..., 0, 0, None], intrinsics[..., 1, 1, None]
     cx, cy = intrinsics[..., 0, 2, None], intrinsics[..., 1, 2, None]
     x = ((j - cx) / fx)[..., None, :].expand(*c2w.shape[:2], height, width)
@@ -69,8 +69,8 @@ def patchify(image, patch):
 
 def rgb_tokens(params, images, patch):
     """Embeds images [B, V, 3, H, W] in [0, 1]. Returns [B, V, P, RGB width]."""
-    mean = torch.tensor(IMAGENET_MEAN, dtype=images.dtype)[:, None, None]
-    std = torch.tensor(IMAGENET_STD, dtype=images.dtype)[:, None, None]
+    mean = torch.tensor(IMAGENET_MEAN, dtype=images.dtype, device=images.device)[:, None, None]
+    std = torch.tensor(IMAGENET_STD, dtype=images.dtype, device=images.device)[:, None, None]
     return linear(params, "rgb_patch_embeds.1", patchify((images - mean) / std, patch))
 
 
