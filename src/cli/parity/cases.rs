@@ -21,6 +21,7 @@ use tch::{Kind, Tensor, nn};
 
 /// Runs the case that `request` names.
 pub(super) fn run(request: &Request) -> Result<Answer> {
+    let number = |key| request.number::<f64>(key);
     match request.case.as_str() {
         "tokens" => tokens(request),
         "radial_warp" => radial_warp(request),
@@ -28,45 +29,55 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
         "attention" => attention(request),
         "encoder" => encoder(request),
         "decoder" => decoder(request),
-        "quaternion" => outputs([("quaternion", model::quaternion_from_6d(request.input("rotations")?))]),
+        "quaternion" => outputs([("quaternion", model::quaternion_from_6d(&request.input("rotations")?))]),
         "scene_normalization" => scene_normalization(request),
         "color_fit" => color_fit(request),
         "projection" => projection(request),
         "rasterizer" => rasterizer(request),
+        "frustum" => frustum(request),
         "mse" => {
             let [image, ground_truth] = request.image_pair()?;
-            loss_of(match request.inputs.get("mask") {
-                None => loss::mse(image, ground_truth),
-                Some(mask) => loss::masked_mse(image, ground_truth, mask),
+            loss_of(match request.optional("mask") {
+                None => loss::mse(&image, &ground_truth),
+                Some(mask) => loss::masked_mse(&image, &ground_truth, &mask),
             })
         }
-        "frustum" => frustum(request),
         "ssim" => {
             let [image, ground_truth] = request.image_pair()?;
-            outputs([("ssim", loss::ssim(image, ground_truth).view([1]))])
+            outputs([("ssim", loss::ssim(&image, &ground_truth).view([1]))])
         }
         "photometric" => {
             let [image, ground_truth] = request.image_pair()?;
-            let (l1_weight, ssim_weight) = (request.number("l1_weight")?, request.number("ssim_weight")?);
-            loss_of(match request.inputs.get("mask") {
-                None => loss::photometric(image, ground_truth, l1_weight, ssim_weight),
-                Some(mask) => loss::masked_photometric(image, ground_truth, mask, l1_weight, ssim_weight),
+            let [l1_weight, ssim_weight] = [number("l1_weight")?, number("ssim_weight")?];
+            loss_of(match request.optional("mask") {
+                None => loss::photometric(&image, &ground_truth, l1_weight, ssim_weight),
+                Some(mask) => loss::masked_photometric(&image, &ground_truth, &mask, l1_weight, ssim_weight),
             })
         }
         "depth_smoothness" => {
-            let (depth, photo, factor) =
-                (request.input("depth")?, request.input("photo")?, request.number("factor")?);
-            loss_of(match request.inputs.get("mask") {
-                None => loss::depth_smoothness(depth, photo, factor),
-                Some(mask) => loss::masked_depth_smoothness(depth, photo, mask, factor),
+            let ([depth, photo], factor) = (request.inputs(["depth", "photo"])?, number("factor")?);
+            loss_of(match request.optional("mask") {
+                None => loss::depth_smoothness(&depth, &photo, factor),
+                Some(mask) => loss::masked_depth_smoothness(&depth, &photo, &mask, factor),
             })
         }
         "depth_search" => depth_search(request, Search::PatchCorrelation, "correlation"),
         "semi_global_matching" => depth_search(request, Search::SemiGlobal, "confidence"),
-        "decoder_regularization" => decoder_regularization(request),
+        "decoder_regularization" => {
+            let [log_scales, rotations, sh, opacity_logits] =
+                request.inputs(["log_scales", "rotations", "sh", "opacity_logits"])?;
+            let raw = RawOutputs { log_scales, rotations, sh, opacity_logits };
+            loss_of(loss::decoder_regularization(&raw, request.number("opacity")?).total)
+        }
         "lpips" => lpips(request),
         "perceptual" => perceptual(request),
-        "consistency" => consistency(request),
+        "consistency" => {
+            let [alpha_a, alpha_b] = request.inputs(["alpha_a", "alpha_b"])?;
+            let [depth_a, depth_b] = request.inputs(["depth_a", "depth_b"])?;
+            let factors = (number("alpha_factor")?, number("depth_factor")?);
+            let (alpha, depth) = ([&alpha_a, &alpha_b], [&depth_a, &depth_b]);
+            loss_of(loss::consistency(alpha, depth, None, factors, &loss::StepFraction::WHOLE))
+        }
         "resample" => resample(request),
         "jitter" => jitter(request),
         "adamw" => steps_of(OptimizerKind::AdamW, request),
@@ -77,13 +88,22 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
 }
 
 impl Request {
-    fn input(&self, name: &str) -> Result<&Tensor> {
-        self.inputs.get(name).ok_or_else(|| Error::request(format!("{}: no input {name}", self.case)))
+    fn optional(&self, name: &str) -> Option<Tensor> {
+        self.inputs.get(name).map(Tensor::shallow_clone)
+    }
+
+    fn input(&self, name: &str) -> Result<Tensor> {
+        self.optional(name).ok_or_else(|| Error::request(format!("{}: no input {name}", self.case)))
+    }
+
+    fn inputs<const N: usize>(&self, names: [&str; N]) -> Result<[Tensor; N]> {
+        let found = names.into_iter().map(|name| self.input(name)).collect::<Result<Vec<_>>>()?;
+        Ok(found.try_into().expect("a tensor for every name"))
     }
 
     /// Returns an image and the one that it has to match.
-    fn image_pair(&self) -> Result<[&Tensor; 2]> {
-        Ok([self.input("image")?, self.input("ground_truth")?])
+    fn image_pair(&self) -> Result<[Tensor; 2]> {
+        self.inputs(["image", "ground_truth"])
     }
 
     /// Returns the value of `key` in the case's configuration, such as a number or a list.
@@ -103,8 +123,7 @@ impl Request {
     }
 
     fn model_input(&self) -> Result<ModelInput> {
-        let input = |name: &str| self.input(name).map(Tensor::shallow_clone);
-        let [images, c2w, intrinsics] = [input("images")?, input("c2w")?, input("intrinsics")?];
+        let [images, c2w, intrinsics] = self.inputs(["images", "c2w", "intrinsics"])?;
         Ok(ModelInput { images, c2w, intrinsics, depths: None })
     }
 
@@ -112,27 +131,27 @@ impl Request {
         Ok(Stage { index: self.number("stage")?, mix: self.number("mix")? })
     }
 
-    /// Returns the image size, `[height, width]`.
-    fn image(&self) -> Result<[i64; 2]> {
-        self.number("image_size")
-    }
-
     /// Builds a module and loads the request's parameters into it, whose names must be those of the module.
     fn build<M>(&self, new: impl FnOnce(&nn::Path) -> M) -> Result<(M, Tensors)> {
         let mut vs = nn::VarStore::new(self.device);
         let module = new(&vs.root());
-        if self.params.values().any(|t| t.kind() == Kind::Double) {
-            vs.double();
-        }
         let mut tensors =
             self.params.iter().map(|(name, t)| (name.clone(), t.shallow_clone())).collect::<Tensors>();
         // The request holds trainable parameters only. Constants keep the values of the module.
         for (name, constant) in vs.variables().into_iter().filter(|(_, t)| !t.requires_grad()) {
             tensors.entry(name).or_insert(constant);
         }
-        Weights { tensors, metadata: Default::default() }.load_into(&vs, Path::new(&self.case))?;
+        self.load(&mut vs, tensors)?;
         let params = vs.variables().into_iter().filter(|(_, t)| t.requires_grad()).collect();
         Ok((module, params))
+    }
+
+    /// Loads `tensors` into the variables of `vs`, which become float64 if one of these is.
+    fn load(&self, vs: &mut nn::VarStore, tensors: Tensors) -> Result<()> {
+        if tensors.values().any(|t| t.kind() == Kind::Double) {
+            vs.double();
+        }
+        Weights { tensors, metadata: Default::default() }.load_into(vs, Path::new(&self.case))
     }
 }
 
@@ -155,30 +174,23 @@ fn tokens(request: &Request) -> Result<Answer> {
 }
 
 fn radial_warp(request: &Request) -> Result<Answer> {
-    let (c2w, intrinsics) = (request.input("c2w")?, request.input("intrinsics")?);
-    let warp = RadialWarp::new(c2w, intrinsics, request.input("depths")?);
-    let (means, scales) = (request.input("means")?, request.input("scales")?);
-    let others = |width: i64| Tensor::zeros_like(means).narrow(-1, 0, 1).repeat([1, 1, width]);
-    let restored = warp.restore(&Gaussians {
-        means: means.shallow_clone(),
-        scales: scales.shallow_clone(),
-        quaternions: others(4),
-        opacities: others(1).squeeze_dim(-1),
-        sh: others(3).unsqueeze(2),
-        antialiased: false,
-    });
+    let [c2w, intrinsics, depths] = request.inputs(["c2w", "intrinsics", "depths"])?;
+    let [means, scales] = request.inputs(["means", "scales"])?;
+    let warp = RadialWarp::new(&c2w, &intrinsics, &depths);
+    let others = |width: i64| Tensor::zeros_like(&means).narrow(-1, 0, 1).repeat([1, 1, width]);
+    let (quaternions, opacities, sh) = (others(4), others(1).squeeze_dim(-1), others(3).unsqueeze(2));
+    let restored = warp.restore(&Gaussians { means, scales, quaternions, opacities, sh, antialiased: false });
     outputs([
-        ("rays", warp.rays(c2w, intrinsics)),
-        ("cameras", warp.cameras(c2w)),
+        ("rays", warp.rays(&c2w, &intrinsics)),
+        ("cameras", warp.cameras(&c2w)),
         ("means", restored.means),
         ("scales", restored.scales),
     ])
 }
 
 fn linear(request: &Request) -> Result<Answer> {
-    let bias = request.inputs.get("bias").map(Tensor::shallow_clone);
-    let layer = nn::Linear { ws: request.input("weight")?.shallow_clone(), bs: bias };
-    outputs([("out", precision(request).linear(&layer, request.input("xs")?).to_kind(Kind::Float))])
+    let layer = nn::Linear { ws: request.input("weight")?, bs: request.optional("bias") };
+    outputs([("out", precision(request).linear(&layer, &request.input("xs")?).to_kind(Kind::Float))])
 }
 
 /// Returns the precision of matrix products: bfloat16 if the case has the key `bf16`, else float32.
@@ -187,13 +199,9 @@ fn precision(request: &Request) -> Precision {
 }
 
 fn attention(request: &Request) -> Result<Answer> {
-    let thirds = request.config.get("thirds").is_some();
-    let inputs = match thirds {
-        true => request.input("rows")?.chunk(3, -1),
-        false => ["q", "k", "v"]
-            .map(|name| request.input(name).map(Tensor::shallow_clone))
-            .into_iter()
-            .collect::<Result<_>>()?,
+    let inputs = match request.config.get("thirds") {
+        Some(_) => request.input("rows")?.chunk(3, -1),
+        None => request.inputs(["q", "k", "v"])?.into(),
     };
     let kind = precision(request).kind();
     let [q, k, v] = [0, 1, 2].map(|n| inputs[n].to_kind(kind));
@@ -207,15 +215,8 @@ fn encoder(request: &Request) -> Result<Answer> {
         let scene_tokens = model::scene_tokens(vs, &config);
         (scene_tokens, model::Encoder::new(&(vs / "slot_encoder"), &config))
     })?;
-    let encoded = encoder.forward(&scene_tokens, &encoder.image_tokens(request.input("tokens")?));
+    let encoded = encoder.forward(&scene_tokens, &encoder.image_tokens(&request.input("tokens")?));
     with_params([("geometry", encoded.geometry), ("appearance", encoded.appearance)], params)
-}
-
-fn encoded(request: &Request) -> Result<EncodedTokens> {
-    Ok(EncodedTokens {
-        geometry: request.input("geometry")?.shallow_clone(),
-        appearance: request.input("appearance")?.shallow_clone(),
-    })
 }
 
 fn decoded(decoded: model::Decoded, params: Tensors) -> Result<Answer> {
@@ -234,7 +235,8 @@ fn decoded(decoded: model::Decoded, params: Tensors) -> Result<Answer> {
 fn decoder(request: &Request) -> Result<Answer> {
     let config = request.model_config()?;
     let (module, params) = request.build(|vs| model::Decoder::new(vs, &config))?;
-    decoded(module.forward(&encoded(request)?, request.stage()?), params)
+    let [geometry, appearance] = request.inputs(["geometry", "appearance"])?;
+    decoded(module.forward(&EncodedTokens { geometry, appearance }, request.stage()?), params)
 }
 
 fn whole_model(request: &Request) -> Result<Answer> {
@@ -259,8 +261,9 @@ fn scene_normalization(request: &Request) -> Result<Answer> {
 
 /// Runs `search`, whose second result is called `score`.
 fn depth_search(request: &Request, search: Search, score: &'static str) -> Result<Answer> {
-    let (grays, matrices) = (request.input("others")?.unbind(0), request.input("to_pixels")?);
-    let weights = request.inputs.get("other_weights").map(|weights| weights.unbind(0));
+    let [grays, matrices] = request.inputs(["others", "to_pixels"])?;
+    let (grays, weights) =
+        (grays.unbind(0), request.optional("other_weights").map(|weights| weights.unbind(0)));
     let compared = |(index, gray)| {
         let matrix = Vec::<f64>::try_from(matrices.get(index as i64).to_kind(Kind::Double).view([-1]))?;
         let column = |i: usize| DVec3::new(matrix[i], matrix[4 + i], matrix[8 + i]);
@@ -270,28 +273,19 @@ fn depth_search(request: &Request, search: Search, score: &'static str) -> Resul
     let others = grays.iter().enumerate().map(compared).collect::<Result<Vec<_>>>()?;
     let (step, planes) = (request.number("step")?, request.number("planes")?);
     let (inverse_depth, scores) =
-        search.run(request.input("gray")?, request.inputs.get("weight"), &others, step, planes);
+        search.run(&request.input("gray")?, request.optional("weight").as_ref(), &others, step, planes);
     let image = |t: Tensor| t.unsqueeze(0).unsqueeze(0);
     outputs([("inverse_depth", image(inverse_depth)), (score, image(scores))])
 }
 
 fn gaussians_and_cameras(request: &Request) -> Result<(Gaussians, Cameras)> {
-    let input = |name: &str| request.input(name).map(Tensor::shallow_clone);
-    let gaussians = Gaussians {
-        means: input("means")?,
-        scales: input("scales")?,
-        quaternions: input("quaternions")?,
-        opacities: input("opacities")?,
-        sh: input("sh")?,
-        antialiased: request.number("antialiased")?,
-    };
-    let cameras = Cameras {
-        w2c: input("w2c")?,
-        intrinsics: input("intrinsics")?,
-        width: request.number("width")?,
-        height: request.number("height")?,
-    };
-    Ok((gaussians, cameras))
+    let [means, scales, quaternions, opacities, sh] =
+        request.inputs(["means", "scales", "quaternions", "opacities", "sh"])?;
+    let antialiased = request.number("antialiased")?;
+    let [w2c, intrinsics] = request.inputs(["w2c", "intrinsics"])?;
+    let (width, height) = (request.number("width")?, request.number("height")?);
+    let gaussians = Gaussians { means, scales, quaternions, opacities, sh, antialiased };
+    Ok((gaussians, Cameras { w2c, intrinsics, width, height }))
 }
 
 fn rasterizer(request: &Request) -> Result<Answer> {
@@ -303,8 +297,8 @@ fn rasterizer(request: &Request) -> Result<Answer> {
 fn color_fit(request: &Request) -> Result<Answer> {
     let (gaussians, cameras) = gaussians_and_cameras(request)?;
     let views = ViewBatch {
-        images: request.input("images")?.shallow_clone(),
-        masks: Some(request.input("masks")?.shallow_clone()),
+        images: request.input("images")?,
+        masks: Some(request.input("masks")?),
         depths: None,
         c2w: cameras.w2c.inverse(),
         w2c: cameras.w2c,
@@ -330,34 +324,11 @@ fn projection(request: &Request) -> Result<Answer> {
 }
 
 fn frustum(request: &Request) -> Result<Answer> {
-    let [height, width] = request.image()?;
-    let (w2c, intrinsics) = (request.input("w2c")?, request.input("intrinsics")?);
-    let views = ViewBatch {
-        images: Tensor::zeros([1, 1, 3, height, width], (Kind::Float, request.device)),
-        masks: None,
-        depths: None,
-        c2w: w2c.inverse(),
-        w2c: w2c.shallow_clone(),
-        intrinsics: intrinsics.shallow_clone(),
-    };
-    loss_of(loss::frustum(request.input("means")?, &views, request.input("far")?))
-}
-
-fn decoder_regularization(request: &Request) -> Result<Answer> {
-    let raw = RawOutputs {
-        log_scales: request.input("log_scales")?.shallow_clone(),
-        rotations: request.input("rotations")?.shallow_clone(),
-        sh: request.input("sh")?.shallow_clone(),
-        opacity_logits: request.input("opacity_logits")?.shallow_clone(),
-    };
-    loss_of(loss::decoder_regularization(&raw, request.number("opacity")?).total)
-}
-
-fn consistency(request: &Request) -> Result<Answer> {
-    let alpha = [request.input("alpha_a")?, request.input("alpha_b")?];
-    let depth = [request.input("depth_a")?, request.input("depth_b")?];
-    let factors = (request.number("alpha_factor")?, request.number("depth_factor")?);
-    loss_of(loss::consistency(alpha, depth, None, factors, &loss::StepFraction::WHOLE))
+    let [height, width] = request.number("image_size")?;
+    let [w2c, intrinsics, means, far] = request.inputs(["w2c", "intrinsics", "means", "far"])?;
+    let images = Tensor::zeros([1, 1, 3, height, width], (Kind::Float, request.device));
+    let views = ViewBatch { images, masks: None, depths: None, c2w: w2c.inverse(), w2c, intrinsics };
+    loss_of(loss::frustum(&means, &views, &far))
 }
 
 fn lpips(request: &Request) -> Result<Answer> {
@@ -366,7 +337,7 @@ fn lpips(request: &Request) -> Result<Answer> {
     let network = network.ok_or_else(|| Error::request(format!("{}: no network {name}", request.case)))?;
     let (lpips, params) = request.build(|vs| loss::Lpips::new(vs, network))?;
     let [image, ground_truth] = request.image_pair()?;
-    with_params([("distance", lpips.distance(image, ground_truth))], params)
+    with_params([("distance", lpips.distance(&image, &ground_truth))], params)
 }
 
 /// Computes the loss between two renderings of the same targets, as training does. The network's weights are the inputs with a dot in their
@@ -379,13 +350,10 @@ fn perceptual(request: &Request) -> Result<Answer> {
     };
     let weights = request.inputs.iter().filter(|(name, _)| name.contains('.'));
     let tensors: Tensors = weights.map(|(name, t)| (name.clone(), t.shallow_clone())).collect();
-    if tensors.values().any(|t| t.kind() == Kind::Double) {
-        vs.double();
-    }
-    Weights { tensors, metadata: Default::default() }.load_into(&vs, Path::new(&request.case))?;
+    request.load(&mut vs, tensors)?;
     vs.freeze();
     let [image, ground_truth] = request.image_pair()?;
-    loss_of(network.loss(image, ground_truth))
+    loss_of(network.loss(&image, &ground_truth))
 }
 
 fn resample(request: &Request) -> Result<Answer> {
@@ -406,7 +374,7 @@ fn jitter(request: &Request) -> Result<Answer> {
     let image = request.input("image")?;
     let mut planes = Vec::<f32>::try_from(image.flatten(0, -1))?;
     data::Jitter { adjustments: request.number("adjustments")? }.apply(&mut planes);
-    outputs([("image", Tensor::from_slice(&planes).view_as(image))])
+    outputs([("image", Tensor::from_slice(&planes).view_as(&image))])
 }
 
 fn steps_of(optimizer: OptimizerKind, request: &Request) -> Result<Answer> {
