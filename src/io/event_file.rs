@@ -11,6 +11,7 @@
 
 use super::images::rgb_from_tensor;
 use crate::error::{Error, Result};
+use crc::{CRC_32_ISCSI, Crc};
 use globalsplat_capture::encode_photo;
 use globalsplat_files::AppendFile;
 use std::path::{Path, PathBuf};
@@ -23,6 +24,9 @@ const VERSION: &str = "brain.Event:2";
 const START: u64 = 1;
 /// Value of `Image.colorspace` for RGB.
 const RGB: u64 = 3;
+
+/// CRC-32 with Castagnoli's polynomial.
+const CRC_32C: Crc<u32> = Crc::<u32>::new(&CRC_32_ISCSI);
 
 /// Folder of event files in the folder of a run.
 const FOLDER: &str = "tensorboard";
@@ -50,21 +54,12 @@ pub struct EventFile {
 }
 
 impl EventFile {
-    /// Creates the file at `path`, whose name must contain `tfevents`.
-    pub fn create(path: &Path) -> Result<Self> {
-        Ok(EventFile { file: AppendFile::open(path)? })
-    }
-
     /// Creates the next file of the run in the folder `run`, in its folder `tensorboard`.
     pub fn create_for(run: &Path) -> Result<Self> {
         let folder = run.join(FOLDER);
         std::fs::create_dir_all(&folder).map_err(Error::write(&folder))?;
-        let mut number = 0;
-        for entry in std::fs::read_dir(&folder).map_err(Error::read(&folder))? {
-            let of = number_of(&entry.map_err(Error::read(&folder))?.path());
-            number = number.max(of.map_or(0, |of| of + 1));
-        }
-        EventFile::create(&folder.join(format!("{PREFIX}{number:010}")))
+        let number = event_files(run).last().and_then(|file| number_of(file)).map_or(0, |last| last + 1);
+        Ok(EventFile { file: AppendFile::open(&folder.join(format!("{PREFIX}{number:010}")))? })
     }
 
     /// Writes the first records of the file: the version, and a session start that invalidates events of `step` and later steps in earlier
@@ -157,26 +152,5 @@ fn record(message: &Message) -> Vec<u8> {
 
 /// Returns the masked CRC-32C of `bytes`, for data that may contain checksums themselves.
 fn masked_crc32c(bytes: &[u8]) -> u32 {
-    crc32c(bytes).rotate_right(15).wrapping_add(0xa282_ead8)
-}
-
-/// Returns the CRC-32 of `bytes` with Castagnoli's polynomial.
-fn crc32c(bytes: &[u8]) -> u32 {
-    const TABLE: [u32; 256] = {
-        const POLYNOMIAL: u32 = 0x82f6_3b78; // bits reversed
-        let mut table = [0; 256];
-        let mut byte = 0;
-        while byte < 256 {
-            let mut crc = byte as u32;
-            let mut bit = 0;
-            while bit < 8 {
-                crc = if crc & 1 == 1 { crc >> 1 ^ POLYNOMIAL } else { crc >> 1 };
-                bit += 1;
-            }
-            table[byte] = crc;
-            byte += 1;
-        }
-        table
-    };
-    !bytes.iter().fold(!0, |crc, &byte| crc >> 8 ^ TABLE[usize::from(crc as u8 ^ byte)])
+    CRC_32C.checksum(bytes).rotate_right(15).wrapping_add(0xa282_ead8)
 }

@@ -22,20 +22,9 @@ pub struct VideoWriter {
     partial: PartialFile,
 }
 
-/// Format of a video, determined by its extension.
-enum Format {
-    Gif,
-    Mp4,
-}
-
-impl Format {
-    fn from_path(path: &Path) -> Option<Self> {
-        match path.extension()?.to_str()?.to_ascii_lowercase().as_str() {
-            "gif" => Some(Format::Gif),
-            "mp4" => Some(Format::Mp4),
-            _ => None,
-        }
-    }
+/// Returns the extension of `path` in lowercase, which determines the format of a video.
+fn format_of(path: &Path) -> String {
+    path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase()
 }
 
 enum Encoder {
@@ -50,16 +39,16 @@ impl VideoWriter {
     /// Returns an error for another extension, for more frames per second than the format supports, or if there is no ffmpeg with libx264
     /// for `.mp4`.
     pub fn check(path: &Path, frames_per_second: u32) -> Result<()> {
-        match Format::from_path(path) {
-            Some(Format::Gif) => Gif::check(path, frames_per_second),
-            Some(Format::Mp4) => Mp4::check(path),
-            None => Err(Error::input(path, "the video's file extension", path.display(), ".gif or .mp4")),
+        match format_of(path).as_str() {
+            "gif" => Gif::check(path, frames_per_second),
+            "mp4" => Mp4::check(path),
+            _ => Err(Error::input(path, "the video's file extension", path.display(), ".gif or .mp4")),
         }
     }
 
     /// Returns `true` if `path` has the extension of a video.
     pub fn has_video_extension(path: &Path) -> bool {
-        Format::from_path(path).is_some()
+        ["gif", "mp4"].contains(&format_of(path).as_str())
     }
 
     /// Starts a video of `size`. An MP4 has even sides: the last row or column is cropped if their number is odd.
@@ -69,8 +58,8 @@ impl VideoWriter {
     pub fn begin(path: &Path, size: ImageSize, frames_per_second: u32) -> Result<Self> {
         Self::check(path, frames_per_second)?;
         let partial = PartialFile::create(path)?;
-        let encoder = match Format::from_path(path) {
-            Some(Format::Gif) => Encoder::Gif(Gif::begin(path, &partial.file, size, frames_per_second)?),
+        let encoder = match format_of(path).as_str() {
+            "gif" => Encoder::Gif(Gif::begin(path, &partial.file, size, frames_per_second)?),
             _ => Encoder::Mp4(Mp4::begin(path, &partial.temporary_path, size, frames_per_second)?),
         };
         Ok(VideoWriter { path: path.to_owned(), size, frames: 0, encoder, partial })
@@ -86,7 +75,7 @@ impl VideoWriter {
         let frame = rgb_from_tensor(&frame.pad(margin, "constant", 1.))?;
         self.frames += 1;
         match &mut self.encoder {
-            Encoder::Gif(gif) => gif.add(&self.path, &frame),
+            Encoder::Gif(gif) => gif.add(&self.path, &frame, self.frames),
             Encoder::Mp4(mp4) => mp4.add(&self.path, &frame),
         }
     }
@@ -102,7 +91,7 @@ impl VideoWriter {
         }
         match encoder {
             Encoder::Gif(gif) => gif.finish(&path)?,
-            Encoder::Mp4(mp4) => mp4.finish(&path)?,
+            Encoder::Mp4(mut mp4) => mp4.end(&path)?,
         }
         Ok(partial.persist()?)
     }
@@ -111,7 +100,6 @@ impl VideoWriter {
 struct Gif {
     encoder: gif::Encoder<BufWriter<File>>,
     frames_per_second: u32,
-    frames: u32,
 }
 
 impl Gif {
@@ -134,18 +122,18 @@ impl Gif {
         let encoder = gif::Encoder::new(writer, sixteen_wide, sixteen_high, &[]);
         let mut encoder = encoder.map_err(not_encoded(path))?;
         encoder.set_repeat(gif::Repeat::Infinite).map_err(not_encoded(path))?;
-        Ok(Gif { encoder, frames_per_second, frames: 0 })
+        Ok(Gif { encoder, frames_per_second })
     }
 
-    fn add(&mut self, path: &Path, frame: &RgbImage) -> Result<()> {
+    /// Adds the frame with this `number`, which counts from 1.
+    fn add(&mut self, path: &Path, frame: &RgbImage, number: u32) -> Result<()> {
         // 1 gives the best palette, 30 is the fastest.
         const SPEED: i32 = 10;
         let (width, height) = (frame.width() as u16, frame.height() as u16);
         let mut encoded = gif::Frame::from_rgb_speed(width, height, frame, SPEED);
         // The end time of each frame is rounded, so that frames don't drift from their times.
         let hundredths = |frames: u32| (100 * frames + self.frames_per_second / 2) / self.frames_per_second;
-        encoded.delay = (hundredths(self.frames + 1) - hundredths(self.frames)) as u16;
-        self.frames += 1;
+        encoded.delay = (hundredths(number) - hundredths(number - 1)) as u16;
         self.encoder.write_frame(&encoded).map_err(not_encoded(path))
     }
 
@@ -244,17 +232,12 @@ impl Mp4 {
     }
 
     fn add(&mut self, path: &Path, frame: &RgbImage) -> Result<()> {
-        match self.input.as_mut().expect("an open pipe to ffmpeg").write_all(frame) {
-            Ok(()) => Ok(()),
+        if self.input.as_mut().expect("an open pipe to ffmpeg").write_all(frame).is_err() {
             // The message of ffmpeg is more helpful than the broken pipe.
-            Err(_) => {
-                self.end(path).and(Err(Error::failed(format!("{}: ffmpeg ended early", path.display()))))
-            }
+            self.end(path)?;
+            return Err(Error::failed(format!("{}: ffmpeg ended early", path.display())));
         }
-    }
-
-    fn finish(mut self, path: &Path) -> Result<()> {
-        self.end(path)
+        Ok(())
     }
 
     /// Closes the input of ffmpeg and waits until it has written everything.
@@ -262,12 +245,10 @@ impl Mp4 {
         self.input = None;
         let status = self.ffmpeg.wait().map_err(Error::write(path))?;
         let said = self.said.take().and_then(|said| said.join().ok()).unwrap_or_default();
+        let why = if said.is_empty() { format!(" ({status})") } else { format!(": {said}") };
         match status.success() {
             true => Ok(()),
-            false if said.is_empty() => {
-                Err(Error::failed(format!("{}: ffmpeg failed ({status})", path.display())))
-            }
-            false => Err(Error::failed(format!("{}: ffmpeg failed: {said}", path.display()))),
+            false => Err(Error::failed(format!("{}: ffmpeg failed{why}", path.display()))),
         }
     }
 }

@@ -43,26 +43,25 @@ pub fn write_weights(
     metadata: HashMap<String, String>,
 ) -> Result<()> {
     let stored = Stored::all(tensors)?;
-    let views = stored.iter().map(|(name, s)| Ok((name, s.view()?))).collect::<Result<Vec<_>>>()?;
-    let failed = |e: &dyn std::fmt::Display| {
-        Error::failed(format!("{}: weights can't be serialized: {e}", path.display()))
-    };
-    let mut bytes = safetensors::serialize(views, Some(metadata)).map_err(|e| failed(&e))?;
-    sort_header(&mut bytes).map_err(|e| failed(&e))?;
+    let failed = |e| Error::failed(format!("{}: weights can't be serialized: {e}", path.display()));
+    let views =
+        stored.iter().map(|(name, s)| Ok((name, TensorView::new(s.dtype, s.shape.clone(), &s.bytes)?)));
+    let views = views.collect::<std::result::Result<Vec<_>, SafeTensorError>>().map_err(failed)?;
+    let mut bytes = safetensors::serialize(views, Some(metadata)).map_err(failed)?;
+    sort_header(&mut bytes);
     write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
 }
 
 /// Sorts the metadata in the header. They come in the order of a hash map, which differs between processes; sorted, equal weights give
 /// equal bytes.
-fn sort_header(bytes: &mut [u8]) -> serde_json::Result<()> {
+fn sort_header(bytes: &mut [u8]) {
     let (length, rest) = bytes.split_at_mut(HEADER_LENGTH);
     let length = u64::from_le_bytes((&*length).try_into().expect("eight bytes")) as usize;
-    let header: serde_json::Map<String, serde_json::Value> = serde_json::from_slice(&rest[..length])?;
-    let sorted = serde_json::to_vec(&header)?;
+    let header: serde_json::Value = serde_json::from_slice(&rest[..length]).expect("the header of a file");
+    let sorted = header.to_string();
     // The header keeps its length, which includes padding with spaces.
-    rest[..sorted.len()].copy_from_slice(&sorted);
+    rest[..sorted.len()].copy_from_slice(sorted.as_bytes());
     rest[sorted.len()..length].fill(b' ');
-    Ok(())
 }
 
 /// Number of bytes of the header's length, at the start of a safetensors file.
@@ -101,11 +100,6 @@ impl Stored {
         tensor.f_copy_data_u8(&mut bytes, tensor.numel())?;
         let shape = tensor.size().iter().map(|&s| s as usize).collect();
         Ok(Stored { dtype, shape, bytes })
-    }
-
-    fn view(&self) -> Result<TensorView<'_>> {
-        TensorView::new(self.dtype, self.shape.clone(), &self.bytes)
-            .map_err(Error::failed_with_context("weights can't be serialized"))
     }
 }
 
