@@ -59,7 +59,7 @@ impl Browser {
                 "--disable-quic",
             ])
             .args(["--no-first-run", "--disable-background-networking", "--disable-component-update"])
-            .args(["--disable-sync", "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"])
+            .args(["--disable-sync", "--host-resolver-rules=MAP * ~NOTFOUND"])
             .arg(format!("--user-data-dir={}", profile.path().display()))
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
@@ -90,7 +90,8 @@ impl Browser {
         for domain in ["Page", "Runtime", "Log", "Network"] {
             browser.call(&format!("{domain}.enable"), json!({}));
         }
-        browser.go(true);
+        let offline = json!({"offline": true, "latency": 0, "downloadThroughput": 0, "uploadThroughput": 0});
+        browser.call("Network.emulateNetworkConditions", offline);
         Some(browser)
     }
 
@@ -117,29 +118,11 @@ impl Browser {
         self.messages.recv_timeout(TIMEOUT).unwrap_or_else(|e| panic!("no answer to {during}: {e}"))
     }
 
-    fn go(&mut self, offline: bool) {
-        let unlimited = if offline { 0 } else { -1 };
-        let conditions = json!({
-            "offline": offline, "latency": 0, "downloadThroughput": unlimited, "uploadThroughput": unlimited,
-        });
-        self.call("Network.emulateNetworkConditions", conditions);
-    }
-
     /// Opens a file and waits until it is shown.
     pub fn open(&mut self, file: &Path) {
         let file = file.canonicalize().expect("a file");
-        self.navigate(&format!("file://{}", file.display()));
-    }
-
-    /// Opens a page that this machine serves at 127.0.0.1, the only reachable address, and waits until it is shown.
-    pub fn open_served(&mut self, url: &str) {
-        self.go(false);
-        self.navigate(url);
-    }
-
-    fn navigate(&mut self, url: &str) {
         self.events.clear();
-        self.call("Page.navigate", json!({"url": url}));
+        self.call("Page.navigate", json!({"url": format!("file://{}", file.display())}));
         while !self.events.iter().any(|event| event["method"] == "Page.loadEventFired") {
             let event = self.next_message("loading");
             self.events.push(event);

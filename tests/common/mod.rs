@@ -34,6 +34,14 @@ pub fn has_viewer() -> bool {
     found
 }
 
+/// Writes the shell script `lines` to `path`, as a program.
+#[cfg(unix)]
+pub fn write_script(path: &std::path::Path, lines: &str) {
+    use std::os::unix::fs::PermissionsExt;
+    std::fs::write(path, format!("#!/bin/sh\n{lines}\n")).unwrap();
+    std::fs::set_permissions(path, PermissionsExt::from_mode(0o755)).unwrap();
+}
+
 /// Returns the relative error ‖a − b‖ / ‖b‖.
 pub fn relative_error(a: &Tensor, b: &Tensor) -> f64 {
     assert_eq!(a.size(), b.size());

@@ -12,6 +12,7 @@ use globalsplat::io::{
 use globalsplat::reconstruct::load_model;
 use globalsplat::scene::Gaussians;
 use globalsplat::train::latest_checkpoint;
+use globalsplat_test_kit::formats::{cameras, names, pinhole, write_colmap_binary, write_colmap_text};
 use std::fs;
 use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
@@ -141,34 +142,17 @@ fn colmap(reader: &str, bytes: &[u8], ending: &str) {
 /// Reads points of an otherwise valid model: text if the first byte is even, else binary.
 fn colmap_points(bytes: &[u8]) {
     let Some((first, bytes)) = bytes.split_first() else { return };
-    let reader = if first % 2 == 0 { "colmap_points_text" } else { "colmap_points_binary" };
-    let folder = folder(reader);
-    let model = |name: &str, bytes: &[u8]| file(reader, &format!("sparse/0/{name}"), bytes);
-    if first % 2 == 0 {
-        model("cameras.txt", b"1 SIMPLE_PINHOLE 8 8 8 4 4\n");
-        model("images.txt", b"1 1 0 0 0 0 0 0 1 000.png\n\n2 1 0 0 0 1 0 0 1 001.png\n\n");
-        model("points3D.txt", bytes);
+    let (is_text, names, cameras) = (first % 2 == 0, &names()[..2], &cameras()[..2]);
+    let folder = folder(if is_text { "colmap_points_text" } else { "colmap_points_binary" });
+    let model = folder.join("sparse/0");
+    let points = if is_text {
+        write_colmap_text(&model, names, cameras, &pinhole(&cameras[0]));
+        model.join("points3D.txt")
     } else {
-        let number = |value: f64| value.to_le_bytes();
-        let camera = [
-            &1u64.to_le_bytes()[..],
-            &1u32.to_le_bytes(),
-            &0i32.to_le_bytes(),
-            &8u64.to_le_bytes(),
-            &8u64.to_le_bytes(),
-        ];
-        let lens = [8., 4., 4.].map(number).concat();
-        model("cameras.bin", &[&camera.concat()[..], &lens].concat());
-        let image = |id: u32, name: &[u8]| {
-            let pose = [1., 0., 0., 0., f64::from(id), 0., 0.].map(number).concat();
-            [&id.to_le_bytes()[..], &pose, &1u32.to_le_bytes(), name, &[0], &0u64.to_le_bytes()].concat()
-        };
-        model(
-            "images.bin",
-            &[&2u64.to_le_bytes()[..], &image(1, b"000.png"), &image(2, b"001.png")].concat(),
-        );
-        model("points3D.bin", bytes);
-    }
+        write_colmap_binary(&model, names, cameras);
+        model.join("points3D.bin")
+    };
+    fs::write(points, bytes).unwrap();
     let _ = read_points(&open_capture(&folder).expect("a model that is right"));
 }
 

@@ -1,10 +1,8 @@
 //! Videos and camera paths: what players decode, the sources of cameras, and cleanup after failures.
 
-use crate::common::browser::Browser;
 use crate::common::formats::{Format, rewrite};
 use crate::common::program::{Sandbox, arg, assert_says};
-use crate::common::skip;
-use base64::Engine;
+use crate::common::{skip, write_script};
 use glam::{DMat4, DVec4};
 use globalsplat::data::{open_capture, read_camera_path, write_cameras_json};
 use globalsplat::io::find_ffmpeg;
@@ -101,79 +99,10 @@ fn an_mp4_shows_what_the_pictures_show() {
     assert!(sandbox.names("").iter().all(|name| !name.contains("partial")));
 }
 
-#[test]
-fn a_browser_plays_an_mp4_from_disk() {
-    if !has_ffmpeg() {
-        return;
-    }
-    let Some(mut browser) = Browser::start() else { return };
-    let sandbox = Sandbox::new();
-    for out in ["film.mp4", "views"] {
-        sandbox.run(&format!("render --splat @room/truth.ply --scene @room --size 384x256 --out @{out}"));
-    }
-    let text = "<!doctype html><body style='margin:0'><canvas width=384 height=256 style='display:block'></canvas>\
-        <video src=film.mp4 muted></video>";
-    sandbox.write("page.html", text);
-    browser.open(&sandbox.path("page.html"));
-    let measured = browser.evaluate(
-        "new Promise((done, failed) => {
-            const v = document.querySelector('video');
-            const tell = () => done([v.readyState, v.duration, v.videoWidth, v.videoHeight]);
-            v.readyState > 1 ? tell() : (v.onloadeddata = tell, v.onerror = () => failed(v.error.message));
-        })",
-    );
-    assert!(measured[0].as_i64() >= Some(2), "{measured}");
-    // Nine frames at 20 frames per second.
-    assert!((measured[1].as_f64().unwrap() - 0.45).abs() < 0.01, "{measured}");
-    assert_eq!((measured[2].as_i64(), measured[3].as_i64()), (Some(384), Some(256)));
-    for (i, picture) in pictures(&sandbox.path("views")).iter().enumerate().step_by(4) {
-        // Seek to the middle of the frame.
-        browser.evaluate(&format!(
-            "new Promise((done) => {{
-                const v = document.querySelector('video');
-                v.onseeked = done;
-                v.currentTime = {};
-            }})",
-            (i as f64 + 0.5) / 20.
-        ));
-        // When the event fires, a canvas may still get the previous frame.
-        let mut look = || {
-            browser.evaluate(
-                "new Promise((done) => {
-                    document.querySelector('canvas').getContext('2d').drawImage(document.querySelector('video'), 0, 0);
-                    requestAnimationFrame(() => requestAnimationFrame(done));
-                })",
-            );
-            // A page from disk may not read the pixels of a video; a screenshot shows them all the same.
-            let clip = json!({"x": 0, "y": 0, "width": 384, "height": 256, "scale": 1});
-            let shot = browser.call("Page.captureScreenshot", json!({"format": "png", "clip": clip}));
-            let png =
-                base64::engine::general_purpose::STANDARD.decode(shot["data"].as_str().unwrap()).unwrap();
-            psnr(&image::load_from_memory(&png).unwrap().into_rgb8(), picture)
-        };
-        let likeness = (0..20).map(|_| look()).find(|&likeness| likeness > 28.).unwrap_or_else(&mut look);
-        println!("frame {i}: {likeness:.1} dB");
-        assert!(likeness > 28., "the browser's frame {i} is {likeness} dB like its picture");
-    }
-    let ended = browser.evaluate(
-        "new Promise((done, failed) => {
-            const v = document.querySelector('video');
-            v.onended = () => done(v.currentTime);
-            v.currentTime = 0;
-            v.play().catch(failed);
-        })",
-    );
-    assert!((ended.as_f64().unwrap() - 0.45).abs() < 0.05, "{ended}");
-    assert!(browser.errors().is_empty(), "{:?}", browser.errors());
-}
-
 /// Returns a folder with this script as `ffmpeg`, for use as the path; the script itself finds the system's tools.
 fn with_ffmpeg(script: &str) -> TempDir {
-    use std::os::unix::fs::PermissionsExt;
     let folder = tempfile::tempdir().unwrap();
-    let file = folder.path().join("ffmpeg");
-    fs::write(&file, format!("#!/bin/sh\nPATH=/usr/bin:/bin\n{script}\n")).unwrap();
-    fs::set_permissions(&file, fs::Permissions::from_mode(0o755)).unwrap();
+    write_script(&folder.path().join("ffmpeg"), &format!("PATH=/usr/bin:/bin\n{script}"));
     folder
 }
 

@@ -20,12 +20,12 @@ impl Folder {
         self.0.join(name).into()
     }
 
-    /// Returns the program's command with this as current folder; arguments that begin with @ are files there.
-    fn command(&self, arguments: &[&str]) -> Command {
+    /// Returns the command of `line` with this as current folder; words that begin with @ are files there.
+    fn command(&self, line: &str) -> Command {
         let mut command = command(&[]);
-        command.args(arguments.iter().map(|argument| match argument.strip_prefix('@') {
+        command.args(line.split(' ').map(|word| match word.strip_prefix('@') {
             Some(name) => self.path(name),
-            None => argument.into(),
+            None => word.into(),
         }));
         // The command finds no networks for LPIPS and no browser, and its temporary files are in this folder.
         command
@@ -37,21 +37,15 @@ impl Folder {
         command
     }
 
-    /// Returns the standard output of a command that must succeed.
-    fn succeed(&self, arguments: &[&str]) -> String {
-        let done = self.command(arguments).output().expect("a program");
-        assert!(done.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&done.stderr));
-        String::from_utf8(done.stdout).expect("text")
-    }
-
     /// Returns the JSON object that the command prints, and asserts that the values of `keys` are paths.
-    fn json(&self, arguments: &[&str], keys: &[&str]) -> Value {
-        let report: Value =
-            serde_json::from_str(&self.succeed(&[arguments, &["--json"]].concat())).expect("JSON");
+    fn json(&self, line: &str, keys: &[&str]) -> Value {
+        let done = self.command(&format!("{line} --json")).output().expect("a program");
+        assert!(done.status.success(), "{line}: {}", String::from_utf8_lossy(&done.stderr));
+        let report: Value = serde_json::from_slice(&done.stdout).expect("JSON");
         for key in keys {
             let path =
                 report.pointer(key).and_then(Value::as_str).unwrap_or_else(|| panic!("{key} of {report}"));
-            assert!(path.contains(SHOWN), "{arguments:?}: {key} is {path}");
+            assert!(path.contains(SHOWN), "{line}: {key} is {path}");
         }
         report
     }
@@ -65,27 +59,15 @@ fn names_that_are_not_utf_8() {
     let write = |name: &str, text: &str| std::fs::write(folder.0.join(name), text).expect("a file");
 
     write_rooms(&folder.0.join("rooms"), 2, 9, 40).expect("rooms");
-    let videos = [
-        "synth",
-        "--out",
-        "@videos",
-        "--frames",
-        "9",
-        "--size",
-        "64",
-        "--depth",
-        "--contact-sheet",
-        "@s.png",
-    ];
-    folder.json(&videos, &["/out", "/index", "/depth", "/contact_sheet"]);
-    let pack = |out: &str| folder.succeed(&["pack", "@rooms", "--out", out, "--json"]);
-    assert!(pack("@chunks").contains(SHOWN));
-    assert!(!pack("chunks_too").contains(SHOWN), "a path as it was given");
+    let videos = "synth --out @videos --frames 9 --size 64 --depth --contact-sheet @s.png";
+    folder.json(videos, &["/out", "/index", "/depth", "/contact_sheet"]);
+    folder.json("pack @rooms --out @chunks", &["/out"]);
+    assert_eq!(folder.json("pack @rooms --out chunks_too", &[])["out"], "chunks_too", "as it was given");
 
     write("tiny.toml", &TINY_CONFIG.replace("[data]", "[data]\ncaptures = [\"${ROOMS}/room_000\"]"));
-    folder.json(&["train", "--config", "@tiny.toml", "--out", "@run"], &["/checkpoint", "/curves"]);
-    folder.json(&["export", "--run", "@run", "--out", "@tiny.safetensors"], &["/weights"]);
-    folder.json(&["import", "--from", "@tiny.safetensors", "--out", "@imported.safetensors"], &["/weights"]);
+    folder.json("train --config @tiny.toml --out @run", &["/checkpoint", "/curves"]);
+    folder.json("export --run @run --out @tiny.safetensors", &["/weights"]);
+    folder.json("import --from @tiny.safetensors --out @imported.safetensors", &["/weights"]);
 
     for path in [
         "@rooms/room_000",
@@ -94,39 +76,35 @@ fn names_that_are_not_utf_8() {
         "@tiny.safetensors",
         "@rooms/room_000/truth.ply",
     ] {
-        folder.json(&["inspect", path], &[]);
+        folder.json(&format!("inspect {path}"), &[]);
     }
     std::fs::remove_file(folder.0.join("chunks_too/000000.torch")).expect("a chunk");
-    folder.json(&["inspect", "@chunks_too"], &["/absent_chunks/0"]);
+    folder.json("inspect @chunks_too", &["/absent_chunks/0"]);
 
-    let room = ["--scene", "@rooms/room_000"];
-    let model = ["reconstruct", "--weights", "@tiny.safetensors", "--out", "@made.ply"];
-    folder.json(&[&model[..], &room].concat(), &["/splat", "/weights"]);
-    let splat = ["--splat", "@rooms/room_000/truth.ply"];
-    let refine = ["refine", "--steps", "1", "--contact-sheet", "@sheet.png", "--out", "@refined.spz"];
-    folder.json(&[&refine[..], &splat, &room].concat(), &["/splat"]);
-    folder.json(&["convert", "@refined.spz", "@refined.splat"], &["/from/splat", "/to/splat"]);
-    for (out, orbit) in [("@views", false), ("@orbit.png", true), ("@orbit.gif", true)] {
-        let frames: &[&str] = if orbit { &["--orbit", "--frames", "3"] } else { &[] };
-        folder.json(&[&["render", "--out", out], frames, &splat, &room].concat(), &["/files/0"]);
+    let splat = "--splat @rooms/room_000/truth.ply --scene @rooms/room_000";
+    let model = "reconstruct --weights @tiny.safetensors --out @made.ply --scene @rooms/room_000";
+    folder.json(model, &["/splat", "/weights"]);
+    let refine = format!("refine --steps 1 --contact-sheet @sheet.png --out @refined.spz {splat}");
+    folder.json(&refine, &["/splat"]);
+    folder.json("convert @refined.spz @refined.splat", &["/from/splat", "/to/splat"]);
+    for out in ["@views", "@orbit.png --orbit --frames 3", "@orbit.gif --orbit --frames 3"] {
+        folder.json(&format!("render {splat} --out {out}"), &["/files/0"]);
     }
-    folder.json(&[&["bench", "raster", "--repeats", "1"], &splat[..], &room].concat(), &[]);
+    folder.json(&format!("bench raster --repeats 1 {splat}"), &[]);
 
-    folder.json(&[&["eval", "--contact-sheet", "@scores.png"], &splat[..], &room].concat(), &[]);
+    folder.json(&format!("eval --contact-sheet @scores.png {splat}"), &[]);
     write("index.json", &json!({"room_001": {"context": [0, 2], "target": [1, 3]}}).to_string());
     std::fs::create_dir(folder.0.join("splats")).expect("a folder");
     std::fs::copy(folder.0.join("rooms/room_001/truth.ply"), folder.0.join("splats/room_001.ply"))
         .expect("a copy");
-    let eval =
-        ["eval", "--splat", "@splats", "--data", "@rooms", "--index", "@index.json", "--out", "@scored"];
-    folder.json(&eval, &["/report", "/evaluations/0/folder"]);
-    folder.json(&["report", "@scored", "--out", "@report.html"], &["/out", "/evaluations/0/folder"]);
-    folder.json(&["doctor"], &[]);
+    let eval = "eval --splat @splats --data @rooms --index @index.json --out @scored";
+    folder.json(eval, &["/report", "/evaluations/0/folder"]);
+    folder.json("report @scored --out @report.html", &["/out", "/evaluations/0/folder"]);
+    folder.json("doctor", &[]);
 
     if !crate::common::has_viewer() {
         return;
     }
-    let page = [&["render", "--html", "@room.html"], &splat[..], &room].concat();
-    folder.json(&page, &["/page"]);
-    folder.json(&[&["view", "@rooms/room_000/truth.ply"], &room[..]].concat(), &["/page"]);
+    folder.json(&format!("render --html @room.html {splat}"), &["/page"]);
+    folder.json("view @rooms/room_000/truth.ply --scene @rooms/room_000", &["/page"]);
 }

@@ -3,7 +3,7 @@
 
 use crate::common::browser::Browser;
 use crate::common::program::{arg, command, room, succeed};
-use crate::common::{captures, has_viewer};
+use crate::common::{captures, has_viewer, write_script};
 use crate::{LEAST, assert_like, own_picture, picture_from_base64};
 use globalsplat::data::{load_views, open_capture};
 use globalsplat::io::{Splat, read_splat, write_splat};
@@ -259,8 +259,7 @@ fn view_opens_a_page_of_a_splat_alone() {
     // A program `xdg-open` that records the path it is asked to open.
     let opener = folder.path().join("xdg-open");
     let opened = folder.path().join("opened");
-    std::fs::write(&opener, format!("#!/bin/sh\nprintf %s \"$1\" > {opened:?}\n")).unwrap();
-    std::fs::set_permissions(&opener, std::fs::Permissions::from_mode(0o755)).unwrap();
+    write_script(&opener, &format!("printf %s \"$1\" > {opened:?}"));
     let path = format!("{}:/usr/bin:/bin", folder.path().display());
     let done =
         command(&["view", arg(&splat)]).env("PATH", path).env("TMPDIR", folder.path()).output().unwrap();
