@@ -1,6 +1,6 @@
 //! The command `capture`, and the captures that other commands make of photos.
 
-use super::{print_json, progress, signals};
+use super::{Output, progress, signals};
 use crate::Error;
 use crate::io::check_writable_dir;
 use anyhow::Result;
@@ -40,13 +40,10 @@ pub struct Capture {
     /// folder `masks` among the photos
     #[arg(long, value_name = "DIR")]
     masks: Option<PathBuf>,
-    /// Print the result as one JSON object
-    #[arg(long)]
-    json: bool,
 }
 
 impl Capture {
-    pub fn run(self) -> Result<()> {
+    pub fn run(self) -> Result<Output> {
         let options = CaptureOptions {
             frames: self.frames,
             camera_model: self.camera_model.map(|model| model.to_uppercase()),
@@ -60,25 +57,13 @@ impl Capture {
         signals::handle_stop_requests()?;
         signals::end_at_request(1);
         let report = run_make_capture(&self.source, &self.out, &options)?;
-        if self.json {
-            let mut json = serde_json::to_value(&report)?;
-            json["out"] = self.out.to_string_lossy().into();
-            print_json(&json);
-        } else {
-            let out = self.out.display();
-            let splat = Path::new(self.out.file_name().unwrap_or("scene".as_ref())).with_extension("ply");
-            println!("{out}: {report}");
-            println!("next: globalsplat refine --scene {} --out {}", quoted(&self.out), quoted(&splat));
-        }
-        Ok(())
+        let mut json = serde_json::to_value(&report)?;
+        json["out"] = self.out.to_string_lossy().into();
+        let (out, name) = (self.out.to_string_lossy(), self.out.file_name().unwrap_or("scene".as_ref()));
+        let splat = Path::new(name).with_extension("ply");
+        let next = ["globalsplat", "refine", "--scene", &out, "--out", &splat.to_string_lossy()];
+        Ok(Output::new(json, format!("{out}: {report}\nnext: {}", shlex::try_join(next)?)))
     }
-}
-
-/// Returns `path` as an argument of a shell, in quotes if it needs them.
-fn quoted(path: &Path) -> String {
-    let path = path.display().to_string();
-    let is_plain = |c: char| c.is_alphanumeric() || "/._-+@:,".contains(c);
-    if path.chars().all(is_plain) { path } else { format!("'{}'", path.replace('\'', r"'\''")) }
 }
 
 /// Makes a capture of `source` in the folder `out`, with progress on standard error. A request to stop ends the program with an error.

@@ -1,5 +1,5 @@
 use super::edits::Edits;
-use super::{open_capture, print_json, splat_out, warn};
+use super::{Output, open_capture, splat_out, warn};
 use crate::Error;
 use crate::data::write_transforms_json;
 use crate::io::{
@@ -8,12 +8,11 @@ use crate::io::{
 };
 use crate::metrics::psnr_between;
 use crate::render::{SplatEdit, edit_splat, move_cameras, orbit_around_splat};
-use crate::scene::{Camera, LocalFrame, splat_frame};
+use crate::scene::{LocalFrame, splat_frame};
 use anyhow::Result;
 use clap::Args;
 use glam::{DMat4, DVec3};
 use serde_json::{Value, json};
-use std::cmp::Ordering;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -72,13 +71,10 @@ pub struct Convert {
     spz_version: Option<u32>,
     #[command(flatten)]
     edits: Edits,
-    /// Print the result as one JSON object
-    #[arg(long)]
-    json: bool,
 }
 
 impl Convert {
-    pub fn run(self) -> Result<()> {
+    pub fn run(self) -> Result<Output> {
         check_writable_splat(&self.to)?;
         splat_out::check_origin(&self.to, self.local_origin)?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
@@ -115,7 +111,6 @@ impl Convert {
             }
         }
         let edited = edit_splat(&source, &edits, &cameras)?;
-        let count = source.len();
         let moved = match edited.from_original == DMat4::IDENTITY {
             true => source,
             false => edit_splat(&source, &[SplatEdit::Transform(edited.from_original)], &[])?.splat,
@@ -127,14 +122,10 @@ impl Convert {
             true => ShLimits::of_viewers(degree),
             false => ShLimits::up_to(degree),
         };
-        let fit = |cameras: &[Camera]| fit_splat(&self.to, &original, &limits, cameras);
-        let fitted = match &capture {
-            Some(_) => Some(fit(&cameras)?),
-            // The writer clamps by itself.
-            None if !self.clamp_sh => None,
-            None => Some(fit(&[])?),
-        };
-        let written = fitted.as_ref().unwrap_or(&original).with_sh_degree(degree);
+        let fitted = fit_splat(&self.to, &original, &limits, &cameras)?;
+        // Without a capture the writer clamps by itself.
+        let is_fitted = capture.is_some() || self.clamp_sh;
+        let written = if is_fitted { &fitted } else { &original }.with_sh_degree(degree);
         let origin = self.local_origin.then(|| match &capture {
             Some(_) => LocalFrame::from_cameras(&cameras).origin,
             // A splat that already has an origin keeps it.
@@ -155,54 +146,38 @@ impl Convert {
         }
         let cameras = if capture.is_some() { cameras } else { orbit_around_splat(&moved) };
         if capture.is_none() {
-            self.warn_clamped(&original, &fit(&[])?);
+            self.warn_clamped(&original, &fitted);
         }
         let psnr = psnr_between(&moved, &copy, &cameras)?;
         // What the file's format costs, without what the edits change.
         let file_psnr =
             (!edits.is_empty()).then(|| psnr_between(&original, &copy, &cameras)).transpose()?.flatten();
         let views = cameras.len();
-        if self.json {
-            let edits: Vec<_> = options
-                .iter()
-                .zip(&edited.counts)
-                .map(|(option, count)| json!({ "edit": option, "gaussians": count }))
-                .collect();
-            let report = json!({ "from": from, "edits": edits, "to": to, "views": views, "psnr": psnr, "file_psnr": file_psnr, "same_pixels": psnr.is_none() });
-            print_json(&report);
-        } else {
-            println!("{}", line(&from));
-            let mut before = count;
-            for (option, &count) in options.iter().zip(&edited.counts) {
-                let change = match count.cmp(&before) {
-                    Ordering::Less => format!("{} removed, {count} left", before - count),
-                    Ordering::Equal => format!("{count} Gaussians"),
-                    Ordering::Greater => format!("{} added, {count} Gaussians", count - before),
-                };
-                println!("{option}: {change}");
-                before = count;
-            }
-            let loss = match psnr {
-                Some(psnr) => format!("{psnr:.2} dB between renders of both"),
-                None => "the same pixels".into(),
-            };
-            let of_file =
-                file_psnr.map(|psnr| format!("; {psnr:.2} dB between the edited splat and the file"));
-            println!("{}\n{views} views: {loss}{}", line(&to), of_file.unwrap_or_default());
-        }
-        Ok(())
+        let edits: Vec<_> = options.iter().zip(&edited.counts).collect();
+        let loss = match psnr {
+            Some(psnr) => format!("{psnr:.2} dB between renders of both"),
+            None => "the same pixels".into(),
+        };
+        let of_file = file_psnr.map(|psnr| format!("; {psnr:.2} dB between the edited splat and the file"));
+        let lines = std::iter::once(line(&from))
+            .chain(edits.iter().map(|(option, count)| format!("{option}: {count} Gaussians")))
+            .chain([line(&to), format!("{views} views: {loss}{}", of_file.unwrap_or_default())]);
+        let text = lines.collect::<Vec<_>>().join("\n");
+        let edits: Vec<_> =
+            edits.iter().map(|(edit, count)| json!({ "edit": edit, "gaussians": count })).collect();
+        let json = json!({
+            "from": from, "edits": edits, "to": to, "views": views, "psnr": psnr, "file_psnr": file_psnr,
+            "same_pixels": psnr.is_none(),
+        });
+        Ok(Output::new(json, text))
     }
 
     /// Warns if coefficients are out of the representable range and no capture was given to fit the others to.
     fn warn_clamped(&self, original: &Splat, held: &Splat) {
-        let coefficients = |index: usize| {
-            let pairs = original.sh_of(index).iter().zip(held.sh_of(index));
-            pairs.flat_map(|(original, held)| original.iter().zip(held))
-        };
-        let cut = (0..held.len())
-            .flat_map(coefficients)
-            .filter(|(original, held)| (**original - **held).abs() > MIN_CUT)
-            .count();
+        let coefficients =
+            |index: usize| original.sh_of(index).as_flattened().iter().zip(held.sh_of(index).as_flattened());
+        let is_cut = |(original, held): &(&f32, &f32)| (*original - *held).abs() > MIN_CUT;
+        let cut = (0..held.len()).flat_map(coefficients).filter(is_cut).count();
         let share = 100. * cut as f64 / (3 * held.sh.len()) as f64;
         if cut > 0 {
             let share = if share < 0.05 { "less than 0.1".into() } else { format!("{share:.1}") };

@@ -1,4 +1,4 @@
-use super::{device, print_json, view};
+use super::{Output, device, view};
 use crate::config::Config;
 use crate::device::total_memory_bytes;
 use crate::distributed::Backends;
@@ -13,7 +13,6 @@ use anyhow::Result;
 use clap::Args;
 use globalsplat_colmap::Colmap;
 use serde_json::{Value, json};
-use std::fmt::Display;
 use std::path::PathBuf;
 use tch::Device;
 
@@ -30,140 +29,55 @@ pub struct Doctor {
     /// Override a key of the configuration, as in train.micro_batch=4
     #[arg(long, value_name = "KEY=VALUE", requires = "config")]
     set: Vec<String>,
-    /// Print the report as one JSON object
-    #[arg(long)]
-    json: bool,
 }
 
 impl Doctor {
-    pub fn run(self) -> Result<()> {
+    pub fn run(self) -> Result<Output> {
         if let Some(file) = &self.config {
-            return Ok(memory_of_training(&Config::read(file, &self.set)?, self.json)?);
+            return memory_of_training(&Config::read(file, &self.set)?);
         }
         let unusable = device::load_cuda().err().unwrap_or("it is for other GPUs, or another driver".into());
         let usable = tch::Cuda::device_count();
-        let devices: Vec<String> =
-            std::iter::once("cpu".to_string()).chain((0..usable).map(|i| format!("cuda:{i}"))).collect();
-        let (simd, libtorch) = (simd_level()?, crate::render::libtorch_version());
-        let (threads, cores) = (tch::get_num_threads(), std::thread::available_parallelism()?.get());
-        let weights =
-            LpipsNetwork::ALL.map(|network| (network.metric(), find_pretrained(network.file_name())));
-        let (driver, nvrtc) = (Driver::find(), Nvrtc::find());
+        let devices = std::iter::once("cpu".to_string()).chain((0..usable).map(|i| format!("cuda:{i}")));
+        let weights = LpipsNetwork::ALL.map(|network| {
+            let file = find_pretrained(network.file_name()).map(|path| path.display().to_string());
+            let absent = || format!("make weights makes it, {WEIGHTS_VARIABLE} names its folder");
+            (network.metric().to_string(), found_or(file.ok_or_else(absent)))
+        });
+        let driver = Driver::find();
         let prepared: Vec<Result<KernelOrigin, String>> = (0..usable as i32).map(load_kernels).collect();
-        let cache = cache_folder().map(|folder| folder.display().to_string());
-        let (together, ffmpeg) = (Backends::built_in(), find_ffmpeg());
-        let colmap = Colmap::find().map(|colmap| colmap.to_string()).map_err(|why| why.to_string());
-        let precision = Precision::fastest_on(Device::Cpu);
-        if self.json {
-            let found: serde_json::Map<_, _> = weights
-                .into_iter()
-                .filter_map(|(metric, path)| Some((metric.to_string(), path?.display().to_string().into())))
-                .collect();
-            print_json(&json!({
-                "version": env!("CARGO_PKG_VERSION"),
-                "libtorch": libtorch,
-                "devices": devices,
-                "simd": simd,
-                "libtorch_simd": libtorch_simd_level(),
-                "precision": precision,
-                "threads": threads,
-                "cores": cores,
-                "driver": or_error(&driver, |driver| json!(cuda_version(driver.version))),
-                "gpus": driver.as_ref().map_or(json!([]), |driver| gpus(driver, &prepared, &unusable)),
-                "nvrtc": or_error(&nvrtc, |nvrtc| json!({
-                    "version": format!("{}.{}", nvrtc.version.0, nvrtc.version.1),
-                    "architectures": nvrtc.architectures,
-                })),
-                "kernels": cache,
-                "model": BUNDLED_MODEL,
-                "weights": found,
-                "ffmpeg": or_error(&ffmpeg, |version| json!(version)),
-                "colmap": or_error(&colmap, |found| json!(found)),
-                "viewer": view::has_viewer(),
-                "together": { "gloo": together.gloo, "nccl": together.nccl },
-            }));
-            return Ok(());
-        }
-        let line = |name: &str, value: &dyn Display| println!("{name:<12} {value}");
-        line("globalsplat", &env!("CARGO_PKG_VERSION"));
-        line("libtorch", &libtorch);
-        line("devices", &devices.join(", "));
-        line(
-            "rasterizer",
-            &format!("{simd} (GLOBALSPLAT_SIMD=avx2 or portable hides what is newer, from libtorch as well)"),
-        );
-        line(
-            "precision",
-            &format!("{precision} (the fastest for wide models on this CPU, which --precision auto takes)"),
-        );
-        line("threads", &format!("{threads} on {cores} cores (OMP_NUM_THREADS sets them)"));
-        let of = |built: bool, without: &'static str| if built { "built in" } else { without };
-        line(
-            "torchrun",
-            &format!(
-                "on CPUs Gloo: {}; on GPUs NCCL: {}",
-                of(
-                    together.gloo,
-                    "absent (Debian and Ubuntu: apt install libgloo-dev, touch csrc/build.rs, build again)"
+        let nvrtc = Nvrtc::find().map(|nvrtc| {
+            let (major, minor) = nvrtc.version;
+            json!({ "version": format!("{major}.{minor}"), "architectures": nvrtc.architectures })
+        });
+        let backends = Backends::built_in();
+        let built = |is_built: bool, why: &str| found_or(is_built.then_some(true).ok_or(why.to_string()));
+        Ok(Output::table(json!({
+            "version": env!("CARGO_PKG_VERSION"),
+            "libtorch": crate::render::libtorch_version(),
+            "devices": devices.collect::<Vec<_>>(),
+            "simd": simd_level()?,
+            "libtorch_simd": libtorch_simd_level(),
+            "precision": Precision::fastest_on(Device::Cpu),
+            "threads": tch::get_num_threads(),
+            "cores": std::thread::available_parallelism()?.get(),
+            "driver": found_or(driver.as_ref().map(|driver| cuda_version(driver.version)).map_err(String::clone)),
+            "gpus": driver.as_ref().map_or(json!([]), |driver| gpus(driver, &prepared, &unusable)),
+            "nvrtc": found_or(nvrtc),
+            "kernels": cache_folder().map(|folder| folder.display().to_string()),
+            "model": BUNDLED_MODEL,
+            "weights": serde_json::Map::from_iter(weights),
+            "ffmpeg": found_or(find_ffmpeg()),
+            "colmap": found_or(Colmap::find().map(|colmap| colmap.to_string()).map_err(|why| why.to_string())),
+            "viewer": built(view::has_viewer(), "install Node.js 20 or newer with npm, then make build"),
+            "together": {
+                "gloo": built(
+                    backends.gloo,
+                    "Debian and Ubuntu: apt install libgloo-dev, touch csrc/build.rs, build again",
                 ),
-                of(
-                    together.nccl,
-                    "absent (its headers and CUDA's come with libtorch's wheel and requirements.txt)"
-                )
-            ),
-        );
-        line(
-            "viewer",
-            &of(
-                view::has_viewer(),
-                "absent: no pages to walk in (install Node.js 20 or newer with npm, then make build)",
-            ),
-        );
-        match &driver {
-            Err(why) => line("driver", &format!("absent: {why}")),
-            Ok(driver) => {
-                line("driver", &format!("NVIDIA's, for CUDA {}", cuda_version(driver.version)));
-                for (number, gpu) in driver.gpus.iter().enumerate() {
-                    let gigabytes = gpu.memory as f64 * 1e-9;
-                    let (name, capability) = (&gpu.name, capability(gpu.architecture));
-                    line(
-                        &format!("cuda:{number}"),
-                        &format!("{name}, compute capability {capability}, {gigabytes:.1} GB"),
-                    );
-                    line("", &state_of_kernels(prepared.get(number), &unusable));
-                }
-                if driver.gpus.is_empty() {
-                    line("", &"it reports no GPU: check nvidia-smi and CUDA_VISIBLE_DEVICES");
-                }
-            }
-        }
-        match &nvrtc {
-            Err(why) => line("nvrtc", &format!("absent: {why}")),
-            Ok(nvrtc) => {
-                let [least, most] = [nvrtc.architectures.first(), nvrtc.architectures.last()]
-                    .map(|of| of.map_or(String::new(), |&of| capability(of)));
-                let (major, minor) = nvrtc.version;
-                line("nvrtc", &format!("{major}.{minor}, for compute capability {least} to {most}"));
-            }
-        }
-        line("kernels", &cache.as_deref().unwrap_or("kept nowhere: neither XDG_CACHE_HOME nor HOME is set"));
-        line("model", &format!("{BUNDLED_MODEL}, inside the program (reconstruct --weights takes another)"));
-        for (metric, path) in weights {
-            let found = match path {
-                Some(path) => path.display().to_string(),
-                None => format!("absent (make weights makes them, {WEIGHTS_VARIABLE} names their folder)"),
-            };
-            line(metric, &found);
-        }
-        match &ffmpeg {
-            Err(why) => line("ffmpeg", &format!("absent, so films are GIFs: {why}")),
-            Ok(version) => line("ffmpeg", &format!("{version}, for films in MP4")),
-        }
-        match &colmap {
-            Err(why) => line("colmap", &format!("absent, so photos need poses: {why}")),
-            Ok(found) => line("colmap", &format!("{found}, for the poses of photos")),
-        }
-        Ok(())
+                "nccl": built(backends.nccl, "its headers and CUDA's come with libtorch's wheel and requirements.txt"),
+            },
+        })))
     }
 }
 
@@ -177,15 +91,16 @@ fn cuda_version(version: i32) -> String {
     format!("{}.{}", version / 1000, version % 1000 / 10)
 }
 
-fn or_error<T>(found: &Result<T, String>, tell: impl FnOnce(&T) -> Value) -> Value {
-    match found {
-        Ok(found) => tell(found),
-        Err(why) => json!({ "absent": why }),
-    }
+/// Returns what was found, or why it is absent.
+fn found_or(found: Result<impl Into<Value>, String>) -> Value {
+    found.map_or_else(|why| json!({ "absent": why }), Into::into)
 }
 
 /// Returns the driver's GPUs as JSON. Those that torch can use come first, and have their kernels.
 fn gpus(driver: &Driver, prepared: &[Result<KernelOrigin, String>], unusable: &str) -> Value {
+    if driver.gpus.is_empty() {
+        return json!({ "absent": "the driver reports none: check nvidia-smi and CUDA_VISIBLE_DEVICES" });
+    }
     let entries = driver.gpus.iter().enumerate().map(|(number, gpu)| {
         json!({
             "name": gpu.name,
@@ -213,62 +128,51 @@ fn state_of_kernels(prepared: Option<&Result<KernelOrigin, String>>, unusable: &
     }
 }
 
-/// Prints the memory of a training step, a column for each kind of device, and whether it fits into the devices of this
-/// machine.
-fn memory_of_training(config: &Config, as_json: bool) -> crate::Result<()> {
+/// Returns the memory of a training step, a column for each kind of device, and whether it fits into the devices of this machine.
+fn memory_of_training(config: &Config) -> Result<Output> {
     let cpu = MemoryEstimate::new(config, Device::Cpu)?;
     let gpu = MemoryEstimate::new(config, Device::Cuda(0))?;
-    let driver = Driver::find();
-    let gpus = driver.iter().flat_map(|driver| &driver.gpus);
-    let machine = total_memory_bytes(Device::Cpu).map(|bytes| ("this machine".to_string(), bytes, cpu));
-    let here: Vec<(String, u64, MemoryEstimate)> =
-        machine.into_iter().chain(gpus.map(|of| (of.name.clone(), of.memory as u64, gpu))).collect();
-    if as_json {
-        let to_json = |estimate: &MemoryEstimate| {
-            let mut json = json!(estimate);
-            json["total"] = json!(estimate.total());
-            json
-        };
-        let devices: Vec<Value> = here
-            .iter()
-            .map(|(name, bytes, needed)| {
-                json!({ "name": name, "memory_bytes": bytes, "fits": needed.fits_into(*bytes) })
-            })
-            .collect();
-        print_json(&json!({ "cpu": to_json(&cpu), "gpu": to_json(&gpu), "devices": devices }));
-        return Ok(());
-    }
-    let (batch, at_once) = (cpu.batch, cpu.scenes_at_once);
-    println!(
-        "{:<56}{:>10}{:>10}",
-        format!("GB in a training step of {batch} scenes, {at_once} at a time"),
-        "CPU",
-        "GPU"
-    );
-    let row = |name: &str, of: &dyn Fn(&MemoryEstimate) -> u64| {
-        let [cpu, gpu] = [&cpu, &gpu].map(|estimate| of(estimate) as f64 * 1e-9);
-        println!("{name:<56}{cpu:>10.2}{gpu:>10.2}");
-    };
-    row("weights and the optimizer's moments", &|of| of.weights);
-    row("photos", &|of| of.photos);
-    row("tokenizer and encoder", &|of| of.encoder);
-    row("heads, Gaussians, pictures and losses", &|of| of.pictures);
-    row("network of L_perc", &|of| of.perceptual);
-    row("together, to 15 %", &MemoryEstimate::total);
+    let title = format!("GB in a training step of {} scenes, {} at a time", cpu.batch, cpu.scenes_at_once);
+    let mut lines = vec![format!("{title:<56}{:>10}{:>10}", "CPU", "GPU")];
+    type Part = fn(&MemoryEstimate) -> u64;
+    let parts: [(&str, Part); 6] = [
+        ("weights and the optimizer's moments", |of| of.weights),
+        ("photos", |of| of.photos),
+        ("tokenizer and encoder", |of| of.encoder),
+        ("heads, Gaussians, pictures and losses", |of| of.pictures),
+        ("network of L_perc", |of| of.perceptual),
+        ("together, to 15 %", MemoryEstimate::total),
+    ];
+    lines.extend(parts.map(|(name, bytes)| {
+        let [cpu, gpu] = [&cpu, &gpu].map(|estimate| bytes(estimate) as f64 * 1e-9);
+        format!("{name:<56}{cpu:>10.2}{gpu:>10.2}")
+    }));
     let train = &config.train;
     let savings = [
-        (at_once > 1).then(|| format!("train.micro_batch={}", at_once / 2)),
+        (cpu.scenes_at_once > 1).then(|| format!("train.micro_batch={}", cpu.scenes_at_once / 2)),
         (!train.checkpoint_rounds).then(|| "train.checkpoint_rounds=true".to_string()),
         (train.precision == Precision::F32).then(|| "train.precision=bf16".to_string()),
     ];
     let savings = savings.into_iter().flatten().collect::<Vec<_>>().join(", ");
-    for (name, bytes, needed) in here {
-        let fits = match needed.fits_into(bytes) {
+    let driver = Driver::find();
+    let gpus =
+        driver.iter().flat_map(|driver| &driver.gpus).map(|of| (of.name.as_str(), of.memory as u64, &gpu));
+    let machine = total_memory_bytes(Device::Cpu).map(|bytes| ("this machine", bytes, &cpu));
+    let mut devices = vec![];
+    for (name, bytes, needed) in machine.into_iter().chain(gpus) {
+        let fits = needed.fits_into(bytes);
+        devices.push(json!({ "name": name, "memory_bytes": bytes, "fits": fits }));
+        let advice = match fits {
             true => "it fits".to_string(),
             false if savings.is_empty() => "it does not fit".to_string(),
             false => format!("it does not fit; to save memory: {savings}"),
         };
-        println!("{name} has {:.1} GB: {fits}", bytes as f64 * 1e-9);
+        lines.push(format!("{name} has {:.1} GB: {advice}", bytes as f64 * 1e-9));
     }
-    Ok(())
+    let [cpu, gpu] = [cpu, gpu].map(|estimate| {
+        let mut json = json!(estimate);
+        json["total"] = estimate.total().into();
+        json
+    });
+    Ok(Output::new(json!({ "cpu": cpu, "gpu": gpu, "devices": devices }), lines.join("\n")))
 }

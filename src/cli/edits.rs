@@ -16,97 +16,83 @@ enum EditArgument {
     Merge(PathBuf),
 }
 
-type Parser = fn(&str) -> Result<EditArgument, String>;
-
-/// Name, name of the value, help and parser of an option.
-type EditOption = (&'static str, &'static str, &'static str, Parser);
-
-/// All options.
-const OPTIONS: [EditOption; 13] = [
-    ("scale", "FACTOR", "Scale about the world's origin", |text| {
-        transform(DMat4::from_scale(DVec3::splat(positive(text)?)))
-    }),
-    (
-        "rotate",
-        "X,Y,Z",
-        "Rotate about the world's x axis, then its y axis, then its z axis, in degrees",
-        |text| {
-            let [x, y, z] = numbers(text)?.map(f64::to_radians);
-            transform(DMat4::from_rotation_z(z) * DMat4::from_rotation_y(y) * DMat4::from_rotation_x(x))
-        },
-    ),
-    ("translate", "X,Y,Z", "Move by a vector", |text| {
-        transform(DMat4::from_translation(DVec3::from(numbers(text)?)))
-    }),
+/// Name of every option, name of its value, and help.
+const OPTIONS: [(&str, &str, &str); 13] = [
+    ("scale", "FACTOR", "Scale about the world's origin"),
+    ("rotate", "X,Y,Z", "Rotate about the world's x axis, then its y axis, then its z axis, in degrees"),
+    ("translate", "X,Y,Z", "Move by a vector"),
     (
         "matrix",
         "NUMBERS",
         "Multiply by a matrix of 4×4 numbers, row by row, which rotates, scales uniformly and translates",
-        |text| transform(DMat4::from_cols_array(&numbers(text)?).transpose()),
     ),
     (
         "up",
         "AXIS",
         "Rotate a splat whose axis x, y, z, -x, -y or -z points up, so that -y does, as 3DGS and most viewers have it",
-        parse_up,
     ),
     (
         "crop-box",
         "X,Y,Z,X,Y,Z",
         "Keep the Gaussians whose centers are in the box between two corners; - stands for no bound",
-        parse_box,
     ),
-    (
-        "crop-sphere",
-        "X,Y,Z,RADIUS",
-        "Keep the Gaussians whose centers are in a sphere",
-        |text| match numbers(text)? {
-            [x, y, z, radius] if radius > 0. => edit(SplatEdit::CropSphere(DVec3::new(x, y, z), radius)),
-            _ => Err("expected a radius above 0".into()),
-        },
-    ),
-    ("min-opacity", "OPACITY", "Remove Gaussians of a lower opacity, 0 to 1", |text| match numbers(text)? {
-        [opacity] if (0. ..=1.).contains(&opacity) => edit(SplatEdit::MinOpacity(opacity)),
-        _ => Err("expected a number from 0 to 1".into()),
-    }),
-    (
-        "max-scale",
-        "LENGTH",
-        "Remove Gaussians with a larger standard deviation along any of their axes",
-        |text| edit(SplatEdit::MaxScale(positive(text)?)),
-    ),
+    ("crop-sphere", "X,Y,Z,RADIUS", "Keep the Gaussians whose centers are in a sphere"),
+    ("min-opacity", "OPACITY", "Remove Gaussians of a lower opacity, 0 to 1"),
+    ("max-scale", "LENGTH", "Remove Gaussians with a larger standard deviation along any of their axes"),
     (
         "filter-floaters",
         "FACTOR",
         "Remove isolated Gaussians: those whose eighth neighbour is FACTOR times as far as is usual, 10 by default, and beyond \
          their own size",
-        |text| edit(SplatEdit::FilterFloaters(positive(text)?)),
     ),
     (
         "prune-unseen",
         "SCENE",
         "Remove Gaussians that no camera of this capture sees: those that contribute less than a thousandth of a pixel to all views \
          together",
-        |text| Ok(EditArgument::PruneUnseen(text.into())),
     ),
     (
         "decimate",
         "N",
         "Keep N Gaussians: those that contribute most to the views of --scene, or to eight views around the splat",
-        |text| match text.parse() {
-            Ok(0) | Err(_) => Err("expected a number of Gaussians, 1 or more".into()),
-            Ok(count) => edit(SplatEdit::Decimate(count)),
-        },
     ),
-    ("merge", "FILE", "Add the Gaussians of another splat", |text| Ok(EditArgument::Merge(text.into()))),
+    ("merge", "FILE", "Add the Gaussians of another splat"),
 ];
 
-fn edit(edit: SplatEdit) -> Result<EditArgument, String> {
+/// Parses the value of the option `name`.
+fn parse(name: &str, text: &str) -> Result<EditArgument, String> {
+    let transform = |matrix| Ok(EditArgument::Edit(SplatEdit::Transform(matrix)));
+    let edit = match name {
+        "scale" => return transform(DMat4::from_scale(DVec3::splat(positive(text)?))),
+        "rotate" => {
+            let [x, y, z] = numbers(text)?.map(f64::to_radians);
+            return transform(
+                DMat4::from_rotation_z(z) * DMat4::from_rotation_y(y) * DMat4::from_rotation_x(x),
+            );
+        }
+        "translate" => return transform(DMat4::from_translation(DVec3::from(numbers(text)?))),
+        "matrix" => return transform(DMat4::from_cols_array(&numbers(text)?).transpose()),
+        "up" => return transform(DMat4::from_quat(rotation_from_up(text)?)),
+        "crop-box" => parse_box(text)?,
+        "crop-sphere" => match numbers(text)? {
+            [x, y, z, radius] if radius > 0. => SplatEdit::CropSphere(DVec3::new(x, y, z), radius),
+            _ => return Err("expected a radius above 0".into()),
+        },
+        "min-opacity" => match numbers(text)? {
+            [opacity] if (0. ..=1.).contains(&opacity) => SplatEdit::MinOpacity(opacity),
+            _ => return Err("expected a number from 0 to 1".into()),
+        },
+        "max-scale" => SplatEdit::MaxScale(positive(text)?),
+        "filter-floaters" => SplatEdit::FilterFloaters(positive(text)?),
+        "decimate" => match text.parse() {
+            Ok(0) | Err(_) => return Err("expected a number of Gaussians, 1 or more".into()),
+            Ok(count) => SplatEdit::Decimate(count),
+        },
+        "prune-unseen" => return Ok(EditArgument::PruneUnseen(text.into())),
+        "merge" => return Ok(EditArgument::Merge(text.into())),
+        other => unreachable!("{other} is no option"),
+    };
     Ok(EditArgument::Edit(edit))
-}
-
-fn transform(matrix: DMat4) -> Result<EditArgument, String> {
-    edit(SplatEdit::Transform(matrix))
 }
 
 /// Parses `N` finite numbers that are separated by commas.
@@ -130,24 +116,23 @@ fn positive(text: &str) -> Result<f64, String> {
 }
 
 /// Parses a box, where - stands for no bound, as for splat-transform.
-fn parse_box(text: &str) -> Result<EditArgument, String> {
+fn parse_box(text: &str) -> Result<SplatEdit, String> {
     let bounds: Vec<&str> = text.split(',').map(str::trim).collect();
-    let corner = |bounds: &[&str], unbounded: f64| -> Result<DVec3, String> {
+    let ([first, second], []) = bounds.as_chunks::<3>() else {
+        return Err("expected 6 numbers with commas between them, or - where there is no bound".into());
+    };
+    let corner = |bounds: &[&str; 3], unbounded: f64| -> Result<DVec3, String> {
         let bound = |text: &&str| if *text == "-" { Ok([unbounded]) } else { numbers(text) };
         let bounds = bounds.iter().map(|text| Ok(bound(text)?[0])).collect::<Result<Vec<f64>, String>>()?;
         Ok(DVec3::from_slice(&bounds))
     };
-    match bounds.split_at_checked(3) {
-        Some((first, second)) if second.len() == 3 => {
-            let (low, high) = (corner(first, f64::NEG_INFINITY)?, corner(second, f64::INFINITY)?);
-            edit(SplatEdit::CropBox(low.min(high), low.max(high)))
-        }
-        _ => Err("expected 6 numbers with commas between them, or - where there is no bound".into()),
-    }
+    let (low, high) = (corner(first, f64::NEG_INFINITY)?, corner(second, f64::INFINITY)?);
+    Ok(SplatEdit::CropBox(low.min(high), low.max(high)))
 }
 
-fn parse_up(text: &str) -> Result<EditArgument, String> {
-    let rotation = match &text.to_lowercase()[..] {
+/// Returns the rotation with which the axis `up` becomes -y.
+fn rotation_from_up(up: &str) -> Result<DQuat, String> {
+    Ok(match &up.to_lowercase()[..] {
         "x" => DQuat::from_rotation_z(-FRAC_PI_2),
         "-x" => DQuat::from_rotation_z(FRAC_PI_2),
         "y" => DQuat::from_rotation_x(PI),
@@ -155,8 +140,7 @@ fn parse_up(text: &str) -> Result<EditArgument, String> {
         "z" => DQuat::from_rotation_x(FRAC_PI_2),
         "-z" => DQuat::from_rotation_x(-FRAC_PI_2),
         _ => return Err("expected x, y, z, -x, -y or -z".into()),
-    };
-    transform(DMat4::from_quat(rotation))
+    })
 }
 
 /// Edits in the order in which they are given, each with its option as it is given.
@@ -193,7 +177,7 @@ impl Edits {
 
 impl Args for Edits {
     fn augment_args(command: Command) -> Command {
-        let argument = |(name, value, help, parser): EditOption| {
+        let argument = |(name, value, help): (&'static str, &'static str, &'static str)| {
             let argument = Arg::new(name)
                 .long(name)
                 .value_name(value)
@@ -202,7 +186,9 @@ impl Args for Edits {
                 .action(ArgAction::Append)
                 // Paths that begin with a hyphen are rare, and a forgotten value isn't the next option.
                 .allow_hyphen_values(!["merge", "prune-unseen"].contains(&name))
-                .value_parser(move |text: &str| parser(text).map(|argument| (text.to_owned(), argument)));
+                .value_parser(move |text: &str| {
+                    parse(name, text).map(|argument| (text.to_owned(), argument))
+                });
             match name {
                 "filter-floaters" => {
                     argument.num_args(0..=1).require_equals(true).default_missing_value("10")
@@ -266,22 +252,14 @@ mod tests {
             "--crop-sphere=0,0,0,1",
         ];
         assert_eq!(options, expected);
-        let SplatEdit::Transform(matrix) = &edits[4].1 else { panic!("{edits:?}") };
-        assert!(matrix.transform_vector3(DVec3::NEG_Z).abs_diff_eq(DVec3::NEG_Y, 1e-12));
-        let Ok(EditArgument::Edit(SplatEdit::CropBox(low, high))) = parse_box("-,1,-,2,-,3") else {
-            panic!()
-        };
+        let SplatEdit::CropBox(low, high) = parse_box("-,1,-,2,-,3").unwrap() else { panic!() };
         assert_eq!((low.y, high.x, high.z), (1., 2., 3.));
         assert!(low.x == f64::NEG_INFINITY && low.z == f64::NEG_INFINITY && high.y == f64::INFINITY);
-        for up in ["x", "y", "-x", "-y", "z"] {
-            let Ok(EditArgument::Edit(SplatEdit::Transform(matrix))) = parse_up(up) else { panic!("{up}") };
-            let sign = if up.starts_with('-') { -1. } else { 1. };
-            let axis = match up.trim_start_matches('-') {
-                "x" => DVec3::X,
-                "y" => DVec3::Y,
-                _ => DVec3::Z,
-            };
-            assert!(matrix.transform_vector3(sign * axis).abs_diff_eq(DVec3::NEG_Y, 1e-12), "{up}");
+        for (up, axis) in [("x", DVec3::X), ("y", DVec3::Y), ("z", DVec3::Z)] {
+            for (up, axis) in [(up.to_string(), axis), (format!("-{up}"), -axis)] {
+                let rotated = rotation_from_up(&up).unwrap() * axis;
+                assert!(rotated.abs_diff_eq(DVec3::NEG_Y, 1e-12), "{up}: {rotated}");
+            }
         }
     }
 

@@ -1,5 +1,5 @@
 use super::{
-    check_views, device, distributed, model, open_masked_capture, parse_holdout, print_json, progress,
+    Output, check_views, device, distributed, model, open_masked_capture, parse_holdout, progress,
     report_downscaling, signals, warn, warn_of_many,
 };
 use crate::data::{Capture, Dataset, Holdout, PhotoSize, Split, View};
@@ -10,7 +10,7 @@ use crate::eval::{
     evaluation_files, machine, score_output, weights_fingerprint, write_csv, write_evaluation, write_report,
 };
 use crate::io::{InputFiles, check_writable_dir, check_writable_png};
-use crate::metrics::{CaptureScores, ContactSheet, Perceptual};
+use crate::metrics::{CaptureScores, ContactSheet, Perceptual, Scores};
 use crate::model::Precision;
 use crate::reconstruct::{LoadedModel, Model, context_views};
 use crate::scene::ImageSize;
@@ -96,13 +96,10 @@ pub struct Eval {
     /// Device: cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
     device: String,
-    /// Print the scores as one JSON object
-    #[arg(long)]
-    json: bool,
 }
 
 impl Eval {
-    pub fn run(self) -> Result<()> {
+    pub fn run(self) -> Result<Output> {
         check_views(self.views)?;
         match &self.scene {
             Some(scene) => self.run_scene(scene, device::parse(&self.device)?),
@@ -115,7 +112,7 @@ impl Eval {
         self.data.is_some()
     }
 
-    fn run_scene(&self, scene: &Path, device: Device) -> Result<()> {
+    fn run_scene(&self, scene: &Path, device: Device) -> Result<Output> {
         if let Some(sheet) = &self.sheet {
             check_writable_png(sheet)?;
         }
@@ -149,33 +146,24 @@ impl Eval {
         if let Some(line) = perceptual.explain_missing(&scores.mean) {
             eprintln!("{line}");
         }
-        if self.json {
-            let mut object = serde_json::to_value(&scores)?;
-            object["peak_memory_bytes"] = peak_memory.into();
-            if let Some(Model { config, .. }) = model {
-                object["image_size"] = json!(self.target_size(model)?);
-                object["input"] =
-                    json!({ "photos": scene.context.len(), "image_size": config.data.image_size });
-                object["forward_seconds"] = json!(output.forward_seconds);
-            }
-            if let Some(Baselines { nearest_photo, mean_photo }) = &baselines {
-                let means =
-                    |scores: &CaptureScores| json!({ "psnr": scores.mean.psnr, "ssim": scores.mean.ssim });
-                object["baselines"] =
-                    json!({ "nearest_photo": means(nearest_photo), "mean_photo": means(mean_photo) });
-            }
-            print_json(&object);
-        } else {
-            print_table(&scores);
-            if let Some(Baselines { nearest_photo, mean_photo }) = &baselines {
-                for (name, scores) in
-                    [("the nearest photo shown", nearest_photo), ("the mean photo shown", mean_photo)]
-                {
-                    println!("{name:<24} {:>8.2} {:>8.4}", scores.mean.psnr, scores.mean.ssim);
-                }
+        let mut json = serde_json::to_value(&scores)?;
+        let mut lines = table(&scores);
+        json["peak_memory_bytes"] = peak_memory.into();
+        if let Some(Model { config, .. }) = model {
+            json["image_size"] = json!(self.target_size(model)?);
+            json["input"] = json!({ "photos": scene.context.len(), "image_size": config.data.image_size });
+            json["forward_seconds"] = json!(output.forward_seconds);
+        }
+        if let Some(Baselines { nearest_photo, mean_photo }) = &baselines {
+            for (key, name, Scores { psnr, ssim, .. }) in [
+                ("nearest_photo", "the nearest photo shown", nearest_photo.mean),
+                ("mean_photo", "the mean photo shown", mean_photo.mean),
+            ] {
+                json["baselines"][key] = json!({ "psnr": psnr, "ssim": ssim });
+                lines.push(format!("{name:<24} {psnr:>8.2} {ssim:>8.4}"));
             }
         }
-        Ok(())
+        Ok(Output::new(json, lines.join("\n")))
     }
 
     /// Returns the scene to evaluate: a model's input and target views; for splats and images, all photos as targets.
@@ -294,7 +282,7 @@ impl Eval {
 
 /// Evaluation of a dataset.
 impl Eval {
-    fn run_dataset(&self) -> Result<()> {
+    fn run_dataset(&self) -> Result<Output> {
         let (group, device) = distributed::join(&self.device)?;
         let (Some(data), Some(out)) = (&self.data, &self.out) else { unreachable!("clap asks for both") };
         let indices =
@@ -337,7 +325,7 @@ impl Eval {
                 out: &folder,
                 group: &group,
             };
-            let bar = progress::bar_on_first_rank(group.is_main_process(), 0, "scenes");
+            let bar = progress::bar(0, "scenes");
             let evaluation = evaluation.run(
                 || Perceptual::find(device),
                 |done, of| {
@@ -367,57 +355,47 @@ impl Eval {
         }
         group.shutdown()?;
         if !group.is_main_process() {
-            return Ok(());
+            return Ok(Output::default());
         }
         let report = out.join(REPORT);
         write_report(&report, &evaluations)?;
-        self.print_summaries(&report, &evaluations)
+        Ok(describe_evaluations(&report, &evaluations))
     }
+}
 
-    fn print_summaries(&self, report: &Path, evaluations: &[(PathBuf, Evaluation)]) -> Result<()> {
-        if self.json {
-            let summaries: Vec<_> = evaluations
-                .iter()
-                .map(|(folder, e)| {
-                    json!({
-                        "folder": folder.to_string_lossy(), "index": e.index, "dataset": e.dataset, "context_views": e.context_views,
-                        "image_size": e.image_size, "scenes": e.scenes.len(), "indexed_scenes": e.indexed_scenes, "summary": e.summary,
-                        "efficiency": e.efficiency, "failures": e.failures,
-                    })
-                })
-                .collect();
-            print_json(&json!({ "report": report.to_string_lossy(), "evaluations": summaries }));
-        } else {
-            for (_, e) in evaluations {
-                let shown = |value: Option<f64>| value.map_or("absent".into(), |value| format!("{value:.4}"));
-                let masked = e.summary.mean.pixel_fraction.map(|fraction| 100. * fraction);
-                let masked =
-                    masked.map_or(String::new(), |percent| format!(", over {percent:.1} % of the pixels"));
-                println!(
-                    "{}, {} of {} scenes: PSNR {:.2}, SSIM {:.4}, LPIPS-VGG {}, LPIPS-Alex {}{masked}",
-                    e.index,
-                    e.scenes.len(),
-                    e.indexed_scenes,
-                    e.summary.mean.psnr,
-                    e.summary.mean.ssim,
-                    shown(e.summary.mean.lpips_vgg),
-                    shown(e.summary.mean.lpips_alex)
-                );
-            }
-            println!("{}", report.display());
-        }
-        let failures: Vec<_> = evaluations.iter().flat_map(|(_, e)| &e.failures).collect();
-        for failure in &failures {
-            eprintln!("{}: {}", failure.scene, failure.error);
-        }
-        match failures.len() {
-            0 => Ok(()),
-            count => {
-                Err(Error::failed(format!("{count} scenes could not be scored, the means are of the others"))
-                    .into())
-            }
-        }
+/// Describes the evaluations in `report`. Scenes that couldn't be scored make the command fail.
+fn describe_evaluations(report: &Path, evaluations: &[(PathBuf, Evaluation)]) -> Output {
+    let summaries = evaluations.iter().map(|(folder, e)| {
+        json!({
+            "folder": folder.to_string_lossy(), "index": e.index, "dataset": e.dataset, "context_views": e.context_views,
+            "image_size": e.image_size, "scenes": e.scenes.len(), "indexed_scenes": e.indexed_scenes, "summary": e.summary,
+            "efficiency": e.efficiency, "failures": e.failures,
+        })
+    });
+    let shown = |value: Option<f64>| value.map_or("absent".into(), |value| format!("{value:.4}"));
+    let line = |(_, e): &(PathBuf, Evaluation)| {
+        let Scores { psnr, ssim, lpips_vgg, lpips_alex, pixel_fraction, .. } = e.summary.mean;
+        let masked = pixel_fraction.map(|fraction| format!(", over {:.1} % of the pixels", 100. * fraction));
+        format!(
+            "{}, {} of {} scenes: PSNR {psnr:.2}, SSIM {ssim:.4}, LPIPS-VGG {}, LPIPS-Alex {}{}\n",
+            e.index,
+            e.scenes.len(),
+            e.indexed_scenes,
+            shown(lpips_vgg),
+            shown(lpips_alex),
+            masked.unwrap_or_default()
+        )
+    };
+    let text = evaluations.iter().map(line).collect::<String>() + &report.to_string_lossy();
+    let summaries: Vec<_> = summaries.collect();
+    let json = json!({ "report": report.to_string_lossy(), "evaluations": summaries });
+    let failures: Vec<_> = evaluations.iter().flat_map(|(_, e)| &e.failures).collect();
+    for failure in &failures {
+        eprintln!("{}: {}", failure.scene, failure.error);
     }
+    let count = failures.len();
+    let failed = || Error::failed(format!("{count} scenes could not be scored, the means are of the others"));
+    Output { failure: (count > 0).then(failed), ..Output::new(json, text) }
 }
 
 /// Size of the protocol's images, [height, width] (spec 9.1).
@@ -442,9 +420,10 @@ fn folders(out: &Path, indices: &[EvaluationIndex]) -> Result<Vec<PathBuf>> {
     }
 }
 
-fn print_table(scores: &CaptureScores) {
+/// Returns the lines of a table of the scores of every view, and of their means.
+fn table(scores: &CaptureScores) -> Vec<String> {
     let gaussians = scores.gaussians.map_or(String::new(), |n| format!(", {n} Gaussians"));
-    println!("{}: {} views{gaussians}", scores.scene, scores.views.len());
+    let mut lines = vec![format!("{}: {} views{gaussians}", scores.scene, scores.views.len())];
     // Columns without any value are left out.
     let columns = [
         ("LPIPS-VGG", scores.views.iter().any(|view| view.scores.lpips_vgg.is_some())),
@@ -458,14 +437,15 @@ fn print_table(scores: &CaptureScores) {
     };
     let names: String =
         columns.iter().filter(|(_, filled)| *filled).map(|(name, _)| format!(" {name:>10}")).collect();
-    println!("{:<24} {:>8} {:>8}{names}", "view", "PSNR", "SSIM");
-    for view in &scores.views {
-        let lpips = lpips([view.scores.lpips_vgg, view.scores.lpips_alex]);
-        println!("{:<24} {:>8.2} {:>8.4}{lpips}", view.image, view.scores.psnr, view.scores.ssim);
-    }
-    let lpips = lpips([scores.mean.lpips_vgg, scores.mean.lpips_alex]);
-    println!("{:<24} {:>8.2} {:>8.4}{lpips}", "mean", scores.mean.psnr, scores.mean.ssim);
+    lines.push(format!("{:<24} {:>8} {:>8}{names}", "view", "PSNR", "SSIM"));
+    let row = |name: &str, scores: &Scores| {
+        let lpips = lpips([scores.lpips_vgg, scores.lpips_alex]);
+        format!("{name:<24} {:>8.2} {:>8.4}{lpips}", scores.psnr, scores.ssim)
+    };
+    lines.extend(scores.views.iter().map(|view| row(&view.image, &view.scores)));
+    lines.push(row("mean", &scores.mean));
     if let Some(fraction) = scores.mean.pixel_fraction {
-        println!("scored over {:.1} % of the pixels: the others are masked out", 100. * fraction);
+        lines.push(format!("scored over {:.1} % of the pixels: the others are masked out", 100. * fraction));
     }
+    lines
 }

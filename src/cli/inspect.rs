@@ -1,4 +1,4 @@
-use super::{open_capture, print_json, splat_out, warn};
+use super::{Output, open_capture, splat_out, warn};
 use crate::data::{Chunk, Dataset, INDEX_FILE, Split};
 use crate::error::Error;
 use crate::io::{
@@ -7,14 +7,12 @@ use crate::io::{
 };
 use crate::reconstruct::{CONFIG_KEY, ModelFile, STAGE_KEY};
 use crate::render::{SplatRenderer, orbit_around_splat};
-use crate::scene::Gaussians;
 use anyhow::Result;
 use clap::Args;
 use glam::DVec3;
 use serde_json::{Value, json};
 use std::f64::consts::PI;
 use std::path::{Path, PathBuf};
-use tch::{Kind, Tensor};
 
 /// Print the contents of a splat, a weights file, a capture, a chunk, or a folder of chunks.
 #[derive(Args)]
@@ -29,13 +27,10 @@ pub struct Inspect {
     /// Also render a splat to this PNG, 512×512 pixels, from in front of it
     #[arg(long, value_name = "FILE")]
     preview: Option<PathBuf>,
-    /// Print the contents as one JSON object
-    #[arg(long)]
-    json: bool,
 }
 
 impl Inspect {
-    pub fn run(self) -> Result<()> {
+    pub fn run(self) -> Result<Output> {
         if let Some(preview) = &self.preview {
             if !is_splat_name(&self.path) {
                 let why =
@@ -65,41 +60,32 @@ impl Inspect {
                 return Err(Error::input(&self.path, "the path", "of an unknown type", expected).into());
             }
         };
-        if self.json {
-            print_json(&object);
-        } else {
-            for (key, value) in object.as_object().expect("an object") {
-                match value {
-                    Value::Null => {}
-                    Value::String(text) => {
-                        println!("{key:<20} {}", text.replace('\n', &format!("\n{:21}", "")))
-                    }
-                    other => println!("{key:<20} {other}"),
-                }
-            }
-        }
-        Ok(())
+        Ok(Output::table(object))
     }
+}
+
+/// Returns the values at these percentages of the sorted `values`, or null if there are none.
+fn percentiles<const N: usize>(
+    values: impl Iterator<Item = f64>,
+    percentages: [usize; N],
+) -> Option<[f64; N]> {
+    let mut sorted: Vec<f64> = values.collect();
+    sorted.sort_unstable_by(f64::total_cmp);
+    let last = sorted.len().checked_sub(1)?;
+    Some(percentages.map(|percentage| sorted[last * percentage / 100]))
 }
 
 /// Returns the minimum, median and maximum.
-fn range(t: &Tensor) -> Value {
-    let t = t.to_kind(Kind::Double);
-    if t.numel() == 0 {
-        return Value::Null;
-    }
-    json!([t.min().double_value(&[]), t.median().double_value(&[]), t.max().double_value(&[])])
+fn range(values: impl Iterator<Item = f64>) -> Value {
+    json!(percentiles(values, [0, 50, 100]))
 }
 
-/// Returns quantiles of the positive `values`, by name.
-fn quantiles(values: impl Iterator<Item = f32>) -> Value {
-    let mut sorted: Vec<f32> = values.collect();
-    if sorted.is_empty() {
-        return Value::Null;
-    }
-    sorted.sort_unstable_by(f32::total_cmp);
-    let at = |percent: usize| sorted.get((sorted.len().saturating_sub(1)) * percent / 100).copied();
-    json!({ "p01": at(1), "p05": at(5), "p25": at(25), "p50": at(50), "p75": at(75), "p95": at(95), "p99": at(99) })
+/// Returns percentiles by name.
+fn quantiles(values: impl Iterator<Item = f64>) -> Value {
+    let found = percentiles(values, [1, 5, 25, 50, 75, 95, 99]);
+    json!(found.map(|[p01, p05, p25, p50, p75, p95, p99]| {
+        json!({ "p01": p01, "p05": p05, "p25": p25, "p50": p50, "p75": p75, "p95": p95, "p99": p99 })
+    }))
 }
 
 /// Returns the mean square over all directions of the colors' part of each SH degree, a mean over Gaussians and channels.
@@ -118,8 +104,9 @@ fn sh_energy(splat: &Splat) -> Vec<f64> {
 fn splat(path: &Path, preview: Option<&Path>) -> Result<Value> {
     let splat = read_splat_without_invalid(path)?;
     warn(&splat.warnings);
-    let g = Gaussians::from_splat(&splat);
-    let axis = |i: usize| range(&(g.means.select(-1, i as i64).to_kind(Kind::Double) + splat.origin[i]));
+    let axis = |i: usize| range(splat.means.iter().map(|mean| f64::from(mean[i]) + splat.origin[i]));
+    let scales = || (0..splat.len()).flat_map(|index| splat.scale(index)).map(f64::from);
+    let opacities = || (0..splat.len()).map(|index| f64::from(splat.opacity(index)));
     let origin = (splat.origin != DVec3::ZERO).then(|| splat.origin.to_array());
     if let Some(preview) = preview {
         let camera = orbit_around_splat(&splat)[0];
@@ -127,7 +114,7 @@ fn splat(path: &Path, preview: Option<&Path>) -> Result<Value> {
     }
     Ok(json!({
         "kind": "splat",
-        "gaussians": g.count(),
+        "gaussians": splat.len(),
         "warnings": Some(&splat.warnings).filter(|warnings| !warnings.is_empty()),
         "sh_degree": splat.sh_degree,
         "antialiased": splat.antialiased,
@@ -136,10 +123,10 @@ fn splat(path: &Path, preview: Option<&Path>) -> Result<Value> {
         "y": axis(1),
         "z": axis(2),
         "local_origin": origin,
-        "scales": range(&g.scales),
-        "scale_quantiles": quantiles((0..splat.len()).flat_map(|index| splat.scale(index))),
-        "opacities": range(&g.opacities),
-        "opacity_quantiles": quantiles((0..splat.len()).map(|index| splat.opacity(index))),
+        "scales": range(scales()),
+        "scale_quantiles": quantiles(scales()),
+        "opacities": range(opacities()),
+        "opacity_quantiles": quantiles(opacities()),
         "sh_energy": sh_energy(&splat),
     }))
 }

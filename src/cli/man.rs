@@ -1,9 +1,10 @@
 //! Descriptions of the command line for other programs: man pages and shell completions.
 
-use super::{command_line, print_json};
+use super::{Output, command_line};
 use crate::Error;
 use crate::io::{check_writable_dir, write_atomically};
 use anyhow::Result;
+use clap::builder::Resettable;
 use clap::{Args, Command};
 use clap_complete::Shell;
 use clap_mangen::Man as Page;
@@ -26,11 +27,11 @@ pub struct Completions {
 }
 
 impl Completions {
-    pub fn run(self) -> Result<()> {
+    pub fn run(self) -> Result<Output> {
         let mut script = vec![];
         clap_complete::generate(self.shell, &mut command_line(), "globalsplat", &mut script);
-        print!("{}", String::from_utf8(script)?);
-        Ok(())
+        let script = String::from_utf8(script)?;
+        Ok(Output::new(json!({ "script": script }), script.trim_end()))
     }
 }
 
@@ -41,30 +42,22 @@ pub struct Man {
     /// Folder for the pages; the folder above it belongs to the MANPATH
     #[arg(value_name = "DIR")]
     out: PathBuf,
-    /// Print the names of the pages as one JSON object
-    #[arg(long)]
-    json: bool,
 }
 
 impl Man {
-    pub fn run(self) -> Result<()> {
+    pub fn run(self) -> Result<Output> {
         check_writable_dir(&self.out)?;
         let mut program = command_line().disable_help_subcommand(true);
         program.build();
-        let source = format!("globalsplat {}", env!("CARGO_PKG_VERSION"));
         let mut names = vec![];
         for command in visible_commands(&program) {
-            let page = Page::new(command.clone()).source(&source);
+            let page = Page::new(command.clone().after_help(Resettable::Reset));
             let file = self.out.join(page.get_filename());
             write_atomically(&file, |writer| render(&page, command, writer).map_err(Error::write(&file)))?;
             names.push(page.get_filename());
         }
-        if self.json {
-            print_json(&json!({ "out": self.out.to_string_lossy(), "pages": names }));
-        } else {
-            println!("{}: {} pages", self.out.display(), names.len());
-        }
-        Ok(())
+        let (out, count) = (self.out.to_string_lossy(), names.len());
+        Ok(Output::new(json!({ "out": out, "pages": names }), format!("{out}: {count} pages")))
     }
 }
 
@@ -74,24 +67,14 @@ fn visible_commands(command: &Command) -> Vec<&Command> {
     std::iter::once(command).chain(below).collect()
 }
 
-/// Writes the page of `command`.
+/// Writes the page of `command`, whose examples clap_mangen would join to a paragraph under the heading EXTRA.
 fn render(page: &Page, command: &Command, writer: &mut dyn Write) -> io::Result<()> {
-    page.render_title(writer)?;
-    page.render_name_section(writer)?;
-    page.render_synopsis_section(writer)?;
-    page.render_description_section(writer)?;
-    page.render_options_section(writer)?;
-    if command.has_subcommands() {
-        page.render_subcommands_section(writer)?;
-    }
-    // clap_mangen would join the lines of the examples to a paragraph under the heading EXTRA.
-    if let Some(examples) = command.get_after_help() {
-        let mut roff = Roff::new();
-        roff.control("SH", ["EXAMPLES"]).control("nf", []);
-        examples.to_string().lines().skip(1).for_each(|line| {
-            roff.text([roman(line.trim_start())]);
-        });
-        roff.control("fi", []).to_writer(writer)?;
-    }
-    Ok(())
+    page.render(writer)?;
+    let examples = command.get_after_help().map(ToString::to_string).unwrap_or_default();
+    let mut roff = Roff::new();
+    roff.control("SH", ["EXAMPLES"]).control("nf", []);
+    examples.lines().skip(1).for_each(|line| {
+        roff.text([roman(line.trim_start())]);
+    });
+    roff.control("fi", []).to_writer(writer)
 }

@@ -33,7 +33,9 @@ use crate::data::{Capture, Holdout};
 use crate::error::panic_message;
 use crate::scene::ImageSize;
 use clap::{CommandFactory, Parser, Subcommand};
+use serde_json::Value;
 use std::backtrace::{Backtrace, BacktraceStatus};
+use std::io::{ErrorKind, Write, stdout};
 use std::panic;
 use std::path::Path;
 use std::process::ExitCode;
@@ -48,6 +50,9 @@ const WRONG_REQUEST: u8 = 2;
 struct Cli {
     #[command(subcommand)]
     command: Command,
+    /// Print the result as one JSON object
+    #[arg(long, global = true)]
+    json: bool,
 }
 
 #[derive(Subcommand)]
@@ -75,28 +80,38 @@ enum Command {
 }
 
 impl Command {
-    fn run(self) -> anyhow::Result<()> {
-        match self {
-            Command::Capture(command) => command.run(),
-            Command::Train(command) => command.run(),
-            Command::Eval(command) => command.run(),
-            Command::Report(command) => command.run(),
-            Command::Reconstruct(command) => command.run(),
-            Command::Refine(command) => command.run(),
-            Command::Render(command) => command.run(),
-            Command::View(command) => command.run(),
-            Command::Convert(command) => command.run(),
-            Command::Export(command) => command.run(),
-            Command::Import(command) => command.run(),
-            Command::Synth(command) => command.run(),
-            Command::Pack(command) => command.run(),
-            Command::Inspect(command) => command.run(),
-            Command::Bench(command) => command.run(),
-            Command::Doctor(command) => command.run(),
-            Command::Completions(command) => command.run(),
-            Command::Man(command) => command.run(),
-            Command::Parity(command) => command.run(),
+    /// Runs the command and prints its result.
+    fn run(self, as_json: bool) -> anyhow::Result<()> {
+        let output = match self {
+            Command::Train(command) => command.run()?,
+            Command::Eval(command) => command.run()?,
+            Command::Report(command) => command.run()?,
+            Command::Refine(command) => command.run()?,
+            Command::Capture(command) => command.run()?,
+            Command::Reconstruct(command) => command.run()?,
+            Command::Render(command) => command.run()?,
+            Command::View(command) => command.run()?,
+            Command::Convert(command) => command.run()?,
+            Command::Export(command) => command.run()?,
+            Command::Import(command) => command.run()?,
+            Command::Synth(command) => command.run()?,
+            Command::Pack(command) => command.run()?,
+            Command::Inspect(command) => command.run()?,
+            Command::Bench(command) => command.run()?,
+            Command::Doctor(command) => command.run()?,
+            Command::Completions(command) => command.run()?,
+            Command::Man(command) => command.run()?,
+            Command::Parity(command) => return command.run(),
+        };
+        if distributed::is_main_process() {
+            let text = if as_json { output.json.to_string() } else { output.text };
+            match writeln!(stdout().lock(), "{text}") {
+                // A reader, such as `head`, has closed the pipe early.
+                Err(e) if e.kind() == ErrorKind::BrokenPipe => std::process::exit(FAILED.into()),
+                written => written.map_err(Error::failed_with_context("standard output can't be written"))?,
+            }
         }
+        output.failure.map_or(Ok(()), |failure| Err(failure.into()))
     }
 
     /// Returns `true` if the processes that `torchrun` started share the work of this command.
@@ -126,14 +141,13 @@ pub fn main() -> ExitCode {
     globalsplat_csrc::runtime::flush_denormals();
     // Errors of libtorch that the library's own checks don't catch arrive as panics: the user still gets one sentence, and with
     // RUST_BACKTRACE=1 a backtrace.
-    panic::set_hook(Box::new(|panic| {
+    panic::set_hook(Box::new(|_| {
         let backtrace = Backtrace::capture();
-        let is_internal = !panic_message(panic.payload()).contains(PRINTING);
-        if is_internal && backtrace.status() == BacktraceStatus::Captured {
+        if backtrace.status() == BacktraceStatus::Captured {
             eprintln!("{backtrace}");
         }
     }));
-    match cli.command.run_to_end() {
+    match cli.command.run_to_end(cli.json) {
         Ok(()) => ExitCode::from(DONE),
         Err((code, message)) => {
             if let Some(message) = message {
@@ -151,60 +165,41 @@ pub fn main() -> ExitCode {
 pub fn run(arguments: &[&str]) -> Result<(), (u8, String)> {
     let cli = Cli::try_parse_from([&["globalsplat"], arguments].concat());
     let cli = cli.map_err(|e| (e.exit_code() as u8, e.to_string()))?;
-    cli.command.run_to_end().map_err(|(code, message)| (code, message.unwrap_or_default()))
+    cli.command.run_to_end(cli.json).map_err(|(code, message)| (code, message.unwrap_or_default()))
 }
 
 impl Command {
     /// Runs the command. A failure is returned as its exit code and the message for the user, unless another process prints it.
-    fn run_to_end(self) -> Result<(), (u8, Option<String>)> {
+    fn run_to_end(self, as_json: bool) -> Result<(), (u8, Option<String>)> {
         // Errors stay one sentence.
         globalsplat_csrc::runtime::disable_stack_traces();
         let result = panic::catch_unwind(panic::AssertUnwindSafe(|| {
             if !self.is_shared() {
                 distributed::require_single_process()?;
             }
-            self.run()
+            self.run(as_json)
         }));
-        match result {
-            Ok(Ok(())) => Ok(()),
-            Ok(Err(error)) => {
-                let message = error.to_string();
-                // An error of the lower crates is one of the library's.
-                let error = error.downcast::<globalsplat_files::Error>().map(Error::from);
-                let error = error.or_else(|other| other.downcast::<Error>()).ok();
-                let message = user_message(&message, error.as_ref().is_some_and(Error::is_distributed));
-                Err((
-                    if error.as_ref().is_some_and(Error::is_invalid_request) {
-                        WRONG_REQUEST
-                    } else {
-                        FAILED
-                    },
-                    message,
-                ))
+        let error = match result {
+            Ok(Ok(())) => return Ok(()),
+            Ok(Err(error)) => error,
+            Err(panic) => {
+                anyhow::anyhow!("internal error (please report): {}", panic_message(&*panic))
             }
-            Err(panic) => Err((
-                FAILED,
-                user_message(&format!("internal error (please report): {}", panic_message(&*panic)), false),
-            )),
-        }
+        };
+        let message = error.to_string();
+        // An error of the lower crates is one of the library's.
+        let error = error.downcast::<globalsplat_files::Error>().map(Error::from);
+        let error = error.or_else(|other| other.downcast::<Error>());
+        let code = if error.as_ref().is_ok_and(Error::is_invalid_request) { WRONG_REQUEST } else { FAILED };
+        Err((code, user_message(&message, error.is_ok_and(|error| error.is_distributed()))))
     }
 }
 
-/// Start of the message of `println!`'s panic if standard output can't be written.
-const PRINTING: &str = "failed printing to stdout: ";
-
-/// Returns an error's message as the user sees it, or `None` if there is nothing to say: another process reports it, or a reader of
-/// standard output, such as `head`, has closed the pipe early.
+/// Returns an error's message as the user sees it, or `None` if another process reports it.
 fn user_message(message: &str, is_secondary: bool) -> Option<String> {
     let message = distributed::message_to_print(message, is_secondary)?;
-    if message.contains("DefaultCPUAllocator") || message.contains("std::bad_alloc") {
-        return Some("out of memory".into());
-    }
-    match message.split_once(PRINTING) {
-        Some((_, why)) if why.contains("Broken pipe") => None,
-        Some((_, why)) => Some(format!("standard output can't be written: {why}")),
-        None => Some(message),
-    }
+    let is_out_of_memory = message.contains("DefaultCPUAllocator") || message.contains("std::bad_alloc");
+    Some(if is_out_of_memory { "out of memory".into() } else { message })
 }
 
 /// Returns the command line, to describe it in other forms than help.
@@ -282,9 +277,61 @@ fn keep_freed_memory() {
     }
 }
 
-/// Prints a result as one JSON object.
-fn print_json(value: &serde_json::Value) {
-    println!("{value}");
+/// Result of a command, which `main` prints.
+#[derive(Default)]
+struct Output {
+    /// Object that `--json` prints.
+    json: Value,
+    /// Lines for people.
+    text: String,
+    /// Error with which the command ends after the result of the other work is printed.
+    failure: Option<Error>,
+}
+
+impl Output {
+    fn new(json: Value, text: impl Into<String>) -> Self {
+        Output { json, text: text.into(), failure: None }
+    }
+
+    /// Creates a result whose text has a line for each value of the object `json`, and for each row of a list in it.
+    fn table(json: Value) -> Self {
+        let line = |name: &str, value: &Value| {
+            let text = value_to_text(value).replace('\n', &format!("\n{:25}", ""));
+            format!("{name:<24} {text}")
+        };
+        let mut lines = vec![];
+        for (key, value) in json.as_object().into_iter().flatten() {
+            match value {
+                Value::Null => {}
+                Value::Array(rows) if rows.is_empty() => {}
+                Value::Array(rows) if rows.iter().any(|row| row.is_object() || row.is_array()) => {
+                    lines.extend(rows.iter().map(|row| line(row["name"].as_str().unwrap_or(key), row)));
+                }
+                value => lines.push(line(key, value)),
+            }
+        }
+        Output::new(json, lines.join("\n"))
+    }
+}
+
+/// Formats a value for people: numbers with four significant digits, and the values of an object side by side.
+fn value_to_text(value: &Value) -> String {
+    let join = |values: Vec<String>| values.join(", ");
+    match value {
+        Value::String(text) => text.clone(),
+        Value::Array(values) => join(values.iter().map(value_to_text).collect()),
+        Value::Object(values) => {
+            let values = values.iter().filter(|(key, _)| *key != "name");
+            join(values.map(|(key, value)| format!("{key} {}", value_to_text(value))).collect())
+        }
+        other => match other.as_f64().filter(|number| number.fract() != 0.) {
+            Some(number) => {
+                let decimals = (3. - number.abs().log10().floor()).clamp(0., 12.) as usize;
+                format!("{number:.decimals$}")
+            }
+            None => other.to_string(),
+        },
+    }
 }
 
 /// Reports that the photos in the file at `path` are downscaled, if the sides of the largest are divided by more than 1.
@@ -302,21 +349,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_command_has_examples_and_json() {
-        let mut program = Cli::command().disable_help_subcommand(true);
-        program.build();
+    fn every_command_has_examples() {
+        let program = Cli::command();
         for command in program.get_subcommands().filter(|command| !command.is_hide_set()) {
-            let name = command.get_name();
-            assert!(command.get_after_help().is_some(), "{name} has no example");
-            let parts: Vec<_> = match command.has_subcommands() {
-                true => command.get_subcommands().collect(),
-                false => vec![command],
-            };
-            // A script, which a shell reads, is no result.
-            for part in parts.into_iter().filter(|part| part.get_name() != "completions") {
-                let has_json = part.get_arguments().any(|argument| argument.get_id() == "json");
-                assert!(has_json, "{name} {} has no --json", part.get_name());
-            }
+            assert!(command.get_after_help().is_some(), "{} has no example", command.get_name());
         }
     }
 
@@ -326,7 +362,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let pages = folder.path().join("man1");
         let arguments = ["globalsplat", "man", pages.to_str().unwrap()];
-        Cli::try_parse_from(arguments).unwrap().command.run().unwrap();
+        Cli::try_parse_from(arguments).unwrap().command.run(false).unwrap();
         let page = std::fs::read_to_string(pages.join("globalsplat-bench-raster.1")).unwrap();
         assert!(
             page.contains("\\-\\-gaussians") && page.contains(".SH EXAMPLES\n.nf\nglobalsplat "),

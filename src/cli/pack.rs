@@ -1,4 +1,4 @@
-use super::{print_json, progress, warn_of_many};
+use super::{Output, progress, warn_of_many};
 use crate::data::{ChunkWriter, Holdout, find_captures, open_capture};
 use crate::error::Error;
 use crate::io::{InputFiles, check_writable_dir};
@@ -23,13 +23,10 @@ pub struct Pack {
     /// Approximate megabytes of photos per chunk
     #[arg(long, value_name = "MB", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=2000))]
     chunk_size: u32,
-    /// Print the result as one JSON object
-    #[arg(long)]
-    json: bool,
 }
 
 impl Pack {
-    pub fn run(self) -> Result<()> {
+    pub fn run(self) -> Result<Output> {
         let (mut captures, mut lines) = (vec![], vec![]);
         for scene in &self.scenes {
             if !scene.exists() && !scene.to_string_lossy().contains('#') {
@@ -73,13 +70,10 @@ impl Pack {
         }
         let chunks = writer.finish()?;
         bar.finish_and_clear();
-        if self.json {
-            print_json(
-                &json!({ "out": self.out.to_string_lossy(), "scenes": captures.len(), "views": views, "chunks": chunks }),
-            );
-        } else {
-            println!("{}: {} scenes, {views} views in {chunks} chunks", self.out.display(), captures.len());
-        }
-        Ok(())
+        let (out, scenes) = (self.out.to_string_lossy(), captures.len());
+        Ok(Output::new(
+            json!({ "out": out, "scenes": scenes, "views": views, "chunks": chunks }),
+            format!("{out}: {scenes} scenes, {views} views in {chunks} chunks"),
+        ))
     }
 }

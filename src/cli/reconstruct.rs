@@ -1,6 +1,6 @@
 use super::capture::SceneSource;
 use super::refine::{Refine, Reports};
-use super::{check_views, device, model, open_masked_capture, parse_holdout, print_json, signals, splat_out};
+use super::{Output, check_views, device, model, open_masked_capture, parse_holdout, signals, splat_out};
 use crate::data::Capture;
 use crate::device::{Stopwatch, peak_memory_bytes, process_age};
 use crate::io::{InputFiles, check_writable_splat};
@@ -54,21 +54,18 @@ pub struct Reconstruct {
     /// Device: cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
     device: String,
-    /// Print the result as one JSON object
-    #[arg(long)]
-    json: bool,
 }
 
 impl Reconstruct {
     /// Reconstructs the same splat and then optimizes its Gaussians for `seconds`.
-    fn run_refined(self, seconds: f64) -> Result<()> {
+    fn run_refined(self, seconds: f64) -> Result<Output> {
         let options = RefineOptions {
             seconds,
             holdout: parse_holdout(&self.holdout)?,
             views: self.views,
             ..Default::default()
         };
-        let Reconstruct { weights, scene, masks, out, local_origin, device, json, .. } = self;
+        let Reconstruct { weights, scene, masks, out, local_origin, device, .. } = self;
         Refine {
             splat: None,
             init: Some("model".into()),
@@ -81,12 +78,11 @@ impl Reconstruct {
             options,
             reports: Reports::default(),
             device,
-            json,
         }
         .run()
     }
 
-    pub fn run(self) -> Result<()> {
+    pub fn run(self) -> Result<Output> {
         check_views(self.views)?;
         if let Some(seconds) = self.refine {
             return self.run_refined(seconds);
@@ -131,35 +127,32 @@ impl Reconstruct {
 
         let bytes = std::fs::metadata(&self.out)?.len();
         let (count, seconds) = (reconstruction.gaussians.count(), reconstruction.forward_time.as_secs_f64());
-        if self.json {
-            print_json(&json!({
-                "splat": self.out.to_string_lossy(),
-                "weights": model::name(self.weights.as_deref()).to_string_lossy(),
-                "photos": photos.len(),
-                "image_size": data.image_size,
-                "gaussians": count,
-                "precision": loaded.model.precision(),
-                "load_seconds": parts["weights"],
-                "seconds": seconds,
-                "seconds_of": parts,
-                "seconds_from_start": from_start,
-                "peak_memory_bytes": peak_memory_bytes(),
-                "bytes": bytes,
-            }));
-        } else {
-            let megabytes = bytes as f64 / 1e6;
-            let pass = match data.color_steps {
-                0 => "forward pass",
-                _ => "forward pass and fit of colors",
-            };
-            println!(
-                "{}: {count} Gaussians from {} photos, {megabytes:.2} MB; {pass} {seconds:.2} s, peak memory {:.2} GB",
-                self.out.display(),
-                photos.len(),
-                peak_memory_bytes() as f64 / 1e9
-            );
-        }
-        Ok(())
+        let (out, peak_memory) = (self.out.to_string_lossy(), peak_memory_bytes());
+        let pass = match data.color_steps {
+            0 => "forward pass",
+            _ => "forward pass and fit of colors",
+        };
+        let text = format!(
+            "{out}: {count} Gaussians from {} photos, {:.2} MB; {pass} {seconds:.2} s, peak memory {:.2} GB",
+            photos.len(),
+            bytes as f64 / 1e6,
+            peak_memory as f64 / 1e9
+        );
+        let json = json!({
+            "splat": out,
+            "weights": model::name(self.weights.as_deref()).to_string_lossy(),
+            "photos": photos.len(),
+            "image_size": data.image_size,
+            "gaussians": count,
+            "precision": loaded.model.precision(),
+            "load_seconds": parts["weights"],
+            "seconds": seconds,
+            "seconds_of": parts,
+            "seconds_from_start": from_start,
+            "peak_memory_bytes": peak_memory,
+            "bytes": bytes,
+        });
+        Ok(Output::new(json, text))
     }
 }
 

@@ -3,8 +3,8 @@
 use super::capture::SceneSource;
 use super::progress::{self, Progress};
 use super::{
-    check_views, device, keep_freed_memory, model, open_masked_capture, print_json, report_downscaling,
-    signals, splat_out, warn,
+    Output, check_views, device, keep_freed_memory, model, open_masked_capture, report_downscaling, signals,
+    splat_out, warn,
 };
 use crate::data::{Capture, PhotoSize};
 use crate::device::process_age;
@@ -79,9 +79,6 @@ pub struct Refine {
     /// Device of the optimization: cpu, cuda or cuda:N
     #[arg(long, value_name = "DEVICE", default_value = "cpu")]
     pub device: String,
-    /// Print the result as one JSON object
-    #[arg(long)]
-    pub json: bool,
 }
 
 /// What a refinement reports besides its result.
@@ -100,7 +97,7 @@ pub struct Reports {
 }
 
 impl Refine {
-    pub fn run(mut self) -> Result<()> {
+    pub fn run(mut self) -> Result<Output> {
         check_views(self.options.views)?;
         self.options.device = device::parse(&self.device)?;
         self.options.check()?;
@@ -203,18 +200,17 @@ impl Refine {
             }
         }
         let lpips = if self.reports.lpips { session.score_lpips(&result)? } else { None };
-        self.print_result(&session, &result, held_out.as_ref(), lpips.as_ref());
-        Ok(())
+        Ok(self.describe_result(&session, &result, held_out.as_ref(), lpips.as_ref()))
     }
 
-    /// Prints the result. Scores are those before and after the optimization.
-    fn print_result(
+    /// Describes the result. Scores are those before and after the optimization.
+    fn describe_result(
         &self,
         session: &RefineSession,
         result: &RefineResult,
         held_out: Option<&[CaptureScores; 2]>,
         lpips: Option<&[CaptureScores; 2]>,
-    ) {
+    ) -> Output {
         let RefineResult { steps, seconds: [begun, ended], shown: [before, after], corrections, .. } = result;
         let (count, photos) = (result.gaussians.count(), session.photos().len());
         // Scores are of the held-out views if there are any, else of the photos.
@@ -222,45 +218,41 @@ impl Refine {
             lpips.map_or([None; 2], |scores| scores.each_ref().map(|scores| scores.mean.lpips_vgg));
         let (of_photos, of_held_out) =
             if session.held_out().is_empty() { (distances, [None; 2]) } else { ([None; 2], distances) };
-        if self.json {
-            let of = |scores: &Scores, lpips: Option<f64>| json!({ "psnr": scores.psnr, "ssim": scores.ssim, "lpips_vgg": lpips });
-            let mut object = json!({
-                "splat": self.out.to_string_lossy(), "gaussians": count, "photos": photos, "near_duplicates": session.near_duplicates(),
-                "steps": steps, "seconds": ended, "begin_seconds": begun, "corrections": corrections,
-                "shown": { "before": of(before, of_photos[0]), "after": of(after, of_photos[1]) },
-            });
-            if let Some([before, after]) = held_out {
-                let scores = session.sample_scores(after);
-                let last = EvalPoint { seconds: *ended, steps: *steps, scores };
-                let curve: Vec<&EvalPoint> = result.curve.iter().chain([&last]).collect();
-                object["held_out"] = json!({
-                    "views": after.views.len(), "before": of(&before.mean, of_held_out[0]),
-                    "after": of(&after.mean, of_held_out[1]), "curve": curve,
-                });
-            }
-            print_json(&object);
-            return;
-        }
-        println!("{}: {count} Gaussians, {steps} steps, {ended:.0} s", self.out.display());
-        println!("{:<24} {:>14} {:>8} {:>8}", "", "PSNR before", "after", "SSIM");
+        let out = self.out.to_string_lossy();
+        let of = |scores: &Scores, lpips: Option<f64>| json!({ "psnr": scores.psnr, "ssim": scores.ssim, "lpips_vgg": lpips });
+        let mut json = json!({
+            "splat": out, "gaussians": count, "photos": photos, "near_duplicates": session.near_duplicates(),
+            "steps": steps, "seconds": ended, "begin_seconds": begun, "corrections": corrections,
+            "shown": { "before": of(before, of_photos[0]), "after": of(after, of_photos[1]) },
+        });
         let row = |name: String, [before, after]: [f64; 2], ssim: f64| {
-            println!("{name:<24} {before:>14.2} {after:>8.2} {ssim:>8.4}");
+            format!("{name:<24} {before:>14.2} {after:>8.2} {ssim:>8.4}")
         };
         let sampled = result.shown_photos;
-        let of_photos = if sampled < photos { format!("{sampled} of ") } else { String::new() };
-        row(format!("{of_photos}{photos} photos"), [before.psnr, after.psnr], after.ssim);
+        let of_all_photos = if sampled < photos { format!("{sampled} of ") } else { String::new() };
+        let mut lines = vec![
+            format!("{out}: {count} Gaussians, {steps} steps, {ended:.0} s"),
+            format!("{:<24} {:>14} {:>8} {:>8}", "", "PSNR before", "after", "SSIM"),
+            row(format!("{of_all_photos}{photos} photos"), [before.psnr, after.psnr], after.ssim),
+        ];
         if let Some([before, after]) = held_out {
+            let scores = session.sample_scores(after);
+            let last = EvalPoint { seconds: *ended, steps: *steps, scores };
+            let curve: Vec<&EvalPoint> = result.curve.iter().chain([&last]).collect();
             let (scored, all) = (after.views.len(), session.held_out().len());
+            json["held_out"] = json!({
+                "views": scored, "before": of(&before.mean, of_held_out[0]),
+                "after": of(&after.mean, of_held_out[1]), "curve": curve,
+            });
             let of_all = if scored < all { format!(" of {all}") } else { String::new() };
             let psnr = [before.mean.psnr, after.mean.psnr];
-            row(format!("{scored}{of_all} views held out"), psnr, after.mean.ssim);
+            lines.push(row(format!("{scored}{of_all} views held out"), psnr, after.mean.ssim));
         }
         if let [Some(before), Some(after)] = distances {
-            println!("LPIPS (VGG) {before:.4} before, {after:.4} after");
+            lines.push(format!("LPIPS (VGG) {before:.4} before, {after:.4} after"));
         }
-        if let Some(line) = describe_corrections(corrections) {
-            println!("{line}");
-        }
+        lines.extend(describe_corrections(corrections));
+        Output::new(json, lines.join("\n"))
     }
 
     /// Returns an error if an output would replace an input, except the initial splat.

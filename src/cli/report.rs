@@ -1,4 +1,4 @@
-use super::print_json;
+use super::Output;
 use crate::eval::{evaluation_files, read_evaluation, write_report};
 use crate::io::{InputFiles, check_writable_file};
 use anyhow::Result;
@@ -18,13 +18,10 @@ pub struct Report {
     /// Output page
     #[arg(long, value_name = "FILE.html")]
     out: PathBuf,
-    /// Print the contents of the page as one JSON object
-    #[arg(long)]
-    json: bool,
 }
 
 impl Report {
-    pub fn run(self) -> Result<()> {
+    pub fn run(self) -> Result<Output> {
         check_writable_file(&self.out)?;
         let (mut evaluations, mut inputs) = (vec![], InputFiles::default());
         for folder in self.folders {
@@ -36,23 +33,18 @@ impl Report {
         inputs.check_file(&self.out)?;
         write_report(&self.out, &evaluations)?;
         let bytes = std::fs::metadata(&self.out)?.len();
-        if self.json {
-            let shown = evaluations.iter().map(|(folder, evaluation)| {
-                json!({
-                    "folder": folder.display().to_string(),
-                    "method": evaluation.method,
-                    "dataset": evaluation.dataset,
-                    "context_views": evaluation.context_views,
-                    "scenes": evaluation.scenes.len(),
-                    "failures": evaluation.failures.len(),
-                    "summary": evaluation.summary,
-                })
-            });
-            let shown: Vec<_> = shown.collect();
-            print_json(&json!({"out": self.out.display().to_string(), "bytes": bytes, "evaluations": shown}));
-        } else {
-            println!("{}", self.out.display());
-        }
-        Ok(())
+        let shown = evaluations.iter().map(|(folder, evaluation)| {
+            json!({
+                "folder": folder.display().to_string(),
+                "method": evaluation.method,
+                "dataset": evaluation.dataset,
+                "context_views": evaluation.context_views,
+                "scenes": evaluation.scenes.len(),
+                "failures": evaluation.failures.len(),
+                "summary": evaluation.summary,
+            })
+        });
+        let (out, shown) = (self.out.to_string_lossy(), shown.collect::<Vec<_>>());
+        Ok(Output::new(json!({ "out": out, "bytes": bytes, "evaluations": shown }), out))
     }
 }

@@ -1,4 +1,4 @@
-use super::{print_json, progress};
+use super::{Output, progress};
 use crate::Error;
 use crate::data::{Capture, ChunkWriter, SyntheticDataset, load_views};
 use crate::eval::{EvaluationIndex, SceneFrames};
@@ -52,16 +52,13 @@ pub struct Synth {
     /// Also write an overview image, a row per video
     #[arg(long, value_name = "FILE")]
     contact_sheet: Option<PathBuf>,
-    /// Print the result as one JSON object
-    #[arg(long)]
-    json: bool,
 }
 
 /// Maximum number of videos in the overview, and number of images of each.
 const SHEET: (usize, usize) = (16, 8);
 
 impl Synth {
-    pub fn run(self) -> Result<()> {
+    pub fn run(self) -> Result<Output> {
         if let Some(sheet) = &self.contact_sheet {
             check_writable_png(sheet)?;
         }
@@ -124,20 +121,15 @@ impl Synth {
         // This must be last: a folder with the index of its chunks is finished, and nothing more is written there.
         let chunks = writer.finish()?;
         bar.finish_and_clear();
-        let (out, scenes) = (self.out.display(), self.scenes);
-        if self.json {
-            print_json(&json!({
-                "out": self.out.to_string_lossy(), "scenes": scenes, "chunks": chunks, "index": index.file.to_string_lossy(),
+        let (out, scenes) = (self.out.to_string_lossy(), self.scenes);
+        Ok(Output::new(
+            json!({
+                "out": out, "scenes": scenes, "chunks": chunks, "index": index.file.to_string_lossy(),
                 "depth": self.depth.then_some(depths.to_string_lossy()),
                 "contact_sheet": self.contact_sheet.as_deref().map(Path::to_string_lossy),
-            }));
-        } else {
-            println!("{out}: {scenes} videos of {} photos in {chunks} chunks", self.frames);
-            if let Some(sheet) = &self.contact_sheet {
-                println!("{}: the first of them", sheet.display());
-            }
-        }
-        Ok(())
+            }),
+            format!("{out}: {scenes} videos of {} photos in {chunks} chunks", self.frames),
+        ))
     }
 
     fn write_depths(&self, file: &Path, capture: &Capture) -> Result<(), Error> {

@@ -1,4 +1,4 @@
-use super::{distributed, keep_freed_memory, print_json, progress, signals, warn_of_many};
+use super::{Output, distributed, keep_freed_memory, progress, signals, warn_of_many};
 use crate::config::Config;
 use crate::data::{BadData, Capture, Dataset, SceneGroups, Split, TrainingScenes};
 use crate::error::Error;
@@ -50,16 +50,13 @@ pub struct Train {
     /// Device: cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
     device: String,
-    /// Print the result as one JSON object
-    #[arg(long)]
-    json: bool,
 }
 
 /// Plot of the run.
 const CURVES_FILE: &str = "curves.svg";
 
 impl Train {
-    pub fn run(self) -> Result<()> {
+    pub fn run(self) -> Result<Output> {
         let (group, device) = distributed::join(&self.device)?;
         let (is_main_process, count) = (group.is_main_process(), group.world_size());
         let config = Config::read(&self.config, &self.set)?;
@@ -112,7 +109,7 @@ impl Train {
         let bad_data = trainer.bad_data();
         trainer.group().shutdown()?;
         if !is_main_process {
-            return Ok(());
+            return Ok(Output::default());
         }
         if outcome.skipped > 0 {
             eprintln!("{} steps were skipped: their loss or gradient was not finite", outcome.skipped);
@@ -153,7 +150,7 @@ impl Train {
         resume: &Resume,
     ) -> Result<Outcome> {
         let is_main_process = trainer.group().is_main_process();
-        let bar = progress::bar_on_first_rank(is_main_process, config.train.steps, "steps");
+        let bar = progress::bar(config.train.steps, "steps");
         let mut smooth_mse = None;
         let mut validation = String::new();
         let mut first = true;
@@ -204,7 +201,7 @@ impl Train {
         seconds: f64,
         validation: &[HeldOutScores],
         bad_data: &BadData,
-    ) -> Result<()> {
+    ) -> Result<Output> {
         let mean = |value: fn(&HeldOutScores) -> f64| {
             validation.iter().map(value).sum::<f64>() / validation.len() as f64
         };
@@ -217,44 +214,40 @@ impl Train {
             !signals::is_stop_requested()
         };
         retry_on_disk_full(&mut on_event, || write_curves(&curves, &self.out, nearest))?;
-        if self.json {
-            let mut object = json!({
-                "checkpoint": outcome.checkpoint.to_string_lossy(),
-                "curves": curves.to_string_lossy(),
-                "seconds": seconds,
-                "skipped_steps": outcome.skipped,
-                "skipped_scenes": bad_data,
-            });
-            if !validation.is_empty() {
-                object["held_out"] = json!({
-                    "psnr": mean(|v| v.ours.mean.psnr),
-                    "ssim": mean(|v| v.ours.mean.ssim),
-                    "nearest_photo_psnr": mean(|v| v.nearest.mean.psnr),
-                    "nearest_photo_ssim": mean(|v| v.nearest.mean.ssim),
-                    "scenes": validation.iter().map(|v| json!({"ours": v.ours, "nearest_photo": v.nearest})).collect::<Vec<_>>(),
-                });
-            }
-            print_json(&object);
-            return Ok(());
-        }
-        println!("trained in {seconds:.0} s, checkpoint {}", outcome.checkpoint.display());
-        println!("{}: training curves", curves.display());
+        let checkpoint = outcome.checkpoint.to_string_lossy();
+        let mut json = json!({
+            "checkpoint": checkpoint,
+            "curves": curves.to_string_lossy(),
+            "seconds": seconds,
+            "skipped_steps": outcome.skipped,
+            "skipped_scenes": bad_data,
+        });
+        let mut lines = vec![
+            format!("trained in {seconds:.0} s, checkpoint {checkpoint}"),
+            format!("{}: training curves", curves.display()),
+        ];
         if !validation.is_empty() {
-            println!("{:<24} {:>10} {:>10} {:>14}", "held-out views", "PSNR", "SSIM", "nearest photo");
-            for v in validation {
-                println!(
-                    "{:<24} {:>10.2} {:>10.4} {:>14.2}",
-                    v.ours.scene, v.ours.mean.psnr, v.ours.mean.ssim, v.nearest.mean.psnr
-                );
-            }
-            let (psnr, nearest) = (mean(|v| v.ours.mean.psnr), mean(|v| v.nearest.mean.psnr));
-            println!(
-                "{:<24} {psnr:>10.2} {:>10.4} {nearest:>14.2}   {:+.2} dB",
-                "mean",
-                mean(|v| v.ours.mean.ssim),
-                psnr - nearest
-            );
+            let (psnr, ssim) = (mean(|v| v.ours.mean.psnr), mean(|v| v.ours.mean.ssim));
+            let nearest = mean(|v| v.nearest.mean.psnr);
+            json["held_out"] = json!({
+                "psnr": psnr,
+                "ssim": ssim,
+                "nearest_photo_psnr": nearest,
+                "nearest_photo_ssim": mean(|v| v.nearest.mean.ssim),
+                "scenes": validation.iter().map(|v| json!({"ours": v.ours, "nearest_photo": v.nearest})).collect::<Vec<_>>(),
+            });
+            let row = |name: &str, psnr, ssim, nearest| {
+                format!("{name:<24} {psnr:>10.2} {ssim:>10.4} {nearest:>14.2}")
+            };
+            lines.push(format!(
+                "{:<24} {:>10} {:>10} {:>14}",
+                "held-out views", "PSNR", "SSIM", "nearest photo"
+            ));
+            lines.extend(validation.iter().map(|HeldOutScores { ours, nearest, .. }| {
+                row(&ours.scene, ours.mean.psnr, ours.mean.ssim, nearest.mean.psnr)
+            }));
+            lines.push(format!("{}   {:+.2} dB", row("mean", psnr, ssim, nearest), psnr - nearest));
         }
-        Ok(())
+        Ok(Output::new(json, lines.join("\n")))
     }
 }

@@ -1,6 +1,6 @@
 //! The commands `export` and `import`, which write weights.
 
-use super::{model, print_json};
+use super::{Output, model};
 use crate::config::Config;
 use crate::io::{InputFiles, check_writable_file, write_weights};
 use crate::model::{GlobalSplat, Precision, Stage};
@@ -40,7 +40,7 @@ pub struct Export {
 }
 
 impl Export {
-    pub fn run(self) -> Result<()> {
+    pub fn run(self) -> Result<Output> {
         let mut inputs = InputFiles::default();
         self.run.iter().for_each(|run| add_run_inputs(run, &mut inputs));
         self.weights.iter().for_each(|weights| inputs.add(weights));
@@ -93,7 +93,7 @@ pub struct Import {
 }
 
 impl Import {
-    pub fn run(self) -> Result<()> {
+    pub fn run(self) -> Result<Output> {
         let mut inputs = InputFiles::default();
         inputs.add(&self.from);
         self.out.check(&inputs)?;
@@ -120,9 +120,6 @@ struct WeightsOut {
     /// Data type of the stored weights
     #[arg(long, value_enum, default_value = "f32")]
     dtype: Dtype,
-    /// Print the result as one JSON object
-    #[arg(long)]
-    json: bool,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -146,15 +143,15 @@ impl WeightsOut {
         Ok(inputs.check_file(&self.out)?)
     }
 
-    /// Writes the variables of `vs` and reports it; the JSON output also gets the entries of `more`, the text output `note`.
+    /// Writes the variables of `vs` and reports it; the JSON output also has the entries of `report`, the text output `note`.
     fn write(
         &self,
         vs: &nn::VarStore,
         config: &Config,
         stage: Stage,
         format: Format,
-        (more, note): (Value, Option<String>),
-    ) -> Result<()> {
+        (mut report, note): (Value, Option<String>),
+    ) -> Result<Output> {
         let dtype = match self.dtype {
             Dtype::F32 => ModelDtype::F32,
             Dtype::Bf16 => ModelDtype::BF16,
@@ -166,20 +163,14 @@ impl WeightsOut {
         }
         let bytes = std::fs::metadata(&self.out)?.len();
         let parameters: usize = vs.trainable_variables().iter().map(|t| t.numel()).sum();
-        if self.json {
-            let mut report = json!({ "weights": self.out.to_string_lossy(), "parameters": parameters, "bytes": bytes, "stage": stage });
-            for (key, value) in more.as_object().into_iter().flatten() {
-                report[key] = value.clone();
-            }
-            print_json(&report);
-        } else {
-            let notes: String = [model::early_stage(stage, config), note]
-                .into_iter()
-                .flatten()
-                .map(|n| format!(", {n}"))
-                .collect();
-            println!("{}: {parameters} parameters, {:.1} MB{notes}", self.out.display(), bytes as f64 / 1e6);
-        }
-        Ok(())
+        let out = self.out.to_string_lossy();
+        let notes = [model::early_stage(stage, config), note].into_iter().flatten();
+        let notes: String = notes.map(|note| format!(", {note}")).collect();
+        let text = format!("{out}: {parameters} parameters, {:.1} MB{notes}", bytes as f64 / 1e6);
+        report["weights"] = out.into();
+        report["parameters"] = parameters.into();
+        report["bytes"] = bytes.into();
+        report["stage"] = json!(stage);
+        Ok(Output::new(report, text))
     }
 }

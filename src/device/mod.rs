@@ -170,11 +170,16 @@ impl Stopwatch {
     pub fn time<T>(&mut self, section: &'static str, work: impl FnOnce() -> T) -> T {
         let start = DeviceEvent::now(self.device);
         let result = work();
+        self.add_since(section, start);
+        result
+    }
+
+    /// Adds the time since `start` to `section`, like [`Stopwatch::time`].
+    pub(crate) fn add_since(&mut self, section: &'static str, start: Result<DeviceEvent>) {
         match (start, DeviceEvent::now(self.device)) {
             (Ok(DeviceEvent::Host(start)), Ok(DeviceEvent::Host(end))) => self.add(section, end - start),
             (start, end) => self.pending.push((section, start, end)),
         }
-        result
     }
 
     /// Returns every section and its time, in the order in which they were first entered. Waits for a GPU to finish.

@@ -126,10 +126,10 @@ fn doctor_reports_missing_libraries() {
     };
     let found = doctor("");
     assert!(
-        found.contains("CUDA 13.0") && found.contains("Imaginary, compute capability 9.0, 8.6 GB"),
+        found.contains("Imaginary") && found.contains("compute_capability 9.0") && found.contains("13.0"),
         "{found}"
     );
     assert!(found.contains("this libtorch can't use it"), "{found}");
-    assert!(doctor("no device").contains("it reports no GPU"));
+    assert!(doctor("no device").contains("the driver reports none"));
     assert!(doctor("mismatch").contains("unsupported display driver"));
 }

@@ -5,10 +5,9 @@ use crate::error::Result;
 use crate::model::Precision;
 use serde::Serialize;
 use serde_json::{Value, json};
-use std::borrow::Cow;
+use std::collections::HashMap;
 use std::fmt::Debug;
 use std::sync::{Arc, Mutex, MutexGuard};
-use std::time::Duration;
 use tch::{Device, Kind, Tensor, nn, no_grad};
 use tracing::field::{Field, Visit};
 use tracing::span::{Attributes, Id, Record};
@@ -36,7 +35,7 @@ impl TimingStats {
 /// A section of a measured operation, with its time per view or per step.
 #[derive(Debug, Serialize)]
 pub struct Section {
-    pub name: Cow<'static, str>,
+    pub name: String,
     pub milliseconds: TimingStats,
 }
 
@@ -48,52 +47,52 @@ pub struct Measured {
 }
 
 struct Recorded {
-    name: Cow<'static, str>,
+    name: String,
     milliseconds: Vec<f64>,
     /// Work of the first run. Every run does the same.
     work: Work,
 }
 
 impl Measured {
-    /// Adds one run with these sections. A name that occurs several times counts with the sum of its times.
-    pub fn add_run(&mut self, sections: impl IntoIterator<Item = (Cow<'static, str>, f64, Work)>) {
+    /// Adds one run with these sections, their times in milliseconds, and their work.
+    pub fn add_run(&mut self, sections: impl IntoIterator<Item = (String, f64, Work)>) {
         self.runs += 1;
         for (name, milliseconds, work) in sections {
             let known = self.sections.iter().position(|section| section.name == name).unwrap_or_else(|| {
-                self.sections.push(Recorded { name, milliseconds: vec![], work: Work::default() });
+                self.sections.push(Recorded { name, milliseconds: vec![], work });
                 self.sections.len() - 1
             });
             let section = &mut self.sections[known];
             section.milliseconds.resize(self.runs, 0.);
             section.milliseconds[self.runs - 1] += milliseconds;
-            if self.runs == 1 {
-                section.work.flops += work.flops;
-                section.work.backward_flops += work.backward_flops;
-                section.work.bytes += work.bytes;
-            }
         }
     }
 
     /// Adds the sections that `watch` recorded as one run.
     pub fn add_watch(&mut self, watch: &mut Stopwatch) -> Result<()> {
+        self.add_timed(watch, HashMap::new())
+    }
+
+    fn add_timed(&mut self, watch: &mut Stopwatch, mut work: HashMap<&'static str, Work>) -> Result<()> {
         let sections = watch.sections()?.iter();
-        self.add_run(
-            sections.map(|(name, time)| ((*name).into(), 1e3 * time.as_secs_f64(), Work::default())),
-        );
+        self.add_run(sections.map(|(name, time)| {
+            (name.to_string(), 1e3 * time.as_secs_f64(), work.remove(name).unwrap_or_default())
+        }));
         Ok(())
     }
 
-    /// Runs `pass` and adds its spans as one run, timed by the clock of `device`.
+    /// Runs `pass` and adds the spans of this library on this thread as one run, timed by the clock of `device`. A span inside of another one
+    /// is part of that.
     ///
     /// # Errors
     /// Returns the error of `pass`, or an error if a GPU is missing or fails.
     pub fn record<T>(&mut self, device: Device, pass: impl FnOnce() -> Result<T>) -> Result<T> {
-        let (result, spans) = record_spans(device, pass);
-        let result = result?;
-        let spans = spans
-            .into_iter()
-            .map(|span| Ok((span.name.into(), 1e3 * span.elapsed?.as_secs_f64(), span.work)));
-        self.add_run(spans.collect::<Result<Vec<_>>>()?);
+        let state = Mutex::new(State { watch: Stopwatch::new(device), ..State::default() });
+        let recorder = Arc::new(SpanRecorder { device, state });
+        let result = subscriber::with_default(recorder.clone(), pass)?;
+        let mut state = recorder.state();
+        let work = std::mem::take(&mut state.work);
+        self.add_timed(&mut state.watch, work)?;
         Ok(result)
     }
 
@@ -130,57 +129,25 @@ impl Measured {
     }
 }
 
-/// Two square matrices, multiplied in the same way as in the model's linear layers: the throughput that other products are compared with.
-pub struct PeakThroughput {
-    matrix: Tensor,
-    layer: nn::Linear,
-    precision: Precision,
-}
+/// Number of products that measure the peak throughput of the machine.
+const PRODUCTS: usize = 6;
 
-impl PeakThroughput {
-    /// Creates random matrices in `precision` on `device`, with sides of 2048 on the CPU and 8192 on a GPU.
-    pub fn new(precision: Precision, device: Device) -> Self {
-        let side = if device == Device::Cpu { 2048 } else { 8192 };
-        let matrix = Tensor::randn([side, side], (Kind::Float, device)).to_kind(precision.kind());
-        let layer = nn::Linear { ws: matrix.shallow_clone(), bs: None };
-        PeakThroughput { matrix, layer, precision }
+/// Returns the throughput in GFLOP/s that other products are compared with: that of the fastest of some products of two square matrices,
+/// multiplied in the same way as in the model's linear layers. Their sides are 2048 on the CPU and 8192 on a GPU.
+///
+/// # Errors
+/// Returns an error if a GPU fails.
+pub fn peak_gflops(precision: Precision, device: Device) -> Result<f64> {
+    let side = if device == Device::Cpu { 2048 } else { 8192 };
+    let matrix = Tensor::randn([side, side], (Kind::Float, device)).to_kind(precision.kind());
+    let layer = nn::Linear { ws: matrix.shallow_clone(), bs: None };
+    let mut fastest = f64::INFINITY;
+    for _ in 0..PRODUCTS {
+        let mut watch = Stopwatch::new(device);
+        no_grad(|| watch.time("product", || drop(precision.linear(&layer, &matrix))));
+        fastest = fastest.min(watch.sections()?[0].1.as_secs_f64());
     }
-
-    /// Returns the time of one product, in milliseconds.
-    ///
-    /// # Errors
-    /// Returns an error if a GPU fails.
-    pub fn time(&self) -> Result<f64> {
-        let mut watch = Stopwatch::new(self.matrix.device());
-        no_grad(|| watch.time("product", || drop(self.precision.linear(&self.layer, &self.matrix))));
-        Ok(1e3 * watch.sections()?[0].1.as_secs_f64())
-    }
-
-    /// Returns the throughput in GFLOP/s of the fastest of some products, by their times in milliseconds.
-    pub fn gflops(&self, milliseconds: Vec<f64>) -> f64 {
-        2e-6 * (self.matrix.size()[0] as f64).powi(3) / TimingStats::from_milliseconds(milliseconds).min
-    }
-}
-
-/// One execution of a span that isn't inside of another span.
-struct RecordedSpan {
-    name: &'static str,
-    elapsed: Result<Duration>,
-    /// Work of the span and of the spans inside.
-    work: Work,
-}
-
-/// Runs `pass` and returns the spans of this library that it runs on this thread, in their order, timed by the clock of `device`.
-fn record_spans<T>(device: Device, pass: impl FnOnce() -> T) -> (T, Vec<RecordedSpan>) {
-    let recorder = Arc::new(SpanRecorder { device, state: Mutex::default() });
-    let result = subscriber::with_default(recorder.clone(), pass);
-    let spans = std::mem::take(&mut recorder.state().left);
-    let finish = |(span, end): (EnteredSpan, Result<DeviceEvent>)| RecordedSpan {
-        elapsed: span.start.and_then(|start| end?.since(&start)),
-        name: span.name,
-        work: span.work,
-    };
-    (result, spans.into_iter().map(finish).collect())
+    Ok(2e-9 * (side as f64).powi(3) / fastest)
 }
 
 /// Subscriber that records the outermost spans of a thread.
@@ -191,20 +158,15 @@ struct SpanRecorder {
 
 #[derive(Default)]
 struct State {
+    watch: Stopwatch,
+    /// Work of the outermost spans and of the spans inside, by name.
+    work: HashMap<&'static str, Work>,
     /// Names of all spans. The number of a span's `Id` is its position here, plus 1.
     names: Vec<&'static str>,
-    /// Number of spans that the thread is inside of.
-    depth: usize,
-    /// Outermost span that the thread is inside of.
-    entered: Option<EnteredSpan>,
-    /// Outermost spans that the thread has left, with their ends, which the device has perhaps not reached yet.
-    left: Vec<(EnteredSpan, Result<DeviceEvent>)>,
-}
-
-struct EnteredSpan {
-    name: &'static str,
-    start: Result<DeviceEvent>,
-    work: Work,
+    /// Names of the spans that the thread is inside of, the outermost first.
+    entered: Vec<&'static str>,
+    /// Start of the outermost span.
+    start: Option<Result<DeviceEvent>>,
 }
 
 /// Sums of the fields of `record_flops` in the model.
@@ -253,29 +215,28 @@ impl Subscriber for SpanRecorder {
     fn record_follows_from(&self, _: &Id, _: &Id) {}
 
     fn event(&self, event: &Event) {
-        if let Some(span) = &mut self.state().entered {
-            event.record(&mut span.work);
+        let state = &mut *self.state();
+        if let Some(span) = state.entered.first() {
+            event.record(state.work.entry(span).or_default());
         }
     }
 
     fn enter(&self, id: &Id) {
         let mut state = self.state();
-        state.depth += 1;
-        if state.depth == 1 {
-            let name = state.names[id.into_u64() as usize - 1];
-            let start = DeviceEvent::now(self.device);
-            state.entered = Some(EnteredSpan { name, start, work: Work::default() });
+        if state.entered.is_empty() {
+            state.start = Some(DeviceEvent::now(self.device));
         }
+        let name = state.names[id.into_u64() as usize - 1];
+        state.entered.push(name);
     }
 
     fn exit(&self, _: &Id) {
-        let end = DeviceEvent::now(self.device);
-        let mut state = self.state();
-        state.depth -= 1;
-        if state.depth == 0
-            && let Some(span) = state.entered.take()
+        let state = &mut *self.state();
+        let name = state.entered.pop().expect("a span that was entered");
+        if state.entered.is_empty()
+            && let Some(start) = state.start.take()
         {
-            state.left.push((span, end));
+            state.watch.add_since(name, start);
         }
     }
 }
@@ -298,14 +259,16 @@ mod tests {
                 .in_scope(|| trace!(target: "another_library", flops = 5));
             trace_span!("next").in_scope(|| 4)
         };
-        let (result, spans) = record_spans(Device::Cpu, pass);
-        assert_eq!(result, 4);
-        let found: Vec<_> =
-            spans.iter().map(|s| (s.name, s.work.flops, s.work.backward_flops, s.work.bytes)).collect();
+        let mut measured = Measured::default();
+        assert_eq!(measured.record(Device::Cpu, || Ok(pass())).unwrap(), 4);
+        let found: Vec<_> = measured
+            .sections
+            .iter()
+            .map(|s| (s.name.as_str(), s.work.flops, s.work.backward_flops, s.work.bytes))
+            .collect();
         assert_eq!(found, [("outer", 3., 6., 60.), ("next", 0., 0., 0.)]);
-        assert!(spans.iter().all(|span| span.elapsed.is_ok()));
-        // Nobody listens outside of `record_spans`.
+        // Nobody listens outside of `record`.
         assert_eq!(trace_span!("unrecorded").in_scope(|| 5), 5);
-        assert_eq!(record_spans(Device::Cpu, || ()).1.len(), 0);
+        assert_eq!(measured.sections.len(), 2);
     }
 }

@@ -11,20 +11,18 @@ use self::raster::{bench_raster, synthetic_gaussians};
 use self::refine::bench_refine;
 use self::train::bench_train;
 use super::model::{parse_precision, precision};
-use super::{device, distributed, keep_freed_memory, open_capture, parse_size, print_json, warn};
+use super::{Output, device, distributed, keep_freed_memory, open_capture, parse_size, warn};
 use crate::config::Config;
 use crate::data::{load_all_views, view_batch};
 use crate::device::total_memory_bytes;
-use crate::distributed::ProcessGroup;
-use crate::error::{Error, panic_message};
+use crate::error::Error;
 use crate::io::read_splat;
 use crate::refine::RefineConfig;
 use crate::scene::Gaussians;
 use crate::train::largest_fitting_batch;
 use anyhow::Result;
 use clap::{Args, Subcommand};
-use serde_json::{Map, Value};
-use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
+use serde_json::Value;
 use std::path::PathBuf;
 use tch::Device;
 
@@ -45,38 +43,18 @@ enum Part {
 }
 
 impl Bench {
-    pub fn run(self) -> Result<()> {
-        match self.part {
+    pub fn run(self) -> Result<Output> {
+        Ok(Output::table(match self.part {
             Part::Raster(raster) => raster.run(),
             Part::Model(model) => model.run(),
             Part::Refine(refine) => refine.run(),
             Part::Train(train) => train.run(),
-        }
+        }?))
     }
 
     /// Returns `true` if the processes that torchrun started share the work.
     pub fn is_shared(&self) -> bool {
         matches!(self.part, Part::Train(_))
-    }
-}
-
-/// Options of every benchmark.
-#[derive(Args)]
-struct Common {
-    /// Device: cpu, cuda or cuda:N
-    #[arg(long, default_value = "cpu")]
-    device: String,
-    /// Print the measurements as one JSON object
-    #[arg(long)]
-    json: bool,
-}
-
-impl Common {
-    fn print(&self, report: &Value) {
-        match report {
-            Value::Object(report) if !self.json => print_report("", report),
-            report => print_json(report),
-        }
     }
 }
 
@@ -108,18 +86,19 @@ pub struct Raster {
     /// Number of timed calls
     #[arg(long, value_name = "N", default_value_t = 30, value_parser = clap::value_parser!(u32).range(1..))]
     repeats: u32,
-    #[command(flatten)]
-    common: Common,
+    /// Device: cpu, cuda or cuda:N
+    #[arg(long, default_value = "cpu")]
+    device: String,
 }
 
 impl Raster {
-    fn run(self) -> Result<()> {
+    fn run(self) -> Result<Value> {
         keep_freed_memory();
         if let Some(threads) = self.threads {
             tch::set_num_threads(i32::from(threads).max(1));
         }
         // The device is parsed before tensors are created, so that a missing one is reported immediately.
-        let device = device::parse(&self.common.device)?;
+        let device = device::parse(&self.device)?;
         let (gaussians, cameras) = match (&self.splat, &self.scene) {
             (Some(splat), Some(scene)) => {
                 let splat = read_splat(splat)?;
@@ -134,8 +113,7 @@ impl Raster {
             _ => synthetic_gaussians(self.gaussians as usize, self.cameras.into(), parse_size(&self.size)?),
         };
         let (gaussians, cameras) = (gaussians.to_device(device), cameras.to_device(device));
-        self.common.print(&bench_raster(&gaussians, &cameras, self.repeats as usize)?);
-        Ok(())
+        Ok(bench_raster(&gaussians, &cameras, self.repeats as usize)?)
     }
 }
 
@@ -158,8 +136,9 @@ pub struct Model {
     /// Precision of matrix products: f32, bf16, or auto: bf16 for wide models if the device has instructions for it
     #[arg(long, default_value = "auto")]
     precision: String,
-    #[command(flatten)]
-    common: Common,
+    /// Device: cpu, cuda or cuda:N
+    #[arg(long, default_value = "cpu")]
+    device: String,
 }
 
 /// Configuration to measure; without a file, the defaults, which are the paper's main model.
@@ -183,14 +162,13 @@ impl Configuration {
 }
 
 impl Model {
-    fn run(self) -> Result<()> {
-        let device = device::parse(&self.common.device)?;
+    fn run(self) -> Result<Value> {
+        let device = device::parse(&self.device)?;
         let requested = parse_precision(&self.precision)?;
         let mut config = self.config.read()?;
         let precision = precision(requested, device, config.model.width);
         config.data.context_views = self.views.into();
-        self.common.print(&bench_model(&config, precision, self.repeats as usize, device)?);
-        Ok(())
+        Ok(bench_model(&config, precision, self.repeats as usize, device)?)
     }
 }
 
@@ -212,17 +190,17 @@ pub struct Refine {
     /// Override a setting of the refinement
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    #[command(flatten)]
-    common: Common,
+    /// Device: cpu, cuda or cuda:N
+    #[arg(long, default_value = "cpu")]
+    device: String,
 }
 
 impl Refine {
-    fn run(self) -> Result<()> {
+    fn run(self) -> Result<Value> {
         keep_freed_memory();
         let config = RefineConfig::with(&self.set, true)?;
-        let (size, device) = (parse_size(&self.size)?, device::parse(&self.common.device)?);
-        self.common.print(&bench_refine(self.gaussians as usize, size, &config, self.steps, device)?);
-        Ok(())
+        let (size, device) = (parse_size(&self.size)?, device::parse(&self.device)?);
+        Ok(bench_refine(self.gaussians as usize, size, &config, self.steps, device)?)
     }
 }
 
@@ -242,34 +220,19 @@ pub struct Train {
     config: Configuration,
     /// Number of scenes per step; auto takes the largest of train.batch_size, half of it, a quarter, … that fits into the device's
     /// memory without train.micro_batch
-    #[arg(long, value_name = "N", default_value = "1", value_parser = parse_batch)]
-    batch: Batch,
+    #[arg(long, value_name = "N", default_value = "1")]
+    batch: String,
     /// Number of measured steps
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..))]
     steps: u32,
-    #[command(flatten)]
-    common: Common,
-}
-
-/// Number of scenes per step, as `--batch` takes it.
-#[derive(Debug, Clone, Copy)]
-enum Batch {
-    Auto,
-    Scenes(usize),
-}
-
-fn parse_batch(text: &str) -> Result<Batch, String> {
-    match text.parse() {
-        Ok(scenes @ 1..=65535) => Ok(Batch::Scenes(scenes)),
-        _ if text == "auto" => Ok(Batch::Auto),
-        _ => Err("expected auto, or a number from 1 to 65535".into()),
-    }
+    /// Device: cpu, cuda or cuda:N
+    #[arg(long, default_value = "cpu")]
+    device: String,
 }
 
 impl Train {
-    fn run(self) -> Result<()> {
-        let (group, device) = distributed::join(&self.common.device)?;
-        let is_main_process = group.is_main_process();
+    fn run(self) -> Result<Value> {
+        let (group, device) = distributed::join(&self.device)?;
         let mut config = self.config.read()?;
         if let Some(set) = self.config.set.iter().find(|set| set.trim_start().starts_with("train.batch")) {
             return Err(Error::request(format!("--set {set}: expected --batch N")).into());
@@ -277,86 +240,30 @@ impl Train {
         if !config.train.checkpoint_rounds {
             keep_freed_memory();
         }
-        let report = match self.batch {
-            Batch::Scenes(scenes) => {
-                config.train.batch_size = scenes;
-                bench_train(&config, self.steps as usize, device, group)?
+        match self.batch.parse() {
+            Ok(scenes @ 1..=65535) => config.train.batch_size = scenes,
+            _ if self.batch != "auto" || group.world_size() > 1 => {
+                let auto = if group.world_size() > 1 { "" } else { ", or auto" };
+                let why = format!("--batch {}: expected a number from 1 to 65535{auto}", self.batch);
+                return Err(Error::request(why).into());
             }
-            Batch::Auto if group.world_size() > 1 => {
-                return Err(Error::request("--batch auto: expected a number under torchrun").into());
-            }
-            Batch::Auto => self.bench_what_fits(config, device)?,
-        };
-        if is_main_process {
-            self.common.print(&report);
+            _ => take_what_fits(&mut config, device)?,
         }
-        Ok(())
-    }
-
-    /// Runs the benchmark with the batch size that fits by the estimate; if a GPU still runs out of memory, halves it and tries
-    /// again.
-    fn bench_what_fits(&self, mut config: Config, device: Device) -> Result<Value> {
-        let wanted = config.train.batch_size;
-        let bytes = total_memory_bytes(device).unwrap_or(u64::MAX);
-        let (fits, refused) = largest_fitting_batch(&config, bytes, device)?;
-        if let Some(refused) = refused {
-            let [more, bytes] = [refused.total(), bytes].map(|bytes| bytes as f64 * 1e-9);
-            eprintln!(
-                "--batch auto: {fits} of {wanted} scenes; {} would take {more:.1} GB, the device has {bytes:.1} GB",
-                refused.batch
-            );
-        }
-        config.train.batch_size = fits;
-        config.train.micro_batch = 0;
-        loop {
-            let batch = config.train.batch_size;
-            let bench = || bench_train(&config, self.steps as usize, device, ProcessGroup::single());
-            let is_refused = |why: &str| batch > 1 && why.contains("out of memory");
-            match catch_unwind(AssertUnwindSafe(bench)) {
-                Ok(Err(error)) if is_refused(&error.to_string()) => {}
-                Ok(done) => return Ok(done?),
-                Err(panic) if is_refused(panic_message(&*panic)) => {}
-                Err(panic) => resume_unwind(panic),
-            }
-            config.train.batch_size = batch / 2;
-            eprintln!("--batch auto: {} scenes; there was too little memory for {batch}", batch / 2);
-        }
+        Ok(bench_train(&config, self.steps as usize, device, group)?)
     }
 }
 
-/// Prints the plain values of `report` in a line, its time among them, and then a line for each object and for each row in it.
-fn print_report(name: &str, report: &Map<String, Value>) {
-    let mut values = report.clone();
-    values.remove("name");
-    if let Some(Value::Object(time)) = values.remove("milliseconds") {
-        values.extend(time);
+/// Sets the batch size to the largest that fits into the memory of `device`, by the estimate.
+fn take_what_fits(config: &mut Config, device: Device) -> Result<()> {
+    let bytes = total_memory_bytes(device).unwrap_or(u64::MAX);
+    let (fits, refused) = largest_fitting_batch(config, bytes, device)?;
+    if let Some(refused) = refused {
+        let [more, bytes] = [refused.total(), bytes].map(|bytes| bytes as f64 * 1e-9);
+        eprintln!(
+            "--batch auto: {fits} of {} scenes; {} would take {more:.1} GB, the device has {bytes:.1} GB",
+            config.train.batch_size, refused.batch
+        );
     }
-    let is_table =
-        |value: &Value| value.as_array().is_some_and(|rows| rows.iter().any(|row| !row.is_number()));
-    let (nested, plain): (Vec<_>, Vec<_>) =
-        values.iter().partition(|(_, value)| value.is_object() || is_table(value));
-    let format = |(key, value): &(&String, &Value)| match (value.as_f64(), value.as_str()) {
-        (Some(number), _) if number.fract() != 0. => format!("{key} {number:.4}"),
-        (_, Some(text)) => format!("{key} {text}"),
-        _ => format!("{key} {value}"),
-    };
-    println!("{name:<28} {}", plain.iter().map(format).collect::<Vec<_>>().join(", "));
-    for (key, value) in nested {
-        if let Value::Object(group) = value {
-            print_report(key, group);
-        }
-        for row in value.as_array().into_iter().flatten() {
-            match row {
-                Value::Object(row) => {
-                    print_report(row.get("name").and_then(Value::as_str).unwrap_or(key), row)
-                }
-                // A name and a mean time.
-                pair => println!(
-                    "{:<28} {:.3} ms",
-                    pair[0].as_str().unwrap_or_default(),
-                    pair[1].as_f64().unwrap_or(f64::NAN)
-                ),
-            }
-        }
-    }
+    (config.train.batch_size, config.train.micro_batch) = (fits, 0);
+    Ok(())
 }

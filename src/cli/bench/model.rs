@@ -1,6 +1,6 @@
 //! Benchmark of the forward pass: the time of its parts, and its memory use.
 
-use super::measure::{Measured, PeakThroughput, TimingStats};
+use super::measure::{Measured, TimingStats, peak_gflops};
 use super::train::synthetic_scene;
 use crate::config::Config;
 use crate::data::Batch;
@@ -31,25 +31,23 @@ pub fn bench_model(config: &Config, precision: Precision, repeats: usize, device
     }
     let context = Batch::from_scenes(&[synthetic_scene(config, 0)], device)?.context;
     let stage = config.curriculum.final_stage();
-    let peak = PeakThroughput::new(precision, device);
+    let peak_gflops = peak_gflops(precision, device)?;
     let input = context.model_input();
     let forward = || -> Result<f64> {
         let mut watch = Stopwatch::new(device);
         drop(no_grad(|| watch.time("pass", || model.forward(&input, stage))));
         Ok(1e3 * watch.sections()?[0].1.as_secs_f64())
     };
-    let (mut parts, mut passes, mut products) = (Measured::default(), vec![], vec![]);
+    let (mut parts, mut passes) = (Measured::default(), vec![]);
     // The first pass warms up caches, threads and the GPU's libraries.
     forward()?;
     reset_peak_memory(device);
     for _ in 0..repeats {
-        products.push(peak.time()?);
         // Events around every part slow down a GPU that runs kernels faster than the host launches them, so time a GPU's pass without them.
         let unwatched = (device != Device::Cpu).then(forward).transpose()?;
         let watched = parts.record(device, forward)?;
         passes.push(unwatched.unwrap_or(watched));
     }
-    let peak_gflops = peak.gflops(products);
     Ok(json!({
         "views": config.data.context_views,
         "size": config.data.image_size,

@@ -61,10 +61,8 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
             let [without, with] = [0, 1].map(|section| sections[section].1.as_secs_f64());
             forward.push(per_view(without));
             forward_backward.push(per_view(with));
-            stages.add_run(
-                named_stages(stage_times())
-                    .map(|(name, seconds)| (name.into(), per_view(seconds), Work::default())),
-            );
+            let times = named_stages(stage_times());
+            stages.add_run(times.map(|(name, time)| (name.into(), per_view(time), Work::default())));
         }
     }
     let working_bytes = peak_memory_bytes_on(device).saturating_sub(memory_before);
@@ -121,7 +119,7 @@ fn time_kernels(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) -> Res
         measure_kernels(true);
         render_with_gradients(gaussians, cameras)?;
         let times = kernel_times()?.into_iter();
-        measured.add_run(times.map(|time| (time.kernel.into(), time.milliseconds / views, Work::default())));
+        measured.add_run(times.map(|time| (time.kernel, time.milliseconds / views, Work::default())));
         Ok(())
     });
     measure_kernels(false);

@@ -1,6 +1,6 @@
 //! Benchmark of a training step: the time of its parts, and its memory use.
 
-use super::measure::{Measured, PeakThroughput};
+use super::measure::{Measured, peak_gflops};
 use crate::config::Config;
 use crate::data::{Batch, Capture, LoadedScene};
 use crate::device::{Stopwatch, Upload, peak_memory_bytes_on};
@@ -16,8 +16,6 @@ use serde_json::{Value, json};
 use std::sync::Arc;
 use tch::Device;
 
-/// Number of matrix products that measure the peak throughput of the machine.
-const PRODUCTS: usize = 5;
 /// Far plane of the synthetic scenes' frusta.
 const FAR: f64 = 40.;
 
@@ -46,11 +44,10 @@ pub fn bench_train(config: &Config, steps: usize, device: Device, group: Process
     let peak_bytes = peak_memory_bytes_on(device);
     let precision = config.train.precision;
     let (threads, slices_at_once) = (tch::get_num_threads(), trainer.slices_at_once(scenes.len()));
-    let peak = PeakThroughput::new(precision, device);
     tch::set_num_threads(threads / slices_at_once as i32);
-    let products = (0..=PRODUCTS).map(|_| peak.time()).skip(1).collect::<Result<Vec<_>>>();
+    let peak_gflops = peak_gflops(precision, device);
     tch::set_num_threads(threads);
-    let peak_gflops = peak.gflops(products?);
+    let peak_gflops = peak_gflops?;
     let (milliseconds, sections) = (measured.total(), measured.sections());
     let waited = sections.iter().find(|section| section.name == COMMUNICATION);
     let together = waited.map(|waited| {

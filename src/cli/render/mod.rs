@@ -3,7 +3,7 @@
 mod output;
 mod shots;
 
-use super::{model, open_capture, parse_size, print_json, progress, signals, view, warn};
+use super::{Output, model, open_capture, progress, signals, view, warn};
 use crate::data::{Capture, Holdout};
 use crate::error::Error;
 use crate::io::{InputFiles, read_splat, splat_files, tiled_size};
@@ -14,7 +14,7 @@ use crate::scene::{Camera, Gaussians, ImageSize};
 use anyhow::Result;
 use clap::{ArgGroup, Args};
 use glam::DVec3;
-use output::Output;
+use output::ImageOutput;
 use serde_json::json;
 use shots::Shots;
 use std::path::{Path, PathBuf};
@@ -79,13 +79,10 @@ pub struct Render {
     /// Image size, as in 640x480; by default the capture's
     #[arg(long, value_name = "WxH")]
     size: Option<String>,
-    /// Print the result as one JSON object
-    #[arg(long)]
-    json: bool,
 }
 
 impl Render {
-    pub fn run(self) -> Result<()> {
+    pub fn run(self) -> Result<Output> {
         match (&self.html, &self.out) {
             (Some(page), _) => self.page(page),
             (None, Some(out)) => self.pictures(out),
@@ -93,35 +90,34 @@ impl Render {
         }
     }
 
-    fn page(&self, page: &Path) -> Result<()> {
-        view::check_writable(page)?;
+    fn page(&self, page: &Path) -> Result<Output> {
+        view::check_writable(Some(page))?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
         self.inputs(capture.as_ref()).check_file(page)?;
         let (splat, origin) = self.gaussians(capture.as_ref())?;
         let name = capture.as_ref().map_or_else(|| view::name_of(page), |capture| capture.name.clone());
         view::write_page(page, &name, &splat, origin, capture.as_ref())?;
         let (gaussians, bytes) = (splat.count(), std::fs::metadata(page)?.len());
-        if self.json {
-            print_json(&json!({ "page": page.to_string_lossy(), "gaussians": gaussians, "bytes": bytes }));
-        } else {
-            println!("{}: {gaussians} Gaussians, {:.1} MB", page.display(), bytes as f64 * 1e-6);
-        }
-        Ok(())
+        let page = page.to_string_lossy();
+        Ok(Output::new(
+            json!({ "page": page, "gaussians": gaussians, "bytes": bytes }),
+            format!("{page}: {gaussians} Gaussians, {:.1} MB", bytes as f64 * 1e-6),
+        ))
     }
 
-    fn pictures(&self, out: &Path) -> Result<()> {
-        Output::check(out, self.fps)?;
+    fn pictures(&self, out: &Path) -> Result<Output> {
+        ImageOutput::check(out, self.fps)?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
         let (gaussians, origin) = self.gaussians(capture.as_ref())?;
         let renderer = SplatRenderer::from_gaussians(&gaussians, origin);
-        let shots = self.shots((&gaussians, origin), &renderer, capture.as_ref())?;
+        let shots = Shots::new(self, capture.as_ref(), (&gaussians, origin), &renderer)?;
         let scale = if self.depth { Some(DepthScale::estimate(&renderer, &shots.cameras)?) } else { None };
 
         signals::handle_stop_requests()?;
         let mut inputs = self.inputs(capture.as_ref());
         inputs.extend(shots.inputs.clone());
         let film = (self.size_of_all(&shots.cameras), shots.frames_per_second);
-        let mut output = Output::begin(out, (&shots.names, &self.suffixes()), film, &inputs)?;
+        let mut output = ImageOutput::begin(out, (&shots.names, &self.suffixes()), film, &inputs)?;
         let bar = progress::bar(shots.cameras.len() as u64, "views");
         for camera in &shots.cameras {
             let rendered = renderer.render(std::slice::from_ref(camera))?.remove(0);
@@ -134,15 +130,12 @@ impl Render {
         }
         let written = output.finish()?;
         bar.finish_and_clear();
-        if self.json {
-            let written: Vec<_> = written.iter().map(|file| file.to_string_lossy()).collect();
-            print_json(
-                &json!({ "views": shots.cameras.len(), "gaussians": gaussians.count(), "files": written }),
-            );
-        } else {
-            println!("{}: {} views", out.display(), shots.cameras.len());
-        }
-        Ok(())
+        let (views, out) = (shots.cameras.len(), out.display());
+        let written: Vec<_> = written.iter().map(|file| file.to_string_lossy()).collect();
+        Ok(Output::new(
+            json!({ "views": views, "gaussians": gaussians.count(), "files": written }),
+            format!("{out}: {views} views"),
+        ))
     }
 
     /// Returns the Gaussians, and the origin of their means in the world.
@@ -156,23 +149,6 @@ impl Render {
         let data = &loaded.config.data;
         let photos = load_context(capture, Holdout::None, Some(data.context_views), data.image_size)?;
         Ok(reconstruct(&loaded, &photos, &[])?.in_world_about_origin())
-    }
-
-    fn shots(
-        &self,
-        (gaussians, origin): (&Gaussians, DVec3),
-        renderer: &SplatRenderer,
-        capture: Option<&Capture>,
-    ) -> Result<Shots> {
-        let size = self.size.as_deref().map(parse_size).transpose()?;
-        let frames = self.frames.map(|frames| frames as usize);
-        let shots = match (&self.path, capture) {
-            (Some(path), _) => Shots::from_path(path, size, frames, renderer)?,
-            (None, Some(capture)) if self.orbit => Shots::orbit_capture(capture, size, frames, renderer)?,
-            (None, Some(capture)) => Shots::from_capture(capture, size, frames, renderer, &self.suffixes())?,
-            (None, None) => Shots::orbit_splat(gaussians, origin, size, frames),
-        };
-        Ok(Shots { frames_per_second: self.fps.unwrap_or(shots.frames_per_second), ..shots })
     }
 
     /// Returns the input files, which no output may replace.

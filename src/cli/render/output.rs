@@ -7,12 +7,11 @@ use crate::io::{
     tile_horizontally, write_png,
 };
 use crate::scene::ImageSize;
-use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use tch::Tensor;
 
 /// Output that `--out` selects.
-pub enum Output<'a> {
+pub enum ImageOutput<'a> {
     /// Folder of PNGs.
     Folder {
         /// Files of each image, one per part.
@@ -25,7 +24,7 @@ pub enum Output<'a> {
     Film(&'a Path, VideoWriter),
 }
 
-impl<'a> Output<'a> {
+impl<'a> ImageOutput<'a> {
     /// Returns an error, before the work, if the output couldn't be written. `frames_per_second` is the user's `--fps`.
     pub fn check(path: &Path, frames_per_second: Option<u32>) -> Result<()> {
         let kind = kind(path);
@@ -43,7 +42,7 @@ impl<'a> Output<'a> {
         Ok(check_writable_file(path)?)
     }
 
-    /// Creates the output for images called `names`, whose parts have `suffixes`, in frames of at most `size` with all parts
+    /// Creates the output for images called `names`, unique with the `suffixes` of their parts, in frames of at most `size` with all parts
     /// side by side.
     ///
     /// # Errors
@@ -60,25 +59,27 @@ impl<'a> Output<'a> {
         }
         Ok(match kind {
             Kind::Folder => {
-                let files = files_of(path, names, suffixes);
+                let file = |name: &String, suffix: &&str| path.join(format!("{name}{suffix}.png"));
+                let of_image = |name| suffixes.iter().map(|suffix| file(name, suffix)).collect();
+                let files: Vec<Vec<PathBuf>> = names.iter().map(of_image).collect();
                 for file in files.iter().flatten() {
                     inputs.check_file(file)?;
                     check_regular(file)?;
                 }
                 inputs.check_folder(path)?;
-                Output::Folder { files, written: 0 }
+                ImageOutput::Folder { files, written: 0 }
             }
-            Kind::Row => Output::Row(path, Mosaic::row(names.len())),
-            Kind::Film => Output::Film(path, VideoWriter::begin(path, size, frames_per_second)?),
+            Kind::Row => ImageOutput::Row(path, Mosaic::row(names.len())),
+            Kind::Film => ImageOutput::Film(path, VideoWriter::begin(path, size, frames_per_second)?),
         })
     }
 
     /// Adds the next image, as its parts [3, H, W].
     pub fn add(&mut self, parts: &[Tensor]) -> Result<()> {
         match self {
-            Output::Film(_, film) => film.add(&tile_horizontally(parts)),
-            Output::Row(_, mosaic) => mosaic.add(parts),
-            Output::Folder { files, written } => {
+            ImageOutput::Film(_, film) => film.add(&tile_horizontally(parts)),
+            ImageOutput::Row(_, mosaic) => mosaic.add(parts),
+            ImageOutput::Folder { files, written } => {
                 let of_picture = &files[*written];
                 *written += 1;
                 of_picture.iter().zip(parts).try_for_each(|(file, picture)| {
@@ -93,31 +94,17 @@ impl<'a> Output<'a> {
     /// Finishes the output and returns the files written.
     pub fn finish(self) -> Result<Vec<PathBuf>> {
         match self {
-            Output::Folder { files, .. } => Ok(files.into_iter().flatten().collect()),
-            Output::Row(path, mosaic) => {
+            ImageOutput::Folder { files, .. } => Ok(files.into_iter().flatten().collect()),
+            ImageOutput::Row(path, mosaic) => {
                 report_downscaling(path, mosaic.shrunk_by());
                 mosaic.write(path)?;
                 Ok(vec![path.to_owned()])
             }
-            Output::Film(path, film) => {
+            ImageOutput::Film(path, film) => {
                 film.finish()?;
                 Ok(vec![path.to_owned()])
             }
         }
-    }
-}
-
-/// Returns the files in `folder` of images called `names`, each with one per suffix. If two would have the same path, as `x`
-/// with a suffix and a photo of that name, all names are replaced by numbers.
-fn files_of(folder: &Path, names: &[String], suffixes: &[&str]) -> Vec<Vec<PathBuf>> {
-    let of_picture = |name: &str| -> Vec<PathBuf> {
-        suffixes.iter().map(|suffix| folder.join(format!("{name}{suffix}.png"))).collect()
-    };
-    let files: Vec<Vec<PathBuf>> = names.iter().map(|name| of_picture(name)).collect();
-    let distinct: BTreeSet<&PathBuf> = files.iter().flatten().collect();
-    match distinct.len() == names.len() * suffixes.len() {
-        true => files,
-        false => (0..names.len()).map(|index| of_picture(&format!("{index:06}"))).collect(),
     }
 }
 

@@ -5,7 +5,7 @@ mod page;
 
 pub use page::{check_writable, has_viewer, write_page};
 
-use super::{open_capture, print_json, warn};
+use super::{Output, open_capture, warn};
 use crate::error::Error;
 use crate::io::read_splat;
 use crate::scene::Gaussians;
@@ -13,6 +13,7 @@ use anyhow::Result;
 use clap::Args;
 use serde_json::json;
 use std::fs::DirEntry;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 /// Explore a splat interactively: writes a page for a browser, with everything in one file, and opens it.
@@ -30,14 +31,11 @@ pub struct View {
     /// Capture that the splat was made from
     #[arg(long, value_name = "PATH")]
     scene: Option<PathBuf>,
-    /// Print the path of the page as one JSON object
-    #[arg(long)]
-    json: bool,
 }
 
 impl View {
-    pub fn run(self) -> Result<()> {
-        page::check_has_viewer()?;
+    pub fn run(self) -> Result<Output> {
+        check_writable(None)?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
         let splat = read_splat(&self.splat)?;
         warn(&splat.warnings);
@@ -48,17 +46,12 @@ impl View {
         write_page(page.path(), &name, &Gaussians::from_splat(&splat), splat.origin, capture.as_ref())?;
         let page = page.into_temp_path().keep().map_err(|e| Error::write(e.path.to_path_buf())(e.error))?;
         let opened = open::that_detached(&page);
-        if self.json {
-            print_json(
-                &json!({ "page": page.to_string_lossy(), "gaussians": splat.len(), "opened": opened.is_ok() }),
-            );
-        } else {
-            println!("{}", page.display());
-        }
-        if let Err(e) = opened {
+        if let Err(e) = &opened {
             eprintln!("no browser could be started ({e}): open the page in one, here or elsewhere");
         }
-        Ok(())
+        let page = page.to_string_lossy();
+        let json = json!({ "page": page, "gaussians": splat.len(), "opened": opened.is_ok() });
+        Ok(Output::new(json, page))
     }
 }
 
@@ -75,17 +68,9 @@ fn remove_pages(folder: &Path) {
 }
 
 /// Returns `true` if `file` is a regular file that belongs to the current user.
-#[cfg(unix)]
 fn is_own(file: &DirEntry) -> bool {
-    use std::os::unix::fs::MetadataExt;
     // SAFETY: `geteuid` takes no arguments and always succeeds.
     file.metadata().is_ok_and(|file| file.is_file() && file.uid() == unsafe { libc::geteuid() })
-}
-
-/// Returns `true` if `file` is a regular file. The temporary folder belongs to one user.
-#[cfg(not(unix))]
-fn is_own(file: &DirEntry) -> bool {
-    file.metadata().is_ok_and(|file| file.is_file())
 }
 
 /// Returns the title of a page for the file at `path`: the file's name without its extension.

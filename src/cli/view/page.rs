@@ -1,6 +1,6 @@
 //! The page: HTML around the viewer that `web/` bundles, with all its data.
 
-use super::contents::Contents;
+use super::contents::contents;
 use crate::data::Capture;
 use crate::error::Error;
 use crate::io::{
@@ -12,6 +12,7 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use glam::DVec3;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
+use serde_json::Value;
 use std::path::Path;
 
 /// Viewer bundled from `web/` when this program was built; empty if npm wasn't available.
@@ -27,27 +28,18 @@ pub fn has_viewer() -> bool {
     !VIEWER.is_empty()
 }
 
-/// Checks that this program can write pages.
+/// Checks that this program has the viewer, and that a page can be written to `path` if it is given. Call it before the work.
 ///
 /// # Errors
-/// A program that was built without npm.
-pub fn check_has_viewer() -> Result<()> {
+/// A program that was built without npm, or a path that can't be written to.
+pub fn check_writable(path: Option<&Path>) -> Result<()> {
     if !has_viewer() {
         return Err(Error::request(
             "this program was built without the viewer that pages need: install Node.js 20 or newer with npm, and run make build",
         )
         .into());
     }
-    Ok(())
-}
-
-/// Checks that a page can be written to `path`. Call it before the work, not after.
-///
-/// # Errors
-/// The errors of [`check_has_viewer`], or a path that can't be written to.
-pub fn check_writable(path: &Path) -> Result<()> {
-    check_has_viewer()?;
-    Ok(check_writable_file(path)?)
+    path.map_or(Ok(()), |path| Ok(check_writable_file(path)?))
 }
 
 /// Writes an interactive page of `gaussians` of one scene, whose means are relative to `origin`, with the photos of `capture`, as one file
@@ -64,9 +56,9 @@ pub fn write_page(
 ) -> Result<()> {
     let frame = gaussians.local_frame(origin);
     let local = gaussians.to_local(&frame, origin);
-    let contents = Contents::new(name, &local, capture, &frame)?;
+    let contents = contents(&local, capture, &frame)?;
     let cameras = frame.cameras_to_local(&capture.map(Capture::cameras).unwrap_or_default());
-    let text = page(&contents, &spz(&local.to_splat(DVec3::ZERO)?, &cameras)?)?.into_string();
+    let text = page(name, &contents, &spz(&local.to_splat(DVec3::ZERO)?, &cameras)?).into_string();
     Ok(write_atomically(path, |writer| writer.write_all(text.as_bytes()).map_err(Error::write(path)))?)
 }
 
@@ -85,9 +77,8 @@ fn in_script(json: &str) -> PreEscaped<String> {
     PreEscaped(json.replace('<', "\\u003c"))
 }
 
-fn page(contents: &Contents, spz: &[u8]) -> Result<Markup> {
-    let json = serde_json::to_string(contents)?;
-    Ok(html! {
+fn page(name: &str, contents: &Value, spz: &[u8]) -> Markup {
+    html! {
         (DOCTYPE)
         html lang="en" {
             head {
@@ -96,7 +87,7 @@ fn page(contents: &Contents, spz: &[u8]) -> Result<Markup> {
                 meta name="viewport" content="width=device-width, initial-scale=1, viewport-fit=cover";
                 meta name="color-scheme" content="dark";
                 meta name="generator" content={ "GlobalSplat " (env!("CARGO_PKG_VERSION")) };
-                title { (contents.name) }
+                title { (name) }
                 style { (PreEscaped(STYLE)) }
             }
             body data-state="loading" {
@@ -109,7 +100,7 @@ fn page(contents: &Contents, spz: &[u8]) -> Result<Markup> {
                 p #message role="status" { "Loading the scene…" }
                 noscript { p { "This page needs JavaScript; it loads none from elsewhere." } }
                 header {
-                    h1 { (contents.name) }
+                    h1 { (name) }
                     nav aria-label="View" {
                         div role="group" aria-label="Shown" {
                             button #color type="button" aria-pressed="true" title="1" { "Color" }
@@ -128,12 +119,12 @@ fn page(contents: &Contents, spz: &[u8]) -> Result<Markup> {
                     div #strip role="group" aria-label="Photos to jump to" {}
                 }
                 (help())
-                script #scene type="application/json" { (in_script(&json)) }
+                script #scene type="application/json" { (in_script(&contents.to_string())) }
                 script #splat type="text/plain" { (PreEscaped(STANDARD.encode(spz))) }
                 script { (PreEscaped(VIEWER.replace("</script", "<\\/script"))) }
             }
         }
-    })
+    }
 }
 
 fn help() -> Markup {
