@@ -134,7 +134,7 @@ impl Convert {
         });
         let begin = Instant::now();
         let spz_version = self.spz_version.unwrap_or(if self.clamp_sh { 3 } else { 4 });
-        splat_out::write_with(&self.to, &written, origin, &WriteOptions { spz_version })?;
+        splat_out::write(&self.to, &written, origin, &WriteOptions { spz_version })?;
         let written_at = Instant::now();
         let copy = read_splat(&self.to)?;
         let mut to = description(&self.to, &copy)?;

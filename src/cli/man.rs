@@ -1,11 +1,11 @@
 //! Descriptions of the command line for other programs: man pages and shell completions.
 
-use super::{Output, command_line};
+use super::{Cli, Output};
 use crate::Error;
 use crate::io::{check_writable_dir, write_atomically};
 use anyhow::Result;
 use clap::builder::Resettable;
-use clap::{Args, Command};
+use clap::{Args, Command, CommandFactory};
 use clap_complete::Shell;
 use clap_mangen::Man as Page;
 use clap_mangen::roff::{Roff, roman};
@@ -29,7 +29,7 @@ pub struct Completions {
 impl Completions {
     pub fn run(self) -> Result<Output> {
         let mut script = vec![];
-        clap_complete::generate(self.shell, &mut command_line(), "globalsplat", &mut script);
+        clap_complete::generate(self.shell, &mut Cli::command(), "globalsplat", &mut script);
         let script = String::from_utf8(script)?;
         Ok(Output::new(json!({ "script": script }), script.trim_end()))
     }
@@ -47,7 +47,7 @@ pub struct Man {
 impl Man {
     pub fn run(self) -> Result<Output> {
         check_writable_dir(&self.out)?;
-        let mut program = command_line().disable_help_subcommand(true);
+        let mut program = Cli::command().disable_help_subcommand(true);
         program.build();
         let mut names = vec![];
         for command in visible_commands(&program) {

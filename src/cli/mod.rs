@@ -32,7 +32,7 @@ use crate::Error;
 use crate::data::{Capture, Holdout};
 use crate::error::panic_message;
 use crate::scene::ImageSize;
-use clap::{CommandFactory, Parser, Subcommand};
+use clap::{Parser, Subcommand};
 use serde_json::Value;
 use std::backtrace::{Backtrace, BacktraceStatus};
 use std::io::{ErrorKind, Write, stdout};
@@ -202,11 +202,6 @@ fn user_message(message: &str, is_secondary: bool) -> Option<String> {
     Some(if is_out_of_memory { "out of memory".into() } else { message })
 }
 
-/// Returns the command line, to describe it in other forms than help.
-fn command_line() -> clap::Command {
-    Cli::command()
-}
-
 /// Parses an image size as `--size` takes it.
 fn parse_size(text: &str) -> Result<ImageSize, Error> {
     let sides = text.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
@@ -347,6 +342,7 @@ fn report_downscaling(path: &Path, by: i64) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use clap::CommandFactory;
 
     #[test]
     fn every_command_has_examples() {
@@ -369,7 +365,7 @@ mod tests {
             "{page}"
         );
         let (script, mut text) = (folder.path().join("completions.sh"), vec![]);
-        clap_complete::generate(clap_complete::Shell::Bash, &mut command_line(), "globalsplat", &mut text);
+        clap_complete::generate(clap_complete::Shell::Bash, &mut Cli::command(), "globalsplat", &mut text);
         std::fs::write(&script, text).unwrap();
         assert!(std::process::Command::new("bash").arg("-n").arg(&script).status().unwrap().success());
     }

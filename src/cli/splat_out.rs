@@ -26,31 +26,20 @@ pub fn total_bytes(path: &Path) -> Result<u64> {
 /// Calls [`write`] with spherical harmonics fitted to the range of the format, so that the splat looks the same from `cameras`.
 pub fn write_for(path: &Path, splat: &Splat, cameras: &[Camera], local_origin: Option<DVec3>) -> Result<()> {
     let limits = ShLimits::up_to(splat.sh_degree);
-    write(path, &fit_splat(path, splat, &limits, cameras)?, local_origin)
+    write(path, &fit_splat(path, splat, &limits, cameras)?, local_origin, &WriteOptions::default())
 }
 
 /// Writes `splat` to `path`, with coordinates relative to `local_origin` if there is one. Otherwise they are world coordinates,
 /// and their loss of precision in float32 is reported on standard error.
-pub fn write(path: &Path, splat: &Splat, local_origin: Option<DVec3>) -> Result<()> {
-    write_with(path, splat, local_origin, &WriteOptions::default())
-}
-
-/// Writes a splat like [`write`], with `options`.
-pub fn write_with(
-    path: &Path,
-    splat: &Splat,
-    local_origin: Option<DVec3>,
-    options: &WriteOptions,
-) -> Result<()> {
+pub fn write(path: &Path, splat: &Splat, local_origin: Option<DVec3>, options: &WriteOptions) -> Result<()> {
     if splat.antialiased && !output_format(path)?.marks_antialiased {
         let line = "the format can't say that the splat is antialiased, and viewers show it slightly wrong";
         eprintln!("{}: {line}", path.display());
     }
-    if let Some(origin) = local_origin {
-        return Ok(write_local_splat(path, &splat.with_origin(origin), options)?);
-    }
-    if let Some(loss) = rounding_warning(splat) {
+    if local_origin.is_none()
+        && let Some(loss) = rounding_warning(splat)
+    {
         eprintln!("{}: {loss}; --local-origin keeps them exact", path.display());
     }
-    Ok(write_local_splat(path, &splat.with_origin(DVec3::ZERO), options)?)
+    Ok(write_local_splat(path, &splat.with_origin(local_origin.unwrap_or(DVec3::ZERO)), options)?)
 }
