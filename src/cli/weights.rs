@@ -8,7 +8,7 @@ use crate::reconstruct::{ModelDtype, ModelFile, load_model, model_weights, save_
 use crate::train::{MODEL_FILE, add_run_inputs, best_checkpoint, latest_checkpoint};
 use anyhow::Result;
 use clap::{ArgGroup, Args, ValueEnum};
-use serde_json::{Value, json};
+use serde_json::json;
 use std::path::PathBuf;
 use tch::{Device, nn};
 
@@ -46,28 +46,26 @@ impl Export {
         self.weights.iter().for_each(|weights| inputs.add(weights));
         self.config.iter().for_each(|config| inputs.add(config));
         self.out.check(&inputs)?;
-        let mut note = None;
-        let (vs, config, stage) = match (&self.run, &self.weights, &self.config) {
-            (Some(run), ..) => {
-                let checkpoint = if self.best { best_checkpoint(run)? } else { latest_checkpoint(run)? };
-                let loaded = load_model(&checkpoint.join(MODEL_FILE), Device::Cpu)?;
-                (loaded.vs, loaded.config, loaded.stage)
-            }
-            (None, Some(weights), _) => {
-                let loaded = load_model(weights, Device::Cpu)?;
-                note = loaded.assumed.map(|assumed| format!("taken for {assumed}"));
-                (loaded.vs, loaded.config, loaded.stage)
-            }
-            (None, None, config) => {
-                let config = Config::read(config.as_ref().expect("clap asks for one of the three"), &[])?;
-                tch::manual_seed(config.train.seed as i64);
-                let vs = nn::VarStore::new(Device::Cpu);
-                GlobalSplat::new(&vs.root(), &config.model)?;
-                let stage = config.curriculum.final_stage();
-                (vs, config, stage)
-            }
+        let weights = match &self.run {
+            Some(run) if self.best => Some(best_checkpoint(run)?.join(MODEL_FILE)),
+            Some(run) => Some(latest_checkpoint(run)?.join(MODEL_FILE)),
+            None => self.weights.clone(),
         };
-        self.out.write(&vs, &config, stage, self.format, (json!({}), note))
+        if let Some(weights) = weights {
+            let loaded = load_model(&weights, Device::Cpu)?;
+            return self.out.write(
+                &loaded.vs,
+                &loaded.config,
+                loaded.stage,
+                self.format,
+                (loaded.assumed, 0),
+            );
+        }
+        let config = Config::read(self.config.as_ref().expect("clap asks for one of the three"), &[])?;
+        tch::manual_seed(config.train.seed as i64);
+        let vs = nn::VarStore::new(Device::Cpu);
+        GlobalSplat::new(&vs.root(), &config.model)?;
+        self.out.write(&vs, &config, config.curriculum.final_stage(), self.format, (None, 0))
     }
 }
 
@@ -100,15 +98,8 @@ impl Import {
         let file = ModelFile::open(&self.from, &self.set)?;
         let left_out = file.left_out;
         let loaded = file.load(Device::Cpu, Precision::F32)?;
-        let notes: Vec<String> = loaded
-            .assumed
-            .iter()
-            .map(|assumed| format!("taken for {assumed}"))
-            .chain((left_out > 0).then(|| format!("{left_out} other tensors left out")))
-            .collect();
-        let note = (!notes.is_empty()).then(|| notes.join("; "));
-        let more = json!({ "taken_for": loaded.assumed, "left_out": left_out });
-        self.out.write(&loaded.vs, &loaded.config, loaded.stage, Format::Safetensors, (more, note))
+        let (vs, config) = (&loaded.vs, &loaded.config);
+        self.out.write(vs, config, loaded.stage, Format::Safetensors, (loaded.assumed, left_out))
     }
 }
 
@@ -143,14 +134,14 @@ impl WeightsOut {
         Ok(inputs.check_file(&self.out)?)
     }
 
-    /// Writes the variables of `vs` and reports it; the JSON output also has the entries of `report`, the text output `note`.
+    /// Writes the variables of `vs`, and reports it with what was assumed about them and the number of tensors that were left out.
     fn write(
         &self,
         vs: &nn::VarStore,
         config: &Config,
         stage: Stage,
         format: Format,
-        (mut report, note): (Value, Option<String>),
+        (assumed, left_out): (Option<String>, usize),
     ) -> Result<Output> {
         let dtype = match self.dtype {
             Dtype::F32 => ModelDtype::F32,
@@ -161,16 +152,20 @@ impl WeightsOut {
             Format::Safetensors => write_weights(&self.out, &weights.tensors, weights.metadata)?,
             Format::Torch => save_checkpoint(&self.out, weights)?,
         }
-        let bytes = std::fs::metadata(&self.out)?.len();
+        let (out, bytes) = (self.out.to_string_lossy(), std::fs::metadata(&self.out)?.len());
         let parameters: usize = vs.trainable_variables().iter().map(|t| t.numel()).sum();
-        let out = self.out.to_string_lossy();
-        let notes = [model::early_stage(stage, config), note].into_iter().flatten();
-        let notes: String = notes.map(|note| format!(", {note}")).collect();
-        let text = format!("{out}: {parameters} parameters, {:.1} MB{notes}", bytes as f64 / 1e6);
-        report["weights"] = out.into();
-        report["parameters"] = parameters.into();
-        report["bytes"] = bytes.into();
-        report["stage"] = json!(stage);
-        Ok(Output::new(report, text))
+        let notes = [
+            model::early_stage(stage, config),
+            assumed.as_ref().map(|assumed| format!("taken for {assumed}")),
+            (left_out > 0).then(|| format!("{left_out} other tensors left out")),
+        ];
+        let notes: String = notes.into_iter().flatten().map(|note| format!(", {note}")).collect();
+        Ok(Output::new(
+            json!({
+                "weights": out, "parameters": parameters, "bytes": bytes, "stage": stage,
+                "taken_for": assumed, "left_out": left_out,
+            }),
+            format!("{out}: {parameters} parameters, {:.1} MB{notes}", bytes as f64 / 1e6),
+        ))
     }
 }
