@@ -3,7 +3,7 @@
 use super::document::{Document, Primitive, quoted};
 use super::{COLOR_SPACE, EXTENSION, KERNEL, POINTS, SPZ_EXTENSION, rotation_from_gltf, sh_attribute};
 use crate::axes::Axes;
-use crate::splat::logit_of_opacity;
+use crate::splat::{color_to_sh0, logit_of_opacity};
 use crate::{Error, Result, Splat, spz};
 use glam::{DMat4, DQuat, DVec3};
 use serde_json::Value;
@@ -98,19 +98,38 @@ impl PrimitiveReader<'_> {
         self.add_size(memory, count, (sh_degree + 1).pow(2))?;
         let own = |name: &str| format!("{EXTENSION}:{name}");
         let rotations = self.numbers(&own("ROTATION"), count)?;
-        let opacities = self.numbers(&own("OPACITY"), count)?;
+        let opacities = self.numbers_or_colors(&own("OPACITY"), count, |[.., opacity]| [opacity])?;
         let mut splat = Splat { means, sh_degree, linear_scales: Some(vec![]), ..Splat::default() };
         splat.quaternions = rotations.into_iter().map(|[x, y, z, w]| [w, x, y, z]).collect();
         splat.opacity_logits =
             opacities.into_iter().map(|[opacity]| logit_of_opacity(f32::into(opacity))).collect();
         self.numbers(&own("SCALE"), count)?.into_iter().for_each(|scale| splat.push_linear_scale(scale));
-        let names =
-            (0..=sh_degree).flat_map(|degree| (0..2 * degree + 1).map(move |k| sh_attribute(degree, k)));
-        let harmonics =
-            names.map(|name| self.numbers(&name, count)).collect::<Result<Vec<Vec<[f32; 3]>>>>()?;
+        let to_sh0 = |color: f32| color_to_sh0(color.into());
+        let sh0 = self.numbers_or_colors(&sh_attribute(0, 0), count, |[r, g, b, _]| [r, g, b].map(to_sh0));
+        let mut harmonics: Vec<Vec<[f32; 3]>> = vec![sh0?];
+        for degree in 1..=sh_degree {
+            for k in 0..2 * degree + 1 {
+                harmonics.push(self.numbers(&sh_attribute(degree, k), count)?);
+            }
+        }
         splat.sh =
             (0..count).flat_map(|index| harmonics.iter().map(move |of_basis| of_basis[index])).collect();
         Ok(splat)
+    }
+
+    /// Returns the numbers of an attribute of the extension. If it is absent, returns `part_of` COLOR_0, as in files of the extension's drafts.
+    fn numbers_or_colors<const N: usize>(
+        &self,
+        name: &str,
+        count: usize,
+        part_of: impl Fn([f32; 4]) -> [f32; N],
+    ) -> Result<Vec<[f32; N]>> {
+        const COLORS: &str = "COLOR_0";
+        let is_present = |name: &str| self.primitive.attributes.contains_key(name);
+        if is_present(name) || !is_present(COLORS) {
+            return self.numbers(name, count);
+        }
+        Ok(self.numbers(COLORS, count)?.into_iter().map(part_of).collect())
     }
 
     /// Returns the numbers of an attribute.

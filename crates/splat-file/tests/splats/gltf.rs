@@ -1,8 +1,8 @@
 //! glTF: its bytes, files as of other programs, and invalid files.
 
 use super::common::{
-    assert_bytes_refused, assert_refused, assert_says, assert_within, bytes_of, random_splat, read_bytes,
-    refusal, written,
+    assert_bytes_refused, assert_refused, assert_says, assert_within, bytes_of, largest_error, random_splat,
+    read_bytes, refusal, written,
 };
 use base64::prelude::{BASE64_STANDARD, Engine};
 use glam::{DMat4, DQuat, DVec3};
@@ -257,6 +257,22 @@ fn quantized_and_interleaved_attributes_are_read() {
     glb.assert_refused_with(&format!("{view}/byteLength"), json!(22), &short);
     let stride = ["the stride of accessor", "(POSITION) is 4, expected 6 bytes or more"];
     glb.assert_refused_with(&format!("{view}/byteStride"), json!(4), &stride);
+}
+
+/// Colors and opacities come from COLOR_0 if the attributes of the extension are absent, as in files of its drafts.
+#[test]
+fn colors_are_a_fallback() {
+    let splat = random_splat(50, 0, 4);
+    let mut glb = Glb::new(&splat);
+    glb.remove_attribute("KHR_gaussian_splatting:SH_DEGREE_0_COEF_0");
+    let read = glb.read();
+    assert!(largest_error(read.sh.as_flattened(), splat.sh.as_flattened()) < 0.51 / 255. / SH_C0);
+    assert_eq!(read.opacity(7), splat.opacity(7));
+    glb.remove_attribute(OPACITY);
+    assert!((glb.read().opacity(7) - splat.opacity(7)).abs() < 0.51 / 255.);
+    glb.remove_attribute("COLOR_0");
+    let message = format!("the attribute {OPACITY} of primitive 0 of mesh 0 is missing");
+    assert_bytes_refused("glb", &glb.bytes(), &[&message]);
 }
 
 /// A buffer is a file beside the .gltf, whose name is percent-encoded, or a data URI.
