@@ -6,8 +6,7 @@ use std::{
 };
 
 /// Source files with the cxx bridges between Rust and C++.
-const BRIDGES: [&str; 6] = [
-    "src/chunk.rs",
+const BRIDGES: [&str; 5] = [
     "src/cuda.rs",
     "src/distributed.rs",
     "src/render.rs",

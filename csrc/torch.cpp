@@ -1,6 +1,5 @@
 // All code that includes torch, as one translation unit: parsing torch's headers is half of the compilation time.
 #include "attention.cpp"
-#include "chunk.cpp"
 #include "cpu/splat.cpp"
 #include "cuda/splat.cpp"
 #include "depth_search.cpp"

@@ -2,11 +2,27 @@
 
 use crate::error::{Error, Result};
 use crate::io::{write_atomically, write_json};
-use globalsplat_capture::{CHUNK_EXTENSION, CHUNK_INDEX_FILE, Capture, Chunk, Holdout, camera_numbers};
-use globalsplat_csrc::chunk::{EncodedImage, SceneToPickle, pickle_scenes};
+use globalsplat_capture::{
+    CAMERA_NUMBERS, CHUNK_EXTENSION, CHUNK_INDEX_FILE, Capture, Chunk, Holdout, camera_numbers,
+};
+use globalsplat_torch_file::{Dtype, Item, TensorView, serialize};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+
+/// Scene that is not written yet, with the bytes of its tensors.
+#[derive(Debug)]
+struct WaitingScene {
+    key: String,
+    /// Numbers of the frames, int64.
+    timestamps: Vec<u8>,
+    /// Numbers of the cameras, float32.
+    cameras: Vec<u8>,
+    /// Size of `cameras`: the number of views, and the count of numbers per camera.
+    size: [usize; 2],
+    /// Lengths and contents of the image files.
+    images: Vec<(usize, Vec<u8>)>,
+}
 
 /// Writes chunks and their index into a folder.
 #[derive(Debug)]
@@ -14,7 +30,7 @@ pub struct ChunkWriter {
     folder: PathBuf,
     /// Size of the images in bytes after which a chunk is written.
     chunk_bytes: usize,
-    waiting: Vec<SceneToPickle>,
+    waiting: Vec<WaitingScene>,
     waiting_bytes: usize,
     chunks: usize,
     index: BTreeMap<String, String>,
@@ -95,19 +111,20 @@ impl ChunkWriter {
             return Err(Error::input(capture.file(), "the scene's name", found, "another for each scene"));
         }
         let (views, _) = capture.split(Holdout::None);
-        let image = |&view| Ok(EncodedImage { bytes: capture.encoded(view)? });
-        let images = views.par_iter().map(image).collect::<Result<Vec<_>>>()?;
-        let bytes: usize = images.iter().map(|image| image.bytes.len()).sum();
+        let image = |&view| capture.encoded(view).map(|bytes| (bytes.len(), bytes));
+        let images = views.par_iter().map(image).collect::<std::result::Result<Vec<_>, _>>()?;
+        let bytes: usize = images.iter().map(|(length, _)| length).sum();
         if !self.waiting.is_empty() && self.waiting_bytes + bytes > self.chunk_bytes {
             self.write_chunk()?;
         }
         self.index.insert(capture.name.clone(), self.chunk_name());
         self.waiting_bytes += bytes;
-        self.waiting.push(SceneToPickle {
+        let cameras = &capture.cameras()[..views.len()];
+        self.waiting.push(WaitingScene {
             key: capture.name.clone(),
-            url: String::new(),
-            timestamps: (0..views.len() as i64).collect(),
-            cameras: capture.cameras()[..views.len()].iter().flat_map(camera_numbers).collect(),
+            timestamps: (0..views.len() as i64).flat_map(i64::to_le_bytes).collect(),
+            cameras: cameras.iter().flat_map(camera_numbers).flat_map(f32::to_le_bytes).collect(),
+            size: [views.len(), CAMERA_NUMBERS],
             images,
         });
         Ok(())
@@ -131,15 +148,34 @@ impl ChunkWriter {
 
     fn write_chunk(&mut self) -> Result<()> {
         let file = self.folder.join(self.chunk_name());
-        let bytes = pickle_scenes(&std::mem::take(&mut self.waiting))?;
+        let bytes = chunk_bytes(&std::mem::take(&mut self.waiting))?;
         // An existing file with the same bytes was left by an interrupted run of the same work.
-        if file.exists() && std::fs::read(&file).map_err(Error::read(&file))? != bytes.as_slice() {
+        if file.exists() && std::fs::read(&file).map_err(Error::read(&file))? != bytes {
             return Err(Error::input(&file, "the output", "an existing chunk", "a folder without chunks"));
         }
-        write_atomically(&file, |writer| writer.write_all(bytes.as_slice()).map_err(Error::write(&file)))?;
+        write_atomically(&file, |writer| writer.write_all(&bytes).map_err(Error::write(&file)))?;
         (self.chunks, self.waiting_bytes) = (self.chunks + 1, 0);
         Ok(())
     }
+}
+
+/// Returns the contents of a chunk: the list of its scenes as `torch.save` writes it.
+fn chunk_bytes(scenes: &[WaitingScene]) -> Result<Vec<u8>> {
+    fn tensor<'a>(dtype: Dtype, shape: &'a [usize], bytes: &'a [u8]) -> Item<'a> {
+        Item::Tensor(TensorView { name: "", dtype, shape, bytes })
+    }
+    let scenes = scenes.iter().map(|scene| {
+        let images = scene.images.iter();
+        let images = images.map(|(length, bytes)| tensor(Dtype::U8, std::slice::from_ref(length), bytes));
+        Item::Dict(vec![
+            ("url", Item::Str("")),
+            ("timestamps", tensor(Dtype::I64, &scene.size[..1], &scene.timestamps)),
+            ("cameras", tensor(Dtype::F32, &scene.size, &scene.cameras)),
+            ("images", Item::List(images.collect())),
+            ("key", Item::Str(&scene.key)),
+        ])
+    });
+    Ok(serialize(&Item::List(scenes.collect()))?)
 }
 
 /// Returns `true` if both captures have equally many photos and the same first photo.

@@ -15,7 +15,7 @@ pub use camera_path::{CameraPath, read_camera_path};
 pub use capture::{Capture, Photo};
 pub use formats::cameras_json::write_cameras_json;
 #[cfg(feature = "chunks")]
-pub use formats::chunk::{CHUNK_EXTENSION, CHUNK_INDEX_FILE, Chunk, camera_numbers};
+pub use formats::chunk::{CAMERA_NUMBERS, CHUNK_EXTENSION, CHUNK_INDEX_FILE, Chunk, camera_numbers};
 pub use formats::colmap::{ColmapModel, Point, read_colmap_models, read_points};
 pub use formats::folder_name;
 pub use formats::transforms_json::write_transforms_json;

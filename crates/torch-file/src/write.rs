@@ -50,6 +50,23 @@ impl TensorView<'_> {
     }
 }
 
+/// A value to be written.
+#[derive(Debug)]
+pub enum Item<'a> {
+    /// String.
+    Str(&'a str),
+    /// Integer.
+    Int(usize),
+    /// Tensor.
+    Tensor(TensorView<'a>),
+    /// List.
+    List(Vec<Item<'a>>),
+    /// Dict whose keys are strings, in this order.
+    Dict(Vec<(&'a str, Item<'a>)>),
+    /// Python's `collections.OrderedDict`.
+    OrderedDict(Vec<(&'a str, Item<'a>)>),
+}
+
 /// Writes a checkpoint to `path` atomically. It is a dict: "state_dict" maps names to `tensors`, and every other key maps to a string of
 /// `metadata`. The keys that Lightning requires are added: "pytorch-lightning_version", "epoch" and "global_step".
 ///
@@ -60,7 +77,27 @@ pub fn write_checkpoint(
     tensors: &[TensorView],
     metadata: &HashMap<String, String>,
 ) -> Result<()> {
-    let pickle = pickle(tensors, metadata)?;
+    let mut strings: Vec<(&str, &str)> = metadata.iter().map(|(k, v)| (k.as_str(), v.as_str())).collect();
+    strings.push((LIGHTNING_VERSION_KEY, LIGHTNING_VERSION));
+    strings.sort();
+    let state = tensors.iter().map(|tensor| (tensor.name, Item::Tensor(*tensor))).collect();
+    let mut root = vec![("state_dict", Item::OrderedDict(state))];
+    root.extend(strings.into_iter().map(|(key, text)| (key, Item::Str(text))));
+    root.extend(COUNTERS.map(|key| (key, Item::Int(0))));
+    let bytes = serialize(&Item::Dict(root))?;
+    write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
+}
+
+/// Returns the contents of a file that holds `root`.
+///
+/// # Errors
+/// Returns an error if torch has no storages for a tensor's type, or its bytes don't fit its shape.
+pub fn serialize(root: &Item) -> Result<Vec<u8>> {
+    // PROTO 2
+    let mut pickle = Pickle { bytes: b"\x80\x02".into(), tensors: vec![] };
+    pickle.item(root)?;
+    // STOP
+    pickle.bytes.push(b'.');
     let mut zip = ZipWriter::new(Cursor::new(vec![]));
     let mut add = |name: &str, contents: &[u8]| {
         let options = FileOptions::default()
@@ -70,96 +107,104 @@ pub fn write_checkpoint(
         zip.write_all(contents).map_err(ZipError::from)
     };
     let written = (|| {
-        add("data.pkl", &pickle)?;
+        add("data.pkl", &pickle.bytes)?;
         add("byteorder", b"little")?;
-        for (key, tensor) in tensors.iter().enumerate() {
-            add(&format!("data/{key}"), tensor.bytes)?;
+        for (key, bytes) in pickle.tensors.iter().enumerate() {
+            add(&format!("data/{key}"), bytes)?;
         }
         add("version", VERSION)
     })();
-    let failed = |e: ZipError| Error::failed_with_context(path.display())(e);
-    written.map_err(failed)?;
-    let bytes = zip.finish().map_err(failed)?.into_inner();
-    write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
+    let finished = written.and_then(|()| zip.finish());
+    Ok(finished.map_err(Error::failed_with_context("a file of torch.save"))?.into_inner())
 }
 
-fn pickle(tensors: &[TensorView], metadata: &HashMap<String, String>) -> Result<Vec<u8>> {
-    // PROTO 2, EMPTY_DICT, MARK
-    let mut p = Pickle(b"\x80\x02}(".into());
-    p.text("state_dict");
-    p.ordered_dict();
-    p.0.push(b'(');
-    for (key, tensor @ TensorView { name, shape, .. }) in tensors.iter().enumerate() {
-        p.text(name);
-        p.global("torch._utils", "_rebuild_tensor_v2");
-        p.0.push(b'(');
+/// Pickle under construction.
+struct Pickle<'a> {
+    /// Instructions for the stack machine of Python's unpickler.
+    bytes: Vec<u8>,
+    /// Bytes of the tensors, in the order in which the pickle refers to them.
+    tensors: Vec<&'a [u8]>,
+}
+
+impl<'a> Pickle<'a> {
+    fn item(&mut self, item: &Item<'a>) -> Result<()> {
+        match item {
+            Item::Str(text) => self.text(text),
+            Item::Int(number) => self.integer(*number),
+            Item::Tensor(tensor) => self.tensor(tensor)?,
+            Item::List(items) => {
+                // EMPTY_LIST, MARK, APPENDS
+                self.bytes.extend(b"](");
+                items.iter().try_for_each(|item| self.item(item))?;
+                self.bytes.push(b'e');
+            }
+            Item::Dict(items) | Item::OrderedDict(items) => {
+                match item {
+                    Item::OrderedDict(_) => self.ordered_dict(),
+                    _ => self.bytes.push(b'}'), // EMPTY_DICT
+                }
+                // MARK, SETITEMS
+                self.bytes.push(b'(');
+                for (key, item) in items {
+                    self.text(key);
+                    self.item(item)?;
+                }
+                self.bytes.push(b'u');
+            }
+        }
+        Ok(())
+    }
+
+    fn tensor(&mut self, tensor: &TensorView<'a>) -> Result<()> {
+        self.global("torch._utils", "_rebuild_tensor_v2");
+        self.bytes.push(b'(');
         // BINPERSID: the persistent id that refers to a storage.
-        p.0.push(b'(');
-        p.text("storage");
-        p.global("torch", tensor.storage_class()?);
-        p.text(&key.to_string());
-        p.text("cpu");
-        p.integer(shape.iter().product());
-        p.0.extend(b"tQ");
+        self.bytes.push(b'(');
+        self.text("storage");
+        self.global("torch", tensor.storage_class()?);
+        self.text(&self.tensors.len().to_string());
+        self.text("cpu");
+        self.integer(tensor.shape.iter().product());
+        self.bytes.extend(b"tQ");
         // Arguments of the call: storage offset, size, stride, requires_grad (NEWFALSE), and an empty dict of backward hooks.
-        p.integer(0);
-        p.tuple(shape);
-        p.tuple(&row_major(shape));
-        p.0.push(0x89);
-        p.ordered_dict();
+        self.integer(0);
+        self.tuple(tensor.shape);
+        self.tuple(&row_major(tensor.shape));
+        self.bytes.push(0x89);
+        self.ordered_dict();
         // TUPLE, REDUCE
-        p.0.extend(b"tR");
+        self.bytes.extend(b"tR");
+        self.tensors.push(tensor.bytes);
+        Ok(())
     }
-    // SETITEMS
-    p.0.push(b'u');
-    let mut strings: Vec<(&str, &str)> = metadata.iter().map(|(k, v)| (k.as_str(), v.as_str())).collect();
-    strings.push((LIGHTNING_VERSION_KEY, LIGHTNING_VERSION));
-    strings.sort();
-    for (key, text) in strings {
-        p.text(key);
-        p.text(text);
-    }
-    for key in COUNTERS {
-        p.text(key);
-        p.integer(0);
-    }
-    // SETITEMS, STOP
-    p.0.extend(b"u.");
-    Ok(p.0)
-}
 
-/// Pickle under construction: instructions for the stack machine of Python's unpickler.
-struct Pickle(Vec<u8>);
-
-impl Pickle {
     /// Appends a string: BINUNICODE.
     fn text(&mut self, text: &str) {
-        self.0.push(b'X');
-        self.0.extend((text.len() as u32).to_le_bytes());
-        self.0.extend(text.as_bytes());
+        self.bytes.push(b'X');
+        self.bytes.extend((text.len() as u32).to_le_bytes());
+        self.bytes.extend(text.as_bytes());
     }
 
     /// Appends an integer: LONG1 of eight bytes.
     fn integer(&mut self, number: usize) {
-        self.0.extend([0x8a, 8]);
-        self.0.extend((number as u64).to_le_bytes());
+        self.bytes.extend([0x8a, 8]);
+        self.bytes.extend((number as u64).to_le_bytes());
     }
 
     /// Appends a tuple of integers, between MARK and TUPLE.
     fn tuple(&mut self, numbers: &[usize]) {
-        self.0.push(b'(');
+        self.bytes.push(b'(');
         numbers.iter().for_each(|&number| self.integer(number));
-        self.0.push(b't');
+        self.bytes.push(b't');
     }
 
     /// Appends a reference to `module.name`: GLOBAL.
     fn global(&mut self, module: &str, name: &str) {
-        self.0.extend(format!("c{module}\n{name}\n").as_bytes());
+        self.bytes.extend(format!("c{module}\n{name}\n").as_bytes());
     }
-
     /// Appends an empty OrderedDict: GLOBAL, EMPTY_TUPLE, REDUCE.
     fn ordered_dict(&mut self) {
         self.global("collections", "OrderedDict");
-        self.0.extend(b")R");
+        self.bytes.extend(b")R");
     }
 }

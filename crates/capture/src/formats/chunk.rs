@@ -18,7 +18,7 @@ pub const CHUNK_EXTENSION: &str = "torch";
 pub const CHUNK_INDEX_FILE: &str = "index.json";
 /// Number of values of a camera: f_x, f_y, c_x, c_y as fractions of the image's width and height, 0, 0, and the first three rows of
 /// w2c.
-const CAMERA_NUMBERS: usize = 18;
+pub const CAMERA_NUMBERS: usize = 18;
 
 /// Number of views that is always allowed. A chunk may refer to one image repeatedly, in a byte or two each time.
 const ALWAYS_ALLOWED_VIEWS: usize = 100_000;
