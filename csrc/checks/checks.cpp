@@ -15,10 +15,10 @@
 #include <cstdlib>
 #include <cstring>
 #include <functional>
-#include <memory>
 #include <stdexcept>
 #include <string>
 #include <thread>
+#include <type_traits>
 
 #include "../cuda/device.h"
 #include "../kernels/attention_types.h"
@@ -26,7 +26,7 @@
 #include "../kernels/kernels.h"
 #include "../kernels/multi_head_attention.h"
 #include "../kernels/parallel.h"
-#include "scenes.h"
+#include "render.h"
 
 namespace globalsplat::checks {
 namespace {
@@ -57,89 +57,11 @@ void on_timeout(int) {
   _exit(say("FOUND: ", 7) && say(now.data(), now.size()) && say(end, sizeof end - 1) ? 1 : 2);
 }
 
-// Render of a scene, with all of its inputs and outputs.
 template <class T>
-class Render {
- public:
-  Render(const Scene<T>& scene, int num_threads)
-      : settings_{scene.width, scene.height, scene.projection, num_threads}, views_(scene.views) {
-    // Unwritten outputs differ from those of a render with another number of threads.
-    const T unwritten = T(num_threads);
-    const size_t pixels = size_t(scene.width) * size_t(scene.height);
-    for (const Arrays<T>& g : scene.gaussians) {
-      scenes_.push_back({g.means.data(), g.scales.data(), g.quaternions.data(), g.opacities.data(), g.sh.data(),
-                         int64_t(g.opacities.size()), scene.bases});
-      gradients_.push_back(g);
-      for (auto* array : arrays(gradients_.back())) std::fill(array->begin(), array->end(), unwritten);
-      means2d_.emplace_back(2 * g.opacities.size() * views_.size() / scene.gaussians.size(), unwritten);
-    }
-    Random random(9);
-    for (size_t k = 0; k < views_.size(); ++k) {
-      pictures_.push_back({std::vector<T>(3 * pixels, unwritten), std::vector<T>(pixels, unwritten),
-                           std::vector<T>(pixels, unwritten)});
-      output_gradients_.push_back(pictures_.back());
-      for (auto* plane : {&output_gradients_.back().rgb, &output_gradients_.back().alpha, &output_gradients_.back().depth})
-        for (T& value : *plane) value = T(random.uniform(-1, 1));
-    }
-  }
-
-  void draw() {
-    raster::StageTimes times;
-    frame_ = raster::Frame<T>::draw(scenes_, views_, settings_, places<T>(pictures_), times);
-  }
-
-  void backward() {
-    std::vector<raster::GaussianGradients<T>> out;
-    for (size_t b = 0; b < gradients_.size(); ++b) {
-      Arrays<T>& g = gradients_[b];
-      out.push_back({g.means.data(), g.scales.data(), g.quaternions.data(), g.opacities.data(), g.sh.data(), means2d_[b].data()});
-    }
-    raster::StageTimes times;
-    cameras_.assign(views_.size(), {});
-    frame_->backward(scenes_, places<const T>(pictures_), places<const T>(output_gradients_), out, cameras_.data(), times);
-  }
-
-  void drop() { frame_.reset(); }
-
-  void expect_bits_of(Render& other) {
-    for (size_t k = 0; k < pictures_.size(); ++k) {
-      expect(have_same_bits(pictures_[k].rgb, other.pictures_[k].rgb), "colors differ from one thread's");
-      expect(have_same_bits(pictures_[k].alpha, other.pictures_[k].alpha), "opacities differ from one thread's");
-      expect(have_same_bits(pictures_[k].depth, other.pictures_[k].depth), "depths differ from one thread's");
-    }
-    for (size_t b = 0; b < gradients_.size(); ++b) {
-      const auto ours = arrays(gradients_[b]), theirs = arrays(other.gradients_[b]);
-      for (size_t k = 0; k < ours.size(); ++k) expect(have_same_bits(*ours[k], *theirs[k]), "gradients differ from one thread's");
-      expect(have_same_bits(means2d_[b], other.means2d_[b]), "gradients of projected means differ from one thread's");
-    }
-    expect(have_same_bits(cameras_, other.cameras_), "cameras' gradients differ from one thread's");
-  }
-
- private:
-  struct Planes {
-    std::vector<T> rgb, alpha, depth;
-  };
-
-  static std::vector<std::vector<T>*> arrays(Arrays<T>& g) {
-    return {&g.means, &g.scales, &g.quaternions, &g.opacities, &g.sh};
-  }
-
-  template <class Pixel>
-  static std::vector<raster::RenderOutput<Pixel>> places(std::vector<Planes>& of) {
-    std::vector<raster::RenderOutput<Pixel>> out;
-    for (Planes& p : of) out.push_back({p.rgb.data(), p.alpha.data(), p.depth.data()});
-    return out;
-  }
-
-  raster::Settings settings_;
-  std::vector<raster::Gaussians<T>> scenes_;
-  std::vector<raster::View<T>> views_;
-  std::vector<Planes> pictures_, output_gradients_;  // output_gradients_: gradients of the loss
-  std::vector<raster::CameraGradient<T>> cameras_;
-  std::vector<Arrays<T>> gradients_;
-  std::vector<std::vector<T>> means2d_;  // gradients of projected means, one item per scene
-  std::unique_ptr<raster::Frame<T>> frame_;
-};
+void expect_same(const Results<T>& found, const Results<T>& one) {
+  for (size_t k = 0; k < one.size(); ++k)
+    if (!have_same_bits(found[k], one[k])) fail(std::string(kResults[k]) + " differ from one thread's");
+}
 
 template <class T>
 std::string type_name() {
@@ -153,26 +75,14 @@ void for_both(const Scene<double>& scene, const Check& check) {
   check(as<double>(scene));
 }
 
-// Renders on one thread.
-template <class T>
-Render<T> expected(const Scene<T>& scene) {
-  Render<T> render(scene, 1);
-  render.draw();
-  render.backward();
-  return render;
-}
-
 template <class T>
 int64_t same_bits(const Scene<T>& scene, const std::vector<int>& thread_counts) {
   const std::string name = scene.name + ", " + type_name<T>() + ", " + std::to_string(scene.bases) + " bases";
   begin(name);
-  Render<T> one = expected(scene);
+  const Results<T> one = rendered(scene, 1);
   for (const int num_threads : thread_counts) {
     begin(name + ", " + std::to_string(num_threads) + " threads");
-    Render<T> render(scene, num_threads);
-    render.draw();
-    render.backward();
-    render.expect_bits_of(one);
+    expect_same(rendered(scene, num_threads), one);
   }
   return 1 + int64_t(thread_counts.size());
 }
@@ -253,16 +163,6 @@ int64_t check_muon(const std::vector<int>& thread_counts) {
   return int64_t(thread_counts.size());
 }
 
-std::vector<raster::Bf16> cut_to_bf16(const std::vector<float>& numbers) {
-  std::vector<raster::Bf16> cut;
-  for (const float number : numbers) {
-    uint32_t bits;
-    std::memcpy(&bits, &number, sizeof bits);
-    cut.push_back(raster::Bf16(bits >> 16));
-  }
-  return cut;
-}
-
 // Reference for raster::Bf16Gemm in scalar code.
 void multiply_bf16(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row, int64_t c_row, bool adds, const raster::Bf16* a,
                    const raster::Bf16* b, float* c) {
@@ -274,53 +174,52 @@ void multiply_bf16(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row
     }
 }
 
-// Attention, forward and backward. Here, too, arrays have their exact sizes.
+float as_float(float number) { return number; }
+float as_float(raster::Bf16 number) { return raster::to_float(number); }
+
+// Computes attention, forward and backward, of heads and an output's gradient drawn with `seed`. Returns all outputs. Arrays have their exact
+// sizes here, too.
+template <class Number>
+std::vector<Number> attended(const raster::AttentionShape& shape, uint64_t seed, int num_threads) {
+  Random random(seed);
+  const int64_t row = shape.heads * shape.width, in = shape.queries * row, seen = shape.keys * row;
+  const auto numbers = [&](int64_t count) {
+    std::vector<Number> drawn;
+    for (const double number : random.normal(size_t(shape.scenes * count), 1)) {
+      if constexpr (std::is_same_v<Number, float>)
+        drawn.push_back(float(number));
+      else
+        drawn.push_back(raster::to_bf16(float(number)));
+    }
+    return drawn;
+  };
+  const std::vector<Number> q = numbers(in), k = numbers(seen), v = numbers(seen), grad_out = numbers(in);
+  const auto unwritten = [&](const std::vector<Number>& like) { return std::vector<Number>(like.size(), Number(num_threads)); };
+  std::vector<Number> out = unwritten(q), dq = unwritten(q), dk = unwritten(k), dv = unwritten(v);
+  std::vector<float> log_sums(size_t(shape.scenes * shape.heads * shape.queries), float(num_threads));
+  const raster::AttentionInputs<Number> inputs{{q.data(), in, row}, {k.data(), seen, row}, {v.data(), seen, row}};
+  const raster::Bf16Gemm gemm = {multiply_bf16, [] {}};
+  raster::multi_head_attention<Number>(shape, inputs, {out.data(), in, row}, log_sums.data(), gemm, num_threads);
+  raster::multi_head_attention_backward<Number>(shape, inputs, {out.data(), in, row}, log_sums.data(), {grad_out.data(), in, row},
+                                                {{dq.data(), in, row}, {dk.data(), seen, row}, {dv.data(), seen, row}}, gemm, num_threads);
+  for (const std::vector<Number>* more : {&dq, &dk, &dv}) out.insert(out.end(), more->begin(), more->end());
+  return out;
+}
+
+template <class Number>
 int64_t check_attention(const std::vector<int>& thread_counts) {
-  Random random(12);
-  const auto numbers = [&](int64_t count) { return converted<float>(random.normal(size_t(count), 1)); };
   int64_t count = 0;
-  for (const raster::AttentionShape& shape : {raster::AttentionShape{1, 1, 1, 1, 4},
+  for (const raster::AttentionShape& shape : {raster::AttentionShape{1, 1, 1, 1, 8},
                                               {2, 3, 7, 65, 8},
                                               {1, 2, 103, 385, 24},
                                               {1, 1, 1100, 300, 32},
                                               {1, 2, 50, 800, 64},
                                               {1, 1, 9, 20, raster::kAttentionWidth}}) {
-    const int64_t row = shape.heads * shape.width, in = shape.queries * row, seen = shape.keys * row;
-    const std::vector<float> q = numbers(shape.scenes * in), grad_out = numbers(shape.scenes * in);
-    const std::vector<float> k = numbers(shape.scenes * seen), v = numbers(shape.scenes * seen);
-    const auto attended = [&](int num_threads) {
-      begin("attention of " + std::to_string(shape.queries) + " to " + std::to_string(shape.keys) + ", " + std::to_string(num_threads) +
-            " threads");
-      const auto unwritten = [&](size_t n) { return std::vector<float>(n, float(num_threads)); };
-      const raster::AttentionInputs<float> inputs{{q.data(), in, row}, {k.data(), seen, row}, {v.data(), seen, row}};
-      std::vector<float> out = unwritten(q.size()), log_sums = unwritten(size_t(shape.scenes * shape.heads * shape.queries));
-      raster::multi_head_attention(shape, inputs, {out.data(), in, row}, log_sums.data(), num_threads);
-      std::vector<float> dq = unwritten(q.size()), dk = unwritten(k.size()), dv = unwritten(v.size());
-      raster::multi_head_attention_backward(shape, inputs, {out.data(), in, row}, log_sums.data(), {grad_out.data(), in, row},
-                                            {{dq.data(), in, row}, {dk.data(), seen, row}, {dv.data(), seen, row}}, num_threads);
-      for (const std::vector<float>* more : {&log_sums, &dq, &dk, &dv}) out.insert(out.end(), more->begin(), more->end());
-      if (shape.width % 8 != 0) return out;
-
-      using Halves = std::vector<raster::Bf16>;
-      const Halves q_cut = cut_to_bf16(q), k_cut = cut_to_bf16(k), v_cut = cut_to_bf16(v), grad_out_cut = cut_to_bf16(grad_out);
-      const auto unwritten_cut = [&](size_t n) { return Halves(n, raster::Bf16(num_threads)); };
-      const raster::AttentionInputs<raster::Bf16> cut{{q_cut.data(), in, row}, {k_cut.data(), seen, row}, {v_cut.data(), seen, row}};
-      const raster::Bf16Gemm gemm = {multiply_bf16, [] {}};
-      Halves out_cut = unwritten_cut(q.size()), dq_cut = unwritten_cut(q.size());
-      Halves dk_cut = unwritten_cut(k.size()), dv_cut = unwritten_cut(v.size());
-      raster::multi_head_attention_bf16(shape, cut, {out_cut.data(), in, row}, log_sums.data(), gemm, num_threads);
-      raster::multi_head_attention_backward_bf16(shape, cut, {out_cut.data(), in, row}, log_sums.data(), {grad_out_cut.data(), in, row},
-                                                 {{dq_cut.data(), in, row}, {dk_cut.data(), seen, row}, {dv_cut.data(), seen, row}}, gemm,
-                                                 num_threads);
-      out.insert(out.end(), log_sums.begin(), log_sums.end());
-      for (const Halves* more : {&out_cut, &dq_cut, &dk_cut, &dv_cut})
-        for (const raster::Bf16 number : *more) out.push_back(raster::to_float(number));
-      return out;
-    };
-    const std::vector<float> one = attended(1);
-    for (const float number : one) expect(std::isfinite(number), "attention isn't finite");
+    begin("attention of " + std::to_string(shape.queries) + " to " + std::to_string(shape.keys));
+    const std::vector<Number> one = attended<Number>(shape, 12, 1);
+    for (const Number number : one) expect(std::isfinite(as_float(number)), "attention isn't finite");
     for (const int num_threads : thread_counts) {
-      expect(have_same_bits(attended(num_threads), one), "threads change attention");
+      expect(have_same_bits(attended<Number>(shape, 12, num_threads), one), "threads change attention");
       ++count;
     }
   }
@@ -333,7 +232,7 @@ int64_t bits(bool is_short) {
   if (!is_short)
     for (int num_threads = 4; num_threads < 16; ++num_threads) thread_counts.push_back(num_threads);
   int64_t count = check_losses<float>(thread_counts) + check_losses<double>(thread_counts) + check_muon(thread_counts);
-  count += check_attention(thread_counts);
+  count += check_attention<float>(thread_counts) + check_attention<raster::Bf16>(thread_counts);
   size_t turn = 0;  // the short form covers all degrees, but one per scene
   for (const int bases : {1, 4, 9, 16}) {
     const std::vector<Scene<double>> scenes = all_scenes(bases);
@@ -353,10 +252,10 @@ void in_another_thread(const std::function<void()>& what) { std::thread(what).jo
 template <class T>
 int64_t callers_of(const std::vector<Scene<double>>& all, int rounds) {
   std::vector<Scene<T>> scenes;
-  std::vector<Render<T>> one;
+  std::vector<Results<T>> one;
   begin("one thread");
   for (const Scene<double>& scene : all) scenes.push_back(as<T>(scene));
-  for (const Scene<T>& scene : scenes) one.push_back(expected(scene));
+  for (const Scene<T>& scene : scenes) one.push_back(rendered(scene, 1));
   const size_t count = scenes.size();
   int64_t checked = 0;
   for (int round = 0; round < rounds; ++round) {
@@ -372,12 +271,12 @@ int64_t callers_of(const std::vector<Scene<double>>& all, int rounds) {
       renders[i].draw();
       renders[i].backward();
     });
-    for (size_t i = 0; i < count; ++i) renders[i].expect_bits_of(one[i]);
+    for (size_t i = 0; i < count; ++i) expect_same(renders[i].results(), one[i]);
 
     begin("frames out of order, " + type_name<T>());
     at_once([&](size_t i) { renders[i].draw(); });
     for (size_t i = 0; i < count; ++i) in_another_thread([&] { renders[(i + 1 + size_t(round)) % count].backward(); });
-    for (size_t i = 0; i < count; ++i) renders[i].expect_bits_of(one[i]);
+    for (size_t i = 0; i < count; ++i) expect_same(renders[i].results(), one[i]);
 
     begin("frames dropped while others are drawn, " + type_name<T>());
     at_once([&](size_t i) {
@@ -386,7 +285,7 @@ int64_t callers_of(const std::vector<Scene<double>>& all, int rounds) {
       renders[i].draw();
       if (i % 2 == 1) renders[i].backward();
     });
-    for (size_t i = 0; i < count; ++i) renders[i].expect_bits_of(one[i]);
+    for (size_t i = 0; i < count; ++i) expect_same(renders[i].results(), one[i]);
     checked += 3 * int64_t(count);
   }
   return checked;
@@ -460,13 +359,10 @@ int64_t orders(bool is_short) {
 int64_t children(bool is_short) {
   Random random(10);
   const Scene<float> scene = as<float>(random_scene(random, "small", 20, 20, 2, 2, 40, 4));
-  Render<float> one = expected(scene);
+  const Results<float> one = rendered(scene, 1);
   const auto render_as = [&](const char* what) {
     begin(what);
-    Render<float> render(scene, 4);
-    render.draw();
-    render.backward();
-    render.expect_bits_of(one);
+    expect_same(rendered(scene, 4), one);
   };
   const int count = is_short ? 3 : 30;
   for (int i = 0; i < count; ++i) {

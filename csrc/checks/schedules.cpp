@@ -1,4 +1,4 @@
-#include "scenes.h"
+#include "render.h"
 
 #include <array>
 #include <cmath>
@@ -14,35 +14,11 @@ namespace {
 
 using Numbers = std::vector<float>;
 
-// Outputs and gradients of a render, for all scenes and views consecutively.
-struct RenderResult {
-  Numbers rgb, alpha, depth, means, scales, quaternions, opacities, sh, w2c, means2d;
-  std::vector<Numbers*> all() {
-    return {&rgb, &alpha, &depth, &means, &scales, &quaternions, &opacities, &sh, &w2c, &means2d};
-  }
-  static constexpr size_t kImages = 3;  // number of images, the first items of all()
-};
-
 void append(Numbers& to, const Numbers& more) { to.insert(to.end(), more.begin(), more.end()); }
 
-// Returns random gradients with respect to images.
-Numbers random_gradients(Random& random, size_t count) { return converted<float>(random.uniform(count, -1, 1)); }
-
-// Returns the number of Gaussians per scene.
-size_t count_of(const Scene<float>& scene) { return scene.gaussians.empty() ? 0 : scene.gaussians[0].opacities.size(); }
-
-// Returns a result of the scene's sizes, filled with NaN.
-RenderResult nan_filled(const Scene<float>& scene) {
-  const size_t pixels = size_t(scene.width) * size_t(scene.height) * scene.views.size();
-  const size_t count = count_of(scene) * scene.gaussians.size();
-  const auto nans = [](size_t numbers) { return Numbers(numbers, std::nanf("")); };
-  return {nans(3 * pixels), nans(pixels), nans(pixels), nans(3 * count), nans(3 * count), nans(4 * count),
-          nans(count), nans(size_t(scene.bases) * 3 * count), nans(16 * scene.views.size()),
-          nans(2 * count_of(scene) * scene.views.size())};
-}
-
-// Renders with the GPU kernels in the emulator, forward and backward. `seed` determines the order of blocks and threads.
-RenderResult render_emulated(const Scene<float>& scene, uint64_t seed) {
+// Renders with the GPU kernels in the emulator, forward and backward from `gradients` of the images. `seed` determines the order of blocks and
+// threads. The results have the sizes of `like`.
+Results<float> render_emulated(const Scene<float>& scene, const Results<float>& gradients, const Results<float>& like, uint64_t seed) {
   Numbers means, scales, quaternions, opacities, sh, w2c, intrinsics;
   for (const Arrays<float>& g : scene.gaussians) {
     append(means, g.means);
@@ -60,64 +36,19 @@ RenderResult render_emulated(const Scene<float>& scene, uint64_t seed) {
     append(w2c, {0, 0, 0, 1});
     append(intrinsics, {c.fx, 0, c.cx, 0, c.fy, c.cy, 0, 0, 1});
   }
-  Random random(9);
-  const size_t pixels = size_t(scene.width) * size_t(scene.height) * scene.views.size();
-  const Numbers g_rgb = random_gradients(random, 3 * pixels), g_alpha = random_gradients(random, pixels);
-  const Numbers g_depth = random_gradients(random, pixels);
-
-  const int64_t scenes = int64_t(scene.gaussians.size());
-  const cuda::Arguments arguments{{means.data(), scales.data(), quaternions.data(), opacities.data(), sh.data(),
-                                   int64_t(count_of(scene)), scene.bases},
+  const int64_t scenes = int64_t(scene.gaussians.size()), count = scenes == 0 ? 0 : int64_t(scene.gaussians[0].opacities.size());
+  const cuda::Arguments arguments{{means.data(), scales.data(), quaternions.data(), opacities.data(), sh.data(), count, scene.bases},
                                   w2c.data(), intrinsics.data(), scenes,
                                   scenes == 0 ? 0 : int64_t(scene.views.size()) / scenes, scene.width, scene.height,
                                   scene.projection};
-  RenderResult result = nan_filled(scene);
+  Results<float> out;
+  for (const Numbers& numbers : like) out.emplace_back(numbers.size(), std::nanf(""));
   const cuda::emulated::Emulator device(seed);
-  const cuda::Frame frame(device, arguments, {result.rgb.data(), result.alpha.data(), result.depth.data()});
-  frame.backward(device, arguments, {result.rgb.data(), result.alpha.data(), result.depth.data()},
-                 {g_rgb.data(), g_alpha.data(), g_depth.data()},
-                 {result.means.data(), result.scales.data(), result.quaternions.data(), result.opacities.data(), result.sh.data(),
-                  result.means2d.data()},
-                 result.w2c.data());
-  return result;
-}
-
-// Renders with the CPU backend, forward and backward.
-RenderResult render_on_cpu(const Scene<float>& scene) {
-  const size_t pixels = size_t(scene.width) * size_t(scene.height), views = scene.views.size(), count = count_of(scene);
-  Random random(9);
-  const Numbers g_rgb = random_gradients(random, 3 * pixels * views), g_alpha = random_gradients(random, pixels * views);
-  const Numbers g_depth = random_gradients(random, pixels * views);
-  RenderResult result = nan_filled(scene);
-  std::vector<raster::Gaussians<float>> gaussians;
-  std::vector<raster::GaussianGradients<float>> out;
-  for (size_t b = 0; b < scene.gaussians.size(); ++b) {
-    const Arrays<float>& g = scene.gaussians[b];
-    gaussians.push_back({g.means.data(), g.scales.data(), g.quaternions.data(), g.opacities.data(), g.sh.data(), int64_t(count),
-                         scene.bases});
-    out.push_back({result.means.data() + 3 * count * b, result.scales.data() + 3 * count * b, result.quaternions.data() + 4 * count * b,
-                   result.opacities.data() + count * b, result.sh.data() + size_t(scene.bases) * 3 * count * b,
-                   result.means2d.data() + 2 * count * views / scene.gaussians.size() * b});
-  }
-  std::vector<raster::RenderOutput<float>> outputs;
-  std::vector<raster::RenderOutput<const float>> pictures, gradients;
-  for (size_t k = 0; k < views; ++k) {
-    outputs.push_back({result.rgb.data() + 3 * pixels * k, result.alpha.data() + pixels * k, result.depth.data() + pixels * k});
-    pictures.push_back({outputs[k].rgb, outputs[k].alpha, outputs[k].depth});
-    gradients.push_back({g_rgb.data() + 3 * pixels * k, g_alpha.data() + pixels * k, g_depth.data() + pixels * k});
-  }
-  raster::StageTimes times;
-  std::vector<raster::CameraGradient<float>> cameras(views);
-  const raster::Settings settings{scene.width, scene.height, scene.projection, 2};
-  const auto frame = raster::Frame<float>::draw(gaussians, scene.views, settings, outputs, times);
-  frame->backward(gaussians, pictures, gradients, out, cameras.data(), times);
-  for (size_t k = 0; k < views; ++k)
-    for (int number = 0; number < 16; ++number) {
-      const int row = number / 4, column = number % 4;
-      result.w2c[16 * k + size_t(number)] =
-          row == 3 ? 0 : cameras[k].numbers[column < 3 ? 3 * row + column : 9 + row];
-    }
-  return result;
+  const cuda::Frame frame(device, arguments, {out[0].data(), out[1].data(), out[2].data()});
+  frame.backward(device, arguments, {out[0].data(), out[1].data(), out[2].data()},
+                 {gradients[0].data(), gradients[1].data(), gradients[2].data()},
+                 {out[3].data(), out[4].data(), out[5].data(), out[6].data(), out[7].data(), out[8].data()}, out[9].data());
+  return out;
 }
 
 double max_abs(const Numbers& numbers) {
@@ -135,26 +66,27 @@ double max_abs_difference(const Numbers& a, const Numbers& b) {
 }  // namespace
 
 std::string schedules_differ(const Scene<float>& scene, const std::vector<uint64_t>& seeds) {
-  const char* const names[] = {"colors", "opacities", "depths", "means", "scales", "quaternions", "opacities' gradients",
-                               "spherical harmonics", "cameras"};
-  RenderResult cpu = render_on_cpu(scene), first = render_emulated(scene, seeds[0]);
+  Render<float> render(scene, 2);
+  render.draw();
+  render.backward();
+  const Results<float> cpu = render.results(), gradients = render.output_gradients();
+  const Results<float> first = render_emulated(scene, gradients, cpu, seeds[0]);
   // Infinite values and NaN spread to other pixels: of a block on the CPU, of two blocks in the kernels. These scenes aren't compared.
   const bool has_special_values = scene.name.rfind("special", 0) == 0;
   double max_gradient = 0;
-  for (size_t k = RenderResult::kImages; k < cpu.all().size(); ++k) max_gradient = std::max(max_gradient, max_abs(*cpu.all()[k]));
-  for (size_t k = 0; k < first.all().size() && !has_special_values; ++k) {
-    const Numbers &ours = *first.all()[k], &theirs = *cpu.all()[k];
+  for (size_t k = kImages; k < cpu.size(); ++k) max_gradient = std::max(max_gradient, max_abs(cpu[k]));
+  for (size_t k = 0; k < first.size() && !has_special_values; ++k) {
     // Some gradients, such as that of a sphere's rotation, are differences of larger values that cancel. So the tolerance also depends on
     // the largest of all gradients.
-    const double error = max_abs_difference(ours, theirs);
-    const double tolerance = k < RenderResult::kImages ? 0 : 1e-3 * max_abs(theirs) + 1e-5 * max_gradient;
-    if (!(error <= tolerance)) return std::string(names[k]) + " differ from the CPU's by " + std::to_string(error);
+    const double error = max_abs_difference(first[k], cpu[k]);
+    const double tolerance = k < kImages ? 0 : 1e-3 * max_abs(cpu[k]) + 1e-5 * max_gradient;
+    if (!(error <= tolerance)) return std::string(kResults[k]) + " differ from the CPU's by " + std::to_string(error);
   }
   for (size_t n = 1; n < seeds.size(); ++n) {
-    RenderResult other = render_emulated(scene, seeds[n]);
-    for (size_t k = 0; k < first.all().size(); ++k)
-      if (!have_same_bits(*first.all()[k], *other.all()[k]))
-        return std::string(names[k]) + " change with the order of threads, seed " + std::to_string(seeds[n]);
+    const Results<float> other = render_emulated(scene, gradients, cpu, seeds[n]);
+    for (size_t k = 0; k < first.size(); ++k)
+      if (!have_same_bits(first[k], other[k]))
+        return std::string(kResults[k]) + " change with the order of threads, seed " + std::to_string(seeds[n]);
   }
   return {};
 }

@@ -87,7 +87,7 @@ struct Block {
   Stack scheduler;
   const Kernel* kernel = nullptr;
   void** arguments = nullptr;
-  Index index{}, size{}, grid{};
+  Index index{}, size{};
   int current = 0, done = 0;
   bool votes[2] = {};  // of this barrier and the next one
   Threads ready, waiting;
@@ -183,7 +183,6 @@ void run_block(std::mt19937_64& order) {
 Index thread_index() { return {unsigned(block().current), 0}; }
 Index block_index() { return block().index; }
 Index block_size() { return block().size; }
-Index grid_size() { return block().grid; }
 
 void sync_block() {
   wait_at_barrier(block().waiting, int(block().size.x));
@@ -240,7 +239,6 @@ void Emulator::launch(const char* kernel, Blocks blocks, int threads_per_block, 
   if (block().kernel == nullptr) throw std::logic_error(std::string("there is no kernel ") + kernel);
   block().arguments = arguments;
   block().size = {unsigned(threads_per_block), 1};
-  block().grid = {unsigned(blocks.x), unsigned(blocks.y)};
   if (threads_per_block > kMaxThreads || threads_per_block % 32 != 0)
     throw std::logic_error("a block of " + std::to_string(threads_per_block) + " threads");
   for (int k = 0; k < threads_per_block; ++k)

@@ -16,7 +16,6 @@
 #define threadIdx (::globalsplat::cuda::emulated::thread_index())
 #define blockIdx (::globalsplat::cuda::emulated::block_index())
 #define blockDim (::globalsplat::cuda::emulated::block_size())
-#define gridDim (::globalsplat::cuda::emulated::grid_size())
 #define __syncthreads() ::globalsplat::cuda::emulated::sync_block()
 #define __syncwarp() ::globalsplat::cuda::emulated::sync_warp()
 
@@ -28,7 +27,6 @@ struct Index {
 Index thread_index();
 Index block_index();
 Index block_size();
-Index grid_size();
 
 // Barriers of a block's, or of a warp's, threads.
 void sync_block();
@@ -62,13 +60,6 @@ inline unsigned ballot(int line, bool given) {
   for (int k = 0; k < 32; ++k) bits |= unsigned(all[k]) << k;
   return bits;
 }
-inline unsigned match_any(int line, int given) {
-  uint64_t all[32];
-  exchange(line, uint64_t(uint32_t(given)), all);
-  unsigned bits = 0;
-  for (int k = 0; k < 32; ++k) bits |= unsigned(all[k] == uint32_t(given)) << k;
-  return bits;
-}
 inline int own_lane() { return int(thread_index().x % 32); }
 
 }  // namespace globalsplat::cuda::emulated
@@ -80,11 +71,9 @@ inline int own_lane() { return int(thread_index().x % 32); }
 #define __shfl_xor_sync(mask, given, by) GS_FROM_LANE(given, GS_OWN_LANE ^ (by))
 #define __ballot_sync(mask, given) ::globalsplat::cuda::emulated::ballot(__LINE__, given)
 #define __any_sync(mask, given) (__ballot_sync(mask, given) != 0)
-#define __match_any_sync(mask, given) ::globalsplat::cuda::emulated::match_any(__LINE__, given)
 #define __syncthreads_or(given) ::globalsplat::cuda::emulated::sync_block_or(given)
 
 inline int __popc(unsigned bits) { return __builtin_popcount(bits); }
-inline int __ffs(int bits) { return __builtin_ffs(bits); }
 inline uint32_t __float_as_uint(float number) {
   uint32_t bits;
   std::memcpy(&bits, &number, sizeof bits);
