@@ -110,22 +110,14 @@ impl ModelConfig {
                 return Err(Error::setting(format!("model.{name}"), value, format!("{least} to {most}")));
             }
         }
-        let expect = |holds: bool, field: &str, value: i64, expected: String| match holds {
-            true => Ok(()),
-            false => Err(Error::request(format!("model.{field} is {value}, expected {expected}"))),
-        };
-        expect(
-            self.width % self.heads == 0,
-            "width",
-            self.width,
-            format!("a multiple of the {} heads", self.heads),
-        )?;
-        expect(
-            (self.candidates as u64).is_power_of_two(),
-            "candidates",
-            self.candidates,
-            "a power of two".into(),
-        )
+        if self.width % self.heads != 0 {
+            let expected = format!("a multiple of the {} heads", self.heads);
+            return Err(Error::setting("model.width", self.width, expected));
+        }
+        if !(self.candidates as u64).is_power_of_two() {
+            return Err(Error::setting("model.candidates", self.candidates, "a power of two"));
+        }
+        Ok(())
     }
 
     /// Returns a lower bound on the number of parameter values of this model: a file with fewer can't hold its weights.

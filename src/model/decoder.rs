@@ -54,16 +54,6 @@ pub struct RawOutputs {
     pub opacity_logits: Tensor,
 }
 
-/// Outputs of the heads for each candidate.
-pub(crate) struct Heads {
-    pub positions: Tensor,      // [B, M, K, 3]
-    pub log_scales: Tensor,     // [B, M, K, 3], with their offset
-    pub rotations: Tensor,      // [B, M, K, 6]
-    pub opacity_logits: Tensor, // [B, M, K, 1], without offset
-    pub gate: Tensor,           // [B, M, K]
-    pub sh: Tensor,             // [B, M, K, bases · 3]
-}
-
 /// Decoded Gaussians, and the other outputs that the losses need.
 #[derive(Debug)]
 pub struct Decoded {
@@ -98,20 +88,20 @@ impl Decoded {
         }
     }
 
-    /// Pairs every tensor with the corresponding one of `other`.
-    pub(crate) fn zip_tensors<'a>(&'a self, other: &'a Decoded) -> [(&'a Tensor, &'a Tensor); 10] {
-        let (ours, theirs) = (&self.gaussians, &other.gaussians);
+    /// Returns every tensor.
+    pub(crate) fn tensors(&self) -> [&Tensor; 10] {
+        let Decoded { gaussians: g, rotations_6d, raw } = self;
         [
-            (&ours.means, &theirs.means),
-            (&ours.scales, &theirs.scales),
-            (&ours.quaternions, &theirs.quaternions),
-            (&ours.opacities, &theirs.opacities),
-            (&ours.sh, &theirs.sh),
-            (&self.rotations_6d, &other.rotations_6d),
-            (&self.raw.log_scales, &other.raw.log_scales),
-            (&self.raw.rotations, &other.raw.rotations),
-            (&self.raw.sh, &other.raw.sh),
-            (&self.raw.opacity_logits, &other.raw.opacity_logits),
+            &g.means,
+            &g.scales,
+            &g.quaternions,
+            &g.opacities,
+            &g.sh,
+            rotations_6d,
+            &raw.log_scales,
+            &raw.rotations,
+            &raw.sh,
+            &raw.opacity_logits,
         ]
     }
 }
@@ -153,26 +143,28 @@ impl Decoder {
         std::iter::once(&self.sh)
     }
 
-    /// Applies only the linear heads.
-    pub(crate) fn heads(&self, encoded: &EncodedTokens) -> Heads {
+    /// Applies only the linear heads. Returns their outputs for each candidate, [B, M, K, ..], and the gate, [B, M, K]. Log-scales have their
+    /// offset, opacity logits don't.
+    fn heads(&self, encoded: &EncodedTokens) -> (Candidates, Tensor) {
         let (b, m, _) = encoded.geometry.size3().expect("[B, M, d]");
         let k = self.candidates;
         let of_geometry = |head| Precision::F32.linear(head, &encoded.geometry);
         let parameters = of_geometry(&self.parameters).view([b, m, k, PARAMETERS]);
         let sh = self.precision.linear(&self.sh, &encoded.appearance).to_kind(encoded.appearance.kind());
-        Heads {
+        let outputs = Candidates {
             positions: of_geometry(&self.positions).view([b, m, k, 3]),
             log_scales: parameters.narrow(-1, 0, 3) + LOG_SCALE_OFFSET,
             rotations: parameters.narrow(-1, 3, 6),
             opacity_logits: parameters.narrow(-1, OPACITY, 1),
-            gate: of_geometry(&self.gate),
             sh: sh.view([b, m, k, self.sh_bases * 3]),
-        }
+        };
+        (outputs, of_geometry(&self.gate))
     }
 
     /// Applies the heads and builds the Gaussians of `stage`.
     pub fn forward(&self, encoded: &EncodedTokens, stage: Stage) -> Decoded {
-        let Heads { positions, log_scales, rotations, opacity_logits, gate, sh } = self.heads(encoded);
+        let (outputs, gate) = self.heads(encoded);
+        let Candidates { positions, log_scales, rotations, opacity_logits, sh } = outputs;
         // A transition doubles the number of Gaussians, so it starts with half the opacity.
         let opacity_logits = opacity_logits + (OPACITY_OFFSET - (1. - stage.mix) * LN_2);
         let candidates = Candidates {
@@ -211,12 +203,12 @@ const MAX_LOG_U: f64 = -1e-12;
 
 /// Five quantities before activation, of candidates, [B, M, K, ..], or of merged Gaussians, [B, M, G, ..].
 #[derive(Debug)]
-pub(crate) struct Candidates {
-    pub positions: Tensor,      // [.., 3]
-    pub log_scales: Tensor,     // [.., 3]
-    pub rotations: Tensor,      // [.., 6]
-    pub opacity_logits: Tensor, // [.., 1]
-    pub sh: Tensor,             // [.., bases · 3]
+struct Candidates {
+    positions: Tensor,      // [.., 3]
+    log_scales: Tensor,     // [.., 3]
+    rotations: Tensor,      // [.., 6]
+    opacity_logits: Tensor, // [.., 1]
+    sh: Tensor,             // [.., bases · 3]
 }
 
 impl Candidates {
@@ -336,10 +328,10 @@ mod tests {
         let mut decoder = Decoder::new(&vs.root(), &config);
         let tokens = || Tensor::linspace(-1., 1., 8 * 32, (Kind::Float, Device::Cpu)).sin().view([1, 8, 32]);
         let encoded = EncodedTokens { geometry: tokens(), appearance: tokens() };
-        let exact = decoder.heads(&encoded);
+        let (exact, exact_gate) = decoder.heads(&encoded);
         decoder.precision = Precision::Bf16;
-        let rounded = decoder.heads(&encoded);
-        assert!(rounded.positions.equal(&exact.positions) && rounded.gate.equal(&exact.gate));
+        let (rounded, gate) = decoder.heads(&encoded);
+        assert!(rounded.positions.equal(&exact.positions) && gate.equal(&exact_gate));
         assert!(rounded.rotations.equal(&exact.rotations) && rounded.log_scales.equal(&exact.log_scales));
         assert!(rounded.opacity_logits.equal(&exact.opacity_logits));
         let error = ((&rounded.sh - &exact.sh).norm() / exact.sh.norm()).double_value(&[]);

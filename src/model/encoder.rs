@@ -3,7 +3,7 @@
 
 use super::config::{ModelConfig, Streams};
 use super::layers::{ENCODER_STD, LayerScale, Mlp, attention, layer_norm, linear, normalize, project, randn};
-use super::precision::{Precision, record_flops};
+use super::precision::Precision;
 use super::tokens::ImageTokens;
 use super::{backward_from_grads, leaf, tracks_grad};
 use tch::{Device, Tensor, nn, no_grad};
@@ -61,23 +61,6 @@ impl SelfAttentionBlock {
         let xs = self.attention_scale.add(xs, &project(&self.project, &attn_out, precision));
         let mlp_out = self.mlp.forward(&normalize(&self.mlp_norm, &xs), precision);
         self.mlp_scale.add(&xs, &mlp_out)
-    }
-}
-
-/// Linear(LayerNorm(slots)): a stream's projection of the shared slots.
-#[derive(Debug)]
-struct StreamStart {
-    norm: nn::LayerNorm,
-    project: nn::Linear,
-}
-
-impl StreamStart {
-    fn new(vs: nn::Path, d: i64) -> Self {
-        StreamStart { norm: layer_norm(&vs / "0", d), project: linear(&vs / "1", d, d, ENCODER_STD) }
-    }
-
-    fn forward(&self, slots: &Tensor) -> Tensor {
-        project(&self.project, &normalize(&self.norm, slots), Precision::F32)
     }
 }
 
@@ -194,11 +177,7 @@ impl StreamRound {
             [attn_out] => attn_out.shallow_clone(),
             several => Tensor::cat(several, -1),
         };
-        trace_span!("residual sums").in_scope(|| {
-            let out = &attn_out + &mean_value;
-            record_flops(0, 0, &[&attn_out, &out]);
-            out
-        })
+        trace_span!("residual sums").in_scope(|| attn_out + mean_value)
     }
 
     /// Returns the layer that computes keys and values, concatenated, of centered tokens, restricted to `width` channels from `first` on of
@@ -261,12 +240,12 @@ impl Mixer {
     }
 
     /// Mixes the two streams, [B, S, d] each; the results have the same shape.
-    pub fn forward(&self, geometry: &Tensor, appearance: &Tensor, precision: Precision) -> (Tensor, Tensor) {
+    pub fn forward(&self, geometry: &Tensor, appearance: &Tensor, precision: Precision) -> [Tensor; 2] {
         trace_span!("mixer").in_scope(|| {
             let both =
                 [normalize(&self.geometry_norm, geometry), normalize(&self.appearance_norm, appearance)];
             let mixed = self.mlp.forward(&Tensor::cat(&both, -1), precision).chunk(2, -1);
-            (self.geometry_scale.add(geometry, &mixed[0]), self.appearance_scale.add(appearance, &mixed[1]))
+            [self.geometry_scale.add(geometry, &mixed[0]), self.appearance_scale.add(appearance, &mixed[1])]
         })
     }
 }
@@ -286,29 +265,33 @@ impl EncodedTokens {
         EncodedTokens { geometry: f(&self.geometry), appearance: f(&self.appearance) }
     }
 
-    /// Pairs both tensors with the corresponding ones of `other`.
-    pub(crate) fn zip_tensors<'a>(&'a self, other: &'a EncodedTokens) -> [(&'a Tensor, &'a Tensor); 2] {
-        [(&self.geometry, &other.geometry), (&self.appearance, &other.appearance)]
+    /// Returns both tensors.
+    pub(crate) fn tensors(&self) -> [&Tensor; 2] {
+        [&self.geometry, &self.appearance]
     }
 }
 
-/// State between rounds: both streams, or the only one, [B, 4 + M + 1 + 4, d] each.
+/// Stream of slots: its projection Linear(LayerNorm(slots)) of the shared slots, and its rounds.
 #[derive(Debug)]
-struct Slots {
-    geometry: Tensor,
-    appearance: Option<Tensor>,
+struct Stream {
+    norm: nn::LayerNorm,
+    project: nn::Linear,
+    rounds: Vec<StreamRound>,
 }
 
-impl Slots {
-    /// Applies `f` to every stream.
-    pub fn map(&self, f: impl Fn(&Tensor) -> Tensor) -> Self {
-        Slots { geometry: f(&self.geometry), appearance: self.appearance.as_ref().map(f) }
+impl Stream {
+    /// Builds the stream under `vs`, the encoder's path. `start` and `rounds` are the names of its parts.
+    fn new(vs: &nn::Path, config: &ModelConfig, start: &str, rounds: &str) -> Self {
+        let d = config.width;
+        Stream {
+            norm: layer_norm(vs / start / "0", d),
+            project: linear(vs / start / "1", d, d, ENCODER_STD),
+            rounds: (0..config.rounds).map(|i| StreamRound::new(&(vs / rounds / i), config)).collect(),
+        }
     }
 
-    /// Pairs every stream with the corresponding one of `other`.
-    pub fn zip_tensors<'a>(&'a self, other: &'a Slots) -> Vec<(&'a Tensor, &'a Tensor)> {
-        let appearance = self.appearance.as_ref().zip(other.appearance.as_ref());
-        std::iter::once((&self.geometry, &other.geometry)).chain(appearance).collect()
+    fn start(&self, slots: &Tensor) -> Tensor {
+        project(&self.project, &normalize(&self.norm, slots), Precision::F32)
     }
 }
 
@@ -319,20 +302,13 @@ pub struct Encoder {
     global: Tensor,
     registers: Tensor,
     token_registers: Tensor,
-    geometry_start: StreamStart,
-    geometry_rounds: Vec<StreamRound>,
-    appearance: Option<Appearance>,
+    /// The geometry stream, then the appearance stream if there are two.
+    streams: Vec<Stream>,
+    /// One mixer per round if there are two streams.
+    mixers: Vec<Mixer>,
     latents: i64,
     /// Precision of the products of the rounds.
     pub(super) precision: Precision,
-}
-
-/// Appearance stream and mixers, which the dual-stream encoder has in addition to the geometry stream.
-#[derive(Debug)]
-struct Appearance {
-    start: StreamStart,
-    rounds: Vec<StreamRound>,
-    mixers: Vec<Mixer>,
 }
 
 impl Encoder {
@@ -341,41 +317,33 @@ impl Encoder {
         let d = config.width;
         let tokens =
             |name: &str, count: i64, width: i64| vs.var(name, &[1, count, width], randn(ENCODER_STD));
-        let rounds = |name: &str| {
-            (0..config.rounds).map(|i| StreamRound::new(&(vs / name / i), config)).collect::<Vec<_>>()
-        };
-        Encoder {
+        let mut encoder = Encoder {
             auxiliaries: tokens("aux_query_tokens", AUXILIARIES, d),
             global: tokens("scale_emb", 1, d),
             registers: tokens("slot_regs", REGISTERS, d),
             token_registers: tokens("mem_regs", TOKEN_REGISTERS, config.token_width()),
-            geometry_start: StreamStart::new(vs / "slot_to_geo", d),
-            geometry_rounds: rounds("geo_rounds"),
-            appearance: match config.streams {
-                Streams::Single => None,
-                Streams::Dual => Some(Appearance {
-                    start: StreamStart::new(vs / "slot_to_tex", d),
-                    rounds: rounds("tex_rounds"),
-                    mixers: (0..config.rounds).map(|i| Mixer::new(&(vs / "pair_adapters" / i), d)).collect(),
-                }),
-            },
+            streams: vec![Stream::new(vs, config, "slot_to_geo", "geo_rounds")],
+            mixers: vec![],
             latents: config.latents,
             precision: Precision::default(),
+        };
+        if config.streams == Streams::Dual {
+            encoder.streams.push(Stream::new(vs, config, "slot_to_tex", "tex_rounds"));
+            encoder.mixers =
+                (0..config.rounds).map(|i| Mixer::new(&(vs / "pair_adapters" / i), d)).collect();
         }
+        encoder
     }
 
     /// Returns the layers that compute in the configurable precision.
     pub(super) fn linear_layers(&self) -> impl Iterator<Item = &nn::Linear> {
-        let branch = self.appearance.iter();
-        let rounds = self.geometry_rounds.iter().chain(branch.clone().flat_map(|branch| &branch.rounds));
-        let mixers = branch.flat_map(|branch| &branch.mixers);
-        rounds.flat_map(StreamRound::linear_layers).chain(mixers.flat_map(Mixer::linear_layers))
+        let rounds = self.streams.iter().flat_map(|stream| &stream.rounds);
+        rounds.flat_map(StreamRound::linear_layers).chain(self.mixers.iter().flat_map(Mixer::linear_layers))
     }
 
     /// Calls [`StreamRound::fold_weights`] for every round of every stream.
     pub(super) fn fold_weights(&mut self) {
-        let appearance = self.appearance.iter_mut().flat_map(|branch| &mut branch.rounds);
-        let rounds = self.geometry_rounds.iter_mut().chain(appearance);
+        let rounds = self.streams.iter_mut().flat_map(|stream| &mut stream.rounds);
         rounds.for_each(|round| round.fold_weights(self.precision));
     }
 
@@ -398,44 +366,36 @@ impl Encoder {
     /// Encodes `scene_tokens` [M, d] with `tokens`, the result of [`Encoder::image_tokens`].
     pub fn forward(&self, scene_tokens: &Tensor, tokens: &ImageTokens) -> EncodedTokens {
         let slots = self.start(scene_tokens, tokens.mean.size()[0]);
-        self.scene_tokens((0..self.rounds()).fold(slots, |slots, round| self.round(round, &slots, tokens)))
+        self.scene_tokens(&(0..self.rounds()).fold(slots, |slots, round| self.round(round, &slots, tokens)))
     }
 
-    /// Computes every stream's projection of the slots, for `batch` scenes.
-    fn start(&self, scene_tokens: &Tensor, batch: i64) -> Slots {
+    /// Computes every stream's projection of the slots, [B, 4 + M + 1 + 4, d] each, for B = `batch` scenes.
+    fn start(&self, scene_tokens: &Tensor, batch: i64) -> Vec<Tensor> {
         let slots = [&self.auxiliaries, &scene_tokens.unsqueeze(0), &self.global, &self.registers];
-        let slots = Tensor::cat(&slots, 1).expand([batch, -1, -1], false); // [B, 4 + M + 1 + 4, d]
-        Slots {
-            geometry: self.geometry_start.forward(&slots),
-            appearance: self.appearance.as_ref().map(|branch| branch.start.forward(&slots)),
-        }
+        let slots = Tensor::cat(&slots, 1).expand([batch, -1, -1], false);
+        self.streams.iter().map(|stream| stream.start(&slots)).collect()
     }
 
     /// Runs one round: each stream by itself, then the mixer.
-    fn round(&self, round: usize, slots: &Slots, tokens: &ImageTokens) -> Slots {
-        let precision = self.precision;
-        let geometry = self.geometry_rounds[round].forward(&slots.geometry, tokens, precision);
-        match (&self.appearance, &slots.appearance) {
-            (Some(branch), Some(appearance)) => {
-                let appearance = branch.rounds[round].forward(appearance, tokens, precision);
-                let (geometry, appearance) = branch.mixers[round].forward(&geometry, &appearance, precision);
-                Slots { geometry, appearance: Some(appearance) }
-            }
-            _ => Slots { geometry, appearance: None },
+    fn round(&self, round: usize, slots: &[Tensor], tokens: &ImageTokens) -> Vec<Tensor> {
+        let streams = self.streams.iter().zip(slots);
+        let slots: Vec<Tensor> = streams
+            .map(|(stream, slots)| stream.rounds[round].forward(slots, tokens, self.precision))
+            .collect();
+        match &slots[..] {
+            [geometry, appearance] => self.mixers[round].forward(geometry, appearance, self.precision).into(),
+            _ => slots,
         }
     }
 
     /// Returns the scene tokens among the slots.
-    fn scene_tokens(&self, slots: Slots) -> EncodedTokens {
+    fn scene_tokens(&self, slots: &[Tensor]) -> EncodedTokens {
         let narrow = |slots: &Tensor| slots.narrow(1, AUXILIARIES, self.latents);
-        EncodedTokens {
-            geometry: narrow(&slots.geometry),
-            appearance: narrow(slots.appearance.as_ref().unwrap_or(&slots.geometry)),
-        }
+        EncodedTokens { geometry: narrow(&slots[0]), appearance: narrow(&slots[slots.len() - 1]) }
     }
 
     fn rounds(&self) -> usize {
-        self.geometry_rounds.len()
+        self.streams[0].rounds.len()
     }
 }
 
@@ -448,13 +408,14 @@ impl Encoder {
         scene_tokens: &Tensor,
         tokens: &'a ImageTokens,
     ) -> (EncodedTokens, CheckpointedRounds<'a>) {
+        let leaves = |slots: &[Tensor]| slots.iter().map(leaf).collect::<Vec<_>>();
         let slots = self.start(scene_tokens, tokens.mean.size()[0]);
-        let mut between = vec![slots.map(leaf)];
+        let mut between = vec![leaves(&slots)];
         for round in 0..self.rounds() {
-            between.push(no_grad(|| self.round(round, &between[round], tokens)).map(leaf));
+            between.push(leaves(&no_grad(|| self.round(round, &between[round], tokens))));
         }
-        let last = between.last().expect("one more than rounds").map(Tensor::shallow_clone);
-        (self.scene_tokens(last), CheckpointedRounds { encoder: self, tokens, slots, between })
+        let encoded = self.scene_tokens(&between[self.rounds()]);
+        (encoded, CheckpointedRounds { encoder: self, tokens, slots, between })
     }
 }
 
@@ -464,9 +425,9 @@ pub(crate) struct CheckpointedRounds<'a> {
     encoder: &'a Encoder,
     tokens: &'a ImageTokens,
     /// Slots before the first round, attached to the graph of the scene tokens.
-    slots: Slots,
+    slots: Vec<Tensor>,
     /// Detached slots before every round, and after the last one.
-    between: Vec<Slots>,
+    between: Vec<Vec<Tensor>>,
 }
 
 impl CheckpointedRounds<'_> {
@@ -475,9 +436,9 @@ impl CheckpointedRounds<'_> {
         for round in (0..self.encoder.rounds()).rev() {
             let after = self.between.pop().expect("one more than rounds");
             let again = self.encoder.round(round, &self.between[round], self.tokens);
-            backward_from_grads(&again.zip_tensors(&after));
+            backward_from_grads(again.iter().zip(&after));
         }
-        backward_from_grads(&self.slots.zip_tensors(&self.between[0]));
+        backward_from_grads(self.slots.iter().zip(&self.between[0]));
     }
 }
 

@@ -1,6 +1,7 @@
-//! Layers that the model is built from, with the initializations of spec 4.4. Each records the time and the work of its part of a pass.
+//! Layers that the model is built from, with the initializations of spec 4.4. Each is a span, whose time `bench` measures.
 
 use super::precision::{Precision, record_flops};
+use crate::ffi::take_tensor;
 use globalsplat_csrc::runtime::{Bf16Support, cpu_bf16_support};
 use globalsplat_csrc::tensor_ops as ours;
 use std::cell::Cell;
@@ -62,21 +63,14 @@ pub(super) fn layer_norm(vs: nn::Path, width: i64) -> nn::LayerNorm {
 
 /// Applies `norm` to `xs`.
 pub(super) fn normalize(norm: &nn::LayerNorm, xs: &Tensor) -> Tensor {
-    trace_span!("norms").in_scope(|| {
-        let out = norm.forward(xs);
-        record_flops(0, 0, &[xs, &out]);
-        out
-    })
+    trace_span!("norms").in_scope(|| norm.forward(xs))
 }
 
 /// Normalizes `xs` over the last dimension without γ and β.
 pub(super) fn normalize_without_affine(xs: &Tensor) -> Tensor {
-    trace_span!("norms").in_scope(|| {
-        let width = *xs.size().last().expect("a last dimension");
-        let out = xs.layer_norm([width], None::<&Tensor>, None::<&Tensor>, LAYER_NORM_EPS, true);
-        record_flops(0, 0, &[xs, &out]);
-        out
-    })
+    let width = *xs.size().last().expect("a last dimension");
+    trace_span!("norms")
+        .in_scope(|| xs.layer_norm([width], None::<&Tensor>, None::<&Tensor>, LAYER_NORM_EPS, true))
 }
 
 /// Learned gain γ, in float32, of an update that is added to a stream.
@@ -92,11 +86,7 @@ impl LayerScale {
 
     /// Returns xs + γ ⊙ `change`.
     pub fn add(&self, xs: &Tensor, change: &Tensor) -> Tensor {
-        trace_span!("residual sums").in_scope(|| {
-            let out = xs.addcmul(change, &self.gamma);
-            record_flops(0, 0, &[xs, change, &out]);
-            out
-        })
+        trace_span!("residual sums").in_scope(|| xs.addcmul(change, &self.gamma))
     }
 }
 
@@ -123,9 +113,7 @@ impl Mlp {
 
     pub fn forward(&self, xs: &Tensor, precision: Precision) -> Tensor {
         trace_span!("MLPs").in_scope(|| {
-            let hidden = gelu(precision.linear(&self.expand, xs));
-            record_flops(0, 0, &[&hidden, &hidden]);
-            precision.linear(&self.contract, &hidden)
+            precision.linear(&self.contract, &gelu(precision.linear(&self.expand, xs)))
         })
     }
 }
@@ -142,7 +130,7 @@ pub(crate) fn attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tenso
     let size = q.size();
     let flops = 4 * size[0] * size[1] * k.size()[1] * size[2];
     // The backward pass recomputes the scores, and computes gradients of queries, keys, attention weights and values.
-    record_flops(flops, if out.requires_grad() { 5 * flops / 2 } else { 0 }, &[q, k, v, &out]);
+    record_flops(flops, if out.requires_grad() { 5 * flops / 2 } else { 0 });
     out
 }
 
@@ -166,9 +154,9 @@ fn dispatch_attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tensor 
 
 fn attention_cpu_kernel(all: [&Tensor; 3], heads: i64) -> Tensor {
     let [q, k, v] = all.map(|t| t.as_ptr() as usize);
-    // SAFETY: the tensors outlive the call, which on success returns the address of a new one.
-    let out = unsafe { ours::attention(q, k, v, heads) }.unwrap_or_else(|error| panic!("{error}"));
-    unsafe { Tensor::from_ptr(out as *mut torch_sys::C_tensor) }
+    // SAFETY: the tensors outlive the call, which returns the address of a new one.
+    let out = unsafe { ours::attention(q, k, v, heads) };
+    unsafe { take_tensor(out.unwrap_or_else(|error| panic!("{error}"))) }
 }
 
 /// Computes [`attention`] with libtorch, on any device and for any kind and width.

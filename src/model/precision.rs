@@ -1,5 +1,6 @@
 //! Precision of matrix products (spec 1.3), and the products themselves, which record their floating-point operations.
 
+use crate::ffi::take_tensor;
 use globalsplat_csrc::runtime::{Bf16Support, cpu_bf16_support, gpu_has_bf16};
 use globalsplat_csrc::tensor_ops::linear;
 use serde::{Deserialize, Serialize};
@@ -71,17 +72,16 @@ fn product(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tensor {
         xs.device() == Device::Cpu && xs.numel() > 0 && matches!(xs.kind(), Kind::Float | Kind::BFloat16);
     let out = if is_ours { product_on_cpu(xs, weights, bias) } else { xs.linear(weights, bias) };
     let flops = 2 * (xs.numel() as i64) * weights.size()[0];
-    record_flops(flops, backward_flops(flops, [xs, weights], &out), &[xs, weights, &out]);
+    record_flops(flops, backward_flops(flops, [xs, weights], &out));
     out
 }
 
 /// Computes [`product`] on the CPU, with the same bits for any number of threads.
 fn product_on_cpu(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tensor {
     let address = |t: &Tensor| t.as_ptr() as usize;
-    // SAFETY: the tensors outlive the call, which on success returns the address of a new one.
+    // SAFETY: the tensors outlive the call, which returns the address of a new one.
     let out = unsafe { linear(address(xs), address(weights), bias.map_or(0, address)) };
-    let out = out.unwrap_or_else(|error| panic!("{error}"));
-    unsafe { Tensor::from_ptr(out as *mut torch_sys::C_tensor) }
+    unsafe { take_tensor(out.unwrap_or_else(|error| panic!("{error}"))) }
 }
 
 /// Returns the backward operations of a product that takes `flops` operations forward: `flops` for each factor that needs a gradient, and 0
@@ -93,18 +93,17 @@ fn backward_flops(flops: i64, both: [&Tensor; 2], out: &Tensor) -> i64 {
     }
 }
 
-/// Records work in the current `tracing` span: `flops` floating-point operations of matrix products in the forward pass, `backward_flops`
-/// in the backward pass (0 if no gradient is needed), and the bytes of `tensors`, the inputs and outputs.
-pub(super) fn record_flops(flops: i64, backward_flops: i64, tensors: &[&Tensor]) {
-    let bytes = |t: &&Tensor| t.numel() * t.kind().elt_size_in_bytes();
-    trace!(flops, backward_flops, bytes = tensors.iter().map(bytes).sum::<usize>() as i64);
+/// Records work in the current `tracing` span: `flops` floating-point operations of matrix products in the forward pass, and `backward_flops`
+/// in the backward pass (0 if no gradient is needed).
+pub(super) fn record_flops(flops: i64, backward_flops: i64) {
+    trace!(flops, backward_flops);
 }
 
 /// Returns the ReLU of `layer` applied to `images`, [B, C, H, W].
 pub(crate) fn convolve(layer: &nn::Conv2D, images: &Tensor) -> Tensor {
     let out = layer.forward(images).relu_();
     let flops = 2 * (out.numel() * layer.ws.numel()) as i64 / layer.ws.size()[0];
-    record_flops(flops, backward_flops(flops, [images, &layer.ws], &out), &[images, &layer.ws, &out]);
+    record_flops(flops, backward_flops(flops, [images, &layer.ws], &out));
     out
 }
 

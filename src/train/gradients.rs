@@ -68,21 +68,23 @@ impl ForwardBackward<'_> {
 
         stopwatch.time("losses backward", || losses.total.backward());
         stopwatch.time("render backward", || {
-            backward_from_grads(&[
+            backward_from_grads([
                 (&rgb, &rendered.rgb),
                 (&alpha, &rendered.alpha),
                 (&depth, &rendered.depth),
             ]);
         });
-        stopwatch.time("decoder backward", || backward_from_grads(&decoded.zip_tensors(&decoded_leaves)));
+        stopwatch.time("decoder backward", || {
+            backward_from_grads(decoded.tensors().into_iter().zip(decoded_leaves.tensors()));
+        });
         stopwatch.time("encoder backward", || {
-            backward_from_grads(&encoded.zip_tensors(&encoded_leaves));
+            backward_from_grads(encoded.tensors().into_iter().zip(encoded_leaves.tensors()));
             if let Some(kept) = kept {
                 kept.backward();
             }
         });
         stopwatch
-            .time("tokens backward", || backward_from_grads(&[(&tokens.centered, &tokens_leaf.centered)]));
+            .time("tokens backward", || backward_from_grads([(&tokens.centered, &tokens_leaf.centered)]));
         Ok(losses.packed())
     }
 
