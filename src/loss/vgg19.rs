@@ -121,3 +121,44 @@ impl Vgg19 {
         differences.reduce(|sum, difference| sum + difference).expect("six terms") / RANGE
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Loss and gradient in bf16 are near those in float32, for images at several distances from the ground truth, of about 14 and 34 dB: the
+    /// smaller the difference, the larger the relative rounding error.
+    #[test]
+    fn bf16_is_float32_but_for_its_rounding() {
+        tch::manual_seed(7);
+        let stores = [(); 2].map(|()| nn::VarStore::new(Device::Cpu));
+        let [exact, rounded] = stores.each_ref().map(|vs| Vgg19::new(&vs.root()));
+        tch::no_grad(|| {
+            for (name, mut kernel) in stores[0].variables().into_iter().filter(|(_, t)| t.dim() == 4) {
+                let bound = (6. / (9. * kernel.size()[1] as f64)).sqrt();
+                let _ = kernel.uniform_(-bound, bound);
+                stores[1].variables()[&name].shallow_clone().copy_(&kernel);
+            }
+        });
+        let networks = [exact, rounded.with_precision(Precision::Bf16)];
+        let options = (Kind::Float, Device::Cpu);
+        let blocks = [4, 12, 32, 64].map(|count| {
+            Tensor::rand([1, 3, count, count], options).upsample_nearest2d([64, 64], None, None)
+        });
+        let ground_truth = blocks.into_iter().reduce(|sum, block| sum + block).expect("four") / 4.;
+        for amplitude in [0.4, 0.04] {
+            let noise = (Tensor::rand([1, 3, 64, 64], options) * 2. - 1.) * amplitude;
+            let [exact, rounded] = networks.each_ref().map(|network| {
+                let image = (&ground_truth + &noise).clamp(0., 1.).set_requires_grad(true);
+                let loss = network.compare(&network.features(&image), &network.features(&ground_truth));
+                loss.backward();
+                (loss.double_value(&[]), image.grad().flatten(0, -1).to_kind(Kind::Double))
+            });
+            let off = (rounded.0 / exact.0 - 1.).abs();
+            let cosine = rounded.1.dot(&exact.1) / (rounded.1.norm() * exact.1.norm());
+            let cosine = cosine.double_value(&[]);
+            assert!(off > 0. && off <= 1e-2, "loss {:.4}, off by {off:.1e}", exact.0);
+            assert!((0.98..0.99999).contains(&cosine), "cosine of the gradients {cosine:.5}");
+        }
+    }
+}

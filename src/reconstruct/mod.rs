@@ -20,7 +20,7 @@ use crate::error::{Error, Result};
 use crate::io::Splat;
 use crate::model::{GlobalSplat, Stage};
 use crate::render::transform;
-use crate::scene::{Gaussians, ImageSize, Similarity, normalize};
+use crate::scene::{Camera, Gaussians, ImageSize, Similarity, normalize};
 use crate::stereo::pixel_depths;
 use glam::{DMat4, DVec3};
 use std::time::{Duration, Instant};
@@ -125,9 +125,11 @@ pub fn reconstruct<'a>(
     let data = &model.config.data;
     let start = Instant::now();
     let (poses, target_poses) = normalization.c2w.split_at(photos.len());
-    let depths = data.depths.then(|| depths_of(photos, poses, data.image_size));
-    let depths = depths.map(|depths| depths.unsqueeze(0).to_device(model.device));
-    let batch = ViewBatch { depths, ..view_batch(photos, poses, model.device) };
+    let mut batch = view_batch(photos, poses, model.device);
+    if data.depths {
+        let depths = depths_of(&batch, &cameras_at(photos, poses), data.image_size);
+        batch.depths = Some(depths.unsqueeze(0).to_device(model.device));
+    }
     let mut gaussians = run_model(model, &batch)?;
     if data.color_steps > 0 {
         gaussians = fit_colors(&gaussians, &batch, data.color_steps)?;
@@ -142,11 +144,11 @@ pub fn reconstruct<'a>(
     })
 }
 
-/// Returns the depths of `photos` with `poses` in a normalized world, resized to `size`, [V, 2, H, W] ([`pixel_depths`]).
-fn depths_of(photos: &[View], poses: &[DMat4], size: ImageSize) -> Tensor {
-    let batch = view_batch(photos, poses, Device::Cpu);
-    let masks = batch.masks.map(|masks| masks.get(0));
-    let depths = pixel_depths(&batch.images.get(0), masks.as_ref(), &cameras_at(photos, poses));
+/// Returns the depths of `views` of one scene, which `cameras` show, resized to `size`, [V, 2, H, W] on the CPU ([`pixel_depths`]).
+fn depths_of(views: &ViewBatch, cameras: &[Camera], size: ImageSize) -> Tensor {
+    let of_scene = |t: &Tensor| t.get(0).to_device(Device::Cpu);
+    let masks = views.masks.as_ref().map(of_scene);
+    let depths = pixel_depths(&of_scene(&views.images), masks.as_ref(), cameras);
     let size = [i64::from(size.height), i64::from(size.width)];
     if depths.size()[2..] == size { depths } else { depths.upsample_bilinear2d(size, false, None, None) }
 }

@@ -1,10 +1,10 @@
 //! Search for the depths of a photo's pixels: on planes at several depths, patches are compared with those of other photos. The kernel is
 //! `csrc/kernels/plane_sweep.h`. Photos are downscaled first.
 
-use crate::ffi::take_outputs;
+use crate::ffi::take_tensors;
 use crate::scene::{Camera, Intrinsics};
 use glam::{DMat3, DVec3};
-use globalsplat_csrc::tensor_ops::{self as kernel, PhotoToCompare};
+use globalsplat_csrc::tensor_ops::{PhotoToCompare, search_depths};
 use tch::{Kind, Tensor};
 
 /// Side in pixels of the patches that are compared, the minimum of a photo's sides.
@@ -58,15 +58,11 @@ impl Search {
             })
             .collect();
         let [gray, weight] = [Some(gray), weight].map(address);
-        let kernel = match self {
-            Search::PatchCorrelation => kernel::search_depths,
-            Search::SemiGlobal => kernel::match_semi_globally,
-        };
-        // SAFETY: the tensors outlive the call, and on success the C++ side has stored two new tensors in `out`.
-        let done =
-            unsafe { take_outputs(|out| kernel(gray, weight, &others, step as f32, planes as i32, out)) };
-        let [inverse_depths, scores] = done.unwrap_or_else(|error| panic!("{error}"));
-        (inverse_depths, scores)
+        let semi_global = matches!(self, Search::SemiGlobal);
+        // SAFETY: the tensors outlive the call, which returns the addresses of new ones.
+        let found =
+            unsafe { search_depths(gray, weight, &others, step as f32, planes as i32, semi_global) };
+        unsafe { take_tensors::<2>(found.unwrap_or_else(|error| panic!("{error}"))) }.into()
     }
 }
 

@@ -118,9 +118,16 @@ impl<'a> Sweep<'a> {
         Sweep { photos, coarse, cameras, points, medians: vec![] }
     }
 
-    /// Estimates how far the scene is from photo `index`. If the photo itself doesn't tell, uses those that came before.
+    /// Estimates how far the scene is from photo `index`: from the points that the photo shows, else by comparing it with others. If the photo
+    /// itself doesn't tell, uses those that came before.
     pub fn scene_depth(&mut self, index: usize) -> SceneDepth {
-        let EstimatedDepth { median, nearest } = EstimatedDepth::of(index, &self.coarse, self.points);
+        let (median, nearest) = match inverse_depths_of(self.points, &self.coarse[index].camera) {
+            Some(inverse) => {
+                let last = ((1. - MAX_NEARER_FRACTION) * inverse.len() as f64) as usize;
+                (Some(1. / inverse[inverse.len() / 2]), Some(NEAR_PLANE_MARGIN * inverse[last]))
+            }
+            None => (median_depth(index, &self.coarse), None),
+        };
         self.medians.extend(median);
         let depth = median.unwrap_or_else(|| typical_depth(&self.medians, extent(&self.cameras)));
         SceneDepth { depth, nearest }
@@ -141,33 +148,18 @@ impl<'a> Sweep<'a> {
     }
 }
 
-/// Distance of the scene as it is estimated from a photo alone, before depths per pixel are computed.
-struct EstimatedDepth {
-    /// Median depth of what the photo shows, if it can be estimated.
-    median: Option<f64>,
-    /// Inverse depth of the nearest plane, if points determine it.
-    nearest: Option<f64>,
-}
-
-impl EstimatedDepth {
-    /// Estimates the depth from the points that the photo shows, else by comparing it with one photo at each of several distances, which
-    /// are the extent of all cameras times powers of ½. Photos that are too near show no parallax, and those that are too far show
-    /// something else. The number of photos at a distance makes no difference.
-    fn of(index: usize, photos: &[SmallPhoto], points: &[Point]) -> Self {
-        let this = &photos[index];
-        if let Some(inverse) = inverse_depths_of(points, &this.camera) {
-            let median = Some(1. / inverse[inverse.len() / 2]);
-            let last = ((1. - MAX_NEARER_FRACTION) * inverse.len() as f64) as usize;
-            return EstimatedDepth { median, nearest: Some(NEAR_PLANE_MARGIN * inverse[last]) };
-        }
-        let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
-        let compared = at_octaves(index, &cameras, OCTAVES).into_iter().map(|i| measured(this, &photos[i]));
-        let agreed: Vec<Measured> = compared.filter(|of| of.share >= MIN_AGREEING_FRACTION).collect();
-        let resolved = agreed.iter().filter(|of| of.planes >= RESOLVED);
-        // The farthest photo comes first. A scene without parallax there is at least that far away.
-        let best = resolved.max_by(|a, b| a.share.total_cmp(&b.share)).or(agreed.first());
-        EstimatedDepth { median: best.map(|of| of.depth), nearest: None }
-    }
+/// Estimates the median depth of photo `index` by comparing it with one photo at each of several distances, which are the extent of all
+/// cameras times powers of ½. Photos that are too near show no parallax, and those that are too far show something else. The number of
+/// photos at a distance makes no difference.
+fn median_depth(index: usize, photos: &[SmallPhoto]) -> Option<f64> {
+    let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
+    let others = at_octaves(index, &cameras, OCTAVES).into_iter();
+    let compared = others.map(|other| measured(&photos[index], &photos[other]));
+    let agreed: Vec<Measured> = compared.filter(|of| of.share >= MIN_AGREEING_FRACTION).collect();
+    let resolved = agreed.iter().filter(|of| of.planes >= RESOLVED);
+    // The farthest photo comes first. A scene without parallax there is at least that far away.
+    let best = resolved.max_by(|a, b| a.share.total_cmp(&b.share)).or(agreed.first());
+    best.map(|of| of.depth)
 }
 
 /// Depth on which two photos agree.
@@ -372,8 +364,9 @@ mod tests {
         let point = |i: i32| Point { position: DVec3::new(0.01 * f64::from(i), 0., 3.), color: [0.; 3] };
         let points: Vec<Point> = (0..40).map(point).collect();
         let photos: Vec<SmallPhoto> = photos(false);
-        assert!((EstimatedDepth::of(1, &photos, &points).nearest.unwrap() - 1.3 / 3.).abs() < 1e-9);
-        assert!(EstimatedDepth::of(1, &photos, &points[..20]).nearest.is_none());
+        let nearest = |points: &[Point]| Sweep::new(&photos, points).scene_depth(1).nearest;
+        assert!((nearest(&points).unwrap() - 1.3 / 3.).abs() < 1e-9);
+        assert!(nearest(&points[..20]).is_none());
         // A single photo has no measurable depth, and the result must not be NaN.
         let alone = sweep(vec![photo(0., false)], &[], |_| true).depth_maps;
         assert!(alone[0].1.depth.isfinite().all().int64_value(&[]) == 1);

@@ -7,5 +7,4 @@ mod fuzz_seeds;
 mod golden;
 mod loader;
 mod model;
-mod perceptual;
 mod splat;
