@@ -37,9 +37,13 @@ raster::Heads<Number> written(const Tensor& t) {
   return {static_cast<Number*>(t.data_ptr()), t.stride(0), t.stride(1)};
 }
 
-template <class Number>
-raster::AttentionInputs<Number> read_all(const Tensor& q, const Tensor& k, const Tensor& v) {
-  return {read<Number>(q), read<Number>(k), read<Number>(v)};
+// Calls body() with a number of the tensor's type.
+template <class Body>
+void dispatch_by_type(const Tensor& t, const Body& body) {
+  if (is_bf16(t))
+    body(raster::Bf16());
+  else
+    body(0.f);
 }
 
 raster::AttentionShape shape_of(const Tensor& q, const Tensor& k, int64_t heads) {
@@ -79,12 +83,11 @@ struct AttentionFunction : torch::autograd::Function<AttentionFunction> {
     const Tensor out = at::empty(q.sizes(), q.options());
     const Tensor log_sums = at::empty({q.size(0), heads, q.size(1)}, q.options().dtype(at::kFloat));
     const raster::AttentionShape shape = shape_of(q, k, heads);
-    float* const sums = log_sums.data_ptr<float>();
-    if (is_bf16(q))
-      raster::multi_head_attention_bf16(shape, read_all<raster::Bf16>(q, k, v), written<raster::Bf16>(out), sums, bf16_gemm(),
-                                        get_num_threads());
-    else
-      raster::multi_head_attention(shape, read_all<float>(q, k, v), written<float>(out), sums, get_num_threads());
+    dispatch_by_type(q, [&](auto number) {
+      using Number = decltype(number);
+      raster::multi_head_attention<Number>(shape, {read<Number>(q), read<Number>(k), read<Number>(v)}, written<Number>(out),
+                                           log_sums.data_ptr<float>(), bf16_gemm(), get_num_threads());
+    });
     ctx->save_for_backward({q, k, v, out, log_sums});
     ctx->saved_data["heads"] = heads;
     return out;
@@ -96,14 +99,13 @@ struct AttentionFunction : torch::autograd::Function<AttentionFunction> {
     const auto like = [](const Tensor& of) { return at::empty(of.sizes(), of.options()); };
     const Tensor dq = like(q), dk = like(k), dv = like(v);
     const raster::AttentionShape shape = shape_of(q, k, ctx->saved_data["heads"].toInt());
-    const float* const sums = t[4].const_data_ptr<float>();
-    if (is_bf16(q))
-      raster::multi_head_attention_backward_bf16(
-          shape, read_all<raster::Bf16>(q, k, v), read<raster::Bf16>(out), sums, read<raster::Bf16>(grad_out),
-          {written<raster::Bf16>(dq), written<raster::Bf16>(dk), written<raster::Bf16>(dv)}, bf16_gemm(), get_num_threads());
-    else
-      raster::multi_head_attention_backward(shape, read_all<float>(q, k, v), read<float>(out), sums, read<float>(grad_out),
-                                            {written<float>(dq), written<float>(dk), written<float>(dv)}, get_num_threads());
+    dispatch_by_type(q, [&](auto number) {
+      using Number = decltype(number);
+      raster::multi_head_attention_backward<Number>(shape, {read<Number>(q), read<Number>(k), read<Number>(v)}, read<Number>(out),
+                                                    t[4].const_data_ptr<float>(), read<Number>(grad_out),
+                                                    {written<Number>(dq), written<Number>(dk), written<Number>(dv)}, bf16_gemm(),
+                                                    get_num_threads());
+    });
     return {dq, dk, dv, Tensor()};
   }
 };

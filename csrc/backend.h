@@ -1,5 +1,5 @@
-// Arguments of the splat ops, and the interface of a backend, which implements them for one kind of device. splat.cpp does what is common to
-// all backends: it checks the arguments, moves them, and integrates the ops with autograd.
+// Inputs of the splat ops, and the interface of a backend, which implements them for one kind of device. splat.cpp does what is common to
+// all backends: it checks the inputs, moves them, and integrates the op with autograd.
 #pragma once
 
 #include <ATen/core/Tensor.h>
@@ -12,17 +12,23 @@ namespace globalsplat {
 
 using at::Tensor;
 
-// Gaussians of all scenes, or their gradients; shapes as in Arguments.
+// Gaussians of all scenes, or their gradients: means [B, N, 3], scales [B, N, 3], quaternions [B, N, 4], opacities [B, N], and sh [B, N,
+// bases, 3].
 struct Gaussians {
   Tensor means, scales, quaternions, opacities, sh;
 };
 
-// Inputs of an op: on the backend's device, contiguous, all float32 or all float64; shapes as in Arguments.
+// Gaussians and cameras of one call. A backend takes tensors on its device that are contiguous, and all float32 or all float64.
 struct Inputs {
   Gaussians gaussians;
-  Tensor w2c, intrinsics;
-  int64_t width, height;  // pixels
+  Tensor w2c, intrinsics;  // [B, C, 4, 4], [B, C, 3, 3] in pixels
+  int64_t width, height;   // pixels
   raster::ProjectionSettings projection;
+
+  // Checks the inputs, and returns them as the backend for their device takes them: float64 if the means are, and float32 otherwise. Moving
+  // and converting are differentiable, so gradients return to the caller's device and type. Intrinsics get no gradient. Throws if shapes or
+  // values are invalid.
+  Inputs to_backend() const;
 
   int64_t scenes() const { return w2c.size(0); }
   int64_t cameras() const { return w2c.size(1); }  // per scene
@@ -46,10 +52,14 @@ struct RenderOutput {
   Tensor rgb, alpha, depth;
 };
 
-// Outputs of project(), or their gradients, except that `visible`, `opacity` and `variance` have none; shapes as in splat.h.
-// `opacity`, [B, C, N], is that of the splat, which antialiasing reduces, and `variance`, [B, C, N, 2], the diagonal of its covariance.
+// Outputs of project(); zeros for Gaussians that aren't visible.
 struct Projected {
-  Tensor visible, mean2d, conic, depth, color, opacity, variance;
+  Tensor mean2d;    // [B, C, N, 2], pixels
+  Tensor conic;     // [B, C, N, 3], xx, xy, yy of the inverse 2D covariance
+  Tensor depth;     // [B, C, N]
+  Tensor opacity;   // [B, C, N], of the splat, which antialiasing reduces
+  Tensor variance;  // [B, C, N, 2], the diagonal of the 2D covariance
+  Tensor visible;   // [B, C, N], int64, 1 if a Gaussian isn't dropped
 };
 
 // State other than tensors that a backend's splat() passes to its splat_backward().
@@ -57,34 +67,13 @@ struct SavedState {
   virtual ~SavedState() = default;
 };
 
-struct SplatArguments;  // shared with Rust, see src/render.rs
-
-// Gaussians and cameras of one call, borrowed:
-//   means [B, N, 3], scales [B, N, 3], quaternions [B, N, 4], opacities [B, N], sh [B, N, bases, 3]
-//   w2c [B, C, 4, 4], intrinsics [B, C, 3, 3] in pixels
-struct Arguments {
-  const Tensor &means, &scales, &quaternions, &opacities, &sh, &w2c, &intrinsics;
-  int64_t width, height;
-  raster::ProjectionSettings projection;
-
-  // Throws if shapes or values are invalid.
-  void check() const;
-
-  // Returns contiguous inputs on `device`, all of one type: float64 if the means are, and float32 otherwise. Moving and converting are
-  // differentiable, so gradients return to the caller's device and type. Intrinsics get no gradient.
-  Inputs to_inputs(at::Device device) const;
-};
-
-Arguments borrowed(const SplatArguments& of);
-
-// Functions of a backend. New tensors have the device and the type of the inputs. Incoming gradients are contiguous. Backward functions
-// return gradients of all five Gaussian tensors, and those that are requested. Only splat_backward() computes `means2d`.
+// Functions of a backend. New tensors have the device and the type of the inputs. Incoming gradients are contiguous. splat_backward() returns
+// the gradients of all five Gaussian tensors, and those that are requested. project() is the first step of splat() by itself.
 struct Backend {
   at::DeviceType device;
   RenderOutput (*splat)(const Inputs&, std::unique_ptr<const SavedState>& saved);
   Gradients (*splat_backward)(const Inputs&, const RenderOutput& outputs, const RenderOutput& gradients, const SavedState&, GradientRequest);
   Projected (*project)(const Inputs&);
-  Gradients (*project_backward)(const Inputs&, const Projected& gradients, GradientRequest);
 };
 
 namespace cpu {
@@ -100,8 +89,5 @@ const Backend* emulated_backend();
 // Returns the backend for tensors of this device and type. The CPU backend also serves devices without a backend of their own, and float64,
 // which exists to verify gradients.
 const Backend& backend_of(const Tensor& means);
-
-// Returns the device on which that backend computes: that of the means, unless the backend is for another kind of device.
-at::Device backend_device(const Tensor& means);
 
 }  // namespace globalsplat

@@ -46,28 +46,20 @@ struct SweepTensors {
   }
 };
 
-// Calls search(sweep, planes, inverse depth, score, number of threads), and puts the two results in `out`.
-template <class Search>
-void run(const Search& search, const raster::PlaneSweep& sweep, int32_t planes, rust::Slice<size_t> out) {
-  const at::Tensor inverse_depth = at::empty({sweep.own.height, sweep.own.width}, at::kFloat), score = at::empty_like(inverse_depth);
-  search(sweep, planes, inverse_depth.data_ptr<float>(), score.data_ptr<float>(), get_num_threads());
-  out[0] = owned(inverse_depth);
-  out[1] = owned(score);
-}
-
 }  // namespace
 
-void search_depths(size_t gray, size_t weight, rust::Slice<const PhotoToCompare> others, float step, int32_t planes,
-                   rust::Slice<size_t> out) {
-  const SweepTensors tensors(gray, weight, others, step, planes, 1e-4f, -1);
-  run(raster::search_depths, tensors.sweep, planes, out);
-}
-
-void match_semi_globally(size_t gray, size_t weight, rust::Slice<const PhotoToCompare> others, float step, int32_t planes,
-                         rust::Slice<size_t> out) {
-  // A smooth depth needs less texture. Photos that don't show a pixel say nothing about its depth, like those without any likeness.
-  const SweepTensors tensors(gray, weight, others, step, planes, 1e-5f, 0);
-  run(raster::match_semi_globally, tensors.sweep, planes, out);
+rust::Vec<size_t> search_depths(size_t gray, size_t weight, rust::Slice<const PhotoToCompare> others, float step, int32_t planes,
+                                bool semi_global) {
+  // In semi-global matching, a smooth depth needs less texture, and photos that don't show a pixel say nothing about its depth, like those
+  // without any likeness.
+  const SweepTensors tensors(gray, weight, others, step, planes, semi_global ? 1e-5f : 1e-4f, semi_global ? 0 : -1);
+  const raster::PlaneSweep& sweep = tensors.sweep;
+  const at::Tensor inverse_depth = at::empty({sweep.own.height, sweep.own.width}, at::kFloat), score = at::empty_like(inverse_depth);
+  const auto search = semi_global ? raster::match_semi_globally : raster::search_depths;
+  search(sweep, planes, inverse_depth.data_ptr<float>(), score.data_ptr<float>(), get_num_threads());
+  rust::Vec<size_t> out;
+  for (const at::Tensor& t : {inverse_depth, score}) out.push_back(owned(t));
+  return out;
 }
 
 }  // namespace globalsplat

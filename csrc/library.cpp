@@ -37,22 +37,12 @@ const SavedState* state_of(const Tensor& tensor) {
   "float eps2d, float near_plane, float far_plane, bool antialiased, bool direct_colors"
 constexpr size_t kArguments = 14;
 
-// Checks the arguments and returns them on the device of their backend.
+// Checks the arguments and returns them as their backend takes them.
 Inputs inputs_of(c10::ArrayRef<c10::IValue> of) {
-  const Tensor& means = of[0].toTensor();
+  const auto tensor = [&](size_t index) { return of[index].toTensor(); };
   const raster::ProjectionSettings projection{of[9].toDouble(), of[12].toBool(), of[13].toBool(), of[10].toDouble(), of[11].toDouble()};
-  const Arguments arguments{means,
-                            of[2].toTensor(),
-                            of[1].toTensor(),
-                            of[3].toTensor(),
-                            of[4].toTensor(),
-                            of[5].toTensor(),
-                            of[6].toTensor(),
-                            of[7].toInt(),
-                            of[8].toInt(),
-                            projection};
-  arguments.check();
-  return arguments.to_inputs(backend_device(means));
+  const Inputs given{{tensor(0), tensor(2), tensor(1), tensor(3), tensor(4)}, tensor(5), tensor(6), of[7].toInt(), of[8].toInt(), projection};
+  return given.to_backend();
 }
 
 // Replaces an op's arguments by its results, on the device of the means, the first argument.

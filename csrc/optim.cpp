@@ -28,10 +28,9 @@ std::vector<Tensor> all_borrowed(rust::Slice<const size_t> addresses) {
 
 }  // namespace
 
-void norm(rust::Slice<const size_t> tensors, rust::Slice<size_t> out) {
+size_t norm(rust::Slice<const size_t> tensors) {
   const at::NoGradGuard no_grad;
-  const Tensor norms = at::stack(at::_foreach_norm(all_borrowed(tensors)));
-  out[0] = owned(at::linalg_vector_norm(norms));
+  return owned(at::linalg_vector_norm(at::stack(at::_foreach_norm(all_borrowed(tensors)))));
 }
 
 void scale(rust::Slice<const size_t> tensors, double factor) {

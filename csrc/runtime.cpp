@@ -67,9 +67,8 @@ Bf16Support detect_bf16_support() {
 
 std::atomic<int> own_threads{0};
 
-thread_local rust::Vec<rust::String> op_names;
+thread_local rust::Vec<RecordedOp> recorded_ops;
 thread_local at::CallbackHandle callback = at::INVALID_CALLBACK_HANDLE;
-thread_local bool only_outermost = false;
 thread_local int depth = 0;  // number of nested ops that are running
 
 // Returns true if `function` is a node of autograd's graph. Nodes call ops but aren't ops. Ops of this library have no operator name,
@@ -79,17 +78,17 @@ bool is_autograd_node(const at::RecordFunction& function) {
 }
 
 std::unique_ptr<at::ObserverContext> on_op_begin(const at::RecordFunction& function) {
-  if (only_outermost && (is_autograd_node(function) || depth++ > 0)) return nullptr;
+  const bool is_outermost = !is_autograd_node(function) && depth++ == 0;
   const auto op = function.operator_name();
   std::string name = op ? c10::toString(*op) : std::string(function.name());
   // `to(device)` calls the overload `dtype_layout` without a dtype.
   if (name == "aten::to.dtype_layout" && function.inputs()[1].isNone()) name = "aten::to.device";
-  op_names.push_back(name);
+  recorded_ops.push_back({name, is_outermost});
   return nullptr;
 }
 
 void on_op_end(const at::RecordFunction& function, at::ObserverContext*) {
-  if (only_outermost && !is_autograd_node(function)) --depth;
+  if (!is_autograd_node(function)) --depth;
 }
 
 struct Counter final : c10::MemoryReportingInfoBase {
@@ -125,16 +124,17 @@ std::unique_ptr<CudaEvent> record_event(int32_t gpu) { return std::make_unique<C
 
 PendingCopies::PendingCopies(std::vector<at::Tensor> tensors, c10::Event done) : tensors_(std::move(tensors)), done_(std::move(done)) {}
 
-void PendingCopies::take_tensors(rust::Slice<size_t> out) const {
-  TORCH_CHECK(out.size() == tensors_.size(), "there are ", tensors_.size(), " copies, and places for ", out.size());
+rust::Vec<size_t> PendingCopies::take_tensors() const {
   const c10::Stream current = driver().getStream(tensors_.at(0).device());
   done_.block(current);
-  for (size_t k = 0; k < out.size(); ++k) {
+  rust::Vec<size_t> out;
+  for (const at::Tensor& t : tensors_) {
     // If a tensor is freed, the allocator then reuses its memory for later copies only after this stream has done the work enqueued until
     // then.
-    tensors_[k].record_stream(current);
-    out[k] = owned(tensors_[k]);
+    t.record_stream(current);
+    out.push_back(owned(t));
   }
+  return out;
 }
 
 CopyStream::CopyStream(int32_t gpu) : stream_(driver().getStreamFromGlobalPool(by_number(gpu))) {}
@@ -154,9 +154,9 @@ std::unique_ptr<PendingCopies> CopyStream::copy(rust::Slice<const size_t> tensor
 
 std::unique_ptr<CopyStream> copy_stream(int32_t gpu) { return std::make_unique<CopyStream>(gpu); }
 
-void empty_pinned_bytes(rust::Slice<const int64_t> shape, rust::Slice<size_t> out) {
+size_t empty_pinned_bytes(rust::Slice<const int64_t> shape) {
   const auto options = at::TensorOptions(at::kByte).pinned_memory(true);
-  out[0] = owned(at::empty(at::IntArrayRef(shape.data(), shape.size()), options));
+  return owned(at::empty(at::IntArrayRef(shape.data(), shape.size()), options));
 }
 
 uint64_t max_memory_allocated(int32_t gpu) {
@@ -189,17 +189,16 @@ int get_num_threads() {
 
 void set_num_threads(int count) { own_threads = count; }
 
-void start_recording_ops(bool outermost) {
-  op_names.clear();
-  only_outermost = outermost;
+void start_recording_ops() {
+  recorded_ops.clear();
   depth = 0;
   const auto recorder = at::RecordFunctionCallback(on_op_begin, on_op_end).needsInputs(true).scopes({at::RecordScope::FUNCTION});
   callback = at::addThreadLocalCallback(recorder);
 }
 
-rust::Vec<rust::String> stop_recording_ops() {
+rust::Vec<RecordedOp> stop_recording_ops() {
   at::removeCallback(callback);
-  return std::exchange(op_names, {});
+  return std::exchange(recorded_ops, {});
 }
 
 void start_counting_tensor_bytes() { counting = std::make_unique<Counting>(); }

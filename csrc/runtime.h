@@ -43,7 +43,7 @@ class PendingCopies {
 
   // Passes the tensors to the caller, once and in order. Work that is enqueued in the GPU's current stream from now on waits for the
   // copies; the host doesn't.
-  void take_tensors(rust::Slice<size_t> out) const;
+  rust::Vec<size_t> take_tensors() const;
 
  private:
   std::vector<at::Tensor> tensors_;
@@ -67,7 +67,7 @@ class CopyStream {
 std::unique_ptr<CopyStream> copy_stream(int32_t gpu);
 
 // Allocates an uninitialized byte tensor in page-locked host memory, from which a GPU can copy by itself. The caller owns it.
-void empty_pinned_bytes(rust::Slice<const int64_t> shape, rust::Slice<size_t> out);
+size_t empty_pinned_bytes(rust::Slice<const int64_t> shape);
 
 // Returns the peak of the bytes that tensors take on a GPU since the start of the program or the last reset; the second function resets it.
 uint64_t max_memory_allocated(int32_t gpu);
@@ -103,13 +103,12 @@ int get_num_threads();
 // Sets the number of threads; 0 restores the default.
 void set_num_threads(int count);
 
-// Begins recording the libtorch ops that this thread runs, backward passes included. With `outermost`, ops called by other ops
-// are left out.
-void start_recording_ops(bool outermost);
+// Begins recording the libtorch ops that this thread runs, backward passes included.
+void start_recording_ops();
 
-// Ends recording and returns the ops' full names ("aten::add.Tensor") in order. An op that moves a tensor to a device, including the device
-// on which it already is, is "aten::to.device".
-rust::Vec<rust::String> stop_recording_ops();
+// Ends recording and returns the ops in order.
+struct RecordedOp;
+rust::Vec<RecordedOp> stop_recording_ops();
 
 // Begins counting the bytes that this thread allocates and frees for CPU tensors.
 void start_counting_tensor_bytes();

@@ -1,5 +1,6 @@
-// The ops on torch tensors besides the rasterizer. Rust calls them through cxx. Tensors are passed as addresses of live tensors, and the
-// caller owns the tensors that are returned. All ops throw (a Rust error) if shapes or types don't fit.
+// The ops on torch tensors besides the rasterizer. Rust calls them through cxx. Tensors are passed and returned as addresses: those that are
+// passed must be live, and those that are returned are new and belong to the caller. All ops throw (a Rust error) if shapes or types don't
+// fit.
 #pragma once
 
 #include <cstddef>
@@ -20,38 +21,33 @@ struct MuonOptions;
 bool supports_attention(int64_t width, bool is_bf16);
 
 // Computes softmax(q kᵀ / √(d/h)) v over h adjacent heads (kernels/attention.h). q is [B, n, d], k and v are [B, m, d] with m at least 1,
-// float32 or bfloat16 on the CPU, with any strides; arguments are addresses of live tensors. Returns the address of a new contiguous tensor
-// [B, n, d] of their kind that the caller owns. Differentiable once. Throws if shapes or types don't fit.
+// float32 or bfloat16 on the CPU, with any strides. Returns a contiguous tensor [B, n, d] of their kind. Differentiable once.
 size_t attention(size_t q, size_t k, size_t v, int64_t heads);
 
-// Computes xs weightsᵀ + bias for xs [.., k], weights [n, k] and bias [n], float32 or bfloat16 on the CPU. Arguments are addresses of live
-// tensors; `bias` is 0 if there is none. Returns the address of a new tensor [.., n] that the caller owns, with the same bits for any
-// number of threads. Differentiable once. Throws if shapes or types don't fit, or if the system has no memory for the products' generated
-// code. Float32 products use oneDNN if it is faster than libtorch's choice, MKL; bfloat16 products use libtorch's choice, which is oneDNN.
+// Computes xs weightsᵀ + bias for xs [.., k], weights [n, k] and bias [n], float32 or bfloat16 on the CPU; `bias` is 0 if there is none.
+// Returns a tensor [.., n], with the same bits for any number of threads. Differentiable once. Throws also if the system has no memory for
+// the products' generated code. Float32 products use oneDNN if it is faster than libtorch's choice, MKL; bfloat16 products use libtorch's
+// choice, which is oneDNN.
 size_t linear(size_t xs, size_t weights, size_t bias);
 
 // Computes `l1_weight` · mean |picture − photo| + `ssim_weight` · mean SSIM (spec 9.4) of two tensors [.., H, W] of one shape, both sides
-// at least 11. Arguments are addresses of live tensors. `out` receives a new scalar tensor that the caller owns, on the device of
-// `picture`, float64 if `picture` is and float32 otherwise. Differentiable with respect to `picture`. Throws on shapes that don't fit.
-void photometric(size_t picture, size_t photo, double l1_weight, double ssim_weight, rust::Slice<size_t> out);
+// at least 11. Returns a scalar on the device of `picture`, float64 if `picture` is and float32 otherwise. Differentiable with respect to
+// `picture`.
+size_t photometric(size_t picture, size_t photo, double l1_weight, double ssim_weight);
 
-// Computes `factor` · the edge-aware smoothness of depths (kernels/smoothness.h), for depths [.., H, W] and photos [.., 3, H, W]. Devices,
-// types and ownership are as in photometric(). Differentiable with respect to the depths.
-void depth_smoothness(size_t depths, size_t photos, double factor, rust::Slice<size_t> out);
+// Computes `factor` · the edge-aware smoothness of depths (kernels/smoothness.h), for depths [.., H, W] and photos [.., 3, H, W]. Device and
+// type are as in photometric(). Differentiable with respect to the depths.
+size_t depth_smoothness(size_t depths, size_t photos, double factor);
 
 // Computes the inverse depth at which each pixel of `gray` looks most alike in the other photos, and its score there
-// (kernels/plane_sweep.h). Candidates are the multiples 0 to `planes` − 1 of `step`. Arguments are addresses of live tensors [H, W], both
-// sides at least 9; the address of a weight is 0 if every pixel counts. `out` receives two new tensors [H, W] that the caller owns, float32
-// on the CPU. Throws on shapes that don't fit.
-void search_depths(size_t gray, size_t weight, rust::Slice<const PhotoToCompare> others, float step, int32_t planes,
-                   rust::Slice<size_t> out);
+// (kernels/plane_sweep.h); or, if `semi_global`, the inverse depth by semi-global matching and how sure it is, in [0, 1]
+// (kernels/semi_global.h). Candidates are the multiples 0 to `planes` − 1 of `step`. Photos are [H, W], both sides at least 9; the address
+// of a weight is 0 if every pixel counts. Returns two tensors [H, W], float32 on the CPU.
+rust::Vec<size_t> search_depths(size_t gray, size_t weight, rust::Slice<const PhotoToCompare> others, float step, int32_t planes,
+                                bool semi_global);
 
-// Does the same by semi-global matching (kernels/semi_global.h). `out` receives the inverse depth and how sure it is, in [0, 1].
-void match_semi_globally(size_t gray, size_t weight, rust::Slice<const PhotoToCompare> others, float step, int32_t planes,
-                         rust::Slice<size_t> out);
-
-// Computes the norm of all elements of all tensors. `out` receives a new scalar tensor that the caller owns.
-void norm(rust::Slice<const size_t> tensors, rust::Slice<size_t> out);
+// Computes the norm of all elements of all tensors, a scalar.
+size_t norm(rust::Slice<const size_t> tensors);
 
 // Multiplies tensors by `factor` in place.
 void scale(rust::Slice<const size_t> tensors, double factor);

@@ -20,7 +20,7 @@ parity=() raster=(--repeats 100) large=(--gaussians 1000000 --cameras 1 --size 1
 views=(24 12 36) repeats=50 model=() refine=() batch=4 steps=10 train=(--set train.steps=300)
 if [ "${1:-}" = --dry-run ]; then
     shift
-    parity=(--only 'projection_float32')
+    parity=(--only 'rasterizer_float32')
     raster=(--gaussians 500 --cameras 2 --size 64x64 --repeats 2) large=(--gaussians 2000 --cameras 1 --size 128x64 --repeats 2)
     views=(2) repeats=2
     model=(--set 'data.image_size=[32,32]' --set model.patch_size=16 --set model.latents=16 --set model.width=32)

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <memory>
+#include <type_traits>
 
 #include "kernels.h"
 #include "parallel.h"
@@ -45,25 +46,28 @@ void for_query_blocks(const AttentionShape& shape, const AttentionInputs<Number>
 
 }  // namespace
 
-void multi_head_attention(const AttentionShape& shape, const AttentionInputs<float>& in, Heads<float> out, float* log_sums,
-                          int num_threads) {
-  for_query_blocks(shape, in, kProductRows, num_threads, [&](const AttentionHead<float>& of, int64_t head, int64_t begin) {
-    kernels().attention_forward(of, head_of(out, shape, head).from(begin), log_sums + head * shape.queries + begin,
-                                scratch(attention_scratch_size(shape.width)));
+template <class Number>
+void multi_head_attention(const AttentionShape& shape, const AttentionInputs<Number>& in, Heads<Number> out, float* log_sums,
+                          const Bf16Gemm& gemm, int num_threads) {
+  constexpr bool is_bf16 = std::is_same_v<Number, Bf16>;
+  const int64_t step = is_bf16 ? kBf16Columns : kProductRows;
+  for_query_blocks(shape, in, step, num_threads, [&](const AttentionHead<Number>& of, int64_t head, int64_t begin) {
+    const Rows<Number> to = head_of(out, shape, head).from(begin);
+    float* const to_sums = log_sums + head * shape.queries + begin;
+    if constexpr (is_bf16)
+      kernels().attention_forward_bf16(of, gemm, to, to_sums, scratch(attention_bf16_scratch_size(shape.width)));
+    else
+      kernels().attention_forward(of, to, to_sums, scratch(attention_scratch_size(shape.width)));
   });
 }
 
-void multi_head_attention_bf16(const AttentionShape& shape, const AttentionInputs<Bf16>& in, Heads<Bf16> out, float* log_sums,
-                               const Bf16Gemm& gemm, int num_threads) {
-  for_query_blocks(shape, in, kBf16Columns, num_threads, [&](const AttentionHead<Bf16>& of, int64_t head, int64_t begin) {
-    kernels().attention_forward_bf16(of, gemm, head_of(out, shape, head).from(begin), log_sums + head * shape.queries + begin,
-                                     scratch(attention_bf16_scratch_size(shape.width)));
-  });
-}
+template void multi_head_attention(const AttentionShape&, const AttentionInputs<float>&, Heads<float>, float*, const Bf16Gemm&, int);
+template void multi_head_attention(const AttentionShape&, const AttentionInputs<Bf16>&, Heads<Bf16>, float*, const Bf16Gemm&, int);
 
+template <>
 void multi_head_attention_backward(const AttentionShape& shape, const AttentionInputs<float>& in, Heads<const float> out,
                                    const float* log_sums, Heads<const float> grad_out, const AttentionGradients<float>& gradients,
-                                   int num_threads) {
+                                   const Bf16Gemm&, int num_threads) {
   const int64_t heads = shape.scenes * shape.heads;
   // Every task processes a part of a head's keys, split by shapes alone, and computes a gradient for all of its queries; these are summed
   // in order.
@@ -110,10 +114,11 @@ void multi_head_attention_backward(const AttentionShape& shape, const AttentionI
   });
 }
 
-void multi_head_attention_backward_bf16(const AttentionShape& shape, const AttentionInputs<Bf16>& in, Heads<const Bf16> out,
-                                        const float* log_sums, Heads<const Bf16> grad_out, const AttentionGradients<Bf16>& gradients,
-                                        const Bf16Gemm& gemm, int num_threads) {
-  // Work is split as in multi_head_attention_backward().
+template <>
+void multi_head_attention_backward(const AttentionShape& shape, const AttentionInputs<Bf16>& in, Heads<const Bf16> out,
+                                   const float* log_sums, Heads<const Bf16> grad_out, const AttentionGradients<Bf16>& gradients,
+                                   const Bf16Gemm& gemm, int num_threads) {
+  // Work is split as for float32.
   const int64_t heads = shape.scenes * shape.heads, width = shape.width;
   const int64_t size = rows_per_task(heads, shape.keys, 64, kBf16BackwardKeys, kBf16BackwardKeys), parts = (shape.keys + size - 1) / size;
   const int64_t whole = whole_bf16_columns(shape.queries), all = whole * width, rows_all = whole * attention_columns(shape.width);

@@ -25,25 +25,20 @@ struct AttentionInputs {
   Heads<const Number> q, k, v;
 };
 
-// Computes `out` and log_sums[scene, head, query], which the backward pass needs. There must be at least one key.
-void multi_head_attention(const AttentionShape& shape, const AttentionInputs<float>& in, Heads<float> out, float* log_sums,
-                          int num_threads);
-
-// Computes the same for bfloat16 inputs with the given `gemm` (attention_bf16.h). `width` must be a multiple of 8 and the rows' stride
-// even.
-void multi_head_attention_bf16(const AttentionShape& shape, const AttentionInputs<Bf16>& in, Heads<Bf16> out, float* log_sums,
-                               const Bf16Gemm& gemm, int num_threads);
+// Computes `out` and log_sums[scene, head, query], which the backward pass needs, of float32 or bfloat16 inputs. There must be at least one
+// key. bfloat16 inputs are multiplied by `gemm` (attention_bf16.h); `width` must be a multiple of 8 and the rows' stride even.
+template <class Number>
+void multi_head_attention(const AttentionShape& shape, const AttentionInputs<Number>& in, Heads<Number> out, float* log_sums,
+                          const Bf16Gemm& gemm, int num_threads);
 
 // Gradients of queries, keys and values, computed from the gradient `grad_out` of the output.
 template <class Number>
 struct AttentionGradients {
   Heads<Number> q, k, v;
 };
-void multi_head_attention_backward(const AttentionShape& shape, const AttentionInputs<float>& in, Heads<const float> out,
-                                   const float* log_sums, Heads<const float> grad_out, const AttentionGradients<float>& gradients,
-                                   int num_threads);
-void multi_head_attention_backward_bf16(const AttentionShape& shape, const AttentionInputs<Bf16>& in, Heads<const Bf16> out,
-                                        const float* log_sums, Heads<const Bf16> grad_out, const AttentionGradients<Bf16>& gradients,
-                                        const Bf16Gemm& gemm, int num_threads);
+template <class Number>
+void multi_head_attention_backward(const AttentionShape& shape, const AttentionInputs<Number>& in, Heads<const Number> out,
+                                   const float* log_sums, Heads<const Number> grad_out, const AttentionGradients<Number>& gradients,
+                                   const Bf16Gemm& gemm, int num_threads);
 
 }  // namespace globalsplat::raster

@@ -427,63 +427,53 @@ GS_INLINE Mask<T> sum_records(const SplatRecords<T>& from, int64_t first, int co
   return less(Vector<T>{}, load<T>(has_any));
 }
 
-// Computes all gradients of the group that begins at Gaussian `i` from the pixel sums of `views` cameras; records_of(view) returns a
-// camera's records. If `of_cameras` is set, add_camera_gradient(view, numbers) is called with the group's gradient of each camera, in
-// CameraGradient's order.
-template <class T, class RecordsOf, class AddCameraGradient>
-GS_INLINE void project_backward_group(const Gaussians<T>& g, int64_t i, int64_t end, const ProjectionParams<T>* params, int64_t views,
-                                      const RecordsOf& records_of, const GaussianGradients<T>& out, bool of_cameras,
-                                      const AddCameraGradient& add_camera_gradient) {
-  using V = Vector<T>;
-  Group<T> group;
-  load_group(g, i, end, group);
-  GroupGradient<T> sum;
-  Mask<T> ever{};
-  for (int64_t view = 0; view < views; ++view) {
-    V d[kSplatGradientNumbers], d_mean2d[2] = {}, of_camera[kCameraNumbers] = {};
-    const Mask<T> touched = sum_records(records_of(view), i, group.count, d);
-    if (any(touched)) {
-      ever = Mask<T>(ever | touched);
-      Projection<T> projection;
-      Shading<T> shading;
-      project_group(group, params[view], projection);
-      if (any(projection.visible)) {  // all Gaussians with records are visible
-        shade_group(group, g.bases, params[view], touched, shading);
-        const auto is_unclamped = [&](V color) { return params[view].direct_colors ? touched : less(V{}, color); };
-        const Mask<T> is_lit[3] = {is_unclamped(shading.color[0]), is_unclamped(shading.color[1]), is_unclamped(shading.color[2])};
-        V d_r[3];
-        shade_group_backward<T>(
-            g.bases, shading, is_lit, d, [&](int n) { return group.sh[n]; },
-            [&](int n, V x, V y) { sum.sh[n] = add_product(x, y, sum.sh[n]); }, d_r);
-        project_group_backward(group, params[view], projection, touched, d, d_r, sum, d_mean2d, of_cameras, of_camera);
-      }
-    }
-    if (out.means2d != nullptr) store_columns(d_mean2d, 2, group.count, out.means2d + 2 * (view * g.count + i));
-    if (of_cameras) add_camera_gradient(view, of_camera);
-  }
-  V d_scale[3], d_quaternion[4];
-  axes_backward(group, sum.axes, d_scale, d_quaternion);
-  for (V& v : d_scale) v = select(ever, v, V{});
-  for (V& v : d_quaternion) v = select(ever, v, V{});
-  store_columns(sum.mean, 3, group.count, out.means + 3 * i);
-  store_columns(d_scale, 3, group.count, out.scales + 3 * i);
-  store_columns(d_quaternion, 4, group.count, out.quaternions + 4 * i);
-  store_columns(&sum.opacity, 1, group.count, out.opacities + i);
-  store_columns(sum.sh, 3 * g.bases, group.count, out.sh + int64_t(3) * g.bases * i);
-}
-
-// Computes all gradients of Gaussians begin … end − 1. If `cameras` isn't null, their gradients of the cameras are added to it.
+// Computes all gradients of Gaussians begin … end − 1 from the pixel sums of `views` cameras. If `cameras` isn't null, their gradients of the
+// cameras are added to it.
 template <class T>
 void project_backward(const Gaussians<T>& g, int64_t begin, int64_t end, const ProjectionParams<T>* params, int64_t views,
                       const SplatRecords<T>* records, const GaussianGradients<T>& out, CameraGradient<T>* cameras) {
-  const auto add_camera_gradient = [&](int64_t view, const Vector<T>(&of_camera)[kCameraNumbers]) {
-    T numbers[kCameraNumbers];
-    sum_each<T>(of_camera, numbers);
-    for (int k = 0; k < kCameraNumbers; ++k) cameras[view].numbers[k] += numbers[k];
-  };
-  for (int64_t i = begin; i < end; i += Simd<T>::lanes)
-    project_backward_group(g, i, end, params, views, [&](int64_t view) { return records[view]; }, out, cameras != nullptr,
-                           add_camera_gradient);
+  using V = Vector<T>;
+  for (int64_t i = begin; i < end; i += Simd<T>::lanes) {
+    Group<T> group;
+    load_group(g, i, end, group);
+    GroupGradient<T> sum;
+    Mask<T> ever{};
+    for (int64_t view = 0; view < views; ++view) {
+      V d[kSplatGradientNumbers], d_mean2d[2] = {}, of_camera[kCameraNumbers] = {};
+      const Mask<T> touched = sum_records(records[view], i, group.count, d);
+      if (any(touched)) {
+        ever = Mask<T>(ever | touched);
+        Projection<T> projection;
+        Shading<T> shading;
+        project_group(group, params[view], projection);
+        if (any(projection.visible)) {  // all Gaussians with records are visible
+          shade_group(group, g.bases, params[view], touched, shading);
+          const auto is_unclamped = [&](V color) { return params[view].direct_colors ? touched : less(V{}, color); };
+          const Mask<T> is_lit[3] = {is_unclamped(shading.color[0]), is_unclamped(shading.color[1]), is_unclamped(shading.color[2])};
+          V d_r[3];
+          shade_group_backward<T>(
+              g.bases, shading, is_lit, d, [&](int n) { return group.sh[n]; },
+              [&](int n, V x, V y) { sum.sh[n] = add_product(x, y, sum.sh[n]); }, d_r);
+          project_group_backward(group, params[view], projection, touched, d, d_r, sum, d_mean2d, cameras != nullptr, of_camera);
+        }
+      }
+      if (out.means2d != nullptr) store_columns(d_mean2d, 2, group.count, out.means2d + 2 * (view * g.count + i));
+      if (cameras != nullptr) {
+        T numbers[kCameraNumbers];
+        sum_each<T>(of_camera, numbers);
+        for (int k = 0; k < kCameraNumbers; ++k) cameras[view].numbers[k] += numbers[k];
+      }
+    }
+    V d_scale[3], d_quaternion[4];
+    axes_backward(group, sum.axes, d_scale, d_quaternion);
+    for (V& v : d_scale) v = select(ever, v, V{});
+    for (V& v : d_quaternion) v = select(ever, v, V{});
+    store_columns(sum.mean, 3, group.count, out.means + 3 * i);
+    store_columns(d_scale, 3, group.count, out.scales + 3 * i);
+    store_columns(d_quaternion, 4, group.count, out.quaternions + 4 * i);
+    store_columns(&sum.opacity, 1, group.count, out.opacities + i);
+    store_columns(sum.sh, 3 * g.bases, group.count, out.sh + int64_t(3) * g.bases * i);
+  }
 }
 
 }  // namespace globalsplat::raster::GS_ISA

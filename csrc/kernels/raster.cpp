@@ -262,37 +262,6 @@ void Frame<T>::backward(const std::vector<Gaussians<T>>& scenes, const std::vect
   times.project_backward = watch.lap();
 }
 
-template <class T>
-PairCounts Frame<T>::count() const {
-  PairCounts sum;
-  for (const PerView& view : views_)
-    for (int tile = 0; tile < grid_.tiles(); ++tile) {
-      const PairCounts counts = kernels().of<T>().count(job(view, tile));
-      sum.tile_entries += counts.tile_entries;
-      sum.evaluated += counts.evaluated;
-      sum.contributing += counts.contributing;
-    }
-  return sum;
-}
-
-double multiply_add_peak(int num_threads, double seconds) {
-  std::vector<double> rates(size_t(num_threads), 0.);
-  parallel_for(num_threads, num_threads, [&](int64_t i) {
-    const auto start = std::chrono::steady_clock::now();
-    float out = 1;
-    int64_t operations = 0;
-    double elapsed = 0;
-    while (elapsed < seconds) {
-      operations += kernels().multiply_adds(1 << 16, &out);
-      elapsed = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
-    }
-    rates[size_t(i)] = double(operations) / elapsed;
-  });
-  double sum = 0;
-  for (const double rate : rates) sum += rate;
-  return sum;
-}
-
 template class Frame<float>;
 template class Frame<double>;
 

@@ -45,9 +45,6 @@ class Frame {
                 const std::vector<RenderOutput<const T>>& gradients, const std::vector<GaussianGradients<T>>& out,
                 CameraGradient<T>* cameras, StageTimes& times) const;
 
-  // Counts the pairs that blending all views processes, for benchmarks.
-  PairCounts count() const;
-
   ~Frame();
 
  private:
@@ -69,8 +66,5 @@ class Frame {
   std::vector<ProjectionParams<T>> projection_params_;
   std::vector<size_t> first_view_;  // [scenes + 1] first view of each scene
 };
-
-// Measures the floating-point operations per second that multiply-adds alone reach on this number of threads, for benchmarks.
-double multiply_add_peak(int num_threads, double seconds);
 
 }  // namespace globalsplat::raster

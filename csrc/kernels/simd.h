@@ -213,8 +213,6 @@ GS_INLINE Vector<float> select(Mask<float> m, Vector<float> a, Vector<float> b) 
 GS_INLINE Vector<double> select(Mask<double> m, Vector<double> a, Vector<double> b) { return _mm512_mask_blend_pd(m, b, a); }
 GS_INLINE int lane_bits(Mask<float> m) { return m; }
 GS_INLINE int lane_bits(Mask<double> m) { return m; }
-template <class T>
-GS_INLINE Mask<T> first_lanes(int count) { return Mask<T>((1 << count) - 1); }
 #else
 GS_INLINE Mask<float> less(Vector<float> a, Vector<float> b) { return a < b; }
 GS_INLINE Mask<float> less_equal(Vector<float> a, Vector<float> b) { return a <= b; }
@@ -222,12 +220,6 @@ GS_INLINE Mask<double> less(Vector<double> a, Vector<double> b) { return a < b; 
 GS_INLINE Mask<double> less_equal(Vector<double> a, Vector<double> b) { return a <= b; }
 GS_INLINE Vector<float> select(Mask<float> m, Vector<float> a, Vector<float> b) { return m ? a : b; }
 GS_INLINE Vector<double> select(Mask<double> m, Vector<double> a, Vector<double> b) { return m ? a : b; }
-template <class T>
-GS_INLINE Mask<T> first_lanes(int count) {
-  Mask<T> m{};
-  for (int i = 0; i < count; ++i) m[i] = -1;
-  return m;
-}
 #if defined(__AVX2__)
 GS_INLINE int lane_bits(Mask<float> m) { return _mm256_movemask_ps((__m256)m); }
 GS_INLINE int lane_bits(Mask<double> m) { return _mm256_movemask_pd((__m256d)m); }

@@ -34,9 +34,14 @@ double ssim(const PhotometricPlane<T>& plane, int begin, int end, T* scratch) {
         for (int j = 0; j < 5; ++j)
           means[j] = add_product(broadcast<T>(plane.weights[k]), load<T>(scratch + j * stride + i + k), means[j]);
       WindowSlopes<T> of_window;
-      const V similarity = similarity_of<T>(means, plane.slopes != nullptr, of_window);
+      V similarity = similarity_of<T>(means, plane.slopes != nullptr, of_window);
       const int left = windows - i;
-      sum = sum + (left < lanes ? select(first_lanes<T>(left), similarity, V{}) : similarity);
+      if (left < lanes) {
+        T inside[lanes];
+        store<T>(inside, similarity);
+        similarity = load_partial<T>(inside, left);
+      }
+      sum = sum + similarity;
       if (plane.slopes == nullptr) continue;
       T* const slopes = plane.slopes + int64_t(row) * windows + i;
       for (int j = 0; j < 3; ++j) store_partial<T>(slopes + j * count, of_window[j], left);

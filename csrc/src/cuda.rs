@@ -7,7 +7,7 @@ mod gpu;
 mod libraries;
 
 pub use cache::cache_folder;
-pub use compile::{CodeFormat, Compiled, KernelResources, MIN_ARCHITECTURE, Nvrtc, parse_resources};
+pub use compile::{CodeFormat, Compiled, MIN_ARCHITECTURE, Nvrtc};
 pub use gpu::{Driver, Gpu, KernelOrigin, load_kernels};
 
 use gpu::launch_kernel;
@@ -19,18 +19,13 @@ pub type Result<T> = std::result::Result<T, String>;
 #[allow(clippy::missing_safety_doc)]
 #[cxx::bridge(namespace = "globalsplat::cuda")]
 mod ffi {
-    /// Number of blocks of a launch in each dimension.
-    struct BlockCounts {
-        x: u32,
-        y: u32,
-    }
     extern "Rust" {
         /// Launches a kernel on the device of this index, in a stream, a `CUstream`. `arguments` is a `void**`, as in cuLaunchKernel.
         unsafe fn launch_kernel(
             device: i32,
             stream: usize,
             kernel: &str,
-            blocks: BlockCounts,
+            blocks: [u32; 2],
             threads_per_block: u32,
             arguments: usize,
         ) -> Result<()>;

@@ -1,4 +1,4 @@
-//! The splat ops. Tensors are passed as addresses of `at::Tensor`, which is tch's `C_tensor`.
+//! The splat op. Tensors are passed as addresses of `at::Tensor`, which is tch's `C_tensor`.
 //!
 //! # Safety
 //! Every unsafe function requires that the arguments hold addresses of live tensors.
@@ -53,52 +53,14 @@ mod ffi {
         project_backward: f64,
     }
 
-    /// Numbers of pairs to blend, summed over all views of a call.
-    #[derive(Debug, Clone, Copy)]
-    struct PairCounts {
-        /// Number of (tile, splat) pairs.
-        tile_entries: i64,
-        /// Number of (pixel, splat) pairs whose α is computed.
-        evaluated: i64,
-        /// Number of (pixel, splat) pairs that are blended.
-        contributing: i64,
-    }
-
-    /// Total time of all launches of one of the rasterizer's GPU kernels.
-    #[derive(Debug, Clone)]
-    struct KernelTime {
-        /// Name of the kernel.
-        kernel: String,
-        /// Total time in milliseconds.
-        milliseconds: f64,
-    }
-
     unsafe extern "C++" {
         include!("splat.h");
 
         /// Renders Gaussians; see `csrc/splat.h`.
-        unsafe fn splat(of: &SplatArguments, out: &mut [usize]) -> Result<()>;
-
-        /// Projects Gaussians; see `csrc/splat.h`.
-        unsafe fn project(of: &SplatArguments, out: &mut [usize]) -> Result<()>;
-
-        /// Evaluates the first `out.len()` (1, 4, 9 or 16) spherical harmonics at a unit vector.
-        fn sh_basis(direction: &[f64; 3], out: &mut [f64]);
-
-        /// Counts the pairs that a call has to blend; see `csrc/splat.h`.
-        unsafe fn count_pairs(of: &SplatArguments) -> Result<PairCounts>;
-
-        /// Measures the peak rate of multiply-adds; see `csrc/splat.h`.
-        fn multiply_add_peak(seconds: f64) -> f64;
+        unsafe fn splat(of: &SplatArguments) -> Result<Vec<usize>>;
 
         /// Returns the stage times of this thread's last call; see `csrc/splat.h`.
         fn stage_times() -> StageTimes;
-
-        /// Starts or ends the measurement of GPU kernels; see `csrc/splat.h`.
-        fn measure_kernels(on: bool);
-
-        /// Returns the measured times of GPU kernels; see `csrc/splat.h`.
-        fn kernel_times() -> Result<Vec<KernelTime>>;
 
         /// Returns the instruction set of the CPU kernels in use; see `csrc/splat.h`.
         fn simd_level() -> Result<String>;

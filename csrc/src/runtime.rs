@@ -18,6 +18,16 @@ mod ffi {
         Tiles,
     }
 
+    /// Op that libtorch ran.
+    #[derive(Debug)]
+    struct RecordedOp {
+        /// Full name, as in `aten::add.Tensor`. An op that moves a tensor to a device, including the device on which it already is, is
+        /// `aten::to.device`.
+        name: String,
+        /// `true` if no other op called it.
+        is_outermost: bool,
+    }
+
     unsafe extern "C++" {
         include!("runtime.h");
 
@@ -34,7 +44,7 @@ mod ffi {
         type PendingCopies;
 
         /// Returns the copied tensors; see `csrc/runtime.h`.
-        fn take_tensors(self: &PendingCopies, out: &mut [usize]) -> Result<()>;
+        fn take_tensors(self: &PendingCopies) -> Result<Vec<usize>>;
 
         /// Stream for copies to a GPU; see `csrc/runtime.h`.
         type CopyStream;
@@ -49,7 +59,7 @@ mod ffi {
         unsafe fn copy(self: &CopyStream, tensors: &[usize]) -> Result<UniquePtr<PendingCopies>>;
 
         /// Allocates a tensor in page-locked memory; see `csrc/runtime.h`.
-        fn empty_pinned_bytes(shape: &[i64], out: &mut [usize]) -> Result<()>;
+        fn empty_pinned_bytes(shape: &[i64]) -> Result<usize>;
 
         /// Returns the peak of a GPU's tensor memory in bytes; see `csrc/runtime.h`.
         fn max_memory_allocated(gpu: i32) -> Result<u64>;
@@ -73,10 +83,10 @@ mod ffi {
         fn flush_denormals();
 
         /// Begins recording; see `csrc/runtime.h`.
-        fn start_recording_ops(outermost: bool);
+        fn start_recording_ops();
 
         /// Ends recording and returns the ops; see `csrc/runtime.h`.
-        fn stop_recording_ops() -> Vec<String>;
+        fn stop_recording_ops() -> Vec<RecordedOp>;
 
         /// Begins counting the bytes of tensors; see `csrc/runtime.h`.
         fn start_counting_tensor_bytes();
@@ -105,17 +115,10 @@ unsafe impl Send for PendingCopies {}
 // SAFETY: as above.
 unsafe impl Send for CopyStream {}
 
-/// Runs `work` and returns its result and all libtorch ops that it ran on this thread, in order and by the names that `csrc/runtime.h`
-/// describes. These include ops called by other ops, and ops of backward passes on the CPU.
-pub fn record_ops<T>(work: impl FnOnce() -> T) -> (T, Vec<String>) {
-    ffi::start_recording_ops(false);
-    let done = work();
-    (done, ffi::stop_recording_ops())
-}
-
-/// Runs `work` and returns its result and the outermost libtorch ops that it ran on this thread, in order.
-pub fn record_outermost_ops<T>(work: impl FnOnce() -> T) -> (T, Vec<String>) {
-    ffi::start_recording_ops(true);
+/// Runs `work` and returns its result and all libtorch ops that it ran on this thread, in order. These include ops called by other ops, and
+/// ops of backward passes on the CPU.
+pub fn record_ops<T>(work: impl FnOnce() -> T) -> (T, Vec<RecordedOp>) {
+    ffi::start_recording_ops();
     let done = work();
     (done, ffi::stop_recording_ops())
 }
@@ -164,21 +167,15 @@ pub const WAITING: [&str; 7] = [
 ///
 /// # Panics
 /// Panics if one of the ops waits for a GPU.
-pub fn count_device_copies(ops: &[String]) -> usize {
-    let waits = ops.iter().find(|op| WAITING.contains(&op.as_str()));
+pub fn count_device_copies(ops: &[RecordedOp]) -> usize {
+    let waits = ops.iter().find(|op| WAITING.contains(&op.name.as_str()));
     assert!(waits.is_none(), "{waits:?} waits");
-    ops.iter().filter(|op| *op == "aten::to.device").count()
+    ops.iter().filter(|op| op.name == "aten::to.device").count()
 }
 
-/// Returns the number of `ops` that compute something. On a GPU each is one kernel launch, or a few.
-pub fn computing(ops: &[String]) -> usize {
-    ops.iter().filter(|op| !VIEW_OPS.contains(&op.as_str())).count()
-}
-
-/// Returns `ops` without those of our own float32 linear layers, which compute a product in blocks on any of libtorch's threads.
-pub fn without_own_linear_layers(mut ops: Vec<String>) -> Vec<String> {
-    ops.retain(|op| !["aten::copy_", "aten::linear", "mkldnn::_linear_pointwise"].contains(&op.as_str()));
-    ops
+/// Returns the number of outermost `ops` that compute something. On a GPU each is one kernel launch, or a few.
+pub fn computing(ops: &[RecordedOp]) -> usize {
+    ops.iter().filter(|op| op.is_outermost && !VIEW_OPS.contains(&op.name.as_str())).count()
 }
 
 /// Runs `work` and returns its result and the peak of the bytes that its tensors took on this thread, on the CPU.

@@ -92,16 +92,10 @@ mod ffi {
             photo: usize,
             l1_weight: f64,
             ssim_weight: f64,
-            out: &mut [usize],
-        ) -> Result<()>;
+        ) -> Result<usize>;
 
         /// Computes the depth smoothness loss; see `csrc/tensor_ops.h`.
-        unsafe fn depth_smoothness(
-            depths: usize,
-            photos: usize,
-            factor: f64,
-            out: &mut [usize],
-        ) -> Result<()>;
+        unsafe fn depth_smoothness(depths: usize, photos: usize, factor: f64) -> Result<usize>;
 
         /// Searches for the depths of a photo; see `csrc/tensor_ops.h`.
         unsafe fn search_depths(
@@ -110,21 +104,11 @@ mod ffi {
             others: &[PhotoToCompare],
             step: f32,
             planes: i32,
-            out: &mut [usize],
-        ) -> Result<()>;
-
-        /// Searches for the depths of a photo by semi-global matching; see `csrc/tensor_ops.h`.
-        unsafe fn match_semi_globally(
-            gray: usize,
-            weight: usize,
-            others: &[PhotoToCompare],
-            step: f32,
-            planes: i32,
-            out: &mut [usize],
-        ) -> Result<()>;
+            semi_global: bool,
+        ) -> Result<Vec<usize>>;
 
         /// Computes the norm of all elements of all tensors; see `csrc/tensor_ops.h`.
-        unsafe fn norm(tensors: &[usize], out: &mut [usize]) -> Result<()>;
+        unsafe fn norm(tensors: &[usize]) -> Result<usize>;
 
         /// Multiplies tensors by `factor` in place; see `csrc/tensor_ops.h`.
         unsafe fn scale(tensors: &[usize], factor: f64) -> Result<()>;

@@ -1,4 +1,4 @@
-"""Cases of projection and rasterizer, in float64 and float32.
+"""Cases of the rasterizer, in float64 and float32.
 
 A pixel is doubtful if an alpha is within `margin` (relative) of 1/255 or of the cap 0.999, a transmittance is within
 `margin` of 1e-4, or the depths of two Gaussians that both contribute to it differ by less than a hundredth of `margin`
@@ -13,12 +13,6 @@ from ..harness.compare import FLOAT32, FLOAT64, Tolerance
 from ..harness.registry import Draw, case
 from ..reference import splat
 
-PROJECTION_THIN_FLOAT32 = Tolerance(
-    1e-5,
-    2e-3,
-    why="the gradients of a Gaussian hundreds of times longer than wide are small differences of large terms; "
-    "7e-4 measured, about as much as by the reference in float32",
-)
 RASTERIZER_FLOAT32 = Tolerance(
     1e-5,
     3e-4,
@@ -81,22 +75,6 @@ def doubtful_in_view(projected, opacities, pixels, margin):
     return doubtful | (both & unordered[:, None]).any(0)
 
 
-def project(config, inputs):
-    def of_camera(means, scales, quaternions, opacities, sh, w2c, intrinsics):
-        seen = splat.project(means, scales, quaternions, w2c, intrinsics, **config)
-        visible = seen["visible"] & (opacities * seen["compensation"] >= splat.SMALLEST_ALPHA)
-        color = splat.sh_color(means, sh, w2c)
-        return {
-            "visible": visible.long(),
-            "mean2d": torch.where(visible[:, None], seen["mean2d"], 0.0),
-            "conic": torch.where(visible[:, None], seen["conic"], 0.0),
-            "depth": torch.where(visible, seen["depth"], 0.0),
-            "color": torch.where(visible[:, None], color, 0.0),
-        }
-
-    return map_cameras(inputs, of_camera)
-
-
 def render(config, inputs):
     def of_camera(*scene_and_camera):
         rgb, alpha, depth = splat.render(*scene_and_camera, **config)
@@ -105,17 +83,7 @@ def render(config, inputs):
     return map_cameras(inputs, of_camera)
 
 
-DIFFERENTIATE = ("means", "scales", "quaternions", "sh", "w2c")
-
-
-def projections(name, dtype, family, tolerance):
-    def draws(rng):
-        for label, (size, make) in family.items():
-            inputs = {key: value.astype(dtype) for key, value in make(rng, size).items()}
-            yield Draw(inputs, scenes.settings(size), differentiate=DIFFERENTIATE, label=label)
-
-    draws.__name__ = name
-    case(project, module="projection", tolerance=tolerance)(draws)
+DIFFERENTIATE = ("means", "scales", "quaternions", "sh", "w2c", "opacities")
 
 
 def rasterizations(name, dtype, family, tolerance, antialiased=False):
@@ -135,7 +103,7 @@ def rasterizations(name, dtype, family, tolerance, antialiased=False):
                     break
             else:
                 raise RuntimeError(f"{label}: every one of {MOST_TRIES} scenes has a pixel on a threshold")
-            yield Draw(inputs, config, {}, (*DIFFERENTIATE, "opacities"), label=label, doubtful=doubtful)
+            yield Draw(inputs, config, {}, DIFFERENTIATE, label=label, doubtful=doubtful)
 
     draws.__name__ = name
     case(render, module="rasterizer", tolerance=tolerance)(draws)
@@ -144,9 +112,6 @@ def rasterizations(name, dtype, family, tolerance, antialiased=False):
 ORDINARY, ALL = scenes.RANDOM | scenes.ADVERSARIAL, scenes.RANDOM | scenes.ADVERSARIAL | scenes.THIN
 # Float64 is precise enough for thin Gaussians, too. Needles and discs have tiny determinants of projected covariances,
 # by which antialiasing reduces opacities.
-projections("projection", np.float64, ALL, FLOAT64)
-projections("projection_float32", np.float32, ORDINARY, FLOAT32)
-projections("projection_thin_float32", np.float32, scenes.THIN, PROJECTION_THIN_FLOAT32)
 rasterizations("rasterizer", np.float64, ALL | scenes.LONE, FLOAT64)
 rasterizations("rasterizer_float32", np.float32, ORDINARY | scenes.THIN | scenes.LONE, RASTERIZER_FLOAT32)
 rasterizations("rasterizer_antialiased", np.float64, ALL, FLOAT64, antialiased=True)

@@ -54,7 +54,7 @@ THIN = {
     "255×257": ((255, 257), partial(scattered, batch=1, cameras=1, count=24, bases=16)),
 }
 
-# Scenes of one Gaussian each, which culling could lose. Only images show that, so projections aren't compared.
+# Scenes of one Gaussian each, which culling could lose.
 LONE = {}
 
 

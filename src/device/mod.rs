@@ -9,7 +9,7 @@ pub(crate) use memory::{
 pub use memory::{peak_memory_bytes, total_memory_bytes};
 
 use crate::error::Result;
-use crate::ffi::{take_output_list, take_outputs};
+use crate::ffi::take_tensor;
 use cxx::UniquePtr;
 use globalsplat_csrc::runtime as ffi;
 use std::fmt;
@@ -92,9 +92,8 @@ impl Upload {
         if self.stream.is_none() {
             return Ok(Tensor::empty(shape, (Kind::Uint8, Device::Cpu)));
         }
-        // SAFETY: on success the C++ side has stored a new tensor in `out`.
-        let [bytes] = unsafe { take_outputs(|out| ffi::empty_pinned_bytes(shape, out)) }?;
-        Ok(bytes)
+        // SAFETY: the C++ side returns the address of a new tensor.
+        Ok(unsafe { take_tensor(ffi::empty_pinned_bytes(shape)?) })
     }
 
     /// Starts copying `tensors` from the host; the caller may drop them immediately.
@@ -103,7 +102,7 @@ impl Upload {
             Some(stream) => {
                 let addresses: Vec<usize> = tensors.iter().map(|t| t.as_ptr() as usize).collect();
                 // SAFETY: the tensors outlive the call.
-                PendingCopy::Gpu(unsafe { stream.copy(&addresses) }?, tensors.len())
+                PendingCopy::Gpu(unsafe { stream.copy(&addresses) }?)
             }
             None => PendingCopy::Done(tensors.iter().map(|t| t.to_device(self.device)).collect()),
         })
@@ -119,8 +118,7 @@ impl fmt::Debug for Upload {
 /// Copy of tensors in progress.
 pub(crate) enum PendingCopy {
     Done(Vec<Tensor>),
-    /// Copies to a GPU, and their number.
-    Gpu(UniquePtr<ffi::PendingCopies>, usize),
+    Gpu(UniquePtr<ffi::PendingCopies>),
 }
 
 impl PendingCopy {
@@ -128,9 +126,9 @@ impl PendingCopy {
     pub fn wait(self) -> Result<Vec<Tensor>> {
         match self {
             PendingCopy::Done(tensors) => Ok(tensors),
-            // SAFETY: on success the C++ side has stored new tensors in `out`.
-            PendingCopy::Gpu(copies, count) => {
-                Ok(unsafe { take_output_list(count, |out| copies.take_tensors(out)) }?)
+            PendingCopy::Gpu(copies) => {
+                // SAFETY: the C++ side returns the addresses of new tensors.
+                Ok(copies.take_tensors()?.into_iter().map(|address| unsafe { take_tensor(address) }).collect())
             }
         }
     }

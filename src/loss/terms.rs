@@ -1,7 +1,7 @@
 //! Terms of the loss that need no network, and their variants for photos with masks.
 
 use crate::data::ViewBatch;
-use crate::ffi::take_outputs;
+use crate::ffi::take_tensor;
 use crate::model::{MAX_SCALE, RawOutputs};
 use globalsplat_csrc::tensor_ops;
 use tch::{Kind, Tensor};
@@ -40,12 +40,9 @@ pub fn psnr_of_mse(mse: f64) -> f64 {
 /// Panics if the shapes differ or the images are smaller.
 pub fn photometric(image: &Tensor, ground_truth: &Tensor, l1_weight: f64, ssim_weight: f64) -> Tensor {
     let (image, ground_truth) = (image.as_ptr() as usize, ground_truth.as_ptr() as usize);
-    // SAFETY: the tensors outlive the call, and on success the C++ side has stored a new tensor in `out`.
-    let done = unsafe {
-        take_outputs(|out| tensor_ops::photometric(image, ground_truth, l1_weight, ssim_weight, out))
-    };
-    let [loss] = done.unwrap_or_else(|error| panic!("{error}"));
-    loss
+    // SAFETY: the tensors outlive the call, which returns the address of a new one.
+    let loss = unsafe { tensor_ops::photometric(image, ground_truth, l1_weight, ssim_weight) };
+    unsafe { take_tensor(loss.unwrap_or_else(|error| panic!("{error}"))) }
 }
 
 /// Computes [`photometric`] over the pixels that count (spec 7.9): `l1_weight` times the mean absolute difference weighted by `mask`, plus
@@ -228,10 +225,9 @@ pub fn sh_soft_cap(sh: &Tensor) -> Tensor {
 /// Panics if the shapes don't fit.
 pub fn depth_smoothness(depths: &Tensor, photos: &Tensor, factor: f64) -> Tensor {
     let (depths, photos) = (depths.as_ptr() as usize, photos.as_ptr() as usize);
-    // SAFETY: the tensors outlive the call, and on success the C++ side has stored a new tensor in `out`.
-    let done = unsafe { take_outputs(|out| tensor_ops::depth_smoothness(depths, photos, factor, out)) };
-    let [loss] = done.unwrap_or_else(|error| panic!("{error}"));
-    loss
+    // SAFETY: the tensors outlive the call, which returns the address of a new one.
+    let loss = unsafe { tensor_ops::depth_smoothness(depths, photos, factor) };
+    unsafe { take_tensor(loss.unwrap_or_else(|error| panic!("{error}"))) }
 }
 
 /// Minimum weight of a pixel whose depth is compared.

@@ -4,7 +4,7 @@
 mod muon;
 
 use crate::error::{Error, Result};
-use crate::ffi::take_outputs;
+use crate::ffi::take_tensor;
 use globalsplat_csrc::tensor_ops::{
     self as ffi, AdamArguments, AdamWOptions, adam, fused_adamw, norm, scale,
 };
@@ -188,9 +188,8 @@ impl Optimizer {
     /// Returns an error if a GPU fails.
     pub fn gradient_norm(&self) -> Result<Tensor> {
         let gradients: Vec<Tensor> = self.gradients().map(|(_, gradient)| gradient).collect();
-        // SAFETY: the tensors outlive the call, and on success the C++ side has stored a new tensor at `out`.
-        let [norm] = unsafe { take_outputs(|out| norm(&addresses(&gradients), out)) }?;
-        Ok(norm)
+        // SAFETY: the tensors outlive the call, which returns the address of a new one.
+        Ok(unsafe { take_tensor(norm(&addresses(&gradients))?) })
     }
 
     /// Scales the gradients, whose total norm is `norm`, so that the norm is at most `largest`.

@@ -1,11 +1,9 @@
 //! CPU-only functions: measurements of the CPU rasterizer and its instruction set.
 
-use super::{Cameras, arguments};
 use crate::error::Result;
-use crate::scene::Gaussians;
 use globalsplat_csrc::{render as ffi, runtime};
 
-pub use ffi::{PairCounts, StageTimes, multiply_add_peak, stage_times};
+pub use ffi::{StageTimes, stage_times};
 pub use globalsplat_csrc::runtime::libtorch_simd_level;
 
 /// Returns the instruction set of the rasterizer's kernels: `avx512`, `avx2`, `neon` or `portable`.
@@ -14,15 +12,6 @@ pub use globalsplat_csrc::runtime::libtorch_simd_level;
 /// Fails if `GLOBALSPLAT_SIMD` names an instruction set that this machine doesn't have.
 pub fn simd_level() -> Result<String> {
     Ok(ffi::simd_level()?)
-}
-
-/// Counts the tile entries and (pixel, splat) pairs that a call of [`render()`](super::render()) with float32 Gaussians has to blend.
-///
-/// # Errors
-/// Fails like [`render()`](super::render()).
-pub fn count_pairs(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<PairCounts> {
-    // SAFETY: the tensors outlive the call.
-    Ok(unsafe { ffi::count_pairs(&arguments(gaussians, cameras, eps2d)) }?)
 }
 
 /// Guard that limits libtorch to one thread while it lives. The kernels of this program use as many threads as libtorch did before. This is

@@ -9,8 +9,7 @@
 
 use crate::scene::{Camera, Gaussians, SH_C0};
 use glam::{DMat4, DVec3};
-use globalsplat_csrc::render::sh_basis;
-use globalsplat_splat_file::ShLimits;
+use globalsplat_splat_file::{ShLimits, sh_basis};
 use rayon::prelude::*;
 use tch::Tensor;
 
@@ -275,10 +274,7 @@ impl<'a> Fit<'a> {
 
 /// Returns the values of the basis functions in the direction in which `camera` sees `mean`.
 fn basis_towards(camera: &Camera, mean: DVec3) -> [f64; BASES] {
-    let direction = (mean - camera.c2w.w_axis.truncate()).normalize_or_zero();
-    let mut basis = [0.; BASES];
-    sh_basis(&direction.to_array(), &mut basis);
-    basis
+    sh_basis((mean - camera.c2w.w_axis.truncate()).normalize_or_zero())
 }
 
 /// Returns the weight of `camera` for a Gaussian: proportional to the number of pixels that it covers, and reduced by `OUTSIDE_WEIGHT` if

@@ -9,32 +9,21 @@ mod views;
 pub use depth_colors::{DepthScale, colorize_depth, depth_colors};
 pub use edit::{EditedSplat, SplatEdit, contributions, edit_splat, move_cameras, transform};
 pub(crate) use edit::{image_contributions, largest_contributions};
+pub use globalsplat_csrc::runtime::libtorch_version;
 pub use harmonics::{compensate_mean_color, fit_harmonics, shrink_harmonics};
 pub use views::{RenderedView, SplatRenderer, orbit_around_gaussians, orbit_around_splat, render_views};
 
 use crate::error::Result;
-use crate::ffi::take_outputs;
+use crate::ffi::take_tensors;
 use crate::scene::{Camera, Gaussians, pose_to_rows};
-use globalsplat_csrc::render::{self as ffi, SplatArguments};
+use globalsplat_csrc::render::{SplatArguments, splat};
 use tch::{Device, Kind, Tensor};
 
 /// GPU-only functions: the driver, and kernels that are compiled at first use.
 pub mod cuda {
     pub use globalsplat_csrc::cuda::{
-        CodeFormat, Driver, Gpu, KernelOrigin, KernelResources, Nvrtc, cache_folder, load_kernels,
-        parse_resources,
+        CodeFormat, Driver, Gpu, KernelOrigin, Nvrtc, cache_folder, load_kernels,
     };
-
-    pub use globalsplat_csrc::render::{KernelTime, measure_kernels};
-
-    /// Returns the total time of each of the rasterizer's kernels since [`measure_kernels`]`(true)`, in the order of their first launches.
-    /// Waits for the GPU.
-    ///
-    /// # Errors
-    /// Fails if the GPU reports an error.
-    pub fn kernel_times() -> crate::error::Result<Vec<KernelTime>> {
-        Ok(globalsplat_csrc::render::kernel_times()?)
-    }
 }
 
 /// Value added to the diagonal of every projected covariance of a splat that isn't antialiased, in pixels².
@@ -101,47 +90,8 @@ pub struct RenderOutput {
 /// Fails if shapes don't match, if `GLOBALSPLAT_SIMD` names an instruction set that this machine doesn't have, or if kernels can't be
 /// compiled for the GPU.
 pub fn render(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<RenderOutput> {
-    let [rgb, alpha, depth] = call(ffi::splat, gaussians, cameras, eps2d)?;
-    Ok(RenderOutput { rgb, alpha, depth })
-}
-
-/// Projection of every Gaussian for every camera: the first step of the rasterizer on its own. Values are zero where a Gaussian isn't
-/// visible.
-#[derive(Debug)]
-pub struct Projected {
-    /// Visibility, int64 [B, C, N]: 1 where the Gaussian isn't dropped, else 0.
-    pub visible: Tensor,
-    /// Projected means in pixels, [B, C, N, 2].
-    pub mean2d: Tensor,
-    /// Elements xx, xy and yy of the inverse 2D covariance in pixels⁻², [B, C, N, 3].
-    pub conic: Tensor,
-    /// Depth along the camera's z axis, [B, C, N].
-    pub depth: Tensor,
-    /// RGB color as seen from the camera, [B, C, N, 3].
-    pub color: Tensor,
-}
-
-/// Projects every Gaussian as [`render()`] does. Differentiable with respect to means, scales, quaternions, SH and `w2c`.
-///
-/// # Errors
-/// Fails like [`render()`].
-pub fn project(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<Projected> {
-    let [visible, mean2d, conic, depth, color] = call(ffi::project, gaussians, cameras, eps2d)?;
-    Ok(Projected { visible, mean2d, conic, depth, color })
-}
-
-/// Op of the C++ side. It writes the addresses of new tensors to the slice.
-type Op = unsafe fn(&SplatArguments, &mut [usize]) -> std::result::Result<(), cxx::Exception>;
-
-fn call<const N: usize>(op: Op, gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<[Tensor; N]> {
-    // SAFETY: the tensors outlive the call, and on success the C++ side has written the addresses of new tensors.
-    Ok(unsafe { take_outputs(|out| op(&arguments(gaussians, cameras, eps2d), out)) }?)
-}
-
-/// Returns the arguments of an op. They are valid as long as `gaussians` and `cameras` live.
-fn arguments(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> SplatArguments {
     let address = |t: &Tensor| t.as_ptr() as usize;
-    SplatArguments {
+    let arguments = SplatArguments {
         means: address(&gaussians.means),
         scales: address(&gaussians.scales),
         quaternions: address(&gaussians.quaternions),
@@ -153,10 +103,8 @@ fn arguments(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> SplatArgum
         height: cameras.height as i32,
         eps2d,
         antialiased: gaussians.antialiased,
-    }
-}
-
-/// Returns the version of libtorch that this program was built with.
-pub fn libtorch_version() -> String {
-    globalsplat_csrc::runtime::libtorch_version()
+    };
+    // SAFETY: the tensors outlive the call, which returns the addresses of new ones.
+    let [rgb, alpha, depth] = unsafe { take_tensors(splat(&arguments)?) };
+    Ok(RenderOutput { rgb, alpha, depth })
 }

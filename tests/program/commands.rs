@@ -75,7 +75,7 @@ fn a_million_gaussians_fit_into_a_gigabyte() {
     let report =
         Sandbox::empty().json("bench raster --gaussians 1000000 --size 1920x1080 --cameras 1 --repeats 1");
     assert_eq!((number(&report, "/gaussians"), number(&report, "/width")), (1e6, 1920.));
-    assert!(number(&report, "/pairs/contributing") > 1e7, "an empty picture proves nothing");
+    assert!(number(&report, "/stages/4/milliseconds/least") > 10., "an empty picture proves nothing");
     let bytes = number(&report, "/working_bytes");
     assert!((1e8..1e9).contains(&bytes), "{bytes} bytes of working memory");
 }
@@ -104,12 +104,7 @@ fn bench_raster_reports_the_time_of_stages() {
     let report = Sandbox::empty().json("bench raster --gaussians 500 --cameras 2 --repeats 3");
     let stages = ["project", "sort", "bin", "blend", "blend backward", "project backward"];
     assert_eq!(names(&report["stages"]), stages);
-    let [contributing, evaluated] =
-        ["contributing", "evaluated"].map(|kind| number(&report, &format!("/pairs/{kind}")));
-    assert!(0. < contributing && contributing <= evaluated);
     assert!(number(&report, "/forward_backward/median") > number(&report, "/forward/least"));
-    assert!(number(&report, "/rates/peak_gflops") > 1.);
-    assert!(number(&report, "/rates/blend/share_of_peak") > 0.);
     assert_eq!(report["device"], "cpu");
 }
 
@@ -139,7 +134,7 @@ fn bench_model_reports_the_parts_of_a_pass() {
     );
     assert!(sum <= whole, "{sum} of {whole} ms");
     for part in parts {
-        assert!(number(part, "/backward_gflop") == 0. && number(part, "/gigabytes") > 0., "{part}");
+        assert_eq!(number(part, "/backward_gflop"), 0., "{part}");
         let share = number(part, "/share_of_peak");
         assert!(number(part, "/gflop") == 0. || (0.0..=1.5).contains(&share), "{part}");
     }

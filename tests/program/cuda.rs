@@ -1,16 +1,12 @@
 //! GPU kernels, as far as they can be tested without a GPU.
 
 use crate::common::{rerun_test, skip};
-use globalsplat::render::cuda::{CodeFormat, Driver, Nvrtc, cache_folder, load_kernels, parse_resources};
+use globalsplat::render::cuda::{CodeFormat, Driver, Nvrtc, cache_folder, load_kernels};
 use std::path::Path;
 use std::process::Command;
 
 /// Supported GPU architectures, from the oldest to the newest. Variants for embedded systems are left out.
 const ARCHITECTURES: [i32; 7] = [75, 80, 86, 89, 90, 100, 120];
-/// Shared memory in bytes that every GPU grants a block, registers per block, and threads of the largest block.
-const SHARED: u32 = 48 << 10;
-const REGISTERS: u32 = 64 << 10;
-const BLOCK: u32 = 256;
 
 fn nvrtc() -> Option<Nvrtc> {
     Nvrtc::find().map_err(|why| skip("NVRTC", &why)).ok()
@@ -22,18 +18,13 @@ fn kernels_compile_for_every_gpu_and_need_no_memory_for_registers() {
     for architecture in ARCHITECTURES {
         let compiled = nvrtc.compile(architecture, CodeFormat::Cubin).unwrap();
         assert!(compiled.image.starts_with(b"\x7fELF"), "{architecture}");
-        let kernels = parse_resources(&compiled.log);
-        assert_eq!(kernels.len(), 12, "{}", compiled.log);
-        println!("compute capability {architecture}: {kernels:#?}");
-        for kernel in kernels {
-            assert!(kernel.spills == 0 && kernel.shared <= SHARED, "{architecture}: {kernel:?}");
-            // Kernels with blocks of 128 threads may use all registers.
-            let threads = if kernel.name.contains("project") { BLOCK / 2 } else { BLOCK };
-            assert!(
-                kernel.registers > 0 && kernel.registers * threads <= REGISTERS,
-                "{architecture}: {kernel:?}"
-            );
-        }
+        // Shared memory and registers are within the limits of every GPU, or ptxas fails: blocks have at most 48 KiB, and every kernel has
+        // launch bounds or blocks so small that 255 registers per thread are available.
+        println!("{}", compiled.log);
+        let lines = |text: &str| compiled.log.lines().filter(|line| line.contains(text)).count();
+        assert_eq!(lines("entry function 'gs_"), 12, "{}", compiled.log);
+        assert_eq!(lines("bytes spill stores"), lines(" 0 bytes spill stores, 0 bytes spill loads"));
+        assert!(lines("bytes spill stores") >= 12, "{}", compiled.log);
     }
 }
 

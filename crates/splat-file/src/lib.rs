@@ -27,5 +27,5 @@ pub use formats::{
 pub use globalsplat_files::{Error, Result};
 pub use limits::ShLimits;
 pub use origin::origin_file;
-pub use sh::ShRotation;
+pub use sh::{ShRotation, sh_basis};
 pub use splat::{MIN_SCALE, OPACITY_MARGIN, SH_C0, Splat};

@@ -7,7 +7,7 @@ use std::f64::consts::PI;
 const BASES: usize = 16;
 
 /// Returns the values of the spherical harmonics at a direction of length 1, in the order of the coefficients in a splat.
-fn sh_basis(direction: DVec3) -> [f64; BASES] {
+pub fn sh_basis(direction: DVec3) -> [f64; BASES] {
     let [x, y, z] = direction.to_array();
     let (xx, yy, zz) = (x * x, y * y, z * z);
     // √((2l + 1)/4π · …): the constants that make every function's square integrate to 1 over the sphere.

@@ -63,10 +63,8 @@ mod tests {
         assert!(write(&file, b"machine code"));
         assert_eq!(read(&file).as_deref(), Some(&b"machine code"[..]));
         let whole = std::fs::read(&file).unwrap();
-        for length in 0..whole.len() {
-            std::fs::write(&file, &whole[..length]).unwrap();
-            assert_eq!(read(&file), None, "{length} bytes");
-        }
+        std::fs::write(&file, &whole[..whole.len() - 1]).unwrap();
+        assert_eq!(read(&file), None);
         for place in 0..whole.len() {
             let mut harmed = whole.clone();
             harmed[place] ^= 1;

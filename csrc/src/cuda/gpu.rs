@@ -3,7 +3,6 @@
 use super::{
     Result, cache,
     compile::{CodeFormat, Nvrtc},
-    ffi::BlockCounts,
     libraries::{DriverFunctions, Handle, driver},
 };
 use std::collections::{HashMap, hash_map::Entry};
@@ -208,7 +207,7 @@ pub unsafe fn launch_kernel(
     device: i32,
     stream: usize,
     kernel: &str,
-    blocks: BlockCounts,
+    blocks: [u32; 2],
     threads_per_block: u32,
     arguments: usize,
 ) -> Result<()> {
@@ -225,8 +224,8 @@ pub unsafe fn launch_kernel(
         driver.check(unsafe {
             (driver.cuLaunchKernel)(
                 function,
-                blocks.x,
-                blocks.y,
+                blocks[0],
+                blocks[1],
                 1,
                 threads_per_block,
                 1,

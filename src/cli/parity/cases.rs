@@ -32,7 +32,6 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
         "quaternion" => outputs([("quaternion", model::quaternion_from_6d(&request.input("rotations")?))]),
         "scene_normalization" => scene_normalization(request),
         "color_fit" => color_fit(request),
-        "projection" => projection(request),
         "rasterizer" => rasterizer(request),
         "frustum" => frustum(request),
         "mse" => {
@@ -308,18 +307,6 @@ fn color_fit(request: &Request) -> Result<Answer> {
     outputs([
         ("contributions", render::image_contributions(&gaussians, &views.cameras())?),
         ("sh", fitted.sh),
-    ])
-}
-
-fn projection(request: &Request) -> Result<Answer> {
-    let (gaussians, cameras) = gaussians_and_cameras(request)?;
-    let seen = render::project(&gaussians, &cameras, request.number("eps2d")?)?;
-    outputs([
-        ("visible", seen.visible),
-        ("mean2d", seen.mean2d),
-        ("conic", seen.conic),
-        ("depth", seen.depth),
-        ("color", seen.color),
     ])
 }
 
