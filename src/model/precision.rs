@@ -66,22 +66,22 @@ impl Precision {
     }
 }
 
-/// Computes `xs` [.., k] · `weights`ᵀ [k, n] + `bias` [n].
+/// Computes `xs` [.., k] · `weights`ᵀ [k, n] + `bias` [n]; on the CPU with the same bits for any number of threads.
 fn product(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tensor {
     let is_ours =
         xs.device() == Device::Cpu && xs.numel() > 0 && matches!(xs.kind(), Kind::Float | Kind::BFloat16);
-    let out = if is_ours { product_on_cpu(xs, weights, bias) } else { xs.linear(weights, bias) };
+    let out = match is_ours {
+        true => {
+            let address = |t: &Tensor| t.as_ptr() as usize;
+            // SAFETY: the tensors outlive the call, which returns the address of a new one.
+            let out = unsafe { linear(address(xs), address(weights), bias.map_or(0, address)) };
+            unsafe { take_tensor(out.unwrap_or_else(|error| panic!("{error}"))) }
+        }
+        false => xs.linear(weights, bias),
+    };
     let flops = 2 * (xs.numel() as i64) * weights.size()[0];
     record_flops(flops, backward_flops(flops, [xs, weights], &out));
     out
-}
-
-/// Computes [`product`] on the CPU, with the same bits for any number of threads.
-fn product_on_cpu(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tensor {
-    let address = |t: &Tensor| t.as_ptr() as usize;
-    // SAFETY: the tensors outlive the call, which returns the address of a new one.
-    let out = unsafe { linear(address(xs), address(weights), bias.map_or(0, address)) };
-    unsafe { take_tensor(out.unwrap_or_else(|error| panic!("{error}"))) }
 }
 
 /// Returns the backward operations of a product that takes `flops` operations forward: `flops` for each factor that needs a gradient, and 0

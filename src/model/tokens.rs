@@ -27,85 +27,53 @@ pub fn patchify(xs: &Tensor, patch: i64) -> Tensor {
     ])
 }
 
-/// Tokenizer of images and cameras.
+/// Tokenizer of images and cameras: the RGB half of image tokens, and the ray half, which has the camera code, too.
 #[derive(Debug)]
 pub struct Tokenizer {
-    rgb: RgbTokens,
-    ray: RayTokens,
+    patch_size: i64,
+    /// Mean of ImageNet by channel, [3, 1, 1]; `deviation` is the standard deviation.
+    mean: Tensor,
+    deviation: Tensor,
+    rgb: nn::Linear,
+    rays: nn::Linear,
+    camera_code: Option<CameraCode>,
 }
 
 impl Tokenizer {
     /// Builds the tokenizer; `vs` is the model's root.
     pub fn new(vs: &nn::Path, config: &ModelConfig) -> Self {
-        Tokenizer { rgb: RgbTokens::new(vs, config), ray: RayTokens::new(vs, config) }
+        let pixels = config.patch_size * config.patch_size;
+        let channels = |values: &[f32]| Tensor::from_slice(values).view([3, 1, 1]).to_device(vs.device());
+        let linear =
+            |name: &str, inputs: i64, width: i64| default_linear(vs / name / "1", inputs, width, false);
+        Tokenizer {
+            patch_size: config.patch_size,
+            mean: channels(&IMAGENET_MEAN),
+            deviation: channels(&IMAGENET_STD),
+            rgb: linear("rgb_patch_embeds", 3 * pixels, config.rgb_width),
+            rays: linear("ray_patch_embeds", RAY_CHANNELS * pixels, config.ray_width),
+            camera_code: config.camera_code.then(|| CameraCode::new(&(vs / "view_pe"), config.ray_width)),
+        }
     }
 
     /// Computes raw image tokens, [B, V, P, ray width + RGB width]. With a `warp`, rays and cameras are those of the warped world.
     pub fn forward(&self, input: &ModelInput, warp: Option<&RadialWarp>) -> Tensor {
         let ModelInput { images, c2w, intrinsics, .. } = input;
         let (height, width) = (images.size()[3], images.size()[4]);
-        let rgb = self.rgb.forward(images);
+        let project =
+            |layer: &nn::Linear, xs: &Tensor| Precision::F32.linear(layer, &patchify(xs, self.patch_size));
+        let normalized = (images - &self.mean) / &self.deviation;
+        let rgb = project(&self.rgb, &normalized.permute([0, 1, 3, 4, 2]));
         let (rays, c2w) = match warp {
             Some(warp) => (warp.rays(c2w, intrinsics), &warp.cameras(c2w)),
             None => (plucker_rays(c2w, intrinsics, height, width), c2w),
         };
-        let ray = self.ray.forward(&rays, c2w, intrinsics);
+        let ray = project(&self.rays, &rays); // of [B, V, H, W, 6]
+        let ray = match &self.camera_code {
+            Some(camera_code) => ray + camera_code.forward(c2w, intrinsics, height, width).unsqueeze(2),
+            None => ray,
+        };
         Tensor::cat(&[ray, rgb], -1)
-    }
-}
-
-/// RGB half of image tokens.
-#[derive(Debug)]
-pub(crate) struct RgbTokens {
-    patch_size: i64,
-    /// Mean of ImageNet by channel, [3, 1, 1]; `deviation` is the standard deviation.
-    mean: Tensor,
-    deviation: Tensor,
-    project: nn::Linear,
-}
-
-impl RgbTokens {
-    pub fn new(vs: &nn::Path, config: &ModelConfig) -> Self {
-        let inputs = 3 * config.patch_size * config.patch_size;
-        let project = default_linear(vs / "rgb_patch_embeds" / "1", inputs, config.rgb_width, false);
-        let channels = |values: &[f32]| Tensor::from_slice(values).view([3, 1, 1]).to_device(vs.device());
-        let [mean, deviation] = [&IMAGENET_MEAN, &IMAGENET_STD].map(|values| channels(values));
-        RgbTokens { patch_size: config.patch_size, mean, deviation, project }
-    }
-
-    /// Computes RGB tokens, [B, V, P, RGB width], from `images` [B, V, 3, H, W] in [0, 1].
-    pub fn forward(&self, images: &Tensor) -> Tensor {
-        let normalized = (images - &self.mean) / &self.deviation;
-        Precision::F32.linear(&self.project, &patchify(&normalized.permute([0, 1, 3, 4, 2]), self.patch_size))
-    }
-}
-
-/// Ray half of image tokens: rays of the patches, and the camera code.
-#[derive(Debug)]
-pub(crate) struct RayTokens {
-    patch_size: i64,
-    project: nn::Linear,
-    camera_code: Option<CameraCode>,
-}
-
-impl RayTokens {
-    pub fn new(vs: &nn::Path, config: &ModelConfig) -> Self {
-        let inputs = RAY_CHANNELS * config.patch_size * config.patch_size;
-        RayTokens {
-            patch_size: config.patch_size,
-            project: default_linear(vs / "ray_patch_embeds" / "1", inputs, config.ray_width, false),
-            camera_code: config.camera_code.then(|| CameraCode::new(&(vs / "view_pe"), config.ray_width)),
-        }
-    }
-
-    /// Computes ray tokens, [B, V, P, ray width], from `rays` [B, V, H, W, 6], `c2w` [B, V, 4, 4] and `intrinsics` [B, V, 3, 3] in pixels.
-    pub fn forward(&self, rays: &Tensor, c2w: &Tensor, intrinsics: &Tensor) -> Tensor {
-        let (height, width) = (rays.size()[2], rays.size()[3]);
-        let tokens = Precision::F32.linear(&self.project, &patchify(rays, self.patch_size));
-        match &self.camera_code {
-            Some(camera_code) => tokens + camera_code.forward(c2w, intrinsics, height, width).unsqueeze(2),
-            None => tokens,
-        }
     }
 }
 
@@ -119,14 +87,14 @@ const CENTER_WIDTH: i64 = 3 + 2 * 3 * FREQUENCIES.len() as i64;
 /// Camera code (spec 3.3): one vector per view that distinguishes cameras beyond their Plücker rays. An MLP encodes the intrinsics, sines and
 /// cosines encode the camera center, and one linear layer joins both.
 #[derive(Debug)]
-pub(crate) struct CameraCode {
+struct CameraCode {
     intrinsics_in: nn::Linear,
     intrinsics_out: nn::Linear,
     project: nn::Linear,
 }
 
 impl CameraCode {
-    pub fn new(vs: &nn::Path, width: i64) -> Self {
+    fn new(vs: &nn::Path, width: i64) -> Self {
         let mlp = vs / "k_mlp";
         CameraCode {
             intrinsics_in: default_linear(&mlp / "0", 4, INTRINSICS_WIDTH, true),
@@ -136,7 +104,7 @@ impl CameraCode {
     }
 
     /// Computes the camera code, [B, V, width]. `c2w` is [B, V, 4, 4], `intrinsics` [B, V, 3, 3] in pixels of a `height` × `width` image.
-    pub fn forward(&self, c2w: &Tensor, intrinsics: &Tensor, height: i64, width: i64) -> Tensor {
+    fn forward(&self, c2w: &Tensor, intrinsics: &Tensor, height: i64, width: i64) -> Tensor {
         let entry = |row: i64, column: i64| intrinsics.select(-2, row).select(-1, column);
         let (w, h) = (width as f64, height as f64);
         let features = [(entry(0, 0) / w).log(), (entry(1, 1) / h).log(), entry(0, 2) / w, entry(1, 2) / h];
