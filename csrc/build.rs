@@ -6,13 +6,8 @@ use std::{
 };
 
 /// Source files with the cxx bridges between Rust and C++.
-const BRIDGES: [&str; 5] = [
-    "src/cuda.rs",
-    "src/distributed.rs",
-    "src/render.rs",
-    "src/runtime.rs",
-    "src/tensor_ops.rs",
-];
+const BRIDGES: [&str; 5] =
+    ["src/cuda.rs", "src/distributed.rs", "src/render.rs", "src/runtime.rs", "src/tensor_ops.rs"];
 
 /// Returns the compiler settings that all C++ files share.
 fn cpp() -> cc::Build {

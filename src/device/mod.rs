@@ -128,7 +128,11 @@ impl PendingCopy {
             PendingCopy::Done(tensors) => Ok(tensors),
             PendingCopy::Gpu(copies) => {
                 // SAFETY: the C++ side returns the addresses of new tensors.
-                Ok(copies.take_tensors()?.into_iter().map(|address| unsafe { take_tensor(address) }).collect())
+                Ok(copies
+                    .take_tensors()?
+                    .into_iter()
+                    .map(|address| unsafe { take_tensor(address) })
+                    .collect())
             }
         }
     }

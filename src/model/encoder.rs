@@ -329,8 +329,7 @@ impl Encoder {
         };
         if config.streams == Streams::Dual {
             encoder.streams.push(Stream::new(vs, config, "slot_to_tex", "tex_rounds"));
-            encoder.mixers =
-                (0..config.rounds).map(|i| Mixer::new(&(vs / "pair_adapters" / i), d)).collect();
+            encoder.mixers = (0..config.rounds).map(|i| Mixer::new(&(vs / "pair_adapters" / i), d)).collect();
         }
         encoder
     }

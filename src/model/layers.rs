@@ -112,9 +112,8 @@ impl Mlp {
     }
 
     pub fn forward(&self, xs: &Tensor, precision: Precision) -> Tensor {
-        trace_span!("MLPs").in_scope(|| {
-            precision.linear(&self.contract, &gelu(precision.linear(&self.expand, xs)))
-        })
+        trace_span!("MLPs")
+            .in_scope(|| precision.linear(&self.contract, &gelu(precision.linear(&self.expand, xs))))
     }
 }
 

@@ -60,8 +60,7 @@ impl Search {
         let [gray, weight] = [Some(gray), weight].map(address);
         let semi_global = matches!(self, Search::SemiGlobal);
         // SAFETY: the tensors outlive the call, which returns the addresses of new ones.
-        let found =
-            unsafe { search_depths(gray, weight, &others, step as f32, planes as i32, semi_global) };
+        let found = unsafe { search_depths(gray, weight, &others, step as f32, planes as i32, semi_global) };
         unsafe { take_tensors::<2>(found.unwrap_or_else(|error| panic!("{error}"))) }.into()
     }
 }
