@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ..harness import scenes
-from ..harness.compare import FLOAT32, FLOAT64, Tolerance
+from ..harness.compare import FLOAT64, Tolerance
 from ..harness.registry import Draw, case
 from ..reference import splat
 
