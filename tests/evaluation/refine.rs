@@ -54,15 +54,13 @@ fn photos_alone_become_a_splat() {
     assert!(sandbox.path("a.png").is_file());
 }
 
-/// A refinement from a model's reconstruction improves it and has the requested number of Gaussians, even if these are fewer than the model's.
+/// `reconstruct --refine` improves the splat of the model.
 #[test]
-fn a_reconstruction_becomes_a_splat_of_the_requested_size() {
+fn a_reconstruction_is_refined() {
     let done = world(64).json(
-        "refine --scene @world/000000.torch#7_000000 --out @a.ply --init model --gaussians 4000 --steps 300 \
-         --holdout every:4+1",
+        "reconstruct --scene @world/000000.torch#7_000000 --out @a.ply --holdout every:4+1 --refine 8s",
     );
     assert_improved(&done["held_out"], 1.);
-    assert_eq!(done["gaussians"], 4000);
 }
 
 /// Commands leave out what the masks in a folder cover.
@@ -108,21 +106,19 @@ fn masks_in_a_folder_are_left_out() {
 fn threads_do_not_change_the_bytes() {
     let sandbox = world(48);
     // Enough steps to improve on the initial splat, which would be kept otherwise.
-    for options in ["--gaussians 500", "--init model --gaussians 6000"] {
-        let bytes = |threads: &str, seed: &str| {
-            let line = format!(
-                "refine --scene @world/000000.torch#7_000000 --out @a.ply --steps 60 --seed {seed} \
-                 --set relocate_every=7 {options}"
-            );
-            let done =
-                sandbox.command(&line).envs([("OMP_NUM_THREADS", threads), WAIT_PASSIVELY]).output().unwrap();
-            assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
-            sandbox.read("a.ply")
-        };
-        let one = bytes("1", "3");
-        assert!(one == bytes("3", "3"), "{options}: threads change the bytes");
-        assert!(one != bytes("1", "4"), "{options}: another seed changes nothing");
-    }
+    let bytes = |threads: &str, seed: &str| {
+        let line = format!(
+            "refine --scene @world/000000.torch#7_000000 --out @a.ply --steps 60 --seed {seed} \
+             --set relocate_every=7 --gaussians 500"
+        );
+        let done =
+            sandbox.command(&line).envs([("OMP_NUM_THREADS", threads), WAIT_PASSIVELY]).output().unwrap();
+        assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+        sandbox.read("a.ply")
+    };
+    let one = bytes("1", "3");
+    assert!(one == bytes("3", "3"), "threads change the bytes");
+    assert!(one != bytes("1", "4"), "another seed changes nothing");
 }
 
 /// Rewrites the views of the room's cameras.json.
@@ -207,9 +203,7 @@ fn run_until(
     init: SceneInit,
     is_end: impl Fn(&RefineEvent) -> bool,
 ) -> globalsplat::Result<RefineResult> {
-    let mut session = RefineSession::load(capture, options, init, |event| !is_end(&event))?;
-    session.start()?;
-    session.run()
+    RefineSession::load(capture, options, init, |event| !is_end(&event))?.run()
 }
 
 /// An interrupted refinement returns a splat at any time, once there is one.
@@ -247,7 +241,7 @@ fn a_continued_refinement_equals_one_without_a_break() {
     let capture = open_capture(&sandbox.path("room")).unwrap();
     // Enough steps for the number of Gaussians to grow, before and after the break.
     let options = |steps| RefineOptions {
-        set: vec!["sh_every=0.2".into()],
+        set: vec!["sh_degree=2".into()],
         steps: Some(steps),
         gaussians: Some(300),
         correct_poses: true,
@@ -488,17 +482,10 @@ fn invalid_refinements_are_refused_with_one_sentence() {
     write_splat(&sandbox.path("elsewhere.ply"), &splat).unwrap();
     for (options, expected) in [
         ("--set view=3", "--set view=3: unknown field"),
-        ("--set views='\"a\"'", "--set views"),
-        ("--set views", "expected KEY=VALUE"),
-        ("--set views=0", "--set views=0: expected "),
-        ("--set sh_every=0", "--set sh_every=0: expected "),
-        ("--set resolution_schedule=[0.1,0.1]", "--set resolution_schedule=[0.1,0.1]: expected "),
         ("--set lr_means=nan", "--set lr_means=nan: expected "),
-        ("--set prune_opacity=-1", "--set prune_opacity=-1: expected "),
         ("--seconds 0", "seconds is 0, expected more than 0"),
         ("--seconds 1e300", "seconds is 1000"),
-        ("--init photos --weights a.safetensors", "uses no weights"),
-        ("--views 1", "--views is 1, expected 2 or more"),
+        ("--views 1", "views is 1, expected 2 or more"),
         ("--splat @elsewhere.ply", "no camera sees"),
     ] {
         assert_says(&sandbox.refuse(&format!("refine --scene @room --out @a.ply {options}")), &[expected]);
