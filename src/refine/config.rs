@@ -96,9 +96,6 @@ impl Default for RefineConfig {
 /// Longer side of photos, in pixels, from which the learning rate of poses falls.
 const POSES_SIDE: f64 = 256.;
 
-/// Minimum longer side of photos, in pixels, that show enough detail for most of the steps.
-const DETAILED_SIDE: u32 = 240;
-
 /// Number of Gaussians above which spherical harmonics have degree 2 by default.
 const MANY_GAUSSIANS: i64 = 100_000;
 
@@ -189,14 +186,13 @@ impl RefineConfig {
         self.depth_weight * (1. - 2. * progress).max(0.)
     }
 
-    /// Returns the fractions of the optimization at which the width and height of photos double, up to `longest_side` pixels.
+    /// Returns the fractions of the optimization at which the width and height of photos double, up to `longest_side` pixels. Small photos save
+    /// time, but hide detail: 240 pixels or more are enough for most of the steps.
     pub(super) fn schedule(&self, longest_side: u32) -> Vec<f64> {
-        let by_size = || {
-            // Small photos save time, but hide detail.
-            let part = |side: u32, of: [f64; 2]| of[usize::from(side >= DETAILED_SIDE)];
-            let (quarter, half) = (longest_side / 4, longest_side / 2);
-            let first = part(quarter, [0.03, 0.4]);
-            vec![first, part(half, [0.1, if quarter >= DETAILED_SIDE { 0.7 } else { 0.4 }])]
+        let by_size = || match longest_side {
+            ..480 => vec![0.03, 0.1],
+            480..960 => vec![0.03, 0.4],
+            _ => vec![0.4, 0.7],
         };
         self.resolution_schedule.clone().unwrap_or_else(by_size)
     }
@@ -231,6 +227,7 @@ mod tests {
             assert!(message.contains(expected), "{message}");
         }
         assert_eq!(with("resolution_schedule=[]").unwrap().schedule(1024), [0.; 0]);
+        assert_eq!(RefineConfig::default().schedule(512), [0.03, 0.4]);
         assert_eq!(RefineConfig::default().check(), Ok(()));
         assert_eq!(RefineConfig::from_splat().check(), Ok(()));
     }
@@ -239,13 +236,5 @@ mod tests {
     fn many_gaussians_have_spherical_harmonics_of_degree_2() {
         let degrees = [100_000, 100_001].map(|count| RefineConfig::default().sh_degree_for(count));
         assert_eq!((degrees, RefineConfig::from_splat().sh_degree_for(1_000_000)), ([1, 2], 1));
-    }
-
-    #[test]
-    fn most_steps_are_on_small_but_detailed_photos() {
-        let schedule = |side| RefineConfig::default().schedule(side);
-        assert_eq!(schedule(256), [0.03, 0.1]);
-        assert_eq!(schedule(512), [0.03, 0.4]);
-        assert_eq!(schedule(1024), [0.4, 0.7]);
     }
 }
