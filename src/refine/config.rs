@@ -3,8 +3,8 @@
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
-/// Hyperparameters of the optimization. Learning rates are those of Adam. The unit of lengths is the depth of the scene, which
-/// [`super::scene_depth`] computes.
+/// Hyperparameters of the optimization. Learning rates are those of Adam. The unit of lengths is the median depth of
+/// the scene.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 #[allow(non_snake_case)] // gsplat's name for the higher spherical harmonics

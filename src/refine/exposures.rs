@@ -119,7 +119,7 @@ fn balance(ratios: &[Vec<Option<Ratio>>], indices: &[usize]) -> Vec<LogGains> {
     let of = |values: &[f64], columns: usize| Tensor::from_slice(values).view([n as i64, columns as i64]);
     let solution = Tensor::linalg_solve(&of(&matrix, n), &of(&right, 3), true);
     let numbers = Vec::<f64>::try_from(solution.contiguous().view([-1])).expect("numbers");
-    numbers.chunks_exact(3).map(|gain| [gain[0], gain[1], gain[2]]).collect()
+    numbers.as_chunks().0.to_vec()
 }
 
 impl<'a> ExposedPhoto<'a> {

@@ -29,9 +29,9 @@ const GAUSSIANS_PER_CORE_SECOND: f64 = 400.;
 const MAX_SECONDS_OF_GROWTH: f64 = 240.;
 /// Minimum number of pixels, in all photos together, for each Gaussian.
 const PIXELS_PER_GAUSSIAN: u64 = 24;
-/// Number of Gaussians of the paper's main model, the minimum of [`RefineOptions::gaussians_for`].
+/// Number of Gaussians of the paper's main model, the minimum of the default.
 pub(super) const MIN_GAUSSIANS: usize = 16_384;
-/// Maximum of [`RefineOptions::gaussians_for`].
+/// Maximum of the default number of Gaussians.
 const MAX_GAUSSIANS: usize = 1_000_000;
 /// Maximum default of the longer side of photos in pixels.
 const LARGEST_SIDE: u32 = 1600;
@@ -230,7 +230,7 @@ impl RefineOptions {
     /// Checks that every option is in its range.
     ///
     /// # Errors
-    /// Fails if one isn't, or like [`RefineOptions::config`].
+    /// Fails if one isn't, or like [`RefineConfig::with`].
     pub fn check(&self) -> Result<()> {
         self.config(false)?;
         // NaN is refused, too.
