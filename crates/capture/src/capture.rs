@@ -3,15 +3,15 @@
 use crate::geometry::{Camera, ImageSize, check_pose, nearest_rigid_of_scaled};
 use crate::holdout::Holdout;
 use crate::image_source::ImageSource;
-use crate::lens::{Distortion, Lens, LensModel, PhotoPart, PinholeView, Projection, split_into_views};
+use crate::lens::{Lens, LensModel, PinholeView, Projection, split_into_views};
 use crate::photos::{find_masks_in, format_names, part_name, unique_stems};
 use crate::pixels::{
-    DecodedPhoto, Planes, Undistorter, ViewPixels, decode_photo, encode_photo, gray_to_rgb,
-    has_alpha_channel, multiply, read_image_size, read_mask, resize_and_crop, source_ranges,
+    DecodedPhoto, Planes, decode_photo, encode_photo, gray_to_rgb, has_alpha_channel, multiply,
+    read_image_size, read_mask, resize_and_crop, undistort,
 };
-use glam::DMat4;
+use glam::{DMat3, DMat4};
 use globalsplat_files::{Error, InputFiles, Result, parent_of, split_keyed_path};
-use image::{GrayImage, RgbImage};
+use image::RgbImage;
 use rayon::prelude::*;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -52,14 +52,6 @@ struct View {
     projection: Projection,
 }
 
-impl View {
-    /// Returns the map from the view to its photo, at least in the part that fitting to `size` reads.
-    fn undistorter(&self, size: Option<ImageSize>) -> Undistorter {
-        let window = size.map(|size| source_ranges(&self.camera, size));
-        Undistorter::new(self.projection, self.camera, window)
-    }
-}
-
 /// Location of a photo's image.
 #[derive(Debug, Clone)]
 pub(crate) enum ImageLocation {
@@ -98,8 +90,8 @@ impl ImageLocation {
 
 /// Memory limit for photos that are decoded at the same time. A photo is small again once it is fitted to the model's image size.
 const DECODED_BYTES: u64 = 1 << 30;
-/// Memory per pixel while a photo is decoded: the decoder's 8-bit pixels and those with the distortion removed.
-const DECODED_BYTES_PER_PIXEL: u64 = 8;
+/// Memory per pixel while a photo is decoded, and per pixel of its views.
+const DECODED_BYTES_PER_PIXEL: u64 = 6;
 
 /// Posed photos of one scene. Images are read only when they are loaded.
 #[derive(Debug, Clone)]
@@ -295,8 +287,8 @@ impl Capture {
     ) -> Result<Self> {
         self.is_complete &= changes.missing.is_empty();
         self.warnings.extend(check_frames(file, &mut frames, changes, purpose)?);
-        let (views, lines) = views_of_frames(file, &frames, purpose)?;
-        self.warnings.extend(lines);
+        let (views, line) = views_of_frames(file, &frames, purpose)?;
+        self.warnings.extend(line);
         let first = self.frames.len();
         self.views.extend(views.into_iter().map(|view| View { frame: first + view.frame, ..view }));
         self.frames.append(&mut frames);
@@ -462,18 +454,17 @@ impl Capture {
         let views = |positions: &[usize]| -> Vec<&View> {
             positions.iter().map(|&position| &self.views[indices[position]]).collect()
         };
-        let tables = if photos.len() > 1 { precompute(&views(&photos[0]), size) } else { vec![] };
         let pixels = |positions: &Vec<usize>| {
             let views = views(positions);
             let area = |camera: &Camera| u64::from(camera.width) * u64::from(camera.height);
-            let parts = views.iter().filter(|view| matches!(view.projection, Projection::Part(_)));
-            area(&self.frames[views[0].frame].camera) + parts.map(|view| area(&view.camera)).sum::<u64>()
+            let distorted = views.iter().filter(|view| !view.projection.is_identity());
+            area(&self.frames[views[0].frame].camera) + distorted.map(|view| area(&view.camera)).sum::<u64>()
         };
         let largest = photos.iter().map(pixels).max().unwrap_or(0).max(1);
         let at_once = (DECODED_BYTES / (DECODED_BYTES_PER_PIXEL * largest)).max(1) as usize;
         let mut loaded: Vec<(usize, Photo)> = vec![];
         for photos in photos.chunks(at_once) {
-            let load = |positions: &Vec<usize>| self.load_views(&views(positions), size, &tables);
+            let load = |positions: &Vec<usize>| self.load_views(&views(positions), size);
             let all: Vec<_> = photos.par_iter().map(load).collect();
             // If several images can't be read, the error is that of the first one.
             for (positions, views) in photos.iter().zip(all) {
@@ -492,20 +483,15 @@ impl Capture {
         self.load(&(0..self.len()).collect::<Vec<_>>(), size)
     }
 
-    /// Loads `views`, all of one photo. Uses those of `tables` that match.
-    fn load_views(
-        &self,
-        views: &[&View],
-        size: Option<ImageSize>,
-        tables: &[Undistorter],
-    ) -> Result<Vec<Photo>> {
+    /// Loads `views`, all of one photo.
+    fn load_views(&self, views: &[&View], size: Option<ImageSize>) -> Result<Vec<Photo>> {
         let (photo, mask) = self.read_photo(&self.frames[views[0].frame])?;
         let load = |view: &&View| {
             let fit = |image: &RgbImage| match size {
                 Some(size) => resize_and_crop(image, &view.camera, size),
                 None => (Planes::from_rgb(image), view.camera),
             };
-            let (image, mask) = view_pixels(&photo, mask.as_ref(), view, size, tables);
+            let (image, mask) = view_pixels(&photo, mask.as_ref(), view);
             let (image, camera) = fit(&image);
             let mask = mask.map(|mask| fit(&mask).0.into_first_channel());
             let mask = mask.filter(|mask| mask.iter().any(|&weight| weight < u8::MAX));
@@ -542,7 +528,7 @@ impl Capture {
         if view.projection.is_identity() {
             return Ok((photo, mask));
         }
-        let (image, mask) = view_pixels(&photo, mask.as_ref(), view, None, &[]);
+        let (image, mask) = view_pixels(&photo, mask.as_ref(), view);
         Ok((image.into_owned(), mask.map(Cow::into_owned)))
     }
 
@@ -583,121 +569,77 @@ impl Capture {
         let frame = &self.frames[view.frame];
         let bytes = frame.image.read()?;
         let photo = self.decode(frame, &bytes)?;
-        match view_pixels(&photo.pixels, None, view, None, &[]).0 {
+        match view_pixels(&photo.pixels, None, view).0 {
             Cow::Borrowed(_) if photo.is_verbatim => Ok(bytes.into_owned()),
             image => encode_photo(&image, photo.is_jpeg),
         }
     }
 }
 
-/// Returns undistorters with precomputed positions for `views` of a photo, which those of most other photos usually share. Returns none
-/// if a view is the photo, and for the largest photos: a position takes 16 bytes per pixel, and the size that the capture declares isn't
-/// verified yet.
-fn precompute(views: &[&View], size: Option<ImageSize>) -> Vec<Undistorter> {
-    const MAX_PIXELS: u64 = 1 << 23;
-    let pixels = views.iter().map(|view| u64::from(view.camera.width) * u64::from(view.camera.height));
-    if views.iter().any(|view| view.projection.is_identity()) || pixels.sum::<u64>() > MAX_PIXELS {
-        return vec![];
-    }
-    views.iter().map(|view| view.undistorter(size).precompute()).collect()
-}
-
-/// Returns the pixels of `view` of `photo`, at least in the part that fitting to `size` reads, and their weights in equal channels: those of
-/// the photo's `mask`, and 0 where the photo doesn't show the view. There are no weights if every pixel counts. Uses one of `tables` if it
-/// matches.
+/// Returns the pixels of `view` of `photo`, and their weights in equal channels: those of the photo's `mask`, and 0 where the photo doesn't
+/// show the view. There are no weights if every pixel counts.
 fn view_pixels<'a>(
     photo: &'a RgbImage,
     mask: Option<&'a RgbImage>,
     view: &View,
-    size: Option<ImageSize>,
-    tables: &[Undistorter],
 ) -> (Cow<'a, RgbImage>, Option<Cow<'a, RgbImage>>) {
-    if view.projection.is_identity() {
+    let View { projection, camera, .. } = view;
+    if projection.is_identity() {
         return (Cow::Borrowed(photo), mask.map(Cow::Borrowed));
     }
-    let own;
-    let undistorter = match tables.iter().find(|table| table.matches_camera(&view.projection, &view.camera)) {
-        Some(table) => table,
-        None => {
-            own = view.undistorter(size);
-            &own
-        }
-    };
-    let ViewPixels { image, mask: shown } = undistorter.apply(photo);
-    let shown = shown.and_then(|shown| GrayImage::from_raw(image.width(), image.height(), shown));
-    let mask = match (mask.map(|mask| undistorter.apply(mask).image), shown.map(|shown| gray_to_rgb(&shown)))
-    {
-        (Some(mut mask), Some(shown)) => {
-            multiply(&mut mask, &shown);
-            Some(mask)
-        }
-        (mask, shown) => mask.or(shown),
-    };
-    (Cow::Owned(image), mask.map(Cow::Owned))
+    let (image, shown) = undistort(photo, projection, camera);
+    let mask = mask.map(|mask| {
+        let mut mask = undistort(mask, projection, camera).0;
+        shown.iter().for_each(|shown| multiply(&mut mask, shown));
+        mask
+    });
+    (Cow::Owned(image), mask.or(shown).map(Cow::Owned))
 }
 
-/// Returns the pinhole views of `frames`, which `file` describes, and a line for each kind of lens whose photos change.
-fn views_of_frames(file: &Path, frames: &[Frame], purpose: Purpose) -> Result<(Vec<View>, Vec<String>)> {
+/// Returns the pinhole views of `frames`, which `file` describes, and a line about those whose lenses aren't perspective ones.
+fn views_of_frames(file: &Path, frames: &[Frame], purpose: Purpose) -> Result<(Vec<View>, Option<String>)> {
     let is_path = matches!(purpose, Purpose::Cameras(_));
-    let lens = |frame: &Frame| {
-        let is_split = !is_path && !matches!(frame.lens, LensModel::Perspective(_));
-        is_split.then(|| Lens::new(&frame.camera, frame.lens))
-    };
+    let is_split = |frame: &Frame| !is_path && !matches!(frame.lens, LensModel::Perspective(_));
     // Photos of one camera have the same lens.
     let mut lenses: Vec<Lens> = vec![];
-    let mut lens_index = |lens: Lens| {
-        lenses.iter().rposition(|known| *known == lens).unwrap_or_else(|| {
+    for lens in
+        frames.iter().filter(|frame| is_split(frame)).map(|frame| Lens::new(&frame.camera, frame.lens))
+    {
+        if !lenses.contains(&lens) {
             lenses.push(lens);
-            lenses.len() - 1
-        })
-    };
-    let lens_of_frame: Vec<Option<usize>> =
-        frames.iter().map(|frame| lens(frame).map(&mut lens_index)).collect();
+        }
+    }
     let splits: Vec<_> = lenses.par_iter().map(split_into_views).collect();
-    let mut views = vec![];
-    // Numbers of photos and of their views, by kind.
-    let mut counts = [(0, 0); 3];
-    for (index, (frame, lens)) in frames.iter().zip(&lens_of_frame).enumerate() {
-        let Frame { name, camera, lens: model, .. } = frame;
-        let Some((lens, parts)) = lens.map(|lens| (&lenses[lens], &splits[lens])) else {
-            let distortion = match model {
-                LensModel::Perspective(distortion) => *distortion,
-                LensModel::Equirectangular => {
-                    let (field, found) = (format!("the camera of {name}"), "EQUIRECTANGULAR");
-                    let expected = "a camera with a field of view below 180 degrees";
-                    return Err(Error::input(file, field, found, expected));
-                }
-                _ => Distortion::default(),
-            };
-            let projection = Projection::Distortion(distortion);
+    let (mut views, mut photos, mut parts) = (vec![], 0, 0);
+    for (index, frame) in frames.iter().enumerate() {
+        let (name, camera, lens) = (&frame.name, &frame.camera, Lens::new(&frame.camera, frame.lens));
+        if !is_split(frame) {
+            if frame.lens == LensModel::Equirectangular {
+                let (field, found) = (format!("the camera of {name}"), "EQUIRECTANGULAR");
+                let expected = "a camera with a field of view below 180 degrees";
+                return Err(Error::input(file, field, found, expected));
+            }
+            let projection = Projection { lens, rotation: DMat3::IDENTITY };
             views.push(View { frame: index, name: name.clone(), camera: *camera, projection });
             continue;
-        };
-        let kind = match model {
-            LensModel::Equirectangular => 0,
-            _ if parts.len() > 1 => 1,
-            _ => 2,
-        };
-        counts[kind].0 += 1;
-        counts[kind].1 += parts.len();
-        views.extend(parts.iter().map(|&PinholeView { suffix, rotation, intrinsics, size }| {
+        }
+        let split = lenses.iter().rposition(|known| *known == lens).expect("a lens that was split");
+        photos += 1;
+        parts += splits[split].len();
+        views.extend(splits[split].iter().map(|&PinholeView { suffix, rotation, intrinsics, size }| {
             let c2w = camera.c2w * DMat4::from_mat3(rotation);
             let camera = Camera { intrinsics, c2w, width: size.width, height: size.height };
-            let projection = Projection::Part(PhotoPart { lens: *lens, rotation });
+            let projection = Projection { lens, rotation };
             View { frame: index, name: part_name(name, suffix), camera, projection }
         }));
     }
-    let kinds = ["show 360 degrees", "have a wide field of view", "have a fisheye lens or the like"];
-    let lines =
-        kinds.iter().zip(counts).filter(|(_, (photos, _))| *photos > 0).map(|(kind, (photos, views))| {
-            let outcome = match views > photos {
-                true => format!("are split into {views} pinhole views"),
-                false => "are turned into pinhole views".into(),
-            };
-            format!("{}: {photos} of {} photos {kind} and {outcome}", file.display(), frames.len())
-        });
-    let lines = lines.collect();
-    Ok((views, lines))
+    let line = (photos > 0).then(|| {
+        let (file, all) = (file.display(), frames.len());
+        format!(
+            "{file}: {photos} of {all} photos have a fisheye or 360° lens and become {parts} pinhole views"
+        )
+    });
+    Ok((views, line))
 }
 
 /// Returns the existing file in `path`, which may end in `#` and the key of one of the file's scenes.

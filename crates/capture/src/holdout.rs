@@ -19,16 +19,6 @@ pub enum Holdout {
     },
 }
 
-impl Holdout {
-    /// Returns the indices of the views shown and of those held out, out of `count`.
-    pub fn split(&self, count: usize) -> (Vec<usize>, Vec<usize>) {
-        (0..count).partition(|i| match self {
-            Holdout::None => true,
-            Holdout::Every { every, first } => i % every != *first,
-        })
-    }
-}
-
 impl FromStr for Holdout {
     type Err = String;
 
@@ -83,11 +73,5 @@ mod tests {
         for text in ["", "every:1", "every:3+3", "every:x", "first:2"] {
             assert!(text.parse::<Holdout>().is_err(), "{text}");
         }
-    }
-
-    #[test]
-    fn every_third_view_is_held_out() {
-        let (shown, held_out) = "every:3+1".parse::<Holdout>().unwrap().split(9);
-        assert_eq!((shown, held_out), (vec![0, 2, 3, 5, 6, 8], vec![1, 4, 7]));
     }
 }

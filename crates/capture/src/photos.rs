@@ -291,7 +291,7 @@ mod tests {
         type Names<'a> = &'a [&'a str];
         let cases: [(Names, Names, &[Option<usize>]); 10] = [
             (&files, &files, &[Some(0), Some(1)]),
-            (&files, &["./images/a b (1)", "images\\c.jpg"], &[Some(0), Some(1)]),
+            (&files, &[".\\images\\a b (1)", "images\\c.jpg"], &[Some(0), Some(1)]),
             (&files, &["C:\\room\\images\\a b (1).png", "C:\\room\\images\\c.JPG"], &[Some(0), Some(1)]),
             (&files, &["/home/room/images/a b (1).png", "/home/room/images/c.JPG"], &[Some(0), Some(1)]),
             (&files, &["room/images/a b (1).PNG", "room/images/c"], &[Some(0), Some(1)]),

@@ -1,11 +1,12 @@
 //! Captures from photos or a video: which folders may be used, what an earlier call has made, and the steps in their order.
 
-use crate::colmap::{CAMERA_MODELS, Colmap};
+use crate::colmap::Colmap;
 use crate::photos::find_photos;
 use crate::poses::Estimate;
 use crate::progress::{Interrupt, Progress, Reporter, Step, unless_stopped};
 use crate::record::{CaptureReport, FILE, Matching, Record, VideoRecord};
 use crate::video::write_sharpest_frames;
+use globalsplat_capture::COLMAP_MODELS;
 use globalsplat_files::{Error, Result};
 use std::fs::{self, DirEntry};
 use std::path::{Path, PathBuf};
@@ -58,10 +59,9 @@ fn run_steps(
     colmap: &Colmap,
     reporter: &mut Reporter,
 ) -> Result<CaptureReport, Interrupt> {
-    if let Some(model) =
-        options.camera_model.as_ref().filter(|model| CAMERA_MODELS.split(", ").all(|known| known != **model))
-    {
-        return Err(Error::setting("the camera model", model, format!("one of {CAMERA_MODELS}")).into());
+    let models = COLMAP_MODELS.map(|(model, _)| model);
+    if let Some(model) = options.camera_model.as_ref().filter(|model| !models.contains(&model.as_str())) {
+        return Err(Error::setting("the camera model", model, format!("one of {}", models.join(", "))).into());
     }
     let (images, is_video) = (out.join("images"), source.is_file());
     let photos = if is_video { &images } else { source };

@@ -12,11 +12,6 @@ use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::Duration;
 
-/// Camera models that COLMAP 4 estimates. Versions before 4 lack the last ones.
-pub(crate) const CAMERA_MODELS: &str = "SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, OPENCV_FISHEYE, FOV, \
-                                        SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, THIN_PRISM_FISHEYE, RAD_TAN_THIN_PRISM_FISHEYE, \
-                                        SIMPLE_DIVISION, DIVISION, SIMPLE_FISHEYE, FISHEYE, EUCM, EQUIRECTANGULAR";
-
 /// Environment variable that names the COLMAP to use: the path of a `colmap` program, or of a Python that has pycolmap.
 const VARIABLE: &str = "GLOBALSPLAT_COLMAP";
 /// How to get COLMAP.

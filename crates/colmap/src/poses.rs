@@ -4,7 +4,7 @@ use crate::colmap::Colmap;
 use crate::photos::{Photo, SkippedPhoto, import_photos};
 use crate::progress::{Interrupt, Reporter, Step};
 use crate::record::{CaptureReport, Matching, Record, format_first};
-use globalsplat_capture::{MASKS_FOLDER, read_colmap_models};
+use globalsplat_capture::{COLMAP_MODELS, MASKS_FOLDER, read_colmap_models};
 use globalsplat_files::{Error, Result, write_atomically};
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
@@ -39,19 +39,11 @@ const CENTER_PHOTOS: usize = 10;
 const FOCAL: f64 = 0.85;
 /// [`FOCAL`] of a fisheye lens. For one of 0.38, the estimate succeeds from 0.25 to 0.6.
 const FISHEYE_FOCAL: f64 = 0.4;
-/// Fisheye models of COLMAP, and their numbers of focal lengths and of distortion coefficients.
-const FISHEYE_MODELS: [(&str, usize, usize); 7] = [
-    ("OPENCV_FISHEYE", 2, 4),
-    ("SIMPLE_RADIAL_FISHEYE", 1, 1),
-    ("RADIAL_FISHEYE", 1, 2),
-    ("THIN_PRISM_FISHEYE", 2, 8),
-    ("RAD_TAN_THIN_PRISM_FISHEYE", 2, 12),
-    ("SIMPLE_FISHEYE", 1, 0),
-    ("FISHEYE", 2, 0),
-];
-
 /// Share of the photos below which a report says what to try.
 const FEW_REGISTERED: f64 = 0.8;
+/// What to try if few photos are registered.
+const ADVICE: &str = "Photos are registered if they overlap others by two thirds, are sharp, and show surfaces with texture. Separate models need \
+                      photos in between; a fisheye needs a camera model such as OPENCV_FISHEYE; photos in random order need exhaustive matching.";
 
 /// Side of the blocks in which pairs are listed: COLMAP keeps the features of few photos in memory.
 const BLOCK: usize = 16;
@@ -276,29 +268,8 @@ impl Estimate<'_, '_> {
 
     /// Returns what to try if the largest of `models` has few of the photos.
     fn advice(&self, models: &[usize]) -> Vec<String> {
-        if models[0] as f64 >= FEW_REGISTERED * self.photos().len() as f64 {
-            return vec![];
-        }
-        let has_many = self.photos().len() > EXHAUSTIVE_PHOTOS;
-        let advice = [
-            (
-                models.len() > 1,
-                "The models have no photo that connects them: take photos in between, unless they show different places.",
-            ),
-            (
-                true,
-                "Photos are registered if they overlap others by two thirds, are sharp, and show surfaces with texture.",
-            ),
-            (
-                self.record.camera_model.is_none(),
-                "Photos of a fisheye or wide lens may need another camera model, such as OPENCV_FISHEYE.",
-            ),
-            (
-                has_many && self.record.matching != Matching::Exhaustive,
-                "Photos whose names aren't in the order of shooting need exhaustive matching.",
-            ),
-        ];
-        advice.into_iter().filter(|(applies, _)| *applies).map(|(_, sentence)| sentence.to_string()).collect()
+        let is_few = (models[0] as f64) < FEW_REGISTERED * self.photos().len() as f64;
+        if is_few { vec![ADVICE.to_string()] } else { vec![] }
     }
 }
 
@@ -312,7 +283,7 @@ fn longest_side(photos: &[Photo]) -> u32 {
 }
 
 fn is_fisheye(model: Option<&str>) -> bool {
-    FISHEYE_MODELS.iter().any(|(fisheye, ..)| model == Some(*fisheye))
+    model.is_some_and(|model| model.ends_with("FISHEYE"))
 }
 
 /// Returns the photos of each camera: those of one size, focal length and kind, if they are two or more, or if their camera isn't left to
@@ -339,10 +310,12 @@ fn group_by_camera(photos: &[Photo], model: Option<&str>) -> (Vec<Vec<Photo>>, V
 ///
 /// COLMAP 4.2 matches no photos of a fisheye whose focal length isn't given.
 fn fisheye_parameters(model: &str, photo: &Photo) -> Option<String> {
-    let &(_, focals, coefficients) = FISHEYE_MODELS.iter().find(|(fisheye, ..)| *fisheye == model)?;
+    let (_, count) = COLMAP_MODELS.iter().find(|(known, _)| *known == model && is_fisheye(Some(known)))?;
+    let focals = if model.starts_with("SIMPLE_") || model.starts_with("RADIAL") { 1 } else { 2 };
     let (width, height) = (f64::from(photo.width), f64::from(photo.height));
     let focal = photo.focal.unwrap_or(FISHEYE_FOCAL * width.max(height));
-    let parameters = [vec![focal; focals], vec![width / 2., height / 2.], vec![0.; coefficients]].concat();
+    let parameters =
+        [vec![focal; focals], vec![width / 2., height / 2.], vec![0.; count - focals - 2]].concat();
     Some(parameters.iter().map(f64::to_string).collect::<Vec<_>>().join(","))
 }
 
@@ -384,7 +357,6 @@ fn none_registered(count: usize, out: &Path) -> Error {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::colmap::CAMERA_MODELS;
     use globalsplat_capture::Lens;
 
     #[test]
@@ -393,7 +365,7 @@ mod tests {
             let name = "a.jpg".to_string();
             Photo { name, width: 400, height: 300, focal, is_equirectangular: false }
         };
-        for model in CAMERA_MODELS.split(", ") {
+        for (model, _) in COLMAP_MODELS {
             let parameters = fisheye_parameters(model, &photo(None));
             assert_eq!(parameters.is_some(), model.contains("FISHEYE"), "{model}");
             let Some(parameters) = parameters else { continue };

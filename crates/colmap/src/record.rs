@@ -32,12 +32,7 @@ impl FromStr for Matching {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        match text {
-            "auto" => Ok(Matching::Auto),
-            "exhaustive" => Ok(Matching::Exhaustive),
-            "sequential" => Ok(Matching::Sequential),
-            _ => Err("expected auto, exhaustive or sequential".into()),
-        }
+        serde_json::from_value(text.into()).map_err(|_| "expected auto, exhaustive or sequential".into())
     }
 }
 
@@ -110,7 +105,7 @@ pub struct CaptureReport {
     pub skipped: Vec<SkippedPhoto>,
     /// Names of the other photos that aren't in the largest model.
     pub unregistered: Vec<String>,
-    /// Sentences on what to try if few photos were registered.
+    /// What to try if few photos were registered.
     pub advice: Vec<String>,
     /// Seconds that each step took.
     pub seconds: BTreeMap<Step, f64>,

@@ -56,7 +56,8 @@ pub fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
 }
 
 /// Replaces the folder at `path` by one that `fill` creates: it is filled under a temporary name and then renamed. `own_entries` lists the
-/// names of the entries that such a folder has; all other entries of the old folder are kept in the new one.
+/// names of the entries that such a folder has; all other entries of the old folder are kept in the new one. No other process may write to the
+/// folder meanwhile.
 ///
 /// # Errors
 /// Returns the error of `fill`, or an error if something other than a folder is at `path` or the folder can't be written.
@@ -67,8 +68,9 @@ pub fn replace_dir<E: From<Error>>(
 ) -> Result<(), E> {
     let target = target_of(path, Metadata::is_dir, "the name of a folder")?;
     fs::create_dir_all(parent_of(&target)).map_err(Error::write(path))?;
-    let (temporary, _lock) = claim(&target, make_dir).map_err(Error::write(path))?;
-    let retired = old_name(&target);
+    let (temporary, retired) = (temporary_path(&target, 0), old_name(&target));
+    unless_missing(fs::remove_dir_all(&temporary)).map_err(Error::write(path))?;
+    fs::create_dir(&temporary).map_err(Error::write(path))?;
     let swap = || {
         if retired.is_dir() && !target.exists() {
             fs::rename(&retired, &target).map_err(Error::write(path))?;
@@ -82,8 +84,6 @@ pub fn replace_dir<E: From<Error>>(
     };
     let filled = fill(&temporary);
     sync_dir(&temporary);
-    // Processes replace folders in one parent one at a time, since a folder is missing for a moment. Not every file system has locks.
-    let _swapping = File::open(parent_of(&target)).and_then(|parent| parent.lock().map(|()| parent));
     let result = filled.and_then(|()| Ok(swap()?));
     if result.is_err() {
         let _ = fs::remove_dir_all(&temporary);
@@ -126,12 +126,10 @@ pub fn remove_dir(path: &Path, own_entries: &[&str]) -> Result<()> {
             return remove_own_entries(path, own_entries);
         }
     }
-    let (temporary, _lock) = claim(path, make_dir).map_err(Error::write(path))?;
-    if let Err(error) = fs::rename(path, &temporary) {
-        let _ = fs::remove_dir(&temporary);
-        return Err(Error::write(path)(error));
-    }
-    unless_missing(fs::remove_dir_all(&temporary)).map_err(Error::write(&temporary))
+    let temporary = temporary_path(path, 0);
+    unless_missing(fs::remove_dir_all(&temporary)).map_err(Error::write(&temporary))?;
+    fs::rename(path, &temporary).map_err(Error::write(path))?;
+    fs::remove_dir_all(&temporary).map_err(Error::write(&temporary))
 }
 
 /// Removes `own_entries` from `folder`, and the folder itself if it has no other entries.
@@ -167,7 +165,7 @@ pub fn recover_dirs(folder: &Path, own_entries: &[&str]) -> Result<()> {
                 true => retire(&left, &path, own_entries)?,
             }
         } else if name.contains(&format!(".{PARTIAL}")) {
-            remove_abandoned(&left).map_err(Error::write(&left))?;
+            fs::remove_dir_all(&left).map_err(Error::write(&left))?;
         }
     }
     Ok(())
@@ -196,8 +194,7 @@ impl PartialFile {
     /// Returns an error if something other than a regular file is at `path`, or if the file can't be written.
     pub fn create(path: &Path) -> Result<Self> {
         let target = target_of(path, Metadata::is_file, "the name of a file")?;
-        let make = |place: &Path| OpenOptions::new().write(true).create_new(true).open(place);
-        let (temporary_path, file) = claim(&target, make).map_err(Error::write(path))?;
+        let (temporary_path, file) = claim(&target).map_err(Error::write(path))?;
         if let Ok(replaced) = fs::metadata(&target) {
             // Best effort: some file systems have no permissions.
             let _ = file.set_permissions(writable_by_owner(replaced.permissions()));
@@ -323,14 +320,14 @@ fn writable_by_owner(mut permissions: fs::Permissions) -> fs::Permissions {
     permissions
 }
 
-/// Claims a temporary path beside `target` for this process alone. `make` creates a new file or folder there and opens it. It stays locked
-/// until the returned file is closed. Removes what was abandoned at the temporary paths.
-fn claim(target: &Path, make: impl Fn(&Path) -> io::Result<File>) -> io::Result<(PathBuf, File)> {
+/// Creates a temporary file beside `target` for this process alone. It stays locked until the returned file is closed. Files that killed
+/// processes left at the temporary paths are removed.
+fn claim(target: &Path) -> io::Result<(PathBuf, File)> {
     let remove_abandoned = |number| remove_abandoned(&temporary_path(target, number)).unwrap_or(false);
     let mut number = 0;
     loop {
         let place = temporary_path(target, number);
-        match make(&place) {
+        match OpenOptions::new().write(true).create_new(true).open(&place) {
             Ok(file) => {
                 // On file systems without locks, no process takes it for abandoned, and abandoned files stay.
                 let _ = file.lock();
@@ -346,14 +343,6 @@ fn claim(target: &Path, make: impl Fn(&Path) -> io::Result<File>) -> io::Result<
     }
 }
 
-/// Creates the folder `place` and opens it.
-fn make_dir(place: &Path) -> io::Result<File> {
-    fs::create_dir(place)?;
-    // Another process may have removed the folder before it was locked, and created its own.
-    File::open(place)
-        .map_err(|e| if e.kind() == ErrorKind::NotFound { ErrorKind::AlreadyExists.into() } else { e })
-}
-
 /// Returns a temporary path for `target`, one for each `number`.
 fn temporary_path(target: &Path, number: u32) -> PathBuf {
     let name = target.file_name().unwrap_or_default().to_string_lossy();
@@ -363,21 +352,20 @@ fn temporary_path(target: &Path, number: u32) -> PathBuf {
     target.with_file_name(format!(".{}.{PARTIAL}{ending}", &name[..end]))
 }
 
-/// Removes the temporary file or folder at `place` unless a process uses it. Returns `true` if it was removed.
+/// Removes the temporary file at `place` unless a process uses it. Returns `true` if it was removed.
 fn remove_abandoned(place: &Path) -> io::Result<bool> {
-    let kind = place.symlink_metadata()?.file_type();
-    if !kind.is_file() && !kind.is_dir() {
+    if !place.symlink_metadata()?.is_file() {
         return Ok(false);
     }
     let file = File::open(place)?;
     if file.try_lock().is_err() || !is_at(&file, place) {
         return Ok(false);
     }
-    unless_missing(if kind.is_dir() { fs::remove_dir_all(place) } else { fs::remove_file(place) })?;
+    unless_missing(fs::remove_file(place))?;
     Ok(true)
 }
 
-/// Returns `true` if `file` is the file or folder at `place`.
+/// Returns `true` if `file` is the file at `place`.
 fn is_at(file: &File, place: &Path) -> bool {
     use std::os::unix::fs::MetadataExt;
     let id = |metadata: Metadata| (metadata.dev(), metadata.ino());
@@ -471,24 +459,6 @@ mod tests {
         }
         drop(PartialFile::create(&file).unwrap());
         assert_eq!(names(root.path()), ["room.ply"]);
-    }
-
-    #[test]
-    fn folders_are_replaced_by_many_at_once() {
-        let root = tempfile::tempdir().unwrap();
-        let folder = root.path().join("room");
-        let write_all = |writer: i32| {
-            for _ in 0..20 {
-                let fill = |place: &Path| {
-                    let put = |name| fs::write(place.join(name), format!("{writer}"));
-                    ["a", "b"].into_iter().try_for_each(put).map_err(Error::write(place))
-                };
-                replace_dir(&folder, &["a", "b"], fill).unwrap();
-            }
-        };
-        std::thread::scope(|scope| (0..8).for_each(|writer| drop(scope.spawn(move || write_all(writer)))));
-        assert_eq!(names(root.path()), ["room"]);
-        assert_eq!(fs::read(folder.join("a")).unwrap(), fs::read(folder.join("b")).unwrap());
     }
 
     #[test]

@@ -158,23 +158,3 @@ pub fn is_program_missing(error: &std::io::Error) -> bool {
     use std::io::ErrorKind::{NotFound, PermissionDenied};
     matches!(error.kind(), NotFound | PermissionDenied)
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn errors_keep_their_sources() {
-        let denied = || std::io::Error::from(std::io::ErrorKind::PermissionDenied);
-        let error = Error::failed_with_context("room.ply: the encoder failed")(denied());
-        assert_eq!(error.to_string(), format!("room.ply: the encoder failed: {}", denied()));
-        for error in [error, Error::read("room.ply")(denied()), Error::write("room.ply")(denied())] {
-            let source = error.source().and_then(|source| source.downcast_ref::<std::io::Error>());
-            assert_eq!(
-                source.map(std::io::Error::kind),
-                Some(std::io::ErrorKind::PermissionDenied),
-                "{error}"
-            );
-        }
-    }
-}

@@ -72,9 +72,8 @@ fn colmap_pose(camera: &Camera) -> [f64; 7] {
 /// Writes cameras.txt and images.txt to `folder`: one camera, whose model and parameters are `lens`.
 pub fn write_colmap_text(folder: &Path, names: &[String], cameras: &[Camera], lens: &str) {
     std::fs::create_dir_all(folder).unwrap();
-    let (width, height) = (cameras[0].width, cameras[0].height);
-    let text =
-        format!("# Camera list\n#   CAMERA_ID, MODEL\n7 {} {width} {height} {}\n", word(lens, 0), rest(lens));
+    let (Camera { width, height, .. }, (model, parameters)) = (cameras[0], lens.split_once(' ').unwrap());
+    let text = format!("# Camera list\n#   CAMERA_ID, MODEL\n7 {model} {width} {height} {parameters}\n");
     std::fs::write(folder.join("cameras.txt"), text).unwrap();
     let mut text = String::from("# Image list with two lines of data per image:\n");
     for (i, (name, camera)) in names.iter().zip(cameras).enumerate().rev() {
@@ -83,14 +82,6 @@ pub fn write_colmap_text(folder: &Path, names: &[String], cameras: &[Camera], le
         text += &format!("{} {pose} 7 {name}\n{points}\n", i + 1);
     }
     std::fs::write(folder.join("images.txt"), text).unwrap();
-}
-
-fn word(text: &str, index: usize) -> &str {
-    text.split(' ').nth(index).unwrap()
-}
-
-fn rest(text: &str) -> &str {
-    text.split_once(' ').unwrap().1
 }
 
 /// Returns a pinhole lens, `PINHOLE fx fy cx cy`.

@@ -174,7 +174,7 @@ pub fn camera_numbers(camera: &Camera) -> [f32; CAMERA_NUMBERS] {
     numbers
 }
 
-/// Returns the scenes in a chunk.
+/// Returns the scenes in a chunk. Every error message names the scene and the field.
 ///
 /// # Errors
 /// Fails if the chunk isn't a list of scenes, or if they have more than `max_views` views together.
@@ -183,85 +183,47 @@ fn list_scenes(chunk: &TorchFile, max_views: usize) -> Result<Vec<Scene>, String
     let Value::List(list) = values.get(values.root) else {
         return Err(format!("{}, expected a list of scenes", values.get(values.root).type_name()));
     };
-    let (mut scenes, mut views) = (vec![], 0);
-    for (index, &scene) in list.iter().enumerate() {
-        let dict = match values.get(scene) {
-            Value::Dict(items) => items,
-            other => return Err(format!("scene {index} is {}, expected a dict", other.type_name())),
+    let mut views = 0;
+    let scene = |(index, &scene): (usize, &Id)| {
+        let Value::Dict(dict) = values.get(scene) else {
+            return Err(format!("scene {index} is {}, expected a dict", values.get(scene).type_name()));
         };
-        let fields = Fields { chunk, dict, index };
-        let images = fields.images()?;
+        let get =
+            |field: &str| values.find(dict, field).ok_or_else(|| format!("scene {index} has no {field}"));
+        let array = |field: &str, value: &Value| {
+            let array = Array::locate(values, &chunk.storages, value);
+            array.map_err(|why| format!("{field} of scene {index} {why}"))
+        };
+        let refusal = |field: &str, found: String, expected: &str| {
+            format!("{field} of scene {index} is {found}, expected {expected}")
+        };
+        let images = match get("images")? {
+            Value::List(images) => images,
+            other => return Err(refusal("images", other.type_name().into(), "a list of tensors")),
+        };
         views += images.len();
         if views > max_views {
             return Err(format!("{views} views or more, for which the file has no room"));
         }
-        scenes.push(fields.scene(images)?);
-    }
-    Ok(scenes)
-}
-
-/// Entries of a scene. Every error message names the scene and the field.
-struct Fields<'v, 'a> {
-    chunk: &'v TorchFile<'a>,
-    dict: &'v [(Id, Id)],
-    index: usize,
-}
-
-impl<'v, 'a> Fields<'v, 'a> {
-    fn name(&self, field: &str) -> String {
-        format!("{field} of scene {}", self.index)
-    }
-
-    fn get(&self, field: &str) -> Result<&'v Value<'a>, String> {
-        self.chunk.values.find(self.dict, field).ok_or_else(|| format!("scene {} has no {field}", self.index))
-    }
-
-    fn images(&self) -> Result<&'v [Id], String> {
-        match self.get("images")? {
-            Value::List(items) => Ok(items),
-            other => {
-                Err(format!("{} is {}, expected a list of tensors", self.name("images"), other.type_name()))
-            }
+        let (cameras, shape) = (array("cameras", get("cameras")?)?, [images.len(), CAMERA_NUMBERS]);
+        if !cameras.is_float() || cameras.shape != shape {
+            let found = format!("{} {:?}", cameras.dtype, cameras.shape);
+            return Err(refusal("cameras", found, &format!("F32 {shape:?} for as many images")));
         }
-    }
-
-    /// Returns `value`, which is in `field`, as an array of one or two dimensions.
-    fn array(&self, field: &str, value: &Value) -> Result<Array, String> {
-        let array = Array::locate(&self.chunk.values, &self.chunk.storages, value)
-            .map_err(|why| format!("{} {why}", self.name(field)))?;
-        match array.shape.len() <= 2 {
-            true => Ok(array),
-            false => Err(format!("{} is no plain tensor", self.name(field))),
-        }
-    }
-
-    fn scene(&self, images: &[Id]) -> Result<Scene, String> {
-        let views = images.len();
-        let cameras = self.array("cameras", self.get("cameras")?)?;
-        if !cameras.is_float() || cameras.shape != [views, CAMERA_NUMBERS] {
-            let (found, field) = (format!("{} {:?}", cameras.dtype, cameras.shape), self.name("cameras"));
-            let expected = format!("F32 [{views}, {CAMERA_NUMBERS}] for as many images");
-            return Err(format!("{field} is {found}, expected {expected}"));
-        }
-        let timestamps = self.chunk.values.find(self.dict, "timestamps");
-        let timestamps = timestamps.map(|value| self.array("timestamps", value)).transpose()?;
-        if let Some(Array { shape, .. }) = timestamps.filter(|timestamps| timestamps.shape != [views]) {
-            let field = self.name("timestamps");
-            return Err(format!("{field} has shape {shape:?}, expected [{views}] for as many images"));
-        }
-        let key = match self.get("key")? {
+        let key = match get("key")? {
             Value::Str(key) => key.to_string(),
-            other => return Err(format!("{} is {}, expected a string", self.name("key"), other.type_name())),
+            other => return Err(refusal("key", other.type_name().into(), "a string")),
         };
-        let image = |&id: &Id| match self.array("images", self.chunk.values.get(id))? {
-            array if !array.is_contiguous() => Err(format!("{} is no plain tensor", self.name("images"))),
-            Array { dtype: Dtype::U8, shape, bytes, .. } if shape.len() == 1 => Ok(bytes),
-            Array { dtype, shape, .. } => {
-                let (field, found) = (self.name("images"), format!("{dtype} {shape:?}"));
-                Err(format!("an image of {field} is {found}, expected the bytes of a JPEG"))
+        let image = |&id: &Id| {
+            let image = array("images", values.get(id))?;
+            if image.dtype == Dtype::U8 && image.shape.len() == 1 && image.is_contiguous() {
+                return Ok(image.bytes);
             }
+            let found = format!("{} {:?}", image.dtype, image.shape);
+            Err(refusal("an image", found, "the contiguous bytes of a JPEG"))
         };
         let images = images.iter().map(image).collect::<Result<_, String>>()?;
         Ok(Scene { key, cameras, images })
-    }
+    };
+    list.iter().enumerate().map(scene).collect()
 }

@@ -8,9 +8,9 @@ use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
 use crate::geometry::{Camera, ImageSize};
 use crate::lens::{COLMAP_MODELS, Lens, LensModel};
 use crate::photos::{MASKS_FOLDER, find_masks, find_photos, format_names, natural_order, portable};
-use fields::{ByteReader, WordReader, is_comment};
+use fields::read_entries;
 use glam::{DMat4, DQuat, DVec3};
-use globalsplat_files::{Error, Result, read_text};
+use globalsplat_files::{Error, Result};
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -64,14 +64,6 @@ impl Model {
             false => models.extend(Model::in_folder(folder, &bases)),
         }
         models
-    }
-
-    fn is_text(&self) -> bool {
-        self.images.extension().is_some_and(|form| form == "txt")
-    }
-
-    fn images(&self) -> Result<Vec<ImageEntry>> {
-        if self.is_text() { read_images_text(&self.images) } else { read_images_binary(&self.images) }
     }
 }
 
@@ -131,8 +123,8 @@ pub struct ColmapModel {
 pub fn read_colmap_models(sparse: &Path) -> Result<Vec<ColmapModel>> {
     let folders = numbered(sparse).into_iter().filter(|folder| folder.join("images.bin").is_file());
     let summarize = |folder: PathBuf| {
-        let images = read_images_binary(&folder.join("images.bin"))?;
-        let points = read_points_binary(&folder.join("points3D.bin"))?;
+        let images = read_images(&folder.join("images.bin"))?;
+        let points = read_points_with_errors(&folder.join("points3D.bin"))?;
         let errors: f64 = points.iter().map(|(_, error)| error).sum();
         Ok(ColmapModel {
             folder,
@@ -155,7 +147,8 @@ pub(crate) fn find(folder: &Path) -> Option<CaptureOpener> {
 
 /// Reads the model with the most photos among `models`, the first one in case of a tie.
 fn read_largest(folder: &Path, models: &[Model], purpose: Purpose) -> Result<Capture> {
-    let mut images: Vec<Result<Vec<ImageEntry>>> = models.iter().map(Model::images).collect();
+    let mut images: Vec<Result<Vec<ImageEntry>>> =
+        models.iter().map(|model| read_images(&model.images)).collect();
     let sizes: Vec<Option<usize>> = images.iter().map(|images| images.as_ref().ok().map(Vec::len)).collect();
     // If no model can be read, the first one reports the error.
     let largest = (0..models.len()).rev().max_by_key(|&model| sizes[model]).expect("a model or more");
@@ -187,12 +180,8 @@ fn read(
     lines: Vec<String>,
     purpose: Purpose,
 ) -> Result<Capture> {
-    let entries = match model.is_text() {
-        true => read_cameras_text(&model.cameras)?,
-        false => read_cameras_binary(&model.cameras)?,
-    };
     let mut cameras = BTreeMap::new();
-    for camera in entries {
+    for camera in read_cameras(&model.cameras)? {
         let id = camera.id;
         if cameras.insert(id, camera).is_some() {
             return Err(Error::input(&model.cameras, "the camera ids", format!("{id} twice"), "each once"));
@@ -275,97 +264,49 @@ fn lens(file: &Path, entry: &CameraEntry) -> Result<(Camera, LensModel)> {
     Ok((camera, lens.model))
 }
 
-/// Reads lines of the form CAMERA_ID MODEL WIDTH HEIGHT PARAMS…
-fn read_cameras_text(file: &Path) -> Result<Vec<CameraEntry>> {
-    let text = read_text(file)?;
-    let mut cameras = vec![];
-    for (number, line) in (1..).zip(text.lines()).filter(|(_, line)| !is_comment(line)) {
-        let mut words = WordReader { file, number, rest: line };
-        let id = words.parse("CAMERA_ID", "a whole number")?;
-        let model = words.parse("MODEL", "a camera model")?;
-        let (width, height) =
-            (words.parse("WIDTH", "a whole number")?, words.parse("HEIGHT", "a whole number")?);
-        let mut parameters = vec![];
-        while !words.rest.trim().is_empty() {
-            parameters.push(words.parse("PARAMS", "a number")?);
-        }
-        cameras.push(CameraEntry { id, model, width, height, parameters });
-    }
-    Ok(cameras)
-}
-
-/// Reads pairs of lines: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then POINTS2D as X Y POINT3D_ID, which may be empty.
-fn read_images_text(file: &Path) -> Result<Vec<ImageEntry>> {
-    let text = read_text(file)?;
-    let mut images = vec![];
-    let mut lines = (1..).zip(text.lines());
-    while let Some((number, line)) = lines.next() {
-        if is_comment(line) {
-            continue;
-        }
-        let mut words = WordReader { file, number, rest: line };
-        let id = words.parse("IMAGE_ID", "a whole number")?;
-        let quaternion = words.numbers(["QW", "QX", "QY", "QZ"], "a number")?;
-        let translation = words.numbers(["TX", "TY", "TZ"], "a number")?;
-        let camera = words.parse("CAMERA_ID", "a whole number")?;
-        // A name may contain spaces.
-        images.push(ImageEntry { id, quaternion, translation, camera, name: words.rest.trim().to_string() });
-        // This detects a missing second line, because an image's own line has ten words.
-        if let Some((number, points)) = lines.next()
-            && points.split_whitespace().count() % 3 != 0
-        {
-            let found = format!("{} words", points.split_whitespace().count());
-            let expected = "X, Y and POINT3D_ID of each point, or an empty line";
-            return Err(Error::input(file, format!("POINTS2D in line {number}"), found, expected));
-        }
-    }
-    Ok(images)
-}
-
-/// Reads the number of cameras (u64), then for each camera: id (u32), model (i32), width and height (u64), parameters (f64).
-fn read_cameras_binary(file: &Path) -> Result<Vec<CameraEntry>> {
+/// Reads the entries CAMERA_ID MODEL WIDTH HEIGHT PARAMS… The model is a name in a text file and an i32 in a binary file.
+fn read_cameras(file: &Path) -> Result<Vec<CameraEntry>> {
     const MIN_ENTRY_BYTES: usize = 4 + 4 + 8 + 8 + 2 * 8;
-    let contents = std::fs::read(file).map_err(Error::read(file))?;
-    let mut bytes = ByteReader { file, contents: &contents, at: 0 };
-    let mut cameras = vec![];
-    for i in 0..bytes.count("the number of cameras", MIN_ENTRY_BYTES)? {
-        let id = bytes.u32(|| format!("the id of camera {i}, counted from 0,"))?;
-        let number = i32::from_le_bytes(bytes.take(|| format!("model of camera {id}"))?);
-        let model = usize::try_from(number).ok().and_then(|number| COLMAP_MODELS.get(number));
-        // The number of parameters of an unknown model is unknown, and so is the start of the next camera.
-        let (model, parameters) = model.ok_or_else(|| {
-            let expected = format!("one of {}", COLMAP_MODELS.map(|(name, _)| name).join(", "));
-            Error::input(file, format!("model of camera {id}"), format!("number {number}"), expected)
-        })?;
-        let width = bytes.u64(|| format!("width of camera {id}"))?;
-        let height = bytes.u64(|| format!("height of camera {id}"))?;
-        let parameter = |_| Ok(bytes.numbers::<1>(|| format!("the parameters of camera {id}"))?[0]);
-        let parameters = (0..*parameters).map(parameter).collect::<Result<_>>()?;
-        cameras.push(CameraEntry { id, model: model.to_string(), width, height, parameters });
-    }
-    bytes.end()?;
-    Ok(cameras)
+    read_entries(file, 1, "the number of cameras", MIN_ENTRY_BYTES, |values, index| {
+        let id = values.number("CAMERA_ID", || format!("the id of camera {index}, counted from 0,"))?;
+        let (model, count) = match values.word() {
+            Some(model) => (model, None),
+            None => {
+                let number: i32 = values.number("MODEL", || format!("model of camera {id}"))?;
+                let model = usize::try_from(number).ok().and_then(|number| COLMAP_MODELS.get(number));
+                // The number of parameters of an unknown model is unknown, and so is the start of the next camera.
+                let (model, count) = model.ok_or_else(|| {
+                    let expected = format!("one of {}", COLMAP_MODELS.map(|(name, _)| name).join(", "));
+                    Error::input(file, format!("model of camera {id}"), format!("number {number}"), expected)
+                })?;
+                (*model, Some(*count))
+            }
+        };
+        let width = values.number("WIDTH", || format!("width of camera {id}"))?;
+        let height = values.number("HEIGHT", || format!("height of camera {id}"))?;
+        let mut parameters = vec![];
+        while count.map_or(values.has_words(), |count| parameters.len() < count) {
+            parameters.push(values.number("PARAMS", || format!("the parameters of camera {id}"))?);
+        }
+        Ok(CameraEntry { id, model: model.to_string(), width, height, parameters })
+    })
 }
 
-/// Reads the number of images (u64), then for each image: id (u32), quaternion and translation (f64), camera id (u32), name
-/// (terminated by a 0), and the number of its points (u64), each x, y (f64) and an id (u64).
-fn read_images_binary(file: &Path) -> Result<Vec<ImageEntry>> {
+/// Reads the entries IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, each with its points as X Y POINT3D_ID, in a line of their own in a text
+/// file, which may be empty.
+fn read_images(file: &Path) -> Result<Vec<ImageEntry>> {
     const POINT: usize = 24;
     const MIN_ENTRY_BYTES: usize = 4 + 7 * 8 + 4 + 1 + 8;
-    let contents = std::fs::read(file).map_err(Error::read(file))?;
-    let mut bytes = ByteReader { file, contents: &contents, at: 0 };
-    let mut images = vec![];
-    for i in 0..bytes.count("the number of images", MIN_ENTRY_BYTES)? {
-        let id = bytes.u32(|| format!("the id of image {i}, counted from 0,"))?;
-        let [w, x, y, z, translation @ ..] = bytes.numbers::<7>(|| format!("the pose of image {id}"))?;
-        let camera = bytes.u32(|| format!("camera id of image {id}"))?;
-        let name = bytes.name(|| format!("name of image {id}"))?;
-        let points = bytes.count(&format!("the number of points of image {id}"), POINT)?;
-        bytes.skip(points * POINT);
-        images.push(ImageEntry { id, quaternion: [w, x, y, z], translation, camera, name });
-    }
-    bytes.end()?;
-    Ok(images)
+    read_entries(file, 2, "the number of images", MIN_ENTRY_BYTES, |values, index| {
+        let id = values.number("IMAGE_ID", || format!("the id of image {index}, counted from 0,"))?;
+        let pose = || format!("the pose of image {id}");
+        let quaternion = values.numbers(["QW", "QX", "QY", "QZ"], pose)?;
+        let translation = values.numbers(["TX", "TY", "TZ"], pose)?;
+        let camera = values.number("CAMERA_ID", || format!("camera id of image {id}"))?;
+        let name = values.name(|| format!("name of image {id}"))?;
+        values.skip_list(|| format!("the number of points of image {id}"), POINT)?;
+        Ok(ImageEntry { id, quaternion, translation, camera, name })
+    })
 }
 
 /// A point on the surface of the scene.
@@ -388,54 +329,28 @@ pub fn read_points(capture: &Capture) -> Result<Vec<Point>> {
         images.file_name().and_then(|name| name.to_str()).and_then(|name| name.strip_prefix("images."));
     let file = images.with_file_name(format!("points3D.{}", form.unwrap_or_default()));
     match form {
-        Some("bin") if file.is_file() => {
-            Ok(read_points_binary(&file)?.into_iter().map(|(point, _)| point).collect())
+        Some("bin" | "txt") if file.is_file() => {
+            Ok(read_points_with_errors(&file)?.into_iter().map(|(point, _)| point).collect())
         }
-        Some("txt") if file.is_file() => read_points_text(&file),
         _ => Ok(vec![]),
     }
 }
 
-/// Reads lines of the form POINT3D_ID X Y Z R G B ERROR, followed by the views that see the point.
-fn read_points_text(file: &Path) -> Result<Vec<Point>> {
-    let text = read_text(file)?;
-    let mut points = vec![];
-    for (number, line) in (1..).zip(text.lines()).filter(|(_, line)| !is_comment(line)) {
-        let mut words = WordReader { file, number, rest: line };
-        let id: u64 = words.parse("POINT3D_ID", "a whole number")?;
-        let position = words.numbers(["X", "Y", "Z"], "a number")?;
-        let color = words.numbers(["R", "G", "B"], "a whole number from 0 to 255")?;
-        points.push(point(file, id, position, color)?);
-    }
-    Ok(points)
-}
-
-/// Reads the number of points (u64), then for each point: id (u64), position (f64), color (u8), error (f64), and the number of
-/// views that see it (u64), each two ids (u32). Returns the points and their errors.
-fn read_points_binary(file: &Path) -> Result<Vec<(Point, f64)>> {
+/// Reads the entries POINT3D_ID X Y Z R G B ERROR, each with the views that see the point as two ids. Returns the points and their errors.
+fn read_points_with_errors(file: &Path) -> Result<Vec<(Point, f64)>> {
     const VIEW: usize = 8;
     const MIN_ENTRY_BYTES: usize = 8 + 3 * 8 + 3 + 8 + 8;
-    let contents = std::fs::read(file).map_err(Error::read(file))?;
-    let mut bytes = ByteReader { file, contents: &contents, at: 0 };
-    let mut points = vec![];
-    for i in 0..bytes.count("the number of points", MIN_ENTRY_BYTES)? {
-        let id = bytes.u64(|| format!("the id of point {i}, counted from 0,"))?;
-        let position = bytes.numbers(|| format!("the position of point {id}"))?;
-        let color = bytes.take(|| format!("the color of point {id}"))?;
-        let [error] = bytes.numbers(|| format!("the error of point {id}"))?;
-        let views = bytes.count(&format!("the number of views of point {id}"), VIEW)?;
-        bytes.skip(views * VIEW);
-        points.push((point(file, id, position, color)?, error));
-    }
-    bytes.end()?;
-    Ok(points)
-}
-
-fn point(file: &Path, id: u64, position: [f64; 3], color: [u8; 3]) -> Result<Point> {
-    let position = DVec3::from_array(position);
-    if !position.is_finite() {
-        let found = position.to_string();
-        return Err(Error::input(file, format!("the position of point {id}"), found, "finite numbers"));
-    }
-    Ok(Point { position, color: color.map(|value| f32::from(value) / 255.) })
+    read_entries(file, 1, "the number of points", MIN_ENTRY_BYTES, |values, index| {
+        let id: u64 = values.number("POINT3D_ID", || format!("the id of point {index}, counted from 0,"))?;
+        let position =
+            DVec3::from_array(values.numbers(["X", "Y", "Z"], || format!("the position of point {id}"))?);
+        let color: [u8; 3] = values.numbers(["R", "G", "B"], || format!("the color of point {id}"))?;
+        let error = values.number("ERROR", || format!("the error of point {id}"))?;
+        values.skip_list(|| format!("the number of views of point {id}"), VIEW)?;
+        if !position.is_finite() {
+            let (field, found) = (format!("the position of point {id}"), position.to_string());
+            return Err(Error::input(file, field, found, "finite numbers"));
+        }
+        Ok((Point { position, color: color.map(|value| f32::from(value) / 255.) }, error))
+    })
 }

@@ -10,21 +10,13 @@
 //! d = √(|Δx|² + Z²θ²),
 //! ```
 //!
-//! so that translation, rotation and zoom count by how far they move the image. Knots are √d apart: the centripetal
-//! parametrization, which neither loops nor overshoots if views are unevenly spaced (Yuksel, Schaefer, Keyser: Parameterization and
-//! applications of Catmull–Rom curves, 2011). Between the knots:
+//! so that translation, rotation and zoom count by how far they move the image. Between the cameras, x is a Catmull–Rom spline (Catmull, Rom:
+//! A class of local interpolating splines, 1974), evaluated by repeated linear interpolation (Barry, Goldman: A recursive evaluation algorithm
+//! for a class of Catmull–Rom splines, 1988). The rotation goes through the same interpolations, each along the shorter arc (Schlag: Using
+//! geometric constructions to interpolate orientation with quaternions, 1991). Knots are √d apart: the centripetal parametrization, which neither
+//! loops nor overshoots if views are unevenly spaced (Yuksel, Schaefer, Keyser: Parameterization and applications of Catmull–Rom curves, 2011).
 //!
-//! - x is a cubic in Hermite form, whose velocity at a view is that of the parabola through it and its neighbours: a Catmull–Rom
-//!   spline (Catmull, Rom: A class of local interpolating splines, 1974; uneven knots as in Barry, Goldman, 1988);
-//! - the rotation is the analogue for unit quaternions, in cumulative Bézier form (Kim, Kim, Shin: A general construction scheme
-//!   for unit quaternion curves with simple high order derivatives, 1995). With u from 0 to 1 over a step of h, and the angular
-//!   velocities ω₀ and ω₁ at its ends, in the camera's own axes,
-//!
-//! ```text
-//! q(u) = q₀ · exp(a (1 − (1−u)³)) · exp(b (3u² − 2u³)) · exp(c u³),   a = ω₀h/3,  c = ω₁h/3,  exp(b) = exp(−a) q₀⁻¹ q₁ exp(−c).
-//! ```
-//!
-//! Both curves pass through every view with continuous velocity. Frames are equally spaced by the length d.
+//! The curve passes through every view with continuous velocity. Frames are equally spaced by the length d.
 
 use super::camera::{Camera, ImageSize, Intrinsics, look_at};
 use super::normalize;
@@ -80,6 +72,13 @@ impl View {
         Camera { intrinsics, c2w, width, height }
     }
 
+    /// Returns the view at the fraction `t` of the way to `other`, or beyond it.
+    fn interpolate(&self, other: &View, t: f64) -> View {
+        let point = std::array::from_fn(|i| self.point[i] + t * (other.point[i] - self.point[i]));
+        let rotation = self.rotation * DQuat::from_scaled_axis(t * turn(self.rotation, other.rotation));
+        View { point, rotation: rotation.normalize() }
+    }
+
     /// Returns the length d of a step from this view to `other`.
     fn distance_to(&self, other: &View, distance: f64) -> f64 {
         let way: f64 = self.point.iter().zip(&other.point).map(|(a, b)| (b - a).powi(2)).sum();
@@ -94,67 +93,14 @@ fn turn(a: DQuat, b: DQuat) -> DVec3 {
     (if turn.w < 0. { -turn } else { turn }).normalize().to_scaled_axis()
 }
 
-/// Rate of change of all parameters of a view, per unit of the curve parameter.
-#[derive(Debug, Clone, Copy)]
-struct Velocity {
-    point: Point,
-    turn: DVec3,
-}
-
-impl Velocity {
-    fn between(a: &View, b: &View, h: f64) -> Self {
-        Velocity {
-            point: std::array::from_fn(|i| (b.point[i] - a.point[i]) / h),
-            turn: turn(a.rotation, b.rotation) / h,
-        }
-    }
-
-    /// Returns the weighted mean of this velocity (weight 1−t) and `other` (weight t).
-    fn mixed(&self, other: &Self, t: f64) -> Self {
-        Velocity {
-            point: std::array::from_fn(|i| self.point[i] + t * (other.point[i] - self.point[i])),
-            turn: self.turn.lerp(other.turn, t),
-        }
-    }
-}
-
-/// Curve segment from one view to the next.
-#[derive(Debug)]
-struct Step {
-    from: View,
-    to: View,
-    /// Velocity at the start; `ends` is the velocity at the end.
-    starts: Velocity,
-    ends: Velocity,
-    /// Length of the segment in the curve parameter.
-    h: f64,
-}
-
-impl Step {
-    /// Returns the view at `u`, from 0 to 1.
-    fn at(&self, u: f64) -> View {
-        let Step { from, to, starts, ends, h } = self;
-        let (square, cube) = (u * u, u * u * u);
-        let there = 3. * square - 2. * cube;
-        let (out, in_) = (h * (cube - 2. * square + u), h * (cube - square));
-        let point = std::array::from_fn(|i| {
-            let chord = from.point[i] + there * (to.point[i] - from.point[i]);
-            chord + out * starts.point[i] + in_ * ends.point[i]
-        });
-        let (a, c) = (starts.turn * (h / 3.), ends.turn * (h / 3.));
-        let exp = DQuat::from_scaled_axis;
-        let b = turn(from.rotation * exp(a), to.rotation * exp(-c));
-        let rotation = from.rotation * exp(a * (1. - (1. - u).powi(3))) * exp(b * there) * exp(c * cube);
-        View { point, rotation: rotation.normalize() }
-    }
-}
-
 /// The whole path.
 struct Curve {
-    steps: Vec<Step>,
+    /// The views, with one more before the first and after the last, which continue the first and the last step backward and forward.
+    views: Vec<View>,
+    /// Curve parameter of each of `views`.
+    knots: Vec<f64>,
     /// Path length up to the end of each of the [`PIECES`] pieces of each step.
     lengths: Vec<f64>,
-    first: View,
 }
 
 impl Curve {
@@ -164,46 +110,55 @@ impl Curve {
         };
         let least = SAME * apart(&views).iter().sum::<f64>();
         views.dedup_by(|next, view| view.distance_to(next, distance) <= least);
-        let knots: Vec<f64> = apart(&views).iter().map(|d| d.sqrt()).collect();
-        let chords: Vec<Velocity> =
-            views.windows(2).zip(&knots).map(|(pair, &h)| Velocity::between(&pair[0], &pair[1], h)).collect();
-        // View i lies between chords i−1 and i, of which the shorter one has more weight. Each end has only one chord.
-        let velocity = |i: usize| match (i.checked_sub(1), chords.get(i)) {
-            (Some(before), Some(after)) => {
-                chords[before].mixed(after, knots[before] / (knots[before] + knots[i]))
-            }
-            (Some(before), None) => chords[before],
-            (None, _) => chords[0],
-        };
-        let step = |i: usize| Step {
-            from: views[i],
-            to: views[i + 1],
-            starts: velocity(i),
-            ends: velocity(i + 1),
-            h: knots[i],
-        };
-        let steps: Vec<Step> = (0..knots.len()).map(step).collect();
-        let (mut lengths, mut length, mut before) = (vec![], 0., views[0]);
-        for step in &steps {
+        if let [first, second, ..] = views[..] {
+            let [.., before, last] = views[..] else { unreachable!("two views or more") };
+            views.insert(0, first.interpolate(&second, -1.));
+            views.push(before.interpolate(&last, 2.));
+        }
+        let mut knots = vec![0.];
+        knots.extend(apart(&views).iter().scan(0., |knot, distance| {
+            *knot += distance.sqrt();
+            Some(*knot)
+        }));
+        let mut curve = Curve { views, knots, lengths: vec![] };
+        let (mut length, mut before) = (0., curve.view_at(0, 0.));
+        for step in 0..curve.steps() {
             for piece in 1..=PIECES {
-                let view = step.at(piece as f64 / PIECES as f64);
+                let view = curve.view_at(step, piece as f64 / PIECES as f64);
                 length += before.distance_to(&view, distance);
-                lengths.push(length);
+                curve.lengths.push(length);
                 before = view;
             }
         }
-        Curve { steps, lengths, first: views[0] }
+        curve
+    }
+
+    /// Returns the number of steps from one view to the next.
+    fn steps(&self) -> usize {
+        self.views.len().saturating_sub(3)
+    }
+
+    /// Returns the view at the fraction `u` of a step.
+    fn view_at(&self, step: usize, u: f64) -> View {
+        let Some(&[p, q, r, s]) = self.views[step..].first_chunk::<4>() else { return self.views[0] };
+        let knots = &self.knots[step..];
+        let t = knots[1] + u * (knots[2] - knots[1]);
+        // Returns the view at t between views at two of the knots.
+        let between =
+            |a: View, b: View, i: usize, j: usize| a.interpolate(&b, (t - knots[i]) / (knots[j] - knots[i]));
+        let (p, q, r) = (between(p, q, 0, 1), between(q, r, 1, 2), between(r, s, 2, 3));
+        between(between(p, q, 0, 2), between(q, r, 1, 3), 1, 2)
     }
 
     /// Returns the view at the fraction `share` of the path length.
     fn at(&self, share: f64) -> View {
-        let Some(whole) = self.lengths.last() else { return self.first };
+        let Some(whole) = self.lengths.last() else { return self.views[0] };
         let wanted = share * whole;
         let piece = self.lengths.partition_point(|&length| length < wanted).min(self.lengths.len() - 1);
         let begins = if piece == 0 { 0. } else { self.lengths[piece - 1] };
         let inside = (wanted - begins) / (self.lengths[piece] - begins).max(f64::MIN_POSITIVE);
         let u = ((piece % PIECES) as f64 + inside) / PIECES as f64;
-        self.steps[piece / PIECES].at(u.min(1.))
+        self.view_at(piece / PIECES, u.min(1.))
     }
 }
 
@@ -314,18 +269,22 @@ mod tests {
 
     #[test]
     fn the_path_has_no_kinks() {
+        const SMALL: f64 = 1e-6;
         let curve = curve(&cameras());
-        assert_eq!(curve.steps.len(), 5);
-        for pair in curve.steps.windows(2) {
-            const SMALL: f64 = 1e-6;
-            let [before, after] = pair else { unreachable!() };
-            let incident_at = Velocity::between(&before.at(1. - SMALL), &before.at(1.), SMALL * before.h);
-            let leaving = Velocity::between(&after.at(0.), &after.at(SMALL), SMALL * after.h);
-            let off = |a: f64, b: f64| (a - b).abs() / (1. + b.abs());
-            for (a, b) in incident_at.point.into_iter().zip(leaving.point) {
-                assert!(off(a, b) < 1e-4, "{incident_at:?} {leaving:?}");
+        assert_eq!(curve.steps(), 5);
+        for step in 1..5 {
+            // Velocities by the curve parameter, before and after the view between two steps.
+            let velocity = |step: usize, from: f64| {
+                let h = SMALL * (curve.knots[step + 2] - curve.knots[step + 1]);
+                let (a, b) = (curve.view_at(step, from), curve.view_at(step, from + SMALL));
+                let point: Vec<f64> = a.point.iter().zip(b.point).map(|(a, b)| (b - a) / h).collect();
+                (point, turn(a.rotation, b.rotation) / h)
+            };
+            let (incident, leaving) = (velocity(step - 1, 1. - SMALL), velocity(step, 0.));
+            for (a, b) in incident.0.iter().zip(&leaving.0) {
+                assert!((a - b).abs() < 1e-4 * (1. + b.abs()), "{incident:?} {leaving:?}");
             }
-            assert!(incident_at.turn.distance(leaving.turn) < 1e-4 * (1. + leaving.turn.length()));
+            assert!(incident.1.distance(leaving.1) < 1e-4 * (1. + leaving.1.length()));
         }
         // The speed is constant, except that chords are shorter than their arcs.
         let path = smooth_path(&cameras(), DISTANCE, 10_001).unwrap();

@@ -26,25 +26,9 @@ pub(crate) struct Fisheye {
 }
 
 impl Fisheye {
-    /// Creates a radial distortion.
-    pub fn new(radial: [f64; 6]) -> Self {
-        Fisheye {
-            radial,
-            tangential: [0.; 2],
-            prism: [0.; 4],
-            is_sequential: false,
-            max_angle: max_angle(&radial),
-        }
-    }
-
-    /// Creates the distortion of COLMAP's THIN_PRISM_FISHEYE.
-    pub fn thin_prism([k1, k2, k3, k4]: [f64; 4], tangential: [f64; 2], [sx, sy]: [f64; 2]) -> Self {
-        Fisheye { tangential, prism: [sx, 0., sy, 0.], ..Fisheye::new([k1, k2, k3, k4, 0., 0.]) }
-    }
-
-    /// Creates the distortion of COLMAP's RAD_TAN_THIN_PRISM_FISHEYE, whose tangential coefficients come in the other order.
-    pub fn radial_tangential(radial: [f64; 6], [p0, p1]: [f64; 2], prism: [f64; 4]) -> Self {
-        Fisheye { tangential: [p1, p0], prism, is_sequential: true, ..Fisheye::new(radial) }
+    /// Creates the distortion with coefficients k, p and s, applied in sequence or not.
+    pub fn new(radial: [f64; 6], tangential: [f64; 2], prism: [f64; 4], is_sequential: bool) -> Self {
+        Fisheye { radial, tangential, prism, is_sequential, max_angle: max_angle(&radial) }
     }
 
     /// Lists the coefficients for an error message.

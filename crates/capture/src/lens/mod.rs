@@ -5,7 +5,7 @@ mod fisheye;
 mod views;
 
 pub(crate) use distortion::Distortion;
-pub(crate) use views::{PhotoPart, PinholeView, Projection, split_into_views};
+pub(crate) use views::{PinholeView, Projection, split_into_views};
 
 use crate::geometry::{Camera, ImageSize, Intrinsics};
 use fisheye::Fisheye;
@@ -13,7 +13,7 @@ use glam::{DMat2, DVec2, DVec3};
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 /// COLMAP's camera models in its numbering, each with its number of parameters.
-pub(crate) const COLMAP_MODELS: [(&str, usize); 18] = [
+pub const COLMAP_MODELS: [(&str, usize); 18] = [
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
     ("SIMPLE_RADIAL", 4),
@@ -120,11 +120,13 @@ impl Lens {
             ("RADIAL_FISHEYE", &[k1, k2]) => fisheye([k1, k2, 0., 0.]),
             ("OPENCV_FISHEYE", &[k1, k2, k3, k4]) => fisheye([k1, k2, k3, k4]),
             ("THIN_PRISM_FISHEYE", &[k1, k2, p1, p2, k3, k4, sx, sy]) => {
-                LensModel::Fisheye(Fisheye::thin_prism([k1, k2, k3, k4], [p1, p2], [sx, sy]))
+                let radial = [k1, k2, k3, k4, 0., 0.];
+                LensModel::Fisheye(Fisheye::new(radial, [p1, p2], [sx, 0., sy, 0.], false))
             }
             ("RAD_TAN_THIN_PRISM_FISHEYE", &[k0, k1, k2, k3, k4, k5, p0, p1, s0, s1, s2, s3]) => {
+                // The tangential coefficients come in the other order.
                 let (radial, prism) = ([k0, k1, k2, k3, k4, k5], [s0, s1, s2, s3]);
-                LensModel::Fisheye(Fisheye::radial_tangential(radial, [p0, p1], prism))
+                LensModel::Fisheye(Fisheye::new(radial, [p1, p0], prism, true))
             }
             ("FOV", &[omega]) => LensModel::Fov { omega: omega.abs() },
             ("SIMPLE_DIVISION" | "DIVISION", &[k]) => LensModel::Division { k },
@@ -159,9 +161,12 @@ impl Lens {
         let refuse = |found: String, expected: &str| Err(("the distortion".into(), found, expected.into()));
         let parameters = match self.model {
             LensModel::Perspective(distortion) => {
-                return distortion
-                    .check(&self.intrinsics, self.size)
-                    .map_err(|(found, expected)| ("the distortion".into(), found, expected));
+                let folds = |&pixel: &DVec2| distortion.folds_at(self.plane_point(pixel));
+                let found = format!("{}, by which the lens folds the image over", distortion.describe());
+                return match self.grid(32).iter().any(folds) {
+                    true => refuse(found, "coefficients by which every pixel sees a ray of its own"),
+                    false => Ok(()),
+                };
             }
             LensModel::Equirectangular if width.abs_diff(height.saturating_mul(2)) > 1 => {
                 let expected =
@@ -211,9 +216,14 @@ impl Lens {
 
     /// Returns the direction, of length 1 in camera axes, that the lens shows at the position `pixel`, or `None` if there is none.
     pub fn unproject(&self, pixel: DVec2) -> Option<DVec3> {
-        let Intrinsics { fx, fy, cx, cy } = self.intrinsics;
-        let ray = self.model.unproject((pixel - DVec2::new(cx, cy)) / DVec2::new(fx, fy))?.normalize();
+        let ray = self.model.unproject(self.plane_point(pixel))?.normalize();
         ray.is_finite().then_some(ray)
+    }
+
+    /// Returns the point of the model's image plane at the position `pixel`.
+    fn plane_point(&self, pixel: DVec2) -> DVec2 {
+        let Intrinsics { fx, fy, cx, cy } = self.intrinsics;
+        (pixel - DVec2::new(cx, cy)) / DVec2::new(fx, fy)
     }
 
     /// Returns `true` if `ray` is within the angle at which photos are used.
@@ -249,8 +259,8 @@ fn equirectangular_intrinsics(width: f64, height: f64) -> Intrinsics {
 
 impl LensModel {
     /// Returns OpenCV's fisheye with coefficients k₁ to k₄, and with p₁ and p₂, which nerfstudio adds.
-    pub fn fisheye(radial: [f64; 4], tangential: [f64; 2]) -> Self {
-        LensModel::Fisheye(Fisheye::thin_prism(radial, tangential, [0.; 2]))
+    pub fn fisheye([k1, k2, k3, k4]: [f64; 4], tangential: [f64; 2]) -> Self {
+        LensModel::Fisheye(Fisheye::new([k1, k2, k3, k4, 0., 0.], tangential, [0.; 4], false))
     }
 
     /// Returns the distance on the image plane per radian at the optical axis.
@@ -265,10 +275,7 @@ impl LensModel {
         let (across, z) = (ray.truncate(), ray.z);
         let distance = across.length();
         match *self {
-            LensModel::Perspective(distortion) => {
-                let DVec2 { x, y } = across / z;
-                (z > 0.).then(|| distortion.apply(x, y).into())
-            }
+            LensModel::Perspective(distortion) => (z > 0.).then(|| distortion.apply(across / z)),
             LensModel::Fisheye(fisheye) => {
                 let angle = distance.atan2(z);
                 let is_seen = angle <= fisheye.max_angle && !(distance == 0. && z <= 0.);
@@ -309,8 +316,7 @@ impl LensModel {
         let r2 = point.length_squared();
         match *self {
             LensModel::Perspective(distortion) => {
-                let map = |at: DVec2| DVec2::from(distortion.apply(at.x, at.y));
-                invert(map, point, point).map(|plane| plane.extend(1.))
+                invert(|at| distortion.apply(at), point, point).map(|plane| plane.extend(1.))
             }
             LensModel::Fisheye(fisheye) => {
                 let equidistant = fisheye.invert(point)?;
@@ -355,23 +361,27 @@ fn invert(map: impl Fn(DVec2) -> DVec2, target: DVec2, start: DVec2) -> Option<D
     // Distances from the target at which a solution is exact, and at which it is accepted.
     const EXACT: f64 = 1e-15;
     const ACCEPTED: f64 = 1e-11;
-    /// Distance of the points whose difference approximates a derivative.
-    const STEP: f64 = 1e-6;
-    let slope = |at: DVec2, step: DVec2| (map(at + step) - map(at - step)) / (2. * STEP);
-    let jacobian = |at: DVec2| DMat2::from_cols(slope(at, DVec2::X * STEP), slope(at, DVec2::Y * STEP));
     let mut at = start;
     let mut left = target - map(at);
     for _ in 0..ITERATIONS {
         if left.length() <= EXACT {
             break;
         }
-        let step = jacobian(at).inverse() * left;
+        let step = jacobian(&map, at).inverse() * left;
         let steps = (0..HALVINGS).map(|halving| at + step * 0.5f64.powi(halving as i32));
         let better =
             steps.map(|next| (next, target - map(next))).find(|(_, next)| next.length() < left.length());
         let Some(better) = better else { break };
         (at, left) = better;
     }
-    let is_solved = left.length() <= ACCEPTED * (1. + target.length()) && jacobian(at).determinant() > 0.;
+    let is_solved =
+        left.length() <= ACCEPTED * (1. + target.length()) && jacobian(&map, at).determinant() > 0.;
     is_solved.then_some(at)
+}
+
+/// Returns the Jacobian of `map` at a point, by central differences.
+fn jacobian(map: &impl Fn(DVec2) -> DVec2, at: DVec2) -> DMat2 {
+    const STEP: f64 = 1e-6;
+    let slope = |step: DVec2| (map(at + step) - map(at - step)) / (2. * STEP);
+    DMat2::from_cols(slope(DVec2::X * STEP), slope(DVec2::Y * STEP))
 }

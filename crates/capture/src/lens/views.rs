@@ -1,6 +1,6 @@
 //! Pinhole views of a photo whose lens is not a perspective one (spec 10.5).
 
-use super::{Distortion, Lens, LensModel, MAX_ANGLE};
+use super::{Lens, LensModel, MAX_ANGLE};
 use crate::geometry::{ImageSize, Intrinsics};
 use glam::{DMat3, DVec2, DVec3};
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
@@ -21,40 +21,22 @@ pub(crate) struct PinholeView {
 }
 
 /// Mapping from the rays of a pinhole view to its photo.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum Projection {
-    /// The view has the intrinsics and the size of the photo, whose lens distorts it.
-    Distortion(Distortion),
-    /// The view shows a part of the photo.
-    Part(PhotoPart),
-}
-
-impl Default for Projection {
-    /// Returns the projection of a photo that a pinhole camera took.
-    fn default() -> Self {
-        Projection::Distortion(Distortion::default())
-    }
-}
-
-impl Projection {
-    /// Returns `true` if the view is the photo.
-    pub fn is_identity(&self) -> bool {
-        *self == Projection::default()
-    }
-}
-
-/// The photo that a view shows a part of.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct PhotoPart {
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Projection {
     /// Lens of the photo.
     pub lens: Lens,
     /// Rotation from the view's camera axes to the photo's.
     pub rotation: DMat3,
 }
 
-impl PhotoPart {
+impl Projection {
+    /// Returns `true` if the view is the photo.
+    pub fn is_identity(&self) -> bool {
+        self.lens.model == LensModel::default()
+    }
+
     /// Returns the position in the photo of the view's ray `ray`, or `None` if the photo doesn't show it.
-    pub fn project_into_photo(&self, ray: DVec3) -> Option<DVec2> {
+    pub fn position(&self, ray: DVec3) -> Option<DVec2> {
         self.lens.project_into_photo(self.rotation * ray)
     }
 }
@@ -282,8 +264,8 @@ mod tests {
                     // The view takes the color of its point from the pixel.
                     let Intrinsics { fx, fy, cx, cy } = view.intrinsics;
                     let ray = DVec3::new((point.x - cx) / fx, (point.y - cy) / fy, 1.);
-                    let part = PhotoPart { lens, rotation: view.rotation };
-                    let found = part.project_into_photo(ray).unwrap_or_else(|| panic!("{pixel} of {lens:?}"));
+                    let projection = Projection { lens, rotation: view.rotation };
+                    let found = projection.position(ray).unwrap_or_else(|| panic!("{pixel} of {lens:?}"));
                     assert!((found - pixel).length() < 1e-6, "{found} for {pixel} of {lens:?}");
                 }
             }
@@ -318,9 +300,9 @@ mod tests {
                 let extents = [cx, width - cx, cy, height - cy];
                 assert!(extents.iter().all(|extent| extent / focal <= MAX_TANGENT + 2. / focal), "{view:?}");
                 // Every edge that isn't at the axis or at the end of a face has a pixel that is shown near it.
-                let part = PhotoPart { lens, rotation: view.rotation };
+                let projection = Projection { lens, rotation: view.rotation };
                 let is_shown = |u: f64, v: f64| {
-                    part.project_into_photo(DVec3::new((u - cx) / focal, (v - cy) / focal, 1.)).is_some()
+                    projection.position(DVec3::new((u - cx) / focal, (v - cy) / focal, 1.)).is_some()
                 };
                 let margin = 2. + focal / 16.;
                 let along = |size: f64| (0..=200).map(move |i| size * f64::from(i) / 200.);

@@ -1,6 +1,6 @@
 //! Decoding and encoding of photos.
 
-use super::heif::{HEADER_BYTES, HeifHeader};
+use super::heif::{HEADER_BYTES, decode_heif, heif_size};
 use super::jpeg::{decode_jpeg, jpeg_size};
 use globalsplat_files::{Error, Result, panic_message};
 use image::codecs::jpeg::JpegEncoder;
@@ -22,7 +22,7 @@ pub const PHOTO_EXTENSIONS: [&str; 10] =
 pub(crate) const SUPPORTED_IMAGES: &str = "a JPEG, PNG, WebP, TIFF, BMP, HEIC or AVIF";
 
 /// Reads any image as 8-bit RGB, with pixels as they are stored: gray is repeated, transparent pixels are composited over black, 16 bits
-/// are rounded to 8. HEIC and AVIF are decoded by the ffmpeg on the PATH.
+/// are rounded to 8. HEIC and AVIF are decoded by libheif's program on the PATH.
 ///
 /// # Errors
 /// Returns an error if the file is missing, can't be decoded, or is truncated.
@@ -57,8 +57,8 @@ pub struct DecodedPhoto {
 /// # Errors
 /// Returns the errors of [`read_image`].
 pub fn decode_photo(encoded: &[u8], file: &Path, size: (u32, u32)) -> Result<DecodedPhoto> {
-    if let Some(header) = HeifHeader::parse(encoded) {
-        let (pixels, alpha) = split_alpha(header.decode(encoded, file)?);
+    if heif_size(encoded).is_some() {
+        let (pixels, alpha) = split_alpha(decode_heif(encoded, file)?);
         return Ok(DecodedPhoto { pixels, alpha, is_verbatim: false, is_jpeg: false, is_png: false });
     }
     let reader = ImageReader::new(Cursor::new(encoded)).with_guessed_format().map_err(Error::read(file))?;
@@ -143,8 +143,8 @@ fn image_size(mut reader: impl BufRead + Seek, path: &Path) -> Result<(u32, u32)
         return Ok(size);
     }
     reader.rewind().map_err(Error::read(path))?;
-    if let Some(header) = heif_header(&mut reader, path)? {
-        return Ok(header.rotated_size());
+    if let Some(size) = read_heif_size(&mut reader, path)? {
+        return Ok(size);
     }
     let reader = ImageReader::new(reader).with_guessed_format().map_err(Error::read(path))?;
     reader.into_dimensions().map_err(undecodable(path))
@@ -157,7 +157,7 @@ fn image_size(mut reader: impl BufRead + Seek, path: &Path) -> Result<(u32, u32)
 /// Returns an error if the file is missing or is no image.
 pub(crate) fn has_alpha_channel(path: &Path) -> Result<bool> {
     let mut reader = BufReader::new(File::open(path).map_err(Error::read(path))?);
-    if heif_header(&mut reader, path)?.is_some() {
+    if read_heif_size(&mut reader, path)?.is_some() {
         return Ok(false);
     }
     let reader = ImageReader::new(reader).with_guessed_format().map_err(Error::read(path))?;
@@ -168,12 +168,12 @@ pub(crate) fn has_alpha_channel(path: &Path) -> Result<bool> {
     Ok(reader.into_decoder().map_err(undecodable(path))?.color_type().has_alpha())
 }
 
-/// Reads the header of a HEIC or an AVIF, or returns `None` and rewinds `reader` if the file is neither.
-fn heif_header(reader: &mut (impl BufRead + Seek), path: &Path) -> Result<Option<HeifHeader>> {
+/// Reads (width, height) of a HEIC or an AVIF, or returns `None` and rewinds `reader` if the file is neither.
+fn read_heif_size(reader: &mut (impl BufRead + Seek), path: &Path) -> Result<Option<(u32, u32)>> {
     let mut start = vec![];
     reader.take(HEADER_BYTES).read_to_end(&mut start).map_err(Error::read(path))?;
     reader.rewind().map_err(Error::read(path))?;
-    Ok(HeifHeader::parse(&start))
+    Ok(heif_size(&start))
 }
 
 /// Offset of the color type in the header of a PNG.

@@ -7,46 +7,15 @@ use zune_jpeg::zune_core::bytestream::ZCursor;
 use zune_jpeg::zune_core::colorspace::ColorSpace;
 use zune_jpeg::zune_core::options::DecoderOptions;
 
-const SOI: u8 = 0xd8;
+/// Marker of the end of an image.
 const EOI: u8 = 0xd9;
-const SOS: u8 = 0xda;
-
-fn is_frame(marker: u8) -> bool {
-    matches!(marker, 0xc0..=0xcf) && !matches!(marker, 0xc4 | 0xc8 | 0xcc)
-}
-
-fn is_standalone(marker: u8) -> bool {
-    matches!(marker, 0x01 | 0xd0..=SOI)
-}
 
 /// Returns (width, height) from a JPEG's headers, without reading its data, or `None` if it isn't a JPEG.
-pub(super) fn jpeg_size(mut reader: impl BufRead + Seek) -> Option<(u32, u32)> {
-    let mut pair = [0; 2];
-    reader.read_exact(&mut pair).ok()?;
-    if pair != [0xff, SOI] {
-        return None;
-    }
-    loop {
-        reader.read_exact(&mut pair).ok()?;
-        let [0xff, mut marker] = pair else { return None };
-        while marker == 0xff {
-            reader.read_exact(std::slice::from_mut(&mut marker)).ok()?;
-        }
-        if is_standalone(marker) {
-            continue;
-        }
-        reader.read_exact(&mut pair).ok()?;
-        if is_frame(marker) {
-            let mut frame = [0; 5];
-            reader.read_exact(&mut frame).ok()?;
-            let [_, h1, h0, w1, w0] = frame;
-            return Some([[w1, w0], [h1, h0]].map(|side| u16::from_be_bytes(side).into()).into());
-        }
-        if marker == SOS {
-            return None;
-        }
-        reader.seek_relative(i64::from(u16::from_be_bytes(pair)) - 2).ok()?;
-    }
+pub(super) fn jpeg_size(reader: impl BufRead + Seek) -> Option<(u32, u32)> {
+    let options = DecoderOptions::default().set_max_width(usize::MAX).set_max_height(usize::MAX);
+    let mut decoder = JpegDecoder::new_with_options(reader, options);
+    decoder.decode_headers().ok()?;
+    decoder.info().map(|info| (info.width.into(), info.height.into()))
 }
 
 /// Decodes a JPEG, gray or as RGB. Returns `true` with it if the file holds three components: neither gray nor CMYK.
@@ -79,7 +48,8 @@ pub(super) fn decode_jpeg(bytes: &[u8]) -> Result<(DynamicImage, bool), String> 
 fn has_end_marker(bytes: &[u8]) -> bool {
     let mut rest = bytes;
     // 0 follows a byte of data that isn't a marker, and 0xff fills up.
-    let is_marker = |pair: &[u8]| pair[0] == 0xff && !matches!(pair[1], 0 | 0xff) && !is_standalone(pair[1]);
+    // Markers of restarts and of the start have no segment.
+    let is_marker = |pair: &[u8]| pair[0] == 0xff && !matches!(pair[1], 0 | 0xff | 0x01 | 0xd0..=0xd8);
     while let Some(at) = rest.windows(2).position(is_marker) {
         if rest[at + 1] == EOI {
             return true;

@@ -17,8 +17,8 @@ pub(crate) use codec::{SUPPORTED_IMAGES, has_alpha_channel};
 pub use metadata::{exif_focal, is_equirectangular};
 pub use planes::{CHANNELS, Planes};
 pub use resample::{Region, Resampler};
-pub use resize_and_crop::{resize_and_crop, source_ranges};
+pub use resize_and_crop::resize_and_crop;
 
 pub(crate) use mask::multiply;
 pub use mask::{gray_to_rgb, read_mask};
-pub(crate) use undistort::{Undistorter, ViewPixels};
+pub(crate) use undistort::undistort;

@@ -93,15 +93,6 @@ fn to_level(value: f32) -> f32 {
     ((value + ROUNDING) - ROUNDING).clamp(0., 255.)
 }
 
-/// Returns the columns and rows of an image of `width` × `height` that [`Resampler::resample`] reads.
-pub fn source_ranges((width, height): (u32, u32), region: Region, size: ImageSize) -> [Range<usize>; 2] {
-    [(width, region.left, region.width, size.width), (height, region.top, region.height, size.height)].map(
-        |(inputs, start, extent, outputs)| {
-            Taps::new((inputs as usize, start, extent, outputs as usize)).range()
-        },
-    )
-}
-
 /// Resampler for a sequence of images. It keeps taps and buffers for the next image.
 #[derive(Debug, Default)]
 pub struct Resampler {

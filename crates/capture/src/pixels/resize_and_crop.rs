@@ -1,10 +1,9 @@
 //! Resizing and cropping of an image to the model's size (spec 9.2), with exact intrinsics.
 
 use super::planes::Planes;
-use super::resample::{self, Region, Resampler};
+use super::resample::{Region, Resampler};
 use crate::geometry::{Camera, ImageSize};
 use image::RgbImage;
-use std::ops::Range;
 
 /// The first resize rounds the width to a multiple of this, at least one (spec 9.2).
 const WIDTH_MULTIPLE: f64 = 8.;
@@ -51,15 +50,6 @@ impl Crop {
 
 fn has_size(camera: &Camera, size: ImageSize) -> bool {
     (camera.height, camera.width) == (size.height, size.width)
-}
-
-/// Returns the columns and rows of `camera`'s image that [`resize_and_crop`] reads.
-pub fn source_ranges(camera: &Camera, size: ImageSize) -> [Range<usize>; 2] {
-    if has_size(camera, size) {
-        return [0..camera.width as usize, 0..camera.height as usize];
-    }
-    let crop = Crop::new(camera, size);
-    resample::source_ranges((camera.width, camera.height), crop.region, crop.size)
 }
 
 /// Resizes the image to the height of `size` with the aspect ratio kept (width rounded to a multiple of 8), cuts out the largest
@@ -123,7 +113,6 @@ mod tests {
             let (image, fitted) = resize_and_crop(&RgbImage::new(40, 40), &camera(40, 40), size.into());
             let (width, height) = image.to_rgb().dimensions();
             assert_eq!(([height, width], [fitted.height, fitted.width]), (size, size));
-            source_ranges(&camera(40, 40), size.into());
         }
     }
 

@@ -1,7 +1,7 @@
 //! Capture formats: each gives the same cameras and pixels.
 
 use crate::{assert_refused, assert_warns, open_transforms, photos_alone, write_photos};
-use glam::{DMat3, DMat4, DQuat, DVec3};
+use glam::DMat3;
 use globalsplat_capture::{Camera, Holdout, Intrinsics, find_captures, open_capture, write_cameras_json};
 use globalsplat_test_kit::formats::{
     Format, assert_same_cameras, cameras, in_images, names, pinhole, rewrite, transforms,
@@ -312,21 +312,8 @@ fn a_real_capture_with_a_lens_opens() {
         assert_eq!((camera.width, camera.height), (1080, 1920));
         assert_eq!(camera.intrinsics, Intrinsics { fx: 1375.52, fy: 1374.49, cx: 554.558, cy: 965.268 });
     }
-    // All cameras look at the fox: the point nearest to all optical axes, Σ(I − zzᵀ)(p − c) = 0, is in the middle of every
-    // photo.
-    let (mut a, mut b) = (DMat3::ZERO, DVec3::ZERO);
-    for camera in &cameras {
-        let (z, c) = (camera.c2w.z_axis.truncate(), camera.c2w.w_axis.truncate());
-        let across = DMat3::IDENTITY - DMat3::from_cols(z * z.x, z * z.y, z * z.z);
-        (a, b) = (a + across, b + across * c);
-    }
-    let middle = a.inverse() * b;
-    for camera in &cameras {
-        let p = camera.c2w.inverse().transform_point3(middle);
-        assert!(p.z > 1. && (p.x / p.z).abs() < 0.4 && (p.y / p.z).abs() < 0.7, "{p}");
-        // The photos are upright: the world's up, z, is up in the photo.
-        assert!(camera.c2w.y_axis.z < -0.5, "{}", camera.c2w);
-    }
+    // The photos are upright: the world's up, z, is up in the photo.
+    assert!(cameras.iter().all(|camera| camera.c2w.y_axis.z < -0.5));
     assert_eq!(capture.load(&[0], None).unwrap()[0].image.size(), (1920, 1080));
 }
 
@@ -380,22 +367,6 @@ fn cameras_are_scaled_to_smaller_and_larger_photos() {
     let folder = capture_in(Some(Format::ColmapText));
     save(12, 12, &folder.path().join("images/001.png"));
     assert_refused(open_capture(folder.path()).unwrap().load_all(None), &["001.png", "12×12 pixels"]);
-}
-
-/// COLMAP's names may have subfolders, spaces, parentheses and backslashes.
-#[test]
-fn names_are_found_however_they_are_written() {
-    let folder = tempfile::tempdir().unwrap();
-    for name in ["left/0 (1).png", "a plan (2)/b.png"] {
-        let all: Vec<String> = (0..5).map(|i| name.replace('.', &format!(" {i}."))).collect();
-        write_photos(&folder.path().join("images"), &all);
-        for spelled in [all.clone(), all.iter().map(|name| name.replace('/', "\\")).collect()] {
-            write_colmap_text(&folder.path().join("sparse/0"), &spelled, &cameras(), &pinhole(&cameras()[0]));
-            let capture = open_capture(folder.path()).unwrap();
-            assert_same_cameras(&capture, &cameras());
-            assert!(capture.names().eq(&all) && capture.warnings().is_empty());
-        }
-    }
 }
 
 #[test]
@@ -453,38 +424,6 @@ fn cameras_without_images_do_no_harm() {
     for unused in ["8 OPENCV_FISHEYE 24 16 1 1 1 1 0 0 0 0", "9 A_MODEL_TO_COME 0 0 1"] {
         std::fs::write(model.join("cameras.txt"), format!("{unused}\n{cameras_text}")).unwrap();
         assert_same_cameras(&open_capture(folder.path()).unwrap(), &cameras());
-    }
-}
-
-/// The model has poses of photos, frames of a rig, and the rig's poses of its cameras, as COLMAP has written them since 3.12.
-#[test]
-fn a_model_with_a_rig_has_the_poses_of_its_photos() {
-    let pose = |[w, x, y, z]: [f64; 4], translation: [f64; 3]| {
-        DMat4::from_rotation_translation(DQuat::from_xyzw(x, y, z, w).normalize(), translation.into())
-    };
-    // As in the model, which pycolmap 4.2.1 wrote.
-    let right_from_left = pose([0.9, 0.1, 0.2, -0.3], [0.3, -0.1, 0.2]);
-    let (mut expected, mut photos) = (vec![], vec![]);
-    for (side, focal) in [("left", 21.5), ("right", 23.)] {
-        for number in 0..3 {
-            photos.push(format!("{side}/{number}.png"));
-            let t = f64::from(number);
-            let left_from_world = pose([0.8, 0.3 * t, -0.2, 0.1 * t], [t, 0.5 * t, 1. - t]);
-            let w2c = if side == "left" { left_from_world } else { right_from_left * left_from_world };
-            let intrinsics = Intrinsics { fx: focal, ..cameras()[0].intrinsics };
-            expected.push(Camera { intrinsics, c2w: w2c.inverse(), ..cameras()[0] });
-        }
-    }
-    for form in ["bin", "txt"] {
-        let folder = tempfile::tempdir().unwrap();
-        let model = folder.path().join("sparse/0");
-        std::fs::create_dir_all(&model).unwrap();
-        for name in ["cameras", "images", "frames", "rigs"].map(|name| format!("{name}.{form}")) {
-            let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/rig").join(&name);
-            std::fs::copy(data, model.join(name)).unwrap();
-        }
-        write_photos(&folder.path().join("images"), &photos);
-        assert_same_cameras(&open_capture(folder.path()).unwrap(), &expected);
     }
 }
 

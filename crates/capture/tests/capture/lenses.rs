@@ -181,7 +181,7 @@ fn read_encoded(capture: &Capture, index: usize) -> RgbImage {
 fn views_of_a_photo_are_named_loaded_and_held_out_together() {
     let folder = capture_of("EQUIRECTANGULAR 320 160", [HEIGHT, WIDTH]);
     let capture = open_capture(folder.path()).unwrap();
-    assert_warns(&capture, &["5 of 5 photos show 360 degrees and are split into 30 pinhole views"]);
+    assert_warns(&capture, &["5 of 5 photos have a fisheye or 360° lens and become 30 pinhole views"]);
     let faces = ["front", "right", "back", "left", "up", "down"];
     let expected = (0..5).flat_map(|i| faces.map(move |face| format!("{i:03}@{face}.png")));
     assert!(capture.names().eq(expected.clone()), "{:?}", capture.names().collect::<Vec<_>>());
@@ -214,57 +214,53 @@ fn assert_same_views(found: &Capture, expected: &Capture) {
 
 #[test]
 fn lenses_of_transforms_are_those_of_colmap() {
-    let folder = capture_of("EQUIRECTANGULAR 320 160", [HEIGHT, WIDTH]);
-    let sphere = open_transforms(folder.path(), |t| {
-        (t["w"], t["h"], t["camera_model"]) = (json!(WIDTH), json!(HEIGHT), json!("EQUIRECTANGULAR"));
-    });
-    assert_same_views(&sphere.unwrap(), &open_capture(&folder.path().join("sparse")).unwrap());
-
-    let folder = capture_of("FULL_OPENCV 52 53 39 31 -0.15 0.04 0.01 -0.02 0.02 0.3 -0.08 0.04", [60, 80]);
-    let rational = open_transforms(folder.path(), |t| {
-        let keys = ["fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"];
-        let values = [52., 53., 39., 31., 80., 60., -0.15, 0.04, 0.01, -0.02, 0.02, 0.3, -0.08, 0.04];
-        keys.iter().zip(values).for_each(|(key, value)| t[*key] = json!(value));
-        t["camera_model"] = json!("FULL_OPENCV");
-    });
-    assert_same_views(&rational.unwrap(), &open_capture(&folder.path().join("sparse")).unwrap());
-
-    let lens = "OPENCV_FISHEYE 52 53 39 31 0.03 -0.01 0.002 0.001";
-    let folder = capture_of(lens, [60, 80]);
-    let expected = open_capture(&folder.path().join("sparse")).unwrap();
-    let lens = |t: &mut Value| {
-        for (key, value) in ["fl_x", "fl_y", "cx", "cy", "w", "h"].iter().zip([52, 53, 39, 31, 80, 60]) {
-            t[*key] = json!(value);
-        }
+    let fisheye = "OPENCV_FISHEYE 52 53 39 31 0.03 -0.01 0.002 0.001";
+    let coefficients = |key: &str, value: Value| {
+        let mut keys = json!({"k1": 0.03, "k2": -0.01, "k3": 0.002, "k4": 0.001});
+        keys[key] = value;
+        keys
     };
-    let coefficients = |t: &mut Value, key: &str, value: Value| {
-        for (key, value) in ["k1", "k2", "k3", "k4"].iter().zip([0.03, -0.01, 0.002, 0.001]) {
-            t[*key] = json!(value);
-        }
-        t[key] = value;
-    };
-    let list = |t: &mut Value, model: &str, numbers: usize| {
+    let list = |model: &str, count: usize| {
         let mut list = vec![0.03, -0.01, 0.002, 0.001];
-        list.resize(numbers, 0.);
-        (t["camera_model"], t["distortion_params"]) = (json!(model), json!(list));
+        list.resize(count, 0.);
+        json!({"camera_model": model, "distortion_params": list})
     };
-    let changes: [&dyn Fn(&mut Value); 4] = [
-        &|t| coefficients(t, "camera_model", json!("OPENCV_FISHEYE")),
-        &|t| coefficients(t, "is_fisheye", json!(true)),
-        &|t| list(t, "opencv_fisheye", 6),
-        &|t| list(t, "FISHEYE624", 12),
-    ];
-    for change in changes {
-        let capture = open_transforms(folder.path(), |t| {
-            lens(t);
-            change(t);
+    let set = |t: &mut Value, keys: &Value| {
+        keys.as_object().unwrap().iter().for_each(|(key, value)| t[key] = value.clone());
+    };
+    let pinhole = json!({"fl_x": 52, "fl_y": 53, "cx": 39, "cy": 31, "w": 80, "h": 60});
+    for (lens, size, keys) in [
+        (
+            "EQUIRECTANGULAR 320 160",
+            [HEIGHT, WIDTH],
+            json!({"w": WIDTH, "h": HEIGHT, "camera_model": "EQUIRECTANGULAR"}),
+        ),
+        (
+            "FULL_OPENCV 52 53 39 31 -0.15 0.04 0.01 -0.02 0.02 0.3 -0.08 0.04",
+            [60, 80],
+            json!({
+                "camera_model": "FULL_OPENCV",
+                "k1": -0.15, "k2": 0.04, "p1": 0.01, "p2": -0.02, "k3": 0.02, "k4": 0.3, "k5": -0.08, "k6": 0.04,
+            }),
+        ),
+        (fisheye, [60, 80], coefficients("camera_model", json!("OPENCV_FISHEYE"))),
+        (fisheye, [60, 80], coefficients("is_fisheye", json!(true))),
+        (fisheye, [60, 80], list("opencv_fisheye", 6)),
+        (fisheye, [60, 80], list("FISHEYE624", 12)),
+    ] {
+        let folder = capture_of(lens, size);
+        let found = open_transforms(folder.path(), |t| {
+            set(t, &pinhole);
+            set(t, &keys);
         });
-        assert_same_views(&capture.unwrap(), &expected);
+        assert_same_views(&found.unwrap(), &open_capture(&folder.path().join("sparse")).unwrap());
     }
+    let folder = capture_of(fisheye, [60, 80]);
+    let expected = open_capture(&folder.path().join("sparse")).unwrap();
     // A frame may have a lens of its own. Here, one is said to be a pinhole camera.
     let mixed = open_transforms(folder.path(), |t| {
-        lens(t);
-        coefficients(t, "camera_model", json!("OPENCV_FISHEYE"));
+        set(t, &pinhole);
+        set(t, &coefficients("camera_model", json!("OPENCV_FISHEYE")));
         (t["frames"][2]["camera_model"], t["frames"][2]["k1"]) = (json!("PINHOLE"), json!(0));
     });
     let mixed = mixed.unwrap();
@@ -272,7 +268,7 @@ fn lenses_of_transforms_are_those_of_colmap() {
     let (pinhole, expected) = (photos[2].image.to_rgb(), expected.load_all(None).unwrap());
     assert_eq!(pinhole, read_image(&folder.path().join("images/002.png")).unwrap());
     assert!(photos[1].image == expected[1].image);
-    assert_warns(&mixed, &["4 of 5 photos have a fisheye lens or the like and are turned into"]);
+    assert_warns(&mixed, &["4 of 5 photos have a fisheye or 360° lens and become 4 pinhole views"]);
 }
 
 #[test]
@@ -302,7 +298,7 @@ fn photos_of_other_sizes_and_poses_of_paths_keep_the_field_of_view() {
 #[test]
 fn parameters_that_describe_no_lens_are_refused() {
     let (nan, inf) = (f64::NAN, f64::INFINITY);
-    let cases: [(&str, &[f64], &[&str]); 15] = [
+    let cases: [(&str, &[f64], &[&str]); 19] = [
         ("LENS", &[1.], &["model is LENS", "one of SIMPLE_PINHOLE", "EQUIRECTANGULAR"]),
         ("FISHEYE", &[100., 160., 120.], &["the parameters is [100.0", "4 parameters for FISHEYE"]),
         ("SIMPLE_FISHEYE", &[-100., 160., 120.], &["focal length fx is -100", "above 0"]),
@@ -319,6 +315,16 @@ fn parameters_that_describe_no_lens_are_refused() {
         ("EUCM", &[100., 100., 160., 120., 0.5, nan], &["beta NaN"]),
         ("EQUIRECTANGULAR", &[320., 240.], &["the size is 320×240 pixels", "twice the height"]),
         ("EQUIRECTANGULAR", &[99., 50.], &["the parameters is [99, 50]", "the size, [320, 160]"]),
+        // The map x − x³ turns back at x = 0.577, which lies inside the image.
+        ("SIMPLE_RADIAL", &[250., 165., 115., -1.], &["the distortion is k1 -1,", "folds the image over"]),
+        ("SIMPLE_RADIAL", &[250., 165., 115., nan], &["k1 NaN,"]),
+        ("SIMPLE_RADIAL", &[250., 165., 115., inf], &["k1 inf,"]),
+        // The map 1 / (1 − 3r²) has a pole inside the image, and is steep on either side of it.
+        (
+            "FULL_OPENCV",
+            &[250., 250., 165., 115., 0., 0., 0., 0., 0., -3., 0., 0.],
+            &["over [-3.0, 0.0, 0.0]"],
+        ),
     ];
     for (model, parameters, parts) in cases {
         let height = if parameters[0] == 99. { 160 } else { 240 };
