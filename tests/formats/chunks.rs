@@ -178,7 +178,8 @@ fn entry(key: &str, value: &[u8]) -> Vec<u8> {
 
 /// Returns a pickled tensor of `size` with `stride` at `offset` of a storage that claims to have 64 elements, and was saved on a GPU.
 fn tensor(storage: &str, offset: u32, size: &[u32], stride: &[u32]) -> Vec<u8> {
-    let id = [text("storage"), format!("ctorch\n{storage}\n").into_bytes(), text("0"), text("cuda:0"), int(64)];
+    let id =
+        [text("storage"), format!("ctorch\n{storage}\n").into_bytes(), text("0"), text("cuda:0"), int(64)];
     tensor_of(&id, offset, size, stride)
 }
 
