@@ -84,7 +84,8 @@ part refine_photos 60 "$globalsplat" refine --scene "$scene" --device "$device" 
     --out "$work/photos.ply"
 part refine_splat 60 "$globalsplat" refine --scene "$scene" --device "$device" --steps "$steps" --splat "$work/photos.ply" \
     --holdout every:4 --contact-sheet "$work/views.png" --out "$work/splat.ply"
-part refine_weights 60 "$globalsplat" reconstruct --scene "$scene" --device "$device" --refine 10s --out "$work/weights.ply"
+part refine_weights 60 "$globalsplat" refine --scene "$scene" --device "$device" --steps "$steps" --init model --gaussians 20000 \
+    --correct-exposures --out "$work/weights.ply"
 bench raster_million 60 raster "${large[@]}" --device "$device"
 if [ "$device" != cpu ] && command -v ncu >/dev/null; then
     part ncu 120 ncu --clock-control none --kernel-name 'regex:gs_.*' --launch-skip 20 --launch-count 20 --section SpeedOfLight \

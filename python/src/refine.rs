@@ -45,6 +45,7 @@ pub fn refine<'py>(
         };
         let init = initial.as_ref().map_or(SceneInit::Photos, SceneInit::Splat);
         let mut session = RefineSession::load(&capture.0, &options, init, on_event)?;
+        session.start()?;
         Ok(session.run()?.splat)
     });
     // An interrupted session may end with an error of its own.

@@ -1,7 +1,7 @@
 use super::capture::SceneSource;
-use super::refine::Refine;
+use super::refine::{Refine, Reports};
 use super::{Output, check_views, device, model, open_masked_capture, parse_holdout, signals, splat_out};
-use crate::data::{Capture, Holdout};
+use crate::data::Capture;
 use crate::device::{Stopwatch, peak_memory_bytes, process_age};
 use crate::io::{InputFiles, check_writable_splat};
 use crate::reconstruct::{load_context, reconstruct};
@@ -41,8 +41,8 @@ pub struct Reconstruct {
     /// Held-out views: every:N, every:N+K, or none for only the capture's own test split
     #[arg(long, value_name = "WHICH", default_value = "none")]
     holdout: String,
-    /// Also refine the splat on all input photos for this time, as `refine --splat` does; as in 60s or 2m
-    #[arg(long, value_name = "TIME", value_parser = parse_seconds)]
+    /// Also refine the splat on all input photos for this time, as `refine --init model` does; as in 60s or 2m
+    #[arg(long, value_name = "TIME", value_parser = parse_seconds, conflicts_with = "precision")]
     refine: Option<f64>,
     /// Write coordinates relative to the center of the cameras, which is stored in a file beside the splat: far from the
     /// world's origin, as in UTM coordinates, float32 loses detail
@@ -57,20 +57,26 @@ pub struct Reconstruct {
 }
 
 impl Reconstruct {
-    /// Optimizes the Gaussians of the splat that was just written, until `seconds` have passed since the start of the program.
-    fn refine(self, seconds: f64, holdout: Holdout) -> Result<Output> {
-        let options = RefineOptions { seconds, holdout, views: self.views, ..Default::default() };
-        let Reconstruct { scene, masks, out, local_origin, device, .. } = self;
+    /// Reconstructs the same splat and then optimizes its Gaussians for `seconds`.
+    fn run_refined(self, seconds: f64) -> Result<Output> {
+        let options = RefineOptions {
+            seconds,
+            holdout: parse_holdout(&self.holdout)?,
+            views: self.views,
+            ..Default::default()
+        };
+        let Reconstruct { weights, scene, masks, out, local_origin, device, .. } = self;
         Refine {
-            splat: Some(out.clone()),
+            splat: None,
+            init: Some("model".into()),
+            weights,
             scene,
             masks,
             out,
             resume: false,
             local_origin,
             options,
-            log: None,
-            contact_sheet: None,
+            reports: Reports::default(),
             device,
         }
         .run()
@@ -78,6 +84,9 @@ impl Reconstruct {
 
     pub fn run(self) -> Result<Output> {
         check_views(self.views)?;
+        if let Some(seconds) = self.refine {
+            return self.run_refined(seconds);
+        }
         let device = device::parse(&self.device)?;
         let holdout = parse_holdout(&self.holdout)?;
         check_writable_splat(&self.out)?;
@@ -108,9 +117,6 @@ impl Reconstruct {
             let origin = self.local_origin.then(|| LocalFrame::from_cameras(&cameras).origin);
             splat_out::write_for(&self.out, &splat, &cameras, origin)
         })?;
-        if let Some(seconds) = self.refine {
-            return self.refine(seconds, holdout);
-        }
         let parts: Map<String, Value> = started
             .map(|age| ("start", age))
             .into_iter()

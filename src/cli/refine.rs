@@ -1,31 +1,38 @@
-//! The command `refine`, which `reconstruct --refine` runs, too.
+//! The command `refine`, which also does the work of `reconstruct --refine`.
 
 use super::capture::SceneSource;
 use super::progress::{self, Progress};
 use super::{
-    Output, device, keep_freed_memory, open_masked_capture, report_downscaling, signals, splat_out, warn,
+    Output, check_views, device, keep_freed_memory, model, open_masked_capture, report_downscaling, signals,
+    splat_out, warn,
 };
 use crate::data::{Capture, PhotoSize};
 use crate::device::process_age;
+use crate::error::Error;
 use crate::io::{
     InputFiles, check_writable_dir, check_writable_file, check_writable_png, check_writable_splat,
     read_splat, splat_files,
 };
 use crate::metrics::{CaptureScores, Scores};
+use crate::model::Precision;
 use crate::reconstruct::spread_over_path;
 use crate::refine::{
-    Budget, Correction, RefineEvent, RefineLog, RefineOptions, RefineResult, RefineSession, RefineState,
-    SceneInit,
+    Budget, Correction, EvalPoint, RefineEvent, RefineLog, RefineOptions, RefineResult, RefineSession,
+    RefineState, SceneInit,
 };
 use crate::scene::{Camera, LocalFrame};
 use anyhow::Result;
 use clap::Args;
 use serde_json::json;
+use std::cell::RefCell;
 use std::path::PathBuf;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// Maximum number of cameras for which a splat's colors are fitted to the range of its file format.
 const FITTED_CAMERAS: usize = 64;
+
+/// Estimated time for writing the state of an optimization, per Gaussian.
+const STATE_TIME_PER_GAUSSIAN: Duration = Duration::from_micros(1);
 
 /// Optimize a splat on the photos of its scene, or create one from the photos alone.
 ///
@@ -42,6 +49,12 @@ pub struct Refine {
     /// Initial splat, in the capture's world coordinates, in any format that `convert` reads
     #[arg(long, value_name = "FILE", conflicts_with = "gaussians")]
     pub splat: Option<PathBuf>,
+    /// Initialization without --splat: from the photos alone, or from a model's reconstruction, with new Gaussians up to --gaussians
+    #[arg(long, value_parser = ["photos", "model"], conflicts_with = "splat")]
+    pub init: Option<String>,
+    /// Weights of the initial model, as `globalsplat export` writes them; by default the weights embedded in this program
+    #[arg(long, value_name = "FILE", conflicts_with = "splat")]
+    pub weights: Option<PathBuf>,
     #[command(flatten)]
     pub scene: SceneSource,
     /// Folder of masks named like the photos, as in photo.jpg.png or photo.png: black pixels are ignored; by default the masks and
@@ -61,40 +74,62 @@ pub struct Refine {
     pub local_origin: bool,
     #[command(flatten)]
     pub options: RefineOptions,
-    /// Also write curves of the loss and the scores to a folder: metrics.jsonl and tensorboard, which TensorBoard
-    /// shows during the optimization
-    #[arg(long, value_name = "DIR")]
-    pub log: Option<PathBuf>,
-    /// Also write an image: photo, render and depth side by side, a row per held-out view, or else per view
-    #[arg(long, value_name = "FILE.png")]
-    pub contact_sheet: Option<PathBuf>,
+    #[command(flatten)]
+    pub reports: Reports,
     /// Device of the optimization: cpu, cuda or cuda:N
     #[arg(long, value_name = "DEVICE", default_value = "cpu")]
     pub device: String,
 }
 
+/// What a refinement reports besides its result.
+#[derive(Default, Args)]
+pub struct Reports {
+    /// Also write curves of the loss and the scores to a folder: metrics.jsonl and tensorboard, which TensorBoard
+    /// shows during the optimization
+    #[arg(long, value_name = "DIR")]
+    log: Option<PathBuf>,
+    /// Also write an image: photo, render and depth side by side, a row per held-out view, or else per view
+    #[arg(long, value_name = "FILE.png")]
+    contact_sheet: Option<PathBuf>,
+    /// Also score by LPIPS, before and after, if its weights are found; this takes additional time, after the splat is written
+    #[arg(long)]
+    lpips: bool,
+}
+
 impl Refine {
     pub fn run(mut self) -> Result<Output> {
+        check_views(self.options.views)?;
         self.options.device = device::parse(&self.device)?;
         self.options.check()?;
-        let started = Instant::now().checked_sub(process_age().unwrap_or_default());
+        if self.init.as_deref() == Some("photos") && self.weights.is_some() {
+            return Err(Error::request("--init photos uses no weights; --init model does").into());
+        }
+        let age = process_age().unwrap_or_default();
+        let now = Instant::now();
         check_writable_splat(&self.out)?;
         splat_out::check_origin(&self.out, self.local_origin)?;
-        self.contact_sheet.iter().try_for_each(|sheet| check_writable_png(sheet))?;
+        if let Some(sheet) = &self.reports.contact_sheet {
+            check_writable_png(sheet)?;
+        }
         let state_file = RefineState::path_for(&self.out);
         if self.resume {
             check_writable_file(&state_file)?;
         }
-        self.log.iter().try_for_each(|log| check_writable_dir(log))?;
+        if let Some(log) = &self.reports.log {
+            check_writable_dir(log)?;
+        }
         signals::handle_stop_requests()?;
         signals::end_at_request(1);
         let path = self.scene.path(self.masks.as_deref(), &self.out)?;
         // The time budget begins after the poses of photos are found.
-        let clock = started.filter(|_| !self.scene.is_unposed()).unwrap_or_else(Instant::now);
+        let clock = match self.scene.is_unposed() {
+            true => Instant::now(),
+            false => now.checked_sub(age).unwrap_or(now),
+        };
         self.options.started = Some(clock);
         let capture = open_masked_capture(&path, self.masks.as_deref())?;
         self.check_outputs(&capture)?;
-        let (mut splat, mut state) = (None, None);
+        let (mut splat, mut loaded, mut state) = (None, None, None);
         let init = match &self.splat {
             _ if self.resume && state_file.exists() => {
                 let state = state.insert(RefineState::read(&state_file)?);
@@ -106,30 +141,48 @@ impl Refine {
                 warn(&splat.warnings);
                 SceneInit::Splat(splat)
             }
+            None if self.weights.is_some() || self.init.as_deref() == Some("model") => {
+                let load = model::load(self.weights.as_deref(), Some(Precision::F32), self.options.device);
+                SceneInit::Model(loaded.insert(load?))
+            }
             None => SceneInit::Photos,
         };
         let bar = Bar::new(self.options.budget(), clock);
         let steps = if let SceneInit::State(state) = init { state.steps() } else { 0 };
-        let mut log = self.log.as_ref().map(|folder| RefineLog::create(folder, steps)).transpose()?;
+        let log = self.reports.log.as_ref().map(|folder| RefineLog::create(folder, steps)).transpose()?;
+        let log = RefCell::new(log);
         let on_event = |event: RefineEvent| {
             bar.update(event);
-            if let Some(Err(error)) = log.as_mut().map(|log| log.write(&event)) {
-                bar.bar.suspend(|| eprintln!("{error}; the log ends here"));
-                log = None;
-            }
+            write_event(&mut log.borrow_mut(), event);
             !signals::is_stop_requested()
         };
         let mut session = RefineSession::load(&capture, &self.options, init, on_event)?;
         if let (None, SceneInit::Photos, PhotoSize::Within(side)) =
-            (self.options.gaussians, init, session.size)
+            (self.options.gaussians, init, session.size())
         {
-            let line = format!("{} Gaussians, photos of at most {side} pixels", session.gaussians);
-            bar.bar.suspend(|| eprintln!("{line}; --gaussians and --size set others"));
+            let count = session.gaussians();
+            let line = format!(
+                "{count} Gaussians, photos of at most {side} pixels; --gaussians and --size set others"
+            );
+            bar.bar.suspend(|| eprintln!("{line}"));
         }
-        // Depths of a subset of the photos are enough for an initial splat.
+        // Depths of a subset of the photos are enough for an initial splat, too.
+        signals::end_at_request(if matches!(init, SceneInit::Model(_)) { 1 } else { 2 });
+        let gaussians = session.start()?;
         signals::end_at_request(2);
+        if self.resume {
+            let count = gaussians.count().max(session.gaussians() as i64);
+            session.reserve(STATE_TIME_PER_GAUSSIAN * count as u32);
+        }
+        if self.reports.contact_sheet.is_some() {
+            session.reserve_for_contact_sheet(&gaussians)?;
+        }
         keep_freed_memory();
         let result = session.run()?;
+        bar.bar.finish_and_clear();
+        if result.is_initial && result.steps > 0 {
+            eprintln!("the initial splat reproduces the photos better: it is kept");
+        }
         let cameras = capture.cameras();
         let spread = spread_over_path(&cameras, &(0..cameras.len()).collect::<Vec<_>>(), FITTED_CAMERAS);
         let spread: Vec<Camera> = spread.into_iter().map(|index| cameras[index]).collect();
@@ -139,39 +192,64 @@ impl Refine {
             state.write(&state_file)?;
         }
         let held_out = session.score_held_out(&result)?;
-        bar.bar.finish_and_clear();
-        if let Some(sheet) = &self.contact_sheet {
+        if let Some(sheet) = &self.reports.contact_sheet {
             if signals::is_stop_requested() {
                 eprintln!("{}: stopped before it was written", sheet.display());
             } else {
                 report_downscaling(sheet, session.contact_sheet(&result)?.write(sheet)?);
             }
         }
-        Ok(self.describe_result(&result, held_out.as_ref()))
+        let lpips = if self.reports.lpips { session.score_lpips(&result)? } else { None };
+        Ok(self.describe_result(&session, &result, held_out.as_ref(), lpips.as_ref()))
     }
 
     /// Describes the result. Scores are those before and after the optimization.
-    fn describe_result(&self, result: &RefineResult, held_out: Option<&[CaptureScores; 2]>) -> Output {
-        let RefineResult { steps, seconds, shown: [before, after], photos, corrections, .. } = result;
-        let (out, gaussians) = (self.out.to_string_lossy(), result.gaussians.count());
+    fn describe_result(
+        &self,
+        session: &RefineSession,
+        result: &RefineResult,
+        held_out: Option<&[CaptureScores; 2]>,
+        lpips: Option<&[CaptureScores; 2]>,
+    ) -> Output {
+        let RefineResult { steps, seconds: [begun, ended], shown: [before, after], corrections, .. } = result;
+        let (count, photos) = (result.gaussians.count(), session.photos().len());
+        // Scores are of the held-out views if there are any, else of the photos.
+        let distances =
+            lpips.map_or([None; 2], |scores| scores.each_ref().map(|scores| scores.mean.lpips_vgg));
+        let (of_photos, of_held_out) =
+            if session.held_out().is_empty() { (distances, [None; 2]) } else { ([None; 2], distances) };
+        let out = self.out.to_string_lossy();
+        let of = |scores: &Scores, lpips: Option<f64>| json!({ "psnr": scores.psnr, "ssim": scores.ssim, "lpips_vgg": lpips });
         let mut json = json!({
-            "splat": out, "gaussians": gaussians, "photos": photos, "steps": steps, "seconds": seconds,
-            "corrections": corrections, "shown": { "before": before, "after": after },
+            "splat": out, "gaussians": count, "photos": photos, "near_duplicates": session.near_duplicates(),
+            "steps": steps, "seconds": ended, "begin_seconds": begun, "corrections": corrections,
+            "shown": { "before": of(before, of_photos[0]), "after": of(after, of_photos[1]) },
         });
-        let row = |name: String, before: &Scores, after: &Scores| {
-            format!("{name:<24} {:>14.2} {:>8.2} {:>8.4}", before.psnr, after.psnr, after.ssim)
+        let row = |name: String, [before, after]: [f64; 2], ssim: f64| {
+            format!("{name:<24} {before:>14.2} {after:>8.2} {ssim:>8.4}")
         };
+        let sampled = result.shown_photos;
+        let of_all_photos = if sampled < photos { format!("{sampled} of ") } else { String::new() };
         let mut lines = vec![
-            format!("{out}: {gaussians} Gaussians, {steps} steps, {seconds:.0} s"),
+            format!("{out}: {count} Gaussians, {steps} steps, {ended:.0} s"),
             format!("{:<24} {:>14} {:>8} {:>8}", "", "PSNR before", "after", "SSIM"),
-            row(format!("sample of {photos} photos"), before, after),
+            row(format!("{of_all_photos}{photos} photos"), [before.psnr, after.psnr], after.ssim),
         ];
         if let Some([before, after]) = held_out {
-            let views = after.views.len();
+            let scores = session.sample_scores(after);
+            let last = EvalPoint { seconds: *ended, steps: *steps, scores };
+            let curve: Vec<&EvalPoint> = result.curve.iter().chain([&last]).collect();
+            let (scored, all) = (after.views.len(), session.held_out().len());
             json["held_out"] = json!({
-                "views": views, "before": before.mean, "after": after.mean, "curve": result.curve,
+                "views": scored, "before": of(&before.mean, of_held_out[0]),
+                "after": of(&after.mean, of_held_out[1]), "curve": curve,
             });
-            lines.push(row(format!("{views} views held out"), &before.mean, &after.mean));
+            let of_all = if scored < all { format!(" of {all}") } else { String::new() };
+            let psnr = [before.mean.psnr, after.mean.psnr];
+            lines.push(row(format!("{scored}{of_all} views held out"), psnr, after.mean.ssim));
+        }
+        if let [Some(before), Some(after)] = distances {
+            lines.push(format!("LPIPS (VGG) {before:.4} before, {after:.4} after"));
         }
         lines.extend(describe_corrections(corrections));
         Output::new(json, lines.join("\n"))
@@ -181,10 +259,25 @@ impl Refine {
     fn check_outputs(&self, capture: &Capture) -> Result<()> {
         let mut inputs = InputFiles::default();
         capture.add_input_files(&mut inputs);
+        self.weights.iter().for_each(|weights| inputs.add(weights));
         inputs.check_file(&self.out)?;
         self.splat.iter().for_each(|splat| inputs.add_all(splat_files(splat)));
         inputs.add_all(splat_files(&self.out));
-        Ok(self.contact_sheet.iter().try_for_each(|sheet| inputs.check_file(sheet))?)
+        Ok(self.reports.contact_sheet.iter().try_for_each(|sheet| inputs.check_file(sheet))?)
+    }
+}
+
+/// Writes metrics and scores to the log, if there is one. If that fails, says so and ends the log.
+fn write_event(log: &mut Option<RefineLog>, event: RefineEvent) {
+    let Some(open) = log else { return };
+    let written = match event {
+        RefineEvent::Measured(metrics) => open.log_step(metrics),
+        RefineEvent::Scored(point) => open.log_scores(point),
+        _ => return,
+    };
+    if let Err(error) = written {
+        eprintln!("{error}; the log ends here");
+        *log = None;
     }
 }
 
@@ -208,12 +301,11 @@ impl Bar {
         let message = match event {
             RefineEvent::Loading { done, count } => format!("{done} of {count} photos read"),
             RefineEvent::Starting(done) => format!("depths found in {done} photos"),
-            RefineEvent::Optimizing { steps, psnr: Some(psnr) } => {
-                format!("{steps} steps, held out {psnr:.2} dB")
-            }
-            RefineEvent::Optimizing { steps, psnr: None } => format!("{steps} steps"),
-            RefineEvent::Scoring(done) => format!("{done} held-out views scored"),
-            RefineEvent::Measured { .. } | RefineEvent::Scored(_) => return,
+            RefineEvent::Optimizing { steps, psnr } => match psnr {
+                Some(psnr) => format!("{steps} steps, held out {psnr:.2} dB"),
+                None => format!("{steps} steps"),
+            },
+            RefineEvent::Scoring(_) | RefineEvent::Measured(_) | RefineEvent::Scored(_) => return,
             RefineEvent::Warning(line) => return self.bar.suspend(|| eprintln!("{line}")),
         };
         self.bar.set_message(message);
@@ -232,10 +324,10 @@ impl Bar {
 }
 
 /// Describes the largest learned corrections in one line, or returns `None` if there are none.
-fn describe_corrections(corrections: &[Correction]) -> Option<String> {
-    let largest = |number: fn(&Correction) -> f64| corrections.iter().map(number).fold(0., f64::max);
-    let (degrees, depths) = (largest(|photo| photo.degrees), largest(|photo| photo.depths));
-    let factor = largest(|photo| photo.exposure.iter().map(|gain| gain.max(1. / gain)).fold(1., f64::max));
+fn describe_corrections(corrected: &[Correction]) -> Option<String> {
+    let largest = |number: fn(&Correction) -> f64| corrected.iter().map(number).reduce(f64::max);
+    let factor = |of: &Correction| of.exposure.map(|gain| gain.max(1. / gain)).into_iter().fold(1., f64::max);
+    let (degrees, depths, factor) = (largest(|of| of.degrees)?, largest(|of| of.depths)?, largest(factor)?);
     let cameras = format!("{degrees:.2}° and {depths:.4} of the scene's depth (cameras)");
     let exposures = format!("a factor of {factor:.3} (exposures)");
     let kinds = [(degrees > 0. || depths > 0., cameras), (factor > 1., exposures)];

@@ -3,8 +3,8 @@
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
-/// Hyperparameters of the optimization. Learning rates are those of Adam. The unit of lengths is the median depth of
-/// the scene.
+/// Hyperparameters of the optimization. Learning rates are those of Adam. The unit of lengths is the depth of the scene, which
+/// [`super::scene_depth`] computes.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 #[allow(non_snake_case)] // gsplat's name for the higher spherical harmonics
@@ -18,6 +18,9 @@ pub struct RefineConfig {
     pub antialiased: bool,
     /// Final degree of the spherical harmonics. By default it is 2 for more than 100,000 Gaussians and else 1.
     pub sh_degree: Option<i64>,
+    /// Interval between increases of the degree of the spherical harmonics by one, as a fraction of the optimization. By default it is 0.3
+    /// up to degree 1, and 0.2 up to higher degrees.
+    pub sh_every: Option<f64>,
     /// Initial learning rate of the means, in scene depths, for up to 16,384 Gaussians. For N it is multiplied by (16,384 / N)^0.75.
     pub lr_means: f64,
     /// Final learning rate of the means, relative to the initial one. The decay is exponential.
@@ -43,6 +46,8 @@ pub struct RefineConfig {
     pub ssim_weight: f64,
     /// Weight of the penalty on the mean opacity.
     pub opacity_reg: f64,
+    /// Weight of the penalty on the mean scale in scene depths.
+    pub scale_reg: f64,
     /// Weight of the loss [`crate::loss::depth_smoothness`].
     pub depth_smoothness_weight: f64,
     /// Initial weight of the relative difference between rendered depths and those on which the photos agree. It falls to 0 in the first half
@@ -69,6 +74,7 @@ impl Default for RefineConfig {
             resolution_schedule: None,
             antialiased: false,
             sh_degree: None,
+            sh_every: None,
             lr_means: 2e-3,
             lr_means_final_factor: 0.02,
             lr_scales: 2e-2,
@@ -81,6 +87,7 @@ impl Default for RefineConfig {
             lr_exposures: 5e-3,
             ssim_weight: 0.4,
             opacity_reg: 1e-3,
+            scale_reg: 0.,
             depth_smoothness_weight: 0.7,
             depth_weight: 1.,
             initial_gaussians: 0.2,
@@ -96,8 +103,14 @@ impl Default for RefineConfig {
 /// Longer side of photos, in pixels, from which the learning rate of poses falls.
 const POSES_SIDE: f64 = 256.;
 
+/// Minimum longer side of photos, in pixels, that show enough detail for most of the steps.
+const DETAILED_SIDE: u32 = 240;
+
 /// Number of Gaussians above which spherical harmonics have degree 2 by default.
 const MANY_GAUSSIANS: i64 = 100_000;
+
+/// Maximum number of photo sizes besides the full size.
+const MAX_SIZES: usize = 8;
 
 impl RefineConfig {
     /// Returns the defaults with `overrides` applied, each of which is `key=value` with a TOML value. `from_splat` selects the defaults of
@@ -126,7 +139,7 @@ impl RefineConfig {
     ///
     /// # Errors
     /// Returns the expected range of the first value that is out of range.
-    fn check(&self) -> std::result::Result<(), &'static str> {
+    pub fn check(&self) -> std::result::Result<(), &'static str> {
         let rates = [
             self.lr_means,
             self.lr_scales,
@@ -136,27 +149,30 @@ impl RefineConfig {
             self.lr_shN_factor,
             self.lr_poses,
             self.lr_exposures,
-            self.relocation_noise,
         ];
-        let factors = [self.lr_means_final_factor, self.lr_final_factor, self.initial_gaussians];
-        let weights = [self.opacity_reg, self.depth_smoothness_weight, self.depth_weight];
+        let weights = [self.opacity_reg, self.scale_reg, self.depth_smoothness_weight, self.depth_weight];
         let is_inner_fraction = |&fraction: &f64| 0. < fraction && fraction < 1.;
         let schedule = self.resolution_schedule.as_deref().unwrap_or_default();
         // Comparisons with NaN are false, so NaN fails every rule.
         let rules = [
             (self.views >= 1, "1 or more"),
+            (schedule.len() <= MAX_SIZES, "8 sizes or fewer"),
             (schedule.iter().all(is_inner_fraction), "numbers above 0 and below 1"),
             (schedule.is_sorted_by(|a, b| a < b), "numbers that increase"),
             (self.sh_degree.is_none_or(|degree| (0..=3).contains(&degree)), "0 to 3"),
+            (self.sh_every.is_none_or(|every| 0. < every && every.is_finite()), "a finite number above 0"),
             (rates.iter().all(|rate| (0. ..=10.).contains(rate)), "0 to 10"),
-            (factors.iter().all(|&factor| 0. < factor && factor <= 1.), "above 0, up to 1"),
-            (weights.iter().all(|weight| (0. ..=1000.).contains(weight)), "0 to 1000"),
-            (is_inner_fraction(&self.grow_until), "above 0 and below 1"),
             (
-                [self.ssim_weight, self.relocate_until].iter().all(|share| (0. ..=1.).contains(share)),
-                "0 to 1",
+                [self.lr_means_final_factor, self.lr_final_factor].iter().all(|&end| 0. < end && end <= 1.),
+                "above 0, up to 1",
             ),
+            ((0. ..=1.).contains(&self.ssim_weight), "0 to 1"),
+            (weights.iter().all(|weight| (0. ..=1000.).contains(weight)), "0 to 1000"),
             ((0. ..1.).contains(&self.prune_opacity), "0 or more, below 1"),
+            (is_inner_fraction(&self.grow_until), "above 0 and below 1"),
+            (0. < self.initial_gaussians && self.initial_gaussians <= 1., "above 0, up to 1"),
+            ((0. ..=10.).contains(&self.relocation_noise), "0 to 10"),
+            ((0. ..=1.).contains(&self.relocate_until), "0 to 1"),
         ];
         rules.into_iter().find(|(is_met, _)| !is_met).map_or(Ok(()), |(_, expected)| Err(expected))
     }
@@ -176,6 +192,11 @@ impl RefineConfig {
         self.sh_degree.unwrap_or(if count > MANY_GAUSSIANS { 2 } else { 1 })
     }
 
+    /// Returns the interval between increases of the degree up to `degree`, as a fraction of the optimization.
+    pub(super) fn sh_every_for(&self, degree: i64) -> f64 {
+        self.sh_every.unwrap_or(if degree > 1 { 0.2 } else { 0.3 })
+    }
+
     /// Returns the learning rate of poses for photos of `longest_side` pixels.
     pub(super) fn lr_poses_for(&self, longest_side: u32) -> f64 {
         self.lr_poses * (POSES_SIDE / f64::from(longest_side)).min(1.)
@@ -186,13 +207,14 @@ impl RefineConfig {
         self.depth_weight * (1. - 2. * progress).max(0.)
     }
 
-    /// Returns the fractions of the optimization at which the width and height of photos double, up to `longest_side` pixels. Small photos save
-    /// time, but hide detail: 240 pixels or more are enough for most of the steps.
+    /// Returns the fractions of the optimization at which the width and height of photos double, up to `longest_side` pixels.
     pub(super) fn schedule(&self, longest_side: u32) -> Vec<f64> {
-        let by_size = || match longest_side {
-            ..480 => vec![0.03, 0.1],
-            480..960 => vec![0.03, 0.4],
-            _ => vec![0.4, 0.7],
+        let by_size = || {
+            // Small photos save time, but hide detail.
+            let part = |side: u32, of: [f64; 2]| of[usize::from(side >= DETAILED_SIDE)];
+            let (quarter, half) = (longest_side / 4, longest_side / 2);
+            let first = part(quarter, [0.03, 0.4]);
+            vec![first, part(half, [0.1, if quarter >= DETAILED_SIDE { 0.7 } else { 0.4 }])]
         };
         self.resolution_schedule.clone().unwrap_or_else(by_size)
     }
@@ -203,22 +225,48 @@ mod tests {
     use super::*;
 
     #[test]
+    fn many_gaussians_have_spherical_harmonics_of_degree_2() {
+        let plan = |overrides: &[String], from_splat: bool, count: i64| {
+            let config = RefineConfig::with(overrides, from_splat).unwrap();
+            let degree = config.sh_degree_for(count);
+            (degree, config.sh_every_for(degree))
+        };
+        assert_eq!([100_000, 100_001].map(|count| plan(&[], false, count)), [(1, 0.3), (2, 0.2)]);
+        assert_eq!(plan(&[], true, 1_000_000), (1, 0.3));
+        assert_eq!(plan(&["sh_degree=3".into(), "sh_every=0.1".into()], false, 10), (3, 0.1));
+    }
+
+    #[test]
     fn invalid_overrides_are_refused() {
         let with = |assignment: &str| RefineConfig::with(&[assignment.to_string()], false);
         for (assignment, expected) in [
             ("views=0", "expected 1 or more"),
             ("views=-1", "invalid"),
+            ("resolution_schedule=[0.1, 0.1]", "expected numbers that increase"),
             ("resolution_schedule=[0.3, 0.1]", "expected numbers that increase"),
             ("resolution_schedule=[0.1, nan]", "expected numbers above 0 and below 1"),
+            ("resolution_schedule=[1.0]", "expected numbers above 0 and below 1"),
+            ("resolution_schedule=[.01, .02, .03, .04, .05, .06, .07, .08, .09]", "expected"),
             ("sh_degree=4", "expected 0 to 3"),
+            ("sh_degree=-1", "expected 0 to 3"),
+            ("sh_every=0", "expected a finite number above 0"),
+            ("sh_every=nan", "expected a finite number above 0"),
+            ("sh_every=inf", "expected a finite number above 0"),
+            ("lr_means=-1e-3", "expected 0 to 10"),
             ("lr_means=1e30", "expected 0 to 10"),
             ("lr_shN_factor=nan", "expected 0 to 10"),
-            ("lr_final_factor=0", "expected above 0, up to 1"),
-            ("depth_smoothness_weight=-1", "expected 0 to 1000"),
-            ("grow_until=1.0", "expected above 0 and below 1"),
+            ("lr_means_final_factor=0", "expected above 0, up to 1"),
+            ("lr_final_factor=inf", "expected above 0, up to 1"),
             ("ssim_weight=1.5", "expected 0 to 1"),
+            ("depth_smoothness_weight=-1", "expected 0 to 1000"),
             ("prune_opacity=1", "expected 0 or more, below 1"),
+            ("relocate_until=nan", "expected 0 to 1"),
+            ("grow_until=1.0", "expected above 0 and below 1"),
+            ("initial_gaussians=0.0", "expected above 0, up to 1"),
+            ("relocation_noise=-1", "expected 0 to 10"),
+            ("relocate_every=-1", "invalid"),
             ("views=", "expected KEY=VALUE"),
+            ("", "expected KEY=VALUE"),
             ("views=1\nlr_means=0.1", "expected KEY=VALUE"),
             ("view=3", "unknown field"),
         ] {
@@ -227,14 +275,16 @@ mod tests {
             assert!(message.contains(expected), "{message}");
         }
         assert_eq!(with("resolution_schedule=[]").unwrap().schedule(1024), [0.; 0]);
-        assert_eq!(RefineConfig::default().schedule(512), [0.03, 0.4]);
+        assert_eq!(with("relocate_every=0").unwrap().relocate_every, 0);
         assert_eq!(RefineConfig::default().check(), Ok(()));
         assert_eq!(RefineConfig::from_splat().check(), Ok(()));
     }
 
     #[test]
-    fn many_gaussians_have_spherical_harmonics_of_degree_2() {
-        let degrees = [100_000, 100_001].map(|count| RefineConfig::default().sh_degree_for(count));
-        assert_eq!((degrees, RefineConfig::from_splat().sh_degree_for(1_000_000)), ([1, 2], 1));
+    fn most_steps_are_on_small_but_detailed_photos() {
+        let schedule = |side| RefineConfig::default().schedule(side);
+        assert_eq!(schedule(256), [0.03, 0.1]);
+        assert_eq!(schedule(512), [0.03, 0.4]);
+        assert_eq!(schedule(1024), [0.4, 0.7]);
     }
 }

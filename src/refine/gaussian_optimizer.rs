@@ -1,15 +1,16 @@
-//! Parameters of the Gaussians and their optimizer: a learning rate per kind of parameter, the degree of the spherical harmonics, relocation.
+//! Optimizer of Gaussians: a learning rate per kind of parameter, the degree of the spherical harmonics, relocation.
 
 use super::config::RefineConfig;
+use super::gaussian_params::GaussianParams;
 use super::options::MIN_GAUSSIANS;
 use super::relocate::relocate;
-use super::state::{Growth, Record, RefineState};
+use super::state::{GAUSSIANS, Growth, Record, RefineState};
 use crate::error::{Error, Result};
 use crate::optim::{Optimizer, ParameterGroup, UpdateRule};
 use crate::scene::{Gaussians, RawGaussians};
 use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeMap;
-use tch::{Device, Kind, Tensor};
+use tch::{Device, Tensor};
 
 /// Exponent with which the learning rate of the means falls with the number of Gaussians above [`MIN_GAUSSIANS`].
 const MEANS_POWER: f64 = 0.75;
@@ -18,87 +19,14 @@ const MIN_AVERAGE_WEIGHT: f64 = 0.01;
 /// Adam's ε, added to the root of the second moments. It is small because gradients of single Gaussians are small.
 const EPSILON: f64 = 1e-15;
 
-/// Opacity logit of Gaussians that wait for their relocation.
-const DEAD_LOGIT: f64 = -30.;
-
-/// Names of the parameters, as in gsplat where it has one: means, logarithms of scales, quaternions of any length, logits of opacities, and
-/// spherical harmonics of degree 0 and of higher degrees, which have a smaller learning rate.
-const NAMES: [&str; 6] = ["means", "log_scales", "quaternions", "opacity_logits", "sh0", "shN"];
-
-/// Gaussians of one scene before activation, [1, N, …] each, in the order of [`NAMES`].
-#[derive(Debug)]
-pub(super) struct GaussianParams(pub(super) [Tensor; 6]);
-
-impl GaussianParams {
-    /// Copies `raw` into float32 leaf tensors that require gradients. Coefficients up to `degree`, at least the degree of `raw`, are added
-    /// as zeros.
-    pub(super) fn from_raw(raw: &RawGaussians, degree: i64) -> Self {
-        let RawGaussians { means, log_scales, quaternions, opacity_logits, sh } = raw;
-        let (sh0, known) = (sh.narrow(2, 0, 1), sh.narrow(2, 1, sh.size()[2] - 1));
-        let missing = (degree + 1).pow(2) - sh.size()[2];
-        let sh_rest = known.constant_pad_nd([0, 0, 0, missing]);
-        GaussianParams([means, log_scales, quaternions, opacity_logits, &sh0, &sh_rest].map(leaf))
-    }
-
-    /// Returns the number of Gaussians.
-    fn count(&self) -> i64 {
-        self.0[0].size()[1]
-    }
-
-    /// Returns the parameters with their names.
-    fn named(&self) -> [(&'static str, &Tensor); 6] {
-        std::array::from_fn(|index| (NAMES[index], &self.0[index]))
-    }
-
-    /// Returns a copy that requires no gradients.
-    fn copy(&self) -> Self {
-        GaussianParams(self.0.each_ref().map(|t| t.detach().copy()))
-    }
-
-    /// Returns these Gaussians followed by `count` copies of the first one with almost no opacity (sigmoid(−30)), which the next relocation
-    /// moves. Requires at least one Gaussian.
-    fn append_dead(&self, count: i64) -> Self {
-        GaussianParams(std::array::from_fn(|index| {
-            let t = &self.0[index];
-            let mut size = t.size();
-            size[1] = count;
-            let more = match NAMES[index] {
-                "opacity_logits" => Tensor::full(&size, DEAD_LOGIT, (Kind::Float, t.device())),
-                _ => t.narrow(1, 0, 1).expand(&size, false),
-            };
-            Tensor::cat(&[t, &more], 1).detach().set_requires_grad(true)
-        }))
-    }
-
-    /// Returns the activated Gaussians, with spherical harmonics up to `degree`; differentiable. `degree` is at most the stored one.
-    fn activate(&self, degree: i64) -> Gaussians {
-        let [means, log_scales, quaternions, opacity_logits, sh0, sh_rest] =
-            self.0.each_ref().map(Tensor::shallow_clone);
-        let used_count = (degree + 1).pow(2) - 1;
-        let sh = match used_count {
-            0 => sh0,
-            // The gradient of a part takes another pass over memory.
-            _ if used_count == sh_rest.size()[2] => Tensor::cat(&[sh0, sh_rest], 2),
-            _ => Tensor::cat(&[sh0, sh_rest.narrow(2, 0, used_count)], 2),
-        };
-        RawGaussians { means, log_scales, quaternions, opacity_logits, sh }.activate()
-    }
-}
-
-/// Returns a float32 copy of a tensor that requires gradients.
-fn leaf(t: &Tensor) -> Tensor {
-    t.detach().to_kind(Kind::Float).copy().set_requires_grad(true)
-}
-
 /// Gaussians that are optimized, with the state of Adam.
 #[derive(Debug)]
-pub(crate) struct GaussianOptimizer {
+pub struct GaussianOptimizer {
     params: GaussianParams,
     optimizer: Optimizer,
     config: RefineConfig,
-    /// Depth of the scene, the unit of lengths.
-    pub(super) depth: f64,
-    pub(super) growth: Growth,
+    depth: f64,
+    growth: Growth,
     /// Final number of Gaussians.
     last_count: i64,
     /// Average of the parameters over the last steps, once no Gaussian is moved any more.
@@ -106,13 +34,14 @@ pub(crate) struct GaussianOptimizer {
 }
 
 impl GaussianOptimizer {
-    /// Creates an optimizer of the initial Gaussians `raw`, which grow to at least `count`. `depth` is the depth of the scene.
-    pub(crate) fn new(raw: &RawGaussians, depth: f64, config: &RefineConfig, count: i64) -> Self {
+    /// Creates an optimizer of the initial Gaussians `raw`, which grow to at least `count`. `depth` is the depth of the scene, the unit of
+    /// lengths.
+    pub fn new(raw: &RawGaussians, depth: f64, config: &RefineConfig, count: i64) -> Self {
         let first = raw.sh.size()[2].isqrt() - 1;
-        let first_count = raw.means.size()[1];
-        let degrees = [first, first.max(config.sh_degree_for(count.max(first_count)))];
+        let last_count = count.max(raw.means.size()[1]);
+        let degrees = [first, first.max(config.sh_degree_for(last_count))];
         let params = GaussianParams::from_raw(raw, degrees[1]);
-        let growth = Growth { first_count, degrees, degree: first, averaged_steps: 0 };
+        let growth = Growth { first_count: params.count(), degrees, degree: first, averaged_steps: 0 };
         GaussianOptimizer::from_params(params, depth, config, growth, count)
     }
 
@@ -124,14 +53,7 @@ impl GaussianOptimizer {
         growth: Growth,
         count: i64,
     ) -> Self {
-        // Each parameter is a group, whose learning rate is set before each step.
-        let group = |(name, t): (&str, &Tensor)| ParameterGroup {
-            rule: UpdateRule::AdamW,
-            parameters: vec![(name.into(), t.shallow_clone())],
-            learning_rate: 0.,
-            weight_decay: 0.,
-        };
-        let optimizer = Optimizer::new(params.named().map(group).into()).with_epsilon(EPSILON);
+        let optimizer = Optimizer::new(params.named_parameters().map(alone).into()).with_epsilon(EPSILON);
         let last_count = params.count().max(count);
         let config = config.clone();
         GaussianOptimizer { params, optimizer, config, depth, growth, last_count, average: None }
@@ -148,35 +70,35 @@ impl GaussianOptimizer {
         device: Device,
     ) -> Result<Self> {
         let Record { depth, growth, .. } = state.record;
-        let read = |kind: &str, expected: Option<&GaussianParams>| {
-            let tensor = |(index, name): (usize, &str)| {
-                let key = format!("{kind}.{name}");
-                let found = state.gaussians.get(&key);
-                let has_size = |t: &&Tensor| expected.is_none_or(|params| t.size() == params.0[index].size());
-                let missing = || Error::input(&state.file, key, "missing", "that of a refinement's state");
-                found.filter(has_size).map(|t| leaf(&t.to_device(device))).ok_or_else(missing)
-            };
-            let tensors = NAMES.into_iter().enumerate().map(tensor).collect::<Result<Vec<_>>>()?;
-            Ok::<_, Error>(GaussianParams(tensors.try_into().expect("a tensor for each name")))
+        let read_params = |kind: &str| {
+            GaussianParams::from_named(|name| state.tensor(&format!("{GAUSSIANS}{kind}.{name}")), device)
         };
-        let params = read("value", None)?;
-        let average =
-            (growth.averaged_steps > 0).then(|| Ok::<_, Error>(read("average", Some(&params))?.copy()));
-        let average = average.transpose()?;
+        let params = read_params("value")?;
+        let average = if growth.averaged_steps > 0 { Some(read_params("average")?.copy()) } else { None };
+        let sizes = |params: &GaussianParams| params.named_parameters().map(|(_, t)| t.size());
+        if let Some(found) = average.as_ref().map(sizes).filter(|found| *found != sizes(&params)) {
+            let expected = format!("those of the parameters, {:?}", sizes(&params));
+            return Err(Error::input(
+                state.file(),
+                "the sizes of the averages",
+                format!("{found:?}"),
+                expected,
+            ));
+        }
         let mut all = GaussianOptimizer::from_params(params, depth, config, growth, count);
-        all.optimizer.load_state(&state.file, &state.gaussians)?;
-        Ok(GaussianOptimizer { average, ..all })
+        all.optimizer.load_state(state.file(), &state.tensors_of(GAUSSIANS))?;
+        all.average = average;
+        Ok(all)
     }
 
-    /// Returns the parameters, their moments and their averages with their names in a state.
-    pub(super) fn state(&self) -> BTreeMap<String, Tensor> {
-        let kinds = [("value", Some(&self.params)), ("average", self.average.as_ref())];
-        let mut state = self.optimizer.state();
-        for (kind, params) in kinds {
-            let named = params.into_iter().flat_map(GaussianParams::named);
-            state.extend(named.map(|(name, t)| (format!("{kind}.{name}"), t.detach())));
-        }
-        state
+    /// Adds the parameters, their moments and their averages to `tensors`.
+    pub(super) fn add_to_state(&self, tensors: &mut BTreeMap<String, Tensor>) {
+        let named = |kind: &str, params: &GaussianParams| {
+            params.named_parameters().map(|(name, t)| (format!("{kind}.{name}"), t.detach()))
+        };
+        let averages = self.average.iter().flat_map(|average| named("average", average));
+        let all = named("value", &self.params).into_iter().chain(self.optimizer.state()).chain(averages);
+        tensors.extend(all.map(|(name, t)| (format!("{GAUSSIANS}{name}"), t)));
     }
 
     /// Returns the number of Gaussians.
@@ -184,8 +106,13 @@ impl GaussianOptimizer {
         self.params.count()
     }
 
+    /// Returns how the Gaussians have grown.
+    pub(super) fn growth(&self) -> Growth {
+        self.growth
+    }
+
     /// Returns the Gaussians, differentiable with respect to the parameters. `progress` goes from 0 to 1.
-    pub(super) fn gaussians(&self, progress: f64) -> Gaussians {
+    pub fn gaussians(&self, progress: f64) -> Gaussians {
         self.activate(&self.params, progress)
     }
 
@@ -199,12 +126,10 @@ impl GaussianOptimizer {
         Gaussians { antialiased: self.config.antialiased, ..params.activate(self.degree_at(progress)) }
     }
 
-    /// Returns the degree of the spherical harmonics, at least the one that an earlier step used. It increases by one after each fifth of the
-    /// optimization, or after three tenths up to degree 1.
+    /// Returns the degree of the spherical harmonics, at least the one that an earlier step used.
     fn degree_at(&self, progress: f64) -> i64 {
         let [first, last] = self.growth.degrees;
-        let interval = if last > 1 { 0.2 } else { 0.3 };
-        (first + (progress / interval) as i64).min(last).max(self.growth.degree)
+        (first + (progress / self.config.sh_every_for(last)) as i64).min(last).max(self.growth.degree)
     }
 
     /// Returns the number of Gaussians that there should be, which grows exponentially.
@@ -232,7 +157,7 @@ impl GaussianOptimizer {
     pub(super) fn step(&mut self, progress: f64, step: u64, random: &mut ChaCha8Rng) -> Result<()> {
         let config = &self.config;
         let others = config.lr_final_factor.powf(progress);
-        // In the order of `NAMES`.
+        // The order is that of `GaussianParams::named_parameters`.
         self.optimizer.set_learning_rates(&[
             self.means_learning_rate(progress) * self.depth,
             config.lr_scales * others,
@@ -250,7 +175,7 @@ impl GaussianOptimizer {
         if is_due && progress < config.relocate_until || is_late {
             if missing > 0 {
                 self.params = self.params.append_dead(missing);
-                self.optimizer.extend(self.params.named(), 1);
+                self.optimizer.extend(self.params.named_parameters(), 1);
             }
             let squared_gradients = self.optimizer.squared_gradients("means");
             let changed = relocate(
@@ -260,7 +185,7 @@ impl GaussianOptimizer {
                 config.relocation_noise,
                 random,
             );
-            let changed = Tensor::from_slice(&changed).to_device(self.params.0[0].device());
+            let changed = Tensor::from_slice(&changed).to_device(self.params.means.device());
             for moment in self.optimizer.moments() {
                 let _ = moment.shallow_clone().index_fill_(1, &changed, 0.);
             }
@@ -280,9 +205,17 @@ impl GaussianOptimizer {
         self.growth.averaged_steps += 1;
         let weight = (1. / self.growth.averaged_steps as f64).max(MIN_AVERAGE_WEIGHT);
         tch::no_grad(|| {
-            for (average, t) in average.0.iter_mut().zip(&self.params.0) {
-                let _ = average.lerp_(t, weight);
+            for ((_, average), (_, t)) in
+                average.named_parameters().iter().zip(self.params.named_parameters())
+            {
+                let _ = average.shallow_clone().lerp_(t, weight);
             }
         });
     }
+}
+
+/// Returns a parameter group with one parameter, whose learning rate is set before each step.
+fn alone((name, t): (&str, &Tensor)) -> ParameterGroup {
+    let parameters = vec![(name.into(), t.shallow_clone())];
+    ParameterGroup { rule: UpdateRule::AdamW, parameters, learning_rate: 0., weight_decay: 0. }
 }

@@ -1,11 +1,14 @@
-//! Initial Gaussians from photos, or from photos and points.
+//! Initial Gaussians from photos, from photos and points, or from known Gaussians that agree with the photos.
 
 use super::exposures::{LogGains, correct_exposures};
 use super::options::{ExposureCorrection, RefineOptions};
 use super::state::RefineState;
 use crate::data::{Capture, PhotoSize, Pixels, Point, View};
+use crate::error::Result;
 use crate::io::Splat;
-use crate::scene::{RawGaussians, SH_C0};
+use crate::reconstruct::LoadedModel;
+use crate::render::{contributions, largest_contributions};
+use crate::scene::{Camera, RawGaussians, SH_C0};
 use crate::stereo::{DepthMap, PlaneSweepOutput, SWEEP_SIDE, SmallPhoto, projection, sweep};
 use glam::DVec3;
 use rand::seq::index::sample;
@@ -20,6 +23,8 @@ const LOGIT: f32 = -1.;
 /// Divisor of the minimum number of Gaussians at depths instead of points: 1/`DEPTHS_SHARE` of all. Points are exact, but there are none on
 /// plain surfaces.
 const DEPTHS_SHARE: usize = 10;
+/// Maximum relative distance of a Gaussian from the depth that the photos agree on.
+const NEAR: f64 = 0.1;
 
 /// Isotropic Gaussian.
 struct IsotropicGaussian {
@@ -35,6 +40,8 @@ pub enum SceneInit<'a> {
     Photos,
     /// Splat in the capture's world.
     Splat(&'a Splat),
+    /// Reconstruction of the photos by a model. It sees [`RefineOptions::views`] of them, or the number in its configuration.
+    Model(&'a LoadedModel),
     /// State of an earlier refinement of the same capture, which continues. The time and the steps of [`RefineOptions`] include those of
     /// the earlier refinement.
     State(&'a RefineState),
@@ -46,7 +53,7 @@ impl SceneInit<'_> {
         match self {
             SceneInit::Splat(_) => true,
             SceneInit::State(state) => state.record.from_splat,
-            SceneInit::Photos => false,
+            SceneInit::Photos | SceneInit::Model(_) => false,
         }
     }
 
@@ -57,7 +64,7 @@ impl SceneInit<'_> {
             SceneInit::State(state) if state.record.from_splat => state.count(),
             _ => options.gaussians.unwrap_or_else(|| options.gaussians_for(capture)),
         };
-        (gaussians, options.size_for(gaussians))
+        (gaussians, options.size.unwrap_or(RefineOptions::size_for(gaussians)))
     }
 }
 
@@ -106,6 +113,52 @@ pub(super) fn small_photo(view: &View, longest_side: f64) -> SmallPhoto {
     let on_cpu = |pixels: &Pixels| pixels.to_float().to_device(Device::Cpu);
     let (image, mask) = (on_cpu(&view.image), view.mask.as_ref().map(on_cpu));
     SmallPhoto::new(&view.name, &image, mask.as_ref(), view.camera, longest_side)
+}
+
+/// Returns at most `count` of the `known` Gaussians, on the CPU: of those that don't contradict the photos of `depth_maps`, the ones that
+/// contribute the most to them.
+///
+/// # Errors
+/// Fails if rendering fails.
+pub(super) fn most_visible(
+    known: &RawGaussians,
+    depth_maps: &[DepthMap],
+    count: usize,
+) -> Result<RawGaussians> {
+    let supported = known.select(&supported(known, depth_maps)).to_device(Device::Cpu);
+    let cameras: Vec<Camera> = depth_maps.iter().map(|map| map.camera).collect();
+    let contributions = contributions(&supported.activate(), &cameras)?;
+    let kept = largest_contributions(&contributions, count).into_iter().map(|index| index as i64);
+    Ok(supported.select(&kept.collect::<Vec<_>>()))
+}
+
+/// Returns the indices of the Gaussians that the photos support. A Gaussian must not be in front of a depth that a photo is sure of, and at
+/// least one photo must see it unoccluded or not be sure of the depth there.
+fn supported(raw: &RawGaussians, depth_maps: &[DepthMap]) -> Vec<i64> {
+    let means =
+        Vec::<f64>::try_from(raw.means.to_kind(Kind::Double).contiguous().view([-1])).expect("numbers");
+    let map = |of: &DepthMap| {
+        let width = of.camera.width as usize;
+        (projection(&of.camera), width, of.depths(), of.sure_pixels(), of.counted_pixels())
+    };
+    let maps: Vec<_> = depth_maps.iter().map(map).collect();
+    let holds = |mean: DVec3| {
+        let mut shown = false;
+        for (seen, width, depth, sure, counted) in &maps {
+            let Some([u, v, z]) = seen(mean) else { continue };
+            let pixel = v as usize * width + u as usize;
+            if counted.as_ref().is_some_and(|counted| !counted[pixel]) {
+                continue;
+            }
+            let nearness = z / f64::from(depth[pixel]);
+            if sure[pixel] && nearness < 1. - NEAR {
+                return false;
+            }
+            shown |= !sure[pixel] || nearness < 1. + NEAR;
+        }
+        shown
+    };
+    (0..means.len() / 3).filter(|&i| holds(DVec3::from_slice(&means[3 * i..]))).map(|i| i as i64).collect()
 }
 
 /// Returns `points` without those that photos show only where they are masked out.
@@ -205,6 +258,40 @@ fn raw(gaussians: &[IsotropicGaussian]) -> RawGaussians {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scene::Camera;
+    use glam::DMat4;
+
+    /// Gaussians that contradict the photos are removed. Two cameras are sure of a wall at depth 4, the second only in the left half of its
+    /// image.
+    #[test]
+    fn gaussians_that_contradict_photos_are_removed() {
+        let options = (Kind::Float, Device::Cpu);
+        let wall = |x: f64, sure_columns: i64| DepthMap {
+            camera: Camera {
+                c2w: DMat4::from_translation(DVec3::new(x, 0., 0.)),
+                ..DepthMap::flat(16, 16, 4.).camera
+            },
+            sure: Tensor::arange(16, options).lt(sure_columns as f64).expand([16, 16], false).contiguous(),
+            ..DepthMap::flat(16, 16, 4.)
+        };
+        let depth_maps = [wall(0., 16), wall(0.5, 8)];
+        let kept = |means: &[[f64; 3]]| {
+            let n = means.len() as i64;
+            let of = |shape: &[i64]| Tensor::zeros(shape, options);
+            let raw = RawGaussians {
+                means: Tensor::from_slice(means.as_flattened()).to_kind(Kind::Float).view([1, n, 3]),
+                log_scales: of(&[1, n, 3]),
+                quaternions: of(&[1, n, 4]),
+                opacity_logits: of(&[1, n]),
+                sh: of(&[1, n, 1, 3]),
+            };
+            supported(&raw, &depth_maps)
+        };
+        // The Gaussians are on the wall, in front of it, behind it, and outside both images.
+        assert_eq!(kept(&[[0., 0., 4.1], [0., 0., 2.], [0., 0., 9.], [30., 0., 4.]]), [0]);
+        // The first is behind the wall in one image, but the other camera isn't sure there, so it stays.
+        assert_eq!(kept(&[[3., 0., 9.], [3., 0., 2.]]), [0]);
+    }
 
     /// No Gaussian starts at a masked pixel, and points that photos show only there are left out.
     #[test]
@@ -227,5 +314,30 @@ mod tests {
         assert!(both.contains(&-1.));
         let left = both.iter().filter(|x| **x < 0.).count();
         assert!((50..85).contains(&left), "{left}");
+    }
+
+    /// Of known Gaussians, those are kept that don't contradict the photos and contribute the most, up to the requested number.
+    #[test]
+    fn the_most_visible_gaussians_are_kept() {
+        let options = (Kind::Float, Device::Cpu);
+        let wall = DepthMap {
+            sure: Tensor::ones([16, 16], (Kind::Bool, Device::Cpu)),
+            ..DepthMap::flat(16, 16, 4.)
+        };
+        // The first is in front of the wall, which a photo is sure of; the others are on it, and the last one is the largest.
+        let means = [[0f32, 0., 2.], [-0.5, 0., 4.], [0.5, 0., 4.]];
+        let known = RawGaussians {
+            means: Tensor::from_slice(means.as_flattened()).view([1, 3, 3]),
+            log_scales: Tensor::from_slice(&[-1f32, -2., -1.]).view([1, 3, 1]).repeat([1, 1, 3]),
+            quaternions: Tensor::from_slice(&[1f32, 0., 0., 0.]).repeat([1, 3, 1]),
+            opacity_logits: Tensor::zeros([1, 3], options),
+            sh: Tensor::zeros([1, 3, 1, 3], options),
+        };
+        for (count, expected) in [(0, &[][..]), (1, &[2]), (2, &[2, 1]), (9, &[2, 1])] {
+            let kept = most_visible(&known, std::slice::from_ref(&wall), count).unwrap();
+            assert!(kept.means.equal(&known.select(expected).means), "{count}");
+        }
+        let hidden = known.select(&[0]);
+        assert_eq!(most_visible(&hidden, &[wall], 5).unwrap().means.size(), [1, 0, 3]);
     }
 }

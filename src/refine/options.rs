@@ -29,11 +29,13 @@ const GAUSSIANS_PER_CORE_SECOND: f64 = 400.;
 const MAX_SECONDS_OF_GROWTH: f64 = 240.;
 /// Minimum number of pixels, in all photos together, for each Gaussian.
 const PIXELS_PER_GAUSSIAN: u64 = 24;
-/// Number of Gaussians of the paper's main model, the minimum of the default.
+/// Number of Gaussians of the paper's main model, the minimum of [`RefineOptions::gaussians_for`].
 pub(super) const MIN_GAUSSIANS: usize = 16_384;
-/// Maximum of the default number of Gaussians.
+/// Maximum of [`RefineOptions::gaussians_for`].
 const MAX_GAUSSIANS: usize = 1_000_000;
-/// Maximum default of the longer side of photos in pixels.
+/// Default of the longer side of photos in pixels, for the default number of Gaussians.
+const LONGEST_SIDE: u32 = 512;
+/// Longer side of photos in pixels for a large number of Gaussians.
 const LARGEST_SIDE: u32 = 1600;
 /// Maximum memory of the photos to match, unless their number is given. Smaller copies of them take a third as much again.
 const MAX_PHOTO_BYTES: u64 = 1280 << 20;
@@ -196,7 +198,7 @@ impl RefineOptions {
     ///
     /// # Errors
     /// Fails like [`RefineConfig::with`].
-    pub(super) fn config(&self, from_splat: bool) -> Result<RefineConfig> {
+    pub fn config(&self, from_splat: bool) -> Result<RefineConfig> {
         let mut config = RefineConfig::with(&self.set, from_splat)?;
         config.antialiased |= self.antialiased;
         Ok(config)
@@ -204,7 +206,7 @@ impl RefineOptions {
 
     /// Returns a number of Gaussians that suits the time budget, the number of cores, and the photos of `capture`. Without a time budget it
     /// depends on nothing.
-    pub(super) fn gaussians_for(&self, capture: &Capture) -> usize {
+    pub fn gaussians_for(&self, capture: &Capture) -> usize {
         let Budget::Time(time) = self.budget() else { return MIN_GAUSSIANS };
         let cores = std::thread::available_parallelism().map_or(1., |cores| cores.get() as f64);
         let by_time = GAUSSIANS_PER_CORE_SECOND * cores * time.as_secs_f64().min(MAX_SECONDS_OF_GROWTH);
@@ -217,20 +219,19 @@ impl RefineOptions {
         (by_time.min(by_pixels as f64) as usize).clamp(MIN_GAUSSIANS, MAX_GAUSSIANS)
     }
 
-    /// Returns the size of the photos for a number of Gaussians, by default the one that fits: fewer can't show more detail, and more pixels
-    /// take more time.
-    pub(super) fn size_for(&self, gaussians: usize) -> PhotoSize {
-        self.size.unwrap_or(PhotoSize::Within(match gaussians {
-            ..=25_000 => 512,
+    /// Returns the size of the photos for a number of Gaussians: fewer can't show more detail, and more pixels take more time.
+    pub fn size_for(gaussians: usize) -> PhotoSize {
+        PhotoSize::Within(match gaussians {
+            ..=25_000 => LONGEST_SIDE,
             25_001..=250_000 => 1024,
             _ => LARGEST_SIDE,
-        }))
+        })
     }
 
     /// Checks that every option is in its range.
     ///
     /// # Errors
-    /// Fails if one isn't, or like [`RefineConfig::with`].
+    /// Fails if one isn't, or like [`RefineOptions::config`].
     pub fn check(&self) -> Result<()> {
         self.config(false)?;
         // NaN is refused, too.
@@ -288,8 +289,14 @@ impl RefineOptions {
 
 /// Minimum time for the optimization, however long the start took.
 const MIN_TIME: Duration = Duration::from_secs(1);
+/// Maximum fraction of the time for computing depths, beyond the first `FEW_PHOTOS` photos.
+const MAX_START_SHARE: f64 = 0.5;
+/// Number of photos whose depths are computed regardless of the time budget.
+const FEW_PHOTOS: usize = 2;
 /// Maximum fraction of the time for scores during the optimization.
 const MAX_SCORING_SHARE: f64 = 0.03;
+/// Maximum fraction of the time for scoring whole held-out views before the optimization, and again for scoring them after it.
+const MAX_WHOLE_SCORING_SHARE: f64 = 0.05;
 /// Estimated time for writing the splat and ending the program: a constant, and the time per Gaussian.
 const WRITING_TIME: Duration = Duration::from_millis(200);
 const WRITING_TIME_PER_GAUSSIAN: Duration = Duration::from_micros(2);
@@ -300,11 +307,11 @@ pub(super) struct TimeBudget {
     budget: Budget,
     clock: Instant,
     /// Time for work after the optimization.
-    reserve: Duration,
-    /// Time that scores of held-out views took during the optimization.
+    pub reserve: Duration,
+    /// Time that scores took during the optimization.
     scoring: Duration,
-    /// Time of the last of these scores.
-    last_scoring: Duration,
+    /// Time of the last of these scores; before the first, its expected time.
+    pub last_scoring: Duration,
 }
 
 impl TimeBudget {
@@ -318,9 +325,22 @@ impl TimeBudget {
         self.clock.elapsed()
     }
 
-    /// Reserves the time of writing a splat of `count` Gaussians, and of scoring photos again, which took `scoring`.
-    pub fn reserve(&mut self, count: i64, scoring: Duration) {
-        self.reserve = WRITING_TIME + WRITING_TIME_PER_GAUSSIAN * count as u32 + scoring;
+    /// Returns the time since the clock began in seconds.
+    pub fn seconds(&self) -> f64 {
+        self.elapsed().as_secs_f64()
+    }
+
+    /// Reserves the time of writing a splat of `count` Gaussians.
+    pub fn reserve_for_writing(&mut self, count: i64) {
+        self.reserve += WRITING_TIME + WRITING_TIME_PER_GAUSSIAN * count as u32;
+    }
+
+    /// Returns `true` if the depths of `done` photos have to be enough.
+    pub fn is_late_for_depths(&self, done: usize) -> bool {
+        match self.budget {
+            Budget::Steps(_) => false,
+            Budget::Time(time) => done >= FEW_PHOTOS && self.elapsed() > time.mul_f64(MAX_START_SHARE),
+        }
     }
 
     /// Returns a warning if reading the photos and the start left little or no time for the optimization.
@@ -333,9 +353,19 @@ impl TimeBudget {
         })
     }
 
+    /// Returns the interval between the held-out views that there is time to score as a whole, if all would take `all`.
+    pub fn affordable_every(&self, all: Duration) -> usize {
+        match self.budget {
+            Budget::Steps(_) => 1,
+            Budget::Time(time) => {
+                all.div_duration_f64(time.mul_f64(MAX_WHOLE_SCORING_SHARE)).ceil().max(1.) as usize
+            }
+        }
+    }
+
     /// Returns `true` if another scoring keeps the total time of scoring below its maximum fraction of the time since the clock began.
     pub fn may_score(&self) -> bool {
-        self.scoring + self.last_scoring <= self.elapsed().mul_f64(MAX_SCORING_SHARE)
+        (self.scoring + self.last_scoring).as_secs_f64() <= MAX_SCORING_SHARE * self.seconds()
     }
 
     /// Adds the time of a scoring during the optimization.
@@ -344,12 +374,11 @@ impl TimeBudget {
         self.scoring += time;
     }
 
-    /// Returns the budget of an optimization that continues one of `optimized`, for which `earlier` was spent in all. The last scores are
-    /// those of the result.
+    /// Returns the budget of an optimization that continues one of `optimized`, for which `earlier` was spent in all.
     pub fn remaining(&self, optimized: Duration, earlier: Duration) -> Budget {
         match self.budget {
             Budget::Time(time) => {
-                let used = self.reserve + self.last_scoring + self.elapsed() + earlier;
+                let used = self.reserve + self.elapsed() + earlier;
                 Budget::Time(optimized + time.saturating_sub(used).max(MIN_TIME.min(time)))
             }
             steps => steps,
@@ -383,63 +412,64 @@ mod tests {
         }
     }
 
-    /// Returns a capture of `count` photos along a line.
-    fn walk(width: u32, height: u32, count: i32) -> Capture {
-        let k = f64::from(width);
-        let intrinsics = Intrinsics { fx: k, fy: k, cx: k / 2., cy: f64::from(height) / 2. };
-        let camera = |index: i32| {
-            let c2w = DMat4::from_translation(DVec3::X * f64::from(index));
-            Camera { intrinsics, c2w, width, height }
-        };
-        let cameras: Vec<Camera> = (0..count).map(camera).collect();
-        Capture::from_source("walk".into(), "".into(), &cameras, Arc::new(NoImages)).unwrap()
-    }
-
     #[test]
     fn large_captures_are_limited_to_what_fits_into_memory() {
-        let capture = walk(1600, 1200, 2000);
-        let every_8 = Holdout::Every { every: 8, first: 0 };
-        // Photos of 1024×768 pixels take 4 bytes for each.
-        let limited = Some("walk: 426 of 1750 photos are matched and 85 of 250 scored");
+        let intrinsics = Intrinsics { fx: 1600., fy: 1600., cx: 800., cy: 600. };
+        let camera = |index: i32| {
+            let c2w = DMat4::from_translation(DVec3::X * f64::from(index));
+            Camera { intrinsics, c2w, width: 1600, height: 1200 }
+        };
+        let cameras: Vec<Camera> = (0..2000).map(camera).collect();
+        let capture = Capture::from_source("walk".into(), "".into(), &cameras, Arc::new(NoImages)).unwrap();
+        let options = RefineOptions { holdout: Holdout::Every { every: 8, first: 0 }, ..Default::default() };
+        let ([shown, held_out], warning) = options.select_views(&capture, PhotoSize::Within(1024));
+        // 1024×768 pixels of 4 bytes each.
+        let each = 4 * 1024 * 768;
+        assert_eq!((shown.len(), held_out.len()), ((1280 << 20) / each, (256 << 20) / each));
+        let line = warning.unwrap();
+        assert!(line.starts_with("walk: 426 of 1750 photos are matched and 85 of 250 scored"), "{line}");
         let small = PhotoSize::Exactly([96, 128].into());
-        for (holdout, views, size, counts, expected) in [
-            (every_8, None, PhotoSize::Within(1024), [426, 85], limited),
-            (every_8, None, small, [1750, 250], None),
-            (Holdout::None, Some(500), PhotoSize::Within(1024), [500, 0], None),
-        ] {
-            let options = RefineOptions { holdout, views, ..Default::default() };
-            let (selected, warning) = options.select_views(&capture, size);
-            assert_eq!(selected.map(|views| views.len()), counts);
-            let is_expected = |line: &String| expected.is_some_and(|expected| line.starts_with(expected));
-            assert!(
-                warning.iter().all(is_expected) && warning.is_some() == expected.is_some(),
-                "{warning:?}"
-            );
-        }
+        let ([shown, held_out], warning) = options.select_views(&capture, small);
+        assert_eq!((shown.len(), held_out.len(), warning), (1750, 250, None));
+        let all = RefineOptions { views: Some(500), holdout: Holdout::None, ..options };
+        let ([shown, held_out], warning) = all.select_views(&capture, PhotoSize::Within(1024));
+        assert_eq!((shown.len(), held_out.len(), warning), (500, 0, None));
     }
 
     #[test]
     fn the_number_of_gaussians_grows_if_there_is_time() {
-        for (steps, count, expected) in [(None, 16_384, 3277), (Some(500), 101, 21), (Some(499), 101, 101)] {
-            let options = RefineOptions { steps, ..Default::default() };
-            assert_eq!(options.initial_gaussians(count, &RefineConfig::default()), expected);
-        }
+        let initial = |steps, count| {
+            RefineOptions { steps, ..Default::default() }.initial_gaussians(count, &RefineConfig::default())
+        };
+        assert_eq!(initial(None, 16_384), 3277);
+        assert_eq!(initial(Some(500), 101), 21);
+        assert_eq!(initial(Some(499), 101), 101);
     }
 
     #[test]
     fn the_number_of_gaussians_suits_time_and_photos() {
-        let (large, small) = (walk(1000, 1000, 50), walk(256, 256, 9));
+        let capture = |width: u32, count: i32| {
+            let k = f64::from(width);
+            let intrinsics = Intrinsics { fx: k, fy: k, cx: k / 2., cy: k / 2. };
+            let camera = |index: i32| {
+                let c2w = DMat4::from_translation(DVec3::X * f64::from(index));
+                Camera { intrinsics, c2w, width, height: width }
+            };
+            let cameras: Vec<Camera> = (0..count).map(camera).collect();
+            Capture::from_source("walk".into(), "".into(), &cameras, Arc::new(NoImages)).unwrap()
+        };
         let after = |seconds: f64, capture: &Capture| {
             RefineOptions { seconds, ..RefineOptions::default() }.gaussians_for(capture)
         };
+        let (large, small) = (capture(1000, 50), capture(256, 9));
         let minute = after(60., &large);
         assert!((16_384..=1_000_000).contains(&minute));
+        assert!(after(120., &large) == (2 * minute).min(1_000_000) || minute == 16_384, "{minute}");
         assert_eq!(after(1., &large), 16_384);
         // After four minutes more time is for more steps.
-        for (seconds, factor) in [(120., 2), (240., 4), (100_000., 4)] {
-            let count = after(seconds, &large);
-            assert!(count == (factor * minute).min(1_000_000) || minute == 16_384, "{minute} {count}");
-        }
+        let most = after(240., &large);
+        assert!(most == (4 * minute).min(1_000_000) || minute == 16_384, "{minute} {most}");
+        assert_eq!(after(100_000., &large), most);
         // A Gaussian for 24 pixels.
         assert_eq!(after(100_000., &small), 256 * 256 * 9 / 24);
         let steps = RefineOptions { steps: Some(100_000), ..RefineOptions::default() };
@@ -452,6 +482,7 @@ mod tests {
         assert!(default().check().is_ok());
         for (options, expected) in [
             (RefineOptions { set: vec!["views=0".into()], ..default() }, "views=0: expected 1 or more"),
+            (RefineOptions { seconds: 0., ..default() }, "seconds is 0, expected more than 0"),
             (RefineOptions { seconds: f64::NAN, ..default() }, "seconds is NaN, expected more than 0"),
             (RefineOptions { gaussians: Some(0), ..default() }, "gaussians is 0, expected 1 or more"),
             (RefineOptions { views: Some(1), ..default() }, "views is 1, expected 2 or more"),

@@ -2,34 +2,34 @@
 //! few views during the optimization. All of it shares one budget and uses a local frame of the capture (spec 2.5).
 
 use super::config::RefineConfig;
-use super::events::{EvalPoint, RefineEvent};
+use super::corrections::{Correction, Corrections};
+use super::events::{EvalPoint, RefineEvent, RefineMetrics, ViewSample, summarize_names};
 use super::exposures::LogGains;
 use super::gaussian_optimizer::GaussianOptimizer;
-use super::init::{PhotoInit, SceneInit, gaussians_from_photos};
+use super::init::{PhotoInit, SceneInit, gaussians_from_photos, most_visible};
 use super::options::{Budget, ExposureCorrection, RefineOptions, TimeBudget};
-use super::photo_opt::{Correction, PhotoOpt};
-use super::photos::{Photos, distinct, load_photos, longest_side};
+use super::photos::{Photos, distinct, load_photos};
 use super::state::{Record, RefineState};
 use super::{OptimizeArgs, refine, scene_depth};
 use crate::data::{Capture, PhotoSize, Point, View, read_points};
-use crate::device::Stopwatch;
 use crate::error::{Error, Result};
 use crate::io::Splat;
-use crate::metrics::{CaptureScores, ContactSheet, Scores, score_views};
-use crate::scene::{Gaussians, LocalFrame, RawGaussians};
+use crate::metrics::{CaptureScores, ContactSheet, Perceptual, Scores, score_views};
+use crate::reconstruct::{LoadedModel, Model, reconstruct, spread_over_path};
+use crate::scene::{Camera, Gaussians, LocalFrame, RawGaussians};
 use crate::stereo::DepthMap;
-use std::path::PathBuf;
-use std::time::Instant;
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
 use tch::Tensor;
 
+/// Divisor of the maximum number of initial Gaussians of a model: 1/`MODEL_SHARE` of all.
+const MODEL_SHARE: usize = 3;
 /// Number of steps between metrics.
 const METRICS_EVERY: u64 = 50;
-/// Fractions of the optimization at which the held-out views are scored, besides its start and its end.
-const EVAL_FRACTIONS: [f64; 11] = [0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
-/// Maximum number of views in a sample.
-const MAX_SAMPLE: usize = 8;
-/// Maximum number of pixels of the held-out views in a sample, if there are more than two.
-const MAX_SAMPLE_PIXELS: u64 = 1_200_000;
+/// Maximum number of photos that LPIPS compares if no views are held out.
+const LPIPS_PHOTOS: usize = 8;
+/// Fractions of the optimization at which the held-out views are scored.
+const EVAL_FRACTIONS: [f64; 12] = [0., 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
 
 /// Result of a session.
 #[derive(Debug)]
@@ -38,26 +38,40 @@ pub struct RefineResult {
     pub splat: Splat,
     /// Initial Gaussians in the session's frame, on its device.
     pub initial: Gaussians,
-    /// Final Gaussians in the session's frame, on its device: the initial ones if they match the photos better than the optimized ones.
+    /// Final Gaussians in the session's frame, on its device.
     pub gaussians: Gaussians,
+    /// `true` if these are the initial Gaussians, which matched the photos better than the optimized ones.
+    pub is_initial: bool,
     /// Learned correction of each photo, if corrections were requested.
     pub corrections: Vec<Correction>,
     /// Number of steps done.
     pub steps: u64,
-    /// End of the optimization on the session's clock, in seconds.
-    pub seconds: f64,
+    /// Start and end of the optimization on the session's clock, in seconds.
+    pub seconds: [f64; 2],
     /// State from which [`SceneInit::State`] continues; `None` if the final Gaussians are the initial ones.
     pub state: Option<RefineState>,
-    /// Number of photos that the splat was matched to.
-    pub photos: usize,
     /// Scores of a sample of the photos before and after the optimization.
     pub shown: [Scores; 2],
-    /// Scores of a sample of the held-out views during the optimization. The last is that of the result.
+    /// Number of photos in this sample.
+    pub shown_photos: usize,
+    /// Scores of a sample of the held-out views during the optimization.
     pub curve: Vec<EvalPoint>,
+    /// Scores of the initial Gaussians on whole held-out views; `None` if there are none, or if the callback ended the scoring.
+    /// [`RefineSession::score_held_out`] also scores the final Gaussians.
+    pub held_out_before: Option<CaptureScores>,
+}
+
+/// Initial Gaussians of a session.
+struct Start {
+    gaussians: Gaussians,
+    /// Median depth of these Gaussians.
+    depth: f64,
+    /// Their optimizer; `None` if it begins with other Gaussians than a model's alone.
+    optimizer: Option<GaussianOptimizer>,
 }
 
 /// Refinement session: the photos and the state computed from them, in the local frame of the capture's cameras. Call
-/// [`RefineSession::load`], then [`RefineSession::run`].
+/// [`RefineSession::load`], then [`RefineSession::start`], then [`RefineSession::run`].
 ///
 /// ```no_run
 /// use globalsplat::data::{Holdout, open_capture};
@@ -77,6 +91,7 @@ pub struct RefineResult {
 ///     // `false` would end the work early.
 ///     true
 /// })?;
+/// session.start()?;
 /// let result = session.run()?;
 /// write_splat("room.ply".as_ref(), &result.splat)?;
 /// if let Some([before, after]) = session.score_held_out(&result)? {
@@ -92,15 +107,20 @@ pub struct RefineSession<'a> {
     /// Hyperparameters of the options. `antialiased` is also set for an initial splat or state that is antialiased.
     config: RefineConfig,
     /// Final number of Gaussians. A session that is ended early may have fewer.
-    pub(crate) gaussians: usize,
-    /// Size that the photos were loaded at.
-    pub(crate) size: PhotoSize,
+    gaussians: usize,
+    size: PhotoSize,
     time: TimeBudget,
     on_event: Box<dyn FnMut(RefineEvent) -> bool + 'a>,
     is_stopped: bool,
     frame: LocalFrame,
     photos: Vec<View>,
     held_out: Vec<View>,
+    /// Views among `scored` that are scored during the optimization.
+    held_out_sample: ViewSample,
+    /// Held-out views that there is time to score as a whole.
+    scored: Vec<View>,
+    start: Option<Start>,
+    near_duplicates: usize,
     /// Depths of some photos, if Gaussians were created from them.
     depth_maps: Vec<DepthMap>,
     /// Initial exposures of the photos, if they are corrected.
@@ -114,8 +134,7 @@ impl<'a> RefineSession<'a> {
     /// progress events and ends the work if it returns `false`.
     ///
     /// # Errors
-    /// Fails if an option is out of range, if a photo can't be read or has fewer than [`MIN_SIDE`](crate::data::MIN_SIDE) pixels along a
-    /// side, and if `on_event` ends the work before all photos are read.
+    /// Fails if an option is out of range, like [`load_photos`], and if `on_event` ends the work before all photos are read.
     pub fn load(
         capture: &'a Capture,
         options: &'a RefineOptions,
@@ -128,28 +147,35 @@ impl<'a> RefineSession<'a> {
         let (gaussians, size) = init.sizes(capture, options);
         let ([shown, held_out], warning) = options.select_views(capture, size);
         if let Some(line) = warning {
-            on_event(RefineEvent::Warning(&line));
+            let _ = on_event(RefineEvent::Warning(&line));
         }
         let count = shown.len() + held_out.len();
         let mut should_continue = |done: usize| on_event(RefineEvent::Loading { done, count });
         let mut photos = load_photos(capture, &shown, size, &mut should_continue)?;
         let mut held_out =
             load_photos(capture, &held_out, size, |done| should_continue(photos.len() + done))?;
-        let masked_out: Vec<String> = [&mut photos, &mut held_out]
-            .into_iter()
-            .flat_map(|views| views.extract_if(.., |view| view.is_masked_out()))
-            .map(|view| view.name)
-            .collect();
+        let frame = LocalFrame::from_cameras(&capture.cameras());
+        let masked_out = [&mut photos, &mut held_out].map(|views| {
+            let masked_out = views.extract_if(.., |view| view.is_masked_out());
+            masked_out.map(|view| view.name).collect::<Vec<String>>()
+        });
+        let masked_out = masked_out.concat();
         if photos.is_empty() {
-            let expected = "some in every photo";
-            return Err(Error::input(capture.file(), "the masks", "no pixel that counts", expected));
+            return Err(Error::input(
+                capture.file(),
+                "the masks",
+                "no pixel that counts",
+                "some in every photo",
+            ));
         }
         if !masked_out.is_empty() {
-            let names = summarize_names(&masked_out);
-            let line = format!("{}: masked out as a whole, and left out: {names}", capture.name);
+            let line = format!(
+                "{}: masked out as a whole, and left out: {}",
+                capture.name,
+                summarize_names(&masked_out)
+            );
             on_event(RefineEvent::Warning(&line));
         }
-        let frame = LocalFrame::from_cameras(&capture.cameras());
         for view in photos.iter_mut().chain(&mut held_out) {
             view.camera = frame.camera_to_local(&view.camera);
         }
@@ -164,8 +190,12 @@ impl<'a> RefineSession<'a> {
             on_event: Box::new(on_event),
             is_stopped: false,
             frame,
+            held_out_sample: ViewSample::small(&[]),
             photos,
             held_out,
+            scored: vec![],
+            start: None,
+            near_duplicates: 0,
             depth_maps: vec![],
             log_exposures: None,
             steps: 0,
@@ -173,62 +203,236 @@ impl<'a> RefineSession<'a> {
         })
     }
 
-    /// Creates the initial Gaussians, optimizes them, and scores a sample of the photos before and after. Near duplicates are left out of
-    /// the photos.
+    /// Returns the number of Gaussians that the optimization ends with if it isn't ended early.
+    pub fn gaussians(&self) -> usize {
+        self.gaussians
+    }
+
+    /// Returns the size that the photos were loaded at.
+    pub fn size(&self) -> PhotoSize {
+        self.size
+    }
+
+    /// Returns the photos that the splat has to match, in the session's frame. After [`RefineSession::start`], near duplicates are removed.
+    pub fn photos(&self) -> &[View] {
+        &self.photos
+    }
+
+    /// Returns the held-out views, in the session's frame.
+    pub fn held_out(&self) -> &[View] {
+        &self.held_out
+    }
+
+    /// Returns the views that represent the splat's quality, in the session's frame: the held-out views if there are any, else the photos.
+    fn representative_views(&self) -> &[View] {
+        if self.held_out.is_empty() { &self.photos } else { &self.held_out }
+    }
+
+    /// Returns the number of photos that were left out as near duplicates.
+    pub fn near_duplicates(&self) -> usize {
+        self.near_duplicates
+    }
+
+    /// Reserves a further part of the time budget for work after the optimization. Writing the splat and scoring the held-out views are
+    /// provided for already.
+    pub fn reserve(&mut self, time: Duration) {
+        self.time.reserve += time;
+    }
+
+    /// Reserves the time of [`RefineSession::contact_sheet`], estimated by rendering one row of `gaussians`.
+    ///
+    /// # Errors
+    /// Fails if rendering fails.
+    pub fn reserve_for_contact_sheet(&mut self, gaussians: &Gaussians) -> Result<()> {
+        let views = self.representative_views();
+        let begun = Instant::now();
+        let _ = ContactSheet::render(gaussians, &views[..1])?;
+        let time = begun.elapsed() * views.len() as u32;
+        self.reserve(time);
+        Ok(())
+    }
+
+    /// Creates the initial Gaussians, and returns them in the session's frame on its device. Near duplicates are removed from the photos.
     ///
     /// # Errors
     /// Fails if the model or the rasterizer fails, if no camera sees the splat, or if `on_event` ends the work before there are Gaussians.
+    pub fn start(&mut self) -> Result<Gaussians> {
+        let mut warnings = vec![];
+        let RefineOptions { correct_exposures, device, .. } = *self.options;
+        let final_count = if self.init.is_splat() { 0 } else { self.gaussians as i64 };
+        // Gaussians of a new optimizer, or the optimizer of a state.
+        let (mut raw, mut optimizer) = (None, None);
+        let gaussians = match self.init {
+            SceneInit::Splat(splat) => {
+                self.config.antialiased |= splat.antialiased;
+                let local = Gaussians::from_splat(splat).to_local(&self.frame, splat.origin);
+                let local = raw.insert(RawGaussians::from_gaussians(&local.to_device(device)));
+                Gaussians { antialiased: splat.antialiased, ..local.activate() }
+            }
+            SceneInit::State(state) => {
+                self.config.antialiased |= state.record.antialiased;
+                if state.record.has_depths {
+                    let _ = self.gaussians_from_photos(self.initial_count())?.ok_or_else(stopped)?;
+                }
+                if correct_exposures == ExposureCorrection::Auto {
+                    self.log_exposures = state.has_exposures().then(|| self.equal_exposures());
+                }
+                let known = GaussianOptimizer::from_state(state, &self.config, final_count, device)?;
+                optimizer.insert(known).averaged_gaussians()
+            }
+            SceneInit::Model(loaded) => self.reconstruct(loaded)?,
+            SceneInit::Photos => {
+                if self.photos.len() < 2 {
+                    let why = "one photo gives no depth: expected two or more, or an initial splat";
+                    return Err(Error::request(why));
+                }
+                if self.are_in_one_place() {
+                    let line = "the photos were all taken from one position, so that depth can't be estimated: everything is placed at one distance";
+                    warnings.push(format!("{}: {line}", self.capture.name));
+                }
+                let new = self.gaussians_from_photos(self.initial_count())?.ok_or_else(stopped)?;
+                warnings.extend(self.exposure_warning());
+                Gaussians { antialiased: self.config.antialiased, ..raw.insert(new).activate() }
+            }
+        };
+        if correct_exposures == ExposureCorrection::On && self.log_exposures.is_none() {
+            self.log_exposures = Some(self.equal_exposures());
+        }
+        let depth = match self.init {
+            SceneInit::State(state) => state.record.depth,
+            _ => scene_depth(&gaussians, &self.photos)?,
+        };
+        warnings.extend(self.leave_out_near_duplicates(depth));
+        if let SceneInit::State(state) = self.init {
+            self.check_state(state)?;
+        }
+        warnings.iter().for_each(|line| self.warn(line));
+        let new = || Some(GaussianOptimizer::new(raw.as_ref()?, depth, &self.config, final_count));
+        let optimizer = optimizer.or_else(new);
+        self.start = Some(Start { gaussians: gaussians.map(Tensor::shallow_clone), depth, optimizer });
+        Ok(gaussians)
+    }
+
+    /// Returns the reconstruction of the photos by a model.
+    fn reconstruct(&self, loaded: &LoadedModel) -> Result<Gaussians> {
+        let data = &loaded.config.data;
+        let all: Vec<usize> = (0..self.photos.len()).collect();
+        let count = self.options.views.unwrap_or(data.context_views);
+        let context = spread_over_path(&self.cameras(), &all, count)
+            .into_iter()
+            .map(|index| self.photos[index].fitted(data.image_size))
+            .collect::<Result<Vec<_>>>()?;
+        // The optimization fits the colors, too.
+        let mut config = loaded.config.clone();
+        config.data.color_steps = 0;
+        let model = Model { config: &config, ..loaded.into() };
+        Ok(reconstruct(model, &context, &[])?.in_world().to_device(self.options.device))
+    }
+
+    /// Returns the number of Gaussians to create from photos.
+    fn initial_count(&self) -> usize {
+        self.options.initial_gaussians(self.gaussians, &self.config)
+    }
+
+    /// Scores the result of [`RefineSession::start`] on the held-out views, optimizes it, and scores a sample of the photos before and
+    /// after.
+    ///
+    /// # Errors
+    /// Fails if rendering fails.
+    ///
+    /// # Panics
+    /// Panics if [`RefineSession::start`] was not called before.
     pub fn run(&mut self) -> Result<RefineResult> {
-        let mut optimizer = self.initialize()?;
-        let initial = optimizer.averaged_gaussians();
-        let mut photo_opt = self.photo_opt(optimizer.depth)?;
+        let Start { gaussians: initial, depth, optimizer } =
+            self.start.take().expect("a session that was started");
+        self.scored = self.affordable_views(&initial)?;
+        self.held_out_sample = ViewSample::small(&self.scored);
+        let scoring = Instant::now();
+        let held_out_before = self.score_whole(&initial, &self.scored_views(), None)?;
+        self.reserve(scoring.elapsed());
+        self.time.reserve_for_writing(initial.count().max(self.gaussians as i64));
         let begun_scoring = Instant::now();
-        let before = self.score_photos(&initial, &photo_opt)?;
-        self.time.reserve(optimizer.count().max(self.gaussians as i64), begun_scoring.elapsed());
-        self.add_eval_point(&initial)?;
+        let sample = ViewSample::large(&self.photos);
+        let before = sample.corrected(&self.corrections(depth)?).score(&initial)?.expect("photos");
+        let time = begun_scoring.elapsed();
+        self.reserve(time);
+        self.time.last_scoring = time.mul_f64(self.held_out_sample.len() as f64 / sample.len() as f64);
         if let Some(line) = self.time.late_start_warning() {
             self.warn(&line);
         }
-        let (optimized, state) = self.optimize(&mut optimizer, &mut photo_opt)?;
-        let seconds = self.time.elapsed().as_secs_f64();
-        let after = self.score_photos(&optimized, &photo_opt)?;
-        let is_worse = after.psnr.is_nan() || after.psnr < before.psnr;
-        if is_worse && self.steps > 0 {
-            self.warn("the initial splat reproduces the photos better: it is kept");
+        if matches!(self.init, SceneInit::Model(_)) {
+            self.add_eval_point(&initial)?;
         }
-        let gaussians = if is_worse { initial.map(Tensor::shallow_clone) } else { optimized };
+        let begun = self.time.seconds();
+        let (gaussians, learned, state) = if self.is_stopped {
+            (initial.map(Tensor::shallow_clone), Corrections::none(), None)
+        } else {
+            let (gaussians, learned, state) = self.optimize(&initial, optimizer, depth)?;
+            (gaussians, learned, Some(state))
+        };
+        let ended = self.time.seconds();
+        let after = sample.corrected(&learned).score(&gaussians)?.expect("photos");
+        let is_initial = after.psnr.is_nan() || after.psnr < before.psnr;
+        let corrections =
+            if learned.has_any() && !is_initial { learned.report(&self.photos) } else { vec![] };
+        let gaussians = if is_initial { initial.map(Tensor::shallow_clone) } else { gaussians };
         let splat = match self.init {
-            SceneInit::Splat(splat) if is_worse => Splat { warnings: vec![], ..splat.clone() },
+            SceneInit::Splat(splat) if is_initial => Splat { warnings: vec![], ..splat.clone() },
             _ => gaussians.to_world_units(&self.frame).to_splat(self.frame.origin)?,
         };
-        self.add_eval_point(&gaussians)?;
         Ok(RefineResult {
             splat,
             initial,
             gaussians,
-            state: Some(state).filter(|_| !is_worse),
-            corrections: if is_worse { vec![] } else { photo_opt.report(&self.photos) },
+            is_initial,
+            state: state.filter(|_| !is_initial),
+            corrections,
             steps: self.steps,
-            seconds,
-            photos: self.photos.len(),
-            shown: [before, if is_worse { before } else { after }],
+            seconds: [begun, ended],
+            shown_photos: sample.len(),
+            shown: if is_initial { [before; 2] } else { [before, after] },
             curve: std::mem::take(&mut self.curve),
+            held_out_before,
         })
     }
 
-    /// Scores a result on all held-out views, before and after the optimization. Returns `None` if no views are held out, or if `on_event`
-    /// ends the scoring.
+    /// Scores a result on whole held-out views: those that [`RefineSession::run`] scored before the optimization. With a time budget there
+    /// may be fewer than all. Returns the scores before and after the optimization; `None` if no views are held out, or if `on_event` ended
+    /// the scoring.
     ///
     /// # Errors
     /// Fails if rendering fails.
     pub fn score_held_out(&mut self, result: &RefineResult) -> Result<Option<[CaptureScores; 2]>> {
-        let mut score = |gaussians: &Gaussians| -> Result<Option<CaptureScores>> {
-            let should_continue = |done| (self.on_event)(RefineEvent::Scoring(done));
-            let name = &self.capture.name;
-            let scores = score_views(name, gaussians, &self.held_out, None, should_continue)?;
-            Ok(scores.filter(|scores| scores.views.len() == self.held_out.len()))
+        let before = result.held_out_before.clone();
+        let after = if result.is_initial {
+            before.clone()
+        } else {
+            self.score_whole(&result.gaussians, &self.scored_views(), None)?
         };
-        Ok(score(&result.initial)?.zip(score(&result.gaussians)?).map(<[CaptureScores; 2]>::from))
+        Ok(before.zip(after).map(<[CaptureScores; 2]>::from))
+    }
+
+    /// Returns the mean scores of the sample of [`EvalPoint`], given the scores of all views by [`RefineSession::score_held_out`].
+    pub fn sample_scores(&self, scores: &CaptureScores) -> Scores {
+        self.held_out_sample.select_scores(scores)
+    }
+
+    /// Scores the initial and the final Gaussians by LPIPS, with the networks whose weights are installed: on all held-out views, or on a
+    /// few photos if no views are held out. Returns `None` if `on_event` ends the scoring.
+    ///
+    /// # Errors
+    /// Fails if rendering fails, or if a file of weights is invalid.
+    pub fn score_lpips(&mut self, result: &RefineResult) -> Result<Option<[CaptureScores; 2]>> {
+        let perceptual = Perceptual::find(result.initial.means.device())?;
+        let count = if self.held_out.is_empty() { LPIPS_PHOTOS } else { self.held_out.len() };
+        let views: Vec<View> =
+            self.representative_views().iter().take(count).map(View::shallow_clone).collect();
+        let before = self.score_whole(&result.initial, &views, Some(&perceptual))?;
+        let after = self.score_whole(&result.gaussians, &views, Some(&perceptual))?;
+        if let Some(line) = after.as_ref().and_then(|after| perceptual.explain_missing(&after.mean)) {
+            self.warn(&line);
+        }
+        Ok(before.zip(after).map(<[CaptureScores; 2]>::from))
     }
 
     /// Renders the held-out views, or else the photos, beside their photos: a row per view.
@@ -236,202 +440,44 @@ impl<'a> RefineSession<'a> {
     /// # Errors
     /// Fails if rendering fails.
     pub fn contact_sheet(&self, result: &RefineResult) -> Result<ContactSheet> {
-        let views = if self.held_out.is_empty() { &self.photos } else { &self.held_out };
-        ContactSheet::render(&result.gaussians, views)
+        ContactSheet::render(&result.gaussians, self.representative_views())
     }
 
-    /// Creates the optimizer of the initial Gaussians, or of those of a state.
-    fn initialize(&mut self) -> Result<GaussianOptimizer> {
-        let RefineOptions { correct_exposures, device, .. } = *self.options;
-        let final_count = if self.init.is_splat() { 0 } else { self.gaussians as i64 };
-        let count = self.options.initial_gaussians(self.gaussians, &self.config);
-        let mut antialiased = self.config.antialiased;
-        let raw = match self.init {
-            SceneInit::Splat(splat) => {
-                antialiased = splat.antialiased;
-                let local = Gaussians::from_splat(splat).to_local(&self.frame, splat.origin);
-                RawGaussians::from_gaussians(&local.to_device(device))
+    /// Returns an evenly spaced subset of the held-out views that can be scored within a time budget.
+    fn affordable_views(&mut self, gaussians: &Gaussians) -> Result<Vec<View>> {
+        let every = match self.options.budget() {
+            Budget::Time(_) if !self.held_out.is_empty() => {
+                let begun = Instant::now();
+                self.score_whole(gaussians, &[self.held_out[0].shallow_clone()], None)?;
+                self.time.affordable_every(begun.elapsed() * self.held_out.len() as u32)
             }
-            SceneInit::State(state) => {
-                self.config.antialiased |= state.record.antialiased;
-                if state.record.has_depths {
-                    self.gaussians_from_photos(count)?;
-                }
-                self.leave_out_near_duplicates(state.record.depth);
-                self.check_state(state)?;
-                let has_exposures = match correct_exposures {
-                    ExposureCorrection::Off => false,
-                    ExposureCorrection::Auto => state.has_exposures(),
-                    ExposureCorrection::On => true,
-                };
-                self.log_exposures = has_exposures.then(|| vec![[0.; 3]; self.photos.len()]);
-                return GaussianOptimizer::from_state(state, &self.config, final_count, device);
-            }
-            SceneInit::Photos => {
-                if self.photos.len() < 2 {
-                    let why = "one photo gives no depth: expected two or more, or an initial splat";
-                    return Err(Error::request(why));
-                }
-                let center = |view: &View| view.camera.c2w.w_axis;
-                if self.photos.iter().all(|view| center(view) == center(&self.photos[0])) {
-                    let line = "the photos were all taken from one position, so that depth can't be estimated: everything is placed at one distance";
-                    self.warn(&format!("{}: {line}", self.capture.name));
-                }
-                self.gaussians_from_photos(count)?
-            }
+            _ => 1,
         };
-        self.config.antialiased |= antialiased;
-        let depth = scene_depth(&Gaussians { antialiased, ..raw.activate() }, &self.photos)?;
-        self.leave_out_near_duplicates(depth);
-        if correct_exposures == ExposureCorrection::On && self.log_exposures.is_none() {
-            self.log_exposures = Some(vec![[0.; 3]; self.photos.len()]);
-        }
-        Ok(GaussianOptimizer::new(&raw, depth, &self.config, final_count))
+        Ok(self.held_out.iter().step_by(every).map(View::shallow_clone).collect())
     }
 
-    /// Creates `count` Gaussians on the session's device.
-    fn gaussians_from_photos(&mut self, count: usize) -> Result<RawGaussians> {
-        let to_local = |point: Point| Point { position: self.frame.point_to_local(point.position), ..point };
-        let points: Vec<Point> = read_points(self.capture)?.into_iter().map(to_local).collect();
-        let should_continue = |done: usize| {
-            self.is_stopped |= !(self.on_event)(RefineEvent::Starting(done));
-            !self.is_stopped
-        };
-        let RefineOptions { seed, correct_exposures: correction, .. } = *self.options;
-        let init = gaussians_from_photos(&self.photos, &points, count, seed, correction, should_continue);
-        let stopped = || Error::failed("stopped before there was a splat: nothing is written");
-        let PhotoInit { gaussians, depth_maps, log_exposures } = init.ok_or_else(stopped)?;
-        if let (Some(gains), ExposureCorrection::Auto) = (&log_exposures, correction) {
-            let factors = gains.as_flattened().iter().map(|gain| gain.exp());
-            let [min, max] = [factors.clone().fold(f64::MAX, f64::min), factors.fold(0., f64::max)];
-            let line = "the exposures of neighboring photos differ, and all are corrected";
-            self.warn(&format!("{}: {line}: {min:.2} to {max:.2} times the average", self.capture.name));
-        }
-        self.depth_maps = depth_maps;
-        self.log_exposures = log_exposures;
-        Ok(gaussians.to_device(self.options.device))
+    fn scored_views(&self) -> Vec<View> {
+        self.scored.iter().map(View::shallow_clone).collect()
     }
 
-    /// Removes near duplicates from the photos of a scene at `depth`, and names them.
-    fn leave_out_near_duplicates(&mut self, depth: f64) {
-        let all = self.photos.len();
-        let is_kept = distinct(&self.photos, depth);
-        let mut kept = is_kept.iter();
-        let left_out: Vec<String> = self
-            .photos
-            .extract_if(.., |_| !kept.next().expect("one for each photo"))
-            .map(|photo| photo.name)
-            .collect();
-        if let Some(exposures) = &mut self.log_exposures {
-            let mut kept = is_kept.iter();
-            exposures.retain(|_| *kept.next().expect("one for each photo"));
-        }
-        if !left_out.is_empty() {
-            let (name, count, names) = (&self.capture.name, left_out.len(), summarize_names(&left_out));
-            let line = "photos are nearly equal to others, and left out";
-            self.warn(&format!("{name}: {count} of {all} {line}: {names}"));
-        }
-    }
-
-    /// Returns the corrections with which the optimization begins, those of a state if it continues from one.
-    fn photo_opt(&self, depth: f64) -> Result<PhotoOpt> {
-        let (RefineOptions { correct_poses, device, .. }, config) = (self.options, &self.config);
-        let lr_poses = config.lr_poses_for(longest_side(&self.photos));
-        let config = RefineConfig { lr_poses, ..config.clone() };
-        let (count, exposures) = (self.photos.len(), self.log_exposures.as_deref());
-        let mut photo_opt = PhotoOpt::new(count, *correct_poses, exposures, depth, &config, *device);
-        if let SceneInit::State(state) = self.init {
-            photo_opt.load_state(state)?;
-        }
-        Ok(photo_opt)
-    }
-
-    /// Optimizes the Gaussians of `optimizer` and the corrections of the photos. Returns the Gaussians and the state.
-    fn optimize(
+    /// Scores Gaussians on whole views. Returns `None` if there are no views, or if `on_event` ends the scoring.
+    fn score_whole(
         &mut self,
-        optimizer: &mut GaussianOptimizer,
-        photo_opt: &mut PhotoOpt,
-    ) -> Result<(Gaussians, RefineState)> {
-        let (progress, earlier_total) = match self.init {
-            SceneInit::State(state) => (state.record.progress, state.record.total),
-            _ => Default::default(),
-        };
-        let budget = match self.is_stopped {
-            true => Budget::Steps(0),
-            false => self.time.remaining(progress.time, earlier_total),
-        };
-        let (config, photo_names) = (self.config.clone(), self.photo_names());
-        let args = OptimizeArgs {
-            photos: &Photos::new(&self.photos, &self.depth_maps, &config, self.options.device),
-            config: &config,
-            budget,
-            seed: self.options.seed,
-            background: self.options.mask_background,
-            progress,
-        };
-        let mut fractions = EVAL_FRACTIONS.iter().peekable();
-        let (mut is_due, mut failure) = (false, None);
-        let progress = refine(optimizer, photo_opt, &args, &mut Stopwatch::default(), |now| {
-            self.steps = now.step;
-            while fractions.next_if(|&&fraction| now.progress >= fraction).is_some() {
-                is_due = true;
-            }
-            if is_due && self.time.may_score() {
-                is_due = false;
-                failure = self.add_eval_point(&now.optimizer.averaged_gaussians()).err();
-            }
-            if now.step.is_multiple_of(METRICS_EVERY) {
-                let metrics = RefineEvent::Measured {
-                    steps: now.step,
-                    seconds: self.time.elapsed().as_secs_f64(),
-                    loss: now.loss.double_value(&[]),
-                    gaussians: now.optimizer.count(),
-                    learning_rate: now.optimizer.means_learning_rate(now.progress),
-                };
-                self.is_stopped |= !(self.on_event)(metrics);
-            }
-            let psnr = self.curve.last().map(|point| point.scores.psnr);
-            self.is_stopped |= !(self.on_event)(RefineEvent::Optimizing { steps: self.steps, psnr });
-            failure.is_none() && !self.is_stopped
-        })?;
-        if let Some(error) = failure {
-            return Err(error);
-        }
-        let record = Record {
-            photos: photo_names,
-            frame: self.frame_numbers(),
-            progress,
-            total: earlier_total + self.time.elapsed(),
-            depth: optimizer.depth,
-            has_depths: !self.depth_maps.is_empty(),
-            antialiased: config.antialiased,
-            from_splat: self.init.is_splat(),
-            growth: optimizer.growth,
-        };
-        let (gaussians, corrections) = (optimizer.state(), photo_opt.state());
-        let state = RefineState { record, gaussians, corrections, file: PathBuf::new() };
-        Ok((optimizer.averaged_gaussians(), state))
+        gaussians: &Gaussians,
+        views: &[View],
+        perceptual: Option<&Perceptual>,
+    ) -> Result<Option<CaptureScores>> {
+        let should_continue = |done| (self.on_event)(RefineEvent::Scoring(done));
+        let scores = score_views(&self.capture.name, gaussians, views, perceptual, should_continue)?;
+        Ok(scores.filter(|scores| scores.views.len() == views.len()))
     }
 
-    /// Returns an error if `state` is that of other photos or cameras, or if the budget has been used up already.
-    fn check_state(&self, state: &RefineState) -> Result<()> {
-        let Record { photos, frame, progress, total, .. } = &state.record;
-        if *frame != self.frame_numbers() || *photos != self.photo_names() {
-            let found = format!("that of another refinement, {} photos", photos.len());
-            let expected =
-                format!("that of the {} photos of this one, with the same poses", self.photos.len());
-            return Err(Error::input(&state.file, "the list of photos", found, expected));
-        }
-        let (used, expected) = match self.options.budget() {
-            Budget::Steps(steps) if steps <= progress.steps => {
-                (format!("{} steps", progress.steps), "more steps in all")
-            }
-            Budget::Time(time) if time <= *total => {
-                (format!("{:.0} s", total.as_secs_f64()), "more time in all")
-            }
-            _ => return Ok(()),
-        };
-        Err(Error::input(&state.file, "the refinement", format!("one of {used} already"), expected))
+    fn warn(&mut self, line: &str) {
+        let _ = (self.on_event)(RefineEvent::Warning(line));
+    }
+
+    fn cameras(&self) -> Vec<Camera> {
+        self.photos.iter().map(|photo| photo.camera).collect()
     }
 
     fn photo_names(&self) -> Vec<String> {
@@ -444,44 +490,218 @@ impl<'a> RefineSession<'a> {
         [x, y, z, self.frame.scale]
     }
 
-    /// Scores Gaussians on a sample of the photos, to which corrections are applied.
-    fn score_photos(&self, gaussians: &Gaussians, photo_opt: &PhotoOpt) -> Result<Scores> {
-        let views: Vec<View> =
-            sample(&self.photos, MAX_SAMPLE).map(|(index, view)| photo_opt.apply(index, view)).collect();
-        Ok(score_views("sample", gaussians, &views, None, |_| true)?.expect("at least one photo").mean)
+    fn are_in_one_place(&self) -> bool {
+        let center = |view: &View| view.camera.c2w.w_axis;
+        self.photos.iter().all(|view| center(view) == center(&self.photos[0]))
     }
 
-    /// Scores a sample of the held-out views, if there are any, and appends the scores to the curve.
+    /// Removes near duplicates from the photos. Returns a warning that names them, if there are any.
+    fn leave_out_near_duplicates(&mut self, depth: f64) -> Option<String> {
+        let keep = distinct(&self.photos, depth);
+        if keep.len() == self.photos.len() {
+            return None;
+        }
+        let mut is_kept = vec![false; self.photos.len()];
+        keep.iter().for_each(|&index| is_kept[index] = true);
+        let mut left_out = vec![];
+        let photos = std::mem::take(&mut self.photos);
+        for (photo, is_kept) in photos.into_iter().zip(is_kept) {
+            if is_kept { self.photos.push(photo) } else { left_out.push(photo.name) }
+        }
+        let kept = |all: Vec<LogGains>| keep.iter().map(|&index| all[index]).collect();
+        self.log_exposures = self.log_exposures.take().map(kept);
+        self.near_duplicates = left_out.len();
+        let (count, all) = (left_out.len(), left_out.len() + self.photos.len());
+        Some(format!(
+            "{}: {count} of {all} photos are nearly equal to others, and left out: {}",
+            self.capture.name,
+            summarize_names(&left_out)
+        ))
+    }
+
+    /// Creates `count` Gaussians on the session's device. Returns `None` if the work is ended before any photo has depths.
+    fn gaussians_from_photos(&mut self, count: usize) -> Result<Option<RawGaussians>> {
+        let to_local = |point: Point| Point { position: self.frame.point_to_local(point.position), ..point };
+        let points: Vec<Point> = read_points(self.capture)?.into_iter().map(to_local).collect();
+        let (time, on_event) = (&self.time, &mut self.on_event);
+        let mut is_stopped = false;
+        let should_continue = |done: usize| {
+            is_stopped |= !on_event(RefineEvent::Starting(done));
+            !is_stopped && !time.is_late_for_depths(done)
+        };
+        let RefineOptions { seed, correct_exposures: correction, .. } = *self.options;
+        let init = gaussians_from_photos(&self.photos, &points, count, seed, correction, should_continue);
+        self.is_stopped |= is_stopped;
+        let Some(PhotoInit { gaussians, depth_maps, log_exposures }) = init else { return Ok(None) };
+        self.depth_maps = depth_maps;
+        self.log_exposures = log_exposures;
+        Ok(Some(gaussians.to_device(self.options.device)))
+    }
+
+    /// Returns a line that says that exposures are corrected, if this was not requested.
+    fn exposure_warning(&self) -> Option<String> {
+        let gains = self.log_exposures.as_ref()?;
+        let factors = gains.as_flattened().iter().map(|gain| gain.exp());
+        let [min, max] = [factors.clone().fold(f64::MAX, f64::min), factors.fold(0., f64::max)];
+        (self.options.correct_exposures == ExposureCorrection::Auto).then(|| {
+            format!(
+                "{}: the exposures of neighboring photos differ, and all are corrected: {min:.2} to {max:.2} times the average",
+                self.capture.name
+            )
+        })
+    }
+
+    /// Returns the exposures of photos that don't differ.
+    fn equal_exposures(&self) -> Vec<LogGains> {
+        vec![[0.; 3]; self.photos.len()]
+    }
+
+    /// Returns the corrections with which the optimization begins, those of a state if it continues from one.
+    fn corrections(&self, depth: f64) -> Result<Corrections> {
+        let (RefineOptions { correct_poses, device, .. }, config) = (self.options, &self.config);
+        let (count, exposures) = (self.photos.len(), self.log_exposures.as_deref());
+        let sides = self.photos.iter().map(|photo| photo.camera.width.max(photo.camera.height));
+        let lr_poses = config.lr_poses_for(sides.max().unwrap_or(0));
+        let config = RefineConfig { lr_poses, ..config.clone() };
+        let mut corrections = Corrections::new(count, *correct_poses, exposures, depth, &config, *device);
+        if let SceneInit::State(state) = self.init {
+            corrections.load_state(state)?;
+        }
+        Ok(corrections)
+    }
+
+    /// Optimizes the Gaussians of `optimizer`, or those of a model and others, and the corrections of the photos. `depth` is the depth of the
+    /// `initial` Gaussians.
+    fn optimize(
+        &mut self,
+        initial: &Gaussians,
+        optimizer: Option<GaussianOptimizer>,
+        mut depth: f64,
+    ) -> Result<(Gaussians, Corrections, RefineState)> {
+        let mut optimizer = match optimizer {
+            Some(optimizer) => optimizer,
+            None => {
+                let raw = self.with_gaussians_from_photos(initial)?;
+                depth = scene_depth(&raw.activate(), &self.photos)?;
+                GaussianOptimizer::new(&raw, depth, &self.config, self.gaussians as i64)
+            }
+        };
+        let (RefineOptions { seed, device, .. }, config) = (self.options, self.config.clone());
+        let mut corrections = self.corrections(depth)?;
+        let (progress, earlier_total) = match self.init {
+            SceneInit::State(state) => (state.record.progress, state.record.total),
+            _ => Default::default(),
+        };
+        let photos = Photos::new(&self.photos, &self.depth_maps, &config, *device);
+        let budget = self.time.remaining(progress.time, earlier_total);
+        let background = self.options.mask_background;
+        let args = OptimizeArgs {
+            photos: &photos,
+            depth,
+            config: &config,
+            budget,
+            seed: *seed,
+            background,
+            progress,
+        };
+        let mut fractions = EVAL_FRACTIONS.iter().peekable();
+        let (mut is_due, mut failure) = (false, None);
+        let (gaussians, progress) = refine(&mut optimizer, &mut corrections, &args, |now| {
+            self.steps = now.step;
+            while fractions.next_if(|&&fraction| now.progress >= fraction).is_some() {
+                is_due = true;
+            }
+            if is_due && self.time.may_score() {
+                is_due = false;
+                failure = self.add_eval_point(&now.gaussians()).err();
+            }
+            if now.step.is_multiple_of(METRICS_EVERY) {
+                let metrics = RefineMetrics {
+                    step: now.step,
+                    seconds: self.time.seconds(),
+                    loss: now.loss(),
+                    gaussians: now.count(),
+                    learning_rate: now.means_learning_rate(),
+                };
+                self.is_stopped |= !(self.on_event)(RefineEvent::Measured(&metrics));
+            }
+            let psnr = self.curve.last().map(|point| point.scores.psnr);
+            self.is_stopped |= !(self.on_event)(RefineEvent::Optimizing { steps: self.steps, psnr });
+            failure.is_none() && !self.is_stopped
+        })?;
+        if let Some(error) = failure {
+            return Err(error);
+        }
+        let mut tensors = BTreeMap::new();
+        optimizer.add_to_state(&mut tensors);
+        corrections.add_to_state(&mut tensors);
+        let record = Record {
+            photos: self.photo_names(),
+            frame: self.frame_numbers(),
+            progress,
+            total: earlier_total + self.time.elapsed(),
+            depth,
+            has_depths: !self.depth_maps.is_empty(),
+            antialiased: config.antialiased,
+            from_splat: self.init.is_splat(),
+            growth: optimizer.growth(),
+        };
+        Ok((gaussians, corrections, RefineState::new(record, tensors)))
+    }
+
+    /// Returns an error if `state` is that of other photos or cameras, or if the budget has been used up already.
+    fn check_state(&self, state: &RefineState) -> Result<()> {
+        let Record { photos, frame, progress, total, .. } = &state.record;
+        if *frame != self.frame_numbers() || *photos != self.photo_names() {
+            let found = format!("that of another refinement, {} photos", photos.len());
+            let expected =
+                format!("that of the {} photos of this one, with the same poses", self.photos.len());
+            return Err(Error::input(state.file(), "the list of photos", found, expected));
+        }
+        let (used, expected) = match self.options.budget() {
+            Budget::Steps(steps) if steps <= progress.steps => {
+                (format!("{} steps", progress.steps), "more steps in all")
+            }
+            Budget::Time(time) if time <= *total => {
+                (format!("{:.0} s", total.as_secs_f64()), "more time in all")
+            }
+            _ => return Ok(()),
+        };
+        Err(Error::input(state.file(), "the refinement", format!("one of {used} already"), expected))
+    }
+
+    /// Returns the Gaussians of a model that the photos show best, and new ones at the depths on which the photos agree. As few as from photos
+    /// alone are faster to optimize, and grow to the requested number.
+    fn with_gaussians_from_photos(&mut self, gaussians: &Gaussians) -> Result<RawGaussians> {
+        let mut raw = RawGaussians::from_gaussians(gaussians);
+        if self.photos.len() < 2 {
+            return Ok(raw);
+        }
+        // Higher spherical harmonics are added later, for all Gaussians at the same time.
+        raw.sh = raw.sh.narrow(2, 0, 1);
+        let count = self.initial_count();
+        let of_model = count / MODEL_SHARE;
+        let Some(new) = self.gaussians_from_photos(count - of_model)? else { return Ok(raw) };
+        if let Some(line) = self.exposure_warning() {
+            self.warn(&line);
+        }
+        Ok(most_visible(&raw, &self.depth_maps, of_model)?.to_device(self.options.device).concat(&new))
+    }
+
+    /// Scores the sample of the held-out views, if there are any, and appends the scores to the curve.
     fn add_eval_point(&mut self, gaussians: &Gaussians) -> Result<()> {
         let begun = Instant::now();
-        let pixels = |view: &View| u64::from(view.camera.width) * u64::from(view.camera.height);
-        let largest = self.held_out.iter().map(pixels).max().unwrap_or(1);
-        let count = ((MAX_SAMPLE_PIXELS / largest) as usize).clamp(2, MAX_SAMPLE);
-        let views: Vec<View> = sample(&self.held_out, count).map(|(_, view)| view.shallow_clone()).collect();
-        if let Some(scores) = score_views("sample", gaussians, &views, None, |_| true)? {
-            let seconds = self.time.elapsed().as_secs_f64();
-            let point = EvalPoint { seconds, steps: self.steps, scores: scores.mean };
+        if let Some(scores) = self.held_out_sample.score(gaussians)? {
+            let point = EvalPoint { seconds: self.time.seconds(), steps: self.steps, scores };
             self.is_stopped |= !(self.on_event)(RefineEvent::Scored(&point));
             self.curve.push(point);
         }
         self.time.add_scoring(begun.elapsed());
         Ok(())
     }
-
-    fn warn(&mut self, line: &str) {
-        self.is_stopped |= !(self.on_event)(RefineEvent::Warning(line));
-    }
 }
 
-/// Returns at most `count` evenly spread views of all, with their indices. They are scored as a whole: a part of an image has other borders,
-/// near which large Gaussians are projected differently.
-fn sample(views: &[View], count: usize) -> impl Iterator<Item = (usize, &View)> {
-    views.iter().enumerate().step_by(views.len().div_ceil(count).max(1))
-}
-
-/// Returns the first few names, and the number of the others.
-fn summarize_names(all: &[String]) -> String {
-    const FEW: usize = 3;
-    let few = all[..all.len().min(FEW)].join(", ");
-    if all.len() > FEW { format!("{few} and {} more", all.len() - FEW) } else { few }
+/// Returns the error of a session that is ended before there is a result.
+fn stopped() -> Error {
+    Error::failed("stopped before there was a splat: nothing is written")
 }

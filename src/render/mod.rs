@@ -7,8 +7,8 @@ mod harmonics;
 mod views;
 
 pub use depth_colors::{DepthScale, colorize_depth, depth_colors};
-pub(crate) use edit::image_contributions;
 pub use edit::{EditedSplat, SplatEdit, contributions, edit_splat, move_cameras, transform};
+pub(crate) use edit::{image_contributions, largest_contributions};
 pub use globalsplat_csrc::runtime::libtorch_version;
 pub use harmonics::{compensate_mean_color, fit_harmonics, shrink_harmonics};
 pub use views::{RenderedView, SplatRenderer, orbit_around_gaussians, orbit_around_splat, render_views};

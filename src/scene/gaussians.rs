@@ -110,6 +110,27 @@ impl RawGaussians {
         self.map(|t| t.to_device(device))
     }
 
+    /// Returns the Gaussians `indices` of every scene.
+    pub fn select(&self, indices: &[i64]) -> Self {
+        let indices = Tensor::from_slice(indices).to_device(self.means.device());
+        self.map(|t| t.index_select(1, &indices))
+    }
+
+    /// Concatenates these Gaussians and `others` of the same scenes. The result has the higher of both degrees of spherical
+    /// harmonics.
+    pub fn concat(&self, others: &RawGaussians) -> Self {
+        let joined = |a: &Tensor, b: &Tensor| Tensor::cat(&[a, b], 1);
+        let bases = self.sh.size()[2].max(others.sh.size()[2]);
+        let padded = |sh: &Tensor| sh.constant_pad_nd([0, 0, 0, bases - sh.size()[2]]);
+        RawGaussians {
+            means: joined(&self.means, &others.means),
+            log_scales: joined(&self.log_scales, &others.log_scales),
+            quaternions: joined(&self.quaternions, &others.quaternions),
+            opacity_logits: joined(&self.opacity_logits, &others.opacity_logits),
+            sh: joined(&padded(&self.sh), &padded(&others.sh)),
+        }
+    }
+
     /// Returns every tensor with its name, as optimizers take them.
     pub fn named_parameters(&self) -> [(&'static str, &Tensor); 5] {
         [

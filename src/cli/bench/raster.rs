@@ -1,12 +1,11 @@
 //! Benchmark of the rasterizer: from tensors of Gaussians to images, and back to gradients.
 
 use super::measure::{Measured, TimingStats, Work};
-use crate::data::view_matrices;
 use crate::device::{Stopwatch, peak_memory_bytes_on, reset_peak_memory, resident_memory_bytes};
 use crate::error::Result;
 use crate::render::cpu::{StageTimes, simd_level, stage_times};
 use crate::render::{Cameras, RenderOutput, default_eps2d, render};
-use crate::scene::{Camera, Gaussians, ImageSize, Intrinsics};
+use crate::scene::{Gaussians, ImageSize};
 use glam::{DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -131,7 +130,7 @@ fn named_stages(times: StageTimes) -> [(&'static str, f64); 6] {
 pub fn synthetic_gaussians(count: usize, views: usize, size: ImageSize) -> (Gaussians, Cameras) {
     let mut random = ChaCha8Rng::seed_from_u64(0);
     let (width, height) = (f64::from(size.width), f64::from(size.height));
-    let focal = focal_length(size);
+    let focal = 0.9 * width.max(height);
     let scale_factor = (16_384. / count.max(1) as f64).sqrt();
     let [mut means, mut scales, mut quaternions, mut opacities, mut sh] = [(); 5].map(|()| Vec::<f32>::new());
     for _ in 0..count {
@@ -154,26 +153,30 @@ pub fn synthetic_gaussians(count: usize, views: usize, size: ImageSize) -> (Gaus
         sh: Tensor::from_slice(&sh).view([1, n, 16, 3]),
         antialiased: false,
     };
-    let [_, w2c, intrinsics] = view_matrices(&camera_path(views, size), Device::Cpu);
-    (gaussians, Cameras { w2c, intrinsics, width: size.width.into(), height: size.height.into() })
+    (gaussians, camera_path(views, focal, width, height))
 }
 
 /// Returns `views` cameras that move sideways and forward while they turn.
-pub fn camera_path(views: usize, size: ImageSize) -> Vec<Camera> {
-    let ImageSize { width, height } = size;
-    let camera = |i: usize| {
+fn camera_path(views: usize, focal: f64, width: f64, height: f64) -> Cameras {
+    let (mut w2c, mut intrinsics) = (vec![], vec![]);
+    for i in 0..views {
         let t = i as f64 / (views.max(2) - 1) as f64 - 0.5;
-        let (rotation, center) = (DQuat::from_rotation_y(-0.2 * t), DVec3::new(0.6 * t, 0., 0.2 * t));
-        let (focal, cx, cy) = (focal_length(size), f64::from(width) / 2., f64::from(height) / 2.);
-        let intrinsics = Intrinsics { fx: focal, fy: focal, cx, cy };
-        Camera { intrinsics, c2w: DMat4::from_rotation_translation(rotation, center), width, height }
+        let c2w = DMat4::from_rotation_translation(
+            DQuat::from_rotation_y(-0.2 * t),
+            DVec3::new(0.6 * t, 0., 0.2 * t),
+        );
+        w2c.extend(c2w.inverse().transpose().to_cols_array());
+        intrinsics.extend([focal, 0., width / 2., 0., focal, height / 2., 0., 0., 1.]);
+    }
+    let tensor = |values: &[f64], n: i64| {
+        Tensor::from_slice(values).view([1, views as i64, n, n]).to_kind(Kind::Float)
     };
-    (0..views).map(camera).collect()
-}
-
-/// Returns the focal length of the synthetic cameras, in pixels.
-fn focal_length(size: ImageSize) -> f64 {
-    0.9 * f64::from(size.width.max(size.height))
+    Cameras {
+        w2c: tensor(&w2c, 4),
+        intrinsics: tensor(&intrinsics, 3),
+        width: width as i64,
+        height: height as i64,
+    }
 }
 
 /// Samples a standard normal value with the Box-Muller transform.
