@@ -18,9 +18,11 @@ import os
 import random
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections import Counter
 from contextlib import suppress
 from pathlib import Path
@@ -50,13 +52,13 @@ FAULTS = {
 INTERRUPTIBLE = {"write", "truncate", "fsync", "open"}
 # Maximum number of failing calls per group and operation, evenly spaced.
 MAX_CALLS = 60
-# Number of faults with --short: of a training run, and of any other operation.
+# Number of faults with --short: of an operation that waits for free disk space, and of any other.
 SHORT_OF_RUNS, SHORT_OF_OTHERS = 10, 3
 # Timeout of a command, in seconds.
 TIMEOUT = 30
 # Lines on standard error that are not error messages.
 NOTICE = re.compile(
-    ".*the previous checkpoint is used$"
+    "training paused: .* when there is disk space$|disk space is available again: training resumes$|.*the previous checkpoint is used$"
     "|.*the best checkpoint is determined again$|left out: lpips_|.* pixels that the model sees$"
 )
 # Names of temporary files and folders.
@@ -191,8 +193,8 @@ def whole_checkpoint(name):
 class Operation:
     """A command, the state that it starts from, and the states that it may leave."""
 
-    def __init__(self, bench, name, arguments, unit_of=str, is_run=False, into=None, once=False):
-        self.bench, self.name, self.unit_of, self.is_run, self.into = bench, name, unit_of, is_run, into
+    def __init__(self, bench, name, arguments, unit_of=str, waits=False, into=None, once=False):
+        self.bench, self.name, self.unit_of, self.waits, self.into = bench, name, unit_of, waits, into
         self.once = once
         self.arguments = [str(argument) for argument in arguments]
         self.old = bench.folder / "old" / name.replace(" ", "_").replace(",", "").replace("/", "_")
@@ -301,7 +303,7 @@ class Bench:
     def make(self, *arguments):
         subprocess.run([PROGRAM, *map(str, arguments)], check=True, capture_output=True, env=self.environment)
 
-    def run(self, arguments, fault=None, into=None):
+    def run(self, arguments, fault=None, stop_when_waiting=False, into=None):
         """Runs the program. `fault` is (group, n, kind, sticky); `into` is a file that gets standard output."""
         self.log.unlink(missing_ok=True)
         ours = {"LD_PRELOAD": self.library, "FAULT_ROOT": self.out, "FAULT_LOG": self.log}
@@ -313,9 +315,13 @@ class Bench:
         output, errors = self.folder / "output", self.folder / "errors"
         with (into or output).open("wb") as out, errors.open("wb") as err:
             process = subprocess.Popen([PROGRAM, *arguments], stdout=out, stderr=err, env=environment)
-            code = None
-            with suppress(subprocess.TimeoutExpired):
-                code = process.wait(TIMEOUT)
+            begun, code = time.monotonic(), None
+            while code is None and time.monotonic() - begun < TIMEOUT:
+                if stop_when_waiting and b"training paused" in errors.read_bytes():
+                    process.send_signal(signal.SIGTERM)
+                    stop_when_waiting = False
+                with suppress(subprocess.TimeoutExpired):
+                    code = process.wait(0.02 if stop_when_waiting else TIMEOUT)
             if code is None:
                 process.kill()
                 process.wait()
@@ -370,7 +376,7 @@ def operations(bench, only):
 
     def training(name, stopped):
         """Trains from the start, or resumes a run that failed in its fourth step, with a checkpoint of step 2."""
-        op = Operation(bench, name, train, whole_checkpoint, is_run=True)
+        op = Operation(bench, name, train, whole_checkpoint, waits=True)
         written = [file for _, group, file in bench.run(op.arguments).calls if group == "write"]
         at = [n for n, file in enumerate(written, 1) if file.endswith("/metrics.jsonl")]
         for line in (5, 8):
@@ -451,7 +457,8 @@ def check(op, fault):
     """Injects one fault. Returns the run and the errors, or None if no call was hit."""
     group, _, kind, sticky = fault
     op.reset()
-    done = op.bench.run(op.arguments, fault, into=op.into)
+    waits_forever = op.waits and sticky and kind in ("ENOSPC", "torn")
+    done = op.bench.run(op.arguments, fault, stop_when_waiting=waits_forever, into=op.into)
     if not done.hit:
         return done, None
     tree, wrong = Tree(op.bench.out), []
@@ -474,6 +481,10 @@ def check(op, fault):
             wrong.append("it prints a result, and fails")
         if kind == "short" or (kind == "EINTR" and group in INTERRUPTIBLE):
             wrong.append("it doesn't go on")
+        # The program waits for space on a full disk, but not when it checks that the folder is writable and not locked.
+        is_probe = re.search(r"/out(/\.globalsplat-probe\.globalsplat-partial|/\.lock)?$", done.hit[0])
+        if op.waits and not sticky and kind in ("ENOSPC", "torn") and not is_probe:
+            wrong.append("it doesn't wait for space")
         # If renames fail persistently (all, or those onto this file), a rename can't be undone; the next run repairs
         # it.
         crashed = sticky and group in ("rename", "any")
@@ -498,7 +509,7 @@ def inject(operations, short, one):
         if one:
             faults = [(one[0], int(one[1]), one[2], int(one[3]))]
         elif short:
-            faults = random.Random(0).sample(faults, SHORT_OF_RUNS if op.is_run else SHORT_OF_OTHERS)
+            faults = random.Random(0).sample(faults, SHORT_OF_RUNS if op.waits else SHORT_OF_OTHERS)
         injected, earlier = 0, len(failures)
         for fault in faults:
             done, wrong = check(op, fault)

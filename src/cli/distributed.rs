@@ -43,6 +43,20 @@ pub fn is_main_process() -> bool {
     !matches!(DistributedEnv::from_env(), Ok(Some(DistributedEnv { rank: 1.., .. })))
 }
 
+/// Returns an error if torchrun started several processes for a command that can't be distributed.
+pub fn require_single_process() -> Result<()> {
+    let by_torchrun = std::env::var_os("TORCHELASTIC_RUN_ID").is_some();
+    let Ok(Some(DistributedEnv { rank, ranks, .. })) = DistributedEnv::from_env() else { return Ok(()) };
+    match (by_torchrun, rank) {
+        (false, _) => Ok(()),
+        (true, 0) => Err(Error::request(format!(
+            "this is work for one process, and torchrun started {ranks}: expected train, eval --data or bench train"
+        ))),
+        // The first process reports the error.
+        (true, _) => std::process::exit(super::WRONG_REQUEST.into()),
+    }
+}
+
 /// Returns the error message that this process should print, or `None` if another process reports it.
 /// `is_secondary` is `true` for a failed collective, which is usually the consequence of another rank's error.
 pub fn message_to_print(message: &str, is_secondary: bool) -> Option<String> {

@@ -2,19 +2,22 @@ use super::{
     Output, check_views, device, distributed, model, open_masked_capture, parse_holdout, progress,
     report_downscaling, signals, warn, warn_of_many,
 };
-use crate::data::{Dataset, PhotoSize, Split};
+use crate::data::{Capture, Dataset, Holdout, PhotoSize, Split, View};
+use crate::device::peak_memory_bytes;
 use crate::error::Error;
 use crate::eval::{
-    DatasetEvaluation, EvalScene, Evaluation, EvaluationIndex, Method, REPORT, dataset_name,
-    weights_fingerprint, write_evaluation, write_report,
+    Baselines, DatasetEvaluation, EvalScene, Evaluation, EvaluationIndex, LazyPhotos, Method, REPORT, TABLE,
+    evaluation_files, machine, score_output, weights_fingerprint, write_csv, write_evaluation, write_report,
 };
 use crate::io::{InputFiles, check_writable_dir, check_writable_png};
 use crate::metrics::{CaptureScores, ContactSheet, Perceptual, Scores};
 use crate::model::Precision;
-use crate::reconstruct::{LoadedModel, Model};
+use crate::reconstruct::{LoadedModel, Model, context_views};
+use crate::scene::ImageSize;
 use anyhow::Result;
 use clap::{ArgGroup, Args};
 use serde_json::json;
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use tch::Device;
 
@@ -25,8 +28,8 @@ use tch::Device;
 ///
 /// A dataset (--data, --index, --out), by the paper's protocol: every scene's context frames are the input and its target
 /// frames are scored. DIR gets report.html, scores.json, scores.csv and the scores of every scene as soon as they are computed;
-/// the same command resumes an interrupted evaluation, and scores changed splats and images again; `report` shows several
-/// evaluations. Splats from other methods are DIR/SCENE.ply, or .spz and the like, images from other methods DIR/SCENE/000012.png,
+/// the same command resumes an interrupted evaluation, and scores again what has changed since. Several indices make one
+/// report. Splats from other methods are DIR/SCENE.ply, or .spz and the like, images from other methods DIR/SCENE/000012.png,
 /// named by the frame. Started by torchrun, several processes share the scenes: docs/distributed.md.
 #[derive(Args)]
 #[command(group(ArgGroup::new("subject").required(true)))]
@@ -54,9 +57,9 @@ pub struct Eval {
     /// Dataset: a folder of chunks with an index.json, one with such a folder named test, or one of captures
     #[arg(long, value_name = "ROOT", group = "photos", requires_all = ["index", "out"])]
     data: Option<PathBuf>,
-    /// Context and target frames of the dataset's scenes
+    /// Context and target frames of the dataset's scenes; may be given more than once
     #[arg(long, value_name = "FILE.json", requires = "data", conflicts_with = "scene")]
-    index: Option<PathBuf>,
+    index: Vec<PathBuf>,
     /// Folder for the report and the scores
     #[arg(long, value_name = "DIR", requires = "data", conflicts_with = "scene")]
     out: Option<PathBuf>,
@@ -74,9 +77,13 @@ pub struct Eval {
     /// Number of input photos, spread along the camera path; by default all that are not held out
     #[arg(long, value_name = "N", conflicts_with_all = ["splat", "renders", "data"])]
     views: Option<usize>,
-    /// Size of the scored images, to which photos are cropped and resized: WxH, or on one capture their longer side, as in 1600; by default
-    /// that of the model's images, and for images from other methods 256x256 on a dataset and the photos' own on one capture
-    #[arg(long, value_name = "N|WxH")]
+    /// Height of the scored images in pixels, in the shape of the model's images, or square; by default the size of the model's
+    /// images, for images from other methods 256 on a dataset, and on one capture the size of its photos
+    #[arg(long, value_name = "PIXELS")]
+    render_height: Option<u32>,
+    /// Size of the scored images of a splat or of another method on one capture: their longer side, as in 1600, or WxH, to which
+    /// photos are cropped and resized; by default the size of the photos
+    #[arg(long, value_name = "N|WxH", conflicts_with_all = ["weights", "data", "render_height"])]
     size: Option<String>,
     /// Also write an image: photo, render and depth side by side, a row per view; downscaled if it would have more than 64
     /// million pixels
@@ -100,60 +107,116 @@ impl Eval {
         }
     }
 
+    /// Returns `true` if the processes that torchrun started share the work.
+    pub fn is_shared(&self) -> bool {
+        self.data.is_some()
+    }
+
     fn run_scene(&self, scene: &Path, device: Device) -> Result<Output> {
-        let capture = open_masked_capture(scene, self.masks.as_deref())?;
         if let Some(sheet) = &self.sheet {
             check_writable_png(sheet)?;
-            let mut inputs = InputFiles::default();
-            self.weights.iter().for_each(|weights| inputs.add(weights));
-            self.method(None).add_input_files(&mut inputs);
+        }
+        let capture = open_masked_capture(scene, self.masks.as_deref())?;
+        if let Some(sheet) = &self.sheet {
+            let mut inputs = self.inputs(std::iter::once(self.method(None)));
             capture.add_input_files(&mut inputs);
             inputs.check_file(sheet)?;
         }
         let loaded = self.load_model(device)?;
         let model = loaded.as_ref().map(Model::from);
-        let holdout = self.holdout.as_deref().map(parse_holdout).transpose()?;
-        let scene = match model {
-            Some(Model { config, .. }) => {
-                let (holdout, photo_size) = (holdout.unwrap_or(config.data.holdout), config.data.image_size);
-                let target_size = self.size()?.unwrap_or(PhotoSize::Exactly(photo_size));
-                EvalScene::held_out(&capture, holdout, self.views, photo_size, target_size)?
-            }
-            None => EvalScene::without_context(&capture, holdout, self.size()?.unwrap_or(PhotoSize::Own))?,
-        };
-        let mut sheet = self.sheet.as_ref().map(|_| ContactSheet::new(scene.frames.target.len()));
-        let perceptual = Perceptual::new(device);
-        let scores =
-            self.method(model).score(&scene, device, Some(&perceptual), |view, _, rendered, _| {
-                let row = sheet.as_mut().zip(rendered);
-                row.map_or(Ok(()), |(sheet, rendered)| sheet.add(&view.image.to_float(), rendered))
-            })?;
-        warn(&scores.warnings);
-        // For a model, also score a trivial baseline that uses only the input photos.
-        let nearest = model.map(|_| scene.score_nearest_photo()).transpose()?.map(|nearest| nearest.mean);
+        let scene = self.one_scene(&capture, model)?;
+        if self.render_height.is_some() && scene.enlarged {
+            eprintln!("{}: {}", scene.name, model::ENLARGED);
+        }
+        let mut output = self.method(model).render_targets(scene, device)?;
+        warn(&output.warnings);
+        let peak_memory = peak_memory_bytes(); // of the method, without the networks of the metrics
+        let perceptual = Perceptual::find(device)?;
+        let mut sheet = self.sheet.as_ref().map(|_| ContactSheet::new(output.scene.target.len()));
+        let scores = score_output(&mut output, &perceptual, |ground_truth, picture, _| {
+            let row = sheet.as_mut().zip(picture.rendered.as_ref());
+            row.map_or(Ok(()), |(sheet, rendered)| sheet.add(&ground_truth.image.to_float(), rendered))
+        })?;
+        let scene = &output.scene;
+        // For a model, also score the trivial baselines that use only the input photos.
+        let baselines = model.map(|model| self.baselines(&capture, model, scene)).transpose()?;
         if let Some((path, sheet)) = self.sheet.as_ref().zip(sheet) {
             report_downscaling(path, sheet.write(path)?);
         }
-        if let Some(line) = Perceptual::explain_missing(&scores.scores.mean) {
+        if let Some(line) = perceptual.explain_missing(&scores.mean) {
             eprintln!("{line}");
         }
         let mut json = serde_json::to_value(&scores)?;
-        let mut lines = table(&scores.scores);
-        if let Some((Model { config, .. }, nearest)) = model.zip(nearest) {
+        let mut lines = table(&scores);
+        json["peak_memory_bytes"] = peak_memory.into();
+        if let Some(Model { config, .. }) = model {
+            json["image_size"] = json!(self.target_size(model)?);
             json["input"] = json!({ "photos": scene.context.len(), "image_size": config.data.image_size });
-            json["baselines"] = json!({ "nearest_photo": nearest });
-            let name = "the nearest photo shown";
-            lines.push(format!("{name:<24} {:>8.2} {:>8.4}", nearest.psnr, nearest.ssim));
+            json["forward_seconds"] = json!(output.forward_seconds);
+        }
+        if let Some(Baselines { nearest_photo, mean_photo }) = &baselines {
+            for (key, name, Scores { psnr, ssim, .. }) in [
+                ("nearest_photo", "the nearest photo shown", nearest_photo.mean),
+                ("mean_photo", "the mean photo shown", mean_photo.mean),
+            ] {
+                json["baselines"][key] = json!({ "psnr": psnr, "ssim": ssim });
+                lines.push(format!("{name:<24} {psnr:>8.2} {ssim:>8.4}"));
+            }
         }
         Ok(Output::new(json, lines.join("\n")))
     }
 
-    /// Returns the size of the scored images, if it is given.
-    fn size(&self) -> Result<Option<PhotoSize>> {
-        let parse = |text: &String| {
-            text.parse().map_err(|expected| Error::request(format!("--size {text}: {expected}")))
+    /// Returns the scene to evaluate: a model's input and target views; for splats and images, all photos as targets.
+    fn one_scene(&self, capture: &Capture, model: Option<Model>) -> Result<EvalScene> {
+        let target_size = self.target_size(model)?;
+        let Some(model) = model else {
+            let holdout = self.holdout.as_deref().map(parse_holdout).transpose()?;
+            let size = match &self.size {
+                Some(size) => size
+                    .parse::<PhotoSize>()
+                    .map_err(|expected| Error::request(format!("--size {size}: {expected}")))?,
+                None => self.render_height.map_or(PhotoSize::Own, |_| PhotoSize::Exactly(target_size)),
+            };
+            return Ok(EvalScene::without_context(capture, holdout, size)?);
         };
-        Ok(self.size.as_ref().map(parse).transpose()?)
+        let photo_size = model.config.data.image_size;
+        Ok(EvalScene::held_out(capture, self.holdout(model)?, self.views, photo_size, target_size)?)
+    }
+
+    /// Scores the baselines that use only the input photos of `scene`, at the size of the scored images.
+    fn baselines(&self, capture: &Capture, model: Model, scene: &EvalScene) -> Result<Baselines> {
+        let size = self.target_size(Some(model))?;
+        let photos = match size == model.config.data.image_size {
+            true => LazyPhotos::Loaded(scene.context.iter().map(View::shallow_clone).collect()),
+            false => {
+                let shown = context_views(capture, self.holdout(model)?, self.views);
+                LazyPhotos::from_capture(capture, &shown, PhotoSize::Exactly(size))
+            }
+        };
+        Ok(Baselines::compute(&scene.name, &photos, &scene.target)?)
+    }
+
+    fn holdout(&self, model: Model) -> Result<Holdout> {
+        match &self.holdout {
+            Some(text) => parse_holdout(text),
+            None => Ok(model.config.data.holdout),
+        }
+    }
+
+    /// Returns the size of the scored images.
+    fn target_size(&self, model: Option<Model>) -> Result<ImageSize> {
+        let default = model.map_or(PROTOCOL_SIZE.into(), |model| model.config.data.image_size);
+        let Some(height) = self.render_height else { return Ok(default) };
+        let aspect = f64::from(default.width) / f64::from(default.height);
+        let width = (f64::from(height) * aspect).round() as u32;
+        if !(RENDER_SIDES.contains(&height) && RENDER_SIDES.contains(&width)) {
+            let (least, most) = (RENDER_SIDES.start(), RENDER_SIDES.end());
+            let why = format!(
+                "--render-height is {height}, expected images with sides of {least} to {most} pixels"
+            );
+            return Err(Error::request(why).into());
+        }
+        Ok(ImageSize { height, width })
     }
 
     fn load_model(&self, device: Device) -> Result<Option<LoadedModel>> {
@@ -162,10 +225,50 @@ impl Eval {
         Ok(self.weights.as_ref().map(load).transpose()?)
     }
 
+    /// Returns the input files of the evaluation; for a dataset, `methods` has one method per scene.
+    fn inputs<'a>(&self, methods: impl Iterator<Item = Method<'a>>) -> InputFiles {
+        let mut inputs = InputFiles::default();
+        match &self.weights {
+            Some(weights) => inputs.add(weights),
+            None => methods.for_each(|method| method.add_input_files(&mut inputs)),
+        }
+        inputs
+    }
+
+    /// Returns an error if an output would replace an input.
+    fn check_outputs<'a>(
+        &self,
+        dataset: &Dataset,
+        out: &Path,
+        evaluations: impl Iterator<Item = (&'a EvaluationIndex, &'a PathBuf)> + Clone,
+    ) -> Result<()> {
+        let method = self.method(None);
+        let scenes = || evaluations.clone().flat_map(|(index, _)| index.scenes.keys());
+        let mut inputs = self.inputs(scenes().map(|key| method.of_scene(key)));
+        dataset.add_input_files(out, &mut inputs);
+        evaluations.clone().for_each(|(index, _)| inputs.add(&index.file));
+        inputs.check_folder(out)?;
+        inputs.check_file(&out.join(REPORT))?;
+        for (index, folder) in evaluations {
+            let files = evaluation_files(folder, index.scenes.keys());
+            files.iter().try_for_each(|file| inputs.check_file(file))?;
+        }
+        Ok(())
+    }
+
     /// Returns the file or folder that is evaluated.
     fn path(&self) -> &Path {
         let paths = [&self.weights, &self.splat, &self.renders];
         paths.into_iter().flatten().next().expect("clap asks for one of the three")
+    }
+
+    /// Returns a string that identifies what is evaluated: for weights [`weights_fingerprint`].
+    /// Splats and images are compared scene by scene, so for them it is the path of their folder.
+    fn fingerprint(&self) -> Result<String> {
+        let Some(weights) = &self.weights else {
+            return Ok(self.path().canonicalize()?.display().to_string());
+        };
+        Ok(weights_fingerprint(weights)?)
     }
 
     fn method<'a>(&self, model: Option<Model<'a>>) -> Method<'a> {
@@ -181,116 +284,166 @@ impl Eval {
 impl Eval {
     fn run_dataset(&self) -> Result<Output> {
         let (group, device) = distributed::join(&self.device)?;
-        let (Some(data), Some(index), Some(out)) = (&self.data, &self.index, &self.out) else {
-            unreachable!("clap asks for all three")
-        };
-        let index = EvaluationIndex::read(index)?;
+        let (Some(data), Some(out)) = (&self.data, &self.out) else { unreachable!("clap asks for both") };
+        let indices =
+            self.index.iter().map(|file| EvaluationIndex::read(file)).collect::<Result<Vec<_>, _>>()?;
+        let folders = folders(out, &indices)?;
         if let Some(path) = self.splat.as_ref().or(self.renders.as_ref()).filter(|path| !path.is_dir()) {
             let expected = "a folder with those of every scene, for --data";
             return Err(Error::input(path, "what is to be scored", "no folder", expected).into());
         }
         let dataset = Dataset::open(data, Split::Test)?;
         warn_of_many(dataset.warnings().iter());
+        let dataset_name = |index| DatasetEvaluation::dataset_name(self.dataset.as_deref(), data, index);
+        let dataset_names = indices.iter().map(dataset_name).collect::<Result<Vec<_>, _>>()?;
         check_writable_dir(out)?;
+        self.check_outputs(&dataset, out, indices.iter().zip(&folders))?;
         let (loaded, path) = (self.load_model(device)?, self.path());
         let model = loaded.as_ref().map(Model::from);
-        let target_size = match self.size()? {
-            Some(PhotoSize::Exactly(size)) => size,
-            Some(_) => {
-                let size = self.size.as_deref().unwrap_or_default();
-                return Err(Error::request(format!("--size {size}: expected WxH for a dataset")).into());
-            }
-            None => model.map_or(PROTOCOL_SIZE.into(), |model| model.config.data.image_size),
-        };
-        let precision = match model.map(|model| model.network.precision()) {
-            Some(Precision::Bf16) => " bf16",
-            _ => "",
-        };
-        let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let target_size = self.target_size(model)?;
+        let fingerprint = self.fingerprint()?;
         signals::handle_stop_requests()?;
-        let bar = progress::bar(0, "scenes");
-        let evaluation = DatasetEvaluation {
-            method: self.method(model),
-            name: self.name.clone().unwrap_or(stem + precision),
-            // Splats and images are compared scene by scene, so the path of their folder identifies them.
-            fingerprint: match &self.weights {
-                Some(weights) => weights_fingerprint(weights)? + precision,
-                None => path.canonicalize()?.display().to_string(),
-            },
-            dataset: &dataset,
-            root: data,
-            dataset_name: self.dataset.clone().unwrap_or_else(|| dataset_name(data, &index)),
-            index: &index,
-            target_size,
-            device,
-            out,
-            group: &group,
-        };
-        let evaluation = evaluation.run(|done, of| {
-            bar.set_length(of as u64);
-            bar.set_position(done as u64);
-            !signals::is_stop_requested()
-        })?;
-        bar.finish_and_clear();
+
+        let mut evaluations = vec![];
+        for ((index, folder), dataset_name) in indices.iter().zip(folders).zip(dataset_names) {
+            let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+            let precision = match model.map(|model| model.network.precision()) {
+                Some(Precision::Bf16) => " bf16",
+                _ => "",
+            };
+            let evaluation = DatasetEvaluation {
+                method: self.method(model),
+                name: self.name.clone().unwrap_or(stem + precision),
+                fingerprint: fingerprint.clone() + precision,
+                dataset: &dataset,
+                root: data,
+                dataset_name,
+                index,
+                target_size,
+                machine: machine(device)?,
+                device,
+                out: &folder,
+                group: &group,
+            };
+            let bar = progress::bar(0, "scenes");
+            let evaluation = evaluation.run(
+                || Perceptual::find(device),
+                |done, of| {
+                    bar.set_length(of as u64);
+                    bar.set_position(done as u64);
+                    !signals::is_stop_requested()
+                },
+            )?;
+            bar.finish_and_clear();
+            if !group.is_main_process() {
+                continue;
+            }
+            if evaluation.summary.mean.lpips_vgg.is_none() || evaluation.summary.mean.lpips_alex.is_none() {
+                let perceptual = Perceptual::find(device)?;
+                let why =
+                    evaluation.scenes.iter().find_map(|scene| perceptual.explain_missing(&scene.scores.mean));
+                why.iter().for_each(|line| eprintln!("{line}"));
+            }
+            let enlarged = evaluation.scenes.iter().filter(|scene| scene.enlarged).count();
+            if self.render_height.is_some() && enlarged > 0 {
+                eprintln!("{enlarged} of {} scenes: {}", evaluation.scenes.len(), model::ENLARGED);
+            }
+            warn_of_many(evaluation.scenes.iter().flat_map(|scene| &scene.warnings));
+            write_evaluation(&folder, &evaluation)?;
+            write_csv(&folder.join(TABLE), &evaluation)?;
+            evaluations.push((folder, evaluation));
+        }
         group.shutdown()?;
         if !group.is_main_process() {
             return Ok(Output::default());
         }
-        let scenes = &evaluation.scenes;
-        let missing = scenes.iter().find_map(|scene| Perceptual::explain_missing(&scene.scores.mean));
-        missing.iter().for_each(|line| eprintln!("{line}"));
-        warn_of_many(scenes.iter().flat_map(|scene| &scene.warnings));
-        write_evaluation(out, &evaluation)?;
-        let evaluations = [(out.clone(), evaluation)];
-        write_report(&out.join(REPORT), &evaluations)?;
-        let [(_, evaluation)] = evaluations;
-        describe_evaluation(&out.join(REPORT), &evaluation)
+        let report = out.join(REPORT);
+        write_report(&report, &evaluations)?;
+        Ok(describe_evaluations(&report, &evaluations))
     }
 }
 
-/// Describes the evaluation that `report` shows. Scenes that couldn't be scored make the command fail.
-fn describe_evaluation(report: &Path, evaluation: &Evaluation) -> Result<Output> {
-    let Evaluation { index, scenes, indexed_scenes, summary, failures, .. } = evaluation;
-    let mut json = serde_json::to_value(evaluation)?;
-    json["report"] = report.to_string_lossy().into();
-    json["scenes"] = scenes.len().into();
-    let Scores { psnr, ssim, lpips_vgg, lpips_alex, pixel_fraction } = summary.mean;
-    let [vgg, alex] =
-        [lpips_vgg, lpips_alex].map(|value| value.map_or("absent".into(), |value| format!("{value:.4}")));
-    let masked = pixel_fraction
-        .map_or(String::new(), |fraction| format!(", over {:.1} % of the pixels", 100. * fraction));
-    let count = scenes.len();
-    let text = format!(
-        "{index}, {count} of {indexed_scenes} scenes: PSNR {psnr:.2}, SSIM {ssim:.4}, LPIPS-VGG {vgg}, LPIPS-Alex {alex}{masked}\n{}",
-        report.display()
-    );
-    for failure in failures {
+/// Describes the evaluations in `report`. Scenes that couldn't be scored make the command fail.
+fn describe_evaluations(report: &Path, evaluations: &[(PathBuf, Evaluation)]) -> Output {
+    let summaries = evaluations.iter().map(|(folder, e)| {
+        json!({
+            "folder": folder.to_string_lossy(), "index": e.index, "dataset": e.dataset, "context_views": e.context_views,
+            "image_size": e.image_size, "scenes": e.scenes.len(), "indexed_scenes": e.indexed_scenes, "summary": e.summary,
+            "efficiency": e.efficiency, "failures": e.failures,
+        })
+    });
+    let shown = |value: Option<f64>| value.map_or("absent".into(), |value| format!("{value:.4}"));
+    let line = |(_, e): &(PathBuf, Evaluation)| {
+        let Scores { psnr, ssim, lpips_vgg, lpips_alex, pixel_fraction, .. } = e.summary.mean;
+        let masked = pixel_fraction.map(|fraction| format!(", over {:.1} % of the pixels", 100. * fraction));
+        format!(
+            "{}, {} of {} scenes: PSNR {psnr:.2}, SSIM {ssim:.4}, LPIPS-VGG {}, LPIPS-Alex {}{}\n",
+            e.index,
+            e.scenes.len(),
+            e.indexed_scenes,
+            shown(lpips_vgg),
+            shown(lpips_alex),
+            masked.unwrap_or_default()
+        )
+    };
+    let text = evaluations.iter().map(line).collect::<String>() + &report.to_string_lossy();
+    let summaries: Vec<_> = summaries.collect();
+    let json = json!({ "report": report.to_string_lossy(), "evaluations": summaries });
+    let failures: Vec<_> = evaluations.iter().flat_map(|(_, e)| &e.failures).collect();
+    for failure in &failures {
         eprintln!("{}: {}", failure.scene, failure.error);
     }
     let count = failures.len();
     let failed = || Error::failed(format!("{count} scenes could not be scored, the means are of the others"));
-    Ok(Output { failure: (count > 0).then(failed), ..Output::new(json, text) })
+    Output { failure: (count > 0).then(failed), ..Output::new(json, text) }
 }
 
 /// Size of the protocol's images, [height, width] (spec 9.1).
 const PROTOCOL_SIZE: [u32; 2] = [256, 256];
+/// Allowed sides of scored images in pixels: SSIM uses windows of 11×11.
+const RENDER_SIDES: RangeInclusive<u32> = 11..=16_384;
+
+/// Returns the output folder of each index's scores: `out` itself if there is only one index.
+fn folders(out: &Path, indices: &[EvaluationIndex]) -> Result<Vec<PathBuf>> {
+    let stem = |index: &EvaluationIndex| out.join(index.file.file_stem().unwrap_or_default());
+    let folders: Vec<_> = match indices {
+        [_] => vec![out.to_owned()],
+        several => several.iter().map(stem).collect(),
+    };
+    match folders.iter().enumerate().find(|(i, folder)| folders[..*i].contains(folder)) {
+        Some((_, twice)) => Err(Error::request(format!(
+            "--index: two of them would go to {}, expected other names",
+            twice.display()
+        ))
+        .into()),
+        None => Ok(folders),
+    }
+}
 
 /// Returns the lines of a table of the scores of every view, and of their means.
 fn table(scores: &CaptureScores) -> Vec<String> {
     let gaussians = scores.gaussians.map_or(String::new(), |n| format!(", {n} Gaussians"));
-    let columns = [("LPIPS-VGG", scores.mean.lpips_vgg), ("LPIPS-Alex", scores.mean.lpips_alex)];
-    let columns = columns.into_iter().filter(|(_, mean)| mean.is_some());
-    let names: String = columns.map(|(name, _)| format!(" {name:>10}")).collect();
-    let mut lines = vec![
-        format!("{}: {} views{gaussians}", scores.scene, scores.views.len()),
-        format!("{:<24} {:>8} {:>8}{names}", "view", "PSNR", "SSIM"),
+    let mut lines = vec![format!("{}: {} views{gaussians}", scores.scene, scores.views.len())];
+    // Columns without any value are left out.
+    let columns = [
+        ("LPIPS-VGG", scores.views.iter().any(|view| view.scores.lpips_vgg.is_some())),
+        ("LPIPS-Alex", scores.views.iter().any(|view| view.scores.lpips_alex.is_some())),
     ];
-    let views = scores.views.iter().map(|view| (view.image.as_str(), &view.scores));
-    for (name, Scores { psnr, ssim, lpips_vgg, lpips_alex, .. }) in views.chain([("mean", &scores.mean)]) {
-        let lpips = [lpips_vgg, lpips_alex].into_iter().flatten();
-        let lpips: String = lpips.map(|distance| format!(" {distance:>10.4}")).collect();
-        lines.push(format!("{name:<24} {psnr:>8.2} {ssim:>8.4}{lpips}"));
-    }
+    let lpips = |values: [Option<f64>; 2]| -> String {
+        let shown = columns.iter().zip(values).filter(|((_, filled), _)| *filled);
+        shown
+            .map(|(_, value)| format!(" {:>10}", value.map_or(String::new(), |v| format!("{v:.4}"))))
+            .collect()
+    };
+    let names: String =
+        columns.iter().filter(|(_, filled)| *filled).map(|(name, _)| format!(" {name:>10}")).collect();
+    lines.push(format!("{:<24} {:>8} {:>8}{names}", "view", "PSNR", "SSIM"));
+    let row = |name: &str, scores: &Scores| {
+        let lpips = lpips([scores.lpips_vgg, scores.lpips_alex]);
+        format!("{name:<24} {:>8.2} {:>8.4}{lpips}", scores.psnr, scores.ssim)
+    };
+    lines.extend(scores.views.iter().map(|view| row(&view.image, &view.scores)));
+    lines.push(row("mean", &scores.mean));
     if let Some(fraction) = scores.mean.pixel_fraction {
         lines.push(format!("scored over {:.1} % of the pixels: the others are masked out", 100. * fraction));
     }

@@ -113,6 +113,16 @@ impl Command {
         }
         output.failure.map_or(Ok(()), |failure| Err(failure.into()))
     }
+
+    /// Returns `true` if the processes that `torchrun` started share the work of this command.
+    fn is_shared(&self) -> bool {
+        match self {
+            Command::Train(_) => true,
+            Command::Eval(command) => command.is_shared(),
+            Command::Bench(command) => command.is_shared(),
+            _ => false,
+        }
+    }
 }
 
 /// Runs the command line of this process.
@@ -163,7 +173,12 @@ impl Command {
     fn run_to_end(self, as_json: bool) -> Result<(), (u8, Option<String>)> {
         // Errors stay one sentence.
         globalsplat_csrc::runtime::disable_stack_traces();
-        let result = panic::catch_unwind(panic::AssertUnwindSafe(|| self.run(as_json)));
+        let result = panic::catch_unwind(panic::AssertUnwindSafe(|| {
+            if !self.is_shared() {
+                distributed::require_single_process()?;
+            }
+            self.run(as_json)
+        }));
         let error = match result {
             Ok(Ok(())) => return Ok(()),
             Ok(Err(error)) => error,

@@ -54,6 +54,9 @@ pub fn name(weights: Option<&Path>) -> &Path {
     weights.unwrap_or(Path::new(BUNDLED_MODEL))
 }
 
+/// Warning for photos that are smaller than the size they are resized to.
+pub const ENLARGED: &str = "smaller photos are enlarged, which shows no more of the scene";
+
 /// Returns a warning about weights whose training was stopped before the final stage.
 pub fn early_stage(stage: Stage, config: &Config) -> Option<String> {
     let last = config.curriculum.final_stage();

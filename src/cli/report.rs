@@ -33,7 +33,18 @@ impl Report {
         inputs.check_file(&self.out)?;
         write_report(&self.out, &evaluations)?;
         let bytes = std::fs::metadata(&self.out)?.len();
-        let out = self.out.to_string_lossy();
-        Ok(Output::new(json!({ "out": out, "bytes": bytes }), out))
+        let shown = evaluations.iter().map(|(folder, evaluation)| {
+            json!({
+                "folder": folder.display().to_string(),
+                "method": evaluation.method,
+                "dataset": evaluation.dataset,
+                "context_views": evaluation.context_views,
+                "scenes": evaluation.scenes.len(),
+                "failures": evaluation.failures.len(),
+                "summary": evaluation.summary,
+            })
+        });
+        let (out, shown) = (self.out.to_string_lossy(), shown.collect::<Vec<_>>());
+        Ok(Output::new(json!({ "out": out, "bytes": bytes, "evaluations": shown }), out))
     }
 }

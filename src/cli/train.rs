@@ -1,11 +1,13 @@
 use super::{Output, distributed, keep_freed_memory, progress, signals, warn_of_many};
 use crate::config::Config;
-use crate::data::{BadData, Capture, SceneGroups, TrainingScenes};
+use crate::data::{BadData, Capture, Dataset, SceneGroups, Split, TrainingScenes};
 use crate::error::Error;
 use crate::eval::{HeldOut, HeldOutScores, write_curves};
-use crate::io::check_writable_dir;
-use crate::metrics::{CaptureScores, Scores};
-use crate::train::{Event, Outcome, Resume, Trainer, Validator, run};
+use crate::io::{InputFiles, check_writable_dir};
+use crate::loss::{Term, psnr_of_mse};
+use crate::train::{
+    CONFIG_FILE, Event, METRICS_FILE, Outcome, Resume, Trainer, Validator, retry_on_disk_full, run,
+};
 use anyhow::Result;
 use clap::Args;
 use serde_json::json;
@@ -79,8 +81,15 @@ impl Train {
         }
         if is_main_process {
             check_writable_dir(&self.out)?;
+            self.check_outputs(&config, &scenes)?;
         }
         let mut held_out = HeldOut::find(&config.data, &scenes)?;
+        if let ([first, others @ ..], true) = (held_out.trained_on(), is_main_process) {
+            let more = if others.is_empty() { String::new() } else { format!(" and {} more", others.len()) };
+            eprintln!(
+                "{first}{more} of data.validation is also a training scene: its score says nothing about unseen scenes"
+            );
+        }
         let captures = scenes.captures().iter().flat_map(Capture::warnings);
         warn_of_many(scenes.warnings().iter().chain(captures).chain(held_out.warnings()));
         let mut trainer = Trainer::new(&config, scenes, device)?;
@@ -119,6 +128,20 @@ impl Train {
         self.report(&outcome, seconds, held_out.scores(), &bad_data)
     }
 
+    /// Returns an error for a folder whose files would replace an input. The configuration may be the run's own, since it is
+    /// rewritten unchanged.
+    fn check_outputs(&self, config: &Config, scenes: &TrainingScenes) -> Result<()> {
+        let mut inputs = InputFiles::default();
+        scenes.add_input_files(&self.out, &mut inputs);
+        for path in config.data.validation_paths()? {
+            Dataset::open(&path, Split::Test)?.add_input_files(&self.out, &mut inputs);
+        }
+        self.from.iter().for_each(|path| inputs.add(path));
+        inputs.check_folder(&self.out)?;
+        let files = [CONFIG_FILE, METRICS_FILE, CURVES_FILE].map(|name| self.out.join(name));
+        Ok(files.iter().try_for_each(|file| inputs.check_file(file))?)
+    }
+
     fn train(
         &self,
         config: &Config,
@@ -128,6 +151,7 @@ impl Train {
     ) -> Result<Outcome> {
         let is_main_process = trainer.group().is_main_process();
         let bar = progress::bar(config.train.steps, "steps");
+        let mut smooth_mse = None;
         let mut validation = String::new();
         let mut first = true;
         let validator = (!held_out.is_empty()).then_some(held_out as &mut dyn Validator);
@@ -153,10 +177,14 @@ impl Train {
                 first = false;
             }
             bar.set_position(report.step + 1);
+            let mse = report.losses[Term::Mse];
+            let mse = smooth_mse.map_or(mse, |old: f64| 0.98 * old + 0.02 * mse);
+            // The loss of a skipped step may not be finite.
+            smooth_mse = Some(mse).filter(|mse| mse.is_finite()).or(smooth_mse);
             bar.set_message(format!(
                 "loss {:.4} PSNR {:.2} stage {} λ {:.2} lr {:.1e} {samples_per_second:.1} samples/s{validation}",
                 report.losses.total,
-                report.psnr(),
+                psnr_of_mse(mse),
                 report.stage.index,
                 report.stage.mix,
                 report.learning_rate
@@ -174,12 +202,18 @@ impl Train {
         validation: &[HeldOutScores],
         bad_data: &BadData,
     ) -> Result<Output> {
-        let mean = |scores: fn(&HeldOutScores) -> &CaptureScores| {
-            (!validation.is_empty()).then(|| Scores::mean(validation.iter().map(|v| &scores(v).mean)))
+        let mean = |value: fn(&HeldOutScores) -> f64| {
+            validation.iter().map(value).sum::<f64>() / validation.len() as f64
         };
-        let (ours, nearest) = (mean(|v| &v.ours), mean(|v| &v.nearest));
         let curves = self.out.join(CURVES_FILE);
-        write_curves(&curves, &self.out, nearest.map(|nearest| nearest.psnr))?;
+        let nearest = (!validation.is_empty()).then(|| mean(|v| v.nearest.mean.psnr));
+        let mut on_event = |event: Event| {
+            if let Event::Notice(text) = event {
+                eprintln!("{text}");
+            }
+            !signals::is_stop_requested()
+        };
+        retry_on_disk_full(&mut on_event, || write_curves(&curves, &self.out, nearest))?;
         let checkpoint = outcome.checkpoint.to_string_lossy();
         let mut json = json!({
             "checkpoint": checkpoint,
@@ -192,23 +226,27 @@ impl Train {
             format!("trained in {seconds:.0} s, checkpoint {checkpoint}"),
             format!("{}: training curves", curves.display()),
         ];
-        if let Some((ours, nearest)) = ours.zip(nearest) {
+        if !validation.is_empty() {
+            let (psnr, ssim) = (mean(|v| v.ours.mean.psnr), mean(|v| v.ours.mean.ssim));
+            let nearest = mean(|v| v.nearest.mean.psnr);
             json["held_out"] = json!({
-                "psnr": ours.psnr,
-                "ssim": ours.ssim,
-                "nearest_photo_psnr": nearest.psnr,
-                "nearest_photo_ssim": nearest.ssim,
-                "scenes": validation,
+                "psnr": psnr,
+                "ssim": ssim,
+                "nearest_photo_psnr": nearest,
+                "nearest_photo_ssim": mean(|v| v.nearest.mean.ssim),
+                "scenes": validation.iter().map(|v| json!({"ours": v.ours, "nearest_photo": v.nearest})).collect::<Vec<_>>(),
             });
-            let row = |name: &str, ours: &Scores, nearest: &Scores| {
-                format!("{name:<24} {:>10.2} {:>10.4} {:>14.2}", ours.psnr, ours.ssim, nearest.psnr)
+            let row = |name: &str, psnr, ssim, nearest| {
+                format!("{name:<24} {psnr:>10.2} {ssim:>10.4} {nearest:>14.2}")
             };
             lines.push(format!(
                 "{:<24} {:>10} {:>10} {:>14}",
                 "held-out views", "PSNR", "SSIM", "nearest photo"
             ));
-            lines.extend(validation.iter().map(|v| row(&v.ours.scene, &v.ours.mean, &v.nearest.mean)));
-            lines.push(format!("{}   {:+.2} dB", row("mean", &ours, &nearest), ours.psnr - nearest.psnr));
+            lines.extend(validation.iter().map(|HeldOutScores { ours, nearest, .. }| {
+                row(&ours.scene, ours.mean.psnr, ours.mean.ssim, nearest.mean.psnr)
+            }));
+            lines.push(format!("{}   {:+.2} dB", row("mean", psnr, ssim, nearest), psnr - nearest));
         }
         Ok(Output::new(json, lines.join("\n")))
     }

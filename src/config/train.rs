@@ -89,27 +89,29 @@ impl TrainConfig {
     /// # Errors
     /// Returns an error that names the first invalid field.
     pub(super) fn check(&self) -> Result<()> {
-        let (count, positive) = ("1 or more", "a number above 0");
-        let is_positive = |value: f64| value > 0. && value.is_finite();
-        for (field, value, is_valid, expected) in [
-            ("batch_size", self.batch_size as f64, self.batch_size > 0, count),
-            ("checkpoint_every", self.checkpoint_every as f64, self.checkpoint_every > 0, count),
-            ("keep_checkpoints", self.keep_checkpoints as f64, self.keep_checkpoints > 0, count),
-            ("max_nonfinite_steps", self.max_nonfinite_steps as f64, self.max_nonfinite_steps > 0, count),
-            ("log_every", self.log_every as f64, self.log_every > 0, count),
-            ("learning_rate", self.learning_rate, is_positive(self.learning_rate), positive),
-            ("gradient_clip", self.gradient_clip, is_positive(self.gradient_clip), positive),
-            (
-                "weight_decay",
-                self.weight_decay,
-                (0. ..f64::INFINITY).contains(&self.weight_decay),
-                "0 or more",
-            ),
-            ("warmup", self.warmup, (0. ..=1.).contains(&self.warmup), "a fraction from 0 to 1"),
+        for (field, value) in [
+            ("train.batch_size", self.batch_size as u64),
+            ("train.checkpoint_every", self.checkpoint_every),
+            ("train.keep_checkpoints", self.keep_checkpoints as u64),
+            ("train.max_nonfinite_steps", self.max_nonfinite_steps),
+            ("train.log_every", self.log_every),
         ] {
-            if !is_valid {
-                return Err(Error::setting(format!("train.{field}"), value, expected));
+            if value == 0 {
+                return Err(Error::setting(field, 0, "1 or more"));
             }
+        }
+        for (field, value) in
+            [("train.learning_rate", self.learning_rate), ("train.gradient_clip", self.gradient_clip)]
+        {
+            if !(value > 0. && value.is_finite()) {
+                return Err(Error::setting(field, value, "a number above 0"));
+            }
+        }
+        if !(self.weight_decay >= 0. && self.weight_decay.is_finite()) {
+            return Err(Error::setting("train.weight_decay", self.weight_decay, "0 or more"));
+        }
+        if !(0. ..=1.).contains(&self.warmup) {
+            return Err(Error::setting("train.warmup", self.warmup, "a fraction from 0 to 1"));
         }
         Ok(())
     }

@@ -5,8 +5,7 @@ mod env;
 mod process_group;
 
 pub use env::{DistributedEnv, Rendezvous};
-pub use globalsplat_csrc::distributed::{has_gloo, has_nccl};
-pub use process_group::{Buckets, ProcessGroup};
+pub use process_group::{Backends, Buckets, ProcessGroup};
 
 #[cfg(test)]
 pub(crate) mod tests {

@@ -3,7 +3,7 @@
 
 use crate::error::{Error, Result};
 use crate::io::{write_atomically, write_json};
-use crate::metrics::{CaptureScores, Scores, ViewScore};
+use crate::metrics::{CaptureScores, Scores};
 use crate::render::cpu::simd_level;
 use serde::{Deserialize, Serialize};
 use std::ops::RangeInclusive;
@@ -90,6 +90,9 @@ pub struct SceneScores {
     pub context: Vec<usize>,
     /// Target frames.
     pub target: Vec<usize>,
+    /// `true` if photos had to be enlarged to the size of the context or target views.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub enlarged: bool,
     /// Size of the splat as a PLY, in bytes; `None` if there is no splat.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub splat_bytes: Option<u64>,
@@ -102,11 +105,12 @@ pub struct SceneScores {
     /// `true` if the scene was the first one of the process, so that its time includes the warm-up.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub warm_up: bool,
-    /// Peak resident memory of the process when the scene's first image was there, in bytes. That of the process's later scenes includes the
-    /// networks of LPIPS.
+    /// Peak resident memory of the process after the reconstruction, in bytes. Only the first scene that a process scores with a model has
+    /// it: later peaks would include the networks of LPIPS.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub peak_memory_bytes: Option<u64>,
-    /// Peak memory of the tensors on the GPU at that time, in bytes; `None` without a GPU.
+    /// Peak memory of the tensors on the GPU after the reconstruction, in bytes. Only the first scene that a process scores with a model on
+    /// a GPU has it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub peak_device_memory_bytes: Option<u64>,
 }
@@ -145,9 +149,8 @@ impl Efficiency {
         (!times.is_empty()).then(|| Efficiency {
             forward_seconds: mean(&times),
             timed_scenes: times.len(),
-            // A peak never decreases, so the minimum is that of a process's first scene.
-            peak_memory_bytes: scenes.iter().filter_map(|scene| scene.peak_memory_bytes).min().unwrap_or(0),
-            peak_device_memory_bytes: scenes.iter().filter_map(|scene| scene.peak_device_memory_bytes).min(),
+            peak_memory_bytes: scenes.iter().filter_map(|scene| scene.peak_memory_bytes).max().unwrap_or(0),
+            peak_device_memory_bytes: scenes.iter().filter_map(|scene| scene.peak_device_memory_bytes).max(),
             splat_bytes: mean(&bytes),
         })
     }
@@ -171,9 +174,8 @@ pub fn scene_file_name(scene: &str) -> String {
 const POSSIBLE_PSNR: RangeInclusive<f64> = -0.001..=100.001;
 
 pub(super) const SCORES: &str = "scores.json";
-pub(super) const TABLE: &str = "scores.csv";
-const TABLE_HEAD: [&str; 8] =
-    ["scene", "view", "psnr", "ssim", "lpips_vgg", "lpips_alex", "gaussians", "forward_seconds"];
+/// Name of the file of scores for spreadsheets.
+pub const TABLE: &str = "scores.csv";
 /// Name of the report's page.
 pub const REPORT: &str = "report.html";
 
@@ -183,33 +185,18 @@ pub fn comparison_path(folder: &Path, scene: &str) -> PathBuf {
     folder.join("scenes").join(format!("{}.jpg", scene_file_name(scene)))
 }
 
-/// Writes `folder/scores.json`, and `folder/scores.csv` with a line for every scene and target view, in which missing values are empty.
+/// Writes `folder/scores.json`.
 ///
 /// # Errors
-/// Fails if a file can't be written.
+/// Fails if the file can't be written.
 pub fn write_evaluation(folder: &Path, evaluation: &Evaluation) -> Result<()> {
-    write_json(&folder.join(SCORES), evaluation)?;
-    let path = &folder.join(TABLE);
-    write_atomically(path, |writer| {
-        let refused = |e: csv::Error| Error::write(path)(std::io::Error::other(e));
-        let mut writer = csv::Writer::from_writer(writer);
-        writer.write_record(TABLE_HEAD).map_err(refused)?;
-        for SceneScores { scores, forward_seconds, .. } in &evaluation.scenes {
-            for ViewScore { image, scores: Scores { psnr, ssim, lpips_vgg, lpips_alex, .. } } in &scores.views
-            {
-                let (scene, gaussians) = (&scores.scene, scores.gaussians);
-                let line = (scene, image, psnr, ssim, lpips_vgg, lpips_alex, gaussians, forward_seconds);
-                writer.serialize(line).map_err(refused)?;
-            }
-        }
-        writer.flush().map_err(Error::write(path))
-    })
+    Ok(write_json(&folder.join(SCORES), evaluation)?)
 }
 
 /// Reads `folder/scores.json`.
 ///
 /// # Errors
-/// Fails if the file is missing, isn't valid JSON, lacks a field, or has a mean PSNR outside 0 to 100 dB, which can't be plotted.
+/// Fails if the file is missing, isn't valid JSON, lacks a field, or has a PSNR outside 0 to 100 dB, which can't be plotted.
 pub fn read_evaluation(folder: &Path) -> Result<Evaluation> {
     let path = folder.join(SCORES);
     let text = std::fs::read_to_string(&path).map_err(Error::read(&path))?;
@@ -224,8 +211,51 @@ pub fn read_evaluation(folder: &Path) -> Result<Evaluation> {
     check("the summary", evaluation.summary.mean.psnr)?;
     for scene in evaluation.scenes.iter().map(|scene| &scene.scores) {
         check(&format!("scene {}", scene.scene), scene.mean.psnr)?;
+        for view in &scene.views {
+            check(&format!("view {} of scene {}", view.image, scene.scene), view.scores.psnr)?;
+        }
     }
     Ok(evaluation)
+}
+
+/// A line of `scores.csv`.
+#[derive(Serialize)]
+struct Line<'a> {
+    scene: &'a str,
+    view: &'a str,
+    psnr: f64,
+    ssim: f64,
+    lpips_vgg: Option<f64>,
+    lpips_alex: Option<f64>,
+    gaussians: Option<i64>,
+    forward_seconds: Option<f64>,
+}
+
+/// Writes a line for every scene and target view to `path`. Missing values are left empty.
+///
+/// # Errors
+/// Fails if the file can't be written.
+pub fn write_csv(path: &Path, evaluation: &Evaluation) -> Result<()> {
+    write_atomically(path, |writer| {
+        let refused = |e: csv::Error| Error::write(path)(std::io::Error::other(e));
+        let mut writer = csv::Writer::from_writer(writer);
+        for scene in &evaluation.scenes {
+            for view in &scene.scores.views {
+                let line = Line {
+                    scene: &scene.scores.scene,
+                    view: &view.image,
+                    psnr: view.scores.psnr,
+                    ssim: view.scores.ssim,
+                    lpips_vgg: view.scores.lpips_vgg,
+                    lpips_alex: view.scores.lpips_alex,
+                    gaussians: scene.scores.gaussians,
+                    forward_seconds: scene.forward_seconds,
+                };
+                writer.serialize(line).map_err(refused)?;
+            }
+        }
+        writer.flush().map_err(Error::write(path))
+    })
 }
 
 /// Returns the processor, its number of cores, the SIMD level, and the device unless it is the CPU, such as
@@ -233,7 +263,7 @@ pub fn read_evaluation(folder: &Path) -> Result<Evaluation> {
 ///
 /// # Errors
 /// Fails if `GLOBALSPLAT_SIMD` names a SIMD level that this machine doesn't have.
-pub(super) fn machine(device: Device) -> Result<String> {
+pub fn machine(device: Device) -> Result<String> {
     let cpu_info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let model_name = cpu_info.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
     let processor = model_name.map_or(std::env::consts::ARCH, |(_, name)| name.trim());

@@ -1,16 +1,16 @@
 //! Scenes for evaluation: context photos, which a method may see, and target photos, which it has to match, as an index or a holdout
 //! splits them.
 
-use crate::data::{Capture, Holdout, PhotoSize, View, load_views};
+use crate::data::{Capture, Holdout, PhotoSize, SceneGroup, View, load_views};
 use crate::error::{Error, Result};
 use crate::io::{read_text, write_json};
-use crate::metrics::{CaptureScores, score_view};
-use crate::reconstruct::{context_views, load_context};
+use crate::reconstruct::load_context;
 use crate::scene::ImageSize;
 use glam::DMat4;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::mpsc::SyncSender;
 
 /// Frames of one scene.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -25,6 +25,19 @@ impl SceneFrames {
     /// Splits a video of `count` frames, at least three: every other frame is context, and every other one of the rest is a target.
     pub fn alternating(count: usize) -> Self {
         SceneFrames { context: (0..count).step_by(2).collect(), target: (1..count).step_by(4).collect() }
+    }
+
+    /// Returns a checksum of the unmodified photo files of these frames, and of their cameras.
+    ///
+    /// # Errors
+    /// Fails if a photo can't be read.
+    pub(super) fn checksum(&self, capture: &Capture) -> Result<u32> {
+        Ok(capture.checksum(self.context.iter().chain(&self.target).copied())?)
+    }
+
+    /// Returns the file names of the target images without their extensions: six-digit frame numbers, as chunks name frames.
+    pub(super) fn render_names(&self) -> Vec<String> {
+        self.target.iter().map(|frame| format!("{frame:06}")).collect()
     }
 }
 
@@ -95,59 +108,116 @@ impl EvaluationIndex {
     }
 }
 
-/// A scene: photos that a method may see, and photos that it has to match. The latter are decoded one at a time, so that large photos don't
-/// fill the memory all at once.
+/// Photos of a capture. They are decoded on access, so that large photos don't fill the memory all at once.
+#[derive(Debug)]
+pub enum LazyPhotos {
+    /// Photos in memory.
+    Loaded(Vec<View>),
+    /// Photos in their files.
+    OnDisk {
+        /// Capture that holds the photos.
+        capture: Capture,
+        /// Positions of the photos in the capture.
+        indices: Vec<usize>,
+        /// Names of the photos.
+        names: Vec<String>,
+        /// Size of the photos.
+        size: PhotoSize,
+    },
+}
+
+impl LazyPhotos {
+    /// Creates a source of the photos `indices` of `capture`, under their names in the capture, at `size`.
+    pub fn from_capture(capture: &Capture, indices: &[usize], size: PhotoSize) -> Self {
+        let all: Vec<&str> = capture.names().collect();
+        let names = indices.iter().map(|&index| all[index].to_string()).collect();
+        LazyPhotos::OnDisk { capture: capture.clone(), indices: indices.to_vec(), names, size }
+    }
+
+    /// Returns the number of photos.
+    pub fn len(&self) -> usize {
+        match self {
+            LazyPhotos::Loaded(views) => views.len(),
+            LazyPhotos::OnDisk { indices, .. } => indices.len(),
+        }
+    }
+
+    /// Returns `true` if there are no photos.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Returns the poses of the photos, camera-to-world, without loading pixels.
+    pub fn poses(&self) -> Vec<DMat4> {
+        match self {
+            LazyPhotos::Loaded(views) => views.iter().map(|view| view.camera.c2w).collect(),
+            LazyPhotos::OnDisk { capture, indices, .. } => {
+                let cameras = capture.cameras();
+                indices.iter().map(|&index| cameras[index].c2w).collect()
+            }
+        }
+    }
+
+    /// Loads photo number `i`.
+    ///
+    /// # Errors
+    /// Fails if the photo can't be read.
+    pub fn load(&self, i: usize) -> Result<View> {
+        match self {
+            LazyPhotos::Loaded(views) => Ok(views[i].shallow_clone()),
+            LazyPhotos::OnDisk { capture, indices, names, size } => {
+                let size = size.resized(&capture.camera(indices[i]));
+                let view = load_views(capture, &indices[i..=i], size)?.remove(0);
+                Ok(View { name: names[i].clone(), ..view })
+            }
+        }
+    }
+}
+
+/// A scene, with the context photos in memory.
 #[derive(Debug)]
 pub struct EvalScene {
     /// Name of the capture, or key of the scene in an index.
     pub name: String,
     /// Context photos, which the model sees; empty if no model is evaluated.
     pub context: Vec<View>,
-    /// Positions of the context and target photos in the capture.
-    pub frames: SceneFrames,
+    /// Target photos, loaded one by one.
+    pub target: LazyPhotos,
     /// File names of the target images, without their extensions.
     pub render_names: Vec<String>,
-    capture: Capture,
-    target_size: PhotoSize,
-    /// Names of the target photos.
-    target_names: Vec<String>,
+    /// Positions of the context and target photos in the capture; `None` without an index.
+    pub frames: Option<SceneFrames>,
+    /// Checksum of the photos and cameras that the index names; 0 without an index.
+    pub(super) checksum: u32,
+    /// `true` if photos of the capture were enlarged to the size of the context or target views.
+    pub enlarged: bool,
 }
 
 impl EvalScene {
-    /// Creates a scene from the photos `frames` of `capture`. `context` has the context photos as the model sees them.
-    pub(super) fn new(
-        capture: &Capture,
-        frames: SceneFrames,
-        context: Vec<View>,
-        target_size: PhotoSize,
-    ) -> Self {
-        let (names, render_names): (Vec<_>, _) = (capture.names().collect(), capture.render_names());
-        EvalScene {
-            name: capture.name.clone(),
-            target_names: frames.target.iter().map(|&photo| names[photo].to_string()).collect(),
-            render_names: frames.target.iter().map(|&photo| render_names[photo].clone()).collect(),
-            capture: capture.clone(),
-            context,
-            frames,
-            target_size,
-        }
-    }
-
     /// Creates a scene for splats and images, whose targets have the given size. They are the views that `holdout` holds out; without it,
     /// those of the capture's own test part, or all views if it has none.
     ///
     /// # Errors
     /// Fails if `holdout` holds nothing out, or leaves fewer than two views.
     pub fn without_context(capture: &Capture, holdout: Option<Holdout>, size: PhotoSize) -> Result<Self> {
-        let target = match holdout {
-            Some(holdout) => split_views(capture, holdout)?.target,
+        let views = match holdout {
+            Some(holdout) => split_views(capture, holdout)?.1,
             None => capture.scored_views(),
         };
-        Ok(EvalScene::new(capture, SceneFrames { context: vec![], target }, vec![], size))
+        let names = capture.render_names();
+        Ok(EvalScene {
+            name: capture.name.clone(),
+            context: vec![],
+            target: LazyPhotos::from_capture(capture, &views, size),
+            render_names: views.into_iter().map(|view| names[view].clone()).collect(),
+            frames: None,
+            checksum: 0,
+            enlarged: matches!(size, PhotoSize::Exactly(size) if capture.has_smaller(size)),
+        })
     }
 
     /// Creates a scene for a model. The context consists of the photos that `holdout` leaves, or of `views` of them, spread over the
-    /// camera's path, and is fitted to `photo_size`. The targets are the held-out photos, of `target_size`.
+    /// camera's path, and is fitted to `photo_size`. The targets are the held-out photos, fitted to `target_size`.
     ///
     /// # Errors
     /// Fails if nothing is held out, if fewer than two photos are left, or if photos can't be read.
@@ -156,85 +226,96 @@ impl EvalScene {
         holdout: Holdout,
         views: Option<usize>,
         photo_size: ImageSize,
-        target_size: PhotoSize,
-    ) -> Result<Self> {
-        let SceneFrames { target, .. } = split_views(capture, holdout)?;
-        let photos = load_context(capture, holdout, views, photo_size)?;
-        let context = context_views(capture, holdout, views);
-        Ok(EvalScene::new(capture, SceneFrames { context, target }, photos, target_size))
-    }
-
-    /// Creates the scene from the frames of `key` in `index`, with context photos of `photo_size` if a model is evaluated. The target images
-    /// are named by frame numbers.
-    pub(super) fn indexed(
-        key: &str,
-        capture: &Capture,
-        index: &EvaluationIndex,
-        photo_size: Option<ImageSize>,
         target_size: ImageSize,
     ) -> Result<Self> {
+        let (_, held_out) = split_views(capture, holdout)?;
+        let all = capture.render_names();
+        Ok(EvalScene {
+            name: capture.name.clone(),
+            context: load_context(capture, holdout, views, photo_size)?,
+            target: LazyPhotos::from_capture(capture, &held_out, PhotoSize::Exactly(target_size)),
+            render_names: held_out.iter().map(|&view| all[view].clone()).collect(),
+            frames: None,
+            checksum: 0,
+            enlarged: [photo_size, target_size].into_iter().any(|size| capture.has_smaller(size)),
+        })
+    }
+
+    /// Creates the scene from the frames of `key` in the loader's index. The target images are named by frame numbers.
+    fn indexed(key: &str, capture: &Capture, loader: &SceneLoader) -> Result<Self> {
         if !capture.is_complete() {
             let expected = "all that it names, as an index counts them";
             return Err(Error::input(capture.file(), "the photos", "not all there", expected));
         }
-        let frames = index.frames(key, capture.len())?.clone();
-        let context = match photo_size {
+        let frames = loader.index.frames(key, capture.len())?.clone();
+        let context = match loader.photo_size {
             Some(size) => load_views(capture, &frames.context, Some(size))?,
             None => vec![],
         };
-        // Chunks name frames by six-digit numbers.
-        let names: Vec<_> = frames.target.iter().map(|frame| format!("{frame:06}")).collect();
-        let scene = EvalScene::new(capture, frames, context, PhotoSize::Exactly(target_size));
-        Ok(EvalScene { name: key.into(), target_names: names.clone(), render_names: names, ..scene })
-    }
-
-    /// Loads target photo number `i`.
-    pub(super) fn load_target(&self, i: usize) -> Result<View> {
-        let photo = self.frames.target[i];
-        let size = self.target_size.resized(&self.capture.camera(photo));
-        let view = load_views(&self.capture, &[photo], size)?.remove(0);
-        Ok(View { name: self.target_names[i].clone(), ..view })
-    }
-
-    /// Returns the poses of the target photos, camera-to-world.
-    pub(super) fn target_poses(&self) -> Vec<DMat4> {
-        self.frames.target.iter().map(|&photo| self.capture.camera(photo).c2w).collect()
-    }
-
-    /// Scores a baseline that only copies photos: for every target, the context photo whose camera center is nearest.
-    ///
-    /// # Errors
-    /// Fails if a photo can't be read.
-    pub fn score_nearest_photo(&self) -> Result<CaptureScores> {
-        let center = |photo: usize| self.capture.camera(photo).c2w.w_axis.truncate();
-        let mut scores = vec![];
-        for (i, &target) in self.frames.target.iter().enumerate() {
-            let distance = |photo: &usize| center(*photo).distance(center(target));
-            let nearest = self.frames.context.iter().min_by(|a, b| distance(a).total_cmp(&distance(b)));
-            let view = self.load_target(i)?;
-            if !view.is_masked_out() {
-                let nearest = *nearest.expect("a context view");
-                let photo = load_views(&self.capture, &[nearest], Some(size_of(&view)))?.remove(0);
-                scores.push(score_view(&photo.image.to_float(), &view, None)?);
-            }
-        }
-        Ok(CaptureScores::from_views(&self.name, scores, None))
+        let render_names = frames.render_names();
+        let target = LazyPhotos::OnDisk {
+            capture: capture.clone(),
+            indices: frames.target.clone(),
+            names: render_names.clone(),
+            size: PhotoSize::Exactly(loader.target_size),
+        };
+        let mut sizes = loader.photo_size.into_iter().chain([loader.target_size]);
+        let enlarged = sizes.any(|size| capture.has_smaller(size));
+        let checksum = frames.checksum(capture)?;
+        Ok(EvalScene {
+            name: key.into(),
+            context,
+            target,
+            render_names,
+            frames: Some(frames),
+            checksum,
+            enlarged,
+        })
     }
 }
 
-fn size_of(view: &View) -> ImageSize {
-    ImageSize { height: view.camera.height, width: view.camera.width }
-}
-
-/// Returns the views that `holdout` leaves as context, and those that it holds out as targets.
-pub(super) fn split_views(capture: &Capture, holdout: Holdout) -> Result<SceneFrames> {
-    let (context, target) = capture.split(holdout);
-    if target.is_empty() || context.len() < 2 {
-        let split = format!("{} context and {} target views", context.len(), target.len());
+/// Returns the positions of the views that `holdout` leaves, and of those that it holds out.
+pub(super) fn split_views(capture: &Capture, holdout: Holdout) -> Result<(Vec<usize>, Vec<usize>)> {
+    let (context, held_out) = capture.split(holdout);
+    if held_out.is_empty() || context.len() < 2 {
+        let split = format!("{} context and {} target views", context.len(), held_out.len());
         let expected = "2 and 1 at least (--holdout or data.holdout, every:N)";
         return Err(Error::input(capture.file(), format!("the split by {holdout}"), split, expected));
     }
-    Ok(SceneFrames { context, target })
+    Ok((context, held_out))
+}
+
+/// Loader of the scenes of an index. It runs on another thread than the evaluation.
+pub(super) struct SceneLoader<'a> {
+    pub index: &'a EvaluationIndex,
+    /// Size of the target views.
+    pub target_size: ImageSize,
+    /// Size of the context views; `None` if no model is evaluated.
+    pub photo_size: Option<ImageSize>,
+}
+
+impl SceneLoader<'_> {
+    /// Sends the scenes of `groups` one by one until the receiver is dropped. Each chunk is read once.
+    pub fn send(
+        &self,
+        groups: Vec<(&SceneGroup, Vec<String>)>,
+        sender: &SyncSender<(String, Result<EvalScene>)>,
+    ) {
+        for (group, keys) in groups.into_iter().filter(|(_, keys)| !keys.is_empty()) {
+            let open = group.open().map_err(|e| e.to_string());
+            for key in keys {
+                let scene = match &open {
+                    Ok(open) => {
+                        open.capture(&key).and_then(|capture| EvalScene::indexed(&key, &capture, self))
+                    }
+                    Err(e) => Err(Error::failed(e.clone())),
+                };
+                if sender.send((key, scene)).is_err() {
+                    return;
+                }
+            }
+        }
+    }
 }
 
 #[cfg(test)]

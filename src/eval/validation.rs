@@ -1,21 +1,24 @@
 //! Validation: renders and scores held-out views and scenes during training (spec 8.8).
 
-use super::method::Method;
-use super::scene::{EvalScene, SceneFrames, split_views};
+use super::method::nearest_context_baseline;
+use super::scene::{LazyPhotos, split_views};
 use crate::data::{
-    Capture, DataConfig, Dataset, Holdout, PhotoSize, SceneGroup, Split, TrainingScenes, load_views,
+    Capture, DataConfig, Dataset, Holdout, SceneGroup, Split, TrainingScenes, View, cameras_at, load_views,
 };
 use crate::error::{Error, Result};
-use crate::metrics::CaptureScores;
-use crate::reconstruct::spread_over_path;
+use crate::metrics::{CaptureScores, score_views};
+use crate::reconstruct::{reconstruct, spread_over_path};
 use crate::train::{Score, Trainer, Validator};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
 
 /// Views held out of the training scenes, and scenes that are held out as a whole.
 #[derive(Debug)]
 pub struct HeldOut {
     config: DataConfig,
     scenes: Vec<HeldOutScene>,
+    trained_on: Vec<String>,
     warnings: Vec<String>,
     scores: Vec<HeldOutScores>,
 }
@@ -38,7 +41,6 @@ pub struct HeldOutScores {
     /// Scores of the model.
     pub ours: CaptureScores,
     /// Scores of the nearest context photo, which each target is compared with.
-    #[serde(rename = "nearest_photo")]
     pub nearest: CaptureScores,
 }
 
@@ -66,18 +68,32 @@ impl HeldOut {
             groups.extend_from_slice(dataset.groups());
             warnings.extend_from_slice(dataset.warnings());
         }
+        let (trained, mut trained_on) = (scene_ids(training), vec![]);
         for (group, key) in spread(&groups, config.validation_scenes) {
             let capture = group.open()?.capture(&key)?;
             split_scene(&capture, config)?;
             warnings.extend_from_slice(capture.warnings());
+            let scene_id = match group.is_folder() {
+                true => scene_id(capture.file(), None),
+                false => scene_id(group.path(), Some(&key)),
+            };
+            if trained.contains(&scene_id) {
+                trained_on.push(capture.name.clone());
+            }
             scenes.push(HeldOutScene::Whole(group, key));
         }
-        Ok(HeldOut { config: config.clone(), scenes, warnings, scores: vec![] })
+        Ok(HeldOut { config: config.clone(), scenes, trained_on, warnings, scores: vec![] })
     }
 
     /// Returns `true` if nothing is held out.
     pub fn is_empty(&self) -> bool {
         self.scenes.is_empty()
+    }
+
+    /// Returns the names of the scenes that are held out as a whole although they are also trained on. Their scores say nothing about
+    /// unseen scenes.
+    pub fn trained_on(&self) -> &[String] {
+        &self.trained_on
     }
 
     /// Returns the warnings about the scenes held out as a whole: a line for each kind of data that was left out or changed.
@@ -92,31 +108,105 @@ impl HeldOut {
 }
 
 impl HeldOutScene {
-    /// Loads the scene.
-    fn load(&self, config: &DataConfig) -> Result<EvalScene> {
-        let capture = match self {
-            HeldOutScene::Views(capture) => capture.clone(),
-            HeldOutScene::ViewsInGroup(group, key) | HeldOutScene::Whole(group, key) => {
-                group.open()?.capture(key)?
+    /// Loads the name, the context views and the target views of the scene.
+    fn load(&self, config: &DataConfig) -> Result<(String, Vec<View>, Vec<View>)> {
+        let size = Some(config.image_size);
+        // Use as many context views as in training: a model trained on a few views need not fit in memory with hundreds.
+        let context_views = config.context_views.max(2);
+        let (capture, (context, target)) = match self {
+            HeldOutScene::Views(capture) => {
+                let (shown, held_out) = split_views(capture, config.holdout)?;
+                (capture.clone(), (spread_over_path(&capture.cameras(), &shown, context_views), held_out))
+            }
+            HeldOutScene::ViewsInGroup(group, key) => {
+                let capture = group.open()?.capture(key)?;
+                let (shown, held_out) = split_views(&capture, config.holdout)?;
+                let cameras = capture.cameras();
+                let context = spread_over_path(&cameras, &shown, context_views);
+                let target = spread_over_path(&cameras, &held_out, config.target_views);
+                (capture, (context, target))
+            }
+            HeldOutScene::Whole(group, key) => {
+                let capture = group.open()?.capture(key)?;
+                let split = split_scene(&capture, config)?;
+                (capture, split)
             }
         };
-        let frames = match self {
-            HeldOutScene::Views(_) => split_and_spread(&capture, config, config.holdout, usize::MAX)?,
-            HeldOutScene::ViewsInGroup(..) => {
-                split_and_spread(&capture, config, config.holdout, config.target_views)?
-            }
-            HeldOutScene::Whole(..) => split_scene(&capture, config)?,
-        };
-        let context = load_views(&capture, &frames.context, Some(config.image_size))?;
-        Ok(EvalScene::new(&capture, frames, context, PhotoSize::Exactly(config.image_size)))
+        let mut targets = load_views(&capture, &target, size)?;
+        targets.retain(|view| !view.is_masked_out());
+        if targets.is_empty() {
+            return Err(Error::input(
+                capture.file(),
+                "the masks of the held-out views",
+                "no pixel that counts",
+                "some",
+            ));
+        }
+        Ok((capture.name.clone(), load_views(&capture, &context, size)?, targets))
     }
+}
 
-    /// Scores the model on the scene.
-    fn score(&self, trainer: &Trainer, config: &DataConfig) -> Result<HeldOutScores> {
-        let (scene, model) = (self.load(config)?, trainer.as_model());
-        let ours = Method::Model(model).score(&scene, model.device, None, |_, _, _, _| Ok(()))?.scores;
-        Ok(HeldOutScores { ours, nearest: scene.score_nearest_photo()? })
+/// Results of a rank for its share of the scenes, each with the index of its scene.
+#[derive(Debug, Default, Serialize, Deserialize)]
+struct RankResults {
+    scores: Vec<(usize, HeldOutScores)>,
+    /// Error messages of the scenes that can't be used.
+    unusable: Vec<(usize, String)>,
+    /// Error message if the model can't be evaluated.
+    failed: Option<String>,
+    /// `true` if the caller asked to stop.
+    stopped: bool,
+}
+
+impl HeldOut {
+    /// Evaluates this rank's share of the scenes: every n-th of them for n ranks.
+    fn score_assigned_scenes(
+        &self,
+        trainer: &Trainer,
+        should_continue: &mut dyn FnMut() -> bool,
+    ) -> RankResults {
+        let (mut found, group) = (RankResults::default(), trainer.group());
+        for (i, scene) in self.scenes.iter().enumerate().skip(group.rank()).step_by(group.world_size()) {
+            if !should_continue() {
+                found.stopped = true;
+                break;
+            }
+            let (name, context, target) = match scene.load(&self.config) {
+                Ok(views) => views,
+                Err(e) => {
+                    found.unusable.push((i, e.to_string()));
+                    continue;
+                }
+            };
+            match score_scene(trainer, &name, context, target) {
+                Ok(scores) => found.scores.push((i, scores)),
+                Err(e) => {
+                    found.failed = Some(e.to_string());
+                    break;
+                }
+            }
+        }
+        found
     }
+}
+
+/// Reconstructs scene `name` from the views `context` and scores the renders against `target`.
+fn score_scene(
+    trainer: &Trainer,
+    name: &str,
+    context: Vec<View>,
+    target: Vec<View>,
+) -> Result<HeldOutScores> {
+    let poses: Vec<_> = target.iter().map(|view| view.camera.c2w).collect();
+    let model = trainer.as_model();
+    let reconstruction = reconstruct(model, &context, &poses)?;
+    let gaussians = reconstruction.gaussians.to_device(model.device);
+    let cameras = cameras_at(&target, &reconstruction.target_poses);
+    let moved = target.iter().zip(cameras).map(|(view, camera)| View { camera, ..view.shallow_clone() });
+    let moved: Vec<View> = moved.collect();
+    let ours = score_views(name, &gaussians, &moved, None, |_| true)?.expect("a target view");
+    let [context, target] = [context, target].map(LazyPhotos::Loaded);
+    Ok(HeldOutScores { ours, nearest: nearest_context_baseline(name, &context, &target)? })
 }
 
 impl Validator for HeldOut {
@@ -130,30 +220,26 @@ impl Validator for HeldOut {
         should_continue: &mut dyn FnMut() -> bool,
     ) -> Result<Option<Score>> {
         self.scores.clear();
-        let group = trainer.group();
-        // Each rank scores every n-th scene, until it is asked to stop.
-        let own = (group.rank()..self.scenes.len()).step_by(group.world_size());
-        let own = own.map(|i| {
-            let score = || self.scenes[i].score(trainer, &self.config).map_err(|e| e.to_string());
-            should_continue().then(|| (i, score()))
-        });
-        let own: Option<Vec<(usize, std::result::Result<HeldOutScores, String>)>> = own.collect();
-        let all: Option<Vec<_>> = group.all_gather_object(own)?.into_iter().collect();
-        let Some(all) = all else { return Ok(None) };
-        let mut all = all.concat();
-        all.sort_by_key(|(i, _)| *i);
-        let (mut scores, mut unusable, mut left_out) = (vec![], vec![], vec![]);
-        for (i, result) in all {
-            match result {
-                Ok(of_scene) => scores.push(of_scene),
-                Err(why) => {
-                    unusable.push(i);
-                    left_out.push(why);
-                }
+        let (mut scores, mut unusable) = (vec![], vec![]);
+        for found in
+            trainer.group().all_gather_object(self.score_assigned_scenes(trainer, should_continue))?
+        {
+            if let Some(why) = found.failed {
+                return Err(Error::failed(why));
             }
+            if found.stopped {
+                return Ok(None);
+            }
+            scores.extend(found.scores);
+            unusable.extend(found.unusable);
         }
-        // They are reported once.
-        unusable.into_iter().rev().for_each(|i| drop(self.scenes.remove(i)));
+        scores.sort_by_key(|(i, _)| *i);
+        unusable.sort_by_key(|(i, _)| *i);
+        let scores: Vec<HeldOutScores> = scores.into_iter().map(|(_, scores)| scores).collect();
+        for (i, _) in unusable.iter().rev() {
+            self.scenes.remove(*i);
+        }
+        let left_out: Vec<String> = unusable.into_iter().map(|(_, why)| why).collect();
         if scores.is_empty() {
             let why = left_out.first().map(|why| format!(": {why}")).unwrap_or_default();
             return Err(Error::failed(format!("no held-out scene can be used{why}")));
@@ -167,6 +253,21 @@ impl Validator for HeldOut {
     }
 }
 
+/// Identity of a scene: its file, and its key in that file.
+type SceneId = (PathBuf, Option<String>);
+
+fn scene_id(file: &Path, key: Option<&String>) -> SceneId {
+    (file.canonicalize().unwrap_or(file.to_owned()), key.cloned())
+}
+
+/// Returns the identities of all scenes of `training`.
+fn scene_ids(training: &TrainingScenes) -> BTreeSet<SceneId> {
+    let captures = training.captures().iter().map(|capture| scene_id(capture.file(), None));
+    let others = training.others().iter();
+    let others = others.flat_map(|group| group.keys.iter().map(|key| scene_id(group.path(), Some(key))));
+    captures.chain(others).collect()
+}
+
 /// Returns at most `most` scenes of `groups`, spread evenly over all of them.
 fn spread(groups: &[SceneGroup], most: usize) -> Vec<(SceneGroup, String)> {
     let scenes: Vec<_> =
@@ -176,27 +277,16 @@ fn spread(groups: &[SceneGroup], most: usize) -> Vec<(SceneGroup, String)> {
     chosen.map(|(group, key)| (group.clone(), key.clone())).collect()
 }
 
-/// Splits the views of `capture` by `holdout`. The context has at most as many views as in training, since a model trained on a few need
-/// not fit in memory with hundreds; there are at most `target_views` targets. Both are spread along the camera's path.
-fn split_and_spread(
-    capture: &Capture,
-    config: &DataConfig,
-    holdout: Holdout,
-    target_views: usize,
-) -> Result<SceneFrames> {
-    let (cameras, SceneFrames { context, target }) = (capture.cameras(), split_views(capture, holdout)?);
-    let context = spread_over_path(&cameras, &context, config.context_views.max(2));
-    Ok(SceneFrames { context, target: spread_over_path(&cameras, &target, target_views) })
-}
-
 /// Returns the context and target views of a scene that is held out as a whole. The choice is deterministic: as many views as in training,
 /// at even distances along the camera's path, from the middle of a video that is longer than the training window. A capture with a test
 /// part of its own takes its targets from that part.
-fn split_scene(capture: &Capture, config: &DataConfig) -> Result<SceneFrames> {
-    if capture.has_test_part() {
-        return split_and_spread(capture, config, Holdout::None, config.target_views);
-    }
+fn split_scene(capture: &Capture, config: &DataConfig) -> Result<(Vec<usize>, Vec<usize>)> {
     let cameras = capture.cameras();
+    if capture.has_test_part() {
+        let (shown, held_out) = split_views(capture, Holdout::None)?;
+        let context = spread_over_path(&cameras, &shown, config.context_views.max(2));
+        return Ok((context, spread_over_path(&cameras, &held_out, config.target_views)));
+    }
     if cameras.len() < 3 {
         return Err(Error::input(capture.file(), "the number of views", cameras.len(), "three or more"));
     }
@@ -206,7 +296,7 @@ fn split_scene(capture: &Capture, config: &DataConfig) -> Result<SceneFrames> {
     let context = spread_over_path(&cameras, &window, config.context_views.clamp(2, length - 1));
     let between: Vec<usize> = window.into_iter().filter(|view| !context.contains(view)).collect();
     let target = spread_over_path(&cameras, &between, config.target_views);
-    Ok(SceneFrames { context, target })
+    Ok((context, target))
 }
 
 #[cfg(test)]
@@ -226,11 +316,12 @@ mod tests {
             holdout: "every:3+1".parse().unwrap(),
             ..Default::default()
         };
-        let scene = HeldOutScene::Views(capture).load(&config).unwrap();
+        let (_, context, target) = HeldOutScene::Views(capture).load(&config).unwrap();
+        let names = |views: &[View]| views.iter().map(|view| view.name.clone()).collect::<Vec<_>>();
         // The context views are chosen among views 0, 2, 3, 5, 6, 8, 9 and 11, along the path; the targets are all the others.
-        let SceneFrames { context, target } = &scene.frames;
-        assert_eq!((context.len(), scene.context.len(), target.as_slice()), (4, 4, &[1, 4, 7, 10][..]));
-        assert_eq!((context[0], context[3]), (0, 11));
-        assert_eq!(scene.load_target(3).unwrap().name, "000010");
+        let context = names(&context);
+        assert_eq!((context.len(), target.len()), (4, 4));
+        assert_eq!((context[0].as_str(), context[3].as_str()), ("000000", "000011"));
+        assert_eq!(names(&target)[3], "000010");
     }
 }

@@ -73,9 +73,11 @@ pub fn masked_ssim(image: &Tensor, ground_truth: &Tensor, mask: Option<&Tensor>)
     mask.map_or(whole, |mask| 1. - (1. - whole) / mean_weight(mask))
 }
 
-/// Returns the mean weight of a mask `[1, H, W]`, with values in [0, 1].
+/// Returns the mean weight of a mask `[1, H, W]`, with values clamped to [0, 1].
 pub(super) fn mean_weight(mask: &Tensor) -> f64 {
-    mask.mean(Kind::Double).double_value(&[])
+    let size = mask.size();
+    let sum = |(first, count)| band(mask, first, count).sum(Kind::Double).double_value(&[]);
+    bands(size[1], size[2]).map(sum).sum::<f64>() / mask.numel() as f64
 }
 
 #[cfg(test)]

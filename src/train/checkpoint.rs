@@ -196,11 +196,18 @@ impl Trainer {
     }
 }
 
-/// Removes the oldest checkpoints beyond `kept` ones, but never `latest`.
+/// Removes the oldest checkpoints beyond the `kept` newest ones, but never `latest`. Damaged checkpoints don't count, and are removed if
+/// they are older than `latest`.
 pub(super) fn prune_checkpoints(run: &Path, latest: &Path, kept: usize) -> Result<()> {
-    let others: Vec<_> = list_checkpoints(run)?.into_iter().filter(|other| other != latest).collect();
-    let surplus = (others.len() + 1).saturating_sub(kept);
-    Ok(others.iter().take(surplus).try_for_each(|old| remove_dir(old, &FILES))?)
+    let mut others = list_checkpoints(run)?;
+    others.retain(|other| other != latest);
+    let (whole, broken): (Vec<_>, Vec<_>) = others.into_iter().partition(|other| has_expected_sizes(other));
+    let surplus = (whole.len() + 1).saturating_sub(kept);
+    let useless = broken.iter().filter(|broken| broken.as_path() < latest);
+    for old in whole.iter().take(surplus).chain(useless) {
+        remove_dir(old, &FILES)?;
+    }
+    Ok(())
 }
 
 /// Checks that a checkpoint is complete and its files have not changed since they were written. Returns its state.
@@ -215,6 +222,14 @@ pub(super) fn check(checkpoint: &Path) -> Result<State> {
         }
     }
     Ok(state)
+}
+
+/// Returns `true` if a checkpoint's files exist and have their original sizes. [`check`] reads the files, too.
+fn has_expected_sizes(checkpoint: &Path) -> bool {
+    let is_long = |(name, (bytes, _)): (&String, &(u64, u32))| {
+        fs::metadata(checkpoint.join(name)).is_ok_and(|file| file.len() == *bytes)
+    };
+    read_state(checkpoint).is_ok_and(|state| state.files.iter().all(is_long))
 }
 
 fn read_state(checkpoint: &Path) -> Result<State> {

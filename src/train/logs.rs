@@ -6,33 +6,67 @@ use super::{METRICS_FILE, is_due};
 use crate::error::{Error, Result};
 use crate::io::{AppendFile, EventFile, write_atomically};
 use crate::loss::Term;
+use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::Path;
 
-/// Writer of the logs.
-#[derive(Debug)]
-pub(super) struct RunLog {
-    metrics: AppendFile,
-    events: EventFile,
-    /// Number of steps between scalars in the event file.
-    every: u64,
+/// Returns the values that describe a step, with their names, except the terms of its loss.
+pub(super) fn step_values(report: &StepReport, samples_per_second: f64) -> [(&'static str, f64); 7] {
+    [
+        ("loss", report.losses.total),
+        ("psnr", report.psnr()),
+        ("learning_rate", report.learning_rate),
+        ("gradient_norm", report.gradient_norm),
+        ("stage", f64::from(report.stage.index)),
+        ("mix", report.stage.mix),
+        ("samples_per_second", samples_per_second),
+    ]
 }
 
-impl RunLog {
-    /// Opens the logs in the folder `run` of a run that continues after `step` steps. Removes the lines of later steps, which a stopped run
-    /// wrote after the checkpoint that it continues from. Also returns the last step before the latest validation in the file.
-    pub fn open(run: &Path, step: u64, every: u64) -> Result<(Self, Option<u64>)> {
-        let path = &run.join(METRICS_FILE);
-        let mut validated = None;
+/// Returns the terms of a step's loss, with their names.
+pub(super) fn loss_terms(report: &StepReport) -> [(&'static str, f64); Term::ALL.len()] {
+    Term::ALL.map(|term| (term.name(), report.losses[term]))
+}
+
+/// Record read from one line of `metrics.jsonl`: a training step, or a validation if `validation` is set; `step` is then the last step
+/// before it. Values that weren't finite are `None`.
+#[derive(Debug, Deserialize)]
+struct MetricsRecord {
+    step: u64,
+    #[serde(default)]
+    skipped: bool,
+    psnr: Option<f64>,
+    validation: Option<ValidationRecord>,
+}
+
+/// Scores of a validation.
+#[derive(Debug, Deserialize)]
+struct ValidationRecord {
+    psnr: Option<f64>,
+}
+
+/// Writer of `metrics.jsonl`.
+#[derive(Debug)]
+pub(super) struct MetricsWriter {
+    file: AppendFile,
+    /// Last step before the latest validation in the file.
+    last_validated_step: Option<u64>,
+}
+
+impl MetricsWriter {
+    /// Opens the file of a run that continues after `step` steps. Removes the lines of later steps, which a stopped run wrote after the
+    /// checkpoint that it continues from.
+    pub fn open(path: &Path, step: u64) -> Result<Self> {
+        let mut last_validated_step = None;
         if path.is_file() {
             let text = std::fs::read_to_string(path).map_err(Error::read(path))?;
             let mut kept = String::new();
             for line in text.lines() {
-                let record: Value = serde_json::from_str(line).unwrap_or_default();
-                if let Some(line_step) = record["step"].as_u64().filter(|line_step| *line_step < step) {
+                let line_value: Value = serde_json::from_str(line).unwrap_or_default();
+                if let Some(line_step) = line_value["step"].as_u64().filter(|line_step| *line_step < step) {
                     kept.extend([line, "\n"]);
-                    if record["validation"].is_object() {
-                        validated = validated.max(Some(line_step));
+                    if line_value["validation"].is_object() {
+                        last_validated_step = last_validated_step.max(Some(line_step));
                     }
                 }
             }
@@ -42,58 +76,40 @@ impl RunLog {
                 })?;
             }
         }
-        let mut events = EventFile::create_for(run)?;
-        // Earlier events of this step and of later ones become void.
-        events.start(step)?;
-        Ok((RunLog { metrics: AppendFile::open(path)?, events, every }, validated))
+        Ok(MetricsWriter { file: AppendFile::open(path)?, last_validated_step })
     }
 
-    /// Logs a step.
+    /// Appends the record of a step.
     pub fn log_step(&mut self, report: &StepReport, samples_per_second: f64) -> Result<()> {
-        let values = [
-            ("loss", report.losses.total),
-            ("psnr", report.psnr()),
-            ("learning_rate", report.learning_rate),
-            ("gradient_norm", report.gradient_norm),
-            ("stage", f64::from(report.stage.index)),
-            ("mix", report.stage.mix),
-            ("samples_per_second", samples_per_second),
-        ];
-        let terms = Term::ALL.map(|term| (term.name(), report.losses[term]));
         let mut line = json!({ "step": report.step, "skipped": report.skipped });
-        for (name, value) in values.into_iter().chain(terms) {
+        for (name, value) in step_values(report, samples_per_second).into_iter().chain(loss_terms(report)) {
             line[name] = value.into();
         }
         line["stage"] = report.stage.index.into();
         if report.skipped {
             line["scenes"] = report.scenes.clone().into();
         }
-        self.append(&line)?;
-        if is_due(self.every, report.step) {
-            let tagged = |group: &'static str| move |(name, value)| (format!("{group}/{name}"), value);
-            let scalars = values.into_iter().map(tagged("train")).chain(terms.map(tagged("loss")));
-            self.events.write_scalars(report.step, &scalars.collect::<Vec<_>>())?;
-        }
-        match &report.picture {
-            Some(picture) => self.events.write_image(report.step, "train/views", picture),
-            None => Ok(()),
-        }
+        self.append(&line)
     }
 
-    /// Logs the validation after step `step`. Its line in the metrics comes last, so that a run that was killed before repeats it.
+    /// Appends the record of a validation after step `step`.
     pub fn log_validation(&mut self, step: u64, score: &Score) -> Result<()> {
         let Score { psnr, ssim, scenes, stage, .. } = score;
-        let scalars = [("psnr", *psnr), ("ssim", *ssim), ("stage", f64::from(stage.index))];
-        let scalars = scalars.map(|(name, value)| (format!("validation/{name}"), value));
-        self.events.write_scalars(step, &scalars)?;
         let validation = json!({
             "psnr": psnr, "ssim": ssim, "scenes": scenes, "stage": stage.index, "mix": stage.mix,
         });
-        self.append(&json!({ "step": step, "validation": validation }))
+        self.append(&json!({ "step": step, "validation": validation }))?;
+        self.last_validated_step = Some(step);
+        Ok(())
+    }
+
+    /// Returns the last step before the latest validation in the file.
+    pub fn last_validated_step(&self) -> Option<u64> {
+        self.last_validated_step
     }
 
     fn append(&mut self, line: &Value) -> Result<()> {
-        Ok(self.metrics.append(format!("{line}\n").as_bytes())?)
+        Ok(self.file.append(format!("{line}\n").as_bytes())?)
     }
 }
 
@@ -115,13 +131,13 @@ impl Curves {
     pub fn read(run: &Path, max_points: u64) -> Result<Self> {
         let path = run.join(METRICS_FILE);
         let text = std::fs::read_to_string(&path).map_err(Error::read(&path))?;
+        let records = text.lines().filter_map(|line| serde_json::from_str::<MetricsRecord>(line).ok());
         let (mut steps, mut held_out) = (vec![], vec![]);
-        // The last line may be incomplete, and values that weren't finite are null.
-        for record in text.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok()) {
-            let Some(step) = record["step"].as_u64() else { continue };
-            held_out.extend(record["validation"]["psnr"].as_f64().map(|psnr| (step, psnr)));
-            if record["skipped"] != true {
-                steps.extend(record["psnr"].as_f64().map(|psnr| (step, psnr)));
+        for record in records {
+            match record.validation {
+                Some(validation) => held_out.extend(validation.psnr.map(|psnr| (record.step, psnr))),
+                None if record.skipped => {}
+                None => steps.extend(record.psnr.map(|psnr| (record.step, psnr))),
             }
         }
         if steps.is_empty() {
@@ -132,6 +148,53 @@ impl Curves {
         };
         let training = steps.chunks(steps.len().div_ceil(max_points as usize)).map(mean).collect();
         Ok(Curves { training, held_out })
+    }
+}
+
+/// Event file of the current start of the run.
+#[derive(Debug)]
+pub(super) struct TensorBoard {
+    file: EventFile,
+    /// Number of steps between scalars.
+    every: u64,
+}
+
+impl TensorBoard {
+    /// Creates a new file in the run's folder. Call [`TensorBoard::start`] next.
+    pub fn create(run: &Path, every: u64) -> Result<Self> {
+        Ok(TensorBoard { file: EventFile::create_for(run)?, every })
+    }
+
+    /// Records that the run continues with `step`. Earlier events of this step and of later ones become void.
+    pub fn start(&mut self, step: u64) -> Result<()> {
+        self.file.start(step)
+    }
+
+    pub fn log_step(&mut self, report: &StepReport, samples_per_second: f64) -> Result<()> {
+        if !is_due(self.every, report.step) {
+            return Ok(());
+        }
+        let tagged = |group: &'static str| move |(name, value)| (format!("{group}/{name}"), value);
+        let values = step_values(report, samples_per_second).map(tagged("train"));
+        let terms = loss_terms(report).map(tagged("loss"));
+        self.file.write_scalars(report.step, &[&values[..], &terms].concat())
+    }
+
+    pub fn log_picture(&mut self, report: &StepReport) -> Result<()> {
+        match &report.picture {
+            Some(picture) => self.file.write_image(report.step, "train/views", picture),
+            None => Ok(()),
+        }
+    }
+
+    /// Logs the validation scores after step `step`.
+    pub fn log_validation(&mut self, step: u64, score: &Score) -> Result<()> {
+        let values = [
+            ("validation/psnr", score.psnr),
+            ("validation/ssim", score.ssim),
+            ("validation/stage", f64::from(score.stage.index)),
+        ];
+        self.file.write_scalars(step, &values.map(|(tag, value)| (tag.to_string(), value)))
     }
 }
 

@@ -3,7 +3,7 @@
 use crate::config::{Config, OptimizerKind};
 use crate::error::Result;
 use crate::loss::PerceptualLoss;
-use crate::model::{GlobalSplat, Precision, Streams};
+use crate::model::{GlobalSplat, ModelConfig, Precision, Streams};
 use serde::Serialize;
 use tch::{Device, nn};
 
@@ -34,11 +34,12 @@ impl MemoryEstimate {
     /// # Errors
     /// Returns an error if the model's settings don't fit together.
     pub fn new(config: &Config, device: Device) -> Result<Self> {
+        Ok(Self::with_parameters(config, count_parameters(&config.model)?, device))
+    }
+
+    /// Estimates the memory of a step for a model with `learned` trainable parameters.
+    fn with_parameters(config: &Config, learned: f64, device: Device) -> Self {
         const FLOAT: f64 = 4.;
-        let mut vs = nn::VarStore::new(Device::Cpu);
-        GlobalSplat::uninitialized(&mut vs, &config.model, Precision::F32)?;
-        let learned: usize = vs.trainable_variables().iter().map(|variable| variable.numel()).sum();
-        let learned = learned as f64;
         let (model, data) = (&config.model, &config.data);
         let (batch, precision) = (config.train.batch_size, config.train.precision);
         let scenes_at_once = match config.train.micro_batch {
@@ -87,7 +88,7 @@ impl MemoryEstimate {
 
         let bytes = |numbers: f64| (FLOAT * numbers) as u64;
         let at_once = scenes_at_once as f64;
-        Ok(MemoryEstimate {
+        MemoryEstimate {
             batch,
             scenes_at_once,
             weights: bytes((1. + moments + gradients) * learned),
@@ -101,7 +102,7 @@ impl MemoryEstimate {
                 scenes_at_once * data.target_views,
                 device,
             ),
-        })
+        }
     }
 
     /// Returns the sum of all items.
@@ -113,4 +114,36 @@ impl MemoryEstimate {
     pub fn fits_into(&self, bytes: u64) -> bool {
         self.total() + self.total() * 3 / 20 <= bytes
     }
+}
+
+/// Returns the batch size of `config`, halved until all scenes fit at once into `bytes` of memory on `device`, and the estimate of the last
+/// batch size that did not fit, if any. A batch size of 1 is accepted without a check.
+///
+/// # Errors
+/// Returns an error if the model's settings don't fit together.
+pub fn largest_fitting_batch(
+    config: &Config,
+    bytes: u64,
+    device: Device,
+) -> Result<(usize, Option<MemoryEstimate>)> {
+    let mut config = config.clone();
+    config.train.micro_batch = 0;
+    let learned = count_parameters(&config.model)?;
+    let mut refused = None;
+    while config.train.batch_size > 1 {
+        let estimate = MemoryEstimate::with_parameters(&config, learned, device);
+        if estimate.fits_into(bytes) {
+            break;
+        }
+        refused = Some(estimate);
+        config.train.batch_size /= 2;
+    }
+    Ok((config.train.batch_size, refused))
+}
+
+/// Returns the number of trainable parameters of a model of `config`.
+fn count_parameters(config: &ModelConfig) -> Result<f64> {
+    let mut vs = nn::VarStore::new(Device::Cpu);
+    GlobalSplat::uninitialized(&mut vs, config, Precision::F32)?;
+    Ok(vs.trainable_variables().iter().map(|variable| variable.numel()).sum::<usize>() as f64)
 }

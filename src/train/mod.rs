@@ -14,13 +14,15 @@ mod trainer;
 pub use crate::io::{CONFIG_FILE, METRICS_FILE};
 pub use checkpoint::{MODEL_FILE, best_checkpoint, latest_checkpoint, list_checkpoints};
 pub use logs::Curves;
-pub use memory_estimate::MemoryEstimate;
-pub use run::{Event, Outcome, Resume, Validator, add_run_inputs, run};
+pub use memory_estimate::{MemoryEstimate, largest_fitting_batch};
+pub use run::{Event, Outcome, Resume, Validator, add_run_inputs, retry_on_disk_full, run};
 pub use step::{Score, StepReport};
 pub use trainer::Trainer;
 
 // The parity checks run this function by itself.
 pub(crate) use schedule::parameter_groups;
+// Benchmarks read the time of this span.
+pub(crate) use trainer::COMMUNICATION;
 
 /// Returns `true` if an action that is taken every `every` steps (0: never) is due at `step`.
 fn is_due(every: u64, step: u64) -> bool {

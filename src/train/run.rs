@@ -5,7 +5,7 @@ use super::checkpoint::{
     prune_checkpoints, recover,
 };
 use super::is_due;
-use super::logs::RunLog;
+use super::logs::{MetricsWriter, TensorBoard};
 use super::step::{Score, StepReport};
 use super::trainer::Trainer;
 use super::{CONFIG_FILE, METRICS_FILE};
@@ -13,7 +13,7 @@ use crate::config::{TrainConfig, changed_keys};
 use crate::error::{Error, Result};
 use crate::io::{InputFiles, event_files, write_atomically};
 use std::path::{Path, PathBuf};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// Starting point of a run.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -40,7 +40,7 @@ pub enum Event<'a> {
     Validation(&'a Score),
     /// Message for the user, in one sentence.
     Notice(String),
-    /// No progress to report: the run is inside of a step or a validation.
+    /// No progress to report: the run waits for disk space, or is inside of a step or a validation.
     Waiting,
 }
 
@@ -79,7 +79,7 @@ pub trait Validator {
 ///
 /// # Errors
 /// Returns an error if another process uses the run, a checkpoint doesn't fit, too many steps in a row were skipped, another rank is gone,
-/// or a step or a save fails. If a validation fails, it is left out.
+/// or a step or a save fails. If the disk is full, the run waits for free space. If a validation fails, it is left out.
 pub fn run(
     trainer: &mut Trainer,
     out: &Path,
@@ -87,18 +87,23 @@ pub fn run(
     validator: Option<&mut dyn Validator>,
     mut on_event: impl FnMut(Event) -> bool,
 ) -> Result<Outcome> {
-    let opened = trainer.group.is_main_process();
-    let opened = opened.then(|| RunLogger::open(trainer, out, resume, &mut on_event)).transpose()?;
+    let writes = trainer.group.is_main_process();
+    let opened = writes.then(|| RunLogger::open(trainer, out, resume, &mut on_event)).transpose()?;
     trainer.broadcast_state()?;
-    let held_out = validator.as_ref().map_or(0, |validator| validator.scenes());
-    let (logger, start) =
-        opened.map(|(logger, validated, saved)| (logger, (held_out, validated, saved))).unzip();
-    let (expected, validated, saved) = trainer.group.broadcast_object(start)?;
+    let held_out = validator.as_ref().map(|validator| validator.scenes());
+    let expected = trainer.group.broadcast_object(writes.then_some(held_out))?;
     if held_out != expected {
+        let count = |scenes: Option<usize>| scenes.unwrap_or(0);
+        let (found, expected) = (count(held_out), count(expected));
         return Err(Error::failed(format!(
-            "this rank has {held_out} held-out scenes, expected {expected}, as the first one"
+            "this rank has {found} held-out scenes, expected {expected}, as the first one"
         )));
     }
+    let validated = opened.as_ref().map(|(logger, _)| logger.metrics.last_validated_step());
+    let validated = trainer.group.broadcast_object(validated)?;
+    let saved = opened.as_ref().map(|(_, saved)| saved.clone());
+    let saved = trainer.group.broadcast_object(saved)?;
+    let logger = opened.map(|(logger, _)| logger);
     Run { trainer, out, validator, on_event, logger, validated, asked_to_stop: false }.train(saved)
 }
 
@@ -131,7 +136,8 @@ fn check_output_folder(out: &Path) -> Result<()> {
 /// Files that a run writes beside its checkpoints.
 struct RunLogger {
     _lock: RunLock,
-    log: RunLog,
+    metrics: MetricsWriter,
+    tensorboard: TensorBoard,
     /// PSNR of the best checkpoint, in dB.
     best: Option<f64>,
     /// Settings that validation scores depend on.
@@ -139,14 +145,13 @@ struct RunLogger {
 }
 
 impl RunLogger {
-    /// Brings the trainer to the run's starting point, and opens the run's files. Also returns the step before the last validation that was
-    /// logged, and the run's own checkpoint of this state.
+    /// Brings the trainer to the run's starting point, and opens the run's files. Also returns the run's own checkpoint of this state.
     fn open(
         trainer: &mut Trainer,
         out: &Path,
         resume: &Resume,
         on_event: &mut impl FnMut(Event) -> bool,
-    ) -> Result<(Self, Option<u64>, Option<PathBuf>)> {
+    ) -> Result<(Self, Option<PathBuf>)> {
         check_output_folder(out)?;
         let lock = RunLock::take(out)?;
         recover(out)?;
@@ -161,14 +166,43 @@ impl RunLogger {
             let changes = changes.join(", ");
             on_event(Event::Notice(format!("resuming with a changed configuration: {changes}")));
         }
-        write_atomically(&config, |writer| writer.write_all(toml.as_bytes()).map_err(Error::write(&config)))?;
-        let (log, validated) = RunLog::open(out, trainer.step, trainer.config.train.log_every)?;
+        retry_on_disk_full(on_event, || {
+            write_atomically(&config, |writer| {
+                writer.write_all(toml.as_bytes()).map_err(Error::write(&config))
+            })
+        })?;
+        let metrics =
+            retry_on_disk_full(on_event, || MetricsWriter::open(&out.join(METRICS_FILE), trainer.step))?;
+        let mut tensorboard =
+            retry_on_disk_full(on_event, || TensorBoard::create(out, trainer.config.train.log_every))?;
+        retry_on_disk_full(on_event, || tensorboard.start(trainer.step))?;
         let settings = trainer.config.data.validation_settings();
         let best = best_score(out, &settings).unwrap_or_else(|e| {
             on_event(Event::Notice(format!("{e}; the best checkpoint is determined again")));
             None
         });
-        Ok((RunLogger { _lock: lock, log, best, settings }, validated, saved))
+        Ok((RunLogger { _lock: lock, metrics, tensorboard, best, settings }, saved))
+    }
+
+    fn log_step(
+        &mut self,
+        on_event: &mut impl FnMut(Event) -> bool,
+        report: &StepReport,
+        samples_per_second: f64,
+    ) -> Result<()> {
+        retry_on_disk_full(on_event, || self.metrics.log_step(report, samples_per_second))?;
+        retry_on_disk_full(on_event, || self.tensorboard.log_step(report, samples_per_second))?;
+        retry_on_disk_full(on_event, || self.tensorboard.log_picture(report))
+    }
+
+    fn log_validation(
+        &mut self,
+        on_event: &mut impl FnMut(Event) -> bool,
+        step: u64,
+        score: &Score,
+    ) -> Result<()> {
+        retry_on_disk_full(on_event, || self.tensorboard.log_validation(step, score))?;
+        retry_on_disk_full(on_event, || self.metrics.log_validation(step, score))
     }
 }
 
@@ -200,7 +234,12 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             let validates = self.validator.is_some() && step > 0 && is_due(validate_every, step);
             if validates && skipped_in_a_row == 0 && self.validated != Some(step - 1) {
                 let checkpoint = saved.take().map_or_else(|| self.save(), Ok)?;
-                should_continue = self.validate(&checkpoint)?;
+                should_continue = match self.validate(&checkpoint) {
+                    // A failed write or a lost rank isn't a problem of the held-out data.
+                    Err(e) if e.is_failed_write() || e.is_distributed() => return Err(e),
+                    Err(e) => self.emit(Event::Notice(format!("a validation is left out: {e}"))),
+                    should_continue => should_continue?,
+                };
                 saved = Some(checkpoint);
             }
             if !should_continue {
@@ -216,7 +255,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             let samples_per_second = batch / start.elapsed().as_secs_f64();
             saved = None;
             if let Some(logger) = &mut self.logger {
-                logger.log.log_step(&report, samples_per_second)?;
+                logger.log_step(&mut self.on_event, &report, samples_per_second)?;
             }
             should_continue =
                 self.emit(Event::Step { report: &report, samples_per_second }) && report.should_continue;
@@ -245,9 +284,14 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             prune_checkpoints(self.out, &checkpoint, self.trainer.config.train.keep_checkpoints)?;
         }
         if complete && self.validator.is_some() {
-            self.validate(&checkpoint)?;
-            // If the validation was stopped before its end, the run isn't complete, and the same command repeats the validation.
-            complete = self.validated == Some(self.trainer.step.saturating_sub(1));
+            match self.validate(&checkpoint) {
+                Err(e) if e.is_failed_write() || e.is_distributed() => return Err(e),
+                Err(e) => {
+                    self.emit(Event::Notice(format!("the last validation is left out: {e}")));
+                }
+                // If the validation was stopped before its end, the run isn't complete, and the same command repeats the validation.
+                Ok(_) => complete = self.validated == Some(self.trainer.step.saturating_sub(1)),
+            }
         }
         Ok(Outcome { checkpoint, complete, skipped })
     }
@@ -262,37 +306,31 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
     /// Saves a checkpoint on the first rank. Returns the checkpoint's folder on all ranks, even if it isn't written yet.
     fn save(&mut self) -> Result<PathBuf> {
         match &self.logger {
-            Some(_) => self.trainer.save(self.out),
+            Some(_) => retry_on_disk_full(&mut self.on_event, || self.trainer.save(self.out)),
             None => Ok(self.trainer.checkpoint(self.out)),
         }
     }
 
     /// Validates the current state, which `checkpoint` holds, and returns whether to continue. The score is logged last, so that a run that
-    /// is killed during the validation repeats all of it. A validation that fails is left out.
+    /// is killed during the validation repeats all of it.
     fn validate(&mut self, checkpoint: &Path) -> Result<bool> {
         let Some(validator) = &mut self.validator else { return Ok(true) };
-        let (on_event, step) = (&mut self.on_event, self.trainer.step.saturating_sub(1));
-        let score = match validator.validate(self.trainer, &mut || on_event(Event::Waiting)) {
-            Ok(Some(score)) => score,
-            Ok(None) => return Ok(false),
-            // A lost rank isn't a problem of the held-out data.
-            Err(e) if e.is_distributed() => return Err(e),
-            Err(e) => {
-                self.validated = Some(step);
-                return Ok(self.emit(Event::Notice(format!("a validation is left out: {e}"))));
-            }
+        let on_event = &mut self.on_event;
+        let Some(score) = validator.validate(self.trainer, &mut || on_event(Event::Waiting))? else {
+            return Ok(false);
         };
         for why in &score.left_out {
             on_event(Event::Notice(format!("a held-out scene is left out: {why}")));
         }
+        let step = self.trainer.step.saturating_sub(1);
         if let Some(logger) = &mut self.logger {
             if score.psnr > logger.best.unwrap_or(f64::NEG_INFINITY) {
-                let validation = Validation { psnr: score.psnr, settings: logger.settings.clone() };
-                keep_best(self.out, checkpoint, validation)?;
+                let found = || Validation { psnr: score.psnr, settings: logger.settings.clone() };
+                retry_on_disk_full(on_event, || keep_best(self.out, checkpoint, found()))?;
                 logger.best = Some(score.psnr);
             }
             if self.validated != Some(step) {
-                logger.log.log_validation(step, &score)?;
+                logger.log_validation(on_event, step, &score)?;
             }
         }
         self.validated = Some(step);
@@ -359,6 +397,42 @@ fn begin(
             }
             let found = format!("broken, all {} of them", checkpoints.len());
             Err(Error::input(out, "the run's checkpoints", found, "a whole one (choose another --out)"))
+        }
+    }
+}
+
+/// Time between attempts to write to a full disk.
+const PAUSE: Duration = Duration::from_millis(500);
+
+/// Calls `write`, and repeats it as long as the disk is full and `on_event` returns `true`.
+///
+/// # Errors
+/// Returns the errors of `write`.
+pub fn retry_on_disk_full<T>(
+    on_event: &mut impl FnMut(Event) -> bool,
+    mut write: impl FnMut() -> Result<T>,
+) -> Result<T> {
+    let mut waited = false;
+    loop {
+        match write() {
+            Err(e) if e.is_out_of_space() => {
+                if !waited {
+                    on_event(Event::Notice(format!(
+                        "training paused: {e}; it resumes when there is disk space"
+                    )));
+                    waited = true;
+                }
+                if !on_event(Event::Waiting) {
+                    return Err(e);
+                }
+                std::thread::sleep(PAUSE);
+            }
+            result => {
+                if waited && result.is_ok() {
+                    on_event(Event::Notice("disk space is available again: training resumes".into()));
+                }
+                return result;
+            }
         }
     }
 }

@@ -3,7 +3,7 @@
 use super::gradients::{ForwardBackward, ModelReplica, gradients_in_parallel};
 use super::is_due;
 use super::schedule::{in_backward_order, learning_rate, parameter_groups, stage_at, subsets};
-use super::step::{StepReport, StepSums, preview, to_summed_tensor};
+use super::step::{StepReport, StepSums, StepSync, preview};
 use crate::config::{Config, changed_keys};
 use crate::data::{BadData, BadSceneReport, Batch, BatchShard, DataLoader, SceneGroups};
 use crate::device::Stopwatch;
@@ -17,6 +17,9 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use tch::{Device, Kind, Tensor, nn, no_grad};
+
+/// Name of the section of a step in which ranks wait for each other.
+pub(crate) const COMMUNICATION: &str = "communication";
 
 /// Model, optimizer and data of a run.
 ///
@@ -78,21 +81,24 @@ impl Trainer {
         let mut model = GlobalSplat::new(&vs.root(), &config.model)?;
         model.set_precision(config.train.precision);
         let optimizer = Optimizer::new(parameter_groups(&vs, &config.train));
+        let config = config.clone();
         let group = ProcessGroup::single();
+        let buckets = Buckets::new(&group, &[]);
+        let (step, samples, loader) = (0, 0, None);
         Ok(Trainer {
-            config: config.clone(),
+            config,
             vs,
             model,
             replicas: vec![],
             optimizer,
             perceptual,
             weights: None,
-            step: 0,
-            samples: 0,
+            step,
+            samples,
             scenes,
-            loader: None,
-            buckets: Buckets::new(&group, &[]),
+            loader,
             group,
+            buckets,
         })
     }
 
@@ -193,7 +199,7 @@ impl Trainer {
         let losses = self.gradients(sample, stage, stopwatch)?;
         let sums = match self.group.world_size() {
             1 => self.all_reduce(losses, should_continue)?,
-            _ => stopwatch.time("communication", || self.all_reduce(losses, should_continue))?,
+            _ => stopwatch.time(COMMUNICATION, || self.all_reduce(losses, should_continue))?,
         };
         // The GPU is still busy with this step. The next samples are copied meanwhile.
         if let (Some(loader), device @ Device::Cuda(_)) = (&mut self.loader, self.vs.device()) {
@@ -209,12 +215,13 @@ impl Trainer {
             }
             Ok((sums, skipped))
         })?;
-        if !sums.has_equal_gradients(self.group.world_size()) {
+        let StepSums { losses, sync, gradient_norm } = sums;
+        if !sync.has_equal_gradients(self.group.world_size()) {
             return Err(Error::failed(
                 "ranks have different parameters: were they started with the same program?",
             ));
         }
-        if sums.has_bad_data {
+        if sync.has_bad_data() {
             self.exchange_bad_data()?;
         }
         let scenes = match skipped {
@@ -225,25 +232,24 @@ impl Trainer {
             step: self.step,
             stage,
             learning_rate,
-            losses: sums.losses,
-            gradient_norm: sums.gradient_norm,
+            losses,
+            gradient_norm,
             skipped,
             scenes,
             picture: None,
-            should_continue: !sums.is_asked_to_stop,
+            should_continue: !sync.is_asked_to_stop(),
         };
         self.step += 1;
         Ok(report)
     }
 
-    /// Waits for the sums of the gradients over all ranks. Returns the sums of the
-    /// tensors of [`to_summed_tensor`].
+    /// Waits for the sums of the gradients over all ranks. Returns the sums of `losses` and of the ranks' [`StepSync`], packed.
     fn all_reduce(&self, losses: Tensor, should_continue: &mut dyn FnMut() -> bool) -> Result<Tensor> {
         let gradients = self.buckets.finish()?;
         let is_asked_to_stop = !should_continue();
         let has_bad_data =
             self.loader.as_ref().is_some_and(|loader| loader.bad_data_log().has_bad_scene_reports());
-        let sums = to_summed_tensor(losses, is_asked_to_stop, has_bad_data, gradients);
+        let sums = StepSync::of_rank(is_asked_to_stop, has_bad_data, gradients).to_tensor(losses);
         self.group.all_reduce(&sums)?;
         Ok(sums)
     }
@@ -258,6 +264,17 @@ impl Trainer {
             others.flat_map(|(_, reports)| reports).try_for_each(|report| log.record_report(report))?;
         }
         Ok(())
+    }
+
+    /// Repeats the sum of the gradients over all ranks, with no other work at the same time. For benchmarks.
+    pub(crate) fn add_gradients_up(&self) -> Result<()> {
+        self.buckets.begin();
+        self.buckets.finish().map(|_| ())
+    }
+
+    /// Returns the size of the gradients that the last step left, in bytes.
+    pub(crate) fn gradient_bytes(&self) -> u64 {
+        self.optimizer.gradients().map(|(_, t)| (t.numel() * t.kind().elt_size_in_bytes()) as u64).sum()
     }
 
     /// Copies the state of the first rank to all ranks: its weights, moments, step and position in the data.
@@ -412,9 +429,19 @@ impl Trainer {
         self.loader.as_ref().map(DataLoader::bad_data).unwrap_or_default()
     }
 
+    /// Returns the configuration.
+    pub fn config(&self) -> &Config {
+        &self.config
+    }
+
     /// Returns the group of ranks that train together.
     pub fn group(&self) -> &ProcessGroup {
         &self.group
+    }
+
+    /// Returns the model in its current state.
+    pub fn model(&self) -> &GlobalSplat {
+        &self.model
     }
 
     /// Returns the stage that the weights were trained to: that of the last step, or the final stage once all steps are done (spec 8.7).
@@ -423,6 +450,11 @@ impl Trainer {
             true => stage_at(&self.config.curriculum, self.step.saturating_sub(1)),
             false => self.config.curriculum.final_stage(),
         }
+    }
+
+    /// Returns the device of the weights.
+    pub fn device(&self) -> Device {
+        self.vs.device()
     }
 
     /// Returns the model in its current state, for reconstruction.

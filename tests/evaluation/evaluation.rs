@@ -30,7 +30,7 @@ fn dataset() -> Sandbox {
     sandbox
 }
 
-const SPLATS: &str = "eval --splat @splats --size 64x64 --index @re10k_3v.json --out @out --data";
+const SPLATS: &str = "eval --splat @splats --render-height 64 --index @re10k_3v.json --out @out --data";
 const MODEL: &str = "eval --weights @tiny.safetensors --index @re10k_3v.json --data";
 
 fn read(sandbox: &Sandbox, folder: &str) -> Evaluation {
@@ -97,9 +97,24 @@ fn an_interrupted_evaluation_resumes() {
     assert_says(&sandbox.refuse(&eval), &["choose another --out"]);
 }
 
+/// Replaces the contents of a file without changing its size or modification time.
+fn replace_unnoticed(sandbox: &Sandbox, name: &str, mut bytes: Vec<u8>) {
+    let path = sandbox.path(name);
+    let metadata = std::fs::metadata(&path).unwrap();
+    let (length, modified) = (metadata.len() as usize, metadata.modified().unwrap());
+    assert!(bytes.len() <= length, "{} bytes for {length}", bytes.len());
+    // Decoders ignore bytes behind an image's end.
+    bytes.resize(length, 0);
+    std::fs::write(&path, bytes).unwrap();
+    let file = std::fs::File::options().write(true).open(&path).unwrap();
+    file.set_times(std::fs::FileTimes::new().set_modified(modified)).unwrap();
+}
+
 #[test]
-fn changed_splats_are_scored_again() {
+fn changes_of_same_size_and_time_are_scored_again() {
     let sandbox = dataset();
+    let photo = "captures/room_000/images/001.png";
+    sandbox.write(photo, [sandbox.read(photo), vec![0; 1 << 20]].concat());
     let psnr = || {
         sandbox.succeed(&format!("{SPLATS} @captures"));
         let scenes = read(&sandbox, "out").scenes;
@@ -108,9 +123,16 @@ fn changed_splats_are_scored_again() {
     let first = psnr();
     // Scores that are reused as long as nothing changes.
     sandbox.change_json("out/scenes/room_002.json", |scores| scores["psnr"] = json!(99.5));
-    sandbox.copy("splats/room_001.ply", "splats/room_000.ply");
+    replace_unnoticed(&sandbox, "splats/room_000.ply", sandbox.read("splats/room_001.ply"));
     let second = psnr();
-    assert!(second[0] < first[0] - 10. && second[1] == 99.5, "{first:?} and {second:?}");
+    assert!(second[0] < first[0] - 10. && second[1] == 99.5, "another splat: {first:?} and {second:?}");
+    replace_unnoticed(&sandbox, photo, sandbox.read("captures/room_002/images/000.png"));
+    let third = psnr();
+    assert!(third[0] != second[0] && third[1] == 99.5, "another photo: {second:?} and {third:?}");
+    sandbox
+        .change_json("captures/room_000/cameras.json", |json| json["views"][1]["c2w"][0][3] = json!(0.123));
+    let fourth = psnr();
+    assert!(fourth[0] != third[0] && fourth[1] == 99.5, "another camera: {third:?} and {fourth:?}");
 
     // LPIPS is added once its weights are available.
     if !has_lpips() {
@@ -186,33 +208,42 @@ fn external_renders_are_scored_by_an_index() {
         }
     }
     let report = sandbox.json(
-        "eval --renders @renders --name 'the photos' --size 64x64 --data @chunks --index @re10k_3v.json --out @out",
+        "eval --renders @renders --name 'the photos' --render-height 64 --data @chunks --index @re10k_3v.json --out @out",
     );
-    assert_eq!(report["summary"], json!({"psnr": 100., "ssim": 1.}));
+    assert_eq!(report["evaluations"][0]["summary"], json!({"psnr": 100., "ssim": 1.}));
     assert_eq!(read(&sandbox, "out").method, "the photos");
 }
 
 #[test]
-fn the_index_or_an_option_names_the_dataset() {
+fn several_indices_make_one_report() {
     let sandbox = dataset();
     let index = json!({"room_001": {"context": [0, 4], "target": [2]}}).to_string();
+    ["acid_2v.json", "other/acid_2v.json"].iter().for_each(|name| sandbox.write(name, &index));
+    let eval = format!("{SPLATS} @chunks --index @acid_2v.json");
+    sandbox.succeed(&eval);
+    assert_says(&sandbox.text("out/report.html"), &["room_001", "room_002"]);
+    assert_eq!(read(&sandbox, "out/acid_2v").dataset, "acid");
+    let error = sandbox.refuse(&format!("{eval} --index @other/acid_2v.json"));
+    assert_says(&error, &["two of them would go to"]);
+
+    // A name of two datasets is refused, unless --dataset names one.
     sandbox.write("acid_from_re10k_2v.json", &index);
-    let eval = SPLATS.replace("re10k_3v", "acid_from_re10k_2v");
-    for (option, name) in [("", "acid"), ("--dataset RealEstate10K", "RealEstate10K")] {
-        sandbox.succeed(&format!("{eval} @chunks {option}"));
-        assert_eq!(read(&sandbox, "out").dataset, name);
-    }
+    let eval = SPLATS.replace("re10k_3v", "acid_from_re10k_2v").replace("@out", "@named");
+    let error = sandbox.refuse(&format!("{eval} @chunks"));
+    assert_says(&error, &["acid_from_re10k_2v.json: ", "acid or re10k", "--dataset"]);
+    assert!(!sandbox.path("named").exists(), "nothing was begun");
+    sandbox.succeed(&format!("{eval} @chunks --dataset ACID"));
+    assert_eq!(read(&sandbox, "named").dataset, "acid");
 }
 
 #[test]
-fn images_are_scored_at_the_size_that_is_given() {
+fn images_are_scored_at_the_height_that_is_asked_for() {
     let sandbox = dataset();
-    let eval = "eval --splat @splats/room_000.ply --scene @captures/room_000 --size";
-    let psnr = |size: &str| sandbox.json(&format!("{eval} {size}"))["psnr"].as_f64();
-    assert!(psnr("64x64") > psnr("32x32"), "the photos were rendered at 64");
-    assert_says(&sandbox.refuse(&format!("{eval} 8")), &["--size 8: expected the longer side"]);
-    let error = sandbox.refuse(&format!("{} @chunks", SPLATS.replace("64x64", "64")));
-    assert_says(&error, &["--size 64: expected WxH for a dataset"]);
+    let eval = "eval --splat @splats/room_000.ply --scene @captures/room_000 --render-height";
+    let psnr = |height: u32| sandbox.json(&format!("{eval} {height}"))["psnr"].as_f64();
+    assert!(psnr(64) > psnr(32), "the photos were rendered at 64");
+    let error = sandbox.refuse(&format!("{eval} 8"));
+    assert_says(&error, &["--render-height is 8, expected images with sides of 11 to 16384"]);
 }
 
 #[test]
@@ -260,7 +291,9 @@ fn a_scene_that_fails_is_named_and_the_first_of_the_others_warms_up() {
     assert_eq!((evaluation.scenes.len(), evaluation.failures.len()), (2, 1));
     let efficiency = evaluation.efficiency.expect("a model's cost");
     assert!(efficiency.timed_scenes == 1 && efficiency.peak_memory_bytes > 1_000_000);
-    assert_eq!(evaluation.scenes.iter().map(|scene| scene.warm_up).collect::<Vec<_>>(), [true, false]);
+    let [first, second] = evaluation.scenes.as_slice() else { panic!("two scenes") };
+    assert!(first.warm_up && first.peak_memory_bytes.is_some());
+    assert!(!second.warm_up && second.peak_memory_bytes.is_none());
 
     // Once the photo is repaired, the same command does the rest.
     sandbox.write(photo, bytes);

@@ -3,7 +3,7 @@
 use crate::common::browser::Browser;
 use crate::common::program::{arg, refuse, run_json};
 use globalsplat::eval::{
-    Efficiency, Evaluation, Failure, SceneScores, Summary, comparison_path, read_evaluation,
+    Efficiency, Evaluation, Failure, SceneScores, Summary, comparison_path, read_evaluation, write_csv,
     write_evaluation, write_report,
 };
 use globalsplat::metrics::{CaptureScores, Scores, ViewScore};
@@ -32,6 +32,7 @@ fn scene(name: &str, psnr: f64, lpips: bool) -> SceneScores {
         scores,
         context: vec![0, 9, 20],
         target: vec![4, 12, 17],
+        enlarged: false,
         splat_bytes: None,
         warnings: vec![],
         warm_up: false,
@@ -143,8 +144,9 @@ fn the_csv_has_a_line_for_every_view() {
     let folder = tempfile::tempdir().unwrap();
     let mut scenes = vec![scene("a, \"b\"", 25., true), scene("c", 25., false)];
     scenes[1].forward_seconds = None;
-    write_evaluation(folder.path(), &evaluation("m", "re10k", 24, scenes)).unwrap();
-    let text = std::fs::read_to_string(folder.path().join("scores.csv")).unwrap();
+    let file = folder.path().join("scores.csv");
+    write_csv(&file, &evaluation("m", "re10k", 24, scenes)).unwrap();
+    let text = std::fs::read_to_string(file).unwrap();
     let lines: Vec<&str> = text.lines().collect();
     assert_eq!(lines.len(), 1 + 2 * 3);
     assert_eq!(lines[0], "scene,view,psnr,ssim,lpips_vgg,lpips_alex,gaussians,forward_seconds");
@@ -160,6 +162,8 @@ fn the_command_writes_the_page_and_refuses_in_a_sentence() {
     let (whole, part) = (arg(&evaluations[0].0), arg(&evaluations[1].0));
     let object = run_json(&["report", whole, part, "--out", arg(&page), "--json"]);
     assert_eq!(object["bytes"], page.metadata().unwrap().len());
+    assert_eq!(object["evaluations"][0]["scenes"], 64);
+    assert_eq!(object["evaluations"][1]["failures"], 1);
 
     let absent = folder.path().join("absent");
     let error = refuse(&["report", arg(&absent), "--out", arg(&page)]);

@@ -135,7 +135,7 @@ fn invalid_weights() {
 #[test]
 fn options_that_do_not_apply() {
     let of_models = ["--views 4", "--views 3", "--precision bf16"];
-    let of_datasets = ["--index i.json", "--out o", "--name n"];
+    let of_datasets = ["--index i.json", "--size 64", "--name n"];
     let of_scenes = ["--holdout every:3", "--views 3", "--contact-sheet s.png"];
     for (line, options) in [
         ("eval --splat s.ply --scene c", of_models),

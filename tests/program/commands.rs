@@ -277,6 +277,7 @@ fn a_run_goes_from_photos_to_a_splat() {
     let scores = sandbox.json(&format!("eval {weights} --scene @room"));
     assert_eq!(scores["views"].as_array().unwrap().len(), 3);
     assert!(scores["baselines"]["nearest_photo"]["psnr"].is_f64());
+    assert!(scores["baselines"]["mean_photo"]["ssim"].is_f64());
 
     // Without --weights, the embedded weights are used. One line reports how the photos were selected and resized.
     let (_, out, err) = sandbox.output("reconstruct --scene @room --views 5 --out @room.ply --json");

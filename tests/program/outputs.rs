@@ -126,15 +126,17 @@ fn folders_of_outputs_replace_nothing_that_is_read() {
     refuse_all(
         &sandbox,
         &[
+            "eval --data @data --index @index.json --weights @tiny.safetensors --out @data/room_000/images",
             "eval --data @data --index @scored/scores.json --splat @splats --out @scored",
             "eval --data @data --index @index.json --renders @renders --out @of_renders",
             "pack @data/room_000 --out @data/room_000/images",
+            "train --config @tiny.toml --out @room/images",
         ],
     );
     // An evaluation that is repeated resumes on its own files, also in a folder of the dataset.
     for _ in 0..2 {
         sandbox.succeed(
-            "eval --data @data --index @index.json --splat @splats --size 40x40 --out @data/room_000/scores",
+            "eval --data @data --index @index.json --splat @splats --render-height 40 --out @data/room_000/scores",
         );
     }
     // A report may be written beside the scores that it shows, but must not replace them.

@@ -483,6 +483,27 @@ impl Capture {
         self.load(&(0..self.len()).collect::<Vec<_>>(), size)
     }
 
+    /// Computes the CRC-32 of the views `indices`: the bytes of their photo files and masks, and their cameras. Images that are
+    /// computed contribute their cameras alone.
+    ///
+    /// # Errors
+    /// Fails if a photo or a mask can't be read.
+    pub fn checksum(&self, indices: impl IntoIterator<Item = usize>) -> Result<u32> {
+        let mut hasher = crc32fast::Hasher::new();
+        for index in indices {
+            let View { frame, camera, projection, .. } = &self.views[index];
+            let Frame { image, mask, .. } = &self.frames[*frame];
+            hasher.update(format!("{camera:?}{projection:?}").as_bytes());
+            if !matches!(image, ImageLocation::Source { .. }) {
+                hasher.update(&image.read()?);
+            }
+            if let Some(mask) = mask {
+                hasher.update(&std::fs::read(mask).map_err(Error::read(mask))?);
+            }
+        }
+        Ok(hasher.finalize())
+    }
+
     /// Loads `views`, all of one photo.
     fn load_views(&self, views: &[&View], size: Option<ImageSize>) -> Result<Vec<Photo>> {
         let (photo, mask) = self.read_photo(&self.frames[views[0].frame])?;

@@ -7,7 +7,7 @@ use globalsplat_files::write_atomically;
 use std::collections::HashMap;
 use std::io::{Cursor, Write};
 use std::path::Path;
-use zip::CompressionMethod;
+use zip::{CompressionMethod, DateTime};
 use zip::result::ZipError;
 use zip::write::{FileOptions, ZipWriter};
 
@@ -102,6 +102,8 @@ pub fn serialize(root: &Item) -> Result<Vec<u8>> {
     let mut add = |name: &str, contents: &[u8]| {
         let options = FileOptions::default()
             .compression_method(CompressionMethod::Stored)
+            // The same contents have the same bytes at any time.
+            .last_modified_time(DateTime::default())
             .large_file(contents.len() > u32::MAX as usize);
         zip.start_file_aligned(format!("archive/{name}"), options, ALIGNMENT)?;
         zip.write_all(contents).map_err(ZipError::from)

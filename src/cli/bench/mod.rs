@@ -19,7 +19,7 @@ use crate::error::Error;
 use crate::io::read_splat;
 use crate::refine::RefineConfig;
 use crate::scene::Gaussians;
-use crate::train::MemoryEstimate;
+use crate::train::largest_fitting_batch;
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use serde_json::Value;
@@ -50,6 +50,11 @@ impl Bench {
             Part::Refine(refine) => refine.run(),
             Part::Train(train) => train.run(),
         }?))
+    }
+
+    /// Returns `true` if the processes that torchrun started share the work.
+    pub fn is_shared(&self) -> bool {
+        matches!(self.part, Part::Train(_))
     }
 }
 
@@ -202,7 +207,8 @@ impl Refine {
 /// Benchmark a training step, part by part, on synthetic scenes: photos of noise, all Gaussians visible.
 ///
 /// Without --config the model is the paper's main model, 24 context and 12 target views of 256x256. L_perc is included if its
-/// weights are found. Under torchrun the report includes the time that ranks wait for each other.
+/// weights are found. Under torchrun the report includes the cost of distributed training: the time of a step without
+/// communication, of communication alone, and how much of that the backward pass hides.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat bench train\n  \
     globalsplat bench train --config configs/first_light.toml --steps 20\n  \
@@ -250,16 +256,14 @@ impl Train {
 /// Sets the batch size to the largest that fits into the memory of `device`, by the estimate.
 fn take_what_fits(config: &mut Config, device: Device) -> Result<()> {
     let bytes = total_memory_bytes(device).unwrap_or(u64::MAX);
-    config.train.micro_batch = 0;
-    while config.train.batch_size > 1 {
-        let estimate = MemoryEstimate::new(config, device)?;
-        if estimate.fits_into(bytes) {
-            break;
-        }
-        let (batch, [needed, bytes]) =
-            (estimate.batch, [estimate.total(), bytes].map(|bytes| bytes as f64 * 1e-9));
-        eprintln!("--batch auto: {batch} scenes would take {needed:.1} GB, the device has {bytes:.1} GB");
-        config.train.batch_size /= 2;
+    let (fits, refused) = largest_fitting_batch(config, bytes, device)?;
+    if let Some(refused) = refused {
+        let [more, bytes] = [refused.total(), bytes].map(|bytes| bytes as f64 * 1e-9);
+        eprintln!(
+            "--batch auto: {fits} of {} scenes; {} would take {more:.1} GB, the device has {bytes:.1} GB",
+            config.train.batch_size, refused.batch
+        );
     }
+    (config.train.batch_size, config.train.micro_batch) = (fits, 0);
     Ok(())
 }

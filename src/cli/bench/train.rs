@@ -8,7 +8,7 @@ use crate::distributed::ProcessGroup;
 use crate::error::Result;
 use crate::loss::{PerceptualKind, PerceptualLoss};
 use crate::scene::{Camera, ImageSize, Intrinsics};
-use crate::train::Trainer;
+use crate::train::{COMMUNICATION, Trainer};
 use glam::{DMat4, DVec3};
 use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -48,8 +48,13 @@ pub fn bench_train(config: &Config, steps: usize, device: Device, group: Process
     let peak_gflops = peak_gflops(precision, device);
     tch::set_num_threads(threads);
     let peak_gflops = peak_gflops?;
-    trainer.group().shutdown()?;
-    Ok(json!({
+    let (milliseconds, sections) = (measured.total(), measured.sections());
+    let waited = sections.iter().find(|section| section.name == COMMUNICATION);
+    let together = waited.map(|waited| {
+        let scenes_per_second = 1e3 * (ranks * scenes.len()) as f64 / milliseconds.median;
+        measure_distributed_cost(trainer, &scenes, steps, &upload, scenes_per_second, waited.milliseconds.min)
+    });
+    let mut report = json!({
         "scenes": scenes.len(),
         "context_views": config.data.context_views,
         "target_views": config.data.target_views,
@@ -59,14 +64,17 @@ pub fn bench_train(config: &Config, steps: usize, device: Device, group: Process
         "threads": threads,
         "slices_at_once": slices_at_once,
         "steps": steps,
-        "milliseconds": measured.total(),
-        "sections": measured.sections(),
+        "milliseconds": milliseconds,
+        "sections": sections,
         "parts": parts.parts(peak_gflops),
         "precision": precision,
         "peak_gflops": peak_gflops,
         "peak_bytes": peak_bytes,
-        "ranks": ranks,
-    }))
+    });
+    if let Some(together) = together.transpose()? {
+        report["together"] = together;
+    }
+    Ok(report)
 }
 
 /// Times `steps` steps, after one that warms up caches, threads and the GPU's libraries.
@@ -91,6 +99,40 @@ fn measure(
         }
     }
     Ok(measured)
+}
+
+/// Times the ranks' communication without steps, and their steps without communication. `waited` is the shortest time in milliseconds that a
+/// step waited for communication: `hidden` is the share of the communication that overlaps with that step's backward pass.
+fn measure_distributed_cost(
+    trainer: Trainer,
+    scenes: &[LoadedScene],
+    steps: usize,
+    upload: &Upload,
+    scenes_per_second: f64,
+    waited: f64,
+) -> Result<Value> {
+    let ranks = trainer.group().world_size();
+    let mut communication = Measured::default();
+    for step in 0..=steps {
+        let mut watch = Stopwatch::new(upload.device());
+        watch.time(COMMUNICATION, || trainer.add_gradients_up())?;
+        if step > 0 {
+            communication.add_watch(&mut watch)?;
+        }
+    }
+    let communication = communication.total();
+    let gradient_bytes = trainer.gradient_bytes();
+    trainer.group().shutdown()?;
+    let mut apart = trainer.with_group(ProcessGroup::single());
+    let apart = measure(&mut apart, scenes, steps, upload, &mut Measured::default())?;
+    Ok(json!({
+        "ranks": ranks,
+        "scenes_per_second": scenes_per_second,
+        "apart_milliseconds": apart.total(),
+        "communication_milliseconds": communication,
+        "hidden": (1. - waited / communication.median).clamp(0., 1.),
+        "gradient_bytes": gradient_bytes,
+    }))
 }
 
 /// Returns a scene of random noise with as many views as a step takes. Context and target views are disjoint.

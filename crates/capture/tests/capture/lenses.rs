@@ -201,6 +201,8 @@ fn views_of_a_photo_are_named_loaded_and_held_out_together() {
         assert_eq!(photo.name, capture.names().nth(index).unwrap());
         assert!(photo.image == all[index].image && photo.mask == all[index].mask);
     }
+    // The checksum depends on the view.
+    assert_ne!(capture.checksum([0]).unwrap(), capture.checksum([1]).unwrap());
 }
 
 /// Checks that `found` has the views of `expected`, up to the rounding of their poses.

@@ -201,14 +201,18 @@ fn masks_are_read_however_they_are_written() {
 }
 
 #[test]
-fn masked_out_photos_are_known() {
+fn masked_out_photos_are_known_and_masks_are_part_of_the_checksum() {
     let folder = folder_of_photos(&names());
     let masks = folder.path().join("masks");
     let plain = open_transforms(folder.path(), |_| ()).unwrap();
+    let mut checksums = vec![];
     for (level, count) in [(0, 1), (10, 0), (20, 0)] {
         save(GrayImage::from_pixel(WIDTH, HEIGHT, Luma([level])), &masks.join("002.png"));
         let masked = plain.clone().with_masks(&masks).unwrap();
         let photos = masked.load_all(None).unwrap();
         assert_eq!(photos.iter().filter(|photo| photo.is_masked_out()).count(), count);
+        checksums.extend([&plain, &masked].map(|capture| capture.checksum(0..5).unwrap()));
     }
+    let [a, b, c, d, e, f] = checksums[..] else { unreachable!() };
+    assert!(a == c && c == e && a != b && b != d && d != f && b != f, "{checksums:?}");
 }
