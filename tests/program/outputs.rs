@@ -17,8 +17,8 @@ const NOTES: &str = "what somebody wrote";
 #[track_caller]
 fn refuse_all(sandbox: &Sandbox, lines: &[&str]) {
     let before = sandbox.contents();
-    // A folder with photos, or with files of an evaluation's names that no evaluation wrote.
-    let found = ["a photo of the capture", "a file that this command reads", "a folder with "];
+    let found =
+        ["a photo of the capture", "a file that this command reads", "a folder with the capture's photos"];
     for line in lines {
         let error = sandbox.refuse(line);
         let is_refused = found.iter().any(|found| error.contains(&format!("the output is {found}")));
