@@ -7,9 +7,9 @@ use globalsplat_files::write_atomically;
 use std::collections::HashMap;
 use std::io::{Cursor, Write};
 use std::path::Path;
-use zip::{CompressionMethod, DateTime};
 use zip::result::ZipError;
 use zip::write::{FileOptions, ZipWriter};
+use zip::{CompressionMethod, DateTime};
 
 /// Alignment of each tensor's bytes in the file. Files that torch writes have the same.
 const ALIGNMENT: u16 = 64;

@@ -18,27 +18,32 @@ pub(crate) fn undistort(
 ) -> (RgbImage, Option<RgbImage>) {
     let Lens { intrinsics: Intrinsics { fx, fy, cx, cy }, model, .. } = projection.lens;
     match model {
-        // A loop of its own, which doesn't choose the model for every pixel.
-        LensModel::Perspective(distortion) => sample(photo, camera, |point| {
-            Some(distortion.apply(point) * DVec2::new(fx, fy) + DVec2::new(cx, cy))
-        }),
-        _ => sample(photo, camera, |point| projection.position(point.extend(1.))),
+        // A loop of its own, which the compiler vectorizes.
+        LensModel::Perspective(distortion) => {
+            let (focal, center) = (DVec2::new(fx, fy), DVec2::new(cx, cy));
+            sample(photo, camera, |point| distortion.apply(point) * focal + center)
+        }
+        _ => sample(photo, camera, |point| projection.position(point.extend(1.)).unwrap_or(DVec2::NAN)),
     }
 }
 
-/// Returns the pixels of the view and its mask. `position` maps a ray (x, y, 1) to its position in the photo.
+/// Returns the pixels of the view and its mask. `position` maps a ray (x, y, 1) to its position in the photo, NaN if there is none.
 fn sample(
     photo: &RgbImage,
     camera: &Camera,
-    position: impl Fn(DVec2) -> Option<DVec2>,
+    position: impl Fn(DVec2) -> DVec2,
 ) -> (RgbImage, Option<RgbImage>) {
     let Camera { width, height, intrinsics: Intrinsics { fx, fy, cx, cy }, .. } = *camera;
+    let across: Vec<f64> = (0..width).map(|j| (f64::from(j) + 0.5 - cx) / fx).collect();
+    let mut positions = vec![DVec2::ZERO; across.len()];
     let (mut view, mut mask) = (RgbImage::new(width, height), None);
-    for (j, i, pixel) in view.enumerate_pixels_mut() {
-        let point = DVec2::new((f64::from(j) + 0.5 - cx) / fx, (f64::from(i) + 0.5 - cy) / fy);
-        match position(point) {
-            Some(position) => *pixel = interpolate(photo, position),
-            None => {
+    for (i, row) in view.enumerate_rows_mut() {
+        let y = (f64::from(i) + 0.5 - cy) / fy;
+        positions.iter_mut().zip(&across).for_each(|(place, &x)| *place = position(DVec2::new(x, y)));
+        for ((j, i, pixel), &position) in row.zip(&positions) {
+            if !position.is_nan() {
+                *pixel = interpolate(photo, position);
+            } else {
                 let white = || RgbImage::from_pixel(width, height, Rgb([u8::MAX; 3]));
                 mask.get_or_insert_with(white).put_pixel(j, i, Rgb([0; 3]));
             }
@@ -54,7 +59,7 @@ fn interpolate(photo: &RgbImage, position: DVec2) -> Rgb<u8> {
     let (left, right, to_right) = neighbors(position.x, photo.width());
     let (top, bottom, to_bottom) = neighbors(position.y, photo.height());
     // Four numbers in place of three, to fill a vector.
-    let color = |x, y| {
+    let color = |x: u32, y: u32| {
         let [red, green, blue] = photo.get_pixel(x, y).0.map(f32::from);
         Vec4::new(red, green, blue, 0.)
     };
@@ -69,7 +74,10 @@ fn interpolate(photo: &RgbImage, position: DVec2) -> Rgb<u8> {
 /// Returns the last of `count` pixel centers, along columns or rows, at or before `position`, the next one, and the fractional distance to
 /// it. Positions beyond the outermost centers count as these.
 fn neighbors(position: f64, count: u32) -> (u32, u32, f32) {
-    let position = (position - 0.5).max(0.).min(f64::from(count - 1));
+    let (position, last) = (position - 0.5, f64::from(count - 1));
+    // Comparisons instead of max() and min(), which handle NaN and take longer.
+    let position = if position > 0. { position } else { 0. };
+    let position = if position < last { position } else { last };
     let before = position as u32;
     (before, (before + 1).min(count - 1), (position - f64::from(before)) as f32)
 }
