@@ -3,7 +3,7 @@
 use super::{check_writable_file, encode_photo, write_atomically};
 use crate::error::{Error, Result};
 use crate::scene::ImageSize;
-use image::RgbImage;
+use image::{Rgb, RgbImage};
 use std::path::Path;
 use tch::{Kind, Tensor};
 
@@ -23,18 +23,10 @@ pub fn rgb_from_tensor(image: &Tensor) -> Result<RgbImage> {
     } else {
         image.shallow_clone()
     };
-    rgb_from_bytes(&bytes_from_tensor(&planes))
-}
-
-/// Returns an image in [0, 1] as bytes.
-fn bytes_from_tensor(image: &Tensor) -> Tensor {
-    (image.detach().clamp(0., 1.) * 255.).round().to_kind(Kind::Uint8)
-}
-
-/// Converts bytes [3, H, W] to an image.
-fn rgb_from_bytes(planes: &Tensor) -> Result<RgbImage> {
     let (height, width) = (planes.size()[1], planes.size()[2]);
-    let bytes = Vec::<u8>::try_from(planes.permute([1, 2, 0]).contiguous().flatten(0, -1))?;
+    let bytes =
+        (planes.detach().clamp(0., 1.) * 255.).round().to_kind(Kind::Uint8).permute([1, 2, 0]).contiguous();
+    let bytes = Vec::<u8>::try_from(bytes.flatten(0, -1))?;
     RgbImage::from_raw(width as u32, height as u32, bytes)
         .ok_or_else(|| Error::failed("the number of pixels doesn't match the image size"))
 }
@@ -100,21 +92,35 @@ pub fn subsample(numbers: &Tensor, factor: i64) -> Tensor {
 /// Number of pixels between images.
 const GAP: i64 = 4;
 
-/// Tiles images [3, H, W] in [0, 1] side by side, with a white gap, and white below those that are lower than others.
+/// Tiles images [3, H, W] side by side, with a white gap, and white below those that are lower than others.
 pub fn tile_horizontally(images: &[Tensor]) -> Tensor {
-    tile(images, false, 1.)
+    let height = images.iter().map(|image| image.size()[1]).max().unwrap_or(0);
+    let pad = |(index, image): (usize, &Tensor)| {
+        let gap = if index > 0 { GAP } else { 0 };
+        image.pad([gap, 0, 0, height - image.size()[1]], "constant", 1.)
+    };
+    Tensor::cat(&images.iter().enumerate().map(pad).collect::<Vec<_>>(), 2)
 }
 
-/// Tiles images [3, H, W] side by side, or one below the other, with gaps and margins of the value `white`.
-fn tile(images: &[Tensor], is_column: bool, white: f64) -> Tensor {
-    let (along, across) = if is_column { (1, 2) } else { (2, 1) };
-    let largest = images.iter().map(|image| image.size()[across]).max().unwrap_or(0);
-    let pad = |(index, image): (usize, &Tensor)| {
-        let (gap, margin) = (if index > 0 { GAP } else { 0 }, largest - image.size()[across]);
-        let padding = if is_column { [0, margin, gap, 0] } else { [gap, 0, 0, margin] };
-        image.pad(padding, "constant", white)
+/// Tiles images one below the other, or else side by side, with white between and beside them.
+fn tile_images(images: &[RgbImage], is_column: bool) -> RgbImage {
+    let gap = GAP as u32;
+    let largest = |side: fn(&RgbImage) -> u32| images.iter().map(side).max().unwrap_or(0);
+    let sum = |side: fn(&RgbImage) -> u32| {
+        (images.iter().map(side).sum::<u32>() + gap * images.len() as u32).saturating_sub(gap)
     };
-    Tensor::cat(&images.iter().enumerate().map(pad).collect::<Vec<_>>(), along as i64)
+    let (width, height) = match is_column {
+        true => (largest(RgbImage::width), sum(RgbImage::height)),
+        false => (sum(RgbImage::width), largest(RgbImage::height)),
+    };
+    let mut whole = RgbImage::from_pixel(width, height, Rgb([u8::MAX; 3]));
+    let mut at = 0;
+    for image in images {
+        let (x, y, side) = if is_column { (0, at, image.height()) } else { (at, 0, image.width()) };
+        image::imageops::replace(&mut whole, image, x.into(), y.into());
+        at += side + gap;
+    }
+    whole
 }
 
 /// Returns the size of `count` images of `size` that [`tile_horizontally`] has put side by side.
@@ -132,8 +138,7 @@ pub struct Mosaic {
     is_column: bool,
     /// Maximum number of pixels of each image.
     most_pixels: i64,
-    /// Bytes [3, H, W].
-    images: Vec<Tensor>,
+    images: Vec<RgbImage>,
     shrunk_by: i64,
 }
 
@@ -172,7 +177,7 @@ impl Mosaic {
     /// # Errors
     /// Returns libtorch's error, for example for another shape.
     pub fn add_shrunk(&mut self, parts: &[Tensor]) -> Result<()> {
-        self.images.push(bytes_from_tensor(&tile_horizontally(parts)));
+        self.images.push(rgb_from_tensor(&tile_horizontally(parts))?);
         Ok(())
     }
 
@@ -186,7 +191,7 @@ impl Mosaic {
     /// # Errors
     /// Returns an error if the file can't be written.
     pub fn write(self, path: &Path) -> Result<()> {
-        write_image(path, &rgb_from_bytes(&tile(&self.images, self.is_column, 255.))?, false)
+        write_image(path, &tile_images(&self.images, self.is_column), false)
     }
 }
 
