@@ -172,8 +172,10 @@ fn values_of(splat: &Splat, index: usize) -> Vec<f32> {
     values
 }
 
-/// Returns the size in bytes of the file that [`write`] would write.
-pub(crate) fn size(splat: &Splat) -> u64 {
-    let numbers = property_names(splat.bases()).len() + 3;
-    header(splat).len() as u64 + (splat.len() * numbers * size_of::<f32>()) as u64
+impl Splat {
+    /// Returns the size in bytes of the splat as a 3DGS PLY, the format that every program reads.
+    pub fn ply_bytes(&self) -> u64 {
+        let numbers = property_names(self.bases()).len() + 3;
+        header(self).len() as u64 + (self.len() * numbers * size_of::<f32>()) as u64
+    }
 }

@@ -1,6 +1,5 @@
 //! The splat as plain arrays.
 
-use crate::ply;
 use crate::rotations::{drop_missing_rotations, normalized};
 use crate::{Error, Result};
 use glam::DVec3;
@@ -201,11 +200,6 @@ impl Splat {
             }
         }
         all
-    }
-
-    /// Returns the size in bytes of the splat as a 3DGS PLY, the format that every program reads.
-    pub fn ply_bytes(&self) -> u64 {
-        ply::size(self)
     }
 
     /// Checks that every list has the length that [`Splat`] requires.
