@@ -20,7 +20,6 @@
 #include <thread>
 #include <type_traits>
 
-#include "../cuda/device.h"
 #include "../kernels/attention_types.h"
 #include "../kernels/jobs.h"
 #include "../kernels/kernels.h"
@@ -33,23 +32,9 @@ namespace {
 
 using raster::parallel_for;
 
-constexpr unsigned kTimeoutSeconds = 120;  // timeout in seconds, much longer than any check takes
+constexpr unsigned kTimeoutSeconds = 120;  // much longer than any check takes
 
 std::string now;  // name of the running check
-
-[[noreturn]] void fail(const std::string& what) {
-  std::fprintf(stderr, "FOUND: %s: %s\n", now.c_str(), what.c_str());
-  std::_Exit(1);
-}
-
-void expect(bool holds, const char* what) {
-  if (!holds) fail(what);
-}
-
-void begin(std::string what) {
-  now = std::move(what);
-  alarm(kTimeoutSeconds);
-}
 
 void on_timeout(int) {
   const auto say = [](const char* text, size_t length) { return write(2, text, length) == ssize_t(length); };
@@ -59,8 +44,21 @@ void on_timeout(int) {
 
 template <class T>
 void expect_same(const Results<T>& found, const Results<T>& one) {
+  const bool is_render = one.size() == std::size(kResults);
   for (size_t k = 0; k < one.size(); ++k)
-    if (!have_same_bits(found[k], one[k])) fail(std::string(kResults[k]) + " differ from one thread's");
+    if (!have_same_bits(found[k], one[k])) fail(std::string(is_render ? kResults[k] : "results") + " differ from one thread's");
+}
+
+// Checks that run(num_threads) returns the same bits for each number of threads as for one thread. Returns the number of runs.
+template <class Run>
+int64_t same_bits(const std::string& name, const std::vector<int>& thread_counts, const Run& run) {
+  begin(name);
+  const auto one = run(1);
+  for (const int num_threads : thread_counts) {
+    begin(name + ", " + std::to_string(num_threads) + " threads");
+    expect_same(run(num_threads), one);
+  }
+  return 1 + int64_t(thread_counts.size());
 }
 
 template <class T>
@@ -68,23 +66,10 @@ std::string type_name() {
   return sizeof(T) == sizeof(float) ? "float32" : "float64";
 }
 
-// Calls check(scene) for both types.
-template <class Check>
-void for_both(const Scene<double>& scene, const Check& check) {
-  check(as<float>(scene));
-  check(as<double>(scene));
-}
-
 template <class T>
-int64_t same_bits(const Scene<T>& scene, const std::vector<int>& thread_counts) {
-  const std::string name = scene.name + ", " + type_name<T>() + ", " + std::to_string(scene.bases) + " bases";
-  begin(name);
-  const Results<T> one = rendered(scene, 1);
-  for (const int num_threads : thread_counts) {
-    begin(name + ", " + std::to_string(num_threads) + " threads");
-    expect_same(rendered(scene, num_threads), one);
-  }
-  return 1 + int64_t(thread_counts.size());
+int64_t check_scene(const Scene<T>& scene, const std::vector<int>& thread_counts) {
+  return same_bits(scene.name + ", " + type_name<T>() + ", " + std::to_string(scene.bases) + " bases", thread_counts,
+                   [&](int num_threads) { return rendered(scene, num_threads); });
 }
 
 // Losses and their gradients, and a step of Adam. Arrays have their exact sizes, so that out-of-bounds reads are detected.
@@ -94,24 +79,20 @@ int64_t check_losses(const std::vector<int>& thread_counts) {
   const auto numbers = [&](size_t count) { return converted<T>(random.uniform(count, 0, 1)); };
   int64_t count = 0;
   // evaluate(gradient, num_threads) returns a loss, and writes the gradient's `all` values unless it is null.
-  const auto expect_the_same = [&](const std::string& what, size_t all, const auto& evaluate) {
-    std::vector<T> one(all);
-    begin(what + ", " + type_name<T>());
-    const double value = evaluate(one.data(), 1);
-    expect(evaluate(nullptr, 1) == value, "the gradient changes the value");
-    for (const int num_threads : thread_counts) {
+  const auto check = [&](const std::string& what, size_t all, const auto& evaluate) {
+    count += same_bits(what + ", " + type_name<T>(), thread_counts, [&](int num_threads) {
       std::vector<T> gradient(all, T(num_threads));
-      const double again = evaluate(gradient.data(), num_threads);
-      expect(again == value && have_same_bits(gradient, one), "threads change a loss");
-      ++count;
-    }
+      const double value = evaluate(gradient.data(), num_threads);
+      expect(evaluate(nullptr, num_threads) == value, "the gradient changes the value");
+      return Results<double>{{value}, {gradient.begin(), gradient.end()}};
+    });
   };
   for (const auto& [planes, height, width] : {std::array<int, 3>{1, 11, 11}, {3, 12, 37}, {6, 43, 48}}) {
     const size_t all = size_t(planes * height * width);
     const std::vector<T> pictures = numbers(all), photos = numbers(all);
     const raster::PhotometricJob<T> job{pictures.data(), photos.data(), planes, width, height};
     for (const double ssim_weight : {0.0, -0.2})
-      expect_the_same("the photometric loss", all, [&](T* gradient, int num_threads) {
+      check("the photometric loss", all, [&](T* gradient, int num_threads) {
         return raster::photometric<T>(job, 0.8, ssim_weight, gradient, num_threads);
       });
   }
@@ -119,48 +100,34 @@ int64_t check_losses(const std::vector<int>& thread_counts) {
     const size_t all = size_t(views * height * width);
     const std::vector<T> depths = numbers(all), photos = numbers(3 * all);
     const raster::SmoothnessJob<T> job{depths.data(), photos.data(), views, width, height};
-    expect_the_same("smoothness", all, [&](T* gradient, int num_threads) {
+    check("smoothness", all, [&](T* gradient, int num_threads) {
       return raster::depth_smoothness<T>(job, 0.3, gradient, num_threads);
     });
   }
   const size_t many = 40'000;
   const std::vector<T> gradient = numbers(many), start = numbers(many);
-  const auto stepped = [&](int num_threads) {
-    begin("a step of Adam, " + type_name<T>());
-    std::vector<T> value = start, first = start, second = start;
-    raster::adam<T>({0.1, 0.5, 0.01, 0.9, 0.999, 1e-8}, {value.data(), gradient.data(), first.data(), second.data()}, int64_t(many),
-                    num_threads);
-    value.insert(value.end(), first.begin(), first.end());
-    value.insert(value.end(), second.begin(), second.end());
-    return value;
-  };
-  const std::vector<T> one = stepped(1);
-  for (const int num_threads : thread_counts) {
-    expect(have_same_bits(stepped(num_threads), one), "threads change a step of Adam");
-    ++count;
-  }
-  return count;
+  return count + same_bits("a step of Adam, " + type_name<T>(), thread_counts, [&](int num_threads) {
+    Results<T> state(3, start);
+    raster::adam<T>({0.1, 0.5, 0.01, 0.9, 0.999, 1e-8}, {state[0].data(), gradient.data(), state[1].data(), state[2].data()},
+                    int64_t(many), num_threads);
+    return state;
+  });
 }
 
 // Steps of Muon on matrices of all shapes, with exactly the scratch memory that they request. parity/ compares their values.
 int64_t check_muon(const std::vector<int>& thread_counts) {
-  const raster::MuonStep step{0.1, 0.01, 0.95};
-  const auto stepped = [&](int num_threads) {
-    begin("steps of Muon, " + std::to_string(num_threads) + " threads");
+  return same_bits("steps of Muon", thread_counts, [](int num_threads) {
     Random random(12);
-    std::vector<std::vector<float>> numbers;
+    Results<float> numbers;
     std::vector<raster::MuonMatrix> all;
     for (const auto& [rows, columns] : {std::array<int64_t, 2>{1, 1}, {1, 7}, {7, 1}, {20, 33}, {21, 23}, {128, 128}, {200, 65}}) {
       for (int of = 0; of < 3; ++of) numbers.push_back(converted<float>(random.uniform(size_t(rows * columns), -1, 1)));
       const size_t last = numbers.size() - 1;
       all.push_back({numbers[last - 2].data(), numbers[last].data(), numbers[last - 1].data(), rows, columns});
     }
-    raster::muon(step, all, num_threads);
+    raster::muon({0.1, 0.01, 0.95}, all, num_threads);
     return numbers;
-  };
-  const std::vector<std::vector<float>> one = stepped(1);
-  for (const int num_threads : thread_counts) expect(stepped(num_threads) == one, "threads change a step of Muon");
-  return int64_t(thread_counts.size());
+  });
 }
 
 // Reference for raster::Bf16Gemm in scalar code.
@@ -177,11 +144,11 @@ void multiply_bf16(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row
 float as_float(float number) { return number; }
 float as_float(raster::Bf16 number) { return raster::to_float(number); }
 
-// Computes attention, forward and backward, of heads and an output's gradient drawn with `seed`. Returns all outputs. Arrays have their exact
-// sizes here, too.
+// Computes attention, forward and backward, of random heads and a random gradient of the output. Returns all outputs. Arrays have their
+// exact sizes here, too.
 template <class Number>
-std::vector<Number> attended(const raster::AttentionShape& shape, uint64_t seed, int num_threads) {
-  Random random(seed);
+Results<Number> attended(const raster::AttentionShape& shape, int num_threads) {
+  Random random(12);
   const int64_t row = shape.heads * shape.width, in = shape.queries * row, seen = shape.keys * row;
   const auto numbers = [&](int64_t count) {
     std::vector<Number> drawn;
@@ -195,15 +162,15 @@ std::vector<Number> attended(const raster::AttentionShape& shape, uint64_t seed,
   };
   const std::vector<Number> q = numbers(in), k = numbers(seen), v = numbers(seen), grad_out = numbers(in);
   const auto unwritten = [&](const std::vector<Number>& like) { return std::vector<Number>(like.size(), Number(num_threads)); };
-  std::vector<Number> out = unwritten(q), dq = unwritten(q), dk = unwritten(k), dv = unwritten(v);
+  Results<Number> all{unwritten(q), unwritten(q), unwritten(k), unwritten(v)};
   std::vector<float> log_sums(size_t(shape.scenes * shape.heads * shape.queries), float(num_threads));
   const raster::AttentionInputs<Number> inputs{{q.data(), in, row}, {k.data(), seen, row}, {v.data(), seen, row}};
   const raster::Bf16Gemm gemm = {multiply_bf16, [] {}};
-  raster::multi_head_attention<Number>(shape, inputs, {out.data(), in, row}, log_sums.data(), gemm, num_threads);
-  raster::multi_head_attention_backward<Number>(shape, inputs, {out.data(), in, row}, log_sums.data(), {grad_out.data(), in, row},
-                                                {{dq.data(), in, row}, {dk.data(), seen, row}, {dv.data(), seen, row}}, gemm, num_threads);
-  for (const std::vector<Number>* more : {&dq, &dk, &dv}) out.insert(out.end(), more->begin(), more->end());
-  return out;
+  raster::multi_head_attention<Number>(shape, inputs, {all[0].data(), in, row}, log_sums.data(), gemm, num_threads);
+  raster::multi_head_attention_backward<Number>(shape, inputs, {all[0].data(), in, row}, log_sums.data(), {grad_out.data(), in, row},
+                                                {{all[1].data(), in, row}, {all[2].data(), seen, row}, {all[3].data(), seen, row}}, gemm,
+                                                num_threads);
+  return all;
 }
 
 template <class Number>
@@ -214,15 +181,14 @@ int64_t check_attention(const std::vector<int>& thread_counts) {
                                               {1, 2, 103, 385, 24},
                                               {1, 1, 1100, 300, 32},
                                               {1, 2, 50, 800, 64},
-                                              {1, 1, 9, 20, raster::kAttentionWidth}}) {
-    begin("attention of " + std::to_string(shape.queries) + " to " + std::to_string(shape.keys));
-    const std::vector<Number> one = attended<Number>(shape, 12, 1);
-    for (const Number number : one) expect(std::isfinite(as_float(number)), "attention isn't finite");
-    for (const int num_threads : thread_counts) {
-      expect(have_same_bits(attended<Number>(shape, 12, num_threads), one), "threads change attention");
-      ++count;
-    }
-  }
+                                              {1, 1, 9, 20, raster::kAttentionWidth}})
+    count += same_bits("attention of " + std::to_string(shape.queries) + " to " + std::to_string(shape.keys), thread_counts,
+                       [&](int num_threads) {
+                         const Results<Number> all = attended<Number>(shape, num_threads);
+                         for (const auto& numbers : all)
+                           for (const Number number : numbers) expect(std::isfinite(as_float(number)), "attention isn't finite");
+                         return all;
+                       });
   return count;
 }
 
@@ -238,14 +204,12 @@ int64_t bits(bool is_short) {
     const std::vector<Scene<double>> scenes = all_scenes(bases);
     for (size_t i = 0; i < scenes.size(); ++i)
       if (!is_short || i % 4 == turn)
-        for_both(scenes[i], [&](const auto& scene) { count += same_bits(scene, thread_counts); });
+        count += check_scene(as<float>(scenes[i]), thread_counts) + check_scene(scenes[i], thread_counts);
     ++turn;
   }
-  for_both(many_gaussians(1), [&](const auto& scene) { count += same_bits(scene, {16}); });
-  return count;
+  const Scene<double> many = many_gaussians(1);
+  return count + check_scene(as<float>(many), {16}) + check_scene(many, {16});
 }
-
-void in_another_thread(const std::function<void()>& what) { std::thread(what).join(); }
 
 // Several threads render at the same time, each on several threads if available. The backward passes run in any order, on other threads
 // than the forward passes, or not at all.
@@ -275,7 +239,7 @@ int64_t callers_of(const std::vector<Scene<double>>& all, int rounds) {
 
     begin("frames out of order, " + type_name<T>());
     at_once([&](size_t i) { renders[i].draw(); });
-    for (size_t i = 0; i < count; ++i) in_another_thread([&] { renders[(i + 1 + size_t(round)) % count].backward(); });
+    for (size_t i = 0; i < count; ++i) std::thread([&] { renders[(i + 1 + size_t(round)) % count].backward(); }).join();
     for (size_t i = 0; i < count; ++i) expect_same(renders[i].results(), one[i]);
 
     begin("frames dropped while others are drawn, " + type_name<T>());
@@ -328,33 +292,6 @@ int64_t threads(bool is_short) {
   return 3 * rounds;
 }
 
-// The GPU kernels give the same results in other orders of blocks and threads.
-int64_t orders(bool is_short) {
-  const std::vector<uint64_t> seeds = is_short ? std::vector<uint64_t>{1, 2} : std::vector<uint64_t>{1, 2, 3, 4, 5};
-  const auto expect_none = [](const std::string& difference) {
-    if (!difference.empty()) fail(difference);
-  };
-  begin("sums of kernels");
-  for (const uint64_t seed : seeds) expect_none(sums_differ(seed));
-  begin("losses of kernels");
-  expect_none(losses_differ(seeds));
-  int64_t count = 2 * int64_t(seeds.size());
-  size_t turn = 0;
-  for (const int bases : {1, 4, 9, 16}) {
-    const std::vector<Scene<double>> scenes = all_scenes(bases);
-    for (size_t i = 0; i < scenes.size(); ++i) {
-      const bool is_large = !scenes[i].gaussians.empty() &&
-                            int64_t(scenes[i].gaussians[0].opacities.size()) * scenes[i].width * scenes[i].height > 1'000'000;
-      if (is_short && (i % 4 != turn || is_large)) continue;
-      begin(scenes[i].name + ", in orders of kernels, " + std::to_string(bases) + " bases");
-      expect_none(schedules_differ(as<float>(scenes[i]), seeds));
-      count += int64_t(seeds.size());
-    }
-    ++turn;
-  }
-  return count;
-}
-
 // A child process renders correctly; it has a copy of everything but the threads.
 int64_t children(bool is_short) {
   Random random(10);
@@ -379,6 +316,17 @@ int64_t children(bool is_short) {
 }
 
 }  // namespace
+
+void begin(std::string what) {
+  now = std::move(what);
+  alarm(kTimeoutSeconds);
+}
+
+void fail(const std::string& what) {
+  std::fprintf(stderr, "FOUND: %s: %s\n", now.c_str(), what.c_str());
+  std::_Exit(1);
+}
+
 }  // namespace globalsplat::checks
 
 int main(int count, char** arguments) {

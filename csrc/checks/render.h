@@ -1,13 +1,27 @@
-// Renders of scenes by the CPU backend, forward and backward, with all of their inputs and outputs.
+// Renders of scenes by the CPU backend, forward and backward, with all of their inputs and outputs; and how checks report an error.
 #pragma once
 
 #include <iterator>
 #include <memory>
+#include <string>
 #include <vector>
 
 #include "scenes.h"
 
 namespace globalsplat::checks {
+
+// Names what is checked from now on. If it takes longer than two minutes, the program ends with an error.
+void begin(std::string what);
+// Ends the program with an error.
+[[noreturn]] void fail(const std::string& what);
+template <class Text>
+void expect(bool holds, const Text& what) {
+  if (!holds) fail(what);
+}
+
+// Checks that the GPU kernels, in the emulation on a CPU, give the same results in other orders of blocks and threads, and those of the CPU
+// backend.
+int64_t orders(bool is_short);
 
 // Names of a render's results: images, and gradients of random gradients of these.
 inline constexpr const char* kResults[] = {"colors", "opacities", "depths", "gradients of means", "gradients of scales",
