@@ -86,12 +86,14 @@ inline void attention_forward(const AttentionHead<float>& head, Rows<float> out,
   }
 }
 
-// Packs some of a head's queries for attention_backward(), with the output of the forward pass and its gradient.
+// Packs some of a head's queries for attention_backward(), with the output of the forward pass and its gradient. Only the last of them may
+// be fewer than whole_product_rows().
 inline void pack_queries(const AttentionHead<float>& head, const AttentionOutputs<float>& outputs, const PackedQueries& to) {
   const int width = head.width, columns = attention_columns(width);
   const float scale = float(kLog2E / __builtin_sqrt(double(width)));
-  pack_rows(head.q, head.queries, width, scale, columns, head.queries, to.q);
-  pack_rows(outputs.grad_out, head.queries, width, 1, columns, head.queries, to.grad_out);
+  const int64_t whole = whole_product_rows(head.queries);
+  pack_rows(head.q, head.queries, width, scale, columns, whole, to.q);
+  pack_rows(outputs.grad_out, head.queries, width, 1, columns, whole, to.grad_out);
   for (int64_t i = 0; i < head.queries; ++i) {
     const float *const out = outputs.out.data + i * outputs.out.stride, *const grad_out = to.grad_out + i * columns;
     double sum = 0;

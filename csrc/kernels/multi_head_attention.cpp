@@ -64,100 +64,77 @@ void multi_head_attention(const AttentionShape& shape, const AttentionInputs<Num
 template void multi_head_attention(const AttentionShape&, const AttentionInputs<float>&, Heads<float>, float*, const Bf16Gemm&, int);
 template void multi_head_attention(const AttentionShape&, const AttentionInputs<Bf16>&, Heads<Bf16>, float*, const Bf16Gemm&, int);
 
-template <>
-void multi_head_attention_backward(const AttentionShape& shape, const AttentionInputs<float>& in, Heads<const float> out,
-                                   const float* log_sums, Heads<const float> grad_out, const AttentionGradients<float>& gradients,
-                                   const Bf16Gemm&, int num_threads) {
-  const int64_t heads = shape.scenes * shape.heads;
+template <class Number>
+void multi_head_attention_backward(const AttentionShape& shape, const AttentionInputs<Number>& in, Heads<const Number> out,
+                                   const float* log_sums, Heads<const Number> grad_out, const AttentionGradients<Number>& gradients,
+                                   const Bf16Gemm& gemm, int num_threads) {
+  constexpr bool is_bf16 = std::is_same_v<Number, Bf16>;
+  constexpr int64_t fewest = is_bf16 ? kBf16BackwardKeys : kBackwardKeys, piece = is_bf16 ? kBf16Columns : kPiece;
+  const int64_t heads = shape.scenes * shape.heads, width = shape.width, columns = attention_columns(shape.width);
   // Every task processes a part of a head's keys, split by shapes alone, and computes a gradient for all of its queries; these are summed
   // in order.
-  const int64_t size = rows_per_task(heads, shape.keys, 64, kBackwardKeys, kBackwardKeys), parts = (shape.keys + size - 1) / size;
-  const int64_t whole = whole_product_rows(shape.queries), columns = attention_columns(shape.width), all = whole * columns;
-  const std::unique_ptr<float[]> q(new float[size_t(heads * all)]), grads_out(new float[size_t(heads * all)]);
-  const std::unique_ptr<float[]> means(new float[size_t(heads * whole)]), sums(new float[size_t(heads * parts * all)]);
-  const auto packed = [&](int64_t head, int64_t begin) {
-    const int64_t row = head * whole + begin;
-    return PackedQueries{q.get() + row * columns, grads_out.get() + row * columns, means.get() + row};
+  const int64_t size = rows_per_task(heads, shape.keys, 64, fewest, fewest), parts = (shape.keys + size - 1) / size;
+  const int64_t whole = is_bf16 ? whole_bf16_columns(shape.queries) : whole_product_rows(shape.queries);
+  const int64_t row_size = is_bf16 ? width : columns, all = whole * row_size, rows_all = is_bf16 ? whole * columns : 0;
+  const auto numbers = [&](int64_t each) { return std::unique_ptr<Number[]>(new Number[size_t(heads * each)]); };
+  const auto floats = [&](int64_t each) { return std::unique_ptr<float[]>(new float[size_t(heads * each)]); };
+  const auto q = numbers(all), grads_out = numbers(all), q_rows = numbers(rows_all), grad_out_rows = numbers(rows_all);
+  const auto means = floats(whole), shifts = floats(is_bf16 ? whole : 0), sums = floats(parts * all);
+  const auto packed = [&](int64_t head, [[maybe_unused]] int64_t begin) {
+    if constexpr (is_bf16)
+      return PackedBf16Queries{q.get() + head * all,           grads_out.get() + head * all,  q_rows.get() + head * rows_all,
+                               grad_out_rows.get() + head * rows_all, shifts.get() + head * whole, means.get() + head * whole};
+    else
+      return PackedQueries{q.get() + head * all + begin * columns, grads_out.get() + head * all + begin * columns,
+                           means.get() + head * whole + begin};
   };
   const auto rows = [&](const auto& of, int64_t head, int64_t begin) { return head_of(of, shape, head).from(begin); };
 
-  const int64_t pieces = (shape.queries + kPiece - 1) / kPiece;
+  const int64_t pieces = (shape.queries + piece - 1) / piece;
   parallel_for(num_threads, heads * pieces, [&](int64_t task) {
-    const int64_t head = task / pieces, begin = task % pieces * kPiece, end = std::min(begin + kPiece, shape.queries);
-    const PackedQueries to = packed(head, begin);
-    kernels().pack_queries({rows(in.q, head, begin), {}, {}, end - begin, 0, shape.width},
-                           {rows(out, head, begin), rows(grad_out, head, begin)}, to);
-    if (end < shape.queries) return;
-    std::fill(to.q + (end - begin) * columns, to.q + (whole - begin) * columns, 0.f);
-    std::fill(to.grad_out + (end - begin) * columns, to.grad_out + (whole - begin) * columns, 0.f);
+    const int64_t head = task / pieces, begin = task % pieces * piece, first = is_bf16 ? 0 : begin;
+    const int64_t count = is_bf16 ? shape.queries : std::min(piece, shape.queries - begin);
+    const AttentionHead<Number> queries{rows(in.q, head, first), {}, {}, count, 0, shape.width};
+    const AttentionOutputs<Number> outputs{rows(out, head, first), rows(grad_out, head, first)};
+    if constexpr (is_bf16)
+      kernels().pack_queries_bf16(queries, outputs, log_sums + head * shape.queries, begin, whole, packed(head, 0));
+    else
+      kernels().pack_queries(queries, outputs, packed(head, begin));
   });
   parallel_for(num_threads, heads * parts, [&](int64_t task) {
-    const int64_t head = task / parts, begin = task % parts * size;
-    kernels().attention_backward({{}, rows(in.k, head, begin), rows(in.v, head, begin), shape.queries, std::min(size, shape.keys - begin),
-                                  shape.width},
-                                 packed(head, 0), log_sums + head * shape.queries, sums.get() + task * all,
-                                 rows(gradients.k, head, begin), rows(gradients.v, head, begin),
-                                 scratch(attention_backward_scratch_size(shape.width)));
-  });
-  const float scale = float(1 / std::sqrt(double(shape.width)));
-  parallel_for(num_threads, heads * pieces, [&](int64_t task) {
-    const int64_t head = task / pieces, begin = task % pieces * kPiece;
-    const Rows<float> to = head_of(gradients.q, shape, head);
-    for (int64_t i = begin; i < std::min(begin + kPiece, shape.queries); ++i) {
-      const float* const first = sums.get() + head * parts * all + i * columns;
-      for (int c = 0; c < shape.width; ++c) {
-        float sum = 0;
-        for (int64_t n = 0; n < parts; ++n) sum += first[n * all + c];
-        to.data[i * to.stride + c] = scale * sum;
-      }
-    }
-  });
-}
-
-template <>
-void multi_head_attention_backward(const AttentionShape& shape, const AttentionInputs<Bf16>& in, Heads<const Bf16> out,
-                                   const float* log_sums, Heads<const Bf16> grad_out, const AttentionGradients<Bf16>& gradients,
-                                   const Bf16Gemm& gemm, int num_threads) {
-  // Work is split as for float32.
-  const int64_t heads = shape.scenes * shape.heads, width = shape.width;
-  const int64_t size = rows_per_task(heads, shape.keys, 64, kBf16BackwardKeys, kBf16BackwardKeys), parts = (shape.keys + size - 1) / size;
-  const int64_t whole = whole_bf16_columns(shape.queries), all = whole * width, rows_all = whole * attention_columns(shape.width);
-  const std::unique_ptr<Bf16[]> q_columns(new Bf16[size_t(heads * all)]), grad_out_columns(new Bf16[size_t(heads * all)]);
-  const std::unique_ptr<Bf16[]> q_rows(new Bf16[size_t(heads * rows_all)]), grad_out_rows(new Bf16[size_t(heads * rows_all)]);
-  const std::unique_ptr<float[]> shifts(new float[size_t(heads * whole)]), means(new float[size_t(heads * whole)]);
-  const std::unique_ptr<float[]> sums(new float[size_t(heads * parts * all)]);
-  const auto packed = [&](int64_t head) {
-    return PackedBf16Queries{q_columns.get() + head * all,     grad_out_columns.get() + head * all,   q_rows.get() + head * rows_all,
-                             grad_out_rows.get() + head * rows_all, shifts.get() + head * whole, means.get() + head * whole};
-  };
-  const auto rows = [&](const auto& of, int64_t head, int64_t begin) { return head_of(of, shape, head).from(begin); };
-
-  const int64_t panels = whole / kBf16Columns;
-  parallel_for(num_threads, heads * panels, [&](int64_t task) {
-    const int64_t head = task / panels;
-    kernels().pack_queries_bf16({rows(in.q, head, 0), {}, {}, shape.queries, 0, shape.width}, {rows(out, head, 0), rows(grad_out, head, 0)},
-                                log_sums + head * shape.queries, task % panels * kBf16Columns, whole, packed(head));
-  });
-  parallel_for(num_threads, heads * parts, [&](int64_t task) {
-    const int64_t head = task / parts, begin = task % parts * size;
-    kernels().attention_backward_bf16({{}, rows(in.k, head, begin), rows(in.v, head, begin), shape.queries,
-                                       std::min(size, shape.keys - begin), shape.width},
-                                      gemm, packed(head), sums.get() + task * all, rows(gradients.k, head, begin),
-                                      rows(gradients.v, head, begin), scratch(attention_bf16_backward_scratch_size(shape.width)));
+    const int64_t head = task / parts, begin = task % parts * size, count = std::min(size, shape.keys - begin);
+    const AttentionHead<Number> keys{{}, rows(in.k, head, begin), rows(in.v, head, begin), shape.queries, count, shape.width};
+    const Rows<Number> dk = rows(gradients.k, head, begin), dv = rows(gradients.v, head, begin);
+    float* const dq = sums.get() + task * all;
+    if constexpr (is_bf16)
+      kernels().attention_backward_bf16(keys, gemm, packed(head, 0), dq, dk, dv, scratch(attention_bf16_backward_scratch_size(shape.width)));
+    else
+      kernels().attention_backward(keys, packed(head, 0), log_sums + head * shape.queries, dq, dk, dv,
+                                   scratch(attention_backward_scratch_size(shape.width)));
   });
   const float scale = float(1 / std::sqrt(double(width)));
-  parallel_for(num_threads, heads * panels, [&](int64_t task) {
-    const int64_t head = task / panels, begin = task % panels * kBf16Columns;
-    const Rows<Bf16> to = rows(gradients.q, head, begin);
-    for (int64_t i = 0; i < std::min(kBf16Columns, shape.queries - begin); ++i) {
-      const float* const first = sums.get() + head * parts * all + begin * width + i;
+  // Distances between the sums of adjacent queries and elements: for bfloat16 they are in panels, [width, kBf16Columns].
+  const int64_t query_step = is_bf16 ? 1 : columns, element_step = is_bf16 ? kBf16Columns : 1;
+  parallel_for(num_threads, heads * pieces, [&](int64_t task) {
+    const int64_t head = task / pieces, begin = task % pieces * piece;
+    const Rows<Number> to = rows(gradients.q, head, begin);
+    for (int64_t i = 0; i < std::min(piece, shape.queries - begin); ++i) {
+      const float* const first = sums.get() + head * parts * all + begin * row_size + i * query_step;
       for (int64_t c = 0; c < width; ++c) {
         float sum = 0;
-        for (int64_t n = 0; n < parts; ++n) sum += first[n * all + c * kBf16Columns];
-        to.data[i * to.stride + c] = to_bf16(scale * sum);
+        for (int64_t n = 0; n < parts; ++n) sum += first[n * all + c * element_step];
+        if constexpr (is_bf16)
+          to.data[i * to.stride + c] = to_bf16(scale * sum);
+        else
+          to.data[i * to.stride + c] = scale * sum;
       }
     }
   });
 }
+
+template void multi_head_attention_backward(const AttentionShape&, const AttentionInputs<float>&, Heads<const float>, const float*,
+                                            Heads<const float>, const AttentionGradients<float>&, const Bf16Gemm&, int);
+template void multi_head_attention_backward(const AttentionShape&, const AttentionInputs<Bf16>&, Heads<const Bf16>, const float*,
+                                            Heads<const Bf16>, const AttentionGradients<Bf16>&, const Bf16Gemm&, int);
 
 }  // namespace globalsplat::raster
