@@ -24,12 +24,16 @@
 
 namespace globalsplat::raster::GS_ISA {
 
+// GS_X86(name) is the function of x86's intrinsics for vectors of kVectorBytes.
 #if defined(__AVX512F__)
 inline constexpr int kVectorBytes = 64;
+#define GS_X86(name) _mm512_##name
 #elif defined(__AVX2__)
 inline constexpr int kVectorBytes = 32;
+#define GS_X86(name) _mm256_##name
 #else
 inline constexpr int kVectorBytes = 16;
+#define GS_X86(name) _mm_##name
 #endif
 
 // `bits` is the result of a comparison of vectors: −1 or 0 in every lane. `mask` is the form that the machine computes with: one bit per
@@ -127,16 +131,11 @@ GS_INLINE void load_rows(const float* first, int64_t stride, Vector<float>* out)
 // fma(a, b, c) = a·b + c and fnma(a, b, c) = c − a·b, with one rounding on every machine, so that all machines agree which splats reach
 // which pixels. Kernels are compiled without contraction, so nothing else is fused. float64 exists to verify gradients, and is rounded
 // twice on machines without fused instructions.
-#if defined(__AVX512F__)
-GS_INLINE Vector<float> fma(Vector<float> a, Vector<float> b, Vector<float> c) { return _mm512_fmadd_ps(a, b, c); }
-GS_INLINE Vector<float> fnma(Vector<float> a, Vector<float> b, Vector<float> c) { return _mm512_fnmadd_ps(a, b, c); }
-GS_INLINE Vector<double> fma(Vector<double> a, Vector<double> b, Vector<double> c) { return _mm512_fmadd_pd(a, b, c); }
-GS_INLINE Vector<double> fnma(Vector<double> a, Vector<double> b, Vector<double> c) { return _mm512_fnmadd_pd(a, b, c); }
-#elif defined(__AVX2__)
-GS_INLINE Vector<float> fma(Vector<float> a, Vector<float> b, Vector<float> c) { return _mm256_fmadd_ps(a, b, c); }
-GS_INLINE Vector<float> fnma(Vector<float> a, Vector<float> b, Vector<float> c) { return _mm256_fnmadd_ps(a, b, c); }
-GS_INLINE Vector<double> fma(Vector<double> a, Vector<double> b, Vector<double> c) { return _mm256_fmadd_pd(a, b, c); }
-GS_INLINE Vector<double> fnma(Vector<double> a, Vector<double> b, Vector<double> c) { return _mm256_fnmadd_pd(a, b, c); }
+#if defined(__AVX2__)
+GS_INLINE Vector<float> fma(Vector<float> a, Vector<float> b, Vector<float> c) { return GS_X86(fmadd_ps)(a, b, c); }
+GS_INLINE Vector<float> fnma(Vector<float> a, Vector<float> b, Vector<float> c) { return GS_X86(fnmadd_ps)(a, b, c); }
+GS_INLINE Vector<double> fma(Vector<double> a, Vector<double> b, Vector<double> c) { return GS_X86(fmadd_pd)(a, b, c); }
+GS_INLINE Vector<double> fnma(Vector<double> a, Vector<double> b, Vector<double> c) { return GS_X86(fnmadd_pd)(a, b, c); }
 #elif defined(__aarch64__)
 GS_INLINE Vector<float> fma(Vector<float> a, Vector<float> b, Vector<float> c) { return vfmaq_f32(c, a, b); }
 GS_INLINE Vector<float> fnma(Vector<float> a, Vector<float> b, Vector<float> c) { return vfmsq_f32(c, a, b); }
@@ -243,12 +242,6 @@ GS_INLINE bool any(M m) {
 }
 
 // Both functions return the second operand if either is NaN.
-#if defined(__AVX512F__)
-GS_INLINE Vector<float> smaller(Vector<float> a, Vector<float> b) { return _mm512_min_ps(a, b); }
-GS_INLINE Vector<double> smaller(Vector<double> a, Vector<double> b) { return _mm512_min_pd(a, b); }
-GS_INLINE Vector<float> larger(Vector<float> a, Vector<float> b) { return _mm512_max_ps(a, b); }
-GS_INLINE Vector<double> larger(Vector<double> a, Vector<double> b) { return _mm512_max_pd(a, b); }
-#else
 template <class V>
 GS_INLINE V smaller(V a, V b) {
   return a < b ? a : b;
@@ -258,13 +251,13 @@ GS_INLINE V larger(V a, V b) {
   return a > b ? a : b;
 }
 // Single instructions, which compilers don't generate for the code above.
-#if defined(__AVX2__)
-GS_INLINE Vector<float> smaller(Vector<float> a, Vector<float> b) { return _mm256_min_ps(a, b); }
-GS_INLINE Vector<float> larger(Vector<float> a, Vector<float> b) { return _mm256_max_ps(a, b); }
-#elif defined(__SSE2__)
-GS_INLINE Vector<float> smaller(Vector<float> a, Vector<float> b) { return _mm_min_ps(a, b); }
-GS_INLINE Vector<float> larger(Vector<float> a, Vector<float> b) { return _mm_max_ps(a, b); }
+#if defined(__SSE2__)
+GS_INLINE Vector<float> smaller(Vector<float> a, Vector<float> b) { return GS_X86(min_ps)(a, b); }
+GS_INLINE Vector<float> larger(Vector<float> a, Vector<float> b) { return GS_X86(max_ps)(a, b); }
 #endif
+#if defined(__AVX512F__)
+GS_INLINE Vector<double> smaller(Vector<double> a, Vector<double> b) { return _mm512_min_pd(a, b); }
+GS_INLINE Vector<double> larger(Vector<double> a, Vector<double> b) { return _mm512_max_pd(a, b); }
 #endif
 
 // Returns |v|.
@@ -287,12 +280,9 @@ GS_INLINE V clamp(V v, V low, V high) {
   return smaller(larger(v, low), high);
 }
 
-#if defined(__AVX512F__)
-GS_INLINE Vector<float> sqrt(Vector<float> v) { return _mm512_sqrt_ps(v); }
-GS_INLINE Vector<double> sqrt(Vector<double> v) { return _mm512_sqrt_pd(v); }
-#elif defined(__AVX2__)
-GS_INLINE Vector<float> sqrt(Vector<float> v) { return _mm256_sqrt_ps(v); }
-GS_INLINE Vector<double> sqrt(Vector<double> v) { return _mm256_sqrt_pd(v); }
+#if defined(__AVX2__)
+GS_INLINE Vector<float> sqrt(Vector<float> v) { return GS_X86(sqrt_ps)(v); }
+GS_INLINE Vector<double> sqrt(Vector<double> v) { return GS_X86(sqrt_pd)(v); }
 #elif defined(__aarch64__)
 GS_INLINE Vector<float> sqrt(Vector<float> v) { return vsqrtq_f32(v); }
 GS_INLINE Vector<double> sqrt(Vector<double> v) { return vsqrtq_f64(v); }
@@ -323,14 +313,13 @@ GS_INLINE void transpose4(const void* from, int64_t stride, void* to, int64_t to
 }
 
 // Computes 1/v with an error of 2e-7: an estimate of 12 or 14 bits and one step of Newton's method. No decision depends on it.
+#if defined(__AVX2__)
+GS_INLINE Vector<float> reciprocal(Vector<float> v) {
 #if defined(__AVX512F__)
-GS_INLINE Vector<float> reciprocal(Vector<float> v) {
   const Vector<float> estimate = _mm512_rcp14_ps(v);
-  return fma(fnma(v, estimate, broadcast<float>(1)), estimate, estimate);
-}
-#elif defined(__AVX2__)
-GS_INLINE Vector<float> reciprocal(Vector<float> v) {
+#else
   const Vector<float> estimate = _mm256_rcp_ps(v);
+#endif
   return fma(fnma(v, estimate, broadcast<float>(1)), estimate, estimate);
 }
 #else
