@@ -71,10 +71,12 @@ std::unique_ptr<Store> connect(rust::Str host, uint16_t port, bool is_server, ru
 }
 
 bool has_gloo() { return GLOBALSPLAT_GLOO; }
+bool has_nccl() { return GLOBALSPLAT_NCCL; }
 
-std::unique_ptr<ProcessGroup> new_gloo_group([[maybe_unused]] const Store& store, [[maybe_unused]] int32_t rank,
-                                             [[maybe_unused]] int32_t ranks, [[maybe_unused]] int64_t seconds) {
+namespace {
+
 #if GLOBALSPLAT_GLOO
+Ranks new_gloo_group(const Store& store, int32_t rank, int32_t ranks, int64_t seconds) {
   using c10d::ProcessGroupGloo;
   auto options = ProcessGroupGloo::Options::create(std::chrono::seconds(seconds));
   // Selects the network interface like PyTorch: the one that the user names, or the one of this machine's host name.
@@ -82,19 +84,15 @@ std::unique_ptr<ProcessGroup> new_gloo_group([[maybe_unused]] const Store& store
   const bool named = interface && *interface;
   options->devices.push_back(named ? ProcessGroupGloo::createDeviceForInterface(interface) : ProcessGroupGloo::createDefaultDevice());
   auto inner = c10::make_intrusive<c10d::PrefixStore>("gloo", store.inner());
-  return std::make_unique<ProcessGroup>(c10::make_intrusive<ProcessGroupGloo>(std::move(inner), rank, ranks, std::move(options)));
-#else
-  throw std::runtime_error("built without Gloo");
-#endif
+  return c10::make_intrusive<ProcessGroupGloo>(std::move(inner), rank, ranks, std::move(options));
 }
+#else
+Ranks new_gloo_group(const Store&, int32_t, int32_t, int64_t) { throw std::runtime_error("built without Gloo"); }
+#endif
 
 // The program isn't linked to libtorch's CUDA library, which is loaded when a GPU is requested. The functions that create an NCCL group are
 // therefore looked up by name, and everything else goes through c10d's virtual functions.
-bool has_nccl() { return GLOBALSPLAT_NCCL; }
-
 #if GLOBALSPLAT_NCCL
-namespace {
-
 using c10d::ProcessGroupNCCL;
 using Options = ProcessGroupNCCL::Options;
 
@@ -119,9 +117,7 @@ c10::intrusive_ptr<T> constructed(void (*constructor)(void*, Arguments...), std:
   return c10::intrusive_ptr<T>::unsafe_steal_from_new(static_cast<T*>(place));
 }
 
-}  // namespace
-
-std::unique_ptr<ProcessGroup> new_nccl_group(const Store& store, int32_t rank, int32_t ranks, int64_t seconds) {
+Ranks new_nccl_group(const Store& store, int32_t rank, int32_t ranks, int64_t seconds) {
   // Options contain a struct of NCCL that grows from version to version.
   int version = 0;
   loaded<int(int*)>("ncclGetVersion")(&version);
@@ -132,11 +128,17 @@ std::unique_ptr<ProcessGroup> new_nccl_group(const Store& store, int32_t rank, i
   auto* const constructor = loaded<Constructor>(
       "_ZN4c10d16ProcessGroupNCCLC1EN3c1013intrusive_ptrINS_5StoreENS1_6detail34intrusive_target_default_null_typeIS3_EEEEiiNS2_INS0_"
       "7OptionsENS5_IS8_EEEE");
-  return std::make_unique<ProcessGroup>(constructed<ProcessGroupNCCL>(constructor, store.inner(), rank, ranks, std::move(options)));
+  return constructed<ProcessGroupNCCL>(constructor, store.inner(), rank, ranks, std::move(options));
 }
 #else
-std::unique_ptr<ProcessGroup> new_nccl_group(const Store&, int32_t, int32_t, int64_t) { throw std::runtime_error("built without NCCL"); }
+Ranks new_nccl_group(const Store&, int32_t, int32_t, int64_t) { throw std::runtime_error("built without NCCL"); }
 #endif
+
+}  // namespace
+
+std::unique_ptr<ProcessGroup> new_group(bool is_on_gpus, const Store& store, int32_t rank, int32_t ranks, int64_t seconds) {
+  return std::make_unique<ProcessGroup>((is_on_gpus ? new_nccl_group : new_gloo_group)(store, rank, ranks, seconds));
+}
 
 ProcessGroup::ProcessGroup(Ranks ranks) : ranks_(std::move(ranks)) {}
 ProcessGroup::~ProcessGroup() = default;
@@ -155,8 +157,16 @@ void ProcessGroup::broadcast(size_t tensor) const {
   start_one_at_a_time([&] { return ranks_->broadcast(tensors); })->wait();
 }
 
-// State shared by the parameters' hooks. Backward passes of one step run one after the other, each in one thread.
+// State that the parameters' hooks change. Backward passes of one step run one after the other, each in one thread.
 struct Buckets::State {
+  // Notifies a state that a parameter has its gradient.
+  struct Hook final : torch::autograd::PostAccumulateGradHook {
+    Hook(std::shared_ptr<State> state, size_t parameter) : state(std::move(state)), parameter(parameter) {}
+    void operator()(const at::Tensor&) override { state->on_gradient(parameter); }
+
+    std::shared_ptr<State> state;
+    size_t parameter;
+  };
   struct Bucket {
     size_t first, end;  // range of parameters
     size_t missing;     // gradients not yet computed
@@ -175,21 +185,6 @@ struct Buckets::State {
   void on_gradient(size_t parameter);
   void send(const Bucket& bucket);
 };
-
-namespace {
-
-// Hook that notifies a state that a parameter has its gradient.
-template <class State>
-struct GradientHook final : torch::autograd::PostAccumulateGradHook {
-  GradientHook(std::shared_ptr<State> state, size_t parameter) : state(std::move(state)), parameter(parameter) {}
-
-  void operator()(const at::Tensor&) override { state->on_gradient(parameter); }
-
-  std::shared_ptr<State> state;
-  size_t parameter;
-};
-
-}  // namespace
 
 void Buckets::State::on_gradient(size_t parameter) {
   if (!waiting || error) return;
@@ -243,7 +238,7 @@ Buckets::Buckets(Ranks ranks, std::vector<at::Tensor> parameters, int64_t bytes)
     state.buckets.back().end = i + 1;
     state.bucket_of.push_back(state.buckets.size() - 1);
     size += int64_t(parameter.nbytes());
-    torch::autograd::impl::set_post_acc_grad_hooks(parameter, std::make_unique<GradientHook<State>>(state_, i));
+    torch::autograd::impl::set_post_acc_grad_hooks(parameter, std::make_unique<State::Hook>(state_, i));
   }
 }
 

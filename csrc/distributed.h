@@ -68,10 +68,9 @@ class ProcessGroup {
   Ranks ranks_;
 };
 
-// Creates a group for CPU tensors. Collectives that take longer than `seconds` fail.
-std::unique_ptr<ProcessGroup> new_gloo_group(const Store& store, int32_t rank, int32_t ranks, int64_t seconds);
-// Creates a group for GPU tensors. libtorch's CUDA library must have been loaded. Collectives that take longer than `seconds` fail.
-std::unique_ptr<ProcessGroup> new_nccl_group(const Store& store, int32_t rank, int32_t ranks, int64_t seconds);
+// Creates a group for tensors on GPUs (NCCL; libtorch's CUDA library must have been loaded) or on CPUs (Gloo). Collectives that take longer
+// than `seconds` fail.
+std::unique_ptr<ProcessGroup> new_group(bool is_on_gpus, const Store& store, int32_t rank, int32_t ranks, int64_t seconds);
 
 // Gradients of a step, summed over all ranks in buckets. A bucket is sent as soon as the backward pass has computed all of its gradients
 // and the previous bucket has been sent, so the order is the same on all ranks.

@@ -36,16 +36,11 @@ constexpr int64_t kBlockRows = 256, kBlockColumns = 256, kBlocks = 16;
 using MkldnnLinear = Tensor(const Tensor&, const Tensor&, const std::optional<Tensor>&, c10::string_view,
                             c10::List<std::optional<at::Scalar>>, std::optional<c10::string_view>);
 
-// Finds the op that torch's compiler uses for a linear layer. libtorch may have been built without it.
-std::optional<c10::TypedOperatorHandle<MkldnnLinear>> find_mkldnn_linear() {
-  const auto found = c10::Dispatcher::singleton().findSchema({"mkldnn::_linear_pointwise", ""});
-  if (!found) return {};
-  return found->typed<MkldnnLinear>();
-}
-
+// Returns the op that torch's compiler uses for a linear layer. libtorch may have been built without it.
 const std::optional<c10::TypedOperatorHandle<MkldnnLinear>>& mkldnn_linear() {
-  static const auto known = find_mkldnn_linear();
-  return known;
+  static const auto found = c10::Dispatcher::singleton().findSchema({"mkldnn::_linear_pointwise", ""});
+  static const auto typed = found ? std::optional(found->typed<MkldnnLinear>()) : std::nullopt;
+  return typed;
 }
 
 // Returns true if oneDNN computes float32 products faster than MKL, libtorch's default: MKL leaves half of the vector units idle on

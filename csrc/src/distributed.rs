@@ -36,16 +36,9 @@ mod ffi {
         /// Process group; see `csrc/distributed.h`.
         type ProcessGroup;
 
-        /// Creates a process group for CPU tensors; see `csrc/distributed.h`.
-        fn new_gloo_group(
-            store: &Store,
-            rank: i32,
-            ranks: i32,
-            seconds: i64,
-        ) -> Result<UniquePtr<ProcessGroup>>;
-
-        /// Creates a process group for GPU tensors; see `csrc/distributed.h`.
-        fn new_nccl_group(
+        /// Creates a process group for tensors on GPUs (NCCL) or on CPUs (Gloo); see `csrc/distributed.h`.
+        fn new_group(
+            is_on_gpus: bool,
             store: &Store,
             rank: i32,
             ranks: i32,

@@ -155,7 +155,7 @@ pub(crate) mod tests {
         }
         let store = ffi::connect("127.0.0.1", 0, true, "test", 60).expect("a store");
         // The error comes from NCCL's constructor. So it was found and called, and its exception is passed through.
-        let error = ffi::new_nccl_group(&store, 0, 1, 60).err().expect("no GPU").to_string();
+        let error = ffi::new_group(true, &store, 0, 1, 60).err().expect("no GPU").to_string();
         assert!(error.contains("no GPUs found"), "{error}");
     }
 }

@@ -78,20 +78,13 @@ impl ProcessGroup {
         };
         let (rank, ranks) = (env.rank as i32, env.ranks as i32);
         let Backends { gloo, nccl } = Backends::built_in();
-        let inner = match device {
-            Device::Cuda(_) if !nccl => {
-                let install = "install what requirements.txt pins beside libtorch's wheel";
-                return Err(without("NCCL", install));
-            }
-            Device::Cuda(_) => ffi::new_nccl_group(store, rank, ranks, COLLECTIVE_TIMEOUT_SECONDS),
-            _ if !gloo => {
-                return Err(without(
-                    "Gloo",
-                    "install its headers (Debian and Ubuntu: apt install libgloo-dev)",
-                ));
-            }
-            _ => ffi::new_gloo_group(store, rank, ranks, COLLECTIVE_TIMEOUT_SECONDS),
-        };
+        let is_on_gpus = device.is_cuda();
+        if is_on_gpus && !nccl {
+            return Err(without("NCCL", "install what requirements.txt pins beside libtorch's wheel"));
+        } else if !is_on_gpus && !gloo {
+            return Err(without("Gloo", "install its headers (Debian and Ubuntu: apt install libgloo-dev)"));
+        }
+        let inner = ffi::new_group(is_on_gpus, store, rank, ranks, COLLECTIVE_TIMEOUT_SECONDS);
         let inner = Some(inner.map_err(|e| {
             let why = e.what().lines().next().unwrap_or_default().to_string();
             Error::failed(format!("rank {rank} of {ranks} can't join the process group: {why}"))
