@@ -111,24 +111,23 @@ thread_local std::unique_ptr<Counting> counting;
 
 }  // namespace
 
-// Only events of the backend's default kind record times.
-CudaEvent::CudaEvent(int32_t gpu) : event_(c10::kCUDA, c10::EventFlag::BACKEND_DEFAULT) { event_.record(driver().getStream(by_number(gpu))); }
-
-double CudaEvent::milliseconds_since(const CudaEvent& earlier) const {
-  earlier.event_.synchronize();
-  event_.synchronize();
-  return earlier.event_.elapsedTime(event_);
+std::unique_ptr<CudaEvent> record_event(int32_t gpu) {
+  c10::Event event(c10::kCUDA, c10::EventFlag::BACKEND_DEFAULT);  // the only kind that records times
+  event.record(driver().getStream(by_number(gpu)));
+  return std::unique_ptr<CudaEvent>(new CudaEvent{std::move(event)});
 }
 
-std::unique_ptr<CudaEvent> record_event(int32_t gpu) { return std::make_unique<CudaEvent>(gpu); }
-
-PendingCopies::PendingCopies(std::vector<at::Tensor> tensors, c10::Event done) : tensors_(std::move(tensors)), done_(std::move(done)) {}
+double CudaEvent::milliseconds_since(const CudaEvent& earlier) const {
+  earlier.event.synchronize();
+  event.synchronize();
+  return earlier.event.elapsedTime(event);
+}
 
 rust::Vec<size_t> PendingCopies::take_tensors() const {
-  const c10::Stream current = driver().getStream(tensors_.at(0).device());
-  done_.block(current);
+  const c10::Stream current = driver().getStream(tensors.at(0).device());
+  done.block(current);
   rust::Vec<size_t> out;
-  for (const at::Tensor& t : tensors_) {
+  for (const at::Tensor& t : tensors) {
     // If a tensor is freed, the allocator then reuses its memory for later copies only after this stream has done the work enqueued until
     // then.
     t.record_stream(current);
@@ -137,22 +136,22 @@ rust::Vec<size_t> PendingCopies::take_tensors() const {
   return out;
 }
 
-CopyStream::CopyStream(int32_t gpu) : stream_(driver().getStreamFromGlobalPool(by_number(gpu))) {}
+std::unique_ptr<CopyStream> copy_stream(int32_t gpu) {
+  return std::unique_ptr<CopyStream>(new CopyStream{driver().getStreamFromGlobalPool(by_number(gpu))});
+}
 
 std::unique_ptr<PendingCopies> CopyStream::copy(rust::Slice<const size_t> tensors) const {
-  const c10::StreamGuard here(stream_);
+  const c10::StreamGuard here(stream);
   std::vector<at::Tensor> copies;
   for (const size_t address : tensors) {
     const at::Tensor original = borrowed(address).contiguous();
     const at::Tensor locked = original.is_pinned() ? original : original.pin_memory();
-    copies.push_back(locked.to(stream_.device(), locked.scalar_type(), /*non_blocking=*/true));
+    copies.push_back(locked.to(stream.device(), locked.scalar_type(), /*non_blocking=*/true));
   }
   c10::Event done(c10::kCUDA);
-  done.record(stream_);
-  return std::make_unique<PendingCopies>(std::move(copies), std::move(done));
+  done.record(stream);
+  return std::unique_ptr<PendingCopies>(new PendingCopies{std::move(copies), std::move(done)});
 }
-
-std::unique_ptr<CopyStream> copy_stream(int32_t gpu) { return std::make_unique<CopyStream>(gpu); }
 
 size_t empty_pinned_bytes(rust::Slice<const int64_t> shape) {
   const auto options = at::TensorOptions(at::kByte).pinned_memory(true);

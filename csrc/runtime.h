@@ -23,45 +23,33 @@ inline const at::Tensor& borrowed(size_t address) { return *reinterpret_cast<con
 inline size_t owned(const at::Tensor& tensor) { return reinterpret_cast<size_t>(new at::Tensor(tensor)); }
 
 // Event that records when a GPU has completed the work enqueued in its current stream so far.
-class CudaEvent {
- public:
-  explicit CudaEvent(int32_t gpu);
+struct CudaEvent {
+  c10::Event event;
 
   // Returns the milliseconds since `earlier`. Waits until the GPU has reached both events.
   double milliseconds_since(const CudaEvent& earlier) const;
-
- private:
-  c10::Event event_;
 };
 
 std::unique_ptr<CudaEvent> record_event(int32_t gpu);
 
 // New tensors on a GPU, and the event after which they hold the copied data.
-class PendingCopies {
- public:
-  PendingCopies(std::vector<at::Tensor> tensors, c10::Event done);
+struct PendingCopies {
+  std::vector<at::Tensor> tensors;
+  c10::Event done;
 
   // Passes the tensors to the caller, once and in order. Work that is enqueued in the GPU's current stream from now on waits for the
   // copies; the host doesn't.
   rust::Vec<size_t> take_tensors() const;
-
- private:
-  std::vector<at::Tensor> tensors_;
-  c10::Event done_;
 };
 
 // Stream that is used only for copies. One stream serves all of them, because freed memory is reused only in the stream for which it was
 // allocated.
-class CopyStream {
- public:
-  explicit CopyStream(int32_t gpu);
+struct CopyStream {
+  c10::Stream stream;
 
   // Starts copying host tensors, given by their addresses. Tensors outside of page-locked memory are first copied into it. The originals
   // may be freed at once.
   std::unique_ptr<PendingCopies> copy(rust::Slice<const size_t> tensors) const;
-
- private:
-  c10::Stream stream_;
 };
 
 std::unique_ptr<CopyStream> copy_stream(int32_t gpu);
