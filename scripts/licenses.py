@@ -15,7 +15,8 @@ import re
 import subprocess
 import sys
 from collections import Counter
-from importlib.metadata import Distribution, distributions
+from collections.abc import Callable, Iterable
+from importlib.metadata import distributions
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -34,6 +35,8 @@ LIBGOMP = (
     "GPL version 3 or later with the GCC Runtime Library Exception 3.1, by which programs under any license may contain\n"
     "and be distributed with them. Source: https://gcc.gnu.org. License: https://www.gnu.org/licenses/gpl-3.0.txt and https://www.gnu.org/licenses/gcc-exception-3.1.txt\n",
 )
+# Name, license expression and license texts of a package.
+Package = tuple[str, str, list[str]]
 TEXT = re.compile(r"(un)?licen[sc]e|copying|notice|copyright", re.IGNORECASE)
 
 
@@ -56,72 +59,64 @@ def texts(folder: Path, depth: int = 1) -> list[str]:
     return found
 
 
-def crates() -> list[tuple[str, str, list[str]]]:
-    """Returns the name, license expression and texts of every crate that the program links."""
+def reachable(roots: Iterable[str], successors: Callable[[str], Iterable[str]]) -> set[str]:
+    """Returns the roots and everything that they depend on, directly or through others."""
+    reached: set[str] = set()
+    waiting = list(roots)
+    while waiting:
+        name = waiting.pop()
+        if name not in reached:
+            reached.add(name)
+            waiting += successors(name)
+    return reached
+
+
+def crates() -> list[Package]:
+    """Returns every crate that the program links."""
     command = [os.environ.get("CARGO", "cargo"), "metadata", "--locked", "--format-version", "1"]
     command += ["--filter-platform", f"{os.uname().machine}-unknown-linux-gnu"]
     metadata = json.loads(subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, check=True).stdout)
     packages = {package["id"]: package for package in metadata["packages"]}
-    nodes = {node["id"]: node for node in metadata["resolve"]["nodes"]}
-    reached: set[str] = set()
-    waiting = [name for name in metadata["workspace_members"] if packages[name]["name"] == "globalsplat"]
-    while waiting:
-        name = waiting.pop()
-        if name not in reached:
-            reached.add(name)
-            waiting += [d["pkg"] for d in nodes[name]["deps"] if any(kind["kind"] is None for kind in d["dep_kinds"])]
-    linked = [packages[name] for name in reached if packages[name]["source"]]
+    dependencies = {node["id"]: node["deps"] for node in metadata["resolve"]["nodes"]}
+    linked = reachable(
+        [name for name in metadata["workspace_members"] if packages[name]["name"] == "globalsplat"],
+        lambda name: [d["pkg"] for d in dependencies[name] if any(kind["kind"] is None for kind in d["dep_kinds"])],
+    )
     found = []
-    for package in sorted(linked, key=lambda p: p["name"]):
-        written = texts(Path(package["manifest_path"]).parent)
-        if not written:
-            # Its package has no text, but its authors chose one that is the same for everyone, or asks for their names.
-            written = [
-                f"By {', '.join(package['authors']) or package['repository']}. The text is that of {package['license']}.\n"
-            ]
-        found.append((f"{package['name']} {package['version']}", package["license"] or "", written))
+    for package in sorted((packages[name] for name in linked), key=lambda p: (p["name"], p["version"])):
+        if package["source"]:
+            # A package without a text has a license whose text is the same for everyone, or asks for the authors' names.
+            authors = ", ".join(package["authors"]) or package["repository"]
+            written = texts(Path(package["manifest_path"]).parent)
+            written = written or [f"By {authors}. The text is that of {package['license']}.\n"]
+            found.append((f"{package['name']} {package['version']}", package["license"] or "", written))
     return found
 
 
-def npm_packages(with_texts: bool) -> list[tuple[str, str, list[str]]]:
-    """Returns the same of every npm package that web/ bundles."""
+def npm_packages(with_texts: bool) -> list[Package]:
+    """Returns every npm package that web/ bundles."""
     lock = json.loads((ROOT / "web/package-lock.json").read_text())["packages"]
-    reached: set[str] = set()
-    waiting = [name for name in lock[""]["dependencies"] if name not in BUILD_TOOLS]
-    while waiting:
-        name = waiting.pop()
-        if name not in reached:
-            reached.add(name)
-            waiting += lock[f"node_modules/{name}"].get("dependencies", {})
     found = []
-    for name in sorted(reached):
+    roots = lock[""]["dependencies"].keys() - BUILD_TOOLS
+    for name in sorted(reachable(roots, lambda name: lock[f"node_modules/{name}"].get("dependencies", {}))):
         package = lock[f"node_modules/{name}"]
-        found.append(
-            (
-                f"{name} {package['version']}",
-                package.get("license", ""),
-                texts(ROOT / "web/node_modules" / name, 0) if with_texts else [],
-            )
-        )
+        written = texts(ROOT / "web/node_modules" / name, 0) if with_texts else []
+        found.append((f"{name} {package['version']}", package.get("license", ""), written))
     return found
 
 
-def wheels(cuda: bool) -> list[tuple[str, str, list[str]]]:
-    """Returns the same of the wheels that libtorch and the libraries that it loads come from."""
+def wheels(cuda: bool) -> list[Package]:
+    """Returns the wheels that libtorch and the libraries that it loads come from."""
     libtorch = Path(os.environ.get("LIBTORCH") or ROOT / ".venv/libtorch").resolve()
     found = []
     for wheel in distributions(path=[str(libtorch.parent)]):
         name = wheel.metadata["Name"].lower()
         if name in CPU_WHEELS or (cuda and name.startswith("nvidia-")):
             license = wheel.metadata["License-Expression"] or wheel.metadata["License"] or ""
-            found.append((f"{name} {wheel.version}", license, wheel_texts(wheel)))
+            files = [file for file in wheel.files or [] if TEXT.match(file.name) and file.suffix in ("", ".txt")]
+            written = [Path(str(file.locate())).read_text(errors="replace").strip() + "\n" for file in files]
+            found.append((f"{name} {wheel.version}", license, written))
     return sorted(found)
-
-
-def wheel_texts(wheel: Distribution) -> list[str]:
-    """Returns the license texts that a wheel lists."""
-    files = [file for file in wheel.files or [] if TEXT.match(file.name) and file.suffix in ("", ".txt")]
-    return [Path(str(wheel.locate_file(file))).read_text(errors="replace").strip() + "\n" for file in files]
 
 
 def main() -> None:
