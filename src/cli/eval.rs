@@ -2,17 +2,16 @@ use super::{
     Output, check_views, device, distributed, model, open_masked_capture, parse_holdout, progress,
     report_downscaling, signals, warn, warn_of_many,
 };
-use crate::data::{Capture, Dataset, Holdout, PhotoSize, Split, View};
-use crate::device::peak_memory_bytes;
+use crate::data::{Capture, Dataset, PhotoSize, Split};
 use crate::error::Error;
 use crate::eval::{
-    Baselines, DatasetEvaluation, EvalScene, Evaluation, EvaluationIndex, LazyPhotos, Method, REPORT, TABLE,
-    evaluation_files, machine, score_output, weights_fingerprint, write_csv, write_evaluation, write_report,
+    DatasetEvaluation, EvalScene, Evaluation, EvaluationIndex, Method, REPORT, evaluation_files,
+    weights_fingerprint, write_evaluation, write_report,
 };
 use crate::io::{InputFiles, check_writable_dir, check_writable_png};
 use crate::metrics::{CaptureScores, ContactSheet, Perceptual, Scores};
 use crate::model::Precision;
-use crate::reconstruct::{LoadedModel, Model, context_views};
+use crate::reconstruct::{LoadedModel, Model};
 use crate::scene::ImageSize;
 use anyhow::Result;
 use clap::{ArgGroup, Args};
@@ -128,37 +127,33 @@ impl Eval {
         if self.render_height.is_some() && scene.enlarged {
             eprintln!("{}: {}", scene.name, model::ENLARGED);
         }
-        let mut output = self.method(model).render_targets(scene, device)?;
-        warn(&output.warnings);
-        let peak_memory = peak_memory_bytes(); // of the method, without the networks of the metrics
-        let perceptual = Perceptual::find(device)?;
-        let mut sheet = self.sheet.as_ref().map(|_| ContactSheet::new(output.scene.target.len()));
-        let scores = score_output(&mut output, &perceptual, |ground_truth, picture, _| {
-            let row = sheet.as_mut().zip(picture.rendered.as_ref());
-            row.map_or(Ok(()), |(sheet, rendered)| sheet.add(&ground_truth.image.to_float(), rendered))
-        })?;
-        let scene = &output.scene;
-        // For a model, also score the trivial baselines that use only the input photos.
-        let baselines = model.map(|model| self.baselines(&capture, model, scene)).transpose()?;
+        let perceptual = Perceptual::new(device);
+        let mut sheet = self.sheet.as_ref().map(|_| ContactSheet::new(scene.frames.target.len()));
+        let scored =
+            self.method(model).score(&scene, device, Some(&perceptual), |view, _, rendered, _| {
+                let row = sheet.as_mut().zip(rendered);
+                row.map_or(Ok(()), |(sheet, rendered)| sheet.add(&view.image.to_float(), rendered))
+            })?;
+        warn(&scored.warnings);
         if let Some((path, sheet)) = self.sheet.as_ref().zip(sheet) {
             report_downscaling(path, sheet.write(path)?);
         }
-        if let Some(line) = perceptual.explain_missing(&scores.mean) {
+        if let Some(line) = Perceptual::explain_missing(&scored.scores.mean) {
             eprintln!("{line}");
         }
-        let mut json = serde_json::to_value(&scores)?;
-        let mut lines = table(&scores);
-        json["peak_memory_bytes"] = peak_memory.into();
+        let mut json = serde_json::to_value(&scored.scores)?;
+        let mut lines = table(&scored.scores);
+        json["peak_memory_bytes"] = perceptual.peak_memory().map(|peak| peak.host).into();
         if let Some(Model { config, .. }) = model {
             json["image_size"] = json!(self.target_size(model)?);
             json["input"] = json!({ "photos": scene.context.len(), "image_size": config.data.image_size });
-            json["forward_seconds"] = json!(output.forward_seconds);
-        }
-        if let Some(Baselines { nearest_photo, mean_photo }) = &baselines {
-            for (key, name, Scores { psnr, ssim, .. }) in [
-                ("nearest_photo", "the nearest photo shown", nearest_photo.mean),
-                ("mean_photo", "the mean photo shown", mean_photo.mean),
+            json["forward_seconds"] = json!(scored.forward_seconds);
+            // Also score the trivial baselines that use only the input photos.
+            for (key, name, scores) in [
+                ("nearest_photo", "the nearest photo shown", scene.score_nearest_photo()?),
+                ("mean_photo", "the mean photo shown", scene.score_mean_photo()?),
             ] {
+                let Scores { psnr, ssim, .. } = scores.mean;
                 json["baselines"][key] = json!({ "psnr": psnr, "ssim": ssim });
                 lines.push(format!("{name:<24} {psnr:>8.2} {ssim:>8.4}"));
             }
@@ -169,8 +164,8 @@ impl Eval {
     /// Returns the scene to evaluate: a model's input and target views; for splats and images, all photos as targets.
     fn one_scene(&self, capture: &Capture, model: Option<Model>) -> Result<EvalScene> {
         let target_size = self.target_size(model)?;
-        let Some(model) = model else {
-            let holdout = self.holdout.as_deref().map(parse_holdout).transpose()?;
+        let holdout = self.holdout.as_deref().map(parse_holdout).transpose()?;
+        let Some(Model { config, .. }) = model else {
             let size = match &self.size {
                 Some(size) => size
                     .parse::<PhotoSize>()
@@ -179,28 +174,8 @@ impl Eval {
             };
             return Ok(EvalScene::without_context(capture, holdout, size)?);
         };
-        let photo_size = model.config.data.image_size;
-        Ok(EvalScene::held_out(capture, self.holdout(model)?, self.views, photo_size, target_size)?)
-    }
-
-    /// Scores the baselines that use only the input photos of `scene`, at the size of the scored images.
-    fn baselines(&self, capture: &Capture, model: Model, scene: &EvalScene) -> Result<Baselines> {
-        let size = self.target_size(Some(model))?;
-        let photos = match size == model.config.data.image_size {
-            true => LazyPhotos::Loaded(scene.context.iter().map(View::shallow_clone).collect()),
-            false => {
-                let shown = context_views(capture, self.holdout(model)?, self.views);
-                LazyPhotos::from_capture(capture, &shown, PhotoSize::Exactly(size))
-            }
-        };
-        Ok(Baselines::compute(&scene.name, &photos, &scene.target)?)
-    }
-
-    fn holdout(&self, model: Model) -> Result<Holdout> {
-        match &self.holdout {
-            Some(text) => parse_holdout(text),
-            None => Ok(model.config.data.holdout),
-        }
+        let (holdout, photo_size) = (holdout.unwrap_or(config.data.holdout), config.data.image_size);
+        Ok(EvalScene::held_out(capture, holdout, self.views, photo_size, target_size)?)
     }
 
     /// Returns the size of the scored images.
@@ -262,15 +237,6 @@ impl Eval {
         paths.into_iter().flatten().next().expect("clap asks for one of the three")
     }
 
-    /// Returns a string that identifies what is evaluated: for weights [`weights_fingerprint`].
-    /// Splats and images are compared scene by scene, so for them it is the path of their folder.
-    fn fingerprint(&self) -> Result<String> {
-        let Some(weights) = &self.weights else {
-            return Ok(self.path().canonicalize()?.display().to_string());
-        };
-        Ok(weights_fingerprint(weights)?)
-    }
-
     fn method<'a>(&self, model: Option<Model<'a>>) -> Method<'a> {
         match (model, &self.splat) {
             (Some(model), _) => Method::Model(model),
@@ -301,48 +267,46 @@ impl Eval {
         let (loaded, path) = (self.load_model(device)?, self.path());
         let model = loaded.as_ref().map(Model::from);
         let target_size = self.target_size(model)?;
-        let fingerprint = self.fingerprint()?;
+        let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+        let precision = match model.map(|model| model.network.precision()) {
+            Some(Precision::Bf16) => " bf16",
+            _ => "",
+        };
+        // Splats and images are compared scene by scene, so it is the path of their folder that identifies them.
+        let fingerprint = match &self.weights {
+            Some(weights) => weights_fingerprint(weights)?,
+            None => path.canonicalize()?.display().to_string(),
+        };
         signals::handle_stop_requests()?;
 
         let mut evaluations = vec![];
         for ((index, folder), dataset_name) in indices.iter().zip(folders).zip(dataset_names) {
-            let stem = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-            let precision = match model.map(|model| model.network.precision()) {
-                Some(Precision::Bf16) => " bf16",
-                _ => "",
-            };
             let evaluation = DatasetEvaluation {
                 method: self.method(model),
-                name: self.name.clone().unwrap_or(stem + precision),
-                fingerprint: fingerprint.clone() + precision,
+                name: self.name.clone().unwrap_or(format!("{stem}{precision}")),
+                fingerprint: format!("{fingerprint}{precision}"),
                 dataset: &dataset,
                 root: data,
                 dataset_name,
                 index,
                 target_size,
-                machine: machine(device)?,
                 device,
                 out: &folder,
                 group: &group,
             };
             let bar = progress::bar(0, "scenes");
-            let evaluation = evaluation.run(
-                || Perceptual::find(device),
-                |done, of| {
-                    bar.set_length(of as u64);
-                    bar.set_position(done as u64);
-                    !signals::is_stop_requested()
-                },
-            )?;
+            let evaluation = evaluation.run(|done, of| {
+                bar.set_length(of as u64);
+                bar.set_position(done as u64);
+                !signals::is_stop_requested()
+            })?;
             bar.finish_and_clear();
             if !group.is_main_process() {
                 continue;
             }
-            if evaluation.summary.mean.lpips_vgg.is_none() || evaluation.summary.mean.lpips_alex.is_none() {
-                let perceptual = Perceptual::find(device)?;
-                let why =
-                    evaluation.scenes.iter().find_map(|scene| perceptual.explain_missing(&scene.scores.mean));
-                why.iter().for_each(|line| eprintln!("{line}"));
+            let mut means = evaluation.scenes.iter().map(|scene| &scene.scores.mean);
+            if let Some(line) = means.find_map(Perceptual::explain_missing) {
+                eprintln!("{line}");
             }
             let enlarged = evaluation.scenes.iter().filter(|scene| scene.enlarged).count();
             if self.render_height.is_some() && enlarged > 0 {
@@ -350,7 +314,6 @@ impl Eval {
             }
             warn_of_many(evaluation.scenes.iter().flat_map(|scene| &scene.warnings));
             write_evaluation(&folder, &evaluation)?;
-            write_csv(&folder.join(TABLE), &evaluation)?;
             evaluations.push((folder, evaluation));
         }
         group.shutdown()?;

@@ -5,6 +5,7 @@ use crate::error::Error;
 use crate::eval::{HeldOut, HeldOutScores, write_curves};
 use crate::io::{InputFiles, check_writable_dir};
 use crate::loss::{Term, psnr_of_mse};
+use crate::metrics::{CaptureScores, Scores};
 use crate::train::{
     CONFIG_FILE, Event, METRICS_FILE, Outcome, Resume, Trainer, Validator, retry_on_disk_full, run,
 };
@@ -202,18 +203,19 @@ impl Train {
         validation: &[HeldOutScores],
         bad_data: &BadData,
     ) -> Result<Output> {
-        let mean = |value: fn(&HeldOutScores) -> f64| {
-            validation.iter().map(value).sum::<f64>() / validation.len() as f64
+        let mean = |scores: fn(&HeldOutScores) -> &CaptureScores| {
+            (!validation.is_empty()).then(|| Scores::mean(validation.iter().map(|v| &scores(v).mean)))
         };
+        let (ours, nearest) = (mean(|v| &v.ours), mean(|v| &v.nearest));
         let curves = self.out.join(CURVES_FILE);
-        let nearest = (!validation.is_empty()).then(|| mean(|v| v.nearest.mean.psnr));
         let mut on_event = |event: Event| {
             if let Event::Notice(text) = event {
                 eprintln!("{text}");
             }
             !signals::is_stop_requested()
         };
-        retry_on_disk_full(&mut on_event, || write_curves(&curves, &self.out, nearest))?;
+        let nearest_psnr = nearest.map(|nearest| nearest.psnr);
+        retry_on_disk_full(&mut on_event, || write_curves(&curves, &self.out, nearest_psnr))?;
         let checkpoint = outcome.checkpoint.to_string_lossy();
         let mut json = json!({
             "checkpoint": checkpoint,
@@ -226,27 +228,23 @@ impl Train {
             format!("trained in {seconds:.0} s, checkpoint {checkpoint}"),
             format!("{}: training curves", curves.display()),
         ];
-        if !validation.is_empty() {
-            let (psnr, ssim) = (mean(|v| v.ours.mean.psnr), mean(|v| v.ours.mean.ssim));
-            let nearest = mean(|v| v.nearest.mean.psnr);
+        if let Some((ours, nearest)) = ours.zip(nearest) {
             json["held_out"] = json!({
-                "psnr": psnr,
-                "ssim": ssim,
-                "nearest_photo_psnr": nearest,
-                "nearest_photo_ssim": mean(|v| v.nearest.mean.ssim),
-                "scenes": validation.iter().map(|v| json!({"ours": v.ours, "nearest_photo": v.nearest})).collect::<Vec<_>>(),
+                "psnr": ours.psnr,
+                "ssim": ours.ssim,
+                "nearest_photo_psnr": nearest.psnr,
+                "nearest_photo_ssim": nearest.ssim,
+                "scenes": validation,
             });
-            let row = |name: &str, psnr, ssim, nearest| {
-                format!("{name:<24} {psnr:>10.2} {ssim:>10.4} {nearest:>14.2}")
+            let row = |name: &str, ours: &Scores, nearest: &Scores| {
+                format!("{name:<24} {:>10.2} {:>10.4} {:>14.2}", ours.psnr, ours.ssim, nearest.psnr)
             };
             lines.push(format!(
                 "{:<24} {:>10} {:>10} {:>14}",
                 "held-out views", "PSNR", "SSIM", "nearest photo"
             ));
-            lines.extend(validation.iter().map(|HeldOutScores { ours, nearest, .. }| {
-                row(&ours.scene, ours.mean.psnr, ours.mean.ssim, nearest.mean.psnr)
-            }));
-            lines.push(format!("{}   {:+.2} dB", row("mean", psnr, ssim, nearest), psnr - nearest));
+            lines.extend(validation.iter().map(|v| row(&v.ours.scene, &v.ours.mean, &v.nearest.mean)));
+            lines.push(format!("{}   {:+.2} dB", row("mean", &ours, &nearest), ours.psnr - nearest.psnr));
         }
         Ok(Output::new(json, lines.join("\n")))
     }

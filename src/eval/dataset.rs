@@ -2,12 +2,12 @@
 //! they are computed, so an interrupted evaluation resumes after the last finished scene.
 
 use super::evaluation::{
-    Efficiency, Evaluation, Failure, REPORT, SCORES, SceneScores, Summary, TABLE, comparison_path,
+    Efficiency, Evaluation, Failure, REPORT, SCORES, SceneScores, Summary, TABLE, comparison_path, machine,
     scene_file_name,
 };
-use super::method::{Method, MethodOutput, score_output};
+use super::method::Method;
 use super::published::known_dataset;
-use super::scene::{EvaluationIndex, SceneLoader};
+use super::scene::{EvalScene, EvaluationIndex};
 use crate::data::{Dataset, OpenGroup, SceneGroup};
 use crate::distributed::ProcessGroup;
 use crate::error::{Error, Result};
@@ -15,8 +15,9 @@ use crate::io::{WeightsFile, checksum, write_jpeg, write_json};
 use crate::metrics::{Perceptual, comparison_image};
 use crate::scene::ImageSize;
 use serde::{Deserialize, Serialize};
-use std::cell::OnceCell;
+use std::cell::LazyCell;
 use std::collections::BTreeSet;
+use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::sync_channel;
 use tch::{Device, Tensor};
@@ -26,9 +27,8 @@ use tch::{Device, Tensor};
 /// ```no_run
 /// use globalsplat::data::{Dataset, Split};
 /// use globalsplat::eval::{
-///     DatasetEvaluation, EvaluationIndex, Method, machine, weights_fingerprint, write_evaluation, write_report,
+///     DatasetEvaluation, EvaluationIndex, Method, weights_fingerprint, write_evaluation, write_report,
 /// };
-/// use globalsplat::metrics::Perceptual;
 /// use globalsplat::distributed::ProcessGroup;
 /// use globalsplat::reconstruct::load_model;
 /// use std::path::{Path, PathBuf};
@@ -49,19 +49,15 @@ use tch::{Device, Tensor};
 ///     dataset_name: DatasetEvaluation::dataset_name(None, root, &index)?,
 ///     index: &index,
 ///     target_size: model.config.data.image_size,
-///     machine: machine(device)?,
 ///     device,
 ///     out,
 ///     group: &ProcessGroup::single(),
 /// }
-/// .run(
-///     || Perceptual::find(device),
-///     |done, total| {
-///         println!("{done} of {total} scenes");
-///         // `false` would stop; the next evaluation into the same folder resumes.
-///         true
-///     },
-/// )?;
+/// .run(|done, total| {
+///     println!("{done} of {total} scenes");
+///     // `false` would stop; the next evaluation into the same folder resumes.
+///     true
+/// })?;
 /// write_evaluation(out, &evaluation)?;
 /// write_report(&out.join("report.html"), &[(out.to_owned(), evaluation)])?;
 /// # Ok(())
@@ -85,8 +81,6 @@ pub struct DatasetEvaluation<'a> {
     pub index: &'a EvaluationIndex,
     /// Size of the images, and of the target photos that they are compared with.
     pub target_size: ImageSize,
-    /// Processor, cores and device.
-    pub machine: String,
     /// Device that splats are rendered on.
     pub device: Device,
     /// Output folder, which holds `scenes/`.
@@ -145,22 +139,18 @@ impl DatasetEvaluation<'_> {
     }
 
     /// Scores the scenes that the index and the dataset have in common. `on_progress` is called with the number of finished scenes and the
-    /// total, and returns `false` to stop. `load_perceptual` loads the networks of LPIPS. With several ranks, each scores its share, and
-    /// all of them return the whole.
+    /// total, and returns `false` to stop. With several ranks, each scores its share, and all of them return the whole.
     ///
     /// # Errors
     /// Fails if there is no scene in common, if `out` holds scores of another method, if every scene fails, if another rank is gone, or if
     /// `on_progress` asked to stop. A scene that fails is recorded in [`Evaluation::failures`].
-    pub fn run(
-        &self,
-        load_perceptual: impl FnOnce() -> Result<Perceptual>,
-        mut on_progress: impl FnMut(usize, usize) -> bool,
-    ) -> Result<Evaluation> {
+    pub fn run(&self, mut on_progress: impl FnMut(usize, usize) -> bool) -> Result<Evaluation> {
+        let machine = machine(self.device)?;
         let begun = self.group.is_main_process().then(|| self.begin()).transpose()?;
-        let (kept, missing) = self.group.broadcast_object(begun)?;
-        let share =
-            self.score_own_scenes(self.share(&missing), kept.len(), load_perceptual, &mut on_progress)?;
-        let (mut scenes, mut failures, mut stopped) = (kept, vec![], false);
+        let (mut scenes, missing) = self.group.broadcast_object(begun)?;
+        let own = missing.iter().skip(self.group.rank()).step_by(self.group.world_size());
+        let share = self.score_scenes(own.collect(), scenes.len(), &mut on_progress)?;
+        let (mut failures, mut stopped) = (vec![], false);
         for share in self.group.all_gather_object(share)? {
             scenes.extend(share.scenes);
             failures.extend(share.failures);
@@ -173,22 +163,10 @@ impl DatasetEvaluation<'_> {
                 self.out.display()
             )));
         }
-        for key in &missing {
-            let is_it = |scene: &String| scene == key;
-            if !scenes.iter().any(|scene| is_it(&scene.scores.scene))
-                && !failures.iter().any(|of| is_it(&of.scene))
-            {
-                let error = "the rank that it was assigned to doesn't have it".into();
-                failures.push(Failure { scene: key.clone(), error });
-            }
-        }
         failures.sort_by_key(|failure| missing.iter().position(|key| *key == failure.scene));
-        if let (Some(failure), true) = (failures.first(), scenes.is_empty()) {
+        if let (Some(Failure { scene, error }), true) = (failures.first(), scenes.is_empty()) {
             let count = failures.len();
-            return Err(Error::failed(format!(
-                "none of {count} scenes could be scored; {}: {}",
-                failure.scene, failure.error
-            )));
+            return Err(Error::failed(format!("none of {count} scenes could be scored; {scene}: {error}")));
         }
         scenes.sort_by(|a, b| a.scores.scene.cmp(&b.scores.scene));
         Ok(Evaluation {
@@ -200,179 +178,197 @@ impl DatasetEvaluation<'_> {
             indexed_scenes: self.index.scenes.len(),
             summary: Summary::from_scenes(&scenes),
             efficiency: Efficiency::from_scenes(&scenes),
-            machine: self.machine.clone(),
+            machine,
             scenes,
             failures,
         })
     }
 
-    /// Opens the store. Returns the scores that it holds, and the keys of the scenes that it has no scores of, group after group.
+    /// Prepares the output folder. Returns the scores that it holds, and the keys of the scenes that it has no scores of, group after group.
     fn begin(&self) -> Result<(Vec<SceneScores>, Vec<String>)> {
-        let store = ScoreStore::open(self.out, &self.identity()?)?;
+        self.claim_folder()?;
         let (mut kept, mut missing) = (vec![], vec![]);
-        for (group, keys) in self.wanted()? {
-            let open = OnceCell::new();
-            let open = || open.get_or_init(|| group.open().ok()).as_ref();
-            for key in keys {
-                match self.find_valid_scores(&store, &key, open) {
+        for group in self.dataset.groups() {
+            let open = LazyCell::new(|| group.open().ok());
+            for key in group.keys.iter().filter(|key| self.index.scenes.contains_key(*key)) {
+                match self.read_valid_scores(key, || open.as_ref()) {
                     Some(scores) => kept.push(scores),
-                    None => missing.push(key),
+                    None => missing.push(key.clone()),
                 }
             }
+        }
+        if kept.is_empty() && missing.is_empty() {
+            let found = format!("none of the {} in the dataset {}", self.dataset.scenes(), self.dataset.name);
+            let example = self.index.scenes.keys().next().map_or("", String::as_str);
+            let count = self.index.scenes.len();
+            let expected = format!("scenes of the dataset; the index has {count} such as {example}");
+            return Err(Error::input(&self.index.file, "what the index names", found, expected));
         }
         Ok((kept, missing))
     }
 
-    /// Returns this rank's share of the scenes `missing`, with the groups that hold them.
-    fn share(&self, missing: &[String]) -> Vec<(&SceneGroup, Vec<String>)> {
-        let own: BTreeSet<&String> =
-            missing.iter().skip(self.group.rank()).step_by(self.group.world_size()).collect();
-        let of_group =
-            |group: &SceneGroup| group.keys.iter().filter(|key| own.contains(key)).cloned().collect();
-        self.dataset.groups().iter().map(|group| (group, of_group(group))).collect()
-    }
-
-    /// Scores the scenes `own`. `kept` is the number of scenes that have been scored before.
-    fn score_own_scenes(
-        &self,
-        own: Vec<(&SceneGroup, Vec<String>)>,
-        kept: usize,
-        load_perceptual: impl FnOnce() -> Result<Perceptual>,
-        on_progress: &mut impl FnMut(usize, usize) -> bool,
-    ) -> Result<RankResults> {
-        let store = ScoreStore::new(self.out);
-        let total = kept + own.iter().map(|(_, keys)| keys.len()).sum::<usize>();
-        let mut share = RankResults::default();
-        let mut should_continue = on_progress(kept, total);
-        // The networks of LPIPS would count towards the method's memory. Load them after the first scene that images were rendered of, even
-        // if scenes before it failed.
-        let (mut load_perceptual, mut perceptual, mut memory) = (Some(load_perceptual), None, None);
-        let (target_size, photo_size) = (self.target_size, self.method.photo_size());
-        let loader = SceneLoader { index: self.index, target_size, photo_size };
-        std::thread::scope(|scope| -> Result<()> {
-            let (sender, receiver) = sync_channel(LOADED_AHEAD);
-            scope.spawn(move || loader.send(own, &sender));
-            while should_continue && let Ok((key, loaded)) = receiver.recv() {
-                let method = self.method.of_scene(&key);
-                let output = loaded.and_then(|scene| method.render_targets(scene, self.device));
-                let first = output.is_ok().then(|| load_perceptual.take()).flatten();
-                let warm_up = first.is_some();
-                if let Some(load_perceptual) = first {
-                    memory = method.memory();
-                    perceptual = Some(load_perceptual()?);
-                }
-                let scored = output.and_then(|output| {
-                    let perceptual = perceptual.as_ref().expect("loaded for the first scene");
-                    let content = self.content(&key, output.scene.checksum)?;
-                    let mut scores = self.score_output(output, perceptual)?;
-                    scores.warm_up = warm_up && scores.forward_seconds.is_some();
-                    scores.peak_memory_bytes = memory.map(|memory| memory.host);
-                    scores.peak_device_memory_bytes = memory.and_then(|memory| memory.device);
-                    store.write_scores(&key, &scores, content)?;
-                    Ok(scores)
-                });
-                match scored {
-                    Ok(scene) => {
-                        memory = None;
-                        share.scenes.push(scene);
-                    }
-                    // If this file can't be written, the next scene's can't either.
-                    Err(e) if e.is_failed_write() => return Err(e),
-                    Err(e) => share.failures.push(Failure { scene: key, error: e.to_string() }),
-                }
-                should_continue = on_progress(kept + share.scenes.len() + share.failures.len(), total);
-            }
-            Ok(())
-        })?;
-        share.stopped = !should_continue;
-        Ok(share)
-    }
-
-    /// Returns the settings that must be equal for the evaluation to resume.
-    fn identity(&self) -> Result<Identity> {
+    /// Creates the output folder, or checks that its scores are of this evaluation.
+    fn claim_folder(&self) -> Result<()> {
         let index = std::fs::read(&self.index.file).map_err(Error::read(&self.index.file))?;
         // The folder's name alone doesn't identify a dataset, since many folders are called `test`, so use its absolute path. Synthetic
         // videos have no folder, so the path stays as it is.
         let root = self.root.canonicalize().unwrap_or(self.root.to_owned());
         let generator =
             self.dataset.generator().map_or(String::new(), |generator| format!(" of {generator}"));
-        Ok(Identity {
+        let identity = Identity {
             method: self.fingerprint.clone(),
             dataset: root.display().to_string() + &generator,
             index: format!("{:08x} {}", crc32fast::hash(&index), self.index.name()),
             image_size: self.target_size.into(),
-        })
+        };
+        let (file, scenes) = (self.out.join(IDENTITY), self.out.join("scenes"));
+        // An evaluation writes `file` first, so without it these files belong to something else.
+        let mut others = [SCORES, TABLE, REPORT].into_iter();
+        if let (false, Some(name)) = (file.exists(), others.find(|name| self.out.join(name).exists())) {
+            let found = format!("a folder with a {name} that no evaluation wrote");
+            let expected = "a folder of its own (choose another --out)";
+            return Err(Error::input(self.out, "the output", found, expected));
+        }
+        std::fs::create_dir_all(&scenes).map_err(Error::write(&scenes))?;
+        // If no scene has been scored yet, different settings do no harm.
+        let mut entries = std::fs::read_dir(&scenes).map_err(Error::read(&scenes))?;
+        if entries.next().is_some()
+            && let Ok(text) = std::fs::read(&file)
+        {
+            let found: Identity = serde_json::from_slice(&text).map_err(|e| {
+                Error::input(&file, "the file", format!("broken ({e})"), "what globalsplat eval wrote")
+            })?;
+            if found != identity {
+                let expected = format!("{identity} (choose another --out)");
+                return Err(Error::input(&file, "the evaluation", format!("of {found}"), expected));
+            }
+            return Ok(());
+        }
+        Ok(write_json(&file, &identity)?)
     }
 
     /// Returns the stored scores of scene `key`, which is in the group that `open` opens. Returns `None`, so that the scene is scored
-    /// again, if they are of other files or lack a score that can be computed now.
-    fn find_valid_scores<'a>(
+    /// again, if there are none, if they are of other files, or if they lack a score that can be computed now.
+    fn read_valid_scores<'a>(
         &self,
-        store: &ScoreStore,
         key: &str,
         open: impl FnOnce() -> Option<&'a OpenGroup>,
     ) -> Option<SceneScores> {
-        let kept = store.read_scores(key)?;
-        if Perceptual::could_add_to(&kept.scores.scores.mean, self.target_size) {
+        let text = std::fs::read(scores_path(self.out, key)).ok()?;
+        let StoredScores { scores, files } = serde_json::from_slice(&text).ok()?;
+        if scores.scores.scene != key || Perceptual::could_add_to(&scores.scores.mean, self.target_size) {
             return None;
         }
         let capture = open()?.capture(key).ok()?;
         let frames = self.index.frames(key, capture.len()).ok()?;
-        let content = self.content(key, frames.checksum(&capture).ok()?).ok()?;
-        (kept.files.as_ref() == Some(&content)).then_some(kept.scores)
+        let found = self.files_checksum(key, frames.checksum(&capture).ok()?).ok()?;
+        (files == Some(found)).then_some(scores)
     }
 
     /// Returns a string that identifies the files from which scene `key` is scored: checksums of the splat or the images, if these are
     /// evaluated, and `photos`, the checksum of the photos and cameras.
-    fn content(&self, key: &str, photos: u32) -> Result<String> {
+    fn files_checksum(&self, key: &str, photos: u32) -> Result<String> {
         let names = self.index.scenes[key].render_names();
         let checksum = self.method.of_scene(key).checksum(&names)?.map(|checksum| format!("{checksum:08x} "));
         Ok(format!("{}{photos:08x}", checksum.unwrap_or_default()))
     }
 
-    /// Returns the groups of the dataset, each with the keys of its scenes that are in the index.
-    fn wanted(&self) -> Result<Vec<(&SceneGroup, Vec<String>)>> {
-        let indexed = |group: &SceneGroup| -> Vec<String> {
-            group.keys.iter().filter(|key| self.index.scenes.contains_key(*key)).cloned().collect()
+    /// Scores the scenes `own` of this rank. `kept` is the number of scenes that have been scored before.
+    fn score_scenes(
+        &self,
+        mut own: BTreeSet<&String>,
+        kept: usize,
+        on_progress: &mut impl FnMut(usize, usize) -> bool,
+    ) -> Result<RankResults> {
+        let total = kept + own.len();
+        let groups = self.dataset.groups().iter().map(|group| {
+            let keys: Vec<&String> = group.keys.iter().filter_map(|key| own.take(key)).collect();
+            (group, keys)
+        });
+        let groups: Vec<(&SceneGroup, _)> = groups.filter(|(_, keys)| !keys.is_empty()).collect();
+        let error = "the rank that it was assigned to doesn't have it";
+        let failures = own.into_iter().map(|key| Failure { scene: key.clone(), error: error.into() });
+        let mut results = RankResults { failures: failures.collect(), ..Default::default() };
+        let perceptual = Perceptual::new(self.device);
+        let (index, photo_size, target_size) = (self.index, self.method.photo_size(), self.target_size);
+        let load = move |open: &OpenGroup, key: &str| {
+            let capture = open.capture(key)?;
+            let scene = EvalScene::indexed(key, &capture, index, photo_size, target_size)?;
+            let checksum = scene.frames.checksum(&capture)?;
+            Ok((scene, checksum))
         };
-        let wanted: Vec<_> = self.dataset.groups().iter().map(|group| (group, indexed(group))).collect();
-        if wanted.iter().any(|(_, keys)| !keys.is_empty()) {
-            return Ok(wanted);
-        }
-        let found = format!("none of the {} in the dataset {}", self.dataset.scenes(), self.dataset.name);
-        let example = self.index.scenes.keys().next().map_or("", String::as_str);
-        let expected =
-            format!("scenes of the dataset; the index has {} such as {example}", self.index.scenes.len());
-        Err(Error::input(&self.index.file, "what the index names", found, expected))
+        std::thread::scope(|scope| {
+            let (sender, receiver) = sync_channel(LOADED_AHEAD);
+            scope.spawn(move || {
+                for (group, keys) in groups {
+                    // A chunk is read once for all of its scenes.
+                    let open = group.open().map_err(|e| e.to_string());
+                    for key in keys {
+                        let loaded = open.as_ref().map_err(Error::failed).and_then(|open| load(open, key));
+                        // There is no receiver any more if the evaluation has ended.
+                        if sender.send((key, loaded)).is_err() {
+                            return;
+                        }
+                    }
+                }
+            });
+            loop {
+                let done = kept + results.scenes.len() + results.failures.len();
+                if !on_progress(done, total) {
+                    results.stopped = true;
+                    return Ok(results);
+                }
+                let Ok((key, loaded)) = receiver.recv() else { return Ok(results) };
+                let is_first = results.scenes.is_empty();
+                match loaded
+                    .and_then(|(scene, photos)| self.score_scene(&scene, photos, &perceptual, is_first))
+                {
+                    Ok(scores) => results.scenes.push(scores),
+                    // If this file can't be written, the next scene's can't either.
+                    Err(e) if e.is_failed_write() => return Err(e),
+                    Err(e) => {
+                        // Broken weights of LPIPS aren't a problem of this scene.
+                        if perceptual.peak_memory().is_some() {
+                            perceptual.load()?;
+                        }
+                        results.failures.push(Failure { scene: key.clone(), error: e.to_string() });
+                    }
+                }
+            }
+        })
     }
 
-    /// Scores the scene, and writes the comparison image of its worst view.
-    fn score_output(&self, mut output: MethodOutput, perceptual: &Perceptual) -> Result<SceneScores> {
-        let mut worst: Option<(f64, Tensor)> = None;
-        let scores = score_output(&mut output, perceptual, |ground_truth, picture, score| {
-            if worst.as_ref().is_none_or(|(psnr, _)| score.scores.psnr.total_cmp(psnr).is_lt()) {
-                let photo = ground_truth.image.to_float();
-                let image = comparison_image(&photo, &picture.rgb, picture.rendered.as_ref());
-                worst = Some((score.scores.psnr, image));
-            }
-            Ok(())
-        })?;
-        let MethodOutput { scene, splat_bytes, forward_seconds, warnings, .. } = output;
+    /// Scores the scene, whose photos have the checksum `photos`, and writes its scores and the comparison image of its worst view.
+    /// `is_first` is `true` until a scene has been scored.
+    fn score_scene(
+        &self,
+        scene: &EvalScene,
+        photos: u32,
+        perceptual: &Perceptual,
+        is_first: bool,
+    ) -> Result<SceneScores> {
+        let method = self.method.of_scene(&scene.name);
+        let files = Some(self.files_checksum(&scene.name, photos)?);
+        let (is_warm_up, mut worst) = (perceptual.peak_memory().is_none(), None::<(f64, Tensor)>);
+        let mut scores =
+            method.score(scene, self.device, Some(perceptual), |view, rgb, rendered, score| {
+                let psnr = score.scores.psnr;
+                if worst.as_ref().is_none_or(|(lowest, _)| psnr.total_cmp(lowest).is_lt()) {
+                    worst = Some((psnr, comparison_image(&view.image.to_float(), rgb, rendered)));
+                }
+                Ok(())
+            })?;
+        if let (Method::Model(_), Some(peak)) = (&method, perceptual.peak_memory()) {
+            scores.warm_up = is_warm_up;
+            // Later peaks include the networks of LPIPS.
+            scores.peak_memory_bytes = is_first.then_some(peak.host);
+            scores.peak_device_memory_bytes = peak.device.filter(|_| is_first);
+        }
         let (_, image) = worst.expect("a target view");
         write_jpeg(&comparison_path(self.out, &scene.name), &image)?;
-        let frames = scene.frames.expect("an indexed scene");
-        Ok(SceneScores {
-            scores,
-            context: frames.context,
-            target: frames.target,
-            enlarged: scene.enlarged,
-            splat_bytes,
-            warnings,
-            forward_seconds,
-            warm_up: false,
-            peak_memory_bytes: None,
-            peak_device_memory_bytes: None,
-        })
+        let stored = StoredScores { scores, files };
+        write_json(&scores_path(self.out, &scene.name), &stored)?;
+        Ok(stored.scores)
     }
 }
 
@@ -398,101 +394,40 @@ const IDENTITY: &str = "evaluation.json";
 
 /// Settings that must be equal for an evaluation to resume.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Identity {
+struct Identity {
     #[serde(rename = "subject")]
-    pub method: String,
-    pub dataset: String,
-    pub index: String,
-    pub image_size: [u32; 2],
+    method: String,
+    dataset: String,
+    index: String,
+    image_size: [u32; 2],
+}
+
+impl fmt::Display for Identity {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        let Identity { method, dataset, index, image_size: [height, width] } = self;
+        write!(f, "{method} on {dataset} by {index}, {width}×{height} pixels")
+    }
 }
 
 /// Scores of a scene as they are stored on disk.
 #[derive(Serialize, Deserialize)]
-pub(super) struct StoredScores {
+struct StoredScores {
     #[serde(flatten)]
-    pub scores: SceneScores,
+    scores: SceneScores,
     /// Checksums of the files that were scored, by which replaced files are detected.
-    pub files: Option<String>,
+    files: Option<String>,
+}
+
+/// Returns the path of a scene's scores in the folder `out` of an evaluation.
+fn scores_path(out: &Path, key: &str) -> PathBuf {
+    out.join("scenes").join(format!("{}.json", scene_file_name(key)))
 }
 
 /// Returns the paths of the files that an evaluation of the scenes `keys` writes into the folder `out`.
 pub fn evaluation_files<'a>(out: &Path, keys: impl IntoIterator<Item = &'a String>) -> Vec<PathBuf> {
-    let store = ScoreStore::new(out);
-    let of_scene = |key: &'a String| [store.file(key), comparison_path(out, key)];
+    let of_scene = |key: &'a String| [scores_path(out, key), comparison_path(out, key)];
     let of_all = [IDENTITY, SCORES, TABLE].map(|name| out.join(name));
     keys.into_iter().flat_map(of_scene).chain(of_all).collect()
-}
-
-/// The folder `scenes` of an evaluation, which holds a file of scores per scene.
-pub(super) struct ScoreStore {
-    scenes: PathBuf,
-}
-
-impl ScoreStore {
-    /// Opens the store in the folder `out`, or creates it.
-    ///
-    /// # Errors
-    /// Fails if `out` holds files of another evaluation or a broken store, or if it can't be written.
-    pub fn open(out: &Path, identity: &Identity) -> Result<Self> {
-        let file = out.join(IDENTITY);
-        // An evaluation writes `file` first, so without it these files belong to something else.
-        let others = [SCORES, TABLE, REPORT];
-        if let (false, Some(name)) = (file.exists(), others.into_iter().find(|name| out.join(name).exists()))
-        {
-            let found = format!("a folder with a {name} that no evaluation wrote");
-            return Err(Error::input(out, "the output", found, "a folder of its own (choose another --out)"));
-        }
-        let store = ScoreStore::new(out);
-        std::fs::create_dir_all(&store.scenes).map_err(Error::write(&store.scenes))?;
-        // If no scene has been scored yet, different settings do no harm.
-        let mut entries = std::fs::read_dir(&store.scenes).map_err(Error::read(&store.scenes))?;
-        if entries.next().is_some()
-            && let Ok(text) = std::fs::read(&file)
-        {
-            let wanted = |of: &Identity| {
-                let [height, width] = of.image_size;
-                format!("{} on {} by {}, {width}×{height} pixels", of.method, of.dataset, of.index)
-            };
-            return match serde_json::from_slice::<Identity>(&text) {
-                Ok(found) if found == *identity => Ok(store),
-                Ok(found) => {
-                    let expected = format!("{} (choose another --out)", wanted(identity));
-                    Err(Error::input(&file, "the evaluation", format!("of {}", wanted(&found)), expected))
-                }
-                Err(e) => Err(Error::input(
-                    &file,
-                    "the file",
-                    format!("broken ({e})"),
-                    "what globalsplat eval wrote",
-                )),
-            };
-        }
-        write_json(&file, identity)?;
-        Ok(store)
-    }
-
-    /// Returns the store in the folder `out`, without accessing the disk.
-    pub fn new(out: &Path) -> Self {
-        ScoreStore { scenes: out.join("scenes") }
-    }
-
-    /// Returns the stored scores of scene `key`. Returns `None` if there are none, or if they can't be read.
-    pub fn read_scores(&self, key: &str) -> Option<StoredScores> {
-        let kept: StoredScores = serde_json::from_slice(&std::fs::read(self.file(key)).ok()?).ok()?;
-        (kept.scores.scores.scene == key).then_some(kept)
-    }
-
-    /// Stores the scores of scene `key`. `files` identifies the files that were scored.
-    ///
-    /// # Errors
-    /// Fails if the file can't be written.
-    pub fn write_scores(&self, key: &str, scores: &SceneScores, files: String) -> Result<()> {
-        Ok(write_json(&self.file(key), &StoredScores { scores: scores.clone(), files: Some(files) })?)
-    }
-
-    fn file(&self, key: &str) -> PathBuf {
-        self.scenes.join(format!("{}.json", scene_file_name(key)))
-    }
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 
 use crate::error::{Error, Result};
 use crate::io::{write_atomically, write_json};
-use crate::metrics::{CaptureScores, Scores};
+use crate::metrics::{CaptureScores, Scores, ViewScore};
 use crate::render::cpu::simd_level;
 use serde::{Deserialize, Serialize};
 use std::ops::RangeInclusive;
@@ -174,8 +174,7 @@ pub fn scene_file_name(scene: &str) -> String {
 const POSSIBLE_PSNR: RangeInclusive<f64> = -0.001..=100.001;
 
 pub(super) const SCORES: &str = "scores.json";
-/// Name of the file of scores for spreadsheets.
-pub const TABLE: &str = "scores.csv";
+pub(super) const TABLE: &str = "scores.csv";
 /// Name of the report's page.
 pub const REPORT: &str = "report.html";
 
@@ -185,12 +184,47 @@ pub fn comparison_path(folder: &Path, scene: &str) -> PathBuf {
     folder.join("scenes").join(format!("{}.jpg", scene_file_name(scene)))
 }
 
-/// Writes `folder/scores.json`.
+/// Writes the evaluation to `folder`: `scores.json`, and `scores.csv`, which has a line for every scene and target view. Missing values are
+/// empty in the latter.
 ///
 /// # Errors
-/// Fails if the file can't be written.
+/// Fails if a file can't be written.
 pub fn write_evaluation(folder: &Path, evaluation: &Evaluation) -> Result<()> {
-    Ok(write_json(&folder.join(SCORES), evaluation)?)
+    write_json(&folder.join(SCORES), evaluation)?;
+    let path = folder.join(TABLE);
+    write_atomically(&path, |writer| {
+        let refused = |e: csv::Error| Error::write(&path)(std::io::Error::other(e));
+        let mut writer = csv::Writer::from_writer(writer);
+        for scene in &evaluation.scenes {
+            for ViewScore { image, scores } in &scene.scores.views {
+                let line = Line {
+                    scene: &scene.scores.scene,
+                    view: image,
+                    psnr: scores.psnr,
+                    ssim: scores.ssim,
+                    lpips_vgg: scores.lpips_vgg,
+                    lpips_alex: scores.lpips_alex,
+                    gaussians: scene.scores.gaussians,
+                    forward_seconds: scene.forward_seconds,
+                };
+                writer.serialize(line).map_err(refused)?;
+            }
+        }
+        writer.flush().map_err(Error::write(&path))
+    })
+}
+
+/// A line of `scores.csv`.
+#[derive(Serialize)]
+struct Line<'a> {
+    scene: &'a str,
+    view: &'a str,
+    psnr: f64,
+    ssim: f64,
+    lpips_vgg: Option<f64>,
+    lpips_alex: Option<f64>,
+    gaussians: Option<i64>,
+    forward_seconds: Option<f64>,
 }
 
 /// Reads `folder/scores.json`.
@@ -218,52 +252,12 @@ pub fn read_evaluation(folder: &Path) -> Result<Evaluation> {
     Ok(evaluation)
 }
 
-/// A line of `scores.csv`.
-#[derive(Serialize)]
-struct Line<'a> {
-    scene: &'a str,
-    view: &'a str,
-    psnr: f64,
-    ssim: f64,
-    lpips_vgg: Option<f64>,
-    lpips_alex: Option<f64>,
-    gaussians: Option<i64>,
-    forward_seconds: Option<f64>,
-}
-
-/// Writes a line for every scene and target view to `path`. Missing values are left empty.
-///
-/// # Errors
-/// Fails if the file can't be written.
-pub fn write_csv(path: &Path, evaluation: &Evaluation) -> Result<()> {
-    write_atomically(path, |writer| {
-        let refused = |e: csv::Error| Error::write(path)(std::io::Error::other(e));
-        let mut writer = csv::Writer::from_writer(writer);
-        for scene in &evaluation.scenes {
-            for view in &scene.scores.views {
-                let line = Line {
-                    scene: &scene.scores.scene,
-                    view: &view.image,
-                    psnr: view.scores.psnr,
-                    ssim: view.scores.ssim,
-                    lpips_vgg: view.scores.lpips_vgg,
-                    lpips_alex: view.scores.lpips_alex,
-                    gaussians: scene.scores.gaussians,
-                    forward_seconds: scene.forward_seconds,
-                };
-                writer.serialize(line).map_err(refused)?;
-            }
-        }
-        writer.flush().map_err(Error::write(path))
-    })
-}
-
 /// Returns the processor, its number of cores, the SIMD level, and the device unless it is the CPU, such as
 /// `Intel(R) Xeon(R), 2 cores, avx512`.
 ///
 /// # Errors
 /// Fails if `GLOBALSPLAT_SIMD` names a SIMD level that this machine doesn't have.
-pub fn machine(device: Device) -> Result<String> {
+pub(super) fn machine(device: Device) -> Result<String> {
     let cpu_info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let model_name = cpu_info.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
     let processor = model_name.map_or(std::env::consts::ARCH, |(_, name)| name.trim());

@@ -10,14 +10,10 @@ mod validation;
 
 pub use dataset::{DatasetEvaluation, evaluation_files, weights_fingerprint};
 pub use evaluation::{
-    Efficiency, Evaluation, Failure, REPORT, SceneScores, Summary, TABLE, comparison_path, machine,
-    read_evaluation, write_csv, write_evaluation,
+    Efficiency, Evaluation, Failure, REPORT, SceneScores, Summary, comparison_path, read_evaluation,
+    write_evaluation,
 };
-pub use method::{Baselines, EvalImage, Method, MethodOutput, score_output};
-pub use published::{
-    Published, PublishedAblation, PublishedCompactness, PublishedEfficiency, PublishedMethod,
-    PublishedScores, published,
-};
+pub use method::Method;
 pub use report::{write_curves, write_report};
-pub use scene::{EvalScene, EvaluationIndex, LazyPhotos, SceneFrames};
+pub use scene::{EvalScene, EvaluationIndex, SceneFrames};
 pub use validation::{HeldOut, HeldOutScores};

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::sync::OnceLock;
 
 /// Every table of results in the paper.
-#[derive(Debug, Deserialize)]
+#[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Published {
     /// Results on RealEstate10K and ACID by number of context views, images of 256×256.
@@ -32,80 +32,60 @@ pub(super) fn known_dataset(name: &str) -> Option<&'static str> {
     DATASETS.iter().find(|names| is(names)).map(|(file, _)| *file)
 }
 
-/// Scores of one method on one dataset.
-#[derive(Debug, Deserialize)]
+/// Scores of one method on one dataset, whose key is `re10k` or `acid`, by number of context views.
+#[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PublishedMethod {
-    /// Key of the dataset, `re10k` or `acid`.
     pub dataset: String,
-    /// Name of the method in the paper.
     pub method: String,
-    /// Scores by number of context views.
     pub scores: BTreeMap<usize, PublishedScores>,
 }
 
 /// Table entries for one method and number of context views; `None` where the table has a dash.
-#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[derive(Clone, Copy, Deserialize)]
 pub struct PublishedScores {
-    /// PSNR in dB.
     pub psnr: Option<f64>,
-    /// Structural similarity.
     pub ssim: Option<f64>,
-    /// LPIPS, as the table has it.
     pub lpips: Option<f64>,
     /// Thousands of Gaussians; `None` also for methods that produce no Gaussians.
     pub kilo_gaussians: Option<f64>,
 }
 
-/// Cost of one method.
-#[derive(Debug, Deserialize)]
+/// Cost of one method: its peak GPU memory allocation, the time of a forward pass, and the size of a scene on disk if it writes files.
+#[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PublishedEfficiency {
-    /// Name of the method in the paper.
     pub method: String,
-    /// Peak GPU memory allocation, in GB.
     pub peak_memory_gb: f64,
-    /// Time of one forward pass, in milliseconds.
     pub milliseconds: f64,
-    /// Size of a scene on disk, in MB; `None` for methods that write no files.
     pub disk_mb: Option<f64>,
 }
 
 /// Scores of one size of the model.
-#[derive(Debug, Deserialize)]
+#[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PublishedCompactness {
-    /// Total number of Gaussians.
     pub gaussians: u32,
-    /// Number of scene tokens.
     pub latents: u32,
-    /// Number of Gaussians that a token decodes to.
     pub splats_per_token: u32,
-    /// PSNR in dB.
     pub psnr: f64,
-    /// Structural similarity.
     pub ssim: f64,
-    /// LPIPS, as the table has it.
     pub lpips: f64,
 }
 
 /// Scores of one variant of the model.
-#[derive(Debug, Deserialize)]
+#[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PublishedAblation {
-    /// Description of the change.
     pub variant: String,
-    /// PSNR in dB.
     pub psnr: f64,
-    /// Structural similarity.
     pub ssim: f64,
-    /// LPIPS, as the table has it.
     pub lpips: f64,
 }
 
 /// Returns the paper's tables.
 pub fn published() -> &'static Published {
     static TABLES: OnceLock<Published> = OnceLock::new();
-    TABLES
-        .get_or_init(|| serde_json::from_str(include_str!("published.json")).expect("the tests read it, too"))
+    let read = || serde_json::from_str(include_str!("published.json")).expect("the tests read it, too");
+    TABLES.get_or_init(read)
 }

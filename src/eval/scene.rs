@@ -1,16 +1,17 @@
 //! Scenes for evaluation: context photos, which a method may see, and target photos, which it has to match, as an index or a holdout
 //! splits them.
 
-use crate::data::{Capture, Holdout, PhotoSize, SceneGroup, View, load_views};
+use crate::data::{Capture, Holdout, PhotoSize, View, load_views};
 use crate::error::{Error, Result};
 use crate::io::{read_text, write_json};
-use crate::reconstruct::load_context;
+use crate::metrics::{CaptureScores, score_view};
+use crate::reconstruct::{context_views, load_context};
 use crate::scene::ImageSize;
 use glam::DMat4;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::SyncSender;
+use tch::Tensor;
 
 /// Frames of one scene.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -108,112 +109,60 @@ impl EvaluationIndex {
     }
 }
 
-/// Photos of a capture. They are decoded on access, so that large photos don't fill the memory all at once.
-#[derive(Debug)]
-pub enum LazyPhotos {
-    /// Photos in memory.
-    Loaded(Vec<View>),
-    /// Photos in their files.
-    OnDisk {
-        /// Capture that holds the photos.
-        capture: Capture,
-        /// Positions of the photos in the capture.
-        indices: Vec<usize>,
-        /// Names of the photos.
-        names: Vec<String>,
-        /// Size of the photos.
-        size: PhotoSize,
-    },
-}
-
-impl LazyPhotos {
-    /// Creates a source of the photos `indices` of `capture`, under their names in the capture, at `size`.
-    pub fn from_capture(capture: &Capture, indices: &[usize], size: PhotoSize) -> Self {
-        let all: Vec<&str> = capture.names().collect();
-        let names = indices.iter().map(|&index| all[index].to_string()).collect();
-        LazyPhotos::OnDisk { capture: capture.clone(), indices: indices.to_vec(), names, size }
-    }
-
-    /// Returns the number of photos.
-    pub fn len(&self) -> usize {
-        match self {
-            LazyPhotos::Loaded(views) => views.len(),
-            LazyPhotos::OnDisk { indices, .. } => indices.len(),
-        }
-    }
-
-    /// Returns `true` if there are no photos.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
-    /// Returns the poses of the photos, camera-to-world, without loading pixels.
-    pub fn poses(&self) -> Vec<DMat4> {
-        match self {
-            LazyPhotos::Loaded(views) => views.iter().map(|view| view.camera.c2w).collect(),
-            LazyPhotos::OnDisk { capture, indices, .. } => {
-                let cameras = capture.cameras();
-                indices.iter().map(|&index| cameras[index].c2w).collect()
-            }
-        }
-    }
-
-    /// Loads photo number `i`.
-    ///
-    /// # Errors
-    /// Fails if the photo can't be read.
-    pub fn load(&self, i: usize) -> Result<View> {
-        match self {
-            LazyPhotos::Loaded(views) => Ok(views[i].shallow_clone()),
-            LazyPhotos::OnDisk { capture, indices, names, size } => {
-                let size = size.resized(&capture.camera(indices[i]));
-                let view = load_views(capture, &indices[i..=i], size)?.remove(0);
-                Ok(View { name: names[i].clone(), ..view })
-            }
-        }
-    }
-}
-
-/// A scene, with the context photos in memory.
+/// A scene: photos that a method may see, and photos that it has to match. The latter are decoded one at a time, so that large photos don't
+/// fill the memory all at once.
 #[derive(Debug)]
 pub struct EvalScene {
     /// Name of the capture, or key of the scene in an index.
     pub name: String,
-    /// Context photos, which the model sees; empty if no model is evaluated.
+    /// Context photos as the model sees them; empty if no model is evaluated.
     pub context: Vec<View>,
-    /// Target photos, loaded one by one.
-    pub target: LazyPhotos,
+    /// Positions of the context and target photos in the capture.
+    pub frames: SceneFrames,
     /// File names of the target images, without their extensions.
     pub render_names: Vec<String>,
-    /// Positions of the context and target photos in the capture; `None` without an index.
-    pub frames: Option<SceneFrames>,
-    /// Checksum of the photos and cameras that the index names; 0 without an index.
-    pub(super) checksum: u32,
     /// `true` if photos of the capture were enlarged to the size of the context or target views.
     pub enlarged: bool,
+    capture: Capture,
+    target_size: PhotoSize,
+    /// Names of the target photos.
+    target_names: Vec<String>,
 }
 
 impl EvalScene {
+    /// Creates a scene of the photos `frames` of `capture`. `context` has the context photos as the model sees them.
+    pub(super) fn new(
+        capture: &Capture,
+        frames: SceneFrames,
+        context: Vec<View>,
+        target_size: PhotoSize,
+    ) -> Self {
+        let (names, render_names): (Vec<_>, _) = (capture.names().collect(), capture.render_names());
+        let seen = context.first().map(size_of);
+        let scored = if let PhotoSize::Exactly(size) = target_size { Some(size) } else { None };
+        EvalScene {
+            name: capture.name.clone(),
+            enlarged: seen.into_iter().chain(scored).any(|size| capture.has_smaller(size)),
+            target_names: frames.target.iter().map(|&photo| names[photo].to_string()).collect(),
+            render_names: frames.target.iter().map(|&photo| render_names[photo].clone()).collect(),
+            capture: capture.clone(),
+            context,
+            frames,
+            target_size,
+        }
+    }
+
     /// Creates a scene for splats and images, whose targets have the given size. They are the views that `holdout` holds out; without it,
     /// those of the capture's own test part, or all views if it has none.
     ///
     /// # Errors
     /// Fails if `holdout` holds nothing out, or leaves fewer than two views.
     pub fn without_context(capture: &Capture, holdout: Option<Holdout>, size: PhotoSize) -> Result<Self> {
-        let views = match holdout {
-            Some(holdout) => split_views(capture, holdout)?.1,
+        let target = match holdout {
+            Some(holdout) => split_views(capture, holdout)?.target,
             None => capture.scored_views(),
         };
-        let names = capture.render_names();
-        Ok(EvalScene {
-            name: capture.name.clone(),
-            context: vec![],
-            target: LazyPhotos::from_capture(capture, &views, size),
-            render_names: views.into_iter().map(|view| names[view].clone()).collect(),
-            frames: None,
-            checksum: 0,
-            enlarged: matches!(size, PhotoSize::Exactly(size) if capture.has_smaller(size)),
-        })
+        Ok(EvalScene::new(capture, SceneFrames { context: vec![], target }, vec![], size))
     }
 
     /// Creates a scene for a model. The context consists of the photos that `holdout` leaves, or of `views` of them, spread over the
@@ -228,99 +177,163 @@ impl EvalScene {
         photo_size: ImageSize,
         target_size: ImageSize,
     ) -> Result<Self> {
-        let (_, held_out) = split_views(capture, holdout)?;
-        let all = capture.render_names();
-        Ok(EvalScene {
-            name: capture.name.clone(),
-            context: load_context(capture, holdout, views, photo_size)?,
-            target: LazyPhotos::from_capture(capture, &held_out, PhotoSize::Exactly(target_size)),
-            render_names: held_out.iter().map(|&view| all[view].clone()).collect(),
-            frames: None,
-            checksum: 0,
-            enlarged: [photo_size, target_size].into_iter().any(|size| capture.has_smaller(size)),
-        })
+        let SceneFrames { target, .. } = split_views(capture, holdout)?;
+        let photos = load_context(capture, holdout, views, photo_size)?;
+        let frames = SceneFrames { context: context_views(capture, holdout, views), target };
+        Ok(EvalScene::new(capture, frames, photos, PhotoSize::Exactly(target_size)))
     }
 
-    /// Creates the scene from the frames of `key` in the loader's index. The target images are named by frame numbers.
-    fn indexed(key: &str, capture: &Capture, loader: &SceneLoader) -> Result<Self> {
+    /// Creates the scene of the frames of `key` in `index`, with context photos of `photo_size` if a model is evaluated. The target images
+    /// are named by frame numbers.
+    pub(super) fn indexed(
+        key: &str,
+        capture: &Capture,
+        index: &EvaluationIndex,
+        photo_size: Option<ImageSize>,
+        target_size: ImageSize,
+    ) -> Result<Self> {
         if !capture.is_complete() {
             let expected = "all that it names, as an index counts them";
             return Err(Error::input(capture.file(), "the photos", "not all there", expected));
         }
-        let frames = loader.index.frames(key, capture.len())?.clone();
-        let context = match loader.photo_size {
+        let frames = index.frames(key, capture.len())?.clone();
+        let context = match photo_size {
             Some(size) => load_views(capture, &frames.context, Some(size))?,
             None => vec![],
         };
-        let render_names = frames.render_names();
-        let target = LazyPhotos::OnDisk {
-            capture: capture.clone(),
-            indices: frames.target.clone(),
-            names: render_names.clone(),
-            size: PhotoSize::Exactly(loader.target_size),
-        };
-        let mut sizes = loader.photo_size.into_iter().chain([loader.target_size]);
-        let enlarged = sizes.any(|size| capture.has_smaller(size));
-        let checksum = frames.checksum(capture)?;
-        Ok(EvalScene {
-            name: key.into(),
-            context,
-            target,
-            render_names,
-            frames: Some(frames),
-            checksum,
-            enlarged,
+        let names = frames.render_names();
+        let scene = EvalScene::new(capture, frames, context, PhotoSize::Exactly(target_size));
+        Ok(EvalScene { name: key.into(), target_names: names.clone(), render_names: names, ..scene })
+    }
+
+    /// Loads target photo number `i`.
+    pub(super) fn load_target(&self, i: usize) -> Result<View> {
+        let view = self.load(self.frames.target[i])?;
+        Ok(View { name: self.target_names[i].clone(), ..view })
+    }
+
+    /// Loads a photo of the capture at the size of the targets.
+    fn load(&self, photo: usize) -> Result<View> {
+        let size = self.target_size.resized(&self.capture.camera(photo));
+        Ok(load_views(&self.capture, &[photo], size)?.remove(0))
+    }
+
+    /// Returns the poses of the target photos, camera-to-world.
+    pub(super) fn target_poses(&self) -> Vec<DMat4> {
+        self.frames.target.iter().map(|&photo| self.capture.camera(photo).c2w).collect()
+    }
+
+    /// Scores a baseline that only copies photos: for every target, the context photo whose camera center is nearest.
+    ///
+    /// # Errors
+    /// Fails if a photo can't be read.
+    pub fn score_nearest_photo(&self) -> Result<CaptureScores> {
+        let center = |photo: usize| self.capture.camera(photo).c2w.w_axis.truncate();
+        self.score_baseline(|i| {
+            let target = center(self.frames.target[i]);
+            let distance = |&of: &usize| center(self.frames.context[of]).distance(target);
+            let nearest = (0..self.context.len()).min_by(|a, b| distance(a).total_cmp(&distance(b)));
+            self.context_image(nearest.expect("a context view"))
         })
+    }
+
+    /// Scores a baseline that shows the mean of all context photos at every target.
+    ///
+    /// # Errors
+    /// Fails if a photo can't be read.
+    pub fn score_mean_photo(&self) -> Result<CaptureScores> {
+        let mut sum = self.context_image(0)?.copy();
+        for i in 1..self.context.len() {
+            sum += self.context_image(i)?;
+        }
+        let mean = sum / self.context.len() as f64;
+        self.score_baseline(|_| Ok(mean.shallow_clone()))
+    }
+
+    /// Scores the images that `image` returns for the targets, by number.
+    fn score_baseline(&self, image: impl Fn(usize) -> Result<Tensor>) -> Result<CaptureScores> {
+        let mut scores = vec![];
+        for i in 0..self.frames.target.len() {
+            let view = self.load_target(i)?;
+            if !view.is_masked_out() {
+                scores.push(score_view(&image(i)?, &view, None)?);
+            }
+        }
+        Ok(CaptureScores::from_views(&self.name, scores, None))
+    }
+
+    /// Returns context photo number `i` at the size of the targets, `[3, H, W]`.
+    fn context_image(&self, i: usize) -> Result<Tensor> {
+        match PhotoSize::Exactly(size_of(&self.context[i])) == self.target_size {
+            true => Ok(self.context[i].image.to_float()),
+            false => Ok(self.load(self.frames.context[i])?.image.to_float()),
+        }
     }
 }
 
-/// Returns the positions of the views that `holdout` leaves, and of those that it holds out.
-pub(super) fn split_views(capture: &Capture, holdout: Holdout) -> Result<(Vec<usize>, Vec<usize>)> {
-    let (context, held_out) = capture.split(holdout);
-    if held_out.is_empty() || context.len() < 2 {
-        let split = format!("{} context and {} target views", context.len(), held_out.len());
+fn size_of(view: &View) -> ImageSize {
+    ImageSize { height: view.camera.height, width: view.camera.width }
+}
+
+/// Returns the views that `holdout` leaves as context, and those that it holds out as targets.
+pub(super) fn split_views(capture: &Capture, holdout: Holdout) -> Result<SceneFrames> {
+    let (context, target) = capture.split(holdout);
+    if target.is_empty() || context.len() < 2 {
+        let split = format!("{} context and {} target views", context.len(), target.len());
         let expected = "2 and 1 at least (--holdout or data.holdout, every:N)";
         return Err(Error::input(capture.file(), format!("the split by {holdout}"), split, expected));
     }
-    Ok((context, held_out))
-}
-
-/// Loader of the scenes of an index. It runs on another thread than the evaluation.
-pub(super) struct SceneLoader<'a> {
-    pub index: &'a EvaluationIndex,
-    /// Size of the target views.
-    pub target_size: ImageSize,
-    /// Size of the context views; `None` if no model is evaluated.
-    pub photo_size: Option<ImageSize>,
-}
-
-impl SceneLoader<'_> {
-    /// Sends the scenes of `groups` one by one until the receiver is dropped. Each chunk is read once.
-    pub fn send(
-        &self,
-        groups: Vec<(&SceneGroup, Vec<String>)>,
-        sender: &SyncSender<(String, Result<EvalScene>)>,
-    ) {
-        for (group, keys) in groups.into_iter().filter(|(_, keys)| !keys.is_empty()) {
-            let open = group.open().map_err(|e| e.to_string());
-            for key in keys {
-                let scene = match &open {
-                    Ok(open) => {
-                        open.capture(&key).and_then(|capture| EvalScene::indexed(&key, &capture, self))
-                    }
-                    Err(e) => Err(Error::failed(e.clone())),
-                };
-                if sender.send((key, scene)).is_err() {
-                    return;
-                }
-            }
-        }
-    }
+    Ok(SceneFrames { context, target })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::data::ImageSource;
+    use crate::scene::{Camera, Intrinsics};
+    use glam::DVec3;
+    use image::{Rgb, RgbImage};
+    use std::sync::Arc;
+
+    /// Images of 16×16 pixels of these gray levels.
+    #[derive(Debug)]
+    struct Grays([u8; 3]);
+
+    impl ImageSource for Grays {
+        fn name(&self) -> &str {
+            "grays"
+        }
+
+        fn image(&self, index: usize) -> RgbImage {
+            RgbImage::from_pixel(16, 16, Rgb([self.0[index]; 3]))
+        }
+
+        fn depth(&self, _: usize) -> Option<Vec<f32>> {
+            None
+        }
+    }
+
+    #[test]
+    fn baselines_are_the_nearest_photo_and_the_mean() {
+        let intrinsics = Intrinsics { fx: 16., fy: 16., cx: 8., cy: 8. };
+        let camera =
+            |x: f64| Camera { intrinsics, c2w: DMat4::from_translation(DVec3::X * x), width: 16, height: 16 };
+        let cameras = [0., 1., 0.7].map(camera);
+        let source = Arc::new(Grays([51, 153, 178]));
+        let capture = Capture::from_source("grays".into(), "grays".into(), &cameras, source).unwrap();
+        let frames = SceneFrames { context: vec![0, 1], target: vec![2] };
+        for photo_size in [[16, 16], [8, 8]] {
+            let context = load_views(&capture, &frames.context, Some(photo_size.into())).unwrap();
+            let size = PhotoSize::Exactly([16, 16].into());
+            let scene = EvalScene::new(&capture, frames.clone(), context, size);
+            for (scores, levels) in
+                [(scene.score_nearest_photo(), 178. - 153.), (scene.score_mean_photo(), 178. - 102.)]
+            {
+                let expected = 20. * (255f64 / levels).log10();
+                assert!((scores.unwrap().mean.psnr - expected).abs() < 1e-4, "{expected}");
+            }
+        }
+    }
 
     fn read(text: &str) -> Result<EvaluationIndex> {
         let file = tempfile::NamedTempFile::new().unwrap();

@@ -1,13 +1,13 @@
 //! Validation: renders and scores held-out views and scenes during training (spec 8.8).
 
-use super::method::nearest_context_baseline;
-use super::scene::{LazyPhotos, split_views};
+use super::method::Method;
+use super::scene::{EvalScene, SceneFrames, split_views};
 use crate::data::{
-    Capture, DataConfig, Dataset, Holdout, SceneGroup, Split, TrainingScenes, View, cameras_at, load_views,
+    Capture, DataConfig, Dataset, Holdout, PhotoSize, SceneGroup, Split, TrainingScenes, load_views,
 };
 use crate::error::{Error, Result};
-use crate::metrics::{CaptureScores, score_views};
-use crate::reconstruct::{reconstruct, spread_over_path};
+use crate::metrics::CaptureScores;
+use crate::reconstruct::spread_over_path;
 use crate::train::{Score, Trainer, Validator};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
@@ -41,6 +41,7 @@ pub struct HeldOutScores {
     /// Scores of the model.
     pub ours: CaptureScores,
     /// Scores of the nearest context photo, which each target is compared with.
+    #[serde(rename = "nearest_photo")]
     pub nearest: CaptureScores,
 }
 
@@ -108,41 +109,30 @@ impl HeldOut {
 }
 
 impl HeldOutScene {
-    /// Loads the name, the context views and the target views of the scene.
-    fn load(&self, config: &DataConfig) -> Result<(String, Vec<View>, Vec<View>)> {
-        let size = Some(config.image_size);
-        // Use as many context views as in training: a model trained on a few views need not fit in memory with hundreds.
-        let context_views = config.context_views.max(2);
-        let (capture, (context, target)) = match self {
-            HeldOutScene::Views(capture) => {
-                let (shown, held_out) = split_views(capture, config.holdout)?;
-                (capture.clone(), (spread_over_path(&capture.cameras(), &shown, context_views), held_out))
-            }
-            HeldOutScene::ViewsInGroup(group, key) => {
-                let capture = group.open()?.capture(key)?;
-                let (shown, held_out) = split_views(&capture, config.holdout)?;
-                let cameras = capture.cameras();
-                let context = spread_over_path(&cameras, &shown, context_views);
-                let target = spread_over_path(&cameras, &held_out, config.target_views);
-                (capture, (context, target))
-            }
-            HeldOutScene::Whole(group, key) => {
-                let capture = group.open()?.capture(key)?;
-                let split = split_scene(&capture, config)?;
-                (capture, split)
+    /// Loads the scene.
+    fn load(&self, config: &DataConfig) -> Result<EvalScene> {
+        let capture = match self {
+            HeldOutScene::Views(capture) => capture.clone(),
+            HeldOutScene::ViewsInGroup(group, key) | HeldOutScene::Whole(group, key) => {
+                group.open()?.capture(key)?
             }
         };
-        let mut targets = load_views(&capture, &target, size)?;
-        targets.retain(|view| !view.is_masked_out());
-        if targets.is_empty() {
-            return Err(Error::input(
-                capture.file(),
-                "the masks of the held-out views",
-                "no pixel that counts",
-                "some",
-            ));
-        }
-        Ok((capture.name.clone(), load_views(&capture, &context, size)?, targets))
+        let frames = match self {
+            HeldOutScene::Views(_) => split_and_spread(&capture, config, config.holdout, usize::MAX)?,
+            HeldOutScene::ViewsInGroup(..) => {
+                split_and_spread(&capture, config, config.holdout, config.target_views)?
+            }
+            HeldOutScene::Whole(..) => split_scene(&capture, config)?,
+        };
+        let context = load_views(&capture, &frames.context, Some(config.image_size))?;
+        Ok(EvalScene::new(&capture, frames, context, PhotoSize::Exactly(config.image_size)))
+    }
+
+    /// Scores the model on the scene.
+    fn score(&self, trainer: &Trainer, config: &DataConfig) -> Result<HeldOutScores> {
+        let (scene, model) = (self.load(config)?, trainer.as_model());
+        let ours = Method::Model(model).score(&scene, model.device, None, |_, _, _, _| Ok(()))?.scores;
+        Ok(HeldOutScores { ours, nearest: scene.score_nearest_photo()? })
     }
 }
 
@@ -171,15 +161,10 @@ impl HeldOut {
                 found.stopped = true;
                 break;
             }
-            let (name, context, target) = match scene.load(&self.config) {
-                Ok(views) => views,
-                Err(e) => {
-                    found.unusable.push((i, e.to_string()));
-                    continue;
-                }
-            };
-            match score_scene(trainer, &name, context, target) {
+            match scene.score(trainer, &self.config) {
                 Ok(scores) => found.scores.push((i, scores)),
+                // Files that can't be used are a problem of the scene alone.
+                Err(e) if e.is_invalid_request() => found.unusable.push((i, e.to_string())),
                 Err(e) => {
                     found.failed = Some(e.to_string());
                     break;
@@ -188,25 +173,6 @@ impl HeldOut {
         }
         found
     }
-}
-
-/// Reconstructs scene `name` from the views `context` and scores the renders against `target`.
-fn score_scene(
-    trainer: &Trainer,
-    name: &str,
-    context: Vec<View>,
-    target: Vec<View>,
-) -> Result<HeldOutScores> {
-    let poses: Vec<_> = target.iter().map(|view| view.camera.c2w).collect();
-    let model = trainer.as_model();
-    let reconstruction = reconstruct(model, &context, &poses)?;
-    let gaussians = reconstruction.gaussians.to_device(model.device);
-    let cameras = cameras_at(&target, &reconstruction.target_poses);
-    let moved = target.iter().zip(cameras).map(|(view, camera)| View { camera, ..view.shallow_clone() });
-    let moved: Vec<View> = moved.collect();
-    let ours = score_views(name, &gaussians, &moved, None, |_| true)?.expect("a target view");
-    let [context, target] = [context, target].map(LazyPhotos::Loaded);
-    Ok(HeldOutScores { ours, nearest: nearest_context_baseline(name, &context, &target)? })
 }
 
 impl Validator for HeldOut {
@@ -277,16 +243,27 @@ fn spread(groups: &[SceneGroup], most: usize) -> Vec<(SceneGroup, String)> {
     chosen.map(|(group, key)| (group.clone(), key.clone())).collect()
 }
 
+/// Splits the views of `capture` by `holdout`. The context has at most as many views as in training, since a model trained on a few need
+/// not fit in memory with hundreds; there are at most `target_views` targets. Both are spread along the camera's path.
+fn split_and_spread(
+    capture: &Capture,
+    config: &DataConfig,
+    holdout: Holdout,
+    target_views: usize,
+) -> Result<SceneFrames> {
+    let (cameras, SceneFrames { context, target }) = (capture.cameras(), split_views(capture, holdout)?);
+    let context = spread_over_path(&cameras, &context, config.context_views.max(2));
+    Ok(SceneFrames { context, target: spread_over_path(&cameras, &target, target_views) })
+}
+
 /// Returns the context and target views of a scene that is held out as a whole. The choice is deterministic: as many views as in training,
 /// at even distances along the camera's path, from the middle of a video that is longer than the training window. A capture with a test
 /// part of its own takes its targets from that part.
-fn split_scene(capture: &Capture, config: &DataConfig) -> Result<(Vec<usize>, Vec<usize>)> {
-    let cameras = capture.cameras();
+fn split_scene(capture: &Capture, config: &DataConfig) -> Result<SceneFrames> {
     if capture.has_test_part() {
-        let (shown, held_out) = split_views(capture, Holdout::None)?;
-        let context = spread_over_path(&cameras, &shown, config.context_views.max(2));
-        return Ok((context, spread_over_path(&cameras, &held_out, config.target_views)));
+        return split_and_spread(capture, config, Holdout::None, config.target_views);
     }
+    let cameras = capture.cameras();
     if cameras.len() < 3 {
         return Err(Error::input(capture.file(), "the number of views", cameras.len(), "three or more"));
     }
@@ -296,7 +273,7 @@ fn split_scene(capture: &Capture, config: &DataConfig) -> Result<(Vec<usize>, Ve
     let context = spread_over_path(&cameras, &window, config.context_views.clamp(2, length - 1));
     let between: Vec<usize> = window.into_iter().filter(|view| !context.contains(view)).collect();
     let target = spread_over_path(&cameras, &between, config.target_views);
-    Ok((context, target))
+    Ok(SceneFrames { context, target })
 }
 
 #[cfg(test)]
@@ -316,12 +293,11 @@ mod tests {
             holdout: "every:3+1".parse().unwrap(),
             ..Default::default()
         };
-        let (_, context, target) = HeldOutScene::Views(capture).load(&config).unwrap();
-        let names = |views: &[View]| views.iter().map(|view| view.name.clone()).collect::<Vec<_>>();
+        let scene = HeldOutScene::Views(capture).load(&config).unwrap();
         // The context views are chosen among views 0, 2, 3, 5, 6, 8, 9 and 11, along the path; the targets are all the others.
-        let context = names(&context);
-        assert_eq!((context.len(), target.len()), (4, 4));
-        assert_eq!((context[0].as_str(), context[3].as_str()), ("000000", "000011"));
-        assert_eq!(names(&target)[3], "000010");
+        let SceneFrames { context, target } = &scene.frames;
+        assert_eq!((context.len(), scene.context.len(), target.as_slice()), (4, 4, &[1, 4, 7, 10][..]));
+        assert_eq!((context[0], context[3]), (0, 11));
+        assert_eq!(scene.load_target(3).unwrap().name, "000010");
     }
 }

@@ -5,7 +5,7 @@ mod lpips;
 mod psnr_ssim;
 
 pub use contact_sheet::{ContactSheet, comparison_image};
-pub use lpips::Perceptual;
+pub use lpips::{PeakMemory, Perceptual};
 pub use psnr_ssim::{masked_psnr, masked_ssim, psnr, ssim};
 
 use crate::data::{Pixels, View};
@@ -91,7 +91,8 @@ impl CaptureScores {
 /// Scores an image `[3, H, W]` against the pixels of a view of the same size that count, with LPIPS if `perceptual` is given.
 ///
 /// # Errors
-/// Fails if the image differs in size from the view or is too small for SSIM, or if no pixel of the view counts.
+/// Fails if the image differs in size from the view or is too small for SSIM, if no pixel of the view counts, or if weights of LPIPS
+/// are broken.
 pub fn score_view(image: &Tensor, view: &View, perceptual: Option<&Perceptual>) -> Result<ViewScore> {
     let (found, expected) = (image.size(), view.image.size());
     if found != expected {
@@ -116,7 +117,7 @@ pub fn score_view(image: &Tensor, view: &View, perceptual: Option<&Perceptual>) 
     let ssim = masked_ssim(image, &photo, mask.as_ref());
     let mut scores = Scores { psnr, ssim, lpips_vgg: None, lpips_alex: None, pixel_fraction };
     if let Some(perceptual) = perceptual {
-        perceptual.add_to(&mut scores, image, view);
+        perceptual.add_to(&mut scores, image, view)?;
     }
     Ok(ViewScore { image: view.name.clone(), scores })
 }

@@ -423,13 +423,13 @@ impl<'a> RefineSession<'a> {
     /// # Errors
     /// Fails if rendering fails, or if a file of weights is invalid.
     pub fn score_lpips(&mut self, result: &RefineResult) -> Result<Option<[CaptureScores; 2]>> {
-        let perceptual = Perceptual::find(result.initial.means.device())?;
+        let perceptual = Perceptual::new(result.initial.means.device());
         let count = if self.held_out.is_empty() { LPIPS_PHOTOS } else { self.held_out.len() };
         let views: Vec<View> =
             self.representative_views().iter().take(count).map(View::shallow_clone).collect();
         let before = self.score_whole(&result.initial, &views, Some(&perceptual))?;
         let after = self.score_whole(&result.gaussians, &views, Some(&perceptual))?;
-        if let Some(line) = after.as_ref().and_then(|after| perceptual.explain_missing(&after.mean)) {
+        if let Some(line) = after.as_ref().and_then(|after| Perceptual::explain_missing(&after.mean)) {
             self.warn(&line);
         }
         Ok(before.zip(after).map(<[CaptureScores; 2]>::from))

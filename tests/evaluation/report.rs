@@ -3,7 +3,7 @@
 use crate::common::browser::Browser;
 use crate::common::program::{arg, refuse, run_json};
 use globalsplat::eval::{
-    Efficiency, Evaluation, Failure, SceneScores, Summary, comparison_path, read_evaluation, write_csv,
+    Efficiency, Evaluation, Failure, SceneScores, Summary, comparison_path, read_evaluation,
     write_evaluation, write_report,
 };
 use globalsplat::metrics::{CaptureScores, Scores, ViewScore};
@@ -144,9 +144,8 @@ fn the_csv_has_a_line_for_every_view() {
     let folder = tempfile::tempdir().unwrap();
     let mut scenes = vec![scene("a, \"b\"", 25., true), scene("c", 25., false)];
     scenes[1].forward_seconds = None;
-    let file = folder.path().join("scores.csv");
-    write_csv(&file, &evaluation("m", "re10k", 24, scenes)).unwrap();
-    let text = std::fs::read_to_string(file).unwrap();
+    write_evaluation(folder.path(), &evaluation("m", "re10k", 24, scenes)).unwrap();
+    let text = std::fs::read_to_string(folder.path().join("scores.csv")).unwrap();
     let lines: Vec<&str> = text.lines().collect();
     assert_eq!(lines.len(), 1 + 2 * 3);
     assert_eq!(lines[0], "scene,view,psnr,ssim,lpips_vgg,lpips_alex,gaussians,forward_seconds");

@@ -4,7 +4,7 @@ use crate::common::program::room;
 use crate::common::{captures, has_lpips, relative_error, rerun_test, skip};
 use glam::{DMat3, DMat4, DVec3};
 use globalsplat::data::{PhotoSize, open_capture};
-use globalsplat::eval::{EvalScene, Method, score_output};
+use globalsplat::eval::{EvalScene, Method};
 use globalsplat::io::read_splat;
 use globalsplat::metrics::{Perceptual, psnr};
 use globalsplat::render::{render_views, transform};
@@ -23,7 +23,7 @@ const TOLERANCES: [f64; 4] = [0.01, 0.0005, 0.0005, 0.0005];
 #[test]
 fn published_splats_reach_their_scores() {
     let Some(paths) = captures() else { return };
-    let perceptual = Perceptual::find(tch::Device::Cpu).expect("weights");
+    let perceptual = Perceptual::new(tch::Device::Cpu);
     let mut known = 0;
     for path in &paths {
         let capture = open_capture(path).expect("a capture");
@@ -33,9 +33,9 @@ fn published_splats_reach_their_scores() {
         known += 1;
         let scene = EvalScene::without_context(&capture, None, PhotoSize::Own).expect("views");
         let splat = Method::Splat(path.join("reference.ply"));
-        let mut rendered = splat.render_targets(scene, tch::Device::Cpu).expect("a picture");
-        let mean = score_output(&mut rendered, &perceptual, |_, _, _| Ok(())).expect("scores").mean;
-        assert_eq!(perceptual.explain_missing(&mean).is_none(), has_lpips());
+        let scored = splat.score(&scene, tch::Device::Cpu, Some(&perceptual), |_, _, _, _| Ok(()));
+        let mean = scored.expect("scores").scores.mean;
+        assert_eq!(Perceptual::explain_missing(&mean).is_none(), has_lpips());
         let found = [Some(mean.psnr), Some(mean.ssim), mean.lpips_vgg, mean.lpips_alex];
         for ((found, expected), tolerance) in found.into_iter().zip(expected).zip(TOLERANCES) {
             assert!(

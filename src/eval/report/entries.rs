@@ -1,7 +1,7 @@
 //! Evaluations and published results as the page shows them: names, colors, rows of a comparison, and formatted numbers.
 
-use crate::eval::evaluation::Evaluation;
-use crate::eval::published::{DATASETS, known_dataset, published};
+use crate::eval::evaluation::{Evaluation, Summary};
+use crate::eval::published::{DATASETS, PublishedScores, known_dataset, published};
 use maud::{Markup, html};
 use plotters::style::{Color, Palette, Palette99, RGBColor};
 use std::collections::BTreeSet;
@@ -87,10 +87,7 @@ pub struct Row<'a> {
     pub name: &'a str,
     /// Evaluation that was measured; `None` for a published row.
     pub measured: Option<&'a Entry<'a>>,
-    pub psnr: Option<f64>,
-    pub ssim: Option<f64>,
-    pub lpips: Option<f64>,
-    pub kilo_gaussians: Option<f64>,
+    pub scores: PublishedScores,
     pub color: RGBColor,
 }
 
@@ -105,32 +102,22 @@ impl Row<'_> {
 pub fn rows<'a>(entries: &'a [Entry<'a>], dataset: &str, views: usize) -> Vec<Row<'a>> {
     let methods = published().novel_views.iter().filter(|method| method.dataset == dataset);
     let theirs = methods.enumerate().filter_map(|(position, method)| {
-        let scores = method.scores.get(&views)?;
-        Some(Row {
-            name: &method.method,
-            measured: None,
-            psnr: scores.psnr,
-            ssim: scores.ssim,
-            lpips: scores.lpips,
-            kilo_gaussians: scores.kilo_gaussians,
-            color: color(FIRST_PUBLISHED_COLOR + position),
-        })
+        let (name, scores) = (&method.method, *method.scores.get(&views)?);
+        Some(Row { name, measured: None, scores, color: color(FIRST_PUBLISHED_COLOR + position) })
     });
     let measured = entries.iter().filter(|s| s.dataset == dataset && s.evaluation.context_views == views);
     let ours = measured.map(|entry| {
-        let mean = entry.evaluation.summary.mean;
-        Row {
-            name: &entry.name,
-            measured: Some(entry),
+        let Summary { mean, gaussians } = entry.evaluation.summary;
+        let scores = PublishedScores {
             psnr: finite(mean.psnr),
             ssim: finite(mean.ssim),
             lpips: mean.lpips_vgg.and_then(finite),
-            kilo_gaussians: entry.evaluation.summary.gaussians.and_then(finite).map(|n| n * 1e-3),
-            color: entry.color,
-        }
+            kilo_gaussians: gaussians.and_then(finite).map(|n| n * 1e-3),
+        };
+        Row { name: &entry.name, measured: Some(entry), scores, color: entry.color }
     });
     let mut rows: Vec<Row> = theirs.chain(ours).collect();
-    let order = |row: &Row| row.psnr.unwrap_or(f64::NEG_INFINITY);
+    let order = |row: &Row| row.scores.psnr.unwrap_or(f64::NEG_INFINITY);
     rows.sort_by(|a, b| order(b).total_cmp(&order(a)));
     rows
 }

@@ -130,7 +130,7 @@ pub fn quality_by_views(entries: &[Entry], dataset: &str) -> Markup {
     let by_views: Vec<_> = counts.iter().map(|&views| (views, rows(entries, dataset, views))).collect();
     let mut series: Vec<Series> = vec![];
     for (views, row) in by_views.iter().flat_map(|(views, rows)| rows.iter().map(move |row| (*views, row))) {
-        let Some(psnr) = row.psnr else { continue };
+        let Some(psnr) = row.scores.psnr else { continue };
         let point = (views as f64, psnr);
         let is_same =
             |series: &&mut Series| series.name == row.name && series.is_measured == row.measured.is_some();
@@ -151,7 +151,7 @@ pub fn quality_by_views(entries: &[Entry], dataset: &str) -> Markup {
 /// Plots PSNR against the number of Gaussians: the quality that a method achieves for its size. Renders nothing if no measured row has both,
 /// or if there is only one point.
 pub fn quality_by_size(rows: &[Row], setting: &str) -> Markup {
-    let point = |row: &Row| Some(((row.kilo_gaussians? * 1e3).max(1.).log10(), row.psnr?));
+    let point = |row: &Row| Some(((row.scores.kilo_gaussians? * 1e3).max(1.).log10(), row.scores.psnr?));
     let series = rows.iter().filter_map(|row| Some(Series::new(row, point(row)?)));
     let series: Vec<Series> = series.collect();
     if series.len() < 2 || !series.iter().any(|series| series.is_measured) {

@@ -1,7 +1,7 @@
 //! Scores scene by scene, worst first: comparison images of the worst scenes, and the scores of all.
 
 use super::entries::{Entry, absent, count, dataset_name, decimal, swatch, thousands};
-use super::tables::{Head, cell, table};
+use super::tables::{Head, PSNR, SSIM, cell, table};
 use crate::error::{Error, Result};
 use crate::eval::evaluation::{SceneScores, comparison_path};
 use crate::io::read_image_size;
@@ -159,8 +159,8 @@ fn rest(scenes: &[Scene]) -> Markup {
         Head::Text("Scene"),
         Head::Text("Method"),
         Head::Text("Setting"),
-        Head::Number("PSNR (dB)\u{a0}↑"),
-        Head::Number("SSIM\u{a0}↑"),
+        PSNR,
+        SSIM,
         Head::Number("LPIPS-VGG\u{a0}↓"),
         Head::Number("LPIPS-Alex\u{a0}↓"),
         Head::Number("Gaussians"),

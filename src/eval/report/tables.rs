@@ -68,14 +68,10 @@ pub fn share(entry: &Entry) -> String {
     format!("{} of {of}", thousands(entry.scored() as u64))
 }
 
-const COMPARISON_HEAD: [Head; 6] = [
-    Head::Text("Method"),
-    Head::Text("Source"),
-    Head::Number("PSNR (dB)\u{a0}↑"),
-    Head::Number("SSIM\u{a0}↑"),
-    Head::Number("LPIPS\u{a0}↓"),
-    Head::Number("Gaussians (K)\u{a0}↓"),
-];
+/// Headings of the published scores.
+pub const PSNR: Head = Head::Number("PSNR (dB)\u{a0}↑");
+pub const SSIM: Head = Head::Number("SSIM\u{a0}↑");
+const LPIPS: Head = Head::Number("LPIPS\u{a0}↓");
 
 /// Renders a section for each dataset. Datasets with measured scores come first.
 pub fn comparisons(entries: &[Entry]) -> Markup {
@@ -112,7 +108,9 @@ fn comparison(entries: &[Entry], dataset: &str, views: usize) -> Markup {
     let measured = rows.iter().filter(|row| row.measured.is_some()).count();
     let caption = format!("{}, {}", dataset_name(dataset), count(views, "context view"));
     let body = html! { @for row in &rows { (table_row(row)) } };
-    let table = table(&caption, &COMPARISON_HEAD, body);
+    let gaussians = Head::Number("Gaussians (K)\u{a0}↓");
+    let head = [Head::Text("Method"), Head::Text("Source"), PSNR, SSIM, LPIPS, gaussians];
+    let table = table(&caption, &head, body);
     let published = rows.len() - measured;
     html! {
         // Tables without measured scores are there for reference, so they are collapsed.
@@ -137,10 +135,10 @@ fn table_row(row: &Row) -> Markup {
                 @if row.is_published_globalsplat() { strong { (row.name) } } @else { (row.name) }
             }
             td { @match row.measured { Some(entry) => (measured_badges(entry)), None => (published_badge()) } }
-            (cell(row.psnr.map(|v| decimal(v, 2))))
-            (cell(row.ssim.map(|v| decimal(v, 3))))
-            (cell(row.lpips.map(|v| decimal(v, 3))))
-            (cell(row.kilo_gaussians.map(short)))
+            (cell(row.scores.psnr.map(|v| decimal(v, 2))))
+            (cell(row.scores.ssim.map(|v| decimal(v, 3))))
+            (cell(row.scores.lpips.map(|v| decimal(v, 3))))
+            (cell(row.scores.kilo_gaussians.map(short)))
         }
     }
 }
@@ -218,9 +216,9 @@ pub fn compactness() -> Markup {
         Head::Number("Gaussians"),
         Head::Number("Latents"),
         Head::Number("Gaussians of a latent"),
-        Head::Number("PSNR (dB)\u{a0}↑"),
-        Head::Number("SSIM\u{a0}↑"),
-        Head::Number("LPIPS\u{a0}↓"),
+        PSNR,
+        SSIM,
+        LPIPS,
     ];
     let body = html! {
         @for row in &published().compactness {
@@ -242,12 +240,7 @@ pub fn compactness() -> Markup {
 
 /// Renders the paper's table of ablations.
 pub fn ablations() -> Markup {
-    let head = [
-        Head::Text("Variant"),
-        Head::Number("PSNR (dB)\u{a0}↑"),
-        Head::Number("SSIM\u{a0}↑"),
-        Head::Number("LPIPS\u{a0}↓"),
-    ];
+    let head = [Head::Text("Variant"), PSNR, SSIM, LPIPS];
     let body = html! {
         @for row in &published().ablations {
             tr { th scope="row" { (row.variant) } (scores(row.psnr, row.ssim, row.lpips)) }
