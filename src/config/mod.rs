@@ -53,15 +53,13 @@ impl Config {
         let described = |e: toml::de::Error| {
             Error::input(origin, "a key", one_line(&e, text), "a configuration of globalsplat")
         };
-        toml::from_str::<Config>(text).map_err(described)?;
+        let mut config: Config = toml::from_str(text).map_err(described)?;
         for assignment in overrides {
             override_key(&mut table, assignment)?;
-            let config: std::result::Result<Config, _> = table.clone().try_into();
-            config.map_err(|e: toml::de::Error| {
+            config = table.clone().try_into().map_err(|e: toml::de::Error| {
                 Error::request(format!("--set {assignment}: {}", e.message().replace('\n', " ")))
             })?;
         }
-        let config: Config = table.try_into().map_err(described)?;
         config.check().map_err(|e| Error::request(format!("{}: {e}", origin.display())))?;
         Ok(config)
     }

@@ -65,89 +65,73 @@ impl EventFile {
     /// Writes the first records of the file: the version, and a session start that invalidates events of `step` and later steps in earlier
     /// files.
     pub fn start(&mut self, step: u64) -> Result<()> {
-        let version = record(&Message::event(0).bytes(3, VERSION.as_bytes()));
-        let session = record(&Message::event(step).message(7, &Message::default().varint(1, START)));
+        let version = record(&event(0, &bytes(3, VERSION.as_bytes())));
+        let session = record(&event(step, &bytes(7, &varint(1, START))));
         Ok(self.file.append(&[version, session].concat())?)
     }
 
     /// Writes the scalars of one step, by tag.
     pub fn write_scalars(&mut self, step: u64, values: &[(String, f64)]) -> Result<()> {
-        let summary = values.iter().fold(Message::default(), |summary, (tag, value)| {
-            summary.message(1, &Message::default().bytes(1, tag.as_bytes()).float(2, *value as f32))
-        });
-        Ok(self.file.append(&record(&Message::event(step).message(5, &summary)))?)
+        let value = |(tag, value): &(String, f64)| {
+            bytes(1, &[bytes(1, tag.as_bytes()), float(2, *value as f32)].concat())
+        };
+        self.write_summary(step, &values.iter().flat_map(value).collect::<Vec<_>>())
     }
 
     /// Writes an image [3, H, W] in [0, 1].
     pub fn write_image(&mut self, step: u64, tag: &str, image: &Tensor) -> Result<()> {
         let pixels = rgb_from_tensor(image)?;
-        let image = Message::default()
-            .varint(1, u64::from(pixels.height()))
-            .varint(2, u64::from(pixels.width()))
-            .varint(3, RGB)
-            .bytes(4, &encode_photo(&pixels, false)?);
-        let value = Message::default().bytes(1, tag.as_bytes()).message(4, &image);
-        let summary = Message::default().message(1, &value);
-        Ok(self.file.append(&record(&Message::event(step).message(5, &summary)))?)
+        let [height, width] = [pixels.height(), pixels.width()].map(u64::from);
+        let encoded = encode_photo(&pixels, false)?;
+        let image = [varint(1, height), varint(2, width), varint(3, RGB), bytes(4, &encoded)].concat();
+        self.write_summary(step, &bytes(1, &[bytes(1, tag.as_bytes()), bytes(4, &image)].concat()))
+    }
+
+    fn write_summary(&mut self, step: u64, summary: &[u8]) -> Result<()> {
+        Ok(self.file.append(&record(&event(step, &bytes(5, summary))))?)
     }
 }
 
-/// A protobuf message in its wire format.
-#[derive(Debug, Default)]
-struct Message(Vec<u8>);
-
-impl Message {
-    /// Creates an `Event` of `step` with the current time.
-    fn event(step: u64) -> Self {
-        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs_f64();
-        let mut event = Message::default();
-        event.key(1, 1);
-        event.0.extend(now.to_le_bytes());
-        event.varint(2, step)
-    }
-
-    /// Appends the key of a field. Wire types: 0 varint, 1 eight bytes, 2 length and bytes, 5 four bytes.
-    fn key(&mut self, field: u64, wire_type: u64) {
-        push_varint(&mut self.0, field << 3 | wire_type);
-    }
-
-    fn varint(mut self, field: u64, value: u64) -> Self {
-        self.key(field, 0);
-        push_varint(&mut self.0, value);
-        self
-    }
-
-    fn float(mut self, field: u64, value: f32) -> Self {
-        self.key(field, 5);
-        self.0.extend(value.to_le_bytes());
-        self
-    }
-
-    fn bytes(mut self, field: u64, value: &[u8]) -> Self {
-        self.key(field, 2);
-        push_varint(&mut self.0, value.len() as u64);
-        self.0.extend(value);
-        self
-    }
-
-    fn message(self, field: u64, value: &Message) -> Self {
-        self.bytes(field, &value.0)
-    }
+/// Returns an `Event` of `step` with the current time and the field `content`.
+fn event(step: u64, content: &[u8]) -> Vec<u8> {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs_f64();
+    [&field(1, 1, &now.to_le_bytes()), &varint(2, step), content].concat()
 }
 
-fn push_varint(bytes: &mut Vec<u8>, mut value: u64) {
+/// Returns a field of a protobuf message in its wire format: its key, and its value. Wire types: 0 varint, 1 eight bytes, 2 length and bytes,
+/// 5 four bytes.
+fn field(number: u64, wire_type: u64, value: &[u8]) -> Vec<u8> {
+    [&encode_varint(number << 3 | wire_type), value].concat()
+}
+
+fn varint(number: u64, value: u64) -> Vec<u8> {
+    field(number, 0, &encode_varint(value))
+}
+
+fn float(number: u64, value: f32) -> Vec<u8> {
+    field(number, 5, &value.to_le_bytes())
+}
+
+/// Returns a field of bytes, which may be those of a message.
+fn bytes(number: u64, value: &[u8]) -> Vec<u8> {
+    field(number, 2, &[&encode_varint(value.len() as u64), value].concat())
+}
+
+fn encode_varint(mut value: u64) -> Vec<u8> {
+    let mut bytes = vec![];
     while value >= 0x80 {
         bytes.push(value as u8 | 0x80);
         value >>= 7;
     }
     bytes.push(value as u8);
+    bytes
 }
 
 /// Returns a TFRecord: the length, its checksum, the message, its checksum.
-fn record(message: &Message) -> Vec<u8> {
-    let length = (message.0.len() as u64).to_le_bytes();
-    let sums = [masked_crc32c(&length), masked_crc32c(&message.0)].map(u32::to_le_bytes);
-    [&length[..], &sums[0], &message.0, &sums[1]].concat()
+fn record(message: &[u8]) -> Vec<u8> {
+    let length = (message.len() as u64).to_le_bytes();
+    let sums = [masked_crc32c(&length), masked_crc32c(message)].map(u32::to_le_bytes);
+    [&length[..], &sums[0], message, &sums[1]].concat()
 }
 
 /// Returns the masked CRC-32C of `bytes`, for data that may contain checksums themselves.

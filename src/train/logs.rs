@@ -1,116 +1,121 @@
 //! Logs of a run: `metrics.jsonl`, with one line for every step and for every validation, and `RUN/tensorboard`, with one event file for
 //! every time that the run was started or resumed.
 
+use super::run::{Event, retry_on_disk_full};
 use super::step::{Score, StepReport};
 use super::{METRICS_FILE, is_due};
 use crate::error::{Error, Result};
 use crate::io::{AppendFile, EventFile, write_atomically};
 use crate::loss::Term;
-use serde::Deserialize;
 use serde_json::{Value, json};
 use std::path::Path;
 
-/// Returns the values that describe a step, with their names, except the terms of its loss.
-pub(super) fn step_values(report: &StepReport, samples_per_second: f64) -> [(&'static str, f64); 7] {
-    [
-        ("loss", report.losses.total),
-        ("psnr", report.psnr()),
-        ("learning_rate", report.learning_rate),
-        ("gradient_norm", report.gradient_norm),
-        ("stage", f64::from(report.stage.index)),
-        ("mix", report.stage.mix),
-        ("samples_per_second", samples_per_second),
-    ]
-}
-
-/// Returns the terms of a step's loss, with their names.
-pub(super) fn loss_terms(report: &StepReport) -> [(&'static str, f64); Term::ALL.len()] {
-    Term::ALL.map(|term| (term.name(), report.losses[term]))
-}
-
-/// Record read from one line of `metrics.jsonl`: a training step, or a validation if `validation` is set; `step` is then the last step
-/// before it. Values that weren't finite are `None`.
-#[derive(Debug, Deserialize)]
-struct MetricsRecord {
-    step: u64,
-    #[serde(default)]
-    skipped: bool,
-    psnr: Option<f64>,
-    validation: Option<ValidationRecord>,
-}
-
-/// Scores of a validation.
-#[derive(Debug, Deserialize)]
-struct ValidationRecord {
-    psnr: Option<f64>,
-}
-
-/// Writer of `metrics.jsonl`.
+/// Writer of the logs.
 #[derive(Debug)]
-pub(super) struct MetricsWriter {
-    file: AppendFile,
-    /// Last step before the latest validation in the file.
-    last_validated_step: Option<u64>,
+pub(super) struct RunLog {
+    metrics: AppendFile,
+    events: EventFile,
+    /// Number of steps between scalars in the event file.
+    every: u64,
 }
 
-impl MetricsWriter {
-    /// Opens the file of a run that continues after `step` steps. Removes the lines of later steps, which a stopped run wrote after the
-    /// checkpoint that it continues from.
-    pub fn open(path: &Path, step: u64) -> Result<Self> {
-        let mut last_validated_step = None;
-        if path.is_file() {
-            let text = std::fs::read_to_string(path).map_err(Error::read(path))?;
-            let mut kept = String::new();
-            for line in text.lines() {
-                let line_value: Value = serde_json::from_str(line).unwrap_or_default();
-                if let Some(line_step) = line_value["step"].as_u64().filter(|line_step| *line_step < step) {
-                    kept.extend([line, "\n"]);
-                    if line_value["validation"].is_object() {
-                        last_validated_step = last_validated_step.max(Some(line_step));
-                    }
-                }
-            }
-            if kept != text {
-                write_atomically(path, |writer| {
-                    writer.write_all(kept.as_bytes()).map_err(Error::write(path))
-                })?;
-            }
-        }
-        Ok(MetricsWriter { file: AppendFile::open(path)?, last_validated_step })
+impl RunLog {
+    /// Opens the logs in the folder `run` of a run that continues after `step` steps. Also returns the last step before the latest
+    /// validation in the metrics. This and all writes wait for space on a full disk ([`retry_on_disk_full`]).
+    pub fn open(
+        run: &Path,
+        step: u64,
+        every: u64,
+        on_event: &mut impl FnMut(Event) -> bool,
+    ) -> Result<(Self, Option<u64>)> {
+        let path = run.join(METRICS_FILE);
+        let (metrics, validated) = retry_on_disk_full(on_event, || open_metrics(&path, step))?;
+        let mut events = retry_on_disk_full(on_event, || EventFile::create_for(run))?;
+        // Earlier events of this step and of later ones become void.
+        retry_on_disk_full(on_event, || events.start(step))?;
+        Ok((RunLog { metrics, events, every }, validated))
     }
 
-    /// Appends the record of a step.
-    pub fn log_step(&mut self, report: &StepReport, samples_per_second: f64) -> Result<()> {
+    /// Logs a step.
+    pub fn log_step(
+        &mut self,
+        report: &StepReport,
+        samples_per_second: f64,
+        on_event: &mut impl FnMut(Event) -> bool,
+    ) -> Result<()> {
+        let values = [
+            ("loss", report.losses.total),
+            ("psnr", report.psnr()),
+            ("learning_rate", report.learning_rate),
+            ("gradient_norm", report.gradient_norm),
+            ("stage", f64::from(report.stage.index)),
+            ("mix", report.stage.mix),
+            ("samples_per_second", samples_per_second),
+        ];
+        let terms = Term::ALL.map(|term| (term.name(), report.losses[term]));
         let mut line = json!({ "step": report.step, "skipped": report.skipped });
-        for (name, value) in step_values(report, samples_per_second).into_iter().chain(loss_terms(report)) {
+        for (name, value) in values.into_iter().chain(terms) {
             line[name] = value.into();
         }
         line["stage"] = report.stage.index.into();
         if report.skipped {
             line["scenes"] = report.scenes.clone().into();
         }
-        self.append(&line)
+        self.append(&line, on_event)?;
+        if is_due(self.every, report.step) {
+            let tagged = |group: &'static str| move |(name, value)| (format!("{group}/{name}"), value);
+            let scalars = values.into_iter().map(tagged("train")).chain(terms.map(tagged("loss")));
+            let scalars: Vec<_> = scalars.collect();
+            retry_on_disk_full(on_event, || self.events.write_scalars(report.step, &scalars))?;
+        }
+        let Some(picture) = &report.picture else { return Ok(()) };
+        retry_on_disk_full(on_event, || self.events.write_image(report.step, "train/views", picture))
     }
 
-    /// Appends the record of a validation after step `step`.
-    pub fn log_validation(&mut self, step: u64, score: &Score) -> Result<()> {
+    /// Logs the validation after step `step`. Its line in the metrics comes last, so that a run that was killed before repeats it.
+    pub fn log_validation(
+        &mut self,
+        step: u64,
+        score: &Score,
+        on_event: &mut impl FnMut(Event) -> bool,
+    ) -> Result<()> {
         let Score { psnr, ssim, scenes, stage, .. } = score;
+        let scalars = [("psnr", *psnr), ("ssim", *ssim), ("stage", f64::from(stage.index))];
+        let scalars = scalars.map(|(name, value)| (format!("validation/{name}"), value));
+        retry_on_disk_full(on_event, || self.events.write_scalars(step, &scalars))?;
         let validation = json!({
             "psnr": psnr, "ssim": ssim, "scenes": scenes, "stage": stage.index, "mix": stage.mix,
         });
-        self.append(&json!({ "step": step, "validation": validation }))?;
-        self.last_validated_step = Some(step);
-        Ok(())
+        self.append(&json!({ "step": step, "validation": validation }), on_event)
     }
 
-    /// Returns the last step before the latest validation in the file.
-    pub fn last_validated_step(&self) -> Option<u64> {
-        self.last_validated_step
+    fn append(&mut self, line: &Value, on_event: &mut impl FnMut(Event) -> bool) -> Result<()> {
+        let line = format!("{line}\n");
+        retry_on_disk_full(on_event, || Ok(self.metrics.append(line.as_bytes())?))
     }
+}
 
-    fn append(&mut self, line: &Value) -> Result<()> {
-        Ok(self.file.append(format!("{line}\n").as_bytes())?)
+/// Opens the metrics of a run that continues after `step` steps. Removes the lines of later steps, which a stopped run wrote after the
+/// checkpoint that it continues from. Also returns the last step before the latest validation in the file.
+fn open_metrics(path: &Path, step: u64) -> Result<(AppendFile, Option<u64>)> {
+    let mut validated = None;
+    if path.is_file() {
+        let text = std::fs::read_to_string(path).map_err(Error::read(path))?;
+        let mut kept = String::new();
+        for line in text.lines() {
+            let record: Value = serde_json::from_str(line).unwrap_or_default();
+            if let Some(line_step) = record["step"].as_u64().filter(|line_step| *line_step < step) {
+                kept.extend([line, "\n"]);
+                if record["validation"].is_object() {
+                    validated = validated.max(Some(line_step));
+                }
+            }
+        }
+        if kept != text {
+            write_atomically(path, |writer| writer.write_all(kept.as_bytes()).map_err(Error::write(path)))?;
+        }
     }
+    Ok((AppendFile::open(path)?, validated))
 }
 
 /// Training curves of a run, read from its metrics.
@@ -131,13 +136,13 @@ impl Curves {
     pub fn read(run: &Path, max_points: u64) -> Result<Self> {
         let path = run.join(METRICS_FILE);
         let text = std::fs::read_to_string(&path).map_err(Error::read(&path))?;
-        let records = text.lines().filter_map(|line| serde_json::from_str::<MetricsRecord>(line).ok());
         let (mut steps, mut held_out) = (vec![], vec![]);
-        for record in records {
-            match record.validation {
-                Some(validation) => held_out.extend(validation.psnr.map(|psnr| (record.step, psnr))),
-                None if record.skipped => {}
-                None => steps.extend(record.psnr.map(|psnr| (record.step, psnr))),
+        // The last line may be incomplete, and values that weren't finite are null.
+        for record in text.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok()) {
+            let Some(step) = record["step"].as_u64() else { continue };
+            held_out.extend(record["validation"]["psnr"].as_f64().map(|psnr| (step, psnr)));
+            if record["skipped"] != true {
+                steps.extend(record["psnr"].as_f64().map(|psnr| (step, psnr)));
             }
         }
         if steps.is_empty() {
@@ -148,53 +153,6 @@ impl Curves {
         };
         let training = steps.chunks(steps.len().div_ceil(max_points as usize)).map(mean).collect();
         Ok(Curves { training, held_out })
-    }
-}
-
-/// Event file of the current start of the run.
-#[derive(Debug)]
-pub(super) struct TensorBoard {
-    file: EventFile,
-    /// Number of steps between scalars.
-    every: u64,
-}
-
-impl TensorBoard {
-    /// Creates a new file in the run's folder. Call [`TensorBoard::start`] next.
-    pub fn create(run: &Path, every: u64) -> Result<Self> {
-        Ok(TensorBoard { file: EventFile::create_for(run)?, every })
-    }
-
-    /// Records that the run continues with `step`. Earlier events of this step and of later ones become void.
-    pub fn start(&mut self, step: u64) -> Result<()> {
-        self.file.start(step)
-    }
-
-    pub fn log_step(&mut self, report: &StepReport, samples_per_second: f64) -> Result<()> {
-        if !is_due(self.every, report.step) {
-            return Ok(());
-        }
-        let tagged = |group: &'static str| move |(name, value)| (format!("{group}/{name}"), value);
-        let values = step_values(report, samples_per_second).map(tagged("train"));
-        let terms = loss_terms(report).map(tagged("loss"));
-        self.file.write_scalars(report.step, &[&values[..], &terms].concat())
-    }
-
-    pub fn log_picture(&mut self, report: &StepReport) -> Result<()> {
-        match &report.picture {
-            Some(picture) => self.file.write_image(report.step, "train/views", picture),
-            None => Ok(()),
-        }
-    }
-
-    /// Logs the validation scores after step `step`.
-    pub fn log_validation(&mut self, step: u64, score: &Score) -> Result<()> {
-        let values = [
-            ("validation/psnr", score.psnr),
-            ("validation/ssim", score.ssim),
-            ("validation/stage", f64::from(score.stage.index)),
-        ];
-        self.file.write_scalars(step, &values.map(|(tag, value)| (tag.to_string(), value)))
     }
 }
 

@@ -5,7 +5,7 @@ use super::checkpoint::{
     prune_checkpoints, recover,
 };
 use super::is_due;
-use super::logs::{MetricsWriter, TensorBoard};
+use super::logs::RunLog;
 use super::step::{Score, StepReport};
 use super::trainer::Trainer;
 use super::{CONFIG_FILE, METRICS_FILE};
@@ -87,23 +87,18 @@ pub fn run(
     validator: Option<&mut dyn Validator>,
     mut on_event: impl FnMut(Event) -> bool,
 ) -> Result<Outcome> {
-    let writes = trainer.group.is_main_process();
-    let opened = writes.then(|| RunLogger::open(trainer, out, resume, &mut on_event)).transpose()?;
+    let opened = trainer.group.is_main_process();
+    let opened = opened.then(|| RunLogger::open(trainer, out, resume, &mut on_event)).transpose()?;
     trainer.broadcast_state()?;
-    let held_out = validator.as_ref().map(|validator| validator.scenes());
-    let expected = trainer.group.broadcast_object(writes.then_some(held_out))?;
+    let held_out = validator.as_ref().map_or(0, |validator| validator.scenes());
+    let (logger, start) =
+        opened.map(|(logger, validated, saved)| (logger, (held_out, validated, saved))).unzip();
+    let (expected, validated, saved) = trainer.group.broadcast_object(start)?;
     if held_out != expected {
-        let count = |scenes: Option<usize>| scenes.unwrap_or(0);
-        let (found, expected) = (count(held_out), count(expected));
         return Err(Error::failed(format!(
-            "this rank has {found} held-out scenes, expected {expected}, as the first one"
+            "this rank has {held_out} held-out scenes, expected {expected}, as the first one"
         )));
     }
-    let validated = opened.as_ref().map(|(logger, _)| logger.metrics.last_validated_step());
-    let validated = trainer.group.broadcast_object(validated)?;
-    let saved = opened.as_ref().map(|(_, saved)| saved.clone());
-    let saved = trainer.group.broadcast_object(saved)?;
-    let logger = opened.map(|(logger, _)| logger);
     Run { trainer, out, validator, on_event, logger, validated, asked_to_stop: false }.train(saved)
 }
 
@@ -136,8 +131,7 @@ fn check_output_folder(out: &Path) -> Result<()> {
 /// Files that a run writes beside its checkpoints.
 struct RunLogger {
     _lock: RunLock,
-    metrics: MetricsWriter,
-    tensorboard: TensorBoard,
+    log: RunLog,
     /// PSNR of the best checkpoint, in dB.
     best: Option<f64>,
     /// Settings that validation scores depend on.
@@ -145,13 +139,14 @@ struct RunLogger {
 }
 
 impl RunLogger {
-    /// Brings the trainer to the run's starting point, and opens the run's files. Also returns the run's own checkpoint of this state.
+    /// Brings the trainer to the run's starting point, and opens the run's files. Also returns the step before the last validation that was
+    /// logged, and the run's own checkpoint of this state.
     fn open(
         trainer: &mut Trainer,
         out: &Path,
         resume: &Resume,
         on_event: &mut impl FnMut(Event) -> bool,
-    ) -> Result<(Self, Option<PathBuf>)> {
+    ) -> Result<(Self, Option<u64>, Option<PathBuf>)> {
         check_output_folder(out)?;
         let lock = RunLock::take(out)?;
         recover(out)?;
@@ -171,38 +166,13 @@ impl RunLogger {
                 writer.write_all(toml.as_bytes()).map_err(Error::write(&config))
             })
         })?;
-        let metrics =
-            retry_on_disk_full(on_event, || MetricsWriter::open(&out.join(METRICS_FILE), trainer.step))?;
-        let mut tensorboard =
-            retry_on_disk_full(on_event, || TensorBoard::create(out, trainer.config.train.log_every))?;
-        retry_on_disk_full(on_event, || tensorboard.start(trainer.step))?;
+        let (log, validated) = RunLog::open(out, trainer.step, trainer.config.train.log_every, on_event)?;
         let settings = trainer.config.data.validation_settings();
         let best = best_score(out, &settings).unwrap_or_else(|e| {
             on_event(Event::Notice(format!("{e}; the best checkpoint is determined again")));
             None
         });
-        Ok((RunLogger { _lock: lock, metrics, tensorboard, best, settings }, saved))
-    }
-
-    fn log_step(
-        &mut self,
-        on_event: &mut impl FnMut(Event) -> bool,
-        report: &StepReport,
-        samples_per_second: f64,
-    ) -> Result<()> {
-        retry_on_disk_full(on_event, || self.metrics.log_step(report, samples_per_second))?;
-        retry_on_disk_full(on_event, || self.tensorboard.log_step(report, samples_per_second))?;
-        retry_on_disk_full(on_event, || self.tensorboard.log_picture(report))
-    }
-
-    fn log_validation(
-        &mut self,
-        on_event: &mut impl FnMut(Event) -> bool,
-        step: u64,
-        score: &Score,
-    ) -> Result<()> {
-        retry_on_disk_full(on_event, || self.tensorboard.log_validation(step, score))?;
-        retry_on_disk_full(on_event, || self.metrics.log_validation(step, score))
+        Ok((RunLogger { _lock: lock, log, best, settings }, validated, saved))
     }
 }
 
@@ -255,7 +225,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             let samples_per_second = batch / start.elapsed().as_secs_f64();
             saved = None;
             if let Some(logger) = &mut self.logger {
-                logger.log_step(&mut self.on_event, &report, samples_per_second)?;
+                logger.log.log_step(&report, samples_per_second, &mut self.on_event)?;
             }
             should_continue =
                 self.emit(Event::Step { report: &report, samples_per_second }) && report.should_continue;
@@ -330,7 +300,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
                 logger.best = Some(score.psnr);
             }
             if self.validated != Some(step) {
-                logger.log_validation(on_event, step, &score)?;
+                logger.log.log_validation(step, &score, on_event)?;
             }
         }
         self.validated = Some(step);

@@ -146,34 +146,26 @@ mod tests {
     }
 
     #[test]
-    fn the_paper_s_curriculum() {
-        let config = CurriculumConfig::default();
-        let at = |step| {
-            let stage = stage_at(&config, step);
-            (stage.index, stage.mix)
-        };
-        assert_eq!(at(0), (0, 1.));
-        assert_eq!(at(9_999), (0, 1.));
-        assert_eq!(at(10_000), (1, 0.));
-        assert_eq!(at(11_000), (1, 0.5));
-        assert_eq!(at(12_000), (1, 1.));
-        assert_eq!(at(20_500), (2, 0.25));
-        assert_eq!(at(50_000), (3, 0.));
-        assert_eq!(at(219_999), (3, 1.));
-    }
-
-    #[test]
-    fn boundaries_beyond_the_final_stage_are_ignored() {
-        let config = CurriculumConfig { final_stage: 1, ..Default::default() };
-        assert_eq!(stage_at(&config, 60_000), Stage::complete(1));
-        let config = CurriculumConfig { final_stage: 0, ..Default::default() };
-        assert_eq!(stage_at(&config, 60_000), Stage::complete(0));
-    }
-
-    #[test]
-    fn full_capacity_starts_at_the_end() {
-        let config = CurriculumConfig { full_capacity: true, ..Default::default() };
-        assert_eq!(stage_at(&config, 0), Stage::complete(3));
+    fn stages_begin_at_their_boundaries() {
+        let paper = CurriculumConfig::default();
+        // Boundaries beyond the final stage are ignored.
+        let [first, second] = [0, 1].map(|final_stage| CurriculumConfig { final_stage, ..paper.clone() });
+        let full = CurriculumConfig { full_capacity: true, ..paper.clone() };
+        for (config, step, index, mix) in [
+            (&paper, 0, 0, 1.),
+            (&paper, 9_999, 0, 1.),
+            (&paper, 10_000, 1, 0.),
+            (&paper, 11_000, 1, 0.5),
+            (&paper, 12_000, 1, 1.),
+            (&paper, 20_500, 2, 0.25),
+            (&paper, 50_000, 3, 0.),
+            (&paper, 219_999, 3, 1.),
+            (&first, 60_000, 0, 1.),
+            (&second, 60_000, 1, 1.),
+            (&full, 0, 3, 1.),
+        ] {
+            assert_eq!(stage_at(config, step), Stage { index, mix }, "step {step}");
+        }
     }
 
     #[test]

@@ -71,82 +71,57 @@ pub struct Score {
     pub left_out: Vec<String>,
 }
 
-/// Values of one rank that decide how a step goes on, or their sums over all ranks.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct StepSync {
-    /// Number of ranks that were asked to stop.
-    stop_requests: f64,
-    /// Number of ranks that found bad data.
-    bad_data_reports: f64,
-    /// Number of gradients.
-    gradients: f64,
-    /// Square of the number of gradients of each rank. The two sums show whether all ranks have the same number.
-    squared_gradients: f64,
-}
-
-impl StepSync {
-    const COUNT: usize = 4;
-
-    /// Returns the values of one rank, which has computed `gradients` gradients.
-    pub fn of_rank(is_asked_to_stop: bool, has_bad_data: bool, gradients: usize) -> Self {
-        let gradients = gradients as f64;
-        StepSync {
-            stop_requests: f64::from(is_asked_to_stop),
-            bad_data_reports: f64::from(has_bad_data),
-            gradients,
-            squared_gradients: gradients * gradients,
-        }
-    }
-
-    /// Returns `true` if a rank was asked to stop.
-    pub fn is_asked_to_stop(&self) -> bool {
-        self.stop_requests > 0.
-    }
-
-    /// Returns `true` if a rank found bad data.
-    pub fn has_bad_data(&self) -> bool {
-        self.bad_data_reports > 0.
-    }
-
-    /// Returns `true` if all `ranks` ranks have the same number of gradients, the only case in which (Σ n)² = ranks · Σ n².
-    pub fn has_equal_gradients(&self, ranks: usize) -> bool {
-        self.gradients * self.gradients == self.squared_gradients * ranks as f64
-    }
-
-    /// Returns the tensor that is summed over all ranks: the packed `losses`, then these values, in float64 on the device of `losses`.
-    pub fn to_tensor(self, losses: Tensor) -> Tensor {
-        let StepSync { stop_requests, bad_data_reports, gradients, squared_gradients } = self;
-        let numbers: [f64; Self::COUNT] = [stop_requests, bad_data_reports, gradients, squared_gradients];
-        // Filling a new tensor on a GPU doesn't wait for the GPU.
-        let numbers = numbers.map(|number| Tensor::full([1], number, (Kind::Double, losses.device())));
-        Tensor::cat(&std::iter::once(losses).chain(numbers).collect::<Vec<_>>(), 0)
-    }
-
-    fn from_numbers(numbers: [f64; Self::COUNT]) -> Self {
-        let [stop_requests, bad_data_reports, gradients, squared_gradients] = numbers;
-        StepSync { stop_requests, bad_data_reports, gradients, squared_gradients }
-    }
+/// Returns the tensor of one rank that is summed over all ranks: the packed `losses`, then the values that decide how a step goes on, in
+/// float64 on the device of `losses`. The rank has computed `gradients` gradients.
+pub(super) fn to_summed_tensor(
+    losses: Tensor,
+    is_asked_to_stop: bool,
+    has_bad_data: bool,
+    gradients: usize,
+) -> Tensor {
+    let gradients = gradients as f64;
+    let [stop, bad_data] = [is_asked_to_stop, has_bad_data].map(f64::from);
+    let values = [stop, bad_data, gradients, gradients * gradients];
+    // Filling a new tensor on a GPU doesn't wait for the GPU.
+    let values = values.map(|value| Tensor::full([1], value, (Kind::Double, losses.device())));
+    Tensor::cat(&std::iter::once(losses).chain(values).collect::<Vec<_>>(), 0)
 }
 
 /// Sums of a step over all ranks, on the host.
 #[derive(Debug)]
 pub(super) struct StepSums {
     pub losses: Losses<f64>,
-    pub sync: StepSync,
+    /// `true` if a rank was asked to stop.
+    pub is_asked_to_stop: bool,
+    /// `true` if a rank found bad data.
+    pub has_bad_data: bool,
+    /// Sum of the numbers of gradients of the ranks, and of their squares.
+    gradients: [f64; 2],
     /// Norm of the summed gradients.
     pub gradient_norm: f64,
 }
 
 impl StepSums {
-    /// Reads `sums`, the sum of the tensors of [`StepSync::to_tensor`], and the gradient's norm, a scalar. They are copied from a GPU
+    /// Reads `sums`, the sum of the tensors of [`to_summed_tensor`], and the gradient's norm, a scalar. They are copied from a GPU
     /// together, because every copy waits for all of the GPU's work; this is the only copy of a step.
     pub fn from_tensors(sums: &Tensor, gradient_norm: &Tensor) -> Self {
         let all = Tensor::cat(&[sums, &gradient_norm.to_kind(Kind::Double).view([1])], 0);
         let numbers = Vec::<f64>::try_from(all.to_device(Device::Cpu)).expect("float64");
         let (losses, rest) = numbers.split_first_chunk().expect("all terms");
-        let (sync, rest) = rest.split_first_chunk().expect("all values of StepSync");
-        let [gradient_norm] = rest.try_into().expect("the norm");
-        StepSums { losses: Losses::unpacked(losses), sync: StepSync::from_numbers(*sync), gradient_norm }
+        let [stops, bad_data, gradients, squares, gradient_norm] = *rest else { unreachable!("all values") };
+        StepSums {
+            losses: Losses::unpacked(losses),
+            is_asked_to_stop: stops > 0.,
+            has_bad_data: bad_data > 0.,
+            gradients: [gradients, squares],
+            gradient_norm,
+        }
+    }
+
+    /// Returns `true` if all `ranks` ranks have the same number of gradients, the only case in which (Σ n)² = ranks · Σ n².
+    pub fn has_equal_gradients(&self, ranks: usize) -> bool {
+        let [sum, squares] = self.gradients;
+        sum * sum == squares * ranks as f64
     }
 }
 
@@ -154,23 +129,19 @@ impl StepSums {
 mod tests {
     use super::*;
 
-    /// Returns the sums of the tensors of several ranks, as an all-reduce does.
-    fn sums(ranks: &[StepSync]) -> StepSums {
-        let losses = || Tensor::arange(Losses::COUNT as i64, (Kind::Double, Device::Cpu));
-        let tensors: Vec<Tensor> = ranks.iter().map(|sync| sync.to_tensor(losses())).collect();
-        let sum = Tensor::stack(&tensors, 0).sum_dim_intlist(0i64, false, None::<Kind>);
-        StepSums::from_tensors(&sum, &Tensor::from(2.5f32))
-    }
-
     #[test]
     fn one_rank_decides_for_all() {
-        let idle = StepSync::of_rank(false, false, 7);
-        for (stops, has_bad_data) in [(false, false), (true, false), (false, true), (true, true)] {
-            let found = sums(&[idle, StepSync::of_rank(stops, has_bad_data, 7), idle]).sync;
-            assert_eq!((found.is_asked_to_stop(), found.has_bad_data()), (stops, has_bad_data));
-            assert!(found.has_equal_gradients(3));
+        let rank = |stops: bool, has_bad_data: bool, gradients: usize| {
+            let losses = Tensor::arange(Losses::COUNT as i64, (Kind::Double, Device::Cpu));
+            to_summed_tensor(losses, stops, has_bad_data, gradients)
+        };
+        for (stops, has_bad_data, gradients) in
+            [(false, false, 7), (true, false, 7), (false, true, 7), (true, true, 7), (false, false, 8)]
+        {
+            let sums = rank(false, false, 7) + rank(stops, has_bad_data, gradients) + rank(false, false, 7);
+            let found = StepSums::from_tensors(&sums, &Tensor::from(2.5f32));
+            assert_eq!((found.is_asked_to_stop, found.has_bad_data), (stops, has_bad_data));
+            assert_eq!((found.has_equal_gradients(3), found.gradient_norm), (gradients == 7, 2.5));
         }
-        let other = StepSync::of_rank(false, false, 8);
-        assert!(!sums(&[idle, other, idle]).sync.has_equal_gradients(3));
     }
 }

@@ -3,7 +3,7 @@
 use super::gradients::{ForwardBackward, ModelReplica, gradients_in_parallel};
 use super::is_due;
 use super::schedule::{in_backward_order, learning_rate, parameter_groups, stage_at, subsets};
-use super::step::{StepReport, StepSums, StepSync, preview};
+use super::step::{StepReport, StepSums, preview, to_summed_tensor};
 use crate::config::{Config, changed_keys};
 use crate::data::{BadData, BadSceneReport, Batch, BatchShard, DataLoader, SceneGroups};
 use crate::device::Stopwatch;
@@ -81,24 +81,21 @@ impl Trainer {
         let mut model = GlobalSplat::new(&vs.root(), &config.model)?;
         model.set_precision(config.train.precision);
         let optimizer = Optimizer::new(parameter_groups(&vs, &config.train));
-        let config = config.clone();
         let group = ProcessGroup::single();
-        let buckets = Buckets::new(&group, &[]);
-        let (step, samples, loader) = (0, 0, None);
         Ok(Trainer {
-            config,
+            config: config.clone(),
             vs,
             model,
             replicas: vec![],
             optimizer,
             perceptual,
             weights: None,
-            step,
-            samples,
+            step: 0,
+            samples: 0,
             scenes,
-            loader,
+            loader: None,
+            buckets: Buckets::new(&group, &[]),
             group,
-            buckets,
         })
     }
 
@@ -215,13 +212,12 @@ impl Trainer {
             }
             Ok((sums, skipped))
         })?;
-        let StepSums { losses, sync, gradient_norm } = sums;
-        if !sync.has_equal_gradients(self.group.world_size()) {
+        if !sums.has_equal_gradients(self.group.world_size()) {
             return Err(Error::failed(
                 "ranks have different parameters: were they started with the same program?",
             ));
         }
-        if sync.has_bad_data() {
+        if sums.has_bad_data {
             self.exchange_bad_data()?;
         }
         let scenes = match skipped {
@@ -232,24 +228,24 @@ impl Trainer {
             step: self.step,
             stage,
             learning_rate,
-            losses,
-            gradient_norm,
+            losses: sums.losses,
+            gradient_norm: sums.gradient_norm,
             skipped,
             scenes,
             picture: None,
-            should_continue: !sync.is_asked_to_stop(),
+            should_continue: !sums.is_asked_to_stop,
         };
         self.step += 1;
         Ok(report)
     }
 
-    /// Waits for the sums of the gradients over all ranks. Returns the sums of `losses` and of the ranks' [`StepSync`], packed.
+    /// Waits for the sums of the gradients over all ranks. Returns the sums of the tensors of [`to_summed_tensor`].
     fn all_reduce(&self, losses: Tensor, should_continue: &mut dyn FnMut() -> bool) -> Result<Tensor> {
         let gradients = self.buckets.finish()?;
         let is_asked_to_stop = !should_continue();
         let has_bad_data =
             self.loader.as_ref().is_some_and(|loader| loader.bad_data_log().has_bad_scene_reports());
-        let sums = StepSync::of_rank(is_asked_to_stop, has_bad_data, gradients).to_tensor(losses);
+        let sums = to_summed_tensor(losses, is_asked_to_stop, has_bad_data, gradients);
         self.group.all_reduce(&sums)?;
         Ok(sums)
     }
@@ -429,19 +425,9 @@ impl Trainer {
         self.loader.as_ref().map(DataLoader::bad_data).unwrap_or_default()
     }
 
-    /// Returns the configuration.
-    pub fn config(&self) -> &Config {
-        &self.config
-    }
-
     /// Returns the group of ranks that train together.
     pub fn group(&self) -> &ProcessGroup {
         &self.group
-    }
-
-    /// Returns the model in its current state.
-    pub fn model(&self) -> &GlobalSplat {
-        &self.model
     }
 
     /// Returns the stage that the weights were trained to: that of the last step, or the final stage once all steps are done (spec 8.7).
@@ -450,11 +436,6 @@ impl Trainer {
             true => stage_at(&self.config.curriculum, self.step.saturating_sub(1)),
             false => self.config.curriculum.final_stage(),
         }
-    }
-
-    /// Returns the device of the weights.
-    pub fn device(&self) -> Device {
-        self.vs.device()
     }
 
     /// Returns the model in its current state, for reconstruction.
