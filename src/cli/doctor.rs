@@ -1,7 +1,7 @@
 use super::{Output, device, view};
 use crate::config::Config;
 use crate::device::total_memory_bytes;
-use crate::distributed::Backends;
+use crate::distributed::{has_gloo, has_nccl};
 use crate::io::{WEIGHTS_VARIABLE, find_ffmpeg, find_pretrained};
 use crate::loss::LpipsNetwork;
 use crate::model::Precision;
@@ -50,7 +50,6 @@ impl Doctor {
             let (major, minor) = nvrtc.version;
             json!({ "version": format!("{major}.{minor}"), "architectures": nvrtc.architectures })
         });
-        let backends = Backends::built_in();
         let built = |is_built: bool, why: &str| found_or(is_built.then_some(true).ok_or(why.to_string()));
         Ok(Output::table(json!({
             "version": env!("CARGO_PKG_VERSION"),
@@ -72,10 +71,10 @@ impl Doctor {
             "viewer": built(view::has_viewer(), "install Node.js 20 or newer with npm, then make build"),
             "together": {
                 "gloo": built(
-                    backends.gloo,
+                    has_gloo(),
                     "Debian and Ubuntu: apt install libgloo-dev, touch csrc/build.rs, build again",
                 ),
-                "nccl": built(backends.nccl, "its headers and CUDA's come with libtorch's wheel and requirements.txt"),
+                "nccl": built(has_nccl(), "its headers and CUDA's come with libtorch's wheel and requirements.txt"),
             },
         })))
     }

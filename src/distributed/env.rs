@@ -4,7 +4,6 @@ use crate::error::{Error, Result};
 use cxx::UniquePtr;
 use globalsplat_csrc::distributed as ffi;
 use std::env;
-use std::str::FromStr;
 use std::time::Duration;
 
 /// Timeout for ranks to connect and for a store operation, in seconds.
@@ -26,7 +25,7 @@ pub struct DistributedEnv {
     /// Number of processes on this machine.
     pub local_world_size: usize,
     /// Number of times that all processes have been restarted.
-    pub restarts: u64,
+    pub restarts: u16,
     /// Host of the store through which the processes connect.
     pub host: String,
     /// Port of the store.
@@ -48,54 +47,37 @@ impl DistributedEnv {
         if variable("WORLD_SIZE").is_none() {
             return Ok(None);
         }
-        let variable = Variables(variable);
-        let ranks = variable.number("WORLD_SIZE", None)?;
+        let text = |name: &str| {
+            let expected =
+                "the value that torchrun sets with WORLD_SIZE (unset WORLD_SIZE to run a single process)";
+            variable(name)
+                .ok_or_else(|| Error::setting(format!("the environment's {name}"), "missing", expected))
+        };
+        let parse = |name: &str, text: String| -> Result<u16> {
+            let wrong = |_| Error::setting(format!("the environment's {name}"), &text, "a whole number");
+            text.parse().map_err(wrong)
+        };
+        let number = |name: &str| parse(name, text(name)?);
+        let number_or = |name: &str, default| variable(name).map_or(Ok(default), |text| parse(name, text));
+        let ranks = number("WORLD_SIZE")?;
         if ranks == 1 {
             return Ok(None);
         }
-        let rank = variable.number("RANK", None)?;
+        let rank = number("RANK")?;
         if rank >= ranks {
-            return Err(Error::setting(
-                "the environment's RANK",
-                rank,
-                format!("less than WORLD_SIZE, {ranks}"),
-            ));
+            let expected = format!("less than WORLD_SIZE, {ranks}");
+            return Err(Error::setting("the environment's RANK", rank, expected));
         }
         Ok(Some(DistributedEnv {
-            rank,
-            ranks,
-            local_rank: variable.number("LOCAL_RANK", Some(0))?,
-            local_world_size: variable.number("LOCAL_WORLD_SIZE", Some(1))?.max(1),
-            restarts: variable.number("TORCHELASTIC_RESTART_COUNT", Some(0))?,
-            host: variable.text("MASTER_ADDR")?,
-            port: variable.number("MASTER_PORT", None)?,
-            is_agent_store: (variable.0)("TORCHELASTIC_USE_AGENT_STORE").as_deref() == Some("True"),
+            rank: rank.into(),
+            ranks: ranks.into(),
+            local_rank: number_or("LOCAL_RANK", 0)?.into(),
+            local_world_size: number_or("LOCAL_WORLD_SIZE", 1)?.max(1).into(),
+            restarts: number_or("TORCHELASTIC_RESTART_COUNT", 0)?,
+            host: text("MASTER_ADDR")?,
+            port: number("MASTER_PORT")?,
+            is_agent_store: variable("TORCHELASTIC_USE_AGENT_STORE").as_deref() == Some("True"),
         }))
-    }
-}
-
-/// Environment variables, read by a function.
-struct Variables<F>(F);
-
-impl<F: Fn(&str) -> Option<String>> Variables<F> {
-    fn text(&self, name: &str) -> Result<String> {
-        let missing = || {
-            let expected =
-                "the value that torchrun sets with WORLD_SIZE (unset WORLD_SIZE to run a single process)";
-            Error::setting(format!("the environment's {name}"), "missing", expected)
-        };
-        (self.0)(name).ok_or_else(missing)
-    }
-
-    /// Parses the variable `name`. If it is missing, returns `otherwise`, or an error if that is `None`.
-    fn number<T: FromStr>(&self, name: &str, otherwise: Option<T>) -> Result<T> {
-        let text = match (self.text(name), otherwise) {
-            (Ok(text), _) => text,
-            (Err(_), Some(otherwise)) => return Ok(otherwise),
-            (Err(missing), None) => return Err(missing),
-        };
-        let wrong = |_| Error::setting(format!("the environment's {name}"), &text, "a whole number");
-        text.parse().map_err(wrong)
     }
 }
 
@@ -167,27 +149,25 @@ mod tests {
 
     #[test]
     fn torchrun_is_understood() {
-        let expected = DistributedEnv {
-            rank: 5,
-            ranks: 8,
-            local_rank: 1,
-            local_world_size: 4,
-            restarts: 2,
-            host: "node-0".into(),
-            port: 29500,
-            is_agent_store: true,
-        };
-        assert_eq!(parse(&ALL).unwrap(), Some(expected.clone()));
         // Other launchers set at least these variables.
-        let others = parse(&[ALL[0], ALL[1], ALL[4], ALL[5]]).unwrap();
-        let defaults = DistributedEnv {
-            local_rank: 0,
-            local_world_size: 1,
-            restarts: 0,
-            is_agent_store: false,
-            ..expected
-        };
-        assert_eq!(others, Some(defaults));
+        let others = [ALL[0], ALL[1], ALL[4], ALL[5]];
+        for (variables, local_rank, local_world_size, restarts, is_agent_store) in
+            [(&ALL[..], 1, 4, 2, true), (&others, 0, 1, 0, false)]
+        {
+            let host = "node-0".into();
+            let (rank, ranks, port) = (5, 8, 29500);
+            let expected = DistributedEnv {
+                rank,
+                ranks,
+                local_rank,
+                local_world_size,
+                restarts,
+                host,
+                port,
+                is_agent_store,
+            };
+            assert_eq!(parse(variables).unwrap(), Some(expected));
+        }
         for alone in [&[][..], &[("RANK", "0")], &[("WORLD_SIZE", "1"), ("RANK", "0")]] {
             assert_eq!(parse(alone).unwrap(), None);
         }

@@ -5,7 +5,8 @@ mod env;
 mod process_group;
 
 pub use env::{DistributedEnv, Rendezvous};
-pub use process_group::{Backends, Buckets, ProcessGroup};
+pub use globalsplat_csrc::distributed::{has_gloo, has_nccl};
+pub use process_group::{Buckets, ProcessGroup};
 
 #[cfg(test)]
 pub(crate) mod tests {

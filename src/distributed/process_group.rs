@@ -9,8 +9,8 @@ use serde::de::DeserializeOwned;
 use std::fmt;
 use tch::{Device, Tensor};
 
-/// Timeout of a collective, in seconds. It also covers waiting for a rank that has more scenes to evaluate, or that waits for free space on
-/// a full disk, so it is longer than c10d's default of half an hour.
+/// Timeout of a collective, in seconds. It also covers waiting for a rank that has more scenes to evaluate, so it is longer than c10d's
+/// default of half an hour.
 const COLLECTIVE_TIMEOUT_SECONDS: i64 = 2 * 60 * 60;
 /// Maximum size of a bucket, in bytes: the bucket size of torch's DistributedDataParallel.
 const MAX_BUCKET_BYTES: i64 = 25 << 20;
@@ -41,22 +41,6 @@ fn distributed_error(why: cxx::Exception) -> Error {
     Error::Distributed { message: why.what().lines().next().unwrap_or_default().to_string() }
 }
 
-/// Backends that this build has for communication between ranks.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Backends {
-    /// Gloo, for CPUs.
-    pub gloo: bool,
-    /// NCCL, for GPUs.
-    pub nccl: bool,
-}
-
-impl Backends {
-    /// Returns the backends whose headers were available when the program was built.
-    pub fn built_in() -> Self {
-        Backends { gloo: ffi::has_gloo(), nccl: ffi::has_nccl() }
-    }
-}
-
 impl ProcessGroup {
     /// Returns the group of a process that runs alone.
     pub fn single() -> Self {
@@ -77,11 +61,10 @@ impl ProcessGroup {
             ))
         };
         let (rank, ranks) = (env.rank as i32, env.ranks as i32);
-        let Backends { gloo, nccl } = Backends::built_in();
         let is_on_gpus = device.is_cuda();
-        if is_on_gpus && !nccl {
+        if is_on_gpus && !ffi::has_nccl() {
             return Err(without("NCCL", "install what requirements.txt pins beside libtorch's wheel"));
-        } else if !is_on_gpus && !gloo {
+        } else if !is_on_gpus && !ffi::has_gloo() {
             return Err(without("Gloo", "install its headers (Debian and Ubuntu: apt install libgloo-dev)"));
         }
         let inner = ffi::new_group(is_on_gpus, store, rank, ranks, COLLECTIVE_TIMEOUT_SECONDS);
@@ -118,12 +101,20 @@ impl ProcessGroup {
         self.rank == 0
     }
 
+    /// Calls a function of the C++ implementation, if there are several ranks.
+    fn call(
+        &self,
+        function: impl FnOnce(&ffi::ProcessGroup) -> std::result::Result<(), cxx::Exception>,
+    ) -> Result<()> {
+        self.inner.as_ref().map_or(Ok(()), |inner| function(inner).map_err(distributed_error))
+    }
+
     /// Shuts the group down after the last collective, if there was no error. All ranks call this.
     ///
     /// # Errors
     /// Returns an error if another rank is gone.
     pub fn shutdown(&self) -> Result<()> {
-        self.inner.as_ref().map_or(Ok(()), |inner| inner.shutdown().map_err(distributed_error))
+        self.call(ffi::ProcessGroup::shutdown)
     }
 
     /// Replaces `tensor` by its sum over all ranks, in place (an all-reduce). It has the same shape and kind on all ranks.
@@ -131,11 +122,8 @@ impl ProcessGroup {
     /// # Errors
     /// Returns an error if another rank is gone.
     pub fn all_reduce(&self, tensor: &Tensor) -> Result<()> {
-        match &self.inner {
-            // SAFETY: the tensor is alive, and the caller doesn't use it during the call.
-            Some(inner) => unsafe { inner.all_reduce(tensor.as_ptr() as usize) }.map_err(distributed_error),
-            None => Ok(()),
-        }
+        // SAFETY: the tensor is alive, and the caller doesn't use it during the call.
+        self.call(|group| unsafe { group.all_reduce(tensor.as_ptr() as usize) })
     }
 
     /// Replaces `tensor` by that of the first rank, in place. It has the same shape and kind on all ranks.
@@ -143,11 +131,8 @@ impl ProcessGroup {
     /// # Errors
     /// Returns an error if another rank is gone.
     pub fn broadcast(&self, tensor: &Tensor) -> Result<()> {
-        match &self.inner {
-            // SAFETY: the tensor is alive, and the caller doesn't use it during the call.
-            Some(inner) => unsafe { inner.broadcast(tensor.as_ptr() as usize) }.map_err(distributed_error),
-            None => Ok(()),
-        }
+        // SAFETY: the tensor is alive, and the caller doesn't use it during the call.
+        self.call(|group| unsafe { group.broadcast(tensor.as_ptr() as usize) })
     }
 
     /// Returns the values that all ranks pass, in the order of the ranks.
