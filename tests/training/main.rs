@@ -13,6 +13,12 @@ use serde_json::Value;
 use std::fs;
 use std::path::Path;
 
+/// Returns the line that trains in the sandbox's folder `run`, with `settings` separated by spaces.
+fn train(run: &str, settings: &str) -> String {
+    let settings = settings.split_whitespace().map(|setting| format!(" --set {setting}"));
+    format!("train --config @tiny.toml --out @{run}{}", settings.collect::<String>())
+}
+
 /// Returns the lines of metrics.jsonl about steps, and those about validations.
 fn metrics(run: &Path) -> (Vec<Value>, Vec<Value>) {
     let text = fs::read_to_string(run.join("metrics.jsonl")).unwrap_or_default();
