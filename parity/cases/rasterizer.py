@@ -50,12 +50,8 @@ def doubtful_pixels(config, inputs, margin):
 
 def doubtful_in_view(projected, opacities, pixels, margin):
     """Returns the mask of doubtful pixels of one view, bool [Q], by the rules of splat.composite."""
-    order = torch.argsort(projected["depth"], stable=True)
-    order = order[projected["visible"][order]]
+    order, alpha = splat.alphas(projected, opacities, pixels)
     depth = projected["depth"][order]
-    dx, dy = (projected["mean2d"][order][:, None] - pixels[None]).unbind(-1)
-    a, b, c = (projected["conic"][order][:, k, None] for k in range(3))
-    alpha = opacities[order][:, None] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
 
     def near(value, threshold):
         return (value / threshold - 1.0).abs() < margin
@@ -137,6 +133,5 @@ def color_fit(rng):
             "images": rng.uniform(0.0, 1.0, (1, cameras, 3, *size)),
             "masks": rng.choice([0.0, 0.5, 1.0], (1, cameras, 1, *size)),
         }
-        yield Draw(
-            inputs | images, config | {"steps": 6}, label=f"{cameras} views of {size[0]}×{size[1]}, {bases} bases"
-        )
+        label = f"{cameras} views of {size[0]}×{size[1]}, {bases} bases"
+        yield Draw(inputs | images, config | {"steps": 6}, label=label)

@@ -149,14 +149,9 @@ def parameters(rng, config, *prefixes):
         elif name.endswith(".weight"):
             value = normal(rng, *shape, scale=0.45 / shape[1] ** 0.5)
         elif name == "gaussian_decoder.geo_param_readout.bias":
-            value = np.concatenate(
-                [
-                    normal(rng, config["candidates"], 3, scale=3.0, mean=-2.0),
-                    normal(rng, config["candidates"], 6, scale=0.5),
-                    normal(rng, config["candidates"], 1, scale=4.0, mean=4.0),
-                ],
-                axis=1,
-            ).flatten()
+            kinds = [(3, 3.0, -2.0), (6, 0.5, 0.0), (1, 4.0, 4.0)]  # log-scales, rotations, opacity logits
+            columns = [normal(rng, config["candidates"], n, scale=scale, mean=mean) for n, scale, mean in kinds]
+            value = np.concatenate(columns, axis=1).flatten()
         else:  # biases and learnable tokens
             value = normal(rng, *shape, scale=0.3)
         drawn[name] = value

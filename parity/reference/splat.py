@@ -123,24 +123,25 @@ def pixel_centers(width, height, dtype=torch.float32, device=None):
     return torch.stack([j + 0.5, i + 0.5], dim=-1).reshape(-1, 2)
 
 
+def alphas(projected, opacities, pixels):
+    """Returns the visible Gaussians' indices by depth (ties: lower index first), and their uncapped alphas [N, Q] at pixels [Q, 2]."""
+    order = torch.argsort(projected["depth"], stable=True)
+    order = order[projected["visible"][order]]
+    dx, dy = (projected["mean2d"][order][:, None] - pixels[None]).unbind(-1)
+    a, b, c = (projected["conic"][order][:, k, None] for k in range(3))
+    sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+    return order, opacities[order][:, None] * torch.exp(-sigma)
+
+
 def composite(projected, opacities, colors, pixels):
     """Composites Gaussians at pixels [Q, 2]. projected is the dict of project(); opacities [N], colors [N, 3].
 
-    Returns RGB [Q, 3], accumulated opacity [Q], expected depth [Q]. In order of depth (ties: lower index first), for
-    the Gaussians that contribute to a pixel:
+    Returns RGB [Q, 3], accumulated opacity [Q], expected depth [Q]. In order of depth, for the Gaussians that contribute
+    to a pixel:
         w_i = T_i alpha_i,   T_i = prod_{j<i} (1 - alpha_j)
         RGB = sum w c,   A = sum w = 1 - T,   D = sum w z / A
     """
-    order = torch.argsort(projected["depth"], stable=True)
-    order = order[projected["visible"][order]]
-    mean2d, conic, depth = projected["mean2d"][order], projected["conic"][order], projected["depth"][order]
-    opacities, colors = opacities[order], colors[order]
-
-    delta = mean2d[:, None] - pixels[None]  # [N, Q, 2]
-    dx, dy = delta.unbind(-1)
-    a, b, c = (conic[:, k, None] for k in range(3))
-    sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-    alpha = opacities[:, None] * torch.exp(-sigma)
+    order, alpha = alphas(projected, opacities, pixels)
     alpha = alpha.masked_fill(alpha > LARGEST_ALPHA, LARGEST_ALPHA)  # no gradient through the cap
 
     # The selection of contributing Gaussians is not differentiable. T decreases along the list, so a comparison with
@@ -154,10 +155,12 @@ def composite(projected, opacities, colors, pixels):
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]], dim=0)
     weight = before * alpha  # [N, Q]
 
-    rgb = weight.T @ colors
+    rgb = weight.T @ colors[order]
     accumulated = weight.sum(0)
     covered = accumulated > SMALLEST_ACCUMULATION
-    expected = torch.where(covered, (weight.T @ depth) / torch.where(covered, accumulated, 1.0), 0.0)
+    expected = torch.where(
+        covered, (weight.T @ projected["depth"][order]) / torch.where(covered, accumulated, 1.0), 0.0
+    )
     return rgb, accumulated, expected
 
 

@@ -11,11 +11,8 @@ DISTANCE = 1.8  # to which the warp moves what the photos show
 FARTHEST = 40.0  # depth of pixels whose inverse depth is smaller
 NEAREST = 0.5  # distance of what is closer
 CELLS = 128  # along each side of the map of directions
-BLUR, BLURS, COARSER = (
-    1.0,
-    4,
-    0.02,
-)  # the finest blur in cells, their number, and the weight of each relative to the next finer one
+# The finest blur in cells, their number, and the weight of each relative to the next finer one.
+BLUR, BLURS, COARSER = 1.0, 4, 0.02
 PRIOR = 1e-6  # weight of DISTANCE
 
 
