@@ -66,9 +66,5 @@ def load_model(weights: str | os.PathLike[str] | None = None) -> Model:
         >>> gaussians = model(images, c2w, Ks)
     """
     arrays, config, stage, mix = _native.read_model(weights)
-    return Model(
-        json.loads(config),
-        {name: torch.from_numpy(array) for name, array in arrays.items()},
-        stage,
-        mix,
-    )
+    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    return Model(json.loads(config), tensors, stage, mix)

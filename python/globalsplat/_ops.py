@@ -18,15 +18,9 @@ def result_dtype(means: Tensor) -> torch.dtype:
 
 def _splat_fake(means: Tensor, *inputs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     viewmats, (width, height) = inputs[4], inputs[6:8]
-    scenes, cameras = viewmats.shape[:2]
-    empty = means.new_empty
-    dtype = result_dtype(means)
-    return (
-        empty((scenes, cameras, 3, height, width), dtype=dtype),
-        empty((scenes, cameras, height, width), dtype=dtype),
-        empty((scenes, cameras, height, width), dtype=dtype),
-        torch.empty(1, dtype=torch.int64, device="cpu"),
-    )
+    rgb = means.new_empty((*viewmats.shape[:2], 3, height, width), dtype=result_dtype(means))
+    alpha, depth = (rgb.new_empty((*viewmats.shape[:2], height, width)) for _ in range(2))
+    return rgb, alpha, depth, torch.empty(1, dtype=torch.int64, device="cpu")
 
 
 def _splat_backward_fake(*inputs: Any) -> tuple[Tensor, ...]:
@@ -41,16 +35,9 @@ def _splat_backward_fake(*inputs: Any) -> tuple[Tensor, ...]:
 
 
 def _project_fake(means: Tensor, *inputs: Any) -> tuple[Tensor, ...]:
-    shape = (*inputs[4].shape[:2], means.shape[1])
-    dtype = result_dtype(means)
-    return (
-        means.new_empty((*shape, 2), dtype=dtype),
-        means.new_empty((*shape, 3), dtype=dtype),
-        means.new_empty(shape, dtype=dtype),
-        means.new_empty(shape, dtype=dtype),
-        means.new_empty((*shape, 2), dtype=dtype),
-        means.new_empty(shape, dtype=torch.int64),
-    )
+    shape, dtype = (*inputs[4].shape[:2], means.shape[1]), result_dtype(means)
+    numbers = [means.new_empty((*shape, *each), dtype=dtype) for each in ((2,), (3,), (), (), (2,))]
+    return (*numbers, means.new_empty(shape, dtype=torch.int64))
 
 
 def _save_for_backward(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:

@@ -185,9 +185,8 @@ def rasterization(
     if sh_degree is not None:
         bases = (sh_degree + 1) ** 2
         if bases > colors.shape[-2]:
-            raise ValueError(
-                f"colors has {colors.shape[-2]} spherical harmonics, expected {bases} or more for degree {sh_degree}"
-            )
+            found = f"colors has {colors.shape[-2]} spherical harmonics"
+            raise ValueError(f"{found}, expected {bases} or more for degree {sh_degree}")
         passes = [colors[..., :bases, :]]
     elif has_colors:
         padded = torch.nn.functional.pad(colors, (0, -channels % CHANNELS))

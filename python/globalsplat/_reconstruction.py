@@ -118,14 +118,9 @@ def refine(
         >>> splat = globalsplat.refine("captures/room", seconds=30)
         >>> globalsplat.save_splat("room.ply", splat)
     """
-    for name, value, least in (
-        ("steps", steps, 1),
-        ("gaussians", gaussians, 1),
-        ("views", views, 1),
-        ("size", size, 1),
-        ("seed", seed, 0),
-    ):
-        expect(name, value, value is None or value >= least, f"{least} or more")
+    for name, value in (("steps", steps), ("gaussians", gaussians), ("views", views), ("size", size)):
+        expect(name, value, value is None or value >= 1, "1 or more")
+    expect("seed", seed, seed >= 0, "0 or more")
     options = {
         "seconds": seconds,
         "steps": steps,
@@ -151,9 +146,8 @@ def _to_capture(capture: Capture | Path | Tensor, viewmats: Tensor | None = None
         if images.is_floating_point():
             images = (images.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
         if images.dtype != torch.uint8 or images.dim() != 4 or images.shape[3] != 3:
-            raise ValueError(
-                f"images are {images.dtype} of shape {list(images.shape)}, expected uint8 or floats [V, H, W, 3]"
-            )
+            found = f"{images.dtype} of shape {list(images.shape)}"
+            raise ValueError(f"images are {found}, expected uint8 or floats [V, H, W, 3]")
         expect_shape("viewmats", viewmats, len(images), 4, 4)
         expect_shape("Ks", Ks, len(images), 3, 3)
         if Ks[:, 0, 1].any():
@@ -179,8 +173,6 @@ def _cuda_index(device: str | torch.device) -> int | None:
 
 
 def _to_tensors(raw: Mapping[str, Any], device: str | torch.device) -> Splat:
-    items = to_splat(raw).items()
-    return cast(
-        Splat,
-        {name: torch.from_numpy(value).to(device) if isinstance(value, np.ndarray) else value for name, value in items},
-    )
+    splat = to_splat(raw)
+    tensors = {key: torch.from_numpy(value).to(device) for key, value in splat.items() if isinstance(value, np.ndarray)}
+    return cast(Splat, splat | tensors)

@@ -153,10 +153,8 @@ def from_splat(splat: Mapping[str, Any] | torch.nn.ParameterDict, activated: boo
     mode = splat.get("rasterize_mode", "classic")
     expect("rasterize_mode", repr(mode), mode in ("classic", "antialiased"), "classic or antialiased")
     if activated:
-        for name, array, most, expected in (
-            ("scales", scales, np.inf, "0 or more"),
-            ("opacities", opacities, 1.0, "0 to 1"),
-        ):
+        ranges = (("scales", scales, np.inf, "0 or more"), ("opacities", opacities, 1.0, "0 to 1"))
+        for name, array, most, expected in ranges:
             invalid = array[(array < 0.0) | (array > most)]
             if len(invalid) > 0:
                 raise ValueError(f"{name} has {invalid[0]:g}, expected {expected}")
