@@ -62,6 +62,11 @@ struct Projected {
   Tensor visible;   // [B, C, N], int64, 1 if a Gaussian isn't dropped
 };
 
+struct SplatArguments;  // shared with Rust, see src/render.rs
+
+// Returns the arguments of a call from Rust.
+Inputs borrowed(const SplatArguments& of);
+
 // State other than tensors that a backend's splat() passes to its splat_backward().
 struct SavedState {
   virtual ~SavedState() = default;

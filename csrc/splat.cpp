@@ -102,9 +102,13 @@ struct SplatFunction : torch::autograd::Function<SplatFunction> {
 
 }  // namespace
 
+Inputs borrowed(const SplatArguments& of) {
+  return {{borrowed(of.means), borrowed(of.scales), borrowed(of.quaternions), borrowed(of.opacities), borrowed(of.sh)},
+          borrowed(of.w2c), borrowed(of.intrinsics), of.width, of.height, {of.eps2d, of.antialiased}};
+}
+
 rust::Vec<size_t> splat(const SplatArguments& of) {
-  const Inputs given{{borrowed(of.means), borrowed(of.scales), borrowed(of.quaternions), borrowed(of.opacities), borrowed(of.sh)},
-                     borrowed(of.w2c), borrowed(of.intrinsics), of.width, of.height, {of.eps2d, of.antialiased}};
+  const Inputs given = borrowed(of);
   const Inputs in = given.to_backend();
   const Gaussians& g = in.gaussians;
   rust::Vec<size_t> out;

@@ -5,13 +5,16 @@
 #include <ATen/ops/zeros_like.h>
 
 #include <algorithm>
+#include <chrono>
 #include <cmath>
 #include <memory>
+#include <numeric>
 #include <type_traits>
 #include <vector>
 
 #include "../backend.h"
 #include "../kernels/kernels.h"
+#include "../kernels/parallel.h"
 #include "../kernels/projection_params.h"
 #include "../kernels/raster.h"
 #include "../runtime.h"
@@ -112,15 +115,20 @@ std::vector<raster::RenderOutput<Pixel>> pictures_of(const RenderOutput& p) {
   return pictures;
 }
 
+template <class T>
+std::unique_ptr<raster::Frame<T>> draw(const Inputs& in, RenderOutput& out) {
+  const auto options = in.gaussians.means.options();
+  out.rgb = at::empty({in.scenes(), in.cameras(), 3, in.height, in.width}, options);
+  out.alpha = at::empty({in.scenes(), in.cameras(), in.height, in.width}, options);
+  out.depth = at::empty_like(out.alpha);
+  const raster::Settings settings{int(in.width), int(in.height), in.projection, get_num_threads()};
+  return raster::Frame<T>::draw(scenes_of<T>(in), views_of<T>(in), settings, pictures_of<T>(out), last_times);
+}
+
 RenderOutput splat(const Inputs& in, std::unique_ptr<const SavedState>& saved) {
   return dispatch_by_type(in, [&](auto number) {
-    using T = decltype(number);
-    const auto options = in.gaussians.means.options();
-    const Tensor alpha = at::empty({in.scenes(), in.cameras(), in.height, in.width}, options);
-    const RenderOutput out{at::empty({in.scenes(), in.cameras(), 3, in.height, in.width}, options), alpha, at::empty_like(alpha)};
-    const raster::Settings settings{int(in.width), int(in.height), in.projection, get_num_threads()};
-    saved = std::make_unique<SavedFrame<T>>(
-        raster::Frame<T>::draw(scenes_of<T>(in), views_of<T>(in), settings, pictures_of<T>(out), last_times));
+    RenderOutput out;
+    saved = std::make_unique<SavedFrame<decltype(number)>>(draw<decltype(number)>(in, out));
     return out;
   });
 }
@@ -198,6 +206,29 @@ const Backend backend = {at::kCPU, splat, splat_backward, project};
 StageTimes stage_times() {
   const raster::StageTimes& t = cpu::last_times;
   return {t.project, t.sort, t.bin, t.blend, t.blend_backward, t.project_backward};
+}
+
+PairCounts count_pairs(const SplatArguments& of) {
+  const Inputs in = borrowed(of).to_backend();
+  TORCH_CHECK(in.gaussians.means.is_cpu() && in.gaussians.means.scalar_type() == at::kFloat, "pairs are counted on the CPU, in float32");
+  RenderOutput out;
+  const raster::PairCounts counts = cpu::draw<float>(in, out)->count_pairs();
+  return {counts.tile_entries, counts.evaluated, counts.contributing};
+}
+
+double multiply_add_peak(double seconds) {
+  std::vector<double> rates(static_cast<size_t>(get_num_threads()));
+  raster::parallel_for(int(rates.size()), int64_t(rates.size()), [&](int64_t thread) {
+    const auto start = std::chrono::steady_clock::now();
+    float out = 1;
+    double operations = 0, elapsed = 0;
+    while (elapsed < seconds) {
+      operations += double(raster::kernels().multiply_adds(1 << 16, &out));
+      elapsed = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
+    }
+    rates[size_t(thread)] = operations / elapsed;
+  });
+  return std::accumulate(rates.begin(), rates.end(), 0.);
 }
 
 rust::String simd_level() { return raster::kernels().name; }

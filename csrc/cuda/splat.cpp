@@ -1,15 +1,21 @@
-// The GPU backend.
+// The GPU backend, and the measurement of its kernels with events around every launch, which is off unless a benchmark turns it on.
 
 #include <ATen/TensorOperators.h>
 #include <ATen/ops/empty.h>
 #include <ATen/ops/empty_like.h>
 #include <ATen/ops/stack.h>
 #include <ATen/ops/where.h>
+#include <c10/core/Event.h>
 
+#include <algorithm>
+#include <atomic>
+#include <mutex>
 #include <vector>
 
 #include "../backend.h"
+#include "../splat.h"
 #include "frame.h"
+#include "globalsplat-csrc/src/render.rs.h"
 #include "torch_device.h"
 
 namespace globalsplat::cuda {
@@ -93,9 +99,30 @@ Projected project(const Inputs& in) {
           visible.to(at::kLong)};
 }
 
+struct MeasuredLaunch {
+  const char* kernel;
+  c10::Event begin, end;
+};
+
+// Not thread-local, because the backward pass launches from one of autograd's threads.
+std::atomic<bool> measuring{false};
+std::mutex launches_mutex;
+std::vector<MeasuredLaunch> launches;
+
 constexpr Backend backend_on(at::DeviceType device) { return {device, splat, splat_backward, project}; }
 
 }  // namespace
+
+void measured_launch(const char* kernel, const c10::Stream& stream, const std::function<void()>& launch) {
+  if (!measuring) return launch();
+  const auto event = [&] { return c10::Event(stream.device_type(), c10::EventFlag::BACKEND_DEFAULT); };
+  MeasuredLaunch measured{kernel, event(), event()};
+  measured.begin.record(stream);
+  launch();
+  measured.end.record(stream);
+  const std::lock_guard<std::mutex> lock(launches_mutex);
+  launches.push_back(std::move(measured));
+}
 
 const Backend backend = backend_on(at::kCUDA);
 
@@ -105,3 +132,28 @@ const Backend* emulated_backend() {
 }
 
 }  // namespace globalsplat::cuda
+
+namespace globalsplat {
+
+void measure_kernels(bool on) {
+  const std::lock_guard<std::mutex> lock(cuda::launches_mutex);
+  cuda::launches.clear();
+  cuda::measuring = on;
+}
+
+rust::Vec<KernelTime> kernel_times() {
+  const std::lock_guard<std::mutex> lock(cuda::launches_mutex);
+  rust::Vec<KernelTime> times;
+  for (const cuda::MeasuredLaunch& launch : cuda::launches) {
+    launch.end.synchronize();
+    auto time = std::find_if(times.begin(), times.end(), [&](const KernelTime& t) { return t.kernel == launch.kernel; });
+    if (time == times.end()) {
+      times.push_back(KernelTime{launch.kernel, 0});
+      time = times.end() - 1;
+    }
+    time->milliseconds += launch.begin.elapsedTime(launch.end);
+  }
+  return times;
+}
+
+}  // namespace globalsplat

@@ -9,6 +9,7 @@
 #include <c10/core/impl/VirtualGuardImpl.h>
 
 #include <cstdlib>
+#include <functional>
 #include <memory>
 
 #include "device.h"
@@ -20,6 +21,9 @@ namespace globalsplat::cuda {
 inline at::Tensor tensor_of(const void* memory, at::IntArrayRef size, const at::TensorOptions& options) {
   return at::for_blob(const_cast<void*>(memory), size).options(options).target_device(options.device()).make_tensor();
 }
+
+// Calls `launch`, which launches one kernel in `stream`, between two events if measurement is on.
+void measured_launch(const char* kernel, const c10::Stream& stream, const std::function<void()>& launch);
 
 // GPU of a tensor: memory from torch's allocator, kernels in torch's current stream.
 class Gpu : public Device {
@@ -34,8 +38,10 @@ class Gpu : public Device {
   void launch(const char* kernel, Blocks blocks, int threads_per_block, void** arguments) const override {
     const at::Device device = options_.device();
     const c10::Stream stream = c10::impl::VirtualGuardImpl(device.type()).getStream(device);
-    launch_kernel(device.index(), reinterpret_cast<size_t>(stream.native_handle()), kernel, {uint32_t(blocks.x), uint32_t(blocks.y)},
-                  uint32_t(threads_per_block), reinterpret_cast<size_t>(arguments));
+    measured_launch(kernel, stream, [&] {
+      launch_kernel(device.index(), reinterpret_cast<size_t>(stream.native_handle()), kernel,
+                    {uint32_t(blocks.x), uint32_t(blocks.y)}, uint32_t(threads_per_block), reinterpret_cast<size_t>(arguments));
+    });
   }
 
   uint64_t read(const uint64_t* number) const override {

@@ -257,4 +257,43 @@ void blend_tile_backward(const TileJob<T>& job, const RenderOutput<const T>& pic
   }
 }
 
+// Adds the pairs that blending a tile processes to `counts`, for benchmarks.
+template <class T>
+void count_pairs(const TileJob<T>& job, PairCounts& counts) {
+  Vector<T> transmittance[kBlocks][kVectors<T>];
+  for (int block = 0; block < kBlocks; ++block)
+    begin_block<T>({job.x0 + block % 4 * kBlock, job.y0 + block / 4 * kBlock, job.width, job.height}, transmittance[block]);
+  counts.tile_entries += job.count;
+  for (int64_t item = 0; item < job.count; ++item)
+    for (uint32_t blocks = job.entries[item].blocks; blocks != 0; blocks &= blocks - 1) {
+      const int block = __builtin_ctz(blocks);
+      for (int k = 0; k < kVectors<T>; ++k) {
+        Vector<T>& t = transmittance[block][k];
+        if (!any(less(Vector<T>{}, t))) continue;
+        const Vector<T> x = T(job.x0 + block % 4 * kBlock) + load<T>(kCenters<T>.x + k * Simd<T>::lanes);
+        const Vector<T> y = T(job.y0 + block / 4 * kBlock) + load<T>(kCenters<T>.y + k * Simd<T>::lanes);
+        Evaluated<T> e;
+        evaluate(job.splats[job.entries[item].splat], x, y, e);
+        const Contribution<T> c = blend<T>(t, e.raw);
+        t = next_transmittance(c);
+        counts.evaluated += Simd<T>::lanes;
+        counts.contributing += __builtin_popcount(uint32_t(lane_bits(less(Vector<T>{}, c.weight))));
+      }
+    }
+}
+
+// Runs `rounds` times 16 independent vectors of multiply-adds. Returns the number of floating-point operations, two for each; `out` keeps
+// the compiler from removing the computation.
+inline int64_t multiply_adds(int64_t rounds, float* out) {
+  constexpr int chains = 16;
+  Vector<float> sums[chains];
+  for (int k = 0; k < chains; ++k) sums[k] = broadcast<float>(*out + float(k));
+  const Vector<float> factor = broadcast<float>(0.999f), term = broadcast<float>(*out);
+  for (int64_t round = 0; round < rounds; ++round)
+    for (Vector<float>& sum : sums) sum = fma(sum, factor, term);
+  for (int k = 1; k < chains; ++k) sums[0] += sums[k];
+  *out = sums[0][0];
+  return rounds * chains * Simd<float>::lanes * 2;
+}
+
 }  // namespace globalsplat::raster::GS_ISA

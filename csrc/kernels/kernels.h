@@ -16,6 +16,7 @@ struct KernelsOf {
   void (*blend)(const TileJob<T>&, const RenderOutput<T>&);
   void (*blend_backward)(const TileJob<T>&, const RenderOutput<const T>& pictures, const RenderOutput<const T>& gradients,
                          SplatGradient<T>* records);
+  void (*count_pairs)(const TileJob<T>&, PairCounts& counts);
   void (*project_backward)(const Gaussians<T>&, int64_t begin, int64_t end, const ProjectionParams<T>* params, int64_t views,
                            const SplatRecords<T>* records, const GaussianGradients<T>& out,
                            CameraGradient<T>* cameras);
@@ -49,6 +50,7 @@ struct Kernels {
   void (*costs_of_rows)(const MatchedPhoto&, const float* scores, int begin, int end, float* costs);
   void (*sum_paths)(const MatchedPhoto&, const float* costs, bool backward, float* sums, float* scratch);
   void (*choose_planes)(const MatchedPhoto&, const PlaneCosts&, float step, int begin, int end, float* inverse_depth, float* confidence);
+  int64_t (*multiply_adds)(int64_t rounds, float* out);
 
   template <class T>
   const KernelsOf<T>& of() const {

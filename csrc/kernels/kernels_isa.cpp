@@ -18,10 +18,10 @@ namespace globalsplat::raster::GS_ISA {
 extern const Kernels table;
 const Kernels table = {
     GS_STRING(GS_ISA),
-    {project<float>, list_touched_tiles<float>, blend_tile<float>, blend_tile_backward<float>, project_backward<float>, ssim<float>,
-     photometric_gradient<float>, unevenness<float>, adam<float>},
-    {project<double>, list_touched_tiles<double>, blend_tile<double>, blend_tile_backward<double>, project_backward<double>, ssim<double>,
-     photometric_gradient<double>, unevenness<double>, adam<double>},
+    {project<float>, list_touched_tiles<float>, blend_tile<float>, blend_tile_backward<float>, count_pairs<float>, project_backward<float>,
+     ssim<float>, photometric_gradient<float>, unevenness<float>, adam<float>},
+    {project<double>, list_touched_tiles<double>, blend_tile<double>, blend_tile_backward<double>, count_pairs<double>,
+     project_backward<double>, ssim<double>, photometric_gradient<double>, unevenness<double>, adam<double>},
     attention_forward,
     pack_queries,
     attention_backward,
@@ -34,6 +34,7 @@ const Kernels table = {
     costs_of_rows,
     sum_paths,
     choose_planes,
+    multiply_adds,
 };
 
 }  // namespace globalsplat::raster::GS_ISA

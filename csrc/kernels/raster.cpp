@@ -262,6 +262,14 @@ void Frame<T>::backward(const std::vector<Gaussians<T>>& scenes, const std::vect
   times.project_backward = watch.lap();
 }
 
+template <class T>
+PairCounts Frame<T>::count_pairs() const {
+  PairCounts counts;
+  for (const PerView& view : views_)
+    for (int tile = 0; tile < grid_.tiles(); ++tile) kernels().of<T>().count_pairs(job(view, tile), counts);
+  return counts;
+}
+
 template class Frame<float>;
 template class Frame<double>;
 

@@ -45,6 +45,9 @@ class Frame {
                 const std::vector<RenderOutput<const T>>& gradients, const std::vector<GaussianGradients<T>>& out,
                 CameraGradient<T>* cameras, StageTimes& times) const;
 
+  // Counts the pairs that blending all views processes, for benchmarks.
+  PairCounts count_pairs() const;
+
   ~Frame();
 
  private:

@@ -146,6 +146,13 @@ struct RenderOutput {
   Pixel* depth;
 };
 
+// Numbers of (pixel, splat) pairs and of (tile, splat) pairs.
+struct PairCounts {
+  int64_t tile_entries = 0;
+  int64_t evaluated = 0;     // pairs whose α is computed
+  int64_t contributing = 0;  // pairs that are blended
+};
+
 // Job that blends one tile.
 template <class T>
 struct TileJob {

@@ -53,6 +53,26 @@ mod ffi {
         project_backward: f64,
     }
 
+    /// Numbers of pairs to blend, summed over all views of a call.
+    #[derive(Debug, Clone, Copy)]
+    struct PairCounts {
+        /// Number of (tile, splat) pairs.
+        tile_entries: i64,
+        /// Number of (pixel, splat) pairs whose α is computed.
+        evaluated: i64,
+        /// Number of (pixel, splat) pairs that are blended.
+        contributing: i64,
+    }
+
+    /// Total time of all launches of one of the rasterizer's GPU kernels.
+    #[derive(Debug, Clone)]
+    struct KernelTime {
+        /// Name of the kernel.
+        kernel: String,
+        /// Total time in milliseconds.
+        milliseconds: f64,
+    }
+
     unsafe extern "C++" {
         include!("splat.h");
 
@@ -61,6 +81,18 @@ mod ffi {
 
         /// Returns the stage times of this thread's last call; see `csrc/splat.h`.
         fn stage_times() -> StageTimes;
+
+        /// Counts the pairs that a call blends; see `csrc/splat.h`.
+        unsafe fn count_pairs(of: &SplatArguments) -> Result<PairCounts>;
+
+        /// Measures the peak rate of multiply-adds in operations per second; see `csrc/splat.h`.
+        fn multiply_add_peak(seconds: f64) -> f64;
+
+        /// Starts or ends the measurement of GPU kernels; see `csrc/splat.h`.
+        fn measure_kernels(on: bool);
+
+        /// Returns the measured times of GPU kernels; see `csrc/splat.h`.
+        fn kernel_times() -> Result<Vec<KernelTime>>;
 
         /// Returns the instruction set of the CPU kernels in use; see `csrc/splat.h`.
         fn simd_level() -> Result<String>;

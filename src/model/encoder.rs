@@ -3,7 +3,7 @@
 
 use super::config::{ModelConfig, Streams};
 use super::layers::{ENCODER_STD, LayerScale, Mlp, attention, layer_norm, linear, normalize, project, randn};
-use super::precision::Precision;
+use super::precision::{Precision, record_op};
 use super::tokens::ImageTokens;
 use super::{backward_from_grads, leaf, tracks_grad};
 use tch::{Device, Tensor, nn, no_grad};
@@ -177,7 +177,7 @@ impl StreamRound {
             [attn_out] => attn_out.shallow_clone(),
             several => Tensor::cat(several, -1),
         };
-        trace_span!("residual sums").in_scope(|| attn_out + mean_value)
+        record_op(trace_span!("residual sums"), &[&attn_out], || &attn_out + &mean_value)
     }
 
     /// Returns the layer that computes keys and values, concatenated, of centered tokens, restricted to `width` channels from `first` on of

@@ -1,6 +1,6 @@
 //! Layers that the model is built from, with the initializations of spec 4.4. Each is a span, whose time `bench` measures.
 
-use super::precision::{Precision, record_flops};
+use super::precision::{Precision, record_op, record_work};
 use crate::ffi::take_tensor;
 use globalsplat_csrc::runtime::{Bf16Support, cpu_bf16_support};
 use globalsplat_csrc::tensor_ops as ours;
@@ -63,14 +63,15 @@ pub(super) fn layer_norm(vs: nn::Path, width: i64) -> nn::LayerNorm {
 
 /// Applies `norm` to `xs`.
 pub(super) fn normalize(norm: &nn::LayerNorm, xs: &Tensor) -> Tensor {
-    trace_span!("norms").in_scope(|| norm.forward(xs))
+    record_op(trace_span!("norms"), &[xs], || norm.forward(xs))
 }
 
 /// Normalizes `xs` over the last dimension without γ and β.
 pub(super) fn normalize_without_affine(xs: &Tensor) -> Tensor {
     let width = *xs.size().last().expect("a last dimension");
-    trace_span!("norms")
-        .in_scope(|| xs.layer_norm([width], None::<&Tensor>, None::<&Tensor>, LAYER_NORM_EPS, true))
+    record_op(trace_span!("norms"), &[xs], || {
+        xs.layer_norm([width], None::<&Tensor>, None::<&Tensor>, LAYER_NORM_EPS, true)
+    })
 }
 
 /// Learned gain γ, in float32, of an update that is added to a stream.
@@ -86,7 +87,7 @@ impl LayerScale {
 
     /// Returns xs + γ ⊙ `change`.
     pub fn add(&self, xs: &Tensor, change: &Tensor) -> Tensor {
-        trace_span!("residual sums").in_scope(|| xs.addcmul(change, &self.gamma))
+        record_op(trace_span!("residual sums"), &[xs, change], || xs.addcmul(change, &self.gamma))
     }
 }
 
@@ -112,8 +113,11 @@ impl Mlp {
     }
 
     pub fn forward(&self, xs: &Tensor, precision: Precision) -> Tensor {
-        trace_span!("MLPs")
-            .in_scope(|| precision.linear(&self.contract, &gelu(precision.linear(&self.expand, xs))))
+        trace_span!("MLPs").in_scope(|| {
+            let hidden = gelu(precision.linear(&self.expand, xs));
+            record_work(0, 0, &[&hidden, &hidden]);
+            precision.linear(&self.contract, &hidden)
+        })
     }
 }
 
@@ -129,7 +133,7 @@ pub(crate) fn attention(q: &Tensor, k: &Tensor, v: &Tensor, heads: i64) -> Tenso
     let size = q.size();
     let flops = 4 * size[0] * size[1] * k.size()[1] * size[2];
     // The backward pass recomputes the scores, and computes gradients of queries, keys, attention weights and values.
-    record_flops(flops, if out.requires_grad() { 5 * flops / 2 } else { 0 });
+    record_work(flops, if out.requires_grad() { 5 * flops / 2 } else { 0 }, &[q, k, v, &out]);
     out
 }
 

@@ -8,7 +8,7 @@ use std::fmt;
 use std::str::FromStr;
 use tch::nn::Module;
 use tch::{Device, Kind, Tensor, nn};
-use tracing::trace;
+use tracing::{Span, trace};
 
 /// Precision of the encoder's linear layers and attention, of the decoder's appearance head, and of the network of L_perc. Everything else
 /// is always float32: weights and their gradients, norms, the mean value, accumulation within softmax and products, residual
@@ -80,7 +80,7 @@ fn product(xs: &Tensor, weights: &Tensor, bias: Option<&Tensor>) -> Tensor {
         false => xs.linear(weights, bias),
     };
     let flops = 2 * (xs.numel() as i64) * weights.size()[0];
-    record_flops(flops, backward_flops(flops, [xs, weights], &out));
+    record_work(flops, backward_flops(flops, [xs, weights], &out), &[xs, weights, &out]);
     out
 }
 
@@ -93,17 +93,28 @@ fn backward_flops(flops: i64, both: [&Tensor; 2], out: &Tensor) -> i64 {
     }
 }
 
-/// Records work in the current `tracing` span: `flops` floating-point operations of matrix products in the forward pass, and `backward_flops`
-/// in the backward pass (0 if no gradient is needed).
-pub(super) fn record_flops(flops: i64, backward_flops: i64) {
-    trace!(flops, backward_flops);
+/// Records work in the current `tracing` span: `flops` floating-point operations of matrix products in the forward pass, `backward_flops` in
+/// the backward pass (0 if no gradient is needed), and the bytes of `tensors`, the inputs and outputs.
+pub(super) fn record_work(flops: i64, backward_flops: i64, tensors: &[&Tensor]) {
+    let bytes = |t: &&Tensor| t.numel() * t.kind().elt_size_in_bytes();
+    trace!(flops, backward_flops, bytes = tensors.iter().map(bytes).sum::<usize>() as i64);
+}
+
+/// Runs `op`, which has no matrix products, in `span`, and records the bytes of its inputs and of its output there.
+pub(super) fn record_op(span: Span, inputs: &[&Tensor], op: impl FnOnce() -> Tensor) -> Tensor {
+    span.in_scope(|| {
+        let out = op();
+        record_work(0, 0, inputs);
+        record_work(0, 0, &[&out]);
+        out
+    })
 }
 
 /// Returns the ReLU of `layer` applied to `images`, [B, C, H, W].
 pub(crate) fn convolve(layer: &nn::Conv2D, images: &Tensor) -> Tensor {
     let out = layer.forward(images).relu_();
     let flops = 2 * (out.numel() * layer.ws.numel()) as i64 / layer.ws.size()[0];
-    record_flops(flops, backward_flops(flops, [images, &layer.ws], &out));
+    record_work(flops, backward_flops(flops, [images, &layer.ws], &out), &[images, &layer.ws, &out]);
     out
 }
 

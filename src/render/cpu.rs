@@ -1,9 +1,11 @@
 //! CPU-only functions: measurements of the CPU rasterizer and its instruction set.
 
+use super::{Cameras, splat_arguments};
 use crate::error::Result;
+use crate::scene::Gaussians;
 use globalsplat_csrc::{render as ffi, runtime};
 
-pub use ffi::{StageTimes, stage_times};
+pub use ffi::{PairCounts, StageTimes, multiply_add_peak, stage_times};
 pub use globalsplat_csrc::runtime::libtorch_simd_level;
 
 /// Returns the instruction set of the rasterizer's kernels: `avx512`, `avx2`, `neon` or `portable`.
@@ -12,6 +14,15 @@ pub use globalsplat_csrc::runtime::libtorch_simd_level;
 /// Fails if `GLOBALSPLAT_SIMD` names an instruction set that this machine doesn't have.
 pub fn simd_level() -> Result<String> {
     Ok(ffi::simd_level()?)
+}
+
+/// Counts the tile entries and (pixel, splat) pairs that [`render()`](super::render()) blends for float32 Gaussians on the CPU.
+///
+/// # Errors
+/// Fails like [`render()`](super::render()), and if the Gaussians aren't float32 or not on the CPU.
+pub fn count_pairs(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<PairCounts> {
+    // SAFETY: the tensors outlive the call.
+    Ok(unsafe { ffi::count_pairs(&splat_arguments(gaussians, cameras, eps2d)) }?)
 }
 
 /// Guard that limits libtorch to one thread while it lives. The kernels of this program use as many threads as libtorch did before. This is

@@ -24,6 +24,7 @@ pub mod cuda {
     pub use globalsplat_csrc::cuda::{
         CodeFormat, Driver, Gpu, KernelOrigin, Nvrtc, cache_folder, load_kernels,
     };
+    pub use globalsplat_csrc::render::{KernelTime, kernel_times, measure_kernels};
 }
 
 /// Value added to the diagonal of every projected covariance of a splat that isn't antialiased, in pixels².
@@ -90,8 +91,15 @@ pub struct RenderOutput {
 /// Fails if shapes don't match, if `GLOBALSPLAT_SIMD` names an instruction set that this machine doesn't have, or if kernels can't be
 /// compiled for the GPU.
 pub fn render(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<RenderOutput> {
+    // SAFETY: the tensors outlive the call, which returns the addresses of new ones.
+    let [rgb, alpha, depth] = unsafe { take_tensors(splat(&splat_arguments(gaussians, cameras, eps2d))?) };
+    Ok(RenderOutput { rgb, alpha, depth })
+}
+
+/// Returns the arguments of a call of the C++ side. They are valid as long as `gaussians` and `cameras` live.
+fn splat_arguments(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> SplatArguments {
     let address = |t: &Tensor| t.as_ptr() as usize;
-    let arguments = SplatArguments {
+    SplatArguments {
         means: address(&gaussians.means),
         scales: address(&gaussians.scales),
         quaternions: address(&gaussians.quaternions),
@@ -103,8 +111,5 @@ pub fn render(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<Re
         height: cameras.height as i32,
         eps2d,
         antialiased: gaussians.antialiased,
-    };
-    // SAFETY: the tensors outlive the call, which returns the addresses of new ones.
-    let [rgb, alpha, depth] = unsafe { take_tensors(splat(&arguments)?) };
-    Ok(RenderOutput { rgb, alpha, depth })
+    }
 }

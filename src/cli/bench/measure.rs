@@ -111,8 +111,8 @@ impl Measured {
         self.sections.into_iter().map(section).collect()
     }
 
-    /// Returns each section with its work: GFLOP of its matrix products and of their backward pass (0 if gradients aren't recorded), and the
-    /// throughput at the minimum time as a fraction of `peak_gflops`.
+    /// Returns each section with its work: GFLOP of its matrix products and of their backward pass (0 if gradients aren't recorded), GB of
+    /// memory traffic if each element is moved once, and the throughput at the minimum time as a fraction of `peak_gflops`.
     pub fn parts(self, peak_gflops: f64) -> Vec<Value> {
         let part = |Recorded { name, milliseconds, work }: Recorded| {
             let milliseconds = TimingStats::from_milliseconds(milliseconds);
@@ -121,6 +121,7 @@ impl Measured {
                 "milliseconds": milliseconds,
                 "gflop": 1e-9 * work.flops,
                 "backward_gflop": 1e-9 * work.backward_flops,
+                "gigabytes": 1e-9 * work.bytes,
                 "share_of_peak": 1e-6 * work.flops / milliseconds.min / peak_gflops,
             })
         };
@@ -168,13 +169,15 @@ struct State {
     start: Option<Result<DeviceEvent>>,
 }
 
-/// Sums of the fields of `record_flops` in the model.
+/// Sums of the fields of `record_work` in the model.
 #[derive(Default)]
 pub struct Work {
     /// Floating-point operations of matrix products.
     flops: f64,
     /// Floating-point operations of the backward pass of these products.
     backward_flops: f64,
+    /// Bytes of the inputs and outputs of these products, and of norms and sums.
+    bytes: f64,
 }
 
 impl Visit for Work {
@@ -182,6 +185,7 @@ impl Visit for Work {
         match field.name() {
             "flops" => self.flops += value as f64,
             "backward_flops" => self.backward_flops += value as f64,
+            "bytes" => self.bytes += value as f64,
             _ => (),
         }
     }
@@ -244,7 +248,7 @@ mod tests {
 
     #[test]
     fn nested_spans_are_part_of_the_outer_span() {
-        let record = |flops: i64| trace!(flops, backward_flops = 3);
+        let record = |flops: i64| trace!(flops, backward_flops = 3, bytes = 30);
         let pass = || {
             record(7);
             trace_span!("outer").in_scope(|| {
@@ -260,9 +264,9 @@ mod tests {
         let found: Vec<_> = measured
             .sections
             .iter()
-            .map(|s| (s.name.as_str(), s.work.flops, s.work.backward_flops))
+            .map(|s| (s.name.as_str(), s.work.flops, s.work.backward_flops, s.work.bytes))
             .collect();
-        assert_eq!(found, [("outer", 3., 6.), ("next", 0., 0.)]);
+        assert_eq!(found, [("outer", 3., 6., 60.), ("next", 0., 0., 0.)]);
         // Nobody listens outside of `record`.
         assert_eq!(trace_span!("unrecorded").in_scope(|| 5), 5);
         assert_eq!(measured.sections.len(), 2);

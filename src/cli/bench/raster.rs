@@ -1,9 +1,10 @@
 //! Benchmark of the rasterizer: from tensors of Gaussians to images, and back to gradients.
 
-use super::measure::{Measured, TimingStats, Work};
+use super::measure::{Measured, Section, TimingStats, Work};
 use crate::device::{Stopwatch, peak_memory_bytes_on, reset_peak_memory, resident_memory_bytes};
 use crate::error::Result;
-use crate::render::cpu::{StageTimes, simd_level, stage_times};
+use crate::render::cpu::{StageTimes, count_pairs, multiply_add_peak, simd_level, stage_times};
+use crate::render::cuda::{kernel_times, measure_kernels};
 use crate::render::{Cameras, RenderOutput, default_eps2d, render};
 use crate::scene::{Gaussians, ImageSize};
 use glam::{DMat4, DQuat, DVec3};
@@ -13,9 +14,24 @@ use serde_json::{Value, json};
 use std::f64::consts::TAU;
 use tch::{Device, Kind, Tensor, no_grad};
 
+/// Floating-point operations per pair in `csrc/kernels/pixel.h`: offset 2, p and r 4, exponent 4, 2^e 15, cap 1, T 2, w 1, and A, C and D
+/// 9.
+const FORWARD_OPERATIONS: f64 = 38.;
+/// Floating-point operations per pair of the backward pass: 28 up to T as in the forward pass, w 1, q 8, the remainder 2, ν with a
+/// reciprocal 8, and the ten sums 19.
+const BACKWARD_OPERATIONS: f64 = 66.;
+
+/// Name of the stage of [`StageTimes::blend`].
+const BLEND: &str = "blend";
+/// Name of the stage of [`StageTimes::blend_backward`].
+const BLEND_BACKWARD: &str = "blend backward";
+
+/// Duration of the measurement of multiply-adds, in seconds.
+const PEAK_SECONDS: f64 = 0.2;
+
 /// Times `repeats` calls of the rasterizer without gradients and as many with gradients, alternating between them. Returns milliseconds per
-/// view: of a call without gradients, and of one that records them with its backward pass; and of the stages on the CPU. The results of a
-/// GPU are compared with the CPU's instead. `working_bytes` is the peak memory during the calls minus that before them.
+/// view: of a call without gradients, and of one that records them with its backward pass; of the stages on the CPU, or of the kernels on a
+/// GPU, whose results are also compared with the CPU's. `working_bytes` is the peak memory during the calls minus that before them.
 ///
 /// # Errors
 /// Fails if [`render()`] fails.
@@ -50,6 +66,17 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
         }
     }
     let working_bytes = peak_memory_bytes_on(device).saturating_sub(memory_before);
+    let on_cpu = (gaussians.to_device(Device::Cpu), cameras.to_device(Device::Cpu));
+    let counts = count_pairs(&on_cpu.0, &on_cpu.1, default_eps2d(gaussians))?;
+    let pairs_per_view = |count: i64| count as f64 / views as f64;
+    let (stages, rates) = match device {
+        Device::Cpu => {
+            let stages = stages.sections();
+            let rates = blending_rates(&stages, pairs_per_view(counts.contributing));
+            (stages, rates)
+        }
+        _ => (time_kernels(gaussians, cameras, repeats)?, Value::Null),
+    };
     let mut report = json!({
         "simd": simd_level()?,
         "device": match device {
@@ -63,11 +90,18 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
         "height": cameras.height,
         "forward": TimingStats::from_milliseconds(forward),
         "forward_backward": TimingStats::from_milliseconds(forward_backward),
+        "stages": stages,
+        // (tile, splat) pairs, and (pixel, splat) pairs whose α is computed and that are blended, per view.
+        "pairs": {
+            "tile_entries": pairs_per_view(counts.tile_entries),
+            "evaluated": pairs_per_view(counts.evaluated),
+            "contributing": pairs_per_view(counts.contributing),
+        },
+        "rates": rates,
         "working_bytes": working_bytes,
     });
-    match device {
-        Device::Cpu => report["stages"] = json!(stages.sections()),
-        _ => report["against_cpu"] = compare_with_cpu(gaussians, cameras)?.into(),
+    if device != Device::Cpu {
+        report["against_cpu"] = compare_with_cpu(gaussians, cameras)?.into();
     }
     Ok(report)
 }
@@ -76,6 +110,20 @@ pub fn bench_raster(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) ->
 fn sum_of_images(output: &RenderOutput) -> Tensor {
     let [rgb, alpha, depth] = [&output.rgb, &output.alpha, &output.depth].map(|t| t.sum(Kind::Float));
     rgb + alpha + depth
+}
+
+/// Times each kernel of a GPU. It makes calls of its own, because events around every launch slow a call down.
+fn time_kernels(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) -> Result<Vec<Section>> {
+    let views = (cameras.w2c.size()[0] * cameras.w2c.size()[1]) as f64;
+    let mut measured = Measured::default();
+    for _ in 0..repeats {
+        measure_kernels(true);
+        render_with_gradients(gaussians, cameras)?;
+        let times = kernel_times()?.into_iter();
+        measured.add_run(times.map(|time| (time.kernel, time.milliseconds / views, Work::default())));
+    }
+    measure_kernels(false);
+    Ok(measured.sections())
 }
 
 /// Compares the images and gradients of a GPU with the CPU's.
@@ -119,10 +167,26 @@ fn named_stages(times: StageTimes) -> [(&'static str, f64); 6] {
         ("project", times.project),
         ("sort", times.sort),
         ("bin", times.bin),
-        ("blend", times.blend),
-        ("blend backward", times.blend_backward),
+        (BLEND, times.blend),
+        (BLEND_BACKWARD, times.blend_backward),
         ("project backward", times.project_backward),
     ]
+}
+
+/// Returns the throughput of blending in 10⁹ contributing pairs per second, and the operations that these pairs need as a fraction of the
+/// throughput of multiply-adds alone.
+fn blending_rates(stages: &[Section], contributing_pairs: f64) -> Value {
+    let peak = multiply_add_peak(PEAK_SECONDS);
+    let rate = |name: &str, operations: f64| {
+        let stage = stages.iter().find(|stage| stage.name == name).expect("every stage has a section");
+        let per_second = contributing_pairs / (stage.milliseconds.median * 1e-3);
+        json!({ "gpairs_per_second": per_second * 1e-9, "share_of_peak": per_second * operations / peak })
+    };
+    json!({
+        "peak_gflops": peak * 1e-9,
+        "blend": rate(BLEND, FORWARD_OPERATIONS),
+        "blend_backward": rate(BLEND_BACKWARD, BACKWARD_OPERATIONS),
+    })
 }
 
 /// Returns a synthetic scene that resembles a trained one, and `views` cameras that move past it, from a fixed seed. Projected sizes,
