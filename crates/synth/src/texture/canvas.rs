@@ -1,104 +1,163 @@
-//! Pixel buffer that texture families paint on, and the shapes that they paint.
+//! Squares of values over one repeat of a texture, and the shapes that texture families paint on them.
 
-use glam::{IVec2, Vec2, Vec3};
+use glam::{FloatExt, IVec2, Vec2, Vec3};
 use std::f32::consts::TAU;
 
-use super::noise::Field;
-
-/// A square image of linear RGB whose width is a power of two.
+/// A square of values whose width is a power of two. It repeats in both directions.
 #[derive(Clone)]
-pub(super) struct Canvas {
-    /// Number of pixels in a row.
+pub(super) struct Raster<T> {
+    /// Number of values in a row.
     pub size: usize,
-    /// Pixels row by row, the top row first.
-    pub pixels: Vec<Vec3>,
-    /// `true` if shapes that leave the canvas on one side enter it on the other side; otherwise, the border clips them.
+    /// Values row by row, the top row first.
+    pub values: Vec<T>,
+    /// `true` if shapes that leave the raster on one side enter it on the other side; otherwise, the border clips them.
     wraps_around: bool,
 }
 
+/// A raster of numbers.
+pub(super) type Field = Raster<f32>;
+/// A raster of colors in linear RGB.
+pub(super) type Canvas = Raster<Vec3>;
+
+impl<T: Copy> Raster<T> {
+    /// Creates a raster of `size` × `size` values, row by row.
+    pub fn new(size: usize, values: Vec<T>) -> Raster<T> {
+        Raster { size, values, wraps_around: true }
+    }
+
+    /// Creates a raster that has the same value everywhere.
+    pub fn filled(size: usize, value: T) -> Raster<T> {
+        Raster::new(size, vec![value; size * size])
+    }
+
+    /// Creates a raster from a function of the center of each value's square, in repeats.
+    pub fn from_fn(size: usize, value: impl FnMut(Vec2) -> T) -> Raster<T> {
+        Raster::new(size, centers(size).map(value).collect())
+    }
+
+    /// Returns a raster of the results of `convert` for each value.
+    pub fn map<U: Copy>(&self, convert: impl FnMut(T) -> U) -> Raster<U> {
+        Raster::new(self.size, self.values.iter().copied().map(convert).collect())
+    }
+
+    /// Changes every value by a function of its square's center and its previous value.
+    pub fn update(&mut self, mut change: impl FnMut(Vec2, T) -> T) {
+        for (value, center) in self.values.iter_mut().zip(centers(self.size)) {
+            *value = change(center, *value);
+        }
+    }
+
+    /// Changes every value by a function of its previous value and of the value of another raster of the same size.
+    pub fn update_with<U: Copy>(&mut self, other: &Raster<U>, change: impl Fn(T, U) -> T) {
+        for (value, &other) in self.values.iter_mut().zip(&other.values) {
+            *value = change(*value, other);
+        }
+    }
+
+    /// Returns the value whose square contains `uv`.
+    pub fn value(&self, uv: Vec2) -> T {
+        self.values[self.index((uv * self.size as f32).as_ivec2())]
+    }
+
+    /// Returns the index of a value from its column and row, which wrap around.
+    fn index(&self, place: IVec2) -> usize {
+        let mask = self.size as i32 - 1;
+        ((place.y & mask) * (mask + 1) + (place.x & mask)) as usize
+    }
+
+    /// Returns the bilinear interpolation of four values at `uv` in repeats.
+    fn bilinear(&self, uv: Vec2, lerp: impl Fn(T, T, f32) -> T) -> T {
+        let at = uv * self.size as f32 - 0.5;
+        let floor = at.floor();
+        let part = at - floor;
+        let value = |x, y| self.values[self.index(floor.as_ivec2() + IVec2::new(x, y))];
+        let row = |y| lerp(value(0, y), value(1, y), part.x);
+        lerp(row(0), row(1), part.y)
+    }
+}
+
+impl Field {
+    /// Returns the bilinear interpolation of four values at `uv` in repeats.
+    pub fn sample(&self, uv: Vec2) -> f32 {
+        self.bilinear(uv, FloatExt::lerp)
+    }
+
+    /// Returns the field rescaled to [0, 1].
+    pub fn stretched(&self) -> Field {
+        let low = self.values.iter().copied().fold(f32::INFINITY, f32::min);
+        let high = self.values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        let scale = 1. / (high - low).max(1e-6);
+        self.map(|value| (value - low) * scale)
+    }
+
+    /// Returns the slope in `direction`, per distance between values.
+    pub fn slope(&self, direction: Vec2) -> Field {
+        Field::from_fn(self.size, |uv| {
+            let place = (uv * self.size as f32).as_ivec2();
+            let rise =
+                |step: IVec2| self.values[self.index(place + step)] - self.values[self.index(place - step)];
+            0.5 * Vec2::new(rise(IVec2::X), rise(IVec2::Y)).dot(direction)
+        })
+    }
+}
+
 impl Canvas {
-    /// Creates a canvas from a function of each pixel's center, in repeats.
-    pub fn from_fn(size: usize, mut color: impl FnMut(Vec2) -> Vec3) -> Canvas {
-        let mut canvas = Canvas::filled(size, Vec3::ZERO);
-        canvas.map_pixels(|uv, _| color(uv));
-        canvas
-    }
-
-    /// Creates a canvas from a field, value by value.
-    pub fn from_field(field: &Field, color: impl FnMut(f32) -> Vec3) -> Canvas {
-        let pixels = field.values.iter().copied().map(color).collect();
-        Canvas { size: field.size, pixels, wraps_around: true }
-    }
-
-    /// Creates a canvas of one color.
-    pub fn filled(size: usize, color: Vec3) -> Canvas {
-        Canvas { size, pixels: vec![color; size * size], wraps_around: true }
-    }
-
     /// Returns the canvas with a border that clips shapes.
     pub fn without_wrapping(self) -> Canvas {
         Canvas { wraps_around: false, ..self }
     }
 
-    /// Changes every pixel by a function of its center and its previous color.
-    pub fn map_pixels(&mut self, mut color: impl FnMut(Vec2, Vec3) -> Vec3) {
-        let scale = 1. / self.size as f32;
-        for (y, row) in self.pixels.chunks_exact_mut(self.size).enumerate() {
-            for (x, pixel) in row.iter_mut().enumerate() {
-                *pixel = color((Vec2::new(x as f32, y as f32) + 0.5) * scale, *pixel);
-            }
-        }
-    }
-
-    /// Changes every pixel by a function of its previous color and of the value of a field of the same size.
-    pub fn map_with_field(&mut self, field: &Field, color: impl Fn(Vec3, f32) -> Vec3) {
-        for (pixel, &value) in self.pixels.iter_mut().zip(&field.values) {
-            *pixel = color(*pixel, value);
-        }
-    }
-
-    /// Multiplies each pixel by 1 + `strength` times the value of a field of the same size, at least 0.1.
-    pub fn shade(&mut self, field: &Field, strength: f32) {
-        self.map_with_field(field, |pixel, value| pixel * (1. + strength * value).max(0.1));
-    }
-
-    /// Multiplies all pixels by `factor`.
-    pub fn tint(&mut self, factor: Vec3) {
-        self.pixels.iter_mut().for_each(|pixel| *pixel *= factor);
+    /// Returns the bilinear interpolation of four pixels at `uv` in repeats.
+    pub fn sample(&self, uv: Vec2) -> Vec3 {
+        self.bilinear(uv, Vec3::lerp)
     }
 
     /// Returns the mean of the pixels.
     pub fn mean(&self) -> Vec3 {
-        self.pixels.iter().sum::<Vec3>() / self.pixels.len() as f32
+        self.values.iter().sum::<Vec3>() / self.values.len() as f32
+    }
+
+    /// Multiplies each pixel by 1 + `strength` times the value of a field of the same size, at least 0.1.
+    pub fn shade(&mut self, field: &Field, strength: f32) {
+        self.update_with(field, |pixel, value| pixel * (1. + strength * value).max(0.1));
     }
 
     /// Paints over the pixels within `reach` of `center`. `paint` returns the color and its coverage for the offset from `center`
     /// in repeats.
-    pub fn stamp(&mut self, center: Vec2, reach: Vec2, paint: impl Fn(Vec2) -> (Vec3, f32)) {
+    pub fn blend(&mut self, center: Vec2, reach: Vec2, paint: impl Fn(Vec2) -> (Vec3, f32)) {
         let scale = self.size as f32;
-        let mask = self.size as i32 - 1;
         let mut low = ((center - reach) * scale - 0.5).floor().as_ivec2();
         let mut high = ((center + reach) * scale + 0.5).ceil().as_ivec2();
         if !self.wraps_around {
             low = low.max(IVec2::ZERO);
-            high = high.min(IVec2::splat(mask));
+            high = high.min(IVec2::splat(self.size as i32 - 1));
         }
         for y in low.y..=high.y {
             for x in low.x..=high.x {
                 let offset = (Vec2::new(x as f32, y as f32) + 0.5) / scale - center;
                 let (color, share) = paint(offset);
                 if share > 0. {
-                    let pixel = &mut self.pixels[((y & mask) * (mask + 1) + (x & mask)) as usize];
-                    *pixel = pixel.lerp(color, share.min(1.));
+                    let index = self.index(IVec2::new(x, y));
+                    self.values[index] = self.values[index].lerp(color, share.min(1.));
                 }
             }
         }
     }
 
+    /// Paints over the pixels within `reach` of `center` that a shape with an edge one pixel soft covers. `paint` returns the color and
+    /// the signed distance to the edge for the offset from `center` in repeats.
+    pub fn stamp(&mut self, center: Vec2, reach: Vec2, paint: impl Fn(Vec2) -> (Vec3, f32)) {
+        let pixels = self.size as f32;
+        self.blend(center, reach, |offset| {
+            let (color, distance) = paint(offset);
+            (color, coverage(distance, pixels))
+        });
+    }
+
     /// Fills a shape around `center` with an edge that is one pixel soft.
     pub fn fill(&mut self, center: Vec2, shape: &Shape, color: Vec3) {
-        let pixels = self.size as f32;
-        self.stamp(center, shape.reach + 1. / pixels, |offset| (color, shape.coverage(offset, pixels)));
+        let reach = shape.reach + 1. / self.size as f32;
+        self.stamp(center, reach, |offset| (color, shape.distance(offset)));
     }
 
     /// Draws a line with round ends from `origin + from` to `origin + to`, of half the width `radius`.
@@ -106,20 +165,17 @@ impl Canvas {
         let middle = 0.5 * (from + to);
         self.fill(origin + middle, &Shape::stroke(from - middle, to - middle, radius), color);
     }
+}
 
-    /// Returns the bilinear interpolation of four pixels at `uv` in repeats.
-    pub fn sample(&self, uv: Vec2) -> Vec3 {
-        let at = uv * self.size as f32 - 0.5;
-        let floor = at.floor();
-        let part = at - floor;
-        let mask = self.size - 1;
-        let (left, top) = (floor.x as i32 as usize & mask, floor.y as i32 as usize & mask);
-        let row = |y: usize| {
-            let y = (y & mask) * self.size;
-            self.pixels[y + left].lerp(self.pixels[y + ((left + 1) & mask)], part.x)
-        };
-        row(top).lerp(row(top + 1), part.y)
-    }
+/// Returns the centers of a raster's squares row by row, in repeats.
+fn centers(size: usize) -> impl Iterator<Item = Vec2> {
+    let scale = 1. / size as f32;
+    grid(size, size).map(move |center| center * scale)
+}
+
+/// Returns the centers of the cells of a grid row by row, in cells.
+pub(super) fn grid(columns: usize, rows: usize) -> impl Iterator<Item = Vec2> {
+    (0..rows).flat_map(move |y| (0..columns).map(move |x| Vec2::new(x as f32, y as f32) + 0.5))
 }
 
 /// Interpolates smoothly from 0 at `low` to 1 at `high`, with zero slope at both ends.
@@ -209,10 +265,5 @@ impl Shape {
     /// Returns the signed distance of `offset` to the edge.
     pub fn distance(&self, offset: Vec2) -> f32 {
         (self.distance)(offset)
-    }
-
-    /// Returns the share of the pixel at `offset` that the shape covers, if a repeat has `pixels` pixels.
-    pub fn coverage(&self, offset: Vec2, pixels: f32) -> f32 {
-        coverage(self.distance(offset), pixels)
     }
 }

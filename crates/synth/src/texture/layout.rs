@@ -1,25 +1,12 @@
 //! Layouts of pieces over one repeat: bricks, tiles, planks, stones.
 
-use glam::{Vec2, Vec2Swizzles};
+use glam::{IVec2, UVec2, Vec2, Vec2Swizzles};
 use rand_chacha::ChaCha8Rng;
 
-use super::noise::{RandomValues, Voronoi};
+use super::noise::RandomValues;
 
-/// Arrangement of pieces.
-pub(super) enum Layout {
-    /// Rows of pieces separated by cuts: the rows' tops in [0, 1], and the cuts of each row.
-    Courses { tops: Vec<f32>, cuts: Vec<Vec<f32>>, upright: bool },
-    /// Strips `long` times as long as wide, in a zigzag. A repeat is `across` strip widths wide, a multiple of 2 `long`.
-    Herringbone { across: usize, long: usize },
-    /// Squares of `long` strips each, alternately horizontal and upright. A repeat has `squares` of them per side, an even number.
-    Basket { squares: usize, long: usize },
-    /// Squares standing on their corners, `across` per repeat.
-    Diamonds { across: usize },
-    /// Cells around points.
-    Cells(Voronoi),
-    /// Rectangles of whole squares: the rectangle that each square belongs to, and the rectangles' corners and extents.
-    Quilt { squares: usize, owners: Vec<u32>, pieces: Vec<(Vec2, Vec2)> },
-}
+/// Arrangement of pieces, as a function that returns the piece at a position.
+pub(super) struct Layout(Box<dyn Fn(Vec2) -> Piece>);
 
 /// The piece at a position.
 pub(super) struct Piece {
@@ -42,7 +29,7 @@ impl Layout {
             let start = (row as f32 * shift).fract();
             (0..columns).map(|column| (column as f32 + start) / columns as f32).collect()
         };
-        Layout::Courses { tops, cuts: (0..rows).map(cuts).collect(), upright }
+        Layout::rows(tops, (0..rows).map(cuts).collect(), upright)
     }
 
     /// Creates rows of about equal height, each with about `columns` pieces of different lengths.
@@ -71,7 +58,73 @@ impl Layout {
             cuts.sort_by(f32::total_cmp);
             cuts
         });
-        Layout::Courses { tops, cuts: cuts.collect(), upright }
+        Layout::rows(tops, cuts.collect(), upright)
+    }
+
+    /// Creates rows of pieces: the rows begin at `tops` in [0, 1] and end at 1, and `cuts` separate the pieces of each row.
+    fn rows(tops: Vec<f32>, cuts: Vec<Vec<f32>>, upright: bool) -> Layout {
+        Layout(Box::new(move |uv| {
+            let uv = if upright { uv.yx() } else { uv };
+            let row = tops.partition_point(|&top| top <= uv.y).clamp(1, cuts.len()) - 1;
+            let cuts = &cuts[row];
+            let after = cuts.partition_point(|&cut| cut <= uv.x);
+            let start = if after == 0 { cuts[cuts.len() - 1] - 1. } else { cuts[after - 1] };
+            let end = if after == cuts.len() { cuts[0] + 1. } else { cuts[after] };
+            let number = (after + cuts.len() - 1) % cuts.len();
+            let at = uv - Vec2::new(start, tops[row]);
+            let extent = Vec2::new(end - start, tops[row + 1] - tops[row]);
+            Piece::within((row * 64 + number) as u32, at, extent)
+        }))
+    }
+
+    /// Creates strips `long` times as long as wide, in a zigzag. A repeat is `across` strip widths wide, a multiple of 2 `long`.
+    pub fn herringbone(across: usize, long: usize) -> Layout {
+        let scale = across as f32;
+        let (long, across) = (long as i32, across as i32);
+        Layout(Box::new(move |uv| {
+            let cell = (uv * scale).floor().as_ivec2();
+            let part = uv * scale - cell.as_vec2();
+            let phase = (cell.x - cell.y).rem_euclid(2 * long);
+            let (start, at) = if phase < long {
+                (cell - IVec2::new(phase, 0), part + Vec2::new(phase as f32, 0.))
+            } else {
+                let passed = 2 * long - 1 - phase;
+                (cell - IVec2::new(0, passed), part.yx() + Vec2::new(passed as f32, 0.))
+            };
+            let id = start.x.rem_euclid(across) * across + start.y.rem_euclid(across);
+            Piece::within(id as u32, at / scale, Vec2::new(long as f32, 1.) / scale)
+        }))
+    }
+
+    /// Creates squares of `long` strips each, alternately horizontal and upright. A repeat has `squares` of them per side, an even
+    /// number.
+    pub fn basket(squares: usize, long: usize) -> Layout {
+        let (scale, long) = (squares as f32, long as f32);
+        Layout(Box::new(move |uv| {
+            let cell = (uv * scale).floor().min(Vec2::splat(scale - 1.));
+            let part = uv * scale - cell;
+            let is_upright = (cell.x + cell.y) as usize % 2 == 1;
+            let part = if is_upright { part.yx() } else { part };
+            let strip = (part.y * long).floor();
+            let at = Vec2::new(part.x, part.y - strip / long) / scale;
+            let id = ((cell.y * scale + cell.x) * long + strip) as u32;
+            Piece::within(id, at, Vec2::new(1., 1. / long) / scale)
+        }))
+    }
+
+    /// Creates squares standing on their corners, `across` per repeat.
+    pub fn diamonds(across: usize) -> Layout {
+        let count = across as f32;
+        Layout(Box::new(move |uv| {
+            let turned = Vec2::new(uv.x + uv.y, uv.x - uv.y) * count;
+            let cell = turned.floor();
+            // A repeat to the right adds (count, count), one down (count, -count): reduce by both.
+            let double = 2. * count;
+            let sum = (cell.x + cell.y).rem_euclid(double);
+            let difference = (cell.x - cell.y).rem_euclid(double);
+            let side = std::f32::consts::FRAC_1_SQRT_2 / count;
+            Piece::within((sum * double + difference) as u32, (turned - cell) * side, Vec2::splat(side))
+        }))
     }
 
     /// Creates rectangles of up to `largest` squares per side that fill a repeat.
@@ -100,76 +153,76 @@ impl Layout {
             let corner = Vec2::new(x as f32, y as f32) * scale;
             pieces.push((corner, Vec2::new(wide as f32, high as f32) * scale));
         }
-        Layout::Quilt { squares, owners, pieces }
+        Layout(Box::new(move |uv| {
+            let cell = (uv * squares as f32).as_uvec2().min(UVec2::splat(squares as u32 - 1));
+            let owner = owners[cell.y as usize * squares + cell.x as usize];
+            let (corner, extent) = pieces[owner as usize];
+            let at = uv - corner;
+            Piece::within(owner, at - at.floor(), extent)
+        }))
     }
 
-    /// Returns the piece at `uv`.
+    /// Creates the Voronoi cells of one point in each square of a grid. The points have random offsets from the centers of the squares,
+    /// with `jitter` from 0 to 1 of a square. With `staggered`, every other row is shifted by half a square, which makes hexagons if
+    /// there is no jitter and requires an even number of rows.
+    pub fn cells(
+        random: &mut ChaCha8Rng,
+        columns: usize,
+        rows: usize,
+        jitter: f32,
+        staggered: bool,
+    ) -> Layout {
+        let count = Vec2::new(columns as f32, rows as f32);
+        let mut point = |index: usize| {
+            let (x, y) = (index % columns, index / columns);
+            let shift = if staggered && y % 2 == 1 { 0.5 } else { 0. };
+            let off = (random.point() - 0.5) * jitter + 0.5;
+            (Vec2::new(x as f32 + shift, y as f32) + off) / count
+        };
+        let points: Vec<Vec2> = (0..columns * rows).map(&mut point).collect();
+        let (columns, rows) = (columns as i32, rows as i32);
+        // Returns the point of a grid square, which may lie in another repeat, and the square's index.
+        let point = move |square: IVec2| {
+            let (x, y) = (square.x.rem_euclid(columns), square.y.rem_euclid(rows));
+            let index = (y * columns + x) as usize;
+            let repeat = Vec2::new(((square.x - x) / columns) as f32, ((square.y - y) / rows) as f32);
+            (points[index] + repeat, index as u32)
+        };
+        Layout(Box::new(move |uv| {
+            let home = (uv * count).floor().as_ivec2();
+            let mut nearest = (f32::INFINITY, Vec2::ZERO, 0, home);
+            for y in -1..=1 {
+                for x in -1..=1 {
+                    let square = home + IVec2::new(x, y);
+                    let (point, id) = point(square);
+                    let away = point.distance_squared(uv);
+                    if away < nearest.0 {
+                        nearest = (away, point, id, square);
+                    }
+                }
+            }
+            let (_, own, id, square) = nearest;
+            let mut edge = f32::INFINITY;
+            for y in -2..=2i32 {
+                for x in -2..=2i32 {
+                    // Cells at the corners of this block hardly ever touch.
+                    if (x, y) == (0, 0) || x.abs() + y.abs() == 4 {
+                        continue;
+                    }
+                    let (other, _) = point(square + IVec2::new(x, y));
+                    let across = other - own;
+                    let halfway = 0.5 * (own + other);
+                    edge = edge.min((halfway - uv).dot(across) / across.length().max(1e-6));
+                }
+            }
+            let (at, edge) = (uv - own, edge.max(0.));
+            Piece { id, at, extent: Vec2::splat(2. * (edge + at.length())), edge }
+        }))
+    }
+
+    /// Returns the piece at `uv` in [0, 1)². Cells also extend beyond it.
     pub fn piece(&self, uv: Vec2) -> Piece {
-        let uv = uv - uv.floor();
-        match self {
-            Layout::Courses { tops, cuts, upright } => {
-                let uv = if *upright { uv.yx() } else { uv };
-                let row = tops.partition_point(|&top| top <= uv.y).clamp(1, cuts.len()) - 1;
-                let cuts = &cuts[row];
-                let after = cuts.partition_point(|&cut| cut <= uv.x);
-                let start = if after == 0 { cuts[cuts.len() - 1] - 1. } else { cuts[after - 1] };
-                let end = if after == cuts.len() { cuts[0] + 1. } else { cuts[after] };
-                let number = (after + cuts.len() - 1) % cuts.len();
-                let at = uv - Vec2::new(start, tops[row]);
-                let extent = Vec2::new(end - start, tops[row + 1] - tops[row]);
-                Piece::within((row * 64 + number) as u32, at, extent)
-            }
-            Layout::Herringbone { across, long } => {
-                let scale = *across as f32;
-                let cell = (uv * scale).floor().as_ivec2();
-                let part = uv * scale - cell.as_vec2();
-                let (long, across) = (*long as i32, *across as i32);
-                let phase = (cell.x - cell.y).rem_euclid(2 * long);
-                let (start, at) = if phase < long {
-                    (cell - glam::IVec2::new(phase, 0), part + Vec2::new(phase as f32, 0.))
-                } else {
-                    let passed = 2 * long - 1 - phase;
-                    (cell - glam::IVec2::new(0, passed), part.yx() + Vec2::new(passed as f32, 0.))
-                };
-                let id = start.x.rem_euclid(across) * across + start.y.rem_euclid(across);
-                let extent = Vec2::new(long as f32, 1.) / scale;
-                Piece::within(id as u32, at / scale, extent)
-            }
-            Layout::Basket { squares, long } => {
-                let scale = *squares as f32;
-                let cell = (uv * scale).floor().min(Vec2::splat(scale - 1.));
-                let part = uv * scale - cell;
-                let upright = (cell.x + cell.y) as usize % 2 == 1;
-                let part = if upright { part.yx() } else { part };
-                let strip = (part.y * *long as f32).floor();
-                let at = Vec2::new(part.x, part.y - strip / *long as f32) / scale;
-                let id = ((cell.y * scale + cell.x) * *long as f32 + strip) as u32;
-                Piece::within(id, at, Vec2::new(1., 1. / *long as f32) / scale)
-            }
-            Layout::Diamonds { across } => {
-                let count = *across as f32;
-                let turned = Vec2::new(uv.x + uv.y, uv.x - uv.y) * count;
-                let cell = turned.floor();
-                // A repeat to the right adds (count, count), one down (count, -count): reduce by both.
-                let double = 2. * count;
-                let sum = (cell.x + cell.y).rem_euclid(double);
-                let difference = (cell.x - cell.y).rem_euclid(double);
-                let side = std::f32::consts::FRAC_1_SQRT_2 / count;
-                Piece::within((sum * double + difference) as u32, (turned - cell) * side, Vec2::splat(side))
-            }
-            Layout::Cells(voronoi) => {
-                let cell = voronoi.cell(uv);
-                let extent = Vec2::splat(2. * (cell.edge + cell.offset.length()));
-                Piece { id: cell.id, at: cell.offset, extent, edge: cell.edge }
-            }
-            Layout::Quilt { squares, owners, pieces } => {
-                let cell = (uv * *squares as f32).as_uvec2().min(glam::UVec2::splat(*squares as u32 - 1));
-                let owner = owners[cell.y as usize * squares + cell.x as usize];
-                let (corner, extent) = pieces[owner as usize];
-                let at = uv - corner;
-                Piece::within(owner, at - at.floor(), extent)
-            }
-        }
+        (self.0)(uv)
     }
 }
 

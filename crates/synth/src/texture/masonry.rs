@@ -3,9 +3,9 @@
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
 
-use super::canvas::{Shape, smoothstep};
+use super::canvas::{Field, Shape, smoothstep};
 use super::layout::Layout;
-use super::noise::{Field, RandomValues, Voronoi, folded_fractal, fractal, ridge, smooth, unit_of, warped};
+use super::noise::{RandomValues, folded_fractal, fractal, ridge, smooth, unit_of, warped};
 use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
 
@@ -37,8 +37,8 @@ fn lay(random: &mut ChaCha8Rng, layout: &Layout, finish: &Finish) -> Canvas {
     let light = random.direction();
     let mut heights = Vec::with_capacity(SIZE * SIZE);
     let mut canvas = Canvas::from_fn(SIZE, |uv| {
-        let push = Vec2::new(right.value(uv), down.value(uv)) * finish.crookedness;
-        let piece = layout.piece(uv + push);
+        let at = uv + Vec2::new(right.value(uv), down.value(uv)) * finish.crookedness;
+        let piece = layout.piece(at - at.floor());
         let (rough, stain) = (rough.value(uv), stains.value(uv));
         let on_piece = smoothstep(0., 2. / SIZE as f32, piece.edge - finish.joint_width + 0.5 / SIZE as f32);
         let raised = ((piece.edge - finish.joint_width) / finish.rounding).clamp(0., 1.);
@@ -51,7 +51,7 @@ fn lay(random: &mut ChaCha8Rng, layout: &Layout, finish: &Finish) -> Canvas {
         let joint = finish.joint * (1. + 0.25 * rough).max(0.3);
         joint.lerp(color, on_piece)
     });
-    let height = Field { size: SIZE, values: heights };
+    let height = Field::new(SIZE, heights);
     canvas.shade(&height.slope(light), random.uniform(0., 0.6));
     canvas
 }
@@ -69,7 +69,7 @@ pub(super) fn bricks(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let upright = random.chance(0.05);
     let layout = match random.count(0, 9) {
         0 => Layout::courses(rows, columns, 0., upright),
-        1 => Layout::Herringbone { across: rows / 2 * 6, long: 3 },
+        1 => Layout::herringbone(rows / 2 * 6, 3),
         2 | 3 => Layout::ragged(random, rows, columns as f32, 0.4, upright),
         _ => Layout::courses(rows, columns, 0.5, upright),
     };
@@ -102,13 +102,13 @@ pub(super) fn tiles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let across = random.sqrt_uniform(1., 14.) as usize;
     let even = 2 * across.div_ceil(2);
     let layout = match random.count(0, 11) {
-        0 => Layout::Diamonds { across },
-        1 => Layout::Cells(Voronoi::new(random, even * 6 / 7 + 1, even, 0., true)),
+        0 => Layout::diamonds(across),
+        1 => Layout::cells(random, even * 6 / 7 + 1, even, 0., true),
         2 => Layout::quilt(random, across + 3, 3),
         3 | 4 => Layout::courses(2 * even, even, 0.5, random.chance(0.3)),
         5 => Layout::courses(even, even, 0.5, false),
         6 => Layout::courses(across, (across / 2).max(1), 0., random.chance(0.5)),
-        7 => Layout::Basket { squares: even, long: 2 },
+        7 => Layout::basket(even, 2),
         _ => Layout::courses(across, across, 0., false),
     };
     let wide = 1. / across as f32;
@@ -138,11 +138,11 @@ pub(super) fn stones(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let layout = match random.count(0, 5) {
         0 => Layout::ragged(random, across, across as f32 * 0.7, 0.9, false),
         1 => Layout::quilt(random, across + 2, 3),
-        2 => Layout::Cells(Voronoi::new(random, across, 2 * across.div_ceil(2), 0.5, true)),
+        2 => Layout::cells(random, across, 2 * across.div_ceil(2), 0.5, true),
         3 => Layout::courses(2 * across.div_ceil(2), across, 0.5, false),
         _ => {
             let jitter = random.uniform(0.6, 1.);
-            Layout::Cells(Voronoi::new(random, across, across, jitter, false))
+            Layout::cells(random, across, across, jitter, false)
         }
     };
     let wide = 1. / across as f32;
@@ -217,7 +217,7 @@ pub(super) fn mosaic(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let layout = if random.chance(0.5) {
         Layout::courses(across, across, 0., false)
     } else {
-        Layout::Cells(Voronoi::new(random, across, across, 0.6, false))
+        Layout::cells(random, across, across, 0.6, false)
     };
     let width = 0.1 / across as f32;
     let bright = luminance(joint) > 0.5;
@@ -269,18 +269,18 @@ pub(super) fn terrazzo(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let count = random.count(2, 5);
     let palette = Palette::among(random, &[(STONES, 3.), (WHITES, 1.), (ACCENTS, 2.), (BEIGES, 1.)], count);
     let across = random.count(14, 48);
-    let voronoi = Voronoi::new(random, across, across, 1., false);
+    let chips = Layout::cells(random, across, across, 1., false);
     let (seed, crowd) = (random.seed(), random.uniform(0.25, 0.9));
     let gap = random.uniform(0.04, 0.2) / across as f32;
     let canvas = Canvas::from_fn(SIZE, |uv| {
-        let cell = voronoi.cell(uv);
-        let hash = |salt: u32| unit_of(seed ^ salt, cell.id);
+        let piece = chips.piece(uv);
+        let hash = |salt: u32| unit_of(seed ^ salt, piece.id);
         if hash(0) > crowd {
             return ground;
         }
         let chip = palette.ramp(hash(1)) * (0.8 + 0.4 * hash(2));
         let inner = gap * (1. + 2. * hash(3));
-        ground.lerp(chip, smoothstep(0., 1.5 / SIZE as f32, cell.edge - inner))
+        ground.lerp(chip, smoothstep(0., 1.5 / SIZE as f32, piece.edge - inner))
     });
     Surface { canvas, repeat_metres: across as f32 * random.uniform(0.01, 0.04) }
 }
@@ -301,7 +301,7 @@ pub(super) fn speckle(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let level = random.uniform(0., 0.9);
         let share = random.uniform(0.3, 1.);
         let share_at = |value| share * smoothstep(level, level + 0.3, value);
-        canvas.map_with_field(&field, |pixel, value| pixel.lerp(spots, share_at(value)));
+        canvas.update_with(&field, |pixel, value| pixel.lerp(spots, share_at(value)));
     }
     Surface { canvas, repeat_metres: random.uniform(0.3, 1.2) }
 }
@@ -323,8 +323,7 @@ pub(super) fn concrete(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         let layout = Layout::courses(random.count(1, 3), random.count(1, 2), 0., false);
         let width = random.uniform(0.5, 2.) / SIZE as f32;
         let dark = random.uniform(0.3, 0.8);
-        canvas
-            .map_pixels(|uv, color| color * (1. - dark * smoothstep(2. * width, 0., layout.piece(uv).edge)));
+        canvas.update(|uv, color| color * (1. - dark * smoothstep(2. * width, 0., layout.piece(uv).edge)));
     }
     Surface { canvas, repeat_metres: random.uniform(1., 4.) }
 }
@@ -360,20 +359,20 @@ pub(super) fn asphalt(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     canvas.shade(&fractal(random, SIZE, [2; 2], 5, 0.6), random.uniform(0.05, 0.25));
     if random.chance(0.5) {
         let cells = random.count(1, 3);
-        let voronoi = Voronoi::new(random, cells + 1, cells + 1, 1., false);
+        let slabs = Layout::cells(random, cells + 1, cells + 1, 1., false);
         let [right, down] = [(); 2].map(|()| fractal(random, SIZE, [6; 2], 5, 0.65));
         let width = random.uniform(0.001, 0.006);
         let dark = random.uniform(0.3, 0.9);
-        canvas.map_pixels(|uv, color| {
+        canvas.update(|uv, color| {
             let push = Vec2::new(right.sample(uv), down.sample(uv)) * 0.04;
-            color * (1. - dark * smoothstep(width, 0.2 * width, voronoi.cell(uv + push).edge))
+            color * (1. - dark * smoothstep(width, 0.2 * width, slabs.piece(uv + push).edge))
         });
     }
     if random.chance(0.2) {
         let paint = srgb_to_linear(random.one_of(&[0xe8e6e0, 0xd8b23a]));
         let (from, half) = (random.unit(), random.uniform(0.02, 0.05));
         let worn = fractal(random, SIZE, [8; 2], 5, 0.8);
-        canvas.map_pixels(|uv, color| {
+        canvas.update(|uv, color| {
             let off = uv.x - from;
             let inside = smoothstep(half, half - 0.006, (off - off.round()).abs());
             color.lerp(paint, inside * (0.8 + worn.sample(uv)).clamp(0., 0.95))

@@ -157,13 +157,14 @@ fn combined(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let (level, soft) = (random.uniform(-0.6, 0.8), random.sqrt_uniform(0.03, 1.));
     let tints = random.chance(0.35);
     let mean = other.mean();
-    for ((pixel, other), value) in canvas.pixels.iter_mut().zip(&other.pixels).zip(&mask.values) {
-        *pixel = if tints {
-            *pixel * (0.5 + 0.5 * (*other / mean.max(Vec3::splat(0.02))).min(Vec3::splat(2.)))
+    canvas.update(|uv, pixel| {
+        let other = other.value(uv);
+        if tints {
+            pixel * (0.5 + 0.5 * (other / mean.max(Vec3::splat(0.02))).min(Vec3::splat(2.)))
         } else {
-            pixel.lerp(*other, canvas::smoothstep(level, level + soft, *value))
-        };
-    }
+            pixel.lerp(other, canvas::smoothstep(level, level + soft, mask.value(uv)))
+        }
+    });
     Surface { canvas, repeat_metres }
 }
 
@@ -229,7 +230,7 @@ impl Texture {
         let (low, high) = REFLECTANCE;
         let mut size = canvas.size;
         let mut texels: Vec<Vec3> =
-            canvas.pixels.iter().map(|pixel| pixel.clamp(Vec3::splat(low), Vec3::splat(high))).collect();
+            canvas.values.iter().map(|pixel| pixel.clamp(Vec3::splat(low), Vec3::splat(high))).collect();
         let mut levels = Vec::new();
         loop {
             levels.push(texels.iter().map(|&color| texel_of(color)).collect());

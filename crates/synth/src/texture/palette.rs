@@ -174,11 +174,7 @@ pub(super) fn luminance(color: Vec3) -> f32 {
 /// Converts sRGB 0xrrggbb to linear RGB.
 pub(super) fn srgb_to_linear(srgb: u32) -> Vec3 {
     let [_, red, green, blue] = srgb.to_be_bytes();
-    Vec3::new(srgb_byte_to_linear(red), srgb_byte_to_linear(green), srgb_byte_to_linear(blue))
-}
-
-/// Converts an sRGB byte to a linear value.
-pub(super) fn srgb_byte_to_linear(byte: u8) -> f32 {
-    let value = f32::from(byte) / 255.;
-    if value <= 0.04045 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }
+    let linear =
+        |value: f32| if value <= 0.04045 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) };
+    [red, green, blue].map(|byte| linear(f32::from(byte) / 255.)).into()
 }

@@ -3,10 +3,10 @@
 use glam::{Vec2, Vec2Swizzles, Vec3};
 use rand_chacha::ChaCha8Rng;
 
-use super::canvas::{Shape, coverage, smoothstep};
+use super::canvas::{Field, Shape, grid, smoothstep};
 use super::layout::Layout;
 use super::marks::{Script, ink_for};
-use super::noise::{Field, RandomValues, fractal, smooth, unit_of};
+use super::noise::{RandomValues, fractal, smooth, unit_of};
 use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
 
@@ -58,10 +58,10 @@ pub(super) fn boards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let outdoors = matches!(purpose, Purpose::Facade | Purpose::Ground);
     let kind = if outdoors { 9 } else { random.count(0, 9) };
     let (layout, wide) = match kind {
-        0 => (Layout::Herringbone { across: 2 * long * random.count(1, 2), long }, 0.06),
+        0 => (Layout::herringbone(2 * long * random.count(1, 2), long), 0.06),
         1 => {
             let squares = 2 * random.count(1, 4);
-            (Layout::Basket { squares, long }, 1. / (squares * long) as f32)
+            (Layout::basket(squares, long), 1. / (squares * long) as f32)
         }
         2 => (Layout::courses(2 * rows.div_ceil(2), 2, 0.5, upright), 1. / rows as f32),
         _ => {
@@ -111,13 +111,12 @@ pub(super) fn veneer(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 /// Paints a raised rectangle. Along its edges, over a width of `bevel` repeats, `relief` brightens the left and upper sides and darkens the
 /// right and lower sides. A rectangle with a negative `relief` is sunk.
 fn paint_panel(canvas: &mut Canvas, middle: Vec2, half: Vec2, color: Vec3, bevel: f32, relief: f32) {
-    let pixels = canvas.size as f32;
     canvas.stamp(middle, half, |offset| {
         let inside = half - offset.abs();
         let edge_distance = inside.min_element();
         let side = if inside.x < inside.y { offset.x.signum() } else { offset.y.signum() };
         let edge = smoothstep(bevel, 0.3 * bevel, edge_distance);
-        (color * (1. - relief * side * edge), coverage(-edge_distance, pixels))
+        (color * (1. - relief * side * edge), -edge_distance)
     });
 }
 
@@ -135,8 +134,8 @@ pub(super) fn windows(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let sky = Vec3::new(0.35, 0.45, 0.6) * random.uniform(0.4, 1.2);
     let dark = Vec3::splat(random.uniform(0.02, 0.1));
     let curtains = random.uniform(0., 0.5);
-    for index in 0..rows * columns {
-        let middle = (Vec2::new((index % columns) as f32, (index / columns) as f32) + 0.5) * cell;
+    for place in grid(columns, rows) {
+        let middle = place * cell;
         let half = 0.5 * share * cell;
         paint_panel(&mut canvas, middle, half, frame, border, 0.3);
         if sill {
@@ -147,11 +146,10 @@ pub(super) fn windows(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         let slant = random.uniform(-1., 1.);
         let level = random.uniform(-0.8, 0.8);
         let drawn = random.uniform(0.2, 1.);
-        for pane in 0..panes_x * panes_y {
-            let count = Vec2::new(panes_x as f32, panes_y as f32);
-            let place = (Vec2::new((pane % panes_x) as f32, (pane / panes_x) as f32) + 0.5) / count * 2. - 1.;
+        let count = Vec2::new(panes_x as f32, panes_y as f32);
+        for pane in grid(panes_x, panes_y) {
             let inner = half - border;
-            let at = place * inner;
+            let at = (pane / count * 2. - 1.) * inner;
             let half_pane = inner / count - 0.4 * border;
             canvas.stamp(middle + at, half_pane, |offset| {
                 let position = (at + offset) / inner;
@@ -162,7 +160,7 @@ pub(super) fn windows(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
                 {
                     color = color.lerp(curtain * (0.8 + 0.2 * (position.x * 40.).sin()), 0.7);
                 }
-                (color, coverage((offset.abs() - half_pane).max_element(), SIZE as f32))
+                (color, (offset.abs() - half_pane).max_element())
             });
         }
     }
@@ -195,8 +193,7 @@ pub(super) fn shelves(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
                 let roundness = random.uniform(0.2, 0.6);
                 canvas.stamp(middle, half, |offset| {
                     let across = offset.x / half.x;
-                    let distance = (offset.abs() - half).max_element();
-                    (color * (1. - roundness * across * across), coverage(distance, SIZE as f32))
+                    (color * (1. - roundness * across * across), (offset.abs() - half).max_element())
                 });
                 let label = ink_for(random, color);
                 for _ in 0..random.count(0, 3) {
@@ -233,8 +230,8 @@ pub(super) fn cupboards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let metal = random_theme_color(random, GRAYS);
     let handle = random.count(0, 3);
     let handle_length = random.uniform(0.1, 0.4);
-    for index in 0..rows * columns {
-        let middle = (Vec2::new((index % columns) as f32, (index / columns) as f32) + 0.5) * cell;
+    for place in grid(columns, rows) {
+        let middle = place * cell;
         let mut half = 0.5 * cell - gap;
         let tone = color * random.uniform(0.95, 1.05);
         paint_panel(&mut canvas, middle, half, tone, bevel, relief);
@@ -330,15 +327,15 @@ pub(super) fn ceiling_boards(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let relief = random.uniform(0.05, 0.3);
     let cells = random.one_of(&[64, 128]);
     let rough = smooth(random, SIZE, [cells; 2]);
-    for index in 0..columns * rows {
-        let middle = (Vec2::new((index % columns) as f32, (index / columns) as f32) + 0.5) * cell;
+    for place in grid(columns, rows) {
+        let middle = place * cell;
         let tone = board * random.uniform(0.96, 1.02);
         paint_panel(&mut canvas, middle, 0.5 * cell - 0.008, tone, 0.008, relief);
         if random.chance(lamps) {
             paint_panel(&mut canvas, middle, 0.4 * cell, Vec3::splat(0.93), 0.006, relief);
         }
     }
-    canvas.map_with_field(&rough, |pixel, value| pixel * (1. - speck * smoothstep(0.5, 0.9, value)));
+    canvas.update_with(&rough, |pixel, value| pixel * (1. - speck * smoothstep(0.5, 0.9, value)));
     Surface { canvas, repeat_metres: columns as f32 * 0.6 }
 }
 

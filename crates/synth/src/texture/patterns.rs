@@ -3,9 +3,9 @@
 use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
 
-use super::canvas::{Shape, coverage, smoothstep};
+use super::canvas::{Field, Shape, coverage, grid, smoothstep};
 use super::layout::Layout;
-use super::noise::{Field, RandomValues, Voronoi, fractal, smooth, unit_of};
+use super::noise::{RandomValues, fractal, smooth, unit_of};
 use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
 
@@ -81,11 +81,11 @@ pub(super) fn pieces(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         Layout::courses(2 * fine, 2 * fine, 0., false)
     } else {
         match random.count(0, 4) {
-            0 => Layout::Cells(Voronoi::new(random, 3 * fine, 4 * fine, 0., true)),
-            1 => Layout::Diamonds { across: fine + 1 },
-            2 => Layout::Herringbone { across: 6 * fine, long: 3 },
+            0 => Layout::cells(random, 3 * fine, 4 * fine, 0., true),
+            1 => Layout::diamonds(fine + 1),
+            2 => Layout::herringbone(6 * fine, 3),
             3 => Layout::quilt(random, 4 * fine, 3),
-            _ => Layout::Basket { squares: 2 * fine, long: 2 },
+            _ => Layout::basket(2 * fine, 2),
         }
     };
     let seed = random.seed();
@@ -201,10 +201,9 @@ pub(super) fn ornament(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         }
     }
     let every = random.count(2, 4);
-    for index in 0..2 * columns * columns {
-        // The second half of the ornaments lies between the first half.
-        let half = if index >= columns * columns { 0.5 } else { 0. };
-        let place = Vec2::new((index % columns) as f32, (index / columns % columns) as f32) + half + 0.25;
+    // The second half of the ornaments lies between the first half.
+    for place in [-0.25, 0.25].into_iter().flat_map(|shift| grid(columns, columns).map(move |at| at + shift))
+    {
         let center = place * cell;
         for &(from, to, angle, step) in &tendrils {
             for side in [1., -1.] {
@@ -216,9 +215,8 @@ pub(super) fn ornament(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
                     let turn = Vec2::from_angle(-angle - 0.8) * mirror;
                     let tip = center + to + Vec2::new(turn.x, -turn.y) * 0.5 * length;
                     let leaf = Shape::leaf(length, length * leaf.y).turned(Vec2::from_angle(-angle - 0.8));
-                    canvas.stamp(tip, Vec2::splat(length), |offset| {
-                        (palette.color(2), leaf.coverage(offset * mirror, SIZE as f32))
-                    });
+                    let color = palette.color(2);
+                    canvas.stamp(tip, Vec2::splat(length), |at| (color, leaf.distance(at * mirror)));
                 }
             }
         }
@@ -276,7 +274,7 @@ pub(super) fn pile(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let tufts = fractal(random, SIZE, stretch.map(|share| fine / share), 2, 0.8);
     let brushed = fractal(random, SIZE, [3; 2], 3, 0.5);
     let mixed = random.uniform(0.1, 0.6);
-    let mut canvas = Canvas::from_field(&tufts, |value| palette.ramp(0.5 + mixed * value));
+    let mut canvas = tufts.map(|value| palette.ramp(0.5 + mixed * value));
     canvas.shade(&tufts, random.uniform(0.05, 0.35));
     canvas.shade(&brushed, random.sqrt_uniform(0., 0.25));
     Surface { canvas, repeat_metres: random.uniform(0.4, 1.6) }
@@ -287,8 +285,10 @@ pub(super) fn folds(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 1, 3);
     let depth = random.uniform(0.15, 0.7);
     let (coarse, fine) = (random.count(4, 10), random.count(12, 28));
-    let folds =
-        smooth(random, SIZE, [coarse, 1]).plus(&smooth(random, SIZE, [fine, 2]), random.uniform(0.1, 0.7));
+    let mut folds = smooth(random, SIZE, [coarse, 1]);
+    let finer = smooth(random, SIZE, [fine, 2]);
+    let strength = random.uniform(0.1, 0.7);
+    folds.update_with(&finer, |fold, finer| fold + strength * finer);
     let printed = random.chance(0.3);
     let bands = random.count(2, 8) as f32;
     let canvas = Canvas::from_fn(SIZE, |uv| {
@@ -314,7 +314,7 @@ pub(super) fn quilted(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let part = (at - at.floor() - 0.5) * 2.;
         ((1. - part.x.powi(4)) * (1. - part.y.powi(4))).sqrt()
     });
-    let mut canvas = Canvas::from_field(&height, |value| color * (1. - deep + deep * value));
+    let mut canvas = height.map(|value| color * (1. - deep + deep * value));
     canvas.shade(&height.slope(light), random.uniform(1., 5.));
     canvas.shade(&fractal(random, SIZE, [24; 2], 4, 0.8), random.uniform(0.01, 0.12));
     Surface { canvas, repeat_metres: across * random.uniform(0.06, 0.2) }
@@ -334,8 +334,7 @@ pub(super) fn carpet(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     let cells = random.count(4, 14);
     let small = Motif::draw(random, &palette);
     let crowd = random.uniform(0.3, 1.);
-    for index in 0..cells * cells {
-        let place = Vec2::new((index % cells) as f32, (index / cells) as f32) + 0.5;
+    for place in grid(cells, cells) {
         if random.chance(crowd) {
             small.paint(&mut canvas, place / cells as f32, 1. / cells as f32, Vec2::X);
         }
@@ -347,9 +346,7 @@ pub(super) fn carpet(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         for layer in 0..random.count(2, 7) {
             let color = palette.color(layer + 1);
             let flower = Shape::flower(radius, petals, depth);
-            canvas.stamp(middle, Vec2::splat(0.5), |offset| {
-                (color, flower.coverage(offset * squeeze, SIZE as f32))
-            });
+            canvas.stamp(middle, middle, |offset| (color, flower.distance(offset * squeeze)));
             radius *= random.uniform(0.6, 0.9);
         }
         Motif::draw(random, &palette).paint(&mut canvas, middle, 2. * radius, Vec2::X);
@@ -359,7 +356,7 @@ pub(super) fn carpet(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         let width = random.sqrt_uniform(0.005, 0.07);
         let (color, other) = (palette.color(border + 1), palette.color(border + 2));
         let teeth = random.one_of(&[0., 0., 12., 20., 32., 48.]);
-        canvas.map_pixels(|uv, below| {
+        canvas.update(|uv, below| {
             let from_edge = uv.min(1. - uv).min_element();
             let share = smoothstep(-1., 1., (inset + width - from_edge) * SIZE as f32);
             let outside = smoothstep(-1., 1., (inset - from_edge) * SIZE as f32);

@@ -66,7 +66,7 @@ fn landscape(random: &mut ChaCha8Rng) -> Canvas {
         let texture = fractal(random, SIZE, [4, 16], 5, 0.8);
         let base = horizon + (1. - horizon) * (near - 0.5 / ranges as f32) * 0.8;
         let height = if water { 0. } else { random.uniform(0.03, 0.18) };
-        canvas.map_pixels(|uv, below| {
+        canvas.update(|uv, below| {
             let top = base - height * (1. + profile.values[(uv.x * SIZE as f32) as usize]);
             let value = texture.value(uv);
             let color = if water {
@@ -84,9 +84,9 @@ fn landscape(random: &mut ChaCha8Rng) -> Canvas {
                 let color = ground * random.uniform(0.3, 0.9);
                 let slim = random.uniform(0.4, 1.);
                 let crown = Shape::flower(size, random.count(3, 9), 0.25);
-                canvas.stamp(Vec2::new(x, top - 0.3 * size), Vec2::splat(1.2 * size), |offset| {
-                    (color, crown.coverage(offset / Vec2::new(slim, 1.), SIZE as f32))
-                });
+                let (place, squeeze) = (Vec2::new(x, top - 0.3 * size), Vec2::new(slim, 1.));
+                let reach = Vec2::splat(1.2 * size);
+                canvas.stamp(place, reach, |offset| (color, crown.distance(offset / squeeze)));
             }
         }
     }
@@ -112,7 +112,7 @@ fn portrait(random: &mut ChaCha8Rng) -> Canvas {
             let ellipse = Shape::ellipse(radii);
             canvas.stamp(head + place, radii + 0.004, |offset| {
                 let lit = 1. + shading * (offset / radii).dot(light);
-                (color * lit.max(0.2), ellipse.coverage(offset, SIZE as f32))
+                (color * lit.max(0.2), ellipse.distance(offset))
             });
         };
         let long = random.uniform(0., 1.);
@@ -154,11 +154,10 @@ fn shapes(random: &mut ChaCha8Rng) -> Canvas {
         let shape = shape.turned(turn);
         let (center, reach) = (random.point(), Vec2::splat(1.42 * size));
         let color = palette.any(random);
-        canvas.stamp(center, reach, |offset| (color, shape.coverage(offset, SIZE as f32)));
+        canvas.stamp(center, reach, |offset| (color, shape.distance(offset)));
         if line > 0. {
-            canvas.stamp(center, reach, |offset| {
-                (Vec3::splat(0.02), coverage(shape.distance(offset).abs() - line, SIZE as f32))
-            });
+            let black = Vec3::splat(0.02);
+            canvas.stamp(center, reach, |offset| (black, shape.distance(offset).abs() - line));
         }
     }
     canvas
@@ -184,7 +183,7 @@ fn print(random: &mut ChaCha8Rng) -> Canvas {
                 let height = random.uniform(0.15, 0.6).min(left);
                 let inner = random.one_of(&[landscape, shapes, portrait, dead_leaves])(random);
                 let (low, extent) = (Vec2::new(0.06, top), Vec2::new(0.88, height));
-                canvas.map_pixels(|uv, below| {
+                canvas.update(|uv, below| {
                     let at = (uv - low) / extent;
                     let inside = at.cmpge(Vec2::ZERO).all() && at.cmplt(Vec2::ONE).all();
                     // Crop instead of squeezing, keeping the aspect ratio.
@@ -253,7 +252,7 @@ fn dead_leaves(random: &mut ChaCha8Rng) -> Canvas {
         let leaf = leaf.turned(turn);
         canvas.stamp(random.point(), Vec2::splat(1.42 * size), |offset| {
             let lit = 1. + shading * offset.dot(light) / size;
-            (color * lit.max(0.1), leaf.coverage(offset, SIZE as f32))
+            (color * lit.max(0.1), leaf.distance(offset))
         });
     }
     canvas
@@ -298,14 +297,14 @@ fn palette_shade(random: &mut ChaCha8Rng, palette: &Palette) -> Vec3 {
 fn window(random: &mut ChaCha8Rng) -> Canvas {
     let mut canvas = landscape(random);
     let light = random.uniform(1., 1.8);
-    canvas.pixels.iter_mut().for_each(|pixel| *pixel = (*pixel * light).min(Vec3::ONE));
+    canvas.update(|_, pixel| (pixel * light).min(Vec3::ONE));
     let frame = random_color_of_themes(random, &[(WHITES, 5.), (WOODS, 2.), (GRAYS, 2.)]);
     let panes = Vec2::new(random.count(1, 4) as f32, random.count(1, 4) as f32);
     let (bar, edge) = (random.uniform(0.005, 0.02), random.uniform(0.02, 0.06));
     let [left, right] = [(); 2].map(|()| if random.chance(0.3) { random.uniform(0.1, 0.35) } else { 0. });
     let cloth = random_theme_color(random, WHITES);
     let folds = random.uniform(60., 160.);
-    canvas.map_pixels(|uv, outside| {
+    canvas.update(|uv, outside| {
         let part = (uv * panes - (uv * panes).round()).abs() / panes;
         let near = (part - bar).min_element().min((uv.min(1. - uv) - edge).min_element());
         let seen = outside.lerp(frame * (0.75 + 10. * near.clamp(-0.025, 0.)), coverage(near, SIZE as f32));
@@ -351,7 +350,7 @@ fn frame(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
     let relief = random.uniform(0.1, 0.5);
     let inner = canvas.clone();
     let all = bar + margin;
-    canvas.map_pixels(|uv, _| {
+    canvas.update(|uv, _| {
         let from_edge = uv.min(1. - uv);
         let near = from_edge.min_element();
         if near >= all {

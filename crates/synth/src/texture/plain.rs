@@ -3,8 +3,9 @@
 use glam::Vec3;
 use rand_chacha::ChaCha8Rng;
 
-use super::canvas::smoothstep;
-use super::noise::{Field, RandomValues, Voronoi, folded_fractal, fractal, ridge, smooth, unit_of, warped};
+use super::canvas::{Field, smoothstep};
+use super::layout::Layout;
+use super::noise::{RandomValues, folded_fractal, fractal, ridge, smooth, unit_of, warped};
 use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
 
@@ -48,7 +49,7 @@ pub(super) fn brushed(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let rust = srgb_to_linear(random.one_of(&[0x7a4426, 0x8f5a33, 0x5b3a2a]));
         let patches = fractal(random, SIZE, [3; 2], 6, 0.65);
         let level = random.uniform(0.1, 0.9);
-        canvas.map_with_field(&patches, |pixel, value| {
+        canvas.update_with(&patches, |pixel, value| {
             pixel.lerp(rust * (1. + 0.4 * value), ((value - level) * 5.).clamp(0., 0.9))
         });
     }
@@ -63,7 +64,7 @@ pub(super) fn glossy(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let level = random.uniform(0.1, 0.6);
     let light = Vec3::splat(random.uniform(0.5, 0.9));
     let share = random.uniform(0.15, 0.5);
-    let canvas = Canvas::from_field(&lights, |value| {
+    let canvas = lights.map(|value| {
         (color * (1. + 0.15 * value)).lerp(light, share * smoothstep(level, level + 0.5, value))
     });
     Surface { canvas, repeat_metres: random.uniform(0.6, 2.) }
@@ -77,7 +78,7 @@ pub(super) fn clouds(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         let (cells, reach) = (random.count(1, 6), random.sqrt_uniform(0.01, 0.2));
         field = warped(random, &field, cells, reach);
     }
-    let mut field = field.stretched();
+    field = field.stretched();
     if random.chance(0.2) {
         // Flat patches, like camouflage or flaking paint.
         let steps = random.count(2, 6) as f32;
@@ -85,7 +86,7 @@ pub(super) fn clouds(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         field = field.map(patch).stretched();
     }
     let contrast = random.uniform(0.6, 1.6);
-    let canvas = Canvas::from_field(&field, |value| palette.ramp(0.5 + (value - 0.5) * contrast));
+    let canvas = field.map(|value| palette.ramp(0.5 + (value - 0.5) * contrast));
     Surface { canvas, repeat_metres: random.sqrt_uniform(0.4, 4.) }
 }
 
@@ -99,15 +100,15 @@ fn raw(random: &mut ChaCha8Rng) -> Field {
         2 => folded_fractal(random, SIZE, cells, 6, gain, ridge),
         kind @ (3 | 4) => {
             let count = cells[0].max(3);
-            let voronoi = Voronoi::new(random, count, count, 0.95, false);
+            let layout = Layout::cells(random, count, count, 0.95, false);
             if kind == 4 {
                 let seed = random.seed();
-                return Field::from_fn(SIZE, |uv| unit_of(seed, voronoi.cell(uv).id));
+                return Field::from_fn(SIZE, |uv| unit_of(seed, layout.piece(uv).id));
             }
             let (scale, hollow) = (count as f32, random.chance(0.5));
             Field::from_fn(SIZE, |uv| {
-                let cell = voronoi.cell(uv);
-                if hollow { cell.offset.length() * scale } else { (cell.edge * scale * 3.).min(1.) }
+                let piece = layout.piece(uv);
+                if hollow { piece.at.length() * scale } else { (piece.edge * scale * 3.).min(1.) }
             })
         }
         _ => smooth(random, SIZE, cells),
@@ -135,15 +136,16 @@ pub(super) fn weather(random: &mut ChaCha8Rng, canvas: &mut Canvas, purpose: Pur
     if random.chance(0.3) {
         let tint = Vec3::new(random.approx_normal(), random.approx_normal(), random.approx_normal())
             * random.uniform(0.03, 0.15);
-        canvas.tint(1. + tint);
+        canvas.update(|_, pixel| pixel * (1. + tint));
     }
     if random.chance(0.25) {
         let contrast = if random.chance(0.6) { random.uniform(0.25, 0.9) } else { random.uniform(1.1, 1.5) };
         let mean = canvas.mean();
-        canvas.pixels.iter_mut().for_each(|pixel| *pixel = mean + (*pixel - mean) * contrast);
+        canvas.update(|_, pixel| mean + (pixel - mean) * contrast);
     }
     if random.chance(0.2) {
-        canvas.tint(Vec3::splat(random.uniform(0.5, 1.3)));
+        let light = random.uniform(0.5, 1.3);
+        canvas.update(|_, pixel| pixel * light);
     }
 }
 
@@ -155,7 +157,7 @@ fn dirt(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
     let gain = random.uniform(0.5, 0.85);
     let patches = fractal(random, SIZE, cells, 6, gain);
     let (level, most) = (random.uniform(-0.3, 0.9), random.uniform(0.1, 0.6));
-    canvas.map_with_field(&patches, |pixel, value| {
+    canvas.update_with(&patches, |pixel, value| {
         pixel.lerp(color, most * smoothstep(level, level + 0.9, value))
     });
 }
@@ -167,7 +169,7 @@ fn scratches(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
     let patches = smooth(random, SIZE, [4; 2]);
     let change = if random.chance(0.5) { random.uniform(0.1, 0.4) } else { -random.uniform(0.1, 0.5) };
     let width = random.uniform(0.05, 0.2);
-    canvas.map_pixels(|uv, pixel| {
+    canvas.update(|uv, pixel| {
         let strength = smoothstep(1. - width, 1., lines.value(uv)) * patches.value(uv).clamp(0., 1.);
         pixel * (1. + change * strength)
     });

@@ -14,7 +14,7 @@ fn ground(random: &mut ChaCha8Rng, theme: Theme) -> Canvas {
     let cells = random.count(2, 12);
     let field = fractal(random, SIZE, [cells; 2], 6, 0.75);
     let dark = random.uniform(0.35, 1.);
-    let mut canvas = Canvas::from_field(&field, |value| palette.ramp(0.5 + 0.5 * value) * dark);
+    let mut canvas = field.map(|value| palette.ramp(0.5 + 0.5 * value) * dark);
     canvas.shade(&field, 0.15);
     canvas
 }
@@ -25,7 +25,7 @@ pub(super) fn leaves(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     let theme = if fallen { AUTUMN } else { random.weighted(&[(GREENS, 6.), (AUTUMN, 1.)]) };
     let mut canvas = ground(random, if fallen { EARTHS } else { theme });
     if !fallen {
-        canvas.tint(Vec3::splat(0.35));
+        canvas.update(|_, pixel| pixel * 0.35);
     }
     let palette = Palette::from_theme(random, theme, 4);
     let length = random.sqrt_uniform(0.025, 0.16);
@@ -53,7 +53,7 @@ pub(super) fn leaves(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
             let local = turn.rotate(offset);
             let vein = 1. + veined * (1. - local.y.abs() * pixels).max(0.);
             let side = 1. + tilt * local.y.signum() * (local.y.abs() * pixels).min(1.) + 0.3 * local.x / size;
-            (color * vein * side, leaf.coverage(local, pixels))
+            (color * vein * side, leaf.distance(local))
         });
     }
     Surface { canvas, repeat_metres: random.uniform(0.06, 0.15) / length * 0.6 }
@@ -123,13 +123,12 @@ pub(super) fn gravel(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         };
         let distance = |offset: Vec2| outline.distance(turn.rotate(offset) * size / radii);
         let reach = Vec2::splat(1.5 * size);
-        let pixels = SIZE as f32;
-        canvas.stamp(center - light * 0.35 * size, reach, |offset| {
-            (Vec3::splat(0.01), shadow * coverage(distance(offset), 0.5 * pixels))
+        canvas.blend(center - light * 0.35 * size, reach, |offset| {
+            (Vec3::splat(0.01), shadow * coverage(distance(offset), 0.5 * SIZE as f32))
         });
         canvas.stamp(center, reach, |offset| {
             let lit = 1. + strength * offset.dot(light) / size;
-            (tone * lit.max(0.1), coverage(distance(offset), pixels))
+            (tone * lit.max(0.1), distance(offset))
         });
     }
     Surface { canvas, repeat_metres: random.uniform(0.008, 0.05) / radius }
@@ -147,7 +146,7 @@ pub(super) fn earth(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         let green = Palette::from_theme(random, GREENS, 2);
         let patches = fractal(random, SIZE, [3; 2], 6, 0.75);
         let level = random.uniform(-0.4, 1.);
-        canvas.map_with_field(&patches, |pixel, value| {
+        canvas.update_with(&patches, |pixel, value| {
             pixel.lerp(green.ramp(0.5 + 0.5 * value), 0.9 * smoothstep(level, level + 0.5, value))
         });
     }
@@ -174,8 +173,8 @@ pub(super) fn confetti(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
             _ => Shape::flower(0.5 * size, 5, slim),
         };
         let bit = bit.turned(turn);
-        canvas.stamp(random.point(), Vec2::splat(0.8 * size), |offset| {
-            (color, clear * bit.coverage(offset, SIZE as f32))
+        canvas.blend(random.point(), Vec2::splat(0.8 * size), |offset| {
+            (color, clear * coverage(bit.distance(offset), SIZE as f32))
         });
     }
     Surface { canvas, repeat_metres: random.sqrt_uniform(0.4, 3.) }

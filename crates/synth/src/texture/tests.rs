@@ -8,7 +8,7 @@ const PURPOSES: [Purpose; 8] = [Floor, Wall, Ceiling, Ground, Facade, Thing, Fol
 /// Returns the mean differences between adjacent columns and between adjacent rows. The last ones are those across the border.
 fn steps(canvas: &Canvas) -> [Vec<f32>; 2] {
     let size = canvas.size;
-    let difference = |a: usize, b: usize| (canvas.pixels[a] - canvas.pixels[b]).abs().element_sum();
+    let difference = |a: usize, b: usize| (canvas.values[a] - canvas.values[b]).abs().element_sum();
     let mean = |pairs: &dyn Fn(usize) -> f32| (0..size).map(pairs).sum::<f32>() / size as f32;
     let column = |x| mean(&|y| difference(y * size + x, y * size + (x + 1) % size));
     let row = |y| mean(&|x| difference(y * size + x, (y + 1) % size * size + x));
@@ -23,7 +23,7 @@ fn families_paint_plausible_surfaces_without_seams() {
         let purpose = PURPOSES[weights.iter().position(|&weight| weight == likely).expect("its own")];
         for seed in 0..4 {
             let Surface { canvas, repeat_metres } = family(&mut ChaCha8Rng::seed_from_u64(seed), purpose);
-            assert!(canvas.pixels.iter().all(|pixel| pixel.is_finite()), "family {index}");
+            assert!(canvas.values.iter().all(|pixel| pixel.is_finite()), "family {index}");
             assert!((0.02..25.).contains(&repeat_metres), "family {index}: {repeat_metres} m");
             for steps in steps(&canvas) {
                 let (across, inside) = steps.split_last().expect("many");
