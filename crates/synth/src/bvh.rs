@@ -3,8 +3,8 @@
 use glam::{Vec3, Vec3A, Vec4};
 use obvhs::BvhBuildParams;
 use obvhs::aabb::Aabb;
+use obvhs::bvh2::Bvh2;
 use obvhs::bvh2::builder::build_bvh2_from_tris;
-use obvhs::bvh2::{Bvh2, Bvh2Node};
 use obvhs::triangle::Triangle;
 use std::time::Duration;
 
@@ -16,6 +16,7 @@ const LEVELS: usize = 32;
 const STACK: usize = (WIDTH - 1) * LEVELS + 1;
 
 /// Bounding volume hierarchy of triangles.
+#[derive(Default)]
 pub(super) struct Bvh {
     nodes: Vec<Node>,
     leaves: Vec<Leaf>,
@@ -25,8 +26,8 @@ pub(super) struct Bvh {
 /// Intersection of a ray with a triangle.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Hit {
-    /// Position of the triangle in the tree.
-    pub slot: usize,
+    /// Index of the triangle.
+    pub triangle: usize,
     pub distance: f32,
 }
 
@@ -39,6 +40,8 @@ struct Node {
 
 /// Four triangles in structure-of-arrays layout: one corner, and the vectors from it to the other two.
 struct Leaf {
+    /// Indices of the triangles.
+    triangles: [u32; WIDTH],
     corner: [Vec4; 3],
     right: [Vec4; 3],
     up: [Vec4; 3],
@@ -58,16 +61,68 @@ struct Ray {
 }
 
 impl Bvh {
-    /// Builds the tree. Also returns, for every position in the tree, the index of its triangle, or `None`. There may be more
-    /// positions than triangles.
-    pub fn new(triangles: &[Triangle]) -> (Bvh, Vec<Option<usize>>) {
+    /// Builds the tree: a binary one, converted to one with four boxes per node.
+    pub fn new(triangles: &[Triangle]) -> Bvh {
         let settings = BvhBuildParams { max_prims_per_leaf: WIDTH as u32, ..BvhBuildParams::fast_build() };
         let tree = build_bvh2_from_tris(triangles, settings, &mut Duration::default());
-        let mut builder =
-            BvhBuilder { tree: &tree, triangles, places: vec![], nodes: vec![], leaves: vec![] };
-        let root = builder.child(0, 1);
-        let BvhBuilder { places, nodes, leaves, .. } = builder;
-        (Bvh { nodes, leaves, root }, places)
+        let mut bvh = Bvh::default();
+        bvh.root = bvh.add_node(&tree, triangles, 0, 1);
+        bvh
+    }
+
+    /// Adds node `index` of the binary tree, at depth `level`, with all below it.
+    fn add_node(&mut self, tree: &Bvh2, triangles: &[Triangle], index: usize, level: usize) -> Child {
+        assert!(level <= LEVELS, "triangles that no tree of {LEVELS} levels can sort");
+        let Some(node) = tree.nodes.get(index) else { return self.add_leaf(&[], triangles) };
+        let first = node.first_index as usize;
+        if node.is_leaf() {
+            return self.add_leaf(&tree.primitive_indices[first..][..node.prim_count as usize], triangles);
+        }
+        // Split the largest node until there are four.
+        let mut open = vec![first, first + 1];
+        let size = |index: &usize| tree.nodes[*index].aabb.half_area();
+        while open.len() < WIDTH {
+            let inner = (0..open.len()).filter(|&i| !tree.nodes[open[i]].is_leaf());
+            let Some(largest) = inner.max_by(|&a, &b| size(&open[a]).total_cmp(&size(&open[b]))) else {
+                break;
+            };
+            let children = tree.nodes[open[largest]].first_index as usize;
+            open[largest] = children;
+            open.push(children + 1);
+        }
+        // Empty boxes end before they begin, and no ray hits them.
+        let mut boxes = [Aabb { min: Vec3A::splat(f32::MAX), max: Vec3A::splat(f32::MIN) }; WIDTH];
+        for (aabb, &index) in boxes.iter_mut().zip(&open) {
+            // Enlarge the boxes slightly to allow for rounding.
+            let margin = Vec3A::splat(1e-4);
+            let Aabb { min, max } = tree.nodes[index].aabb;
+            *aabb = Aabb { min: min - margin, max: max + margin };
+        }
+        let corners = [boxes.map(|b| b.min), boxes.map(|b| b.max)].map(transposed);
+        let number = self.nodes.len();
+        self.nodes.push(Node { corners, children: [LEAF; WIDTH] });
+        for (lane, &index) in open.iter().enumerate() {
+            self.nodes[number].children[lane] = self.add_node(tree, triangles, index, level + 1);
+        }
+        number as Child
+    }
+
+    /// Adds a leaf of up to four of the `triangles`.
+    fn add_leaf(&mut self, indices: &[u32], triangles: &[Triangle]) -> Child {
+        // Missing triangles have no area, and no ray hits them.
+        let nothing = Triangle { v0: Vec3A::ZERO, v1: Vec3A::ZERO, v2: Vec3A::ZERO };
+        let mut leaf = ([u32::MAX; WIDTH], [nothing; WIDTH]);
+        for (lane, &index) in indices.iter().enumerate() {
+            (leaf.0[lane], leaf.1[lane]) = (index, triangles[index as usize]);
+        }
+        let along = |point: fn(&Triangle) -> Vec3A| transposed(leaf.1.each_ref().map(point));
+        self.leaves.push(Leaf {
+            triangles: leaf.0,
+            corner: along(|t| t.v0),
+            right: along(|t| t.v1 - t.v0),
+            up: along(|t| t.v2 - t.v0),
+        });
+        LEAF | (self.leaves.len() - 1) as Child
     }
 
     /// Returns the first triangle along the ray from `origin` in `direction` (unit) that is nearer than `limit`.
@@ -83,7 +138,7 @@ impl Bvh {
     /// Returns the first triangle along the ray before `limit`, or with `ANY` one that the ray hits before `limit`.
     fn traverse<const ANY: bool>(&self, origin: Vec3, direction: Vec3, limit: f32) -> Option<Hit> {
         let ray = Ray::new(origin, direction);
-        let mut found = Hit { slot: usize::MAX, distance: limit };
+        let mut found = Hit { triangle: usize::MAX, distance: limit };
         let mut stack = [(0., self.root); STACK];
         let mut count = 1;
         while count > 0 {
@@ -93,11 +148,11 @@ impl Bvh {
                 continue;
             }
             if child & LEAF != 0 {
-                let leaf = (child ^ LEAF) as usize;
-                let (distances, mask) = self.leaves[leaf].intersect(&ray, found.distance);
+                let leaf = &self.leaves[(child ^ LEAF) as usize];
+                let (distances, mask) = leaf.intersect(&ray, found.distance);
                 for lane in lanes(mask) {
                     if distances[lane] < found.distance {
-                        found = Hit { slot: WIDTH * leaf + lane, distance: distances[lane] };
+                        found = Hit { triangle: leaf.triangles[lane] as usize, distance: distances[lane] };
                     }
                 }
                 if ANY && mask != 0 {
@@ -119,7 +174,7 @@ impl Bvh {
                 count += 1;
             }
         }
-        (found.slot != usize::MAX).then_some(found)
+        (found.triangle != usize::MAX).then_some(found)
     }
 }
 
@@ -160,7 +215,7 @@ impl Leaf {
     /// Triangles include their edges, so that there is no gap between adjacent ones.
     #[inline(always)]
     fn intersect(&self, ray: &Ray, limit: f32) -> ([f32; WIDTH], u32) {
-        let Leaf { corner, right, up } = self;
+        let Leaf { corner, right, up, .. } = self;
         let normal = cross(right, up);
         let scale = Vec4::ONE / dot(&normal, &ray.direction);
         let way: [Vec4; 3] = std::array::from_fn(|axis| corner[axis] - ray.origin[axis]);
@@ -182,76 +237,6 @@ fn cross(a: &[Vec4; 3], b: &[Vec4; 3]) -> [Vec4; 3] {
 #[inline(always)]
 fn dot(a: &[Vec4; 3], b: &[Vec4; 3]) -> Vec4 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-}
-
-/// Converter of a binary tree to one with four boxes per node.
-struct BvhBuilder<'a> {
-    tree: &'a Bvh2,
-    triangles: &'a [Triangle],
-    places: Vec<Option<usize>>,
-    nodes: Vec<Node>,
-    leaves: Vec<Leaf>,
-}
-
-impl BvhBuilder<'_> {
-    /// Converts node `index` of the binary tree, at depth `level`.
-    fn child(&mut self, index: usize, level: usize) -> Child {
-        assert!(level <= LEVELS, "triangles that no tree of {LEVELS} levels can sort");
-        let Some(node) = self.tree.nodes.get(index) else { return self.leaf(&[]) };
-        let first = node.first_index as usize;
-        if node.is_leaf() {
-            return self.leaf(&self.tree.primitive_indices[first..][..node.prim_count as usize]);
-        }
-        // Split the largest node until there are four.
-        let mut open = vec![first, first + 1];
-        let size = |index: &usize| self.tree.nodes[*index].aabb.half_area();
-        while open.len() < WIDTH {
-            let inner = (0..open.len()).filter(|&i| !self.tree.nodes[open[i]].is_leaf());
-            let Some(largest) = inner.max_by(|&a, &b| size(&open[a]).total_cmp(&size(&open[b]))) else {
-                break;
-            };
-            let children = self.tree.nodes[open[largest]].first_index as usize;
-            open[largest] = children;
-            open.push(children + 1);
-        }
-        let number = self.nodes.len();
-        self.nodes.push(Node::from_bvh2_nodes(open.iter().map(|&index| &self.tree.nodes[index])));
-        for (lane, &index) in open.iter().enumerate() {
-            self.nodes[number].children[lane] = self.child(index, level + 1);
-        }
-        number as Child
-    }
-
-    fn leaf(&mut self, triangles: &[u32]) -> Child {
-        let number = self.leaves.len() as Child;
-        let lane = |lane: usize| triangles.get(lane).map(|&index| index as usize);
-        let found: [Option<usize>; WIDTH] = std::array::from_fn(lane);
-        self.places.extend(found);
-        // Missing triangles have no area, and no ray hits them.
-        let nothing = Triangle { v0: Vec3A::ZERO, v1: Vec3A::ZERO, v2: Vec3A::ZERO };
-        let corners = found.map(|index| index.map_or(nothing, |index| self.triangles[index]));
-        let along = |point: fn(&Triangle) -> Vec3A| transposed(corners.each_ref().map(point));
-        self.leaves.push(Leaf {
-            corner: along(|t| t.v0),
-            right: along(|t| t.v1 - t.v0),
-            up: along(|t| t.v2 - t.v0),
-        });
-        LEAF | number
-    }
-}
-
-impl Node {
-    fn from_bvh2_nodes<'a>(nodes: impl Iterator<Item = &'a Bvh2Node>) -> Node {
-        // Empty boxes end before they begin, and no ray hits them.
-        let mut boxes = [Aabb { min: Vec3A::splat(f32::MAX), max: Vec3A::splat(f32::MIN) }; WIDTH];
-        for (known, node) in boxes.iter_mut().zip(nodes) {
-            // Enlarge the boxes slightly to allow for rounding.
-            let margin = Vec3A::splat(1e-4);
-            *known = Aabb { min: node.aabb.min - margin, max: node.aabb.max + margin };
-        }
-        let corners = [boxes.map(|b| b.min), boxes.map(|b| b.max)].map(transposed);
-        Node { corners, children: [LEAF; WIDTH] }
-    }
 }
 
 /// Returns the x, y and z coordinates of all points.
@@ -283,10 +268,13 @@ mod tests {
                     Triangle { v0, v1, v2 }
                 })
                 .collect();
-            let (bvh, places) = Bvh::new(&triangles);
-            let mut known: Vec<usize> = places.iter().flatten().copied().collect();
+            let bvh = Bvh::new(&triangles);
+            let mut known: Vec<u32> = bvh.leaves.iter().flat_map(|leaf| leaf.triangles).collect();
             known.sort();
-            assert!(known.into_iter().eq(0..count), "every triangle has a place");
+            assert!(
+                known.into_iter().filter(|&index| index != u32::MAX).eq(0..count),
+                "every triangle is in a leaf"
+            );
             let mut hits = 0;
             for i in 0..4000 {
                 let mut vector =
@@ -308,7 +296,7 @@ mod tests {
                 assert_eq!(bvh.is_occluded(origin, direction, limit), nearest.is_some());
                 if let Some(hit) = found {
                     hits += 1;
-                    let Triangle { v0, v1, v2 } = triangles[places[hit.slot].expect("a triangle")];
+                    let Triangle { v0, v1, v2 } = triangles[hit.triangle];
                     let (point, normal) =
                         (Vec3A::from(origin + hit.distance * direction), (v1 - v0).cross(v2 - v0));
                     assert!((point - v0).dot(normal.normalize()).abs() < 1e-3, "it isn't there");
@@ -327,7 +315,7 @@ mod tests {
             Vec3A::new(cos, 0.3, sin)
         };
         let fan = |i| Triangle { v0: center, v1: point(i), v2: point(i + 1) };
-        let (bvh, _) = Bvh::new(&(0..12).map(fan).collect::<Vec<_>>());
+        let bvh = Bvh::new(&(0..12).map(fan).collect::<Vec<_>>());
         for i in 0..12 * 50 {
             let at = center.lerp(point(i / 50), (i % 50) as f32 / 51.);
             let origin = Vec3::from(at) + Vec3::Y;

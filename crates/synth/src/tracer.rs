@@ -28,7 +28,6 @@ pub(super) struct SceneContents {
 /// A scene prepared for ray tracing.
 pub(super) struct Tracer {
     bvh: Bvh,
-    /// Faces ordered by their positions in the tree, so that neighbours in space are neighbours in memory.
     faces: Vec<Face>,
     normals: Vec<Vec3>,
     uvs: Vec<Vec2>,
@@ -87,9 +86,7 @@ impl Tracer {
         };
         let faces: Vec<Face> = whole.triangles.iter().zip(&owners).map(face).collect();
         let triangles: Vec<Triangle> = faces.iter().map(|face| face.triangle).collect();
-        let (bvh, places) = Bvh::new(&triangles);
-        // Positions without a triangle, which no ray hits, get an arbitrary face, unless there is none.
-        let faces = places.iter().filter_map(|index| faces.get(index.unwrap_or(0)).copied()).collect();
+        let bvh = Bvh::new(&triangles);
         let inset_vertices = whole.inset_vertices();
         let uvs = whole.uvs;
         let (lights, indirect) = (balance_lights(contents.lights), vec![]);
@@ -174,7 +171,7 @@ impl Tracer {
     }
 
     fn surface(&self, origin: Vec3, direction: Vec3, hit: Hit, spread: f32) -> SurfaceHit<'_> {
-        let Face { triangle: Triangle { v0, v1, v2 }, vertices, material } = self.faces[hit.slot];
+        let Face { triangle: Triangle { v0, v1, v2 }, vertices, material } = self.faces[hit.triangle];
         let [a, b, c] = vertices.map(|vertex| vertex as usize);
         let point = origin + hit.distance * direction;
         let cross = Vec3::from((v1 - v0).cross(v2 - v0));
