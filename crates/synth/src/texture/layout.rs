@@ -1,9 +1,8 @@
 //! Layouts of pieces over one repeat: bricks, tiles, planks, stones.
 
 use glam::{IVec2, UVec2, Vec2, Vec2Swizzles};
-use rand_chacha::ChaCha8Rng;
 
-use super::noise::RandomValues;
+use super::noise::Random;
 
 /// Arrangement of pieces, as a function that returns the piece at a position.
 pub(super) struct Layout(Box<dyn Fn(Vec2) -> Piece>);
@@ -33,13 +32,7 @@ impl Layout {
     }
 
     /// Creates rows of about equal height, each with about `columns` pieces of different lengths.
-    pub fn ragged(
-        random: &mut ChaCha8Rng,
-        rows: usize,
-        columns: f32,
-        unequal_rows: f32,
-        upright: bool,
-    ) -> Layout {
+    pub fn ragged(random: &Random, rows: usize, columns: f32, unequal_rows: f32, upright: bool) -> Layout {
         let heights: Vec<f32> = (0..rows).map(|_| 1. + unequal_rows * random.uniform(-0.5, 0.5)).collect();
         let mut tops = vec![0.];
         let sum: f32 = heights.iter().sum();
@@ -128,7 +121,7 @@ impl Layout {
     }
 
     /// Creates rectangles of up to `largest` squares per side that fill a repeat.
-    pub fn quilt(random: &mut ChaCha8Rng, squares: usize, largest: usize) -> Layout {
+    pub fn quilt(random: &Random, squares: usize, largest: usize) -> Layout {
         const FREE: u32 = u32::MAX;
         let mut owners = vec![FREE; squares * squares];
         let mut pieces = Vec::new();
@@ -165,13 +158,7 @@ impl Layout {
     /// Creates the Voronoi cells of one point in each square of a grid. The points have random offsets from the centers of the squares,
     /// with `jitter` from 0 to 1 of a square. With `staggered`, every other row is shifted by half a square, which makes hexagons if
     /// there is no jitter and requires an even number of rows.
-    pub fn cells(
-        random: &mut ChaCha8Rng,
-        columns: usize,
-        rows: usize,
-        jitter: f32,
-        staggered: bool,
-    ) -> Layout {
+    pub fn cells(random: &Random, columns: usize, rows: usize, jitter: f32, staggered: bool) -> Layout {
         let count = Vec2::new(columns as f32, rows as f32);
         let mut point = |index: usize| {
             let (x, y) = (index % columns, index / columns);

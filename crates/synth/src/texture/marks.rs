@@ -1,10 +1,9 @@
 //! Textures of invented writing and of scribbles.
 
 use glam::{Vec2, Vec3};
-use rand_chacha::ChaCha8Rng;
 
 use super::canvas::Shape;
-use super::noise::RandomValues;
+use super::noise::Random;
 use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
 
@@ -19,27 +18,26 @@ pub(super) struct Script {
 
 impl Script {
     /// Draws a random script.
-    pub fn draw(random: &mut ChaCha8Rng) -> Script {
+    pub fn draw(random: &Random) -> Script {
         let aspect = random.uniform(0.4, 0.8);
         let rounded = random.chance(0.5);
-        let glyph = |random: &mut ChaCha8Rng| {
+        let glyph = || {
             let mut strokes = Vec::new();
             // Most letters have a stem.
             if random.chance(0.7) {
                 strokes.push((Vec2::new(0., -0.5), Vec2::new(0., 0.5)));
             }
             for _ in 0..random.count(1, 3) {
-                let point = |random: &mut ChaCha8Rng| {
-                    Vec2::new(random.count(0, 2) as f32 / 2. * aspect, random.count(0, 2) as f32 / 2. - 0.5)
-                };
-                let (from, to) = (point(random), point(random));
+                let step = || random.count(0, 2) as f32 / 2.;
+                let point = || Vec2::new(step() * aspect, step() - 0.5);
+                let (from, to) = (point(), point());
                 let bend = if rounded { (to - from).perp() * random.uniform(-0.4, 0.4) } else { Vec2::ZERO };
                 let middle = 0.5 * (from + to) + bend;
                 strokes.extend([(from, middle), (middle, to)]);
             }
             strokes
         };
-        let glyphs = (0..random.count(10, 26)).map(|_| glyph(random)).collect();
+        let glyphs = (0..random.count(10, 26)).map(|_| glyph()).collect();
         Script { glyphs, aspect, weight: random.uniform(0.05, 0.14) }
     }
 
@@ -47,7 +45,7 @@ impl Script {
     /// repeats of the texture.
     pub fn write(
         &self,
-        random: &mut ChaCha8Rng,
+        random: &Random,
         canvas: &mut Canvas,
         start: Vec2,
         length: f32,
@@ -83,7 +81,7 @@ impl Script {
     /// high.
     pub fn paragraph(
         &self,
-        random: &mut ChaCha8Rng,
+        random: &Random,
         canvas: &mut Canvas,
         corner: Vec2,
         extent: Vec2,
@@ -103,7 +101,7 @@ impl Script {
 }
 
 /// Returns a color of paper: white with the probability `white`, or a likely one for `purpose`.
-pub(super) fn paper(random: &mut ChaCha8Rng, purpose: Purpose, white: f32) -> Vec3 {
+pub(super) fn paper(random: &Random, purpose: Purpose, white: f32) -> Vec3 {
     if random.chance(white) {
         random_theme_color(random, WHITES)
     } else {
@@ -112,13 +110,13 @@ pub(super) fn paper(random: &mut ChaCha8Rng, purpose: Purpose, white: f32) -> Ve
 }
 
 /// Returns a color that is legible on `paper`.
-pub(super) fn ink_for(random: &mut ChaCha8Rng, paper: Vec3) -> Vec3 {
+pub(super) fn ink_for(random: &Random, paper: Vec3) -> Vec3 {
     let ink = random_color_of_themes(random, &[(GRAYS, 4.), (VIVID, 1.), (ACCENTS, 1.)]);
     if luminance(paper) > 0.3 { ink * 0.35 } else { Vec3::splat(0.75).lerp(ink, 0.3) }
 }
 
 /// Draws a texture of columns of writing, like newspapers, labels and notices.
-pub(super) fn writing(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn writing(random: &Random, purpose: Purpose) -> Surface {
     let paper = paper(random, purpose, 0.6);
     let mut canvas = Canvas::filled(SIZE, paper);
     let ink = ink_for(random, paper);
@@ -148,7 +146,7 @@ pub(super) fn writing(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws a texture of curly lines drawn by hand, as with chalk, crayons or spray paint.
-pub(super) fn scribbles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn scribbles(random: &Random, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 2, 5);
     let mut canvas = Canvas::filled(SIZE, palette.color(0));
     for _ in 0..random.count(1, 12) {

@@ -1,11 +1,10 @@
 //! Textures of bricks, tiles, paving, stone, concrete, plaster and asphalt.
 
 use glam::{Vec2, Vec3};
-use rand_chacha::ChaCha8Rng;
 
 use super::canvas::{Field, Shape, smoothstep};
 use super::layout::Layout;
-use super::noise::{RandomValues, folded_fractal, fractal, ridge, smooth, unit_of, warped};
+use super::noise::{Random, folded_fractal, fractal, ridge, smooth, unit_of, warped};
 use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
 
@@ -29,7 +28,7 @@ struct Finish {
     crookedness: f32,
 }
 
-fn lay(random: &mut ChaCha8Rng, layout: &Layout, finish: &Finish) -> Canvas {
+fn lay(random: &Random, layout: &Layout, finish: &Finish) -> Canvas {
     let rough = fractal(random, SIZE, [16; 2], 4, 0.8);
     let stains = fractal(random, SIZE, [4; 2], 4, 0.6);
     let [right, down] = [(); 2].map(|()| fractal(random, SIZE, [12; 2], 3, 0.6));
@@ -56,13 +55,13 @@ fn lay(random: &mut ChaCha8Rng, layout: &Layout, finish: &Finish) -> Canvas {
     canvas
 }
 
-fn joint_color(random: &mut ChaCha8Rng, theme: Theme) -> Vec3 {
-    let other = random.weighted(&[(STONES, 4.), (GRAYS, 2.), (WHITES, 2.), (theme, 1.)]);
-    random_theme_color(random, other) * random.uniform(0.5, 1.)
+fn joint_color(random: &Random, theme: Theme) -> Vec3 {
+    let themes = [(STONES, 4.), (GRAYS, 2.), (WHITES, 2.), (theme, 1.)];
+    random_color_of_themes(random, &themes) * random.uniform(0.5, 1.)
 }
 
 /// Draws a texture of courses of bricks.
-pub(super) fn bricks(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+pub(super) fn bricks(random: &Random, _: Purpose) -> Surface {
     let theme = random.weighted(&[(BRICKS, 6.), (STONES, 1.), (WHITES, 1.), (GRAYS, 1.)]);
     let rows = 2 * random.count(3, 8);
     let columns = (rows as f32 / random.uniform(2.2, 3.6)).round().max(1.) as usize;
@@ -74,9 +73,8 @@ pub(super) fn bricks(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         _ => Layout::courses(rows, columns, 0.5, upright),
     };
     let high = 1. / rows as f32;
-    let count = random.count(1, 4);
     let finish = Finish {
-        palette: Palette::from_theme(random, theme, count),
+        palette: Palette::from_theme(random, theme, random.count(1, 4)),
         joint: joint_color(random, theme),
         joint_width: high * random.uniform(0.03, 0.11),
         rounding: high * random.uniform(0.05, 0.2),
@@ -85,12 +83,11 @@ pub(super) fn bricks(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         roughness: random.sqrt_uniform(0.03, 0.3),
         crookedness: high * random.sqrt_uniform(0.005, 0.08),
     };
-    let canvas = lay(random, &layout, &finish);
-    Surface { canvas, repeat_metres: rows as f32 * random.uniform(0.065, 0.1) }
+    Surface { canvas: lay(random, &layout, &finish), repeat_metres: rows as f32 * random.uniform(0.065, 0.1) }
 }
 
 /// Draws a texture of glazed or stone tiles with grout, as in kitchens, bathrooms and halls.
-pub(super) fn tiles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn tiles(random: &Random, purpose: Purpose) -> Surface {
     let theme = random.weighted(&[
         (WHITES, 3.),
         (BEIGES, 2.),
@@ -112,9 +109,8 @@ pub(super) fn tiles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         _ => Layout::courses(across, across, 0., false),
     };
     let wide = 1. / across as f32;
-    let count = random.one_of(&[1, 1, 1, 2, 3, 4]);
     let finish = Finish {
-        palette: Palette::from_theme(random, theme, count),
+        palette: Palette::from_theme(random, theme, random.one_of(&[1, 1, 1, 2, 3, 4])),
         joint: joint_color(random, theme),
         joint_width: (wide * random.sqrt_uniform(0.004, 0.03)).max(0.3 / SIZE as f32),
         rounding: wide * random.uniform(0.01, 0.08),
@@ -132,7 +128,7 @@ pub(super) fn tiles(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws a texture of stones of all shapes: cobbles, flagstones, dry walls.
-pub(super) fn stones(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+pub(super) fn stones(random: &Random, _: Purpose) -> Surface {
     let theme = random.weighted(&[(STONES, 5.), (GRAYS, 2.), (EARTHS, 2.), (BRICKS, 0.5)]);
     let across = random.sqrt_uniform(3., 14.) as usize;
     let layout = match random.count(0, 5) {
@@ -140,10 +136,7 @@ pub(super) fn stones(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         1 => Layout::quilt(random, across + 2, 3),
         2 => Layout::cells(random, across, 2 * across.div_ceil(2), 0.5, true),
         3 => Layout::courses(2 * across.div_ceil(2), across, 0.5, false),
-        _ => {
-            let jitter = random.uniform(0.6, 1.);
-            Layout::cells(random, across, across, jitter, false)
-        }
+        _ => Layout::cells(random, across, across, random.uniform(0.6, 1.), false),
     };
     let wide = 1. / across as f32;
     let joint = if random.chance(0.25) {
@@ -151,9 +144,8 @@ pub(super) fn stones(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
     } else {
         joint_color(random, EARTHS) * random.uniform(0.3, 1.)
     };
-    let count = random.count(1, 4);
     let finish = Finish {
-        palette: Palette::from_theme(random, theme, count),
+        palette: Palette::from_theme(random, theme, random.count(1, 4)),
         joint,
         joint_width: wide * random.uniform(0.02, 0.09),
         rounding: wide * random.uniform(0.05, 0.35),
@@ -162,15 +154,16 @@ pub(super) fn stones(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
         roughness: random.uniform(0.08, 0.35),
         crookedness: wide * random.sqrt_uniform(0.01, 0.12),
     };
-    let canvas = lay(random, &layout, &finish);
-    Surface { canvas, repeat_metres: across as f32 * random.uniform(0.08, 0.4) }
+    Surface {
+        canvas: lay(random, &layout, &finish),
+        repeat_metres: across as f32 * random.uniform(0.08, 0.4),
+    }
 }
 
 /// Draws a texture of roof tiles or shingles: rows that overlap the one below.
-pub(super) fn shingles(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+pub(super) fn shingles(random: &Random, _: Purpose) -> Surface {
     let theme = random.weighted(&[(BRICKS, 3.), (GRAYS, 3.), (WOODS, 2.), (STONES, 1.)]);
-    let count = random.count(1, 4);
-    let palette = Palette::from_theme(random, theme, count);
+    let palette = Palette::from_theme(random, theme, random.count(1, 4));
     let rows = 2 * random.count(2, 8);
     let columns = rows * random.count(1, 2);
     let (seed, scalloped) = (random.seed(), random.uniform(0., 0.6));
@@ -207,7 +200,7 @@ pub(super) fn shingles(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 }
 
 /// Draws a mosaic of small stones in many colors.
-pub(super) fn mosaic(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn mosaic(random: &Random, purpose: Purpose) -> Surface {
     let across = random.count(16, 40);
     let palette = Palette::draw_between(random, purpose, 2, 5);
     let drift = smooth(random, SIZE, [4; 2]);
@@ -232,23 +225,19 @@ pub(super) fn mosaic(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws marble: thin and wide veins through clouds.
-pub(super) fn marble(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+pub(super) fn marble(random: &Random, _: Purpose) -> Surface {
     let palette =
         Palette::among(random, &[(WHITES, 4.), (GRAYS, 2.), (BEIGES, 2.), (BROWNS, 1.), (ACCENTS, 1.)], 2);
     let vein = if random.chance(0.7) {
         random_theme_color(random, GRAYS) * random.uniform(0.3, 1.)
     } else {
-        let theme = random.one_of(&[WHITES, BROWNS, AUTUMN]);
-        random_theme_color(random, theme)
+        random_theme_color(random, random.one_of(&[WHITES, BROWNS, AUTUMN]))
     };
-    let cells = random.count(2, 4);
-    let clouds = fractal(random, SIZE, [cells; 2], 6, 0.6);
+    let clouds = fractal(random, SIZE, [random.count(2, 4); 2], 6, 0.6);
     let reach = random.uniform(0.03, 0.15);
-    let cells = [random.count(1, 4), random.count(1, 5)];
-    let veins = smooth(random, SIZE, cells);
+    let veins = smooth(random, SIZE, [random.count(1, 4), random.count(1, 5)]);
     let veins = warped(random, &veins, 3, reach);
-    let cells = random.count(4, 9);
-    let fine = smooth(random, SIZE, [cells; 2]);
+    let fine = smooth(random, SIZE, [random.count(4, 9); 2]);
     let fine = warped(random, &fine, 6, 0.04);
     let (width, fine_width) = (random.sqrt_uniform(0.03, 0.35), random.sqrt_uniform(0.02, 0.15));
     let (share, fine_share) = (random.uniform(0.3, 1.), random.uniform(0., 0.6));
@@ -264,7 +253,7 @@ pub(super) fn marble(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 }
 
 /// Draws terrazzo: chips of stone in cement.
-pub(super) fn terrazzo(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn terrazzo(random: &Random, purpose: Purpose) -> Surface {
     let ground = Palette::draw(random, purpose, 1).color(0);
     let count = random.count(2, 5);
     let palette = Palette::among(random, &[(STONES, 3.), (WHITES, 1.), (ACCENTS, 2.), (BEIGES, 1.)], count);
@@ -286,7 +275,7 @@ pub(super) fn terrazzo(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws granite, sandstone or worktops: grains of a few colors.
-pub(super) fn speckle(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn speckle(random: &Random, purpose: Purpose) -> Surface {
     let theme = random.weighted(&[(STONES, 4.), (GRAYS, 3.), (BEIGES, 2.), (BROWNS, 1.)]);
     let base = if random.chance(0.7) {
         random_theme_color(random, theme)
@@ -295,8 +284,7 @@ pub(super) fn speckle(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     };
     let mut canvas = Canvas::filled(SIZE, base);
     for _ in 0..random.count(2, 4) {
-        let grain = random.one_of(&[32, 48, 64, 96, 128]);
-        let field = smooth(random, SIZE, [grain; 2]);
+        let field = smooth(random, SIZE, [random.one_of(&[32, 48, 64, 96, 128]); 2]);
         let spots = shade(random, base, 0.7);
         let level = random.uniform(0., 0.9);
         let share = random.uniform(0.3, 1.);
@@ -307,12 +295,11 @@ pub(super) fn speckle(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws concrete with stains, pores and the joints of its formwork.
-pub(super) fn concrete(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+pub(super) fn concrete(random: &Random, _: Purpose) -> Surface {
     let base = random_color_of_themes(random, &[(GRAYS, 3.), (STONES, 4.), (BEIGES, 1.)]);
     let mut canvas = Canvas::filled(SIZE, base);
     canvas.shade(&fractal(random, SIZE, [3; 2], 7, 0.7), random.uniform(0.05, 0.3));
-    let streaks = fractal(random, SIZE, [16, 2], 4, 0.6);
-    canvas.shade(&streaks, random.sqrt_uniform(0., 0.25));
+    canvas.shade(&fractal(random, SIZE, [16, 2], 4, 0.6), random.sqrt_uniform(0., 0.25));
     canvas.shade(&smooth(random, SIZE, [128; 2]), random.uniform(0.02, 0.12));
     for _ in 0..random.count(0, 250) {
         let radius = random.sqrt_uniform(0.5, 2.5) / SIZE as f32;
@@ -329,18 +316,14 @@ pub(super) fn concrete(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 }
 
 /// Draws plaster or stucco: relief lit from the side.
-pub(super) fn plaster(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let color = Palette::draw(random, purpose, 1).color(0);
-    let mut canvas = Canvas::filled(SIZE, color);
+pub(super) fn plaster(random: &Random, purpose: Purpose) -> Surface {
+    let mut canvas = Canvas::filled(SIZE, Palette::draw(random, purpose, 1).color(0));
     let cells = random.sqrt_uniform(2., 48.) as usize;
     let gain = random.uniform(0.5, 0.9);
     let relief = match random.count(0, 3) {
         0 => folded_fractal(random, SIZE, [cells; 2], 5, gain, ridge),
         1 => fractal(random, SIZE, [cells, 3 * cells], 5, gain),
-        2 => {
-            let strokes = fractal(random, SIZE, [cells, 2 * cells], 4, gain);
-            warped(random, &strokes, 4, 0.12)
-        }
+        2 => warped(random, &fractal(random, SIZE, [cells, 2 * cells], 4, gain), 4, 0.12),
         _ => fractal(random, SIZE, [cells; 2], 6, gain),
     };
     canvas.shade(&relief.slope(random.direction()), random.uniform(0.1, 0.9));
@@ -350,10 +333,9 @@ pub(super) fn plaster(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws asphalt, tarmac or worn roads: fine grit, patches and cracks.
-pub(super) fn asphalt(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+pub(super) fn asphalt(random: &Random, _: Purpose) -> Surface {
     let base = srgb_to_linear(random.one_of(&[0x4a4a4b, 0x5f5e5c, 0x6f6c68, 0x3a3a3c, 0x85817b]));
-    let base = shade(random, base, 0.15);
-    let mut canvas = Canvas::filled(SIZE, base);
+    let mut canvas = Canvas::filled(SIZE, shade(random, base, 0.15));
     canvas.shade(&smooth(random, SIZE, [256; 2]), random.uniform(0.15, 0.5));
     canvas.shade(&smooth(random, SIZE, [96; 2]), random.uniform(0.05, 0.25));
     canvas.shade(&fractal(random, SIZE, [2; 2], 5, 0.6), random.uniform(0.05, 0.25));

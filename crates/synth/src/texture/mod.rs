@@ -19,7 +19,7 @@ use glam::{Vec2, Vec3};
 use rand_chacha::ChaCha8Rng;
 
 use canvas::Canvas;
-use noise::RandomValues;
+use noise::Random;
 
 /// Width in pixels of all textures except pictures.
 const SIZE: usize = 256;
@@ -70,7 +70,7 @@ struct Surface {
 }
 
 /// A family of textures: a function that paints a surface.
-type Family = fn(&mut ChaCha8Rng, Purpose) -> Surface;
+type Family = fn(&Random, Purpose) -> Surface;
 
 /// All families and their weights by purpose, in the order of [`Purpose`] without pictures.
 #[rustfmt::skip]
@@ -120,7 +120,7 @@ const FAMILIES: [(Family, [f32; 7]); 41] = [
 ];
 
 /// Draws boards for ceilings, and keys or grids for other purposes.
-fn rows_of_things(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+fn rows_of_things(random: &Random, purpose: Purpose) -> Surface {
     let family: Family = match purpose {
         Purpose::Ceiling => panels::ceiling_boards,
         Purpose::Floor | Purpose::Wall | Purpose::Ground | Purpose::Facade => panels::grids,
@@ -130,7 +130,7 @@ fn rows_of_things(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws a house wall that other elements are set into.
-fn masonry_or_paint(random: &mut ChaCha8Rng) -> Surface {
+fn masonry_or_paint(random: &Random) -> Surface {
     let family: Family = random.one_of(&[
         masonry::bricks as Family,
         masonry::plaster,
@@ -142,18 +142,16 @@ fn masonry_or_paint(random: &mut ChaCha8Rng) -> Surface {
 }
 
 /// Draws one surface of one family.
-fn surface(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+fn surface(random: &Random, purpose: Purpose) -> Surface {
     let family = random.weighted(&FAMILIES.map(|(family, weights)| (family, weights[purpose as usize])));
     family(random, purpose)
 }
 
 /// Draws two surfaces, where one shows through worn parts of the other, or tints it.
-fn combined(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+fn combined(random: &Random, purpose: Purpose) -> Surface {
     let Surface { mut canvas, repeat_metres } = surface(random, purpose);
     let other = surface(random, purpose).canvas;
-    let cells = random.count(1, 4);
-    let gain = random.uniform(0.3, 0.8);
-    let mask = noise::fractal(random, SIZE, [cells; 2], 6, gain);
+    let mask = noise::fractal(random, SIZE, [random.count(1, 4); 2], 6, random.uniform(0.3, 0.8));
     let (level, soft) = (random.uniform(-0.6, 0.8), random.sqrt_uniform(0.03, 1.));
     let tints = random.chance(0.35);
     let mean = other.mean();
@@ -169,8 +167,9 @@ fn combined(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 impl Texture {
-    /// Draws a texture of a random family. The result depends only on `purpose` and the state of `random`.
-    pub fn draw(random: &mut ChaCha8Rng, purpose: Purpose) -> Texture {
+    /// Draws a texture of a random family. The result depends only on `purpose` and the state of `generator`.
+    pub fn draw(generator: &mut ChaCha8Rng, purpose: Purpose) -> Texture {
+        let random = &Random::new(generator);
         if purpose == Purpose::Poster {
             return Texture::from_surface(pictures::picture(random));
         }

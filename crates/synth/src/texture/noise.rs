@@ -3,50 +3,57 @@
 use glam::Vec2;
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
+use std::cell::RefCell;
 
 use super::canvas::Field;
 use crate::noise::hash;
 
-/// Random draws that texture families need from a generator.
-pub(super) trait RandomValues: Rng {
+/// Handle of a random number generator, whose draws may be arguments of each other.
+pub(super) struct Random<'a>(RefCell<&'a mut ChaCha8Rng>);
+
+impl<'a> Random<'a> {
+    pub fn new(generator: &'a mut ChaCha8Rng) -> Random<'a> {
+        Random(RefCell::new(generator))
+    }
+
     /// Returns a uniform random value in [0, 1).
-    fn unit(&mut self) -> f32 {
-        self.random()
+    pub fn unit(&self) -> f32 {
+        self.0.borrow_mut().random()
     }
 
     /// Returns a uniform random value in [low, high).
-    fn uniform(&mut self, low: f32, high: f32) -> f32 {
+    pub fn uniform(&self, low: f32, high: f32) -> f32 {
         low + (high - low) * self.unit()
     }
 
     /// Returns a random value in [low, high) that favours low values: the square of a uniform draw between the square roots.
-    fn sqrt_uniform(&mut self, low: f32, high: f32) -> f32 {
+    pub fn sqrt_uniform(&self, low: f32, high: f32) -> f32 {
         let root = self.uniform(low.sqrt(), high.sqrt());
         root * root
     }
 
     /// Returns a random value in (-2, 2) with a bell-shaped distribution around 0.
-    fn approx_normal(&mut self) -> f32 {
+    pub fn approx_normal(&self) -> f32 {
         self.unit() + self.unit() - self.unit() - self.unit()
     }
 
     /// Returns `true` with the given probability.
-    fn chance(&mut self, probability: f32) -> bool {
+    pub fn chance(&self, probability: f32) -> bool {
         self.unit() < probability
     }
 
     /// Returns a uniform random integer from `low` to `high`, both inclusive.
-    fn count(&mut self, low: usize, high: usize) -> usize {
-        self.random_range(low..=high)
+    pub fn count(&self, low: usize, high: usize) -> usize {
+        self.0.borrow_mut().random_range(low..=high)
     }
 
     /// Returns one of the choices, all equally likely.
-    fn one_of<T: Copy>(&mut self, choices: &[T]) -> T {
-        choices[self.random_range(0..choices.len())]
+    pub fn one_of<T: Copy>(&self, choices: &[T]) -> T {
+        choices[self.0.borrow_mut().random_range(0..choices.len())]
     }
 
     /// Returns one of the choices with the given weights, which needn't add up to 1.
-    fn weighted<T: Copy>(&mut self, choices: &[(T, f32)]) -> T {
+    pub fn weighted<T: Copy>(&self, choices: &[(T, f32)]) -> T {
         let sum: f32 = choices.iter().map(|(_, weight)| weight).sum();
         let mut left = self.unit() * sum;
         let mut chosen = None;
@@ -62,22 +69,20 @@ pub(super) trait RandomValues: Rng {
     }
 
     /// Returns a uniformly random position in the repeat.
-    fn point(&mut self) -> Vec2 {
+    pub fn point(&self) -> Vec2 {
         Vec2::new(self.unit(), self.unit())
     }
 
     /// Returns a random direction of length 1.
-    fn direction(&mut self) -> Vec2 {
+    pub fn direction(&self) -> Vec2 {
         Vec2::from_angle(self.unit() * std::f32::consts::TAU)
     }
 
     /// Returns a seed for [`unit_of`].
-    fn seed(&mut self) -> u32 {
-        self.random()
+    pub fn seed(&self) -> u32 {
+        self.0.borrow_mut().random()
     }
 }
-
-impl RandomValues for ChaCha8Rng {}
 
 /// Returns a pseudo-random value in [0, 1) determined by `seed` and `id`, for pieces that are visited in no fixed order.
 pub(super) fn unit_of(seed: u32, id: u32) -> f32 {
@@ -86,7 +91,7 @@ pub(super) fn unit_of(seed: u32, id: u32) -> f32 {
 }
 
 /// Interpolates a lattice of random values by cubic B-splines: about in [-1, 1], with `cells` per repeat in x and y.
-pub(super) fn smooth(random: &mut ChaCha8Rng, size: usize, cells: [usize; 2]) -> Field {
+pub(super) fn smooth(random: &Random, size: usize, cells: [usize; 2]) -> Field {
     let [columns, rows] = cells.map(|count| count.clamp(1, size));
     // The spline halves the spread of uniform noise. With doubled lattice values, few results leave [-1, 1].
     let lattice: Vec<f32> = (0..columns * rows).map(|_| random.uniform(-2., 2.)).collect();
@@ -127,19 +132,13 @@ fn spline(index: usize, size: usize, points: usize) -> (usize, [f32; 4]) {
 }
 
 /// Sums octaves of [`smooth`], each with twice the frequency and `gain` times the amplitude of the previous one; about in [-1, 1].
-pub(super) fn fractal(
-    random: &mut ChaCha8Rng,
-    size: usize,
-    cells: [usize; 2],
-    octaves: usize,
-    gain: f32,
-) -> Field {
+pub(super) fn fractal(random: &Random, size: usize, cells: [usize; 2], octaves: usize, gain: f32) -> Field {
     folded_fractal(random, size, cells, octaves, gain, |value| value)
 }
 
 /// Sums octaves like [`fractal`], each of whose values is mapped by `fold`.
 pub(super) fn folded_fractal(
-    random: &mut ChaCha8Rng,
+    random: &Random,
     size: usize,
     cells: [usize; 2],
     octaves: usize,
@@ -168,7 +167,7 @@ pub(super) fn ridge(value: f32) -> f32 {
 }
 
 /// Returns a field whose positions are displaced by about `reach` repeats, in patches of which `cells` fit into a repeat.
-pub(super) fn warped(random: &mut ChaCha8Rng, field: &Field, cells: usize, reach: f32) -> Field {
+pub(super) fn warped(random: &Random, field: &Field, cells: usize, reach: f32) -> Field {
     let [right, down] = [(); 2].map(|()| fractal(random, field.size, [cells; 2], 3, 0.5));
     Field::from_fn(field.size, |uv| {
         let push = Vec2::new(right.value(uv), down.value(uv));

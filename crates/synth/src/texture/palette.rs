@@ -1,10 +1,9 @@
 //! Realistic colors, and palettes of a few that go together.
 
 use glam::Vec3;
-use rand_chacha::ChaCha8Rng;
 
 use super::Purpose;
-use super::noise::RandomValues;
+use super::noise::Random;
 
 /// Colors of one kind in sRGB, as 0xrrggbb.
 pub(super) type Theme = &'static [u32];
@@ -70,24 +69,22 @@ pub(super) struct Palette {
 
 impl Palette {
     /// Draws `count` colors that are likely for `purpose`.
-    pub fn draw(random: &mut ChaCha8Rng, purpose: Purpose, count: usize) -> Palette {
+    pub fn draw(random: &Random, purpose: Purpose, count: usize) -> Palette {
         Palette::among(random, THEMES[purpose as usize], count)
     }
 
     /// Draws `low` to `high` colors that are likely for `purpose`.
-    pub fn draw_between(random: &mut ChaCha8Rng, purpose: Purpose, low: usize, high: usize) -> Palette {
-        let count = random.count(low, high);
-        Palette::draw(random, purpose, count)
+    pub fn draw_between(random: &Random, purpose: Purpose, low: usize, high: usize) -> Palette {
+        Palette::draw(random, purpose, random.count(low, high))
     }
 
     /// Draws `count` colors of one of the themes with the given weights.
-    pub fn among(random: &mut ChaCha8Rng, themes: &[(Theme, f32)], count: usize) -> Palette {
-        let theme = random.weighted(themes);
-        Palette::from_theme(random, theme, count)
+    pub fn among(random: &Random, themes: &[(Theme, f32)], count: usize) -> Palette {
+        Palette::from_theme(random, random.weighted(themes), count)
     }
 
     /// Draws `count` colors of one theme: shades of one color, several colors, one with accents, or rarely arbitrary colors.
-    pub fn from_theme(random: &mut ChaCha8Rng, theme: Theme, count: usize) -> Palette {
+    pub fn from_theme(random: &Random, theme: Theme, count: usize) -> Palette {
         let base = random_theme_color(random, theme);
         let kind = random.unit();
         let mut colors = vec![base];
@@ -97,9 +94,8 @@ impl Palette {
             } else if kind < 0.68 {
                 random_theme_color(random, theme)
             } else if kind < 0.94 {
-                let other =
-                    random.weighted(&[(theme, 3.), (ACCENTS, 2.), (GRAYS, 1.), (WHITES, 1.), (VIVID, 0.5)]);
-                random_theme_color(random, other)
+                let themes = [(theme, 3.), (ACCENTS, 2.), (GRAYS, 1.), (WHITES, 1.), (VIVID, 0.5)];
+                random_color_of_themes(random, &themes)
             } else {
                 random_color(random)
             });
@@ -111,7 +107,7 @@ impl Palette {
     }
 
     /// Returns a random color of the palette.
-    pub fn any(&self, random: &mut ChaCha8Rng) -> Vec3 {
+    pub fn any(&self, random: &Random) -> Vec3 {
         random.one_of(&self.colors)
     }
 
@@ -136,19 +132,17 @@ impl Palette {
 }
 
 /// Returns a random color of a theme, slightly varied.
-pub(super) fn random_theme_color(random: &mut ChaCha8Rng, theme: Theme) -> Vec3 {
-    let color = srgb_to_linear(random.one_of(theme));
-    shade(random, color, 0.12)
+pub(super) fn random_theme_color(random: &Random, theme: Theme) -> Vec3 {
+    shade(random, srgb_to_linear(random.one_of(theme)), 0.12)
 }
 
 /// Returns a random color of one of the themes with the given weights.
-pub(super) fn random_color_of_themes(random: &mut ChaCha8Rng, themes: &[(Theme, f32)]) -> Vec3 {
-    let theme = random.weighted(themes);
-    random_theme_color(random, theme)
+pub(super) fn random_color_of_themes(random: &Random, themes: &[(Theme, f32)]) -> Vec3 {
+    random_theme_color(random, random.weighted(themes))
 }
 
 /// Returns `color` made brighter or darker by about `spread`, with small random changes of saturation and hue.
-pub(super) fn shade(random: &mut ChaCha8Rng, color: Vec3, spread: f32) -> Vec3 {
+pub(super) fn shade(random: &Random, color: Vec3, spread: f32) -> Vec3 {
     let gray = Vec3::splat(luminance(color));
     let saturation = random.uniform(0.65, 1.2);
     let hue = Vec3::new(random.approx_normal(), random.approx_normal(), random.approx_normal()) * 0.05 + 1.;
@@ -160,7 +154,7 @@ pub(super) fn shade(random: &mut ChaCha8Rng, color: Vec3, spread: f32) -> Vec3 {
 }
 
 /// Returns a color of random hue, brightness and saturation.
-pub(super) fn random_color(random: &mut ChaCha8Rng) -> Vec3 {
+pub(super) fn random_color(random: &Random) -> Vec3 {
     let color = Vec3::new(random.unit(), random.unit(), random.unit());
     let gray = Vec3::splat(luminance(color));
     (gray + (color - gray) * random.uniform(0.3, 1.3)).clamp(Vec3::splat(0.01), Vec3::splat(0.92))

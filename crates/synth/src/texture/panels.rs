@@ -1,20 +1,18 @@
 //! Textures of wood, and of regular arrangements: windows of a house, books on shelves, doors, keys, slats, ceiling boards, grids.
 
 use glam::{Vec2, Vec2Swizzles, Vec3};
-use rand_chacha::ChaCha8Rng;
 
 use super::canvas::{Field, Shape, grid, smoothstep};
 use super::layout::Layout;
 use super::marks::{Script, ink_for};
-use super::noise::{RandomValues, fractal, smooth, unit_of};
+use super::noise::{Random, fractal, smooth, unit_of};
 use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
 
 /// Returns grain along u, about in [-1, 1]: rings cut lengthwise, stretched into fibres, with knots.
-fn grain(random: &mut ChaCha8Rng) -> Field {
+fn grain(random: &Random) -> Field {
     let rings = random.count(2, 14) as f32;
-    let cells = [random.count(1, 2), random.count(2, 5)];
-    let bend = smooth(random, SIZE, cells);
+    let bend = smooth(random, SIZE, [random.count(1, 2), random.count(2, 5)]);
     let sway = random.uniform(0.3, 2.5);
     let (drawn_out, wide) = (random.count(2, 6), random.count(4, 16));
     let fibres = fractal(random, SIZE, [drawn_out, 64], 3, 0.8);
@@ -44,14 +42,14 @@ fn grain(random: &mut ChaCha8Rng) -> Field {
 }
 
 /// Returns two colors of one wood: earlywood and latewood.
-fn tones(random: &mut ChaCha8Rng) -> (Vec3, Vec3) {
+fn tones(random: &Random) -> (Vec3, Vec3) {
     let light = random_color_of_themes(random, &[(WOODS, 10.), (GRAYS, 1.), (WHITES, 1.), (ACCENTS, 0.7)]);
     let red = Vec3::new(1., random.uniform(0.82, 1.), random.uniform(0.65, 1.));
     (light, light * red * random.uniform(0.35, 0.85))
 }
 
 /// Draws boards or parquet with joints.
-pub(super) fn boards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn boards(random: &Random, purpose: Purpose) -> Surface {
     let upright = random.chance(0.5);
     let rows = random.sqrt_uniform(3., 16.) as usize;
     let long = random.count(2, 6);
@@ -65,8 +63,7 @@ pub(super) fn boards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
         }
         2 => (Layout::courses(2 * rows.div_ceil(2), 2, 0.5, upright), 1. / rows as f32),
         _ => {
-            let pieces = random.sqrt_uniform(1., 4.);
-            let unequal = random.one_of(&[0., 0., 0.6]);
+            let (pieces, unequal) = (random.sqrt_uniform(1., 4.), random.one_of(&[0., 0., 0.6]));
             (Layout::ragged(random, rows, pieces, unequal, upright), 1. / rows as f32)
         }
     };
@@ -96,7 +93,7 @@ pub(super) fn boards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws grain without joints, as on doors and tables.
-pub(super) fn veneer(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+pub(super) fn veneer(random: &Random, _: Purpose) -> Surface {
     let (light, dark) = tones(random);
     let grain = grain(random);
     let contrast = random.uniform(0.3, 1.2);
@@ -121,7 +118,7 @@ fn paint_panel(canvas: &mut Canvas, middle: Vec2, half: Vec2, color: Vec3, bevel
 }
 
 /// Draws a texture of a house wall with rows of windows, which have frames, curtains and reflections.
-pub(super) fn windows(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+pub(super) fn windows(random: &Random, _: Purpose) -> Surface {
     let wall = super::masonry_or_paint(random);
     let mut canvas = wall.canvas;
     let (rows, columns) = (random.count(1, 5), random.count(1, 6));
@@ -168,7 +165,7 @@ pub(super) fn windows(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 }
 
 /// Draws a texture of shelves with upright books, folders or boxes.
-pub(super) fn shelves(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+pub(super) fn shelves(random: &Random, _: Purpose) -> Surface {
     let wood = random_color_of_themes(random, &[(WOODS, 4.), (WHITES, 2.), (GRAYS, 1.)]);
     let mut canvas = Canvas::filled(SIZE, wood * random.uniform(0.15, 0.5));
     let rows = random.count(2, 6);
@@ -186,8 +183,7 @@ pub(super) fn shelves(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
             let width = random.sqrt_uniform(thin, thick).min(0.995 - x).max(0.005);
             if random.chance(fill_probability) {
                 let height = (row_height - board) * random.uniform(0.6, 0.96);
-                let theme = random.weighted(&weights);
-                let color = random_theme_color(random, theme);
+                let color = random_color_of_themes(random, &weights);
                 let middle = Vec2::new(x + 0.5 * width, floor - 0.5 * height);
                 let half = 0.5 * Vec2::new(width, height);
                 let roundness = random.uniform(0.2, 0.6);
@@ -217,7 +213,7 @@ pub(super) fn shelves(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 }
 
 /// Draws a texture of doors and drawers with handles and inset panels in relief.
-pub(super) fn cupboards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn cupboards(random: &Random, purpose: Purpose) -> Surface {
     let theme = random.weighted(&[(WHITES, 4.), (WOODS, 3.), (GRAYS, 2.), (ACCENTS, 2.)]);
     let color = random_theme_color(random, theme);
     let mut canvas = Canvas::filled(SIZE, color * random.uniform(0.15, 0.6));
@@ -262,7 +258,7 @@ pub(super) fn cupboards(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws a texture of keys, switches, buttons or vents: small rounded boxes in rows, some of them labelled.
-pub(super) fn keys(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn keys(random: &Random, purpose: Purpose) -> Surface {
     let ground = Palette::draw(random, purpose, 1).color(0);
     let palette = Palette::draw_between(random, Purpose::Thing, 1, 3);
     let mut canvas = Canvas::filled(SIZE, ground * random.uniform(0.3, 1.));
@@ -293,7 +289,7 @@ pub(super) fn keys(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws a texture of parallel strips with the same profile: blinds, shutters, siding, radiators, corrugated sheets.
-pub(super) fn slats(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn slats(random: &Random, purpose: Purpose) -> Surface {
     let color = Palette::draw(random, purpose, 1).color(0);
     let count = random.sqrt_uniform(4., 40.).floor();
     let upright = random.chance(0.5);
@@ -316,17 +312,15 @@ pub(super) fn slats(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws a texture of a suspended ceiling: a grid of boards, which may have specks, with some lamps.
-pub(super) fn ceiling_boards(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+pub(super) fn ceiling_boards(random: &Random, _: Purpose) -> Surface {
     let board = random_theme_color(random, WHITES);
-    let rail = board * random.uniform(0.7, 1.1);
-    let mut canvas = Canvas::filled(SIZE, rail);
+    let mut canvas = Canvas::filled(SIZE, board * random.uniform(0.7, 1.1));
     let (columns, rows) = random.one_of(&[(2, 2), (3, 3), (4, 4), (2, 4), (1, 2)]);
     let cell = Vec2::new(1. / columns as f32, 1. / rows as f32);
     let speck = random.uniform(0., 0.5);
     let lamps = random.uniform(0., 0.2);
     let relief = random.uniform(0.05, 0.3);
-    let cells = random.one_of(&[64, 128]);
-    let rough = smooth(random, SIZE, [cells; 2]);
+    let rough = smooth(random, SIZE, [random.one_of(&[64, 128]); 2]);
     for place in grid(columns, rows) {
         let middle = place * cell;
         let tone = board * random.uniform(0.96, 1.02);
@@ -340,7 +334,7 @@ pub(super) fn ceiling_boards(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 }
 
 /// Draws a texture of bars or wires over a background: fences, grates, nets, trellis.
-pub(super) fn grids(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn grids(random: &Random, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 2, 3);
     let behind = fractal(random, SIZE, [3; 2], 4, 0.6);
     let dark = random.uniform(0.1, 0.8);

@@ -1,16 +1,15 @@
 //! Textures of wallpaper, print and textiles: repeated figures, threads, piles and folds.
 
 use glam::{Vec2, Vec3};
-use rand_chacha::ChaCha8Rng;
 
 use super::canvas::{Field, Shape, coverage, grid, smoothstep};
 use super::layout::Layout;
-use super::noise::{RandomValues, fractal, smooth, unit_of};
+use super::noise::{Random, fractal, smooth, unit_of};
 use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
 
 /// Draws stripes of different widths, horizontal, upright or oblique.
-pub(super) fn stripes(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn stripes(random: &Random, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 2, 5);
     let bands = bands(random, &palette);
     let (across, along) = random.one_of(&[(1., 0.), (1., 0.), (0., 1.), (1., 1.), (1., -1.), (2., 1.)]);
@@ -32,7 +31,7 @@ pub(super) fn stripes(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws stripes in both directions, woven into each other.
-pub(super) fn plaid(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn plaid(random: &Random, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 2, 4);
     let bands_across = bands(random, &palette);
     let bands_along = if random.chance(0.7) { bands_across.clone() } else { bands(random, &palette) };
@@ -51,7 +50,7 @@ pub(super) fn plaid(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 /// A sequence of stripes: the end of each in [0, 1], and its color.
 type Bands = Vec<(f32, Vec3)>;
 
-fn bands(random: &mut ChaCha8Rng, palette: &Palette) -> Bands {
+fn bands(random: &Random, palette: &Palette) -> Bands {
     let widths: Vec<f32> = (0..random.count(2, 7)).map(|_| random.sqrt_uniform(0.05, 1.)).collect();
     let sum: f32 = widths.iter().sum();
     let mut end = 0.;
@@ -72,7 +71,7 @@ fn band_at(bands: &Bands, at: f32, times: f32) -> Vec3 {
 }
 
 /// Draws flat pieces: checks, hexagons, diamonds, zigzags, patchwork.
-pub(super) fn pieces(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn pieces(random: &Random, purpose: Purpose) -> Surface {
     let count = random.count(2, 5);
     let palette = Palette::draw(random, purpose, count);
     let fine = random.count(1, 6);
@@ -113,7 +112,7 @@ pub(super) fn pieces(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws dots, rings, stars, flowers and polygons on a straight, staggered or loose grid.
-pub(super) fn motifs(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn motifs(random: &Random, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 2, 5);
     let mut canvas = Canvas::filled(SIZE, palette.color(0));
     let rows = 2 * random.sqrt_uniform(1., 8.) as usize;
@@ -143,7 +142,7 @@ type MotifLayer = (Box<dyn Fn(f32) -> Shape>, f32, Vec3);
 
 impl Motif {
     /// Draws one to four shapes.
-    pub fn draw(random: &mut ChaCha8Rng, palette: &Palette) -> Motif {
+    pub fn draw(random: &Random, palette: &Palette) -> Motif {
         let mut share = random.uniform(0.15, 0.5);
         let mut layers: Vec<MotifLayer> = Vec::new();
         for index in 0..random.count(1, 4) {
@@ -181,7 +180,7 @@ impl Motif {
 }
 
 /// Draws ornaments with mirror symmetry, as on old wallpaper: tendrils, leaves and flowers.
-pub(super) fn ornament(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn ornament(random: &Random, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 2, 4);
     let mut canvas = Canvas::filled(SIZE, palette.color(0));
     let columns = random.one_of(&[1usize, 2, 2, 3, 4]);
@@ -226,7 +225,7 @@ pub(super) fn ornament(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws threads that pass over and under each other.
-pub(super) fn weave(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn weave(random: &Random, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 1, 3);
     let threads = random.one_of(&[24, 32, 40, 48, 64]);
     let twill = random.one_of(&[1, 1, 2, 3]);
@@ -247,7 +246,7 @@ pub(super) fn weave(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws knitted rows of loops.
-pub(super) fn knit(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn knit(random: &Random, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 1, 3);
     let columns = random.one_of(&[12, 16, 24, 32]);
     let seed = random.seed();
@@ -267,7 +266,7 @@ pub(super) fn knit(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws carpet pile, felt or fur: fine and soft, brushed in some places.
-pub(super) fn pile(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn pile(random: &Random, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 1, 3);
     let fine = random.one_of(&[64, 96, 128, 200]);
     let stretch = random.one_of(&[[1, 1], [1, 1], [1, 3], [3, 1]]);
@@ -281,7 +280,7 @@ pub(super) fn pile(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws cloth hanging in folds along v.
-pub(super) fn folds(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn folds(random: &Random, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 1, 3);
     let depth = random.uniform(0.15, 0.7);
     let (coarse, fine) = (random.count(4, 10), random.count(12, 28));
@@ -300,7 +299,7 @@ pub(super) fn folds(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws padded leather or cloth, buttoned in diamonds or stitched in channels.
-pub(super) fn quilted(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn quilted(random: &Random, purpose: Purpose) -> Surface {
     let color = Palette::draw(random, purpose, 1).color(0);
     let across = random.count(2, 8) as f32;
     let kind = random.count(0, 2);
@@ -321,13 +320,10 @@ pub(super) fn quilted(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws a whole carpet: borders around a field of small figures, with a medallion in the middle.
-pub(super) fn carpet(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+pub(super) fn carpet(random: &Random, _: Purpose) -> Surface {
     let count = random.count(3, 5);
-    let palette = Palette::among(
-        random,
-        &[(ACCENTS, 5.), (BROWNS, 2.), (BEIGES, 2.), (GRAYS, 1.), (VIVID, 0.5)],
-        count,
-    );
+    let themes = [(ACCENTS, 5.), (BROWNS, 2.), (BEIGES, 2.), (GRAYS, 1.), (VIVID, 0.5)];
+    let palette = Palette::among(random, &themes, count);
     let mut canvas = Canvas::filled(SIZE, palette.color(0));
     let middle = Vec2::splat(0.5);
     // Paint the middle first, so that the borders cover what extends too far.

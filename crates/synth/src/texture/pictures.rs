@@ -1,11 +1,10 @@
 //! Pictures for walls and sills: paintings, prints, photos, signs. One repeat is the whole picture.
 
 use glam::{Vec2, Vec3};
-use rand_chacha::ChaCha8Rng;
 
 use super::canvas::{Shape, coverage, smoothstep};
 use super::marks::{Script, ink_for, paper};
-use super::noise::{RandomValues, fractal, smooth};
+use super::noise::{Random, fractal, smooth};
 use super::palette::*;
 use super::{Canvas, Purpose, Surface};
 
@@ -13,8 +12,8 @@ use super::{Canvas, Purpose, Surface};
 const SIZE: usize = 512;
 
 /// Draws a picture of a random kind, often with a mat or a frame.
-pub(super) fn picture(random: &mut ChaCha8Rng) -> Surface {
-    let kind: fn(&mut ChaCha8Rng) -> Canvas = random.weighted(&[
+pub(super) fn picture(random: &Random) -> Surface {
+    let kind: fn(&Random) -> Canvas = random.weighted(&[
         (landscape as _, 3.),
         (portrait as _, 1.5),
         (window as _, 2.),
@@ -33,7 +32,7 @@ pub(super) fn picture(random: &mut ChaCha8Rng) -> Surface {
 }
 
 /// Draws a landscape: sky over hills, water or roofs.
-fn landscape(random: &mut ChaCha8Rng) -> Canvas {
+fn landscape(random: &Random) -> Canvas {
     let skies = [
         [0x5f93c9, 0xd6e4ee],
         [0x8fa5b5, 0xe3e0d8],
@@ -94,13 +93,13 @@ fn landscape(random: &mut ChaCha8Rng) -> Canvas {
 }
 
 /// Draws a portrait: shoulders, neck, head, hair, face.
-fn portrait(random: &mut ChaCha8Rng) -> Canvas {
+fn portrait(random: &Random) -> Canvas {
     let backdrop = Palette::draw(random, Purpose::Poster, 2);
     let drift = smooth(random, SIZE, [2, 2]);
     let backdrop = |uv: Vec2| backdrop.ramp(0.3 * uv.y + 0.35 + 0.3 * drift.value(uv)) * 0.7;
     let mut canvas = Canvas::from_fn(SIZE, backdrop).without_wrapping();
-    let skin = srgb_to_linear(random.one_of(&[0xe6b998, 0xc98f6b, 0x8d5a3c, 0x5c3a28, 0xf0d0b8]));
-    let skin = shade(random, skin, 0.1);
+    let skins = [0xe6b998, 0xc98f6b, 0x8d5a3c, 0x5c3a28, 0xf0d0b8];
+    let skin = shade(random, srgb_to_linear(random.one_of(&skins)), 0.1);
     let hair = random_theme_color(random, BROWNS) * random.uniform(0.2, 1.);
     let cloth = random_color_of_themes(random, &[(ACCENTS, 3.), (GRAYS, 2.), (VIVID, 1.)]);
     for _ in 0..random.one_of(&[1, 1, 1, 2, 3]) {
@@ -133,7 +132,7 @@ fn portrait(random: &mut ChaCha8Rng) -> Canvas {
 }
 
 /// Draws an abstract picture of large flat shapes.
-fn shapes(random: &mut ChaCha8Rng) -> Canvas {
+fn shapes(random: &Random) -> Canvas {
     let palette = Palette::draw_between(random, Purpose::Poster, 3, 5);
     let mut canvas = Canvas::filled(SIZE, palette.color(0)).without_wrapping();
     let straight = random.chance(0.4);
@@ -164,7 +163,7 @@ fn shapes(random: &mut ChaCha8Rng) -> Canvas {
 }
 
 /// Draws a poster or a sign: a heading, a picture, paragraphs.
-fn print(random: &mut ChaCha8Rng) -> Canvas {
+fn print(random: &Random) -> Canvas {
     let paper = paper(random, Purpose::Poster, 0.5);
     let mut canvas = Canvas::filled(SIZE, paper).without_wrapping();
     let ink = ink_for(random, paper);
@@ -211,7 +210,7 @@ fn print(random: &mut ChaCha8Rng) -> Canvas {
 }
 
 /// Draws brush strokes that follow a field, in the colors of an underlying picture.
-fn painting(random: &mut ChaCha8Rng) -> Canvas {
+fn painting(random: &Random) -> Canvas {
     let model = random.one_of(&[landscape, portrait, dead_leaves, flowers, shapes])(random);
     let flow = smooth(random, SIZE, [3; 2]);
     let mut canvas = model.clone();
@@ -230,7 +229,7 @@ fn painting(random: &mut ChaCha8Rng) -> Canvas {
 }
 
 /// Draws overlapping shapes of all sizes, more of the small ones, as in the statistics of photos (dead leaves model).
-fn dead_leaves(random: &mut ChaCha8Rng) -> Canvas {
+fn dead_leaves(random: &Random) -> Canvas {
     let palette = Palette::draw_between(random, Purpose::Thing, 3, 5);
     let other = Palette::draw(random, Purpose::Poster, 3);
     let mut canvas = Canvas::filled(SIZE, palette.color(0)).without_wrapping();
@@ -259,16 +258,15 @@ fn dead_leaves(random: &mut ChaCha8Rng) -> Canvas {
 }
 
 /// Draws flowers with stems and leaves in front of a plain background.
-fn flowers(random: &mut ChaCha8Rng) -> Canvas {
-    let ground = Palette::draw(random, Purpose::Wall, 1).color(0);
-    let mut canvas = Canvas::filled(SIZE, ground).without_wrapping();
+fn flowers(random: &Random) -> Canvas {
+    let wall = Palette::draw(random, Purpose::Wall, 1).color(0);
+    let mut canvas = Canvas::filled(SIZE, wall).without_wrapping();
     let foot = Vec2::new(random.uniform(0.4, 0.6), random.uniform(0.8, 1.1));
     let green = Palette::from_theme(random, GREENS, 3);
     for _ in 0..random.count(3, 16) {
         let head = Vec2::new(random.uniform(0.12, 0.88), random.uniform(0.1, 0.6));
-        let stem = palette_shade(random, &green);
         let half = 0.5 * (foot - head);
-        canvas.fill(head + half, &Shape::stroke(-half, half, 0.005), stem);
+        canvas.fill(head + half, &Shape::stroke(-half, half, 0.005), palette_shade(random, &green));
         for _ in 0..random.count(0, 3) {
             let (place, turn) = (head.lerp(foot, random.uniform(0.2, 0.9)), random.direction());
             let (length, leaf) = (random.uniform(0.08, 0.2), palette_shade(random, &green));
@@ -279,22 +277,20 @@ fn flowers(random: &mut ChaCha8Rng) -> Canvas {
         let mut radius = random.uniform(0.04, 0.14);
         for layer in 0..random.count(2, 4) {
             let color = petals * (1. - 0.2 * layer as f32);
-            let flower = Shape::flower(radius, count, depth).turned(random.direction());
-            canvas.fill(head, &flower, color);
+            canvas.fill(head, &Shape::flower(radius, count, depth).turned(random.direction()), color);
             radius *= 0.65;
         }
-        let heart = random_theme_color(random, AUTUMN);
-        canvas.fill(head, &Shape::disk(0.6 * radius), heart);
+        canvas.fill(head, &Shape::disk(0.6 * radius), random_theme_color(random, AUTUMN));
     }
     canvas
 }
 
-fn palette_shade(random: &mut ChaCha8Rng, palette: &Palette) -> Vec3 {
+fn palette_shade(random: &Random, palette: &Palette) -> Vec3 {
     palette.ramp(random.unit()) * random.uniform(0.5, 1.1)
 }
 
 /// Draws a window and the view through it, in bright light.
-fn window(random: &mut ChaCha8Rng) -> Canvas {
+fn window(random: &Random) -> Canvas {
     let mut canvas = landscape(random);
     let light = random.uniform(1., 1.8);
     canvas.update(|_, pixel| (pixel * light).min(Vec3::ONE));
@@ -315,7 +311,7 @@ fn window(random: &mut ChaCha8Rng) -> Canvas {
 }
 
 /// Draws the screen of a television or a monitor: windows, or only a faint reflection.
-fn screen(random: &mut ChaCha8Rng) -> Canvas {
+fn screen(random: &Random) -> Canvas {
     if random.chance(0.35) {
         let glimmer = random.uniform(0.02, 0.12);
         let slant = random.uniform(-1., 1.);
@@ -341,7 +337,7 @@ fn screen(random: &mut ChaCha8Rng) -> Canvas {
 }
 
 /// Adds a mat and a frame around the picture.
-fn frame(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
+fn frame(random: &Random, canvas: &mut Canvas) {
     let wood = random_color_of_themes(random, &[(WOODS, 3.), (GRAYS, 2.), (WHITES, 2.), (AUTUMN, 1.)]);
     let wood = wood * random.uniform(0.3, 1.);
     let mat = random_color_of_themes(random, &[(WHITES, 4.), (ACCENTS, 1.)]);

@@ -1,34 +1,30 @@
 //! Textures of one material: paint, plastic, metal, clouds of noise; and the weathering of all textures.
 
 use glam::Vec3;
-use rand_chacha::ChaCha8Rng;
 
 use super::canvas::{Field, smoothstep};
 use super::layout::Layout;
-use super::noise::{RandomValues, folded_fractal, fractal, ridge, smooth, unit_of, warped};
+use super::noise::{Random, folded_fractal, fractal, ridge, smooth, unit_of, warped};
 use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
 
 /// Draws an even color with a slightly uneven coat of paint.
-pub(super) fn paint(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
-    let color = Palette::draw(random, purpose, 1).color(0);
-    let mut canvas = Canvas::filled(SIZE, color);
-    let cells = random.count(1, 4);
-    canvas.shade(&fractal(random, SIZE, [cells; 2], 4, 0.5), random.sqrt_uniform(0.005, 0.12));
+pub(super) fn paint(random: &Random, purpose: Purpose) -> Surface {
+    let mut canvas = Canvas::filled(SIZE, Palette::draw(random, purpose, 1).color(0));
+    let coat = fractal(random, SIZE, [random.count(1, 4); 2], 4, 0.5);
+    canvas.shade(&coat, random.sqrt_uniform(0.005, 0.12));
     if random.chance(0.6) {
-        let grain = random.one_of(&[48, 96, 128]);
-        let coat = smooth(random, SIZE, [grain; 2]);
+        let coat = smooth(random, SIZE, [random.one_of(&[48, 96, 128]); 2]);
         canvas.shade(&coat.slope(random.direction()), random.sqrt_uniform(0.02, 0.25));
     }
     Surface { canvas, repeat_metres: random.uniform(2., 4.) }
 }
 
 /// Draws a soft gradient from one color to others and back.
-pub(super) fn gradient(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn gradient(random: &Random, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 2, 4);
     let (across, along) = random.one_of(&[(0., 1.), (1., 0.), (1., 1.), (1., -1.), (0., 2.)]);
-    let cells = random.count(1, 3);
-    let drift = smooth(random, SIZE, [cells; 2]);
+    let drift = smooth(random, SIZE, [random.count(1, 3); 2]);
     let strength = random.sqrt_uniform(0.001, 0.25);
     let canvas = Canvas::from_fn(SIZE, |uv| {
         let turns = uv.x * across + uv.y * along + strength * drift.sample(uv);
@@ -38,7 +34,7 @@ pub(super) fn gradient(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws metal brushed in one direction.
-pub(super) fn brushed(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn brushed(random: &Random, purpose: Purpose) -> Surface {
     let color = random_color_of_themes(random, &[(GRAYS, 4.), (BEIGES, 1.), (ACCENTS, 0.5)]);
     let mut canvas = Canvas::filled(SIZE, color);
     let cells = random.one_of(&[[2, 128], [128, 2], [4, 64], [64, 4], [1, 256]]);
@@ -57,10 +53,9 @@ pub(super) fn brushed(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws bright and dull spots as on polished or wet surfaces.
-pub(super) fn glossy(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn glossy(random: &Random, purpose: Purpose) -> Surface {
     let color = Palette::draw(random, purpose, 1).color(0);
-    let cells = [random.count(1, 3), random.count(1, 3)];
-    let lights = fractal(random, SIZE, cells, 2, 0.4);
+    let lights = fractal(random, SIZE, [random.count(1, 3), random.count(1, 3)], 2, 0.4);
     let level = random.uniform(0.1, 0.6);
     let light = Vec3::splat(random.uniform(0.5, 0.9));
     let share = random.uniform(0.15, 0.5);
@@ -71,12 +66,11 @@ pub(super) fn glossy(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws a texture of a random kind of noise.
-pub(super) fn clouds(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn clouds(random: &Random, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 2, 5);
     let mut field = raw(random);
     if random.chance(0.4) {
-        let (cells, reach) = (random.count(1, 6), random.sqrt_uniform(0.01, 0.2));
-        field = warped(random, &field, cells, reach);
+        field = warped(random, &field, random.count(1, 6), random.sqrt_uniform(0.01, 0.2));
     }
     field = field.stretched();
     if random.chance(0.2) {
@@ -90,7 +84,7 @@ pub(super) fn clouds(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
     Surface { canvas, repeat_metres: random.sqrt_uniform(0.4, 4.) }
 }
 
-fn raw(random: &mut ChaCha8Rng) -> Field {
+fn raw(random: &Random) -> Field {
     let cells = random.sqrt_uniform(1., 24.) as usize;
     let stretch = if random.chance(0.25) { random.one_of(&[[1, 4], [4, 1], [1, 8]]) } else { [1, 1] };
     let cells = stretch.map(|factor| cells * factor);
@@ -116,7 +110,7 @@ fn raw(random: &mut ChaCha8Rng) -> Field {
 }
 
 /// Applies some of these effects, each with its own probability.
-pub(super) fn weather(random: &mut ChaCha8Rng, canvas: &mut Canvas, purpose: Purpose) {
+pub(super) fn weather(random: &Random, canvas: &mut Canvas, purpose: Purpose) {
     let outdoors = matches!(purpose, Purpose::Ground | Purpose::Facade | Purpose::Foliage);
     let often = if outdoors { 1.5 } else { 1. };
     if random.chance(0.18 * often) {
@@ -126,12 +120,12 @@ pub(super) fn weather(random: &mut ChaCha8Rng, canvas: &mut Canvas, purpose: Pur
         scratches(random, canvas);
     }
     if random.chance(0.25) {
-        let cells = random.count(1, 3);
-        canvas.shade(&fractal(random, SIZE, [cells; 2], 2, 0.5), random.uniform(0.03, 0.2));
+        let patches = fractal(random, SIZE, [random.count(1, 3); 2], 2, 0.5);
+        canvas.shade(&patches, random.uniform(0.03, 0.2));
     }
     if random.chance(0.3) {
-        let grain = random.one_of(&[64, 128, 256]);
-        canvas.shade(&smooth(random, SIZE, [grain; 2]), random.sqrt_uniform(0.01, 0.15));
+        let grain = smooth(random, SIZE, [random.one_of(&[64, 128, 256]); 2]);
+        canvas.shade(&grain, random.sqrt_uniform(0.01, 0.15));
     }
     if random.chance(0.3) {
         let tint = Vec3::new(random.approx_normal(), random.approx_normal(), random.approx_normal())
@@ -150,12 +144,11 @@ pub(super) fn weather(random: &mut ChaCha8Rng, canvas: &mut Canvas, purpose: Pur
 }
 
 /// Adds patches of dust, moss or soot.
-fn dirt(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
+fn dirt(random: &Random, canvas: &mut Canvas) {
     let color =
         random_color_of_themes(random, &[(EARTHS, 4.), (GRAYS, 2.), (GREENS, 1.)]) * random.uniform(0.2, 1.);
     let cells = random.one_of(&[[2, 2], [3, 3], [5, 5], [8, 2]]);
-    let gain = random.uniform(0.5, 0.85);
-    let patches = fractal(random, SIZE, cells, 6, gain);
+    let patches = fractal(random, SIZE, cells, 6, random.uniform(0.5, 0.85));
     let (level, most) = (random.uniform(-0.3, 0.9), random.uniform(0.1, 0.6));
     canvas.update_with(&patches, |pixel, value| {
         pixel.lerp(color, most * smoothstep(level, level + 0.9, value))
@@ -163,9 +156,8 @@ fn dirt(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
 }
 
 /// Adds thin brighter or darker lines.
-fn scratches(random: &mut ChaCha8Rng, canvas: &mut Canvas) {
-    let cells = random.count(2, 6);
-    let lines = folded_fractal(random, SIZE, [cells; 2], 3, 0.6, ridge);
+fn scratches(random: &Random, canvas: &mut Canvas) {
+    let lines = folded_fractal(random, SIZE, [random.count(2, 6); 2], 3, 0.6, ridge);
     let patches = smooth(random, SIZE, [4; 2]);
     let change = if random.chance(0.5) { random.uniform(0.1, 0.4) } else { -random.uniform(0.1, 0.5) };
     let width = random.uniform(0.05, 0.2);

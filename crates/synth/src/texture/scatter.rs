@@ -1,18 +1,16 @@
 //! Textures of many scattered small objects: leaves, grass, gravel, chips, flowers.
 
 use glam::{Vec2, Vec3};
-use rand_chacha::ChaCha8Rng;
 
 use super::canvas::{Shape, coverage, smoothstep};
-use super::noise::{RandomValues, fractal};
+use super::noise::{Random, fractal};
 use super::palette::*;
 use super::{Canvas, Purpose, SIZE, Surface};
 
 /// Draws ground of one theme, dark enough to lie below other objects.
-fn ground(random: &mut ChaCha8Rng, theme: Theme) -> Canvas {
+fn ground(random: &Random, theme: Theme) -> Canvas {
     let palette = Palette::from_theme(random, theme, 2);
-    let cells = random.count(2, 12);
-    let field = fractal(random, SIZE, [cells; 2], 6, 0.75);
+    let field = fractal(random, SIZE, [random.count(2, 12); 2], 6, 0.75);
     let dark = random.uniform(0.35, 1.);
     let mut canvas = field.map(|value| palette.ramp(0.5 + 0.5 * value) * dark);
     canvas.shade(&field, 0.15);
@@ -20,7 +18,7 @@ fn ground(random: &mut ChaCha8Rng, theme: Theme) -> Canvas {
 }
 
 /// Draws overlapping leaves, the upper ones brighter.
-pub(super) fn leaves(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn leaves(random: &Random, purpose: Purpose) -> Surface {
     let fallen = !matches!(purpose, Purpose::Foliage) && random.chance(0.5);
     let theme = if fallen { AUTUMN } else { random.weighted(&[(GREENS, 6.), (AUTUMN, 1.)]) };
     let mut canvas = ground(random, if fallen { EARTHS } else { theme });
@@ -60,10 +58,9 @@ pub(super) fn leaves(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
 }
 
 /// Draws blades of grass, needles or straw.
-pub(super) fn grass(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+pub(super) fn grass(random: &Random, _: Purpose) -> Surface {
     let theme = random.weighted(&[(GREENS, 6.), (AUTUMN, 1.5), (EARTHS, 0.5)]);
-    let below = random.one_of(&[EARTHS, theme]);
-    let mut canvas = ground(random, below);
+    let mut canvas = ground(random, random.one_of(&[EARTHS, theme]));
     let palette = Palette::from_theme(random, theme, 4);
     let patches = fractal(random, SIZE, [3; 2], 4, 0.6);
     let bare = random.uniform(-1.5, 0.3);
@@ -97,10 +94,9 @@ pub(super) fn grass(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 }
 
 /// Draws pebbles, gravel, bark or rubble: rounded bits with a lit side and a shadow.
-pub(super) fn gravel(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
+pub(super) fn gravel(random: &Random, _: Purpose) -> Surface {
     let theme = random.weighted(&[(STONES, 5.), (EARTHS, 2.), (GRAYS, 2.), (BROWNS, 1.), (WHITES, 0.5)]);
-    let below = random.one_of(&[EARTHS, theme]);
-    let mut canvas = ground(random, below);
+    let mut canvas = ground(random, random.one_of(&[EARTHS, theme]));
     let palette = Palette::from_theme(random, theme, 4);
     let radius = random.sqrt_uniform(0.008, 0.06);
     let cover = random.uniform(0.4, 1.4);
@@ -135,9 +131,8 @@ pub(super) fn gravel(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 }
 
 /// Draws earth or sand, with tracks, clods and some green.
-pub(super) fn earth(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
-    let theme = random.weighted(&[(EARTHS, 5.), (BEIGES, 1.5), (BROWNS, 1.)]);
-    let mut canvas = ground(random, theme);
+pub(super) fn earth(random: &Random, _: Purpose) -> Surface {
+    let mut canvas = ground(random, random.weighted(&[(EARTHS, 5.), (BEIGES, 1.5), (BROWNS, 1.)]));
     let cells = random.sqrt_uniform(4., 32.) as usize;
     let stretch = random.one_of(&[[1, 1], [1, 1], [1, 3]]);
     let clods = fractal(random, SIZE, stretch.map(|factor| cells * factor), 5, 0.8);
@@ -154,7 +149,7 @@ pub(super) fn earth(random: &mut ChaCha8Rng, _: Purpose) -> Surface {
 }
 
 /// Draws confetti, splashes or brush strokes: bits of any shape in several colors.
-pub(super) fn confetti(random: &mut ChaCha8Rng, purpose: Purpose) -> Surface {
+pub(super) fn confetti(random: &Random, purpose: Purpose) -> Surface {
     let palette = Palette::draw_between(random, purpose, 3, 5);
     let mut canvas = Canvas::filled(SIZE, palette.color(0));
     let length = random.sqrt_uniform(0.02, 0.3);

@@ -22,7 +22,8 @@ fn families_paint_plausible_surfaces_without_seams() {
         let likely = weights.iter().copied().fold(0., f32::max);
         let purpose = PURPOSES[weights.iter().position(|&weight| weight == likely).expect("its own")];
         for seed in 0..4 {
-            let Surface { canvas, repeat_metres } = family(&mut ChaCha8Rng::seed_from_u64(seed), purpose);
+            let Surface { canvas, repeat_metres } =
+                family(&Random::new(&mut ChaCha8Rng::seed_from_u64(seed)), purpose);
             assert!(canvas.values.iter().all(|pixel| pixel.is_finite()), "family {index}");
             assert!((0.02..25.).contains(&repeat_metres), "family {index}: {repeat_metres} m");
             for steps in steps(&canvas) {
@@ -38,9 +39,9 @@ fn families_paint_plausible_surfaces_without_seams() {
 /// Reflectance stays in its range, and the mean is that of the texels and a sample with a wide footprint.
 #[test]
 fn textures_of_all_purposes_are_plausible() {
-    let mut random = ChaCha8Rng::seed_from_u64(6);
+    let mut generator = ChaCha8Rng::seed_from_u64(6);
     for purpose in [PURPOSES; 3].concat() {
-        let texture = Texture::draw(&mut random, purpose);
+        let texture = Texture::draw(&mut generator, purpose);
         let within = |texel: &[u8; 4]| texel[..3].iter().all(|byte| (36..=249).contains(byte));
         assert!(texture.levels.iter().flatten().all(within), "{purpose:?}");
         let texels = &texture.levels[0];
@@ -49,7 +50,7 @@ fn textures_of_all_purposes_are_plausible() {
         // Both the single texel and the texels that it is compared with are rounded to bytes.
         assert!((found - mean).abs().max_element() < 0.006, "{purpose:?}: {found} for {mean}");
         for footprint in [1., 3., f32::INFINITY] {
-            assert_eq!(texture.sample(random.point() * 9. - 4., footprint), found);
+            assert_eq!(texture.sample(Random::new(&mut generator).point() * 9. - 4., footprint), found);
         }
     }
 }
@@ -57,9 +58,9 @@ fn textures_of_all_purposes_are_plausible() {
 #[test]
 fn samples_are_periodic_and_continuous_in_footprint() {
     let texture = Texture::draw(&mut ChaCha8Rng::seed_from_u64(8), Purpose::Floor);
-    let mut random = ChaCha8Rng::seed_from_u64(9);
+    let mut generator = ChaCha8Rng::seed_from_u64(9);
     for _ in 0..100 {
-        let uv = random.point();
+        let uv = Random::new(&mut generator).point();
         let here = texture.sample(uv, 0.01);
         assert!((texture.sample(uv + Vec2::new(2., -3.), 0.01) - here).abs().max_element() < 1e-3);
         assert!((texture.sample(uv, 0.0101) - here).abs().max_element() < 0.01);
