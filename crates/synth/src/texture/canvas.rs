@@ -31,8 +31,11 @@ impl<T: Copy> Raster<T> {
     }
 
     /// Creates a raster from a function of the center of each value's square, in repeats.
-    pub fn from_fn(size: usize, value: impl FnMut(Vec2) -> T) -> Raster<T> {
-        Raster::new(size, centers(size).map(value).collect())
+    pub fn from_fn(size: usize, mut value: impl FnMut(Vec2) -> T) -> Raster<T> {
+        let mut values = Vec::with_capacity(size * size);
+        // Visits the centers by nested loops, which an iterator of results doesn't.
+        centers(size).for_each(|center| values.push(value(center)));
+        Raster::new(size, values)
     }
 
     /// Returns a raster of the results of `convert` for each value.
