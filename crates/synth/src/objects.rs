@@ -16,7 +16,7 @@ fn turned(angle: f32) -> Affine3A {
 }
 
 /// Creates a random plain shape within `size`, possibly stretched, bent and roughened, standing on y = 0.
-pub(super) fn plain(builder: &mut SceneBuilder, size: Vec3) -> Mesh {
+pub(super) fn plain(builder: &SceneBuilder, size: Vec3) -> Mesh {
     let half = size / 2.;
     let mut mesh = match builder.within(0..9) {
         0 => cuboid(size, 0.),
@@ -64,16 +64,14 @@ pub(super) fn plain(builder: &mut SceneBuilder, size: Vec3) -> Mesh {
 }
 
 /// Adds a random plain shape within `size`.
-fn add_plain(builder: &mut SceneBuilder, size: Vec3, transform: Affine3A) {
-    let (mesh, material) = (plain(builder, size), builder.thing());
-    builder.add_mesh(mesh, &material, transform);
+fn add_plain(builder: &SceneBuilder, size: Vec3, transform: Affine3A) {
+    builder.add_mesh(plain(builder, size), &builder.thing(), transform);
 }
 
 /// Adds a heap of plain shapes on and beside each other, of about `size` in metres. Their number is random in `counts`.
-pub(super) fn heap(builder: &mut SceneBuilder, size: Vec3, transform: Affine3A, counts: Range<usize>) {
+pub(super) fn heap(builder: &SceneBuilder, size: Vec3, transform: Affine3A, counts: Range<usize>) {
     for _ in 0..builder.within(counts) {
-        let part = size * builder.vector([(0.2, 0.6); 3]);
-        let mesh = plain(builder, part);
+        let mesh = plain(builder, size * builder.vector([(0.2, 0.6); 3]));
         let material = builder.thing();
         let spot =
             vec3(builder.within(-0.4..0.4), builder.within(0. ..0.6f32).powi(2), builder.within(-0.4..0.4))
@@ -87,7 +85,7 @@ pub(super) fn heap(builder: &mut SceneBuilder, size: Vec3, transform: Affine3A, 
 }
 
 /// Adds a table: a top on legs or on a central foot, with objects on it.
-pub(super) fn table(builder: &mut SceneBuilder, transform: Affine3A) {
+pub(super) fn table(builder: &SceneBuilder, transform: Affine3A) {
     let size = builder.vector([(0.5, 2.), (0.4, 0.85), (0.5, 1.1)]);
     let (top, legs) = (builder.thing(), builder.thing());
     let thick = builder.within(0.02..0.07);
@@ -111,7 +109,7 @@ pub(super) fn table(builder: &mut SceneBuilder, transform: Affine3A) {
 }
 
 /// Adds small objects on a surface of `size`: books, vessels, lamps, plain shapes.
-pub(super) fn clutter(builder: &mut SceneBuilder, size: Vec2, transform: Affine3A, most: usize) {
+pub(super) fn clutter(builder: &SceneBuilder, size: Vec2, transform: Affine3A, most: usize) {
     for _ in 0..builder.within(0..=most) {
         let spot = at(builder.within(-0.5..0.5) * size.x, 0., builder.within(-0.5..0.5) * size.y)
             * turned(builder.angle());
@@ -128,7 +126,7 @@ pub(super) fn clutter(builder: &mut SceneBuilder, size: Vec2, transform: Affine3
 }
 
 /// Adds a bowl, cup, bottle or vase, sometimes with a plant in it.
-pub(super) fn vessel(builder: &mut SceneBuilder, transform: Affine3A) {
+pub(super) fn vessel(builder: &SceneBuilder, transform: Affine3A) {
     let (radius, height) = (builder.within(0.03..0.14), builder.within(0.06..0.4));
     let material = builder.thing();
     let mut rims = vec![vec2(0., 0.), vec2(radius * builder.within(0.4..1.), 0.)];
@@ -142,7 +140,7 @@ pub(super) fn vessel(builder: &mut SceneBuilder, transform: Affine3A) {
 }
 
 /// Adds a row or a pile of books, `length` metres long.
-pub(super) fn books(builder: &mut SceneBuilder, transform: Affine3A, length: f32) {
+pub(super) fn books(builder: &SceneBuilder, transform: Affine3A, length: f32) {
     let mut reached = 0.;
     let piled = builder.chance(0.3);
     while reached < length {
@@ -170,7 +168,7 @@ pub(super) fn books(builder: &mut SceneBuilder, transform: Affine3A, length: f32
 }
 
 /// Adds shelves with objects on them, a cupboard with doors, or a chest of drawers.
-pub(super) fn cabinet(builder: &mut SceneBuilder, transform: Affine3A) {
+pub(super) fn cabinet(builder: &SceneBuilder, transform: Affine3A) {
     let size = builder.vector([(0.5, 2.2), (0.6, 2.3), (0.25, 0.6)]);
     let (body, front) = (builder.thing(), builder.thing());
     let board = 0.025;
@@ -186,10 +184,7 @@ pub(super) fn cabinet(builder: &mut SceneBuilder, transform: Affine3A) {
             if i < shelves && builder.chance(0.8) {
                 let above = transform * at(0., height + board, 0.);
                 match builder.chance(0.5) {
-                    true => {
-                        let length = size.x * builder.within(0.4..0.9);
-                        books(builder, above, length);
-                    }
+                    true => books(builder, above, size.x * builder.within(0.4..0.9)),
                     false => clutter(builder, vec2(0.8 * size.x, 0.5 * size.z), above, 4),
                 }
             }
@@ -212,7 +207,7 @@ pub(super) fn cabinet(builder: &mut SceneBuilder, transform: Affine3A) {
 }
 
 /// Adds a chair or stool.
-pub(super) fn chair(builder: &mut SceneBuilder, transform: Affine3A) {
+pub(super) fn chair(builder: &SceneBuilder, transform: Affine3A) {
     let [wide, deep, seat] = builder.vector([(0.38, 0.6), (0.38, 0.6), (0.38, 0.5)]).into();
     let (cloth, wood) = (builder.thing(), builder.thing());
     let thick = builder.within(0.02..0.12);
@@ -241,7 +236,7 @@ pub(super) fn chair(builder: &mut SceneBuilder, transform: Affine3A) {
 }
 
 /// Adds a sofa or armchair with cushions.
-pub(super) fn sofa(builder: &mut SceneBuilder, transform: Affine3A) {
+pub(super) fn sofa(builder: &SceneBuilder, transform: Affine3A) {
     let (wide, deep) = (builder.within(0.8..2.4), builder.within(0.75..1.));
     let cloth = builder.thing();
     let [seat, back, arm] = builder.vector([(0.35, 0.45), (0.7, 0.95), (0.12, 0.25)]).into();
@@ -260,7 +255,7 @@ pub(super) fn sofa(builder: &mut SceneBuilder, transform: Affine3A) {
 }
 
 /// Adds a bed with bedding.
-pub(super) fn bed(builder: &mut SceneBuilder, transform: Affine3A) {
+pub(super) fn bed(builder: &SceneBuilder, transform: Affine3A) {
     let (wide, long, high) = (builder.within(0.9..2.), 2.1, builder.within(0.35..0.6));
     let (wood, sheet, cover) = (builder.thing(), builder.thing(), builder.thing());
     builder.add_rounded_box(vec3(wide + 0.06, 0.6 * high, long), 0.01, &wood, transform);
@@ -280,7 +275,7 @@ pub(super) fn bed(builder: &mut SceneBuilder, transform: Affine3A) {
 }
 
 /// Adds a lamp of `height` metres: a shade on a stand, which glows if the lamp is on.
-pub(super) fn lamp(builder: &mut SceneBuilder, transform: Affine3A, height: f32) {
+pub(super) fn lamp(builder: &SceneBuilder, transform: Affine3A, height: f32) {
     let (stand, mut shade) = (builder.thing(), builder.thing());
     shade.emission = if builder.chance(0.6) { builder.within(0.5..2.5) } else { 0. };
     shade.specular = 0.;
@@ -294,7 +289,7 @@ pub(super) fn lamp(builder: &mut SceneBuilder, transform: Affine3A, height: f32)
 }
 
 /// Adds leaves on arching stems, up to `reach` metres long.
-pub(super) fn leaves(builder: &mut SceneBuilder, transform: Affine3A, reach: f32, count: usize) {
+pub(super) fn leaves(builder: &SceneBuilder, transform: Affine3A, reach: f32, count: usize) {
     let mut material = builder.material(Purpose::Foliage);
     material.mirror_reflectance = 0.;
     let mut all = Mesh::default();
@@ -314,27 +309,25 @@ pub(super) fn leaves(builder: &mut SceneBuilder, transform: Affine3A, reach: f32
 }
 
 /// Adds a plant in a pot on the floor.
-pub(super) fn plant(builder: &mut SceneBuilder, transform: Affine3A) {
+pub(super) fn plant(builder: &SceneBuilder, transform: Affine3A) {
     let (radius, height) = (builder.within(0.1..0.25), builder.within(0.15..0.5));
     let pot = builder.thing();
     let slope = builder.within(0.6..1.);
     let rims = [vec2(slope * radius, 0.), vec2(radius, height), vec2(0., 0.9 * height)];
     builder.add_mesh(lathe(&rims, 18), &pot, transform);
-    let (reach, count) = (builder.within(0.3..1.1), builder.within(12..60));
-    leaves(builder, transform * at(0., 0.9 * height, 0.), reach, count);
+    let above = transform * at(0., 0.9 * height, 0.);
+    leaves(builder, above, builder.within(0.3..1.1), builder.within(12..60));
 }
 
 /// Adds a framed picture on a wall, with its back at z = 0 and its center at the origin.
-pub(super) fn picture(builder: &mut SceneBuilder, transform: Affine3A) {
+pub(super) fn picture(builder: &SceneBuilder, transform: Affine3A) {
     let size = vec2(builder.log_uniform(0.2, 1.4), builder.log_uniform(0.2, 1.2));
-    let poster = builder.picture(size);
-    let frame = builder.thing();
-    let edge = builder.within(0.01..0.08);
-    framed_sheet(builder, size, &poster, edge, &frame, transform);
+    let (poster, frame) = (builder.picture(size), builder.thing());
+    framed_sheet(builder, size, &poster, builder.within(0.01..0.08), &frame, transform);
 }
 
 /// Adds a framed mirror, placed like a picture.
-pub(super) fn mirror(builder: &mut SceneBuilder, transform: Affine3A) {
+pub(super) fn mirror(builder: &SceneBuilder, transform: Affine3A) {
     let size = vec2(builder.within(0.4..1.2), builder.within(0.5..1.6));
     let frame = builder.thing();
     let mut glass = builder.material(Purpose::Ceiling);
@@ -344,7 +337,7 @@ pub(super) fn mirror(builder: &mut SceneBuilder, transform: Affine3A) {
 
 /// Adds a flat `sheet` of `size` in a frame that is `edge` metres wide.
 fn framed_sheet(
-    builder: &mut SceneBuilder,
+    builder: &SceneBuilder,
     size: Vec2,
     sheet: &Material,
     edge: f32,
@@ -358,7 +351,7 @@ fn framed_sheet(
 }
 
 /// Adds curtains on both sides of a window of `size` whose center is at the origin.
-pub(super) fn curtains(builder: &mut SceneBuilder, transform: Affine3A, size: Vec2) {
+pub(super) fn curtains(builder: &SceneBuilder, transform: Affine3A, size: Vec2) {
     let cloth = builder.thing();
     let (wide, folds) = (size.x * builder.within(0.2..0.4), builder.within(3. ..7.));
     let height = size.y + 0.3 + if builder.chance(0.5) { builder.within(0. ..0.6) } else { 0. };
@@ -369,7 +362,7 @@ pub(super) fn curtains(builder: &mut SceneBuilder, transform: Affine3A, size: Ve
 }
 
 /// Adds a tree: a bent trunk, branches, and a crown of leaves or of green clouds.
-pub(super) fn tree(builder: &mut SceneBuilder, transform: Affine3A, height: f32) {
+pub(super) fn tree(builder: &SceneBuilder, transform: Affine3A, height: f32) {
     let bark = builder.thing();
     let (bend_x, bend_z) = (builder.within(-0.15..0.15) * height, builder.within(-0.15..0.15) * height);
     let stem = move |t: f32| vec3(bend_x * t * t, height * t, bend_z * t * t);
@@ -411,7 +404,7 @@ pub(super) fn tree(builder: &mut SceneBuilder, transform: Affine3A, height: f32)
 }
 
 /// Adds a bush or a tuft of grass.
-pub(super) fn bush(builder: &mut SceneBuilder, transform: Affine3A) {
+pub(super) fn bush(builder: &SceneBuilder, transform: Affine3A) {
     let size = builder.vector([(0.4, 1.6), (0.3, 1.2), (0.4, 1.6)]);
     if builder.chance(0.5) {
         leaves(builder, transform, size.y, 40);
@@ -423,7 +416,7 @@ pub(super) fn bush(builder: &mut SceneBuilder, transform: Affine3A) {
 }
 
 /// Adds a rock.
-pub(super) fn rock(builder: &mut SceneBuilder, transform: Affine3A, size: f32) {
+pub(super) fn rock(builder: &SceneBuilder, transform: Affine3A, size: f32) {
     let (stone, noise) = (builder.material(Purpose::Ground), builder.noise());
     let size = size * builder.vector([(0.6, 1.4), (0.4, 1.), (0.6, 1.4)]);
     let ball = superellipsoid(size, [0.8, 0.8], 12);
@@ -432,7 +425,7 @@ pub(super) fn rock(builder: &mut SceneBuilder, transform: Affine3A, size: f32) {
 }
 
 /// Adds a house: walls with windows and doors, under a roof.
-pub(super) fn house(builder: &mut SceneBuilder, transform: Affine3A) {
+pub(super) fn house(builder: &SceneBuilder, transform: Affine3A) {
     let size = builder.vector([(4., 10.), (2.6, 7.), (4., 9.)]);
     let (wall, roof) = (builder.material(Purpose::Facade), builder.material(Purpose::Facade));
     builder.add_box(size, &wall, transform);
@@ -468,7 +461,7 @@ pub(super) fn house(builder: &mut SceneBuilder, transform: Affine3A) {
 }
 
 /// Returns the material of window panes seen from outside: dark and reflecting.
-fn window_glass(builder: &mut SceneBuilder) -> Material {
+fn window_glass(builder: &SceneBuilder) -> Material {
     let mut glass = builder.material(Purpose::Ceiling);
     glass.tint = Vec3::splat(builder.within(0.03..0.25));
     glass.mirror_reflectance = builder.within(0.05..0.3);
@@ -476,7 +469,7 @@ fn window_glass(builder: &mut SceneBuilder) -> Material {
 }
 
 /// Adds a fence of boards and rails, `length` metres along x.
-pub(super) fn fence(builder: &mut SceneBuilder, transform: Affine3A, length: f32) {
+pub(super) fn fence(builder: &SceneBuilder, transform: Affine3A, length: f32) {
     let wood = builder.thing();
     let (height, gap) = (builder.within(0.7..1.8), builder.within(0.08..0.5f32));
     let board = (0.5 * gap).min(0.12);
@@ -490,7 +483,7 @@ pub(super) fn fence(builder: &mut SceneBuilder, transform: Affine3A, length: f32
 }
 
 /// Adds a single object, on the ground at `spot` or on a block there, to be viewed from all sides.
-pub(super) fn orbit_target(builder: &mut SceneBuilder, spot: Vec3) -> OrbitTarget {
+pub(super) fn orbit_target(builder: &SceneBuilder, spot: Vec3) -> OrbitTarget {
     let size = builder.log_vector([(0.3, 1.5); 3]);
     let below = if builder.chance(0.3) { 0. } else { builder.within(0.2..1.1) };
     if below > 0. {
@@ -506,7 +499,7 @@ pub(super) fn orbit_target(builder: &mut SceneBuilder, spot: Vec3) -> OrbitTarge
 }
 
 /// Adds an object on a wall at `spot`, to be viewed from the direction `front`.
-pub(super) fn hung(builder: &mut SceneBuilder, spot: Vec3, front: Vec3) -> OrbitTarget {
+pub(super) fn hung(builder: &SceneBuilder, spot: Vec3, front: Vec3) -> OrbitTarget {
     let size = builder.log_vector([(0.3, 1.2), (0.2, 1.), (0.3, 1.2)]);
     // The object's up axis points away from the wall.
     let off_the_wall = Quat::from_rotation_arc(Vec3::Y, front) * Quat::from_rotation_y(builder.angle());
@@ -515,7 +508,7 @@ pub(super) fn hung(builder: &mut SceneBuilder, spot: Vec3, front: Vec3) -> Orbit
 }
 
 /// Adds an object that merits its own video, about `size` metres large, standing at the origin of `transform`.
-fn exhibit_object(builder: &mut SceneBuilder, size: Vec3, transform: Affine3A) {
+fn exhibit_object(builder: &SceneBuilder, size: Vec3, transform: Affine3A) {
     match builder.within(0..6) {
         0 => add_plain(builder, size, transform),
         1 => rock(builder, transform, size.max_element()),
@@ -525,25 +518,16 @@ fn exhibit_object(builder: &mut SceneBuilder, size: Vec3, transform: Affine3A) {
 }
 
 /// Adds a random piece of furniture, for placement along a wall or in the open.
-pub(super) fn furniture(builder: &mut SceneBuilder, transform: Affine3A) {
+pub(super) fn furniture(builder: &SceneBuilder, transform: Affine3A) {
     match builder.within(0..12) {
         0 | 1 => table(builder, transform),
         2 | 3 => cabinet(builder, transform),
         4 | 5 => chair(builder, transform),
         6 => sofa(builder, transform),
         7 => bed(builder, transform),
-        8 => {
-            let height = builder.within(1.1..1.8);
-            lamp(builder, transform, height);
-        }
+        8 => lamp(builder, transform, builder.within(1.1..1.8)),
         9 => plant(builder, transform),
-        10 => {
-            let size = builder.log_vector([(0.3, 1.5); 3]);
-            add_plain(builder, size, transform);
-        }
-        _ => {
-            let size = builder.vector([(0.4, 1.4); 3]);
-            heap(builder, size, transform, 3..9);
-        }
+        10 => add_plain(builder, builder.log_vector([(0.3, 1.5); 3]), transform),
+        _ => heap(builder, builder.vector([(0.4, 1.4); 3]), transform, 3..9),
     }
 }

@@ -1,6 +1,6 @@
 //! Outdoor scenes: ground, and objects on it under the sky.
 
-use super::light::{Light, LightSource, Sky};
+use super::light::{LightSource, Sky};
 use super::mesh::{Mesh, height_field};
 use super::objects;
 use super::scene_builder::{SceneBuilder, standing};
@@ -9,7 +9,7 @@ use super::walk::CameraSpace;
 use glam::{Affine3A, Vec3, vec2, vec3};
 
 /// Returns a random sky: clear, hazy or overcast, at noon or in the evening.
-pub(super) fn sky(builder: &mut SceneBuilder) -> Sky {
+pub(super) fn sky(builder: &SceneBuilder) -> Sky {
     let evening = builder.within(0. ..1f32).powi(2);
     let overcast = builder.within(0. ..1.);
     let blue = vec3(0.25, 0.45, 0.95).lerp(vec3(0.25, 0.3, 0.6), evening);
@@ -26,7 +26,7 @@ pub(super) fn sky(builder: &mut SceneBuilder) -> Sky {
 }
 
 /// Builds a landscape or a street. Returns the space where cameras may be.
-pub(super) fn landscape(builder: &mut SceneBuilder, sky: &Sky) -> CameraSpace {
+pub(super) fn landscape(builder: &SceneBuilder, sky: &Sky) -> CameraSpace {
     let noise = builder.noise();
     let (hills, wide) = (builder.within(0. ..1f32).powi(3) * 2.5, builder.within(6. ..24.));
     let height = move |x: f32, z: f32| {
@@ -48,39 +48,31 @@ pub(super) fn landscape(builder: &mut SceneBuilder, sky: &Sky) -> CameraSpace {
         });
         builder.add_mesh(way, &paving, Affine3A::IDENTITY);
     }
-    let spot = |builder: &mut SceneBuilder, least: f32, most: f32| {
+    let spot = |least: f32, most: f32| {
         let (far, turn) = (builder.log_uniform(least, most), builder.angle());
         let (x, z) = (far * turn.cos(), far * turn.sin());
         standing(vec3(x, height(x, z) - 0.02, z), builder.angle())
     };
     for _ in 0..builder.within(0..10) {
-        let transform = spot(builder, 8., 60.);
-        objects::house(builder, transform);
+        objects::house(builder, spot(8., 60.));
     }
     for _ in 0..builder.within(0..22) {
-        let (transform, tall) = (spot(builder, 3., 50.), builder.within(2. ..9.));
-        objects::tree(builder, transform, tall);
+        objects::tree(builder, spot(3., 50.), builder.within(2. ..9.));
     }
     for _ in 0..builder.within(0..14) {
-        let transform = spot(builder, 1.5, 25.);
-        objects::bush(builder, transform);
+        objects::bush(builder, spot(1.5, 25.));
     }
     for _ in 0..builder.within(0..10) {
-        let (transform, size) = (spot(builder, 1.5, 25.), builder.log_uniform(0.3, 3.));
-        objects::rock(builder, transform, size);
+        objects::rock(builder, spot(1.5, 25.), builder.log_uniform(0.3, 3.));
     }
     for _ in 0..builder.within(0..3) {
-        let (transform, length) = (spot(builder, 3., 20.), builder.within(3. ..15.));
-        objects::fence(builder, transform, length);
+        objects::fence(builder, spot(3., 20.), builder.within(3. ..15.));
     }
     for _ in 0..builder.within(2..12) {
-        let transform = spot(builder, 1., 0.6 * wide);
+        let transform = spot(1., 0.6 * wide);
         match builder.chance(0.4) {
             true => objects::furniture(builder, transform),
-            false => {
-                let size = builder.log_vector([(0.3, 4.); 3]);
-                objects::heap(builder, size, transform, 1..8);
-            }
+            false => objects::heap(builder, builder.log_vector([(0.3, 4.); 3]), transform, 1..8),
         }
     }
     sun(builder, sky);
@@ -90,7 +82,7 @@ pub(super) fn landscape(builder: &mut SceneBuilder, sky: &Sky) -> CameraSpace {
 }
 
 /// Builds the surroundings that are visible through the windows of a room of `size`.
-pub(super) fn outside(builder: &mut SceneBuilder, size: Vec3) {
+pub(super) fn outside(builder: &SceneBuilder, size: Vec3) {
     let below = builder.within(0. ..1f32).powi(2) * 8. + 0.1;
     let middle = vec3(0.5 * size.x, -below, 0.5 * size.z);
     let ground = builder.material(Purpose::Ground);
@@ -103,16 +95,13 @@ pub(super) fn outside(builder: &mut SceneBuilder, size: Vec3) {
         let transform = standing(at, builder.angle());
         match builder.within(0..4) {
             0 if far > reach + 9. => objects::house(builder, transform),
-            1 | 2 => {
-                let tall = builder.within(2. ..8.) + below;
-                objects::tree(builder, transform, tall);
-            }
+            1 | 2 => objects::tree(builder, transform, builder.within(2. ..8.) + below),
             _ => objects::bush(builder, transform),
         }
     }
 }
 
-fn sun(builder: &mut SceneBuilder, sky: &Sky) {
+fn sun(builder: &SceneBuilder, sky: &Sky) {
     let cover = sky.clouds.max(1. - 2. * (sky.zenith.z - sky.zenith.x).max(0.));
     if builder.chance(0.25) && cover > 0.6 {
         return;
@@ -122,5 +111,5 @@ fn sun(builder: &mut SceneBuilder, sky: &Sky) {
     let warm = vec3(1., 0.95, 0.88).lerp(vec3(1., 0.7, 0.45), (1. - towards.y).powi(3));
     let color = builder.within(1. ..4.5) * (1.1 - cover) * warm;
     let spread = if cover > 0.5 { 0.3 } else { 0.02 };
-    builder.contents.lights.push(Light { color, source: LightSource::Sun { towards, spread } });
+    builder.add_light(color, LightSource::Sun { towards, spread });
 }

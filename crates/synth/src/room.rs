@@ -1,6 +1,6 @@
 //! Rooms: floor, ceiling, walls with openings, and furnishings.
 
-use super::light::{Light, LightSource, Material, Sky};
+use super::light::{LightSource, Material, Sky};
 use super::mesh::{Mesh, cone, superellipsoid};
 use super::objects;
 use super::outdoors::outside;
@@ -43,7 +43,7 @@ impl Wall {
 }
 
 /// Builds a furnished room. Returns the space where cameras may be.
-pub(super) fn room(builder: &mut SceneBuilder, sky: &mut Sky) -> CameraSpace {
+pub(super) fn room(builder: &SceneBuilder, sky: &mut Sky) -> CameraSpace {
     let size = vec3(builder.log_uniform(2.6, 9.), builder.within(2.3..3.6), builder.log_uniform(2.6, 9.));
     let (wall, floor, ceiling) = (
         builder.material(Purpose::Wall),
@@ -81,7 +81,7 @@ pub(super) fn room(builder: &mut SceneBuilder, sky: &mut Sky) -> CameraSpace {
 }
 
 /// Adds windows and doors to the wall.
-fn add_openings(builder: &mut SceneBuilder, wall: &mut Wall, height: f32) {
+fn add_openings(builder: &SceneBuilder, wall: &mut Wall, height: f32) {
     for _ in 0..builder.one_of(&[0, 0, 1, 1, 2, 3]) {
         let is_door = builder.chance(0.3);
         let wide = if is_door { builder.within(0.8..1.8) } else { builder.within(0.6..2.2) };
@@ -102,9 +102,9 @@ fn add_openings(builder: &mut SceneBuilder, wall: &mut Wall, height: f32) {
 }
 
 /// Builds the wall around its openings, their reveals and frames, and a skirting board.
-fn build_wall(builder: &mut SceneBuilder, wall: &Wall, height: f32, material: &Material) {
+fn build_wall(builder: &SceneBuilder, wall: &Wall, height: f32, material: &Material) {
     let transform = wall.transform();
-    let panel = |builder: &mut SceneBuilder, from: Vec2, to: Vec2| {
+    let panel = |from: Vec2, to: Vec2| {
         let size = to - from;
         if size.min_element() < 1e-3 {
             return;
@@ -115,12 +115,12 @@ fn build_wall(builder: &mut SceneBuilder, wall: &Wall, height: f32, material: &M
     };
     let mut reached = 0.;
     for &Opening { from, to, .. } in &wall.openings {
-        panel(builder, vec2(reached, 0.), vec2(from.x, height));
-        panel(builder, vec2(from.x, 0.), vec2(to.x, from.y));
-        panel(builder, vec2(from.x, to.y), vec2(to.x, height));
+        panel(vec2(reached, 0.), vec2(from.x, height));
+        panel(vec2(from.x, 0.), vec2(to.x, from.y));
+        panel(vec2(from.x, to.y), vec2(to.x, height));
         reached = to.x;
     }
-    panel(builder, vec2(reached, 0.), vec2(wall.length, height));
+    panel(vec2(reached, 0.), vec2(wall.length, height));
 
     let frame = builder.material(Purpose::Ceiling);
     let deep = builder.within(0.08..0.3);
@@ -186,7 +186,7 @@ fn build_wall(builder: &mut SceneBuilder, wall: &Wall, height: f32, material: &M
 }
 
 /// Adds beams under the ceiling, or columns.
-fn beams(builder: &mut SceneBuilder, size: Vec3) {
+fn beams(builder: &SceneBuilder, size: Vec3) {
     let wood = builder.thing();
     let thick = builder.within(0.08..0.3);
     let count = builder.within(1..6);
@@ -202,7 +202,7 @@ fn beams(builder: &mut SceneBuilder, size: Vec3) {
     }
 }
 
-fn furnish(builder: &mut SceneBuilder, size: Vec3, walls: &[Wall]) {
+fn furnish(builder: &SceneBuilder, size: Vec3, walls: &[Wall]) {
     // A carpet.
     if builder.chance(0.5) {
         let wide = vec2(builder.within(0.3..0.8) * size.x, builder.within(0.3..0.8) * size.z);
@@ -253,7 +253,7 @@ fn furnish(builder: &mut SceneBuilder, size: Vec3, walls: &[Wall]) {
 }
 
 /// Adds ceiling and hanging lamps of one color tone, and the sun if it can shine in.
-fn light(builder: &mut SceneBuilder, size: Vec3, sky: &mut Sky, has_openings: bool) {
+fn light(builder: &SceneBuilder, size: Vec3, sky: &mut Sky, has_openings: bool) {
     let warmth = builder.within(0. ..1.);
     let tone = vec3(1., 1. - 0.25 * warmth, 1. - 0.55 * warmth);
     let count = if has_openings { builder.within(0..4) } else { builder.within(1..4) };
@@ -265,28 +265,23 @@ fn light(builder: &mut SceneBuilder, size: Vec3, sky: &mut Sky, has_openings: bo
             let half = vec2(builder.within(0.1..0.6), builder.within(0.1..0.4));
             let (right, up) = (half.x * Vec3::X, half.y * Vec3::Z);
             let source = LightSource::Panel { center: at - 0.05 * Vec3::Y, right, up, facing: Vec3::NEG_Y };
-            builder.contents.lights.push(Light { color: strength * tone, source });
-            let glass = lamp_glass(builder);
+            builder.add_light(strength * tone, source);
             let below = Affine3A::from_translation(at - 0.03 * Vec3::Y);
-            builder.add_box(vec3(2. * half.x, 0.03, 2. * half.y), &glass, below);
+            builder.add_box(vec3(2. * half.x, 0.03, 2. * half.y), &lamp_glass(builder), below);
         } else {
             let below = builder.within(0.2..(0.35 * size.y));
             let (radius, at) = (builder.within(0.05..0.2), at - below * Vec3::Y);
-            let glass = lamp_glass(builder);
             let ball = superellipsoid(Vec3::splat(2. * radius), [1., 1.], 8);
-            builder.add_mesh(ball, &glass, Affine3A::from_translation(at));
-            let cord = builder.thing();
+            builder.add_mesh(ball, &lamp_glass(builder), Affine3A::from_translation(at));
             let top = Affine3A::from_translation(at + radius * Vec3::Y);
-            builder.add_mesh(cone(0.006, 0.006, below - radius, 5), &cord, top);
-            let source = LightSource::Ball { center: at, radius };
-            builder.contents.lights.push(Light { color: 0.8 * strength * tone, source });
+            builder.add_mesh(cone(0.006, 0.006, below - radius, 5), &builder.thing(), top);
+            builder.add_light(0.8 * strength * tone, LightSource::Ball { center: at, radius });
         }
     }
     if has_openings && builder.chance(0.7) {
         let (turn, height) = (builder.angle(), builder.within(0.2..1.));
         let towards = vec3(turn.cos(), height, turn.sin()).normalize();
-        let source = LightSource::Sun { towards, spread: 0.02 };
-        builder.contents.lights.push(Light { color: 8. * vec3(1., 0.93, 0.82), source });
+        builder.add_light(8. * vec3(1., 0.93, 0.82), LightSource::Sun { towards, spread: 0.02 });
     }
     if has_openings {
         // The outdoors is brighter than rooms in daytime.
@@ -302,26 +297,24 @@ fn light(builder: &mut SceneBuilder, size: Vec3, sky: &mut Sky, has_openings: bo
 }
 
 /// Returns the material of lamps that are on.
-fn lamp_glass(builder: &mut SceneBuilder) -> Material {
+fn lamp_glass(builder: &SceneBuilder) -> Material {
     Material { emission: 3., ..builder.material(Purpose::Ceiling) }
 }
 
 /// Builds a closed box full of plain shapes in mid-air and on the floor, with random textures. It contains no recognizable objects,
 /// and everything in it may be visible.
-pub(super) fn box_of_shapes(builder: &mut SceneBuilder, sky: &mut Sky) -> CameraSpace {
+pub(super) fn box_of_shapes(builder: &SceneBuilder, sky: &mut Sky) -> CameraSpace {
     let size = vec3(builder.log_uniform(3., 10.), builder.within(2.4..5.), builder.log_uniform(3., 10.));
     let purposes = [Purpose::Wall, Purpose::Floor, Purpose::Thing, Purpose::Ground];
     let (x, y, z) = (Vec3::X * size.x, Vec3::Y * size.y, Vec3::Z * size.z);
     for (corner, along, up) in
         [(z, x, -z), (y, x, z), (z, -z, y), (Vec3::ZERO, x, y), (x, z, y), (x + z, -x, y)]
     {
-        let purpose = builder.one_of(&purposes);
-        let material = builder.material(purpose);
+        let material = builder.material(builder.one_of(&purposes));
         builder.add_mesh(Mesh::rectangle(corner, along, up, CELL), &material, Affine3A::IDENTITY);
     }
     for _ in 0..builder.within(12..45) {
-        let part = builder.log_vector([(0.15, 2.); 3]);
-        let mesh = objects::plain(builder, part);
+        let mesh = objects::plain(builder, builder.log_vector([(0.15, 2.); 3]));
         let material = builder.thing();
         let mut spot = size * builder.vector([(0., 1.); 3]);
         let mut turn = Quat::from_axis_angle(builder.direction(), builder.angle());

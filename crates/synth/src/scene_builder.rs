@@ -1,6 +1,6 @@
 //! Builder of synthetic scenes: their contents so far, and the random number generator.
 
-use super::light::Material;
+use super::light::{Light, LightSource, Material};
 use super::mesh::{Mesh, cuboid};
 use super::noise::Noise;
 use super::texture::{Purpose, Texture};
@@ -9,83 +9,84 @@ use glam::{Affine2, Affine3A, Quat, Vec2, Vec3};
 use rand::Rng;
 use rand::distr::uniform::{SampleRange, SampleUniform};
 use rand_chacha::ChaCha8Rng;
+use std::cell::RefCell;
 use std::f32::consts::TAU;
 use std::sync::Arc;
 
 /// Number of textures per purpose in a scene. Objects share them, as they do in a home.
 const SHARED: usize = 6;
 
-/// Builder that adds objects to a scene.
+/// Builder that adds objects to a scene. It can be shared, so that random draws may be arguments of what is added.
 pub(super) struct SceneBuilder {
-    pub random: ChaCha8Rng,
-    pub contents: SceneContents,
-    textures: Vec<(Purpose, Arc<Texture>)>,
+    random: RefCell<ChaCha8Rng>,
+    pub contents: RefCell<SceneContents>,
+    textures: RefCell<Vec<(Purpose, Arc<Texture>)>>,
 }
 
 impl SceneBuilder {
     pub fn new(random: ChaCha8Rng) -> Self {
-        SceneBuilder { random, contents: SceneContents::default(), textures: vec![] }
+        SceneBuilder { random: random.into(), contents: RefCell::default(), textures: RefCell::default() }
     }
 
-    pub fn within<T: SampleUniform>(&mut self, range: impl SampleRange<T>) -> T {
-        self.random.random_range(range)
+    pub fn within<T: SampleUniform>(&self, range: impl SampleRange<T>) -> T {
+        self.random.borrow_mut().random_range(range)
     }
 
     /// Returns a random value between `least` and `most` on a logarithmic scale: each doubling is equally likely.
-    pub fn log_uniform(&mut self, least: f32, most: f32) -> f32 {
+    pub fn log_uniform(&self, least: f32, most: f32) -> f32 {
         least * (most / least).powf(self.within(0. ..1.))
     }
 
     /// Returns a vector whose components are uniformly random between the given bounds.
-    pub fn vector(&mut self, bounds: [(f32, f32); 3]) -> Vec3 {
+    pub fn vector(&self, bounds: [(f32, f32); 3]) -> Vec3 {
         bounds.map(|(low, high)| self.within(low..high)).into()
     }
 
     /// Returns a vector whose components are drawn by [`SceneBuilder::log_uniform`].
-    pub fn log_vector(&mut self, bounds: [(f32, f32); 3]) -> Vec3 {
+    pub fn log_vector(&self, bounds: [(f32, f32); 3]) -> Vec3 {
         bounds.map(|(least, most)| self.log_uniform(least, most)).into()
     }
 
-    pub fn chance(&mut self, probability: f64) -> bool {
-        self.random.random_bool(probability)
+    pub fn chance(&self, probability: f64) -> bool {
+        self.random.borrow_mut().random_bool(probability)
     }
 
-    pub fn one_of<T: Copy>(&mut self, choices: &[T]) -> T {
+    pub fn one_of<T: Copy>(&self, choices: &[T]) -> T {
         choices[self.within(0..choices.len())]
     }
 
-    pub fn angle(&mut self) -> f32 {
+    pub fn angle(&self) -> f32 {
         self.within(0. ..TAU)
     }
 
     /// Returns a unit vector in a uniformly random direction.
-    pub fn direction(&mut self) -> Vec3 {
+    pub fn direction(&self) -> Vec3 {
         let (y, angle) = (self.within(-1f32..1.), self.angle());
         let ring = (1. - y * y).sqrt();
         Vec3::new(ring * angle.cos(), y, ring * angle.sin())
     }
 
-    pub fn noise(&mut self) -> Noise {
-        Noise::new(self.random.random())
+    pub fn noise(&self) -> Noise {
+        Noise::new(self.random.borrow_mut().random())
     }
 
-    pub fn texture(&mut self, purpose: Purpose) -> Arc<Texture> {
-        let turn = self.random.random_range(0..SHARED);
-        let mut shared = self.textures.iter().filter(|(other, _)| *other == purpose);
+    pub fn texture(&self, purpose: Purpose) -> Arc<Texture> {
+        let turn = self.within(0..SHARED);
+        let mut textures = self.textures.borrow_mut();
+        let mut shared = textures.iter().filter(|(other, _)| *other == purpose);
         if let Some((_, texture)) = shared.nth(turn)
             && purpose != Purpose::Poster
         {
             return texture.clone();
         }
-        let texture = Arc::new(Texture::draw(&mut self.random, purpose));
-        self.textures.push((purpose, texture.clone()));
+        let texture = Arc::new(Texture::draw(&mut self.random.borrow_mut(), purpose));
+        textures.push((purpose, texture.clone()));
         texture
     }
 
     /// Returns a random material for `purpose` with its own texture size and orientation, matte or glossy.
-    pub fn material(&mut self, purpose: Purpose) -> Material {
-        let texture = self.texture(purpose);
-        let mut material = Material::matte(texture);
+    pub fn material(&self, purpose: Purpose) -> Material {
+        let mut material = Material::matte(self.texture(purpose));
         let (scale, angle) = match purpose {
             Purpose::Thing => (self.log_uniform(0.6, 3.), self.angle()),
             _ => (self.log_uniform(0.7, 1.5), 0.),
@@ -112,29 +113,33 @@ impl SceneBuilder {
     }
 
     /// Returns a material that shows one whole image on a surface of `size` metres.
-    pub fn picture(&mut self, size: Vec2) -> Material {
+    pub fn picture(&self, size: Vec2) -> Material {
         let mut material = Material::matte(self.texture(Purpose::Poster));
         material.repeats = Affine2::from_scale(1. / size);
         material
     }
 
     /// Returns a random material for furniture and other objects.
-    pub fn thing(&mut self) -> Material {
+    pub fn thing(&self) -> Material {
         self.material(Purpose::Thing)
     }
 
     /// Adds a [`cuboid`] of `size` with sharp edges.
-    pub fn add_box(&mut self, size: Vec3, material: &Material, transform: Affine3A) {
+    pub fn add_box(&self, size: Vec3, material: &Material, transform: Affine3A) {
         self.add_rounded_box(size, 0., material, transform);
     }
 
     /// Adds a [`cuboid`] of `size` with edges rounded by `round` metres.
-    pub fn add_rounded_box(&mut self, size: Vec3, round: f32, material: &Material, transform: Affine3A) {
+    pub fn add_rounded_box(&self, size: Vec3, round: f32, material: &Material, transform: Affine3A) {
         self.add_mesh(cuboid(size, round), material, transform);
     }
 
-    pub fn add_mesh(&mut self, mesh: Mesh, material: &Material, transform: Affine3A) {
-        self.contents.meshes.push((mesh.moved(transform), material.clone()));
+    pub fn add_mesh(&self, mesh: Mesh, material: &Material, transform: Affine3A) {
+        self.contents.borrow_mut().meshes.push((mesh.moved(transform), material.clone()));
+    }
+
+    pub fn add_light(&self, color: Vec3, source: LightSource) {
+        self.contents.borrow_mut().lights.push(Light { color, source });
     }
 }
 

@@ -26,7 +26,7 @@ pub(super) struct Sensor {
 
 impl Sensor {
     /// Draws a random sensor, exposed for images with the mean radiance `mean`.
-    pub fn draw(builder: &mut SceneBuilder, mean: Vec3) -> Sensor {
+    pub fn draw(builder: &SceneBuilder, mean: Vec3) -> Sensor {
         let brightness = mean.element_sum() / 3.;
         let target = 0.2 * builder.log_uniform(0.6, 2.);
         // Automatic white balance removes most of the light's color.

@@ -56,13 +56,13 @@ impl Video {
     }
 
     fn attempt(random: ChaCha8Rng, settings: &VideoSettings) -> Option<Video> {
-        let mut builder = SceneBuilder::new(random);
-        let (place, orbit_target, sky) = world(&mut builder);
-        let tracer = Tracer::new(std::mem::take(&mut builder.contents), sky);
-        let poses = walk(&mut builder, &tracer, place, orbit_target, settings.frames)?;
-        let cameras = cameras(&mut builder, poses, settings.size);
+        let builder = SceneBuilder::new(random);
+        let (place, orbit_target, sky) = world(&builder);
+        let tracer = Tracer::new(builder.contents.take(), sky);
+        let poses = walk(&builder, &tracer, place, orbit_target, settings.frames)?;
+        let cameras = cameras(&builder, poses, settings.size);
         let seen = mean_light(&tracer, &cameras);
-        let sensor = Sensor::draw(&mut builder, seen);
+        let sensor = Sensor::draw(&builder, seen);
         let seed = builder.within(0..u32::MAX);
         Some(Video { tracer, sensor, cameras, seed })
     }
@@ -148,7 +148,7 @@ impl fmt::Debug for Video {
 }
 
 /// Builds a random scene, mostly rooms: people often photograph them, and they are the hardest to reconstruct.
-fn world(builder: &mut SceneBuilder) -> (CameraSpace, Option<OrbitTarget>, Sky) {
+fn world(builder: &SceneBuilder) -> (CameraSpace, Option<OrbitTarget>, Sky) {
     let mut sky = outdoors::sky(builder);
     let place = match builder.within(0..100) {
         0..55 => room::room(builder, &mut sky),
@@ -166,7 +166,7 @@ fn world(builder: &mut SceneBuilder) -> (CameraSpace, Option<OrbitTarget>, Sky) 
 }
 
 /// Returns a position on a wall, and the direction away from the wall.
-fn on_a_wall(builder: &mut SceneBuilder, place: CameraSpace, behind: f32) -> (Vec3, Vec3) {
+fn on_a_wall(builder: &SceneBuilder, place: CameraSpace, behind: f32) -> (Vec3, Vec3) {
     let (least, most) = (place.min - behind, place.max + behind);
     let share = builder.vector([(0.2, 0.8), (0.3, 0.75), (0.2, 0.8)]);
     let spot = least + share * (most - least);
@@ -178,7 +178,7 @@ fn on_a_wall(builder: &mut SceneBuilder, place: CameraSpace, behind: f32) -> (Ve
     }
 }
 
-fn cameras(builder: &mut SceneBuilder, poses: Vec<DMat4>, size: ImageSize) -> Vec<Camera> {
+fn cameras(builder: &SceneBuilder, poses: Vec<DMat4>, size: ImageSize) -> Vec<Camera> {
     let (width, height) = (f64::from(size.width), f64::from(size.height));
     let focal = f64::from(builder.log_uniform(0.55, 1.6)) * width.min(height);
     let intrinsics = Intrinsics { fx: focal, fy: focal, cx: width / 2., cy: height / 2. };

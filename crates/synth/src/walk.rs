@@ -59,7 +59,7 @@ struct Path {
 
 impl Path {
     /// Creates a path that stays at the origin, with the shake of a hand-held camera.
-    fn hand_held(builder: &mut SceneBuilder) -> Self {
+    fn hand_held(builder: &SceneBuilder) -> Self {
         Path {
             start: Vec3::ZERO,
             target: Vec3::ZERO,
@@ -93,7 +93,7 @@ impl Path {
 /// Returns camera-to-world poses of `frames` images, x right, y down, z forward, or `None` if there is no free path. If there is an
 /// orbit_target, most paths orbit it.
 pub(super) fn walk(
-    builder: &mut SceneBuilder,
+    builder: &SceneBuilder,
     tracer: &Tracer,
     place: CameraSpace,
     orbit_target: Option<OrbitTarget>,
@@ -115,12 +115,7 @@ pub(super) fn walk(
 }
 
 /// Creates a hand-held path around an object, from a short distance.
-fn orbit_path(
-    builder: &mut SceneBuilder,
-    orbit_target: OrbitTarget,
-    place: CameraSpace,
-    patience: f32,
-) -> Path {
+fn orbit_path(builder: &SceneBuilder, orbit_target: OrbitTarget, place: CameraSpace, patience: f32) -> Path {
     let OrbitTarget { middle, radius, front } = orbit_target;
     let away = 1.2 * radius + builder.log_uniform(0.3, 2.);
     let height = (middle.y + builder.within(-0.4..0.9) * away).max(place.min.y + 0.2);
@@ -147,7 +142,7 @@ fn orbit_path(
 }
 
 /// Creates a path past the objects of the scene.
-fn walk_path(builder: &mut SceneBuilder, tracer: &Tracer, place: CameraSpace, patience: f32) -> Option<Path> {
+fn walk_path(builder: &SceneBuilder, tracer: &Tracer, place: CameraSpace, patience: f32) -> Option<Path> {
     // Choose the viewpoint with the widest view among several, as photographers do.
     let views: Vec<(Vec3, Vec3)> =
         (0..builder.within(1..6)).map(|_| random_viewpoint(builder, tracer, place)).collect();
@@ -210,7 +205,7 @@ fn walk_path(builder: &mut SceneBuilder, tracer: &Tracer, place: CameraSpace, pa
 }
 
 /// Returns the position of a standing or flying camera, and its viewing direction.
-fn random_viewpoint(builder: &mut SceneBuilder, tracer: &Tracer, place: CameraSpace) -> (Vec3, Vec3) {
+fn random_viewpoint(builder: &SceneBuilder, tracer: &Tracer, place: CameraSpace) -> (Vec3, Vec3) {
     let CameraSpace { min, max, eye_heights: (low, high), .. } = place;
     let start = min + (max - min) * vec3(builder.within(0. ..1.), 0., builder.within(0. ..1.));
     let below = tracer.free_distance(start.with_y(max.y), Vec3::NEG_Y, 40.);
@@ -280,14 +275,14 @@ mod tests {
 
     #[test]
     fn orbits_show_objects_from_below_above_and_in_front() {
-        let mut builder = SceneBuilder::new(ChaCha8Rng::seed_from_u64(1));
+        let builder = SceneBuilder::new(ChaCha8Rng::seed_from_u64(1));
         let (min, max) = (Vec3::splat(-9.), Vec3::splat(9.));
         let place = CameraSpace { min, max, eye_heights: (1., 2.), clearance: 0.3, walls: Some(0.3) };
         let (mut up_and_down, mut before) = (0, 0);
         for i in 0..400 {
             let front = (i % 2 == 0).then_some(Vec3::X);
             let path =
-                orbit_path(&mut builder, OrbitTarget { middle: Vec3::ZERO, radius: 0.5, front }, place, 1.);
+                orbit_path(&builder, OrbitTarget { middle: Vec3::ZERO, radius: 0.5, front }, place, 1.);
             let seen: Vec<(Vec3, Vec3, f32)> = (0..=16).map(|i| path.at(i as f32 / 16.)).collect();
             let pitches = seen.iter().map(|(_, towards, _)| towards.normalize().y.asin());
             let (lowest, highest) = pitches.fold((f32::MAX, f32::MIN), |(a, b), y| (a.min(y), b.max(y)));
