@@ -121,7 +121,7 @@ impl Capture {
             return Err(PyIndexError::new_err(format!("photo {index} of {count}")));
         }
         let index = index.rem_euclid(count) as usize;
-        let photo = run(py, || Ok(self.0.photo(index)?))?;
+        let photo = run(py, || Ok(self.0.photo_with_mask(index)?.0))?;
         let (width, height) = photo.dimensions();
         PyArray::from_vec(py, photo.into_raw()).reshape([height as usize, width as usize, 3])
     }

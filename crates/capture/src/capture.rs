@@ -4,10 +4,10 @@ use crate::geometry::{Camera, ImageSize, check_pose, nearest_rigid_of_scaled};
 use crate::holdout::Holdout;
 use crate::image_source::ImageSource;
 use crate::lens::{Lens, LensModel, PinholeView, Projection, split_into_views};
-use crate::photos::{find_masks_in, format_names, part_name, unique_stems};
+use crate::photos::{describe_photos, find_masks_in, part_name, unique_stems};
 use crate::pixels::{
     DecodedPhoto, Planes, decode_photo, encode_photo, gray_to_rgb, has_alpha_channel, multiply,
-    read_image_size, read_mask, resize_and_crop, undistort,
+    read_image_size, read_mask, resize_and_crop, source_window, undistort,
 };
 use glam::{DMat3, DMat4};
 use globalsplat_files::{Error, InputFiles, Result, parent_of, split_keyed_path};
@@ -150,22 +150,16 @@ impl Changes {
 
     /// Returns one line for each kind of change to the capture that `file` describes, of which `present` photos are left.
     fn into_lines(self, file: &Path, present: usize) -> Vec<String> {
-        let file = file.display();
-        let mut lines = vec![];
-        if !self.missing.is_empty() {
-            let (count, all) = (self.missing.len(), present + self.missing.len());
-            let names = format_names(&self.missing);
-            lines.push(format!("{file}: {count} of {all} photos are missing and left out: {names}"));
-        }
-        if let Some((_, factor)) = self.scaled.first() {
-            let names = format_names(&self.scaled.iter().map(|(name, _)| name).collect::<Vec<_>>());
-            lines.push(format!(
-                "{file}: {} of {present} rotations are scaled, the first by {factor:.6}, which is taken out: {names}",
-                self.scaled.len()
-            ));
-        }
-        lines.extend(self.lines.into_iter().map(|line| format!("{file}: {line}")));
-        lines
+        let missing = describe_photos(file, &self.missing, |count| {
+            format!("{count} of {} photos are missing and left out", present + count)
+        });
+        let (scaled, factors): (Vec<String>, Vec<f64>) = self.scaled.into_iter().unzip();
+        let scaled = describe_photos(file, &scaled, |count| {
+            let first = factors[0];
+            format!("{count} of {present} rotations are scaled, the first by {first:.6}, which is taken out")
+        });
+        let others = self.lines.into_iter().map(|line| format!("{}: {line}", file.display()));
+        missing.into_iter().chain(scaled).chain(others).collect()
     }
 }
 
@@ -286,7 +280,12 @@ impl Capture {
         purpose: Purpose,
     ) -> Result<Self> {
         self.is_complete &= changes.missing.is_empty();
-        self.warnings.extend(check_frames(file, &mut frames, changes, purpose)?);
+        check_cameras(file, frames.iter().map(|frame| &frame.camera))?;
+        self.warnings.extend(changes.into_lines(file, frames.len()));
+        if matches!(purpose, Purpose::Photos) {
+            self.warnings.extend(fit_cameras_to_photos(file, &mut frames));
+            self.warnings.extend(check_masks(file, &frames)?);
+        }
         let (views, line) = views_of_frames(file, &frames, purpose)?;
         self.warnings.extend(line);
         let first = self.frames.len();
@@ -305,12 +304,8 @@ impl Capture {
         let masks = find_masks_in(folder, &names)?;
         let without: Vec<&str> =
             names.iter().zip(&masks).filter(|(_, mask)| mask.is_none()).map(|(name, _)| *name).collect();
-        let line = (!without.is_empty()).then(|| {
-            let (folder, count, all) = (folder.display(), without.len(), names.len());
-            format!(
-                "{folder}: {count} of {all} photos have no mask and count whole: {}",
-                format_names(&without)
-            )
+        let line = describe_photos(folder, &without, |count| {
+            format!("{count} of {} photos have no mask and count whole", names.len())
         });
         for (frame, mask) in self.frames.iter_mut().zip(masks) {
             frame.mask = mask;
@@ -512,7 +507,7 @@ impl Capture {
                 Some(size) => resize_and_crop(image, &view.camera, size),
                 None => (Planes::from_rgb(image), view.camera),
             };
-            let (image, mask) = view_pixels(&photo, mask.as_ref(), view);
+            let (image, mask) = view_pixels(&photo, mask.as_ref(), view, size);
             let (image, camera) = fit(&image);
             let mask = mask.map(|mask| fit(&mask).0.into_first_channel());
             let mask = mask.filter(|mask| mask.iter().any(|&weight| weight < u8::MAX));
@@ -530,16 +525,8 @@ impl Capture {
         }
     }
 
-    /// Returns the photo of view `index` at its camera's size, with lens distortion removed. Pixels that the photo doesn't show are
-    /// black.
-    ///
-    /// # Errors
-    /// Fails like [`Capture::load`].
-    pub fn photo(&self, index: usize) -> Result<RgbImage> {
-        Ok(self.photo_with_mask(index)?.0)
-    }
-
-    /// Returns the photo of view `index` like [`Capture::photo`], and the weights of its pixels, as in [`Photo::mask`], in equal channels.
+    /// Returns the photo of view `index` at its camera's size, with lens distortion removed, and the weights of its pixels, as in
+    /// [`Photo::mask`], in equal channels. Pixels that the photo doesn't show are black.
     ///
     /// # Errors
     /// Fails like [`Capture::load`].
@@ -549,7 +536,7 @@ impl Capture {
         if view.projection.is_identity() {
             return Ok((photo, mask));
         }
-        let (image, mask) = view_pixels(&photo, mask.as_ref(), view);
+        let (image, mask) = view_pixels(&photo, mask.as_ref(), view, None);
         Ok((image.into_owned(), mask.map(Cow::into_owned)))
     }
 
@@ -590,7 +577,7 @@ impl Capture {
         let frame = &self.frames[view.frame];
         let bytes = frame.image.read()?;
         let photo = self.decode(frame, &bytes)?;
-        match view_pixels(&photo.pixels, None, view).0 {
+        match view_pixels(&photo.pixels, None, view, None).0 {
             Cow::Borrowed(_) if photo.is_verbatim => Ok(bytes.into_owned()),
             image => encode_photo(&image, photo.is_jpeg),
         }
@@ -598,19 +585,22 @@ impl Capture {
 }
 
 /// Returns the pixels of `view` of `photo`, and their weights in equal channels: those of the photo's `mask`, and 0 where the photo doesn't
-/// show the view. There are no weights if every pixel counts.
+/// show the view. There are no weights if every pixel counts. Pixels are undefined where fitting the view to `size` doesn't read them.
 fn view_pixels<'a>(
     photo: &'a RgbImage,
     mask: Option<&'a RgbImage>,
     view: &View,
+    size: Option<ImageSize>,
 ) -> (Cow<'a, RgbImage>, Option<Cow<'a, RgbImage>>) {
     let View { projection, camera, .. } = view;
     if projection.is_identity() {
         return (Cow::Borrowed(photo), mask.map(Cow::Borrowed));
     }
-    let (image, shown) = undistort(photo, projection, camera);
+    let own_size = ImageSize { height: camera.height, width: camera.width };
+    let window = source_window(camera, size.unwrap_or(own_size));
+    let (image, shown) = undistort(photo, projection, camera, &window);
     let mask = mask.map(|mask| {
-        let mut mask = undistort(mask, projection, camera).0;
+        let mut mask = undistort(mask, projection, camera, &window).0;
         shown.iter().for_each(|shown| multiply(&mut mask, shown));
         mask
     });
@@ -669,22 +659,6 @@ fn description_file(path: &Path) -> PathBuf {
     std::iter::once(path.to_owned()).chain(files).find(|file| file.is_file()).unwrap_or_default()
 }
 
-/// Checks the cameras of `frames`, which `file` describes, fits them to their photos, and returns a line for each kind of change.
-fn check_frames(
-    file: &Path,
-    frames: &mut [Frame],
-    changes: Changes,
-    purpose: Purpose,
-) -> Result<Vec<String>> {
-    check_cameras(file, frames.iter().map(|frame| &frame.camera))?;
-    let mut lines = changes.into_lines(file, frames.len());
-    if matches!(purpose, Purpose::Photos) {
-        lines.extend(fit_cameras_to_photos(file, frames));
-        lines.extend(check_masks(file, frames)?);
-    }
-    Ok(lines)
-}
-
 /// Scales the intrinsics of `frames` to photos whose size differs from that in `file` but whose aspect ratio agrees with it, and
 /// returns a line about it. A photo whose size can't be read keeps its camera; loading it reports the error.
 fn fit_cameras_to_photos(file: &Path, frames: &mut [Frame]) -> Option<String> {
@@ -693,27 +667,17 @@ fn fit_cameras_to_photos(file: &Path, frames: &mut [Frame]) -> Option<String> {
         ImageLocation::Bytes { .. } | ImageLocation::Source { .. } => None,
     };
     let scaled: Vec<_> = frames.par_iter().map(scaled).collect();
-    let count = frames.len();
-    let mut names = vec![];
-    let mut first = None;
+    let (all, mut names, mut sizes) = (frames.len(), vec![], vec![]);
     for (frame, camera) in frames.iter_mut().zip(scaled) {
         let Some(camera) = camera else { continue };
-        first.get_or_insert((frame.camera, camera));
-        frame.camera = camera;
+        let Camera { width, height, .. } = std::mem::replace(&mut frame.camera, camera);
+        sizes.push(format!("{}×{} pixels in place of {width}×{height}", camera.width, camera.height));
         names.push(frame.name.as_str());
     }
-    let (said, found) = first?;
-    Some(format!(
-        "{}: {} of {count} photos have another size than it says, the first {}×{} pixels in place of {}×{}: their intrinsics \
-         are scaled: {}",
-        file.display(),
-        names.len(),
-        found.width,
-        found.height,
-        said.width,
-        said.height,
-        format_names(&names)
-    ))
+    describe_photos(file, &names, |count| {
+        let first = &sizes[0];
+        format!("{count} of {all} photos have another size than it says, the first {first}: their intrinsics are scaled")
+    })
 }
 
 /// Checks that the masks of `frames` have the sizes of their photos up to a factor. Returns a line about those that have another size.
@@ -735,16 +699,11 @@ fn check_masks(file: &Path, frames: &[Frame]) -> Result<Option<String>> {
     };
     // If several masks are wrong, the error is that of the first one.
     let resized: Vec<Result<bool>> = frames.par_iter().map(is_resized).collect();
-    let mut names = vec![];
-    for (frame, is_resized) in frames.iter().zip(resized) {
-        if is_resized? {
-            names.push(frame.name.as_str());
-        }
-    }
-    Ok((!names.is_empty()).then(|| {
-        let (file, count, all) = (file.display(), names.len(), frames.len());
-        let names = format_names(&names);
-        format!("{file}: the masks of {count} of {all} photos have another size and are resized: {names}")
+    let resized = resized.into_iter().collect::<Result<Vec<_>>>()?;
+    let resized = frames.iter().zip(resized).filter(|(_, is_resized)| *is_resized);
+    let names: Vec<&str> = resized.map(|(frame, _)| frame.name.as_str()).collect();
+    Ok(describe_photos(file, &names, |count| {
+        format!("the masks of {count} of {} photos have another size and are resized", frames.len())
     }))
 }
 

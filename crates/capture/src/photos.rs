@@ -140,13 +140,8 @@ impl PhotoList {
     pub fn warning(&self) -> Option<String> {
         let name = |path: &PathBuf| path.strip_prefix(&self.folder).unwrap_or(path).display().to_string();
         let names: Vec<String> = self.others.iter().map(name).collect();
-        (!names.is_empty()).then(|| {
-            let (count, all) = (names.len(), names.len() + self.photos.len());
-            format!(
-                "{}: {count} of {all} files are no photos and left out: {}",
-                self.folder.display(),
-                format_names(&names)
-            )
+        describe_photos(&self.folder, &names, |count| {
+            format!("{count} of {} files are no photos and left out", count + self.photos.len())
         })
     }
 }
@@ -229,6 +224,16 @@ fn tokens(mut rest: &[u8]) -> impl Iterator<Item = (u8, usize, &[u8])> {
         let zeros = token.iter().take_while(|&&digit| digit == b'0').count();
         Some((b'0', digits - zeros, &token[zeros..]))
     })
+}
+
+/// Returns a line about the photos `names` of `file`, of which `describe` tells something, given their number. Returns `None` without photos.
+pub(crate) fn describe_photos(
+    file: &Path,
+    names: &[impl AsRef<str>],
+    describe: impl FnOnce(usize) -> String,
+) -> Option<String> {
+    (!names.is_empty())
+        .then(|| format!("{}: {}: {}", file.display(), describe(names.len()), format_names(names)))
 }
 
 /// Formats the first few of `names` and the number of the remaining ones.

@@ -1,6 +1,6 @@
 //! COLMAP, as a program or as the Python package pycolmap: found, and its commands run.
 
-use crate::progress::Interrupt;
+use crate::progress::{Interrupt, KillOnDrop};
 use globalsplat_files::{Error, Result};
 use serde_json::Value;
 use std::fmt;
@@ -8,7 +8,7 @@ use std::fs::OpenOptions;
 use std::io::{BufRead, BufReader, Write, pipe};
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::Duration;
 
@@ -135,7 +135,7 @@ impl Colmap {
         let errors = writer.try_clone().map_err(failed_start())?;
         // Python ends when its standard input closes.
         let child = command.stdin(Stdio::piped()).stdout(writer).stderr(errors).spawn();
-        let mut child = Running(child.map_err(failed_start())?);
+        let mut child = KillOnDrop(child.map_err(failed_start())?);
         // It holds the end of the pipe for writing.
         drop(command);
         let (sender, lines) = channel();
@@ -216,16 +216,6 @@ fn arguments(options: &Value, help: &str) -> Vec<String> {
         [format!("--{}", old_name.as_ref().unwrap_or(name)), value]
     });
     arguments.collect()
-}
-
-/// A process that is killed on drop unless it has ended.
-struct Running(Child);
-
-impl Drop for Running {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
 }
 
 /// Returns the number of photos that a line of COLMAP's log reports: those with features, or those registered so far.

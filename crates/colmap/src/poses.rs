@@ -249,7 +249,7 @@ impl Estimate<'_, '_> {
         };
         let registered: BTreeSet<&String> = largest.photos.iter().collect();
         let unregistered = self.photos().iter().filter(|photo| !registered.contains(&photo.name));
-        let sizes: Vec<usize> = models.iter().map(|model| model.photos.len()).collect();
+        let is_few = (largest.photos.len() as f64) < FEW_REGISTERED * self.photos().len() as f64;
         Ok(CaptureReport {
             video: None,
             colmap: self.record.colmap.clone(),
@@ -260,16 +260,10 @@ impl Estimate<'_, '_> {
             other_files: None,
             skipped: self.record.skipped.clone(),
             unregistered: unregistered.map(|photo| photo.name.clone()).collect(),
-            advice: self.advice(&sizes),
-            models: sizes,
+            advice: if is_few { vec![ADVICE.to_string()] } else { vec![] },
+            models: models.iter().map(|model| model.photos.len()).collect(),
             seconds: self.record.seconds.clone(),
         })
-    }
-
-    /// Returns what to try if the largest of `models` has few of the photos.
-    fn advice(&self, models: &[usize]) -> Vec<String> {
-        let is_few = (models[0] as f64) < FEW_REGISTERED * self.photos().len() as f64;
-        if is_few { vec![ADVICE.to_string()] } else { vec![] }
     }
 }
 

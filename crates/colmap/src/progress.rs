@@ -2,6 +2,7 @@
 
 use globalsplat_files::{Error, Result};
 use serde::{Deserialize, Serialize};
+use std::process::Child;
 
 /// Steps of making a capture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -58,6 +59,16 @@ pub(crate) enum Interrupt {
 impl From<Error> for Interrupt {
     fn from(error: Error) -> Self {
         Interrupt::Failed(error)
+    }
+}
+
+/// A process that is killed on drop unless it has ended.
+pub(crate) struct KillOnDrop(pub Child);
+
+impl Drop for KillOnDrop {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
     }
 }
 

@@ -46,11 +46,12 @@ pub struct Chunk {
 
 /// Recognizes `CHUNK.torch#KEY`, or `CHUNK.torch` with a single scene.
 pub(crate) fn find(path: &Path) -> Option<CaptureOpener> {
-    if let Some((file, key)) = split_keyed_path(path).find(|(file, _)| is_chunk(file)) {
-        return Some(Box::new(move |purpose| Chunk::read(&file)?.capture_for(&key, purpose)));
-    }
-    let file = is_chunk(path).then(|| path.to_owned())?;
-    Some(Box::new(move |purpose| Chunk::read(&file)?.only_capture(purpose)))
+    let keyed = split_keyed_path(path).find(|(file, _)| is_chunk(file));
+    let (file, key) = match keyed {
+        Some((file, key)) => (file, Some(key)),
+        None => (is_chunk(path).then(|| path.to_owned())?, None),
+    };
+    Some(Box::new(move |purpose| Chunk::read(&file)?.capture_for(key.as_deref(), purpose)))
 }
 
 /// Returns `true` if `path` is a file with the extension of a chunk.
@@ -90,41 +91,27 @@ impl Chunk {
     /// # Errors
     /// Fails if there is no such scene, or if it violates the requirements on captures.
     pub fn capture(&self, key: &str) -> Result<Capture> {
-        self.capture_for(key, Purpose::Photos)
+        self.capture_for(Some(key), Purpose::Photos)
     }
 
-    fn capture_for(&self, key: &str, purpose: Purpose) -> Result<Capture> {
-        match self.scenes.iter().find(|scene| scene.key == key) {
-            Some(scene) => self.capture_of(scene, purpose),
-            None => {
-                let found = format!("{key:?}, which is missing");
-                Err(Error::input(&self.file, "the scene", found, self.choice()))
-            }
-        }
-    }
-
-    /// Returns the scene of a chunk that has a single scene.
-    ///
-    /// # Errors
-    /// Fails if there are more scenes or none; otherwise like [`Chunk::capture`].
-    fn only_capture(&self, purpose: Purpose) -> Result<Capture> {
-        match self.scenes.as_slice() {
-            [scene] => self.capture_of(scene, purpose),
-            scenes => {
-                let (file, count, choice) = (self.file.display(), scenes.len(), self.choice());
-                Err(Error::request(format!(
-                    "{file}: it holds {count} scenes, expected {file}#KEY with {choice}"
-                )))
-            }
-        }
-    }
-
-    /// Lists the available scenes for an error message.
-    fn choice(&self) -> String {
+    /// Returns the scene `key`, or the single one without a key.
+    fn capture_for(&self, key: Option<&str>, purpose: Purpose) -> Result<Capture> {
         const SHOWN: usize = 8;
-        let keys: Vec<&str> = self.keys().take(SHOWN).collect();
-        let more = if self.scenes.len() > SHOWN { ", …" } else { "" };
-        format!("one of its {}: {}{more}", self.scenes.len(), keys.join(", "))
+        let is_chosen = |scene: &&Scene| key.map_or(self.scenes.len() == 1, |key| scene.key == key);
+        if let Some(scene) = self.scenes.iter().find(is_chosen) {
+            return self.capture_of(scene, purpose);
+        }
+        let (keys, count) = (self.keys().take(SHOWN).collect::<Vec<_>>().join(", "), self.scenes.len());
+        let choice = format!("one of its {count}: {keys}{}", if count > SHOWN { ", …" } else { "" });
+        Err(match key {
+            Some(key) => {
+                Error::input(&self.file, "the scene", format!("{key:?}, which is missing"), choice)
+            }
+            None => {
+                let file = self.file.display();
+                Error::request(format!("{file}: it holds {count} scenes, expected {file}#KEY with {choice}"))
+            }
+        })
     }
 
     fn capture_of(&self, scene: &Scene, purpose: Purpose) -> Result<Capture> {

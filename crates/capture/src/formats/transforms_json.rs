@@ -160,7 +160,7 @@ fn find_named_masks(
     fields: &[Fields],
     photos: &[Option<PathBuf>],
 ) -> Result<Vec<Option<PathBuf>>> {
-    let names = fields.iter().map(Fields::mask_path).collect::<Result<Vec<_>>>()?;
+    let names = fields.iter().map(|fields| fields.path("mask_path")).collect::<Result<Vec<_>>>()?;
     if names.iter().all(Option::is_none) {
         return Ok(vec![None; fields.len()]);
     }
@@ -280,10 +280,6 @@ impl<'a> Fields<'a> {
 
     fn file_path(&self) -> Result<&'a str> {
         self.path("file_path")?.ok_or_else(|| self.refuse_path("file_path"))
-    }
-
-    fn mask_path(&self) -> Result<Option<&'a str>> {
-        self.path("mask_path")
     }
 
     /// Returns the frame's own path `key`, or `None` if it is empty or missing.

@@ -126,7 +126,7 @@ pub fn encode_photo(pixels: &RgbImage, as_jpeg: bool) -> Result<Vec<u8>> {
 /// Returns (width, height) like [`read_image_size`], for an image in memory, or `None` if it isn't an image.
 #[cfg(feature = "chunks")]
 pub fn encoded_image_size(encoded: &[u8]) -> Option<(u32, u32)> {
-    image_size(Cursor::new(encoded), Path::new("")).ok()
+    read_header(Cursor::new(encoded), Path::new("")).ok().map(|(size, _)| size)
 }
 
 /// Returns (width, height) of the pixels as stored, from the image's header alone.
@@ -134,20 +134,7 @@ pub fn encoded_image_size(encoded: &[u8]) -> Option<(u32, u32)> {
 /// # Errors
 /// Returns an error if the file is missing or isn't an image.
 pub fn read_image_size(path: &Path) -> Result<(u32, u32)> {
-    image_size(BufReader::new(File::open(path).map_err(Error::read(path))?), path)
-}
-
-fn image_size(mut reader: impl BufRead + Seek, path: &Path) -> Result<(u32, u32)> {
-    // image's JPEG decoder would read the whole file.
-    if let Some(size) = jpeg_size(&mut reader) {
-        return Ok(size);
-    }
-    reader.rewind().map_err(Error::read(path))?;
-    if let Some(size) = read_heif_size(&mut reader, path)? {
-        return Ok(size);
-    }
-    let reader = ImageReader::new(reader).with_guessed_format().map_err(Error::read(path))?;
-    reader.into_dimensions().map_err(undecodable(path))
+    Ok(read_header(BufReader::new(File::open(path).map_err(Error::read(path))?), path)?.0)
 }
 
 /// Returns `true` if the image's header declares an alpha channel or a transparent color. HEIC and AVIF are decoded without their alpha channel,
@@ -156,24 +143,25 @@ fn image_size(mut reader: impl BufRead + Seek, path: &Path) -> Result<(u32, u32)
 /// # Errors
 /// Returns an error if the file is missing or is no image.
 pub(crate) fn has_alpha_channel(path: &Path) -> Result<bool> {
-    let mut reader = BufReader::new(File::open(path).map_err(Error::read(path))?);
-    if read_heif_size(&mut reader, path)?.is_some() {
-        return Ok(false);
-    }
-    let reader = ImageReader::new(reader).with_guessed_format().map_err(Error::read(path))?;
-    // The decoder of JPEGs would read the whole file.
-    if reader.format() == Some(ImageFormat::Jpeg) {
-        return Ok(false);
-    }
-    Ok(reader.into_decoder().map_err(undecodable(path))?.color_type().has_alpha())
+    Ok(read_header(BufReader::new(File::open(path).map_err(Error::read(path))?), path)?.1)
 }
 
-/// Reads (width, height) of a HEIC or an AVIF, or returns `None` and rewinds `reader` if the file is neither.
-fn read_heif_size(reader: &mut (impl BufRead + Seek), path: &Path) -> Result<Option<(u32, u32)>> {
-    let mut start = vec![];
-    reader.take(HEADER_BYTES).read_to_end(&mut start).map_err(Error::read(path))?;
+/// Returns (width, height) and whether there is an alpha channel, from the header of the image `path`.
+fn read_header(mut reader: impl BufRead + Seek, path: &Path) -> Result<((u32, u32), bool)> {
+    // image's JPEG decoder would read the whole file.
+    if let Some(size) = jpeg_size(&mut reader) {
+        return Ok((size, false));
+    }
     reader.rewind().map_err(Error::read(path))?;
-    Ok(heif_size(&start))
+    let mut start = vec![];
+    reader.by_ref().take(HEADER_BYTES).read_to_end(&mut start).map_err(Error::read(path))?;
+    if let Some(size) = heif_size(&start) {
+        return Ok((size, false));
+    }
+    reader.rewind().map_err(Error::read(path))?;
+    let reader = ImageReader::new(reader).with_guessed_format().map_err(Error::read(path))?;
+    let decoder = reader.into_decoder().map_err(undecodable(path))?;
+    Ok((decoder.dimensions(), decoder.color_type().has_alpha()))
 }
 
 /// Offset of the color type in the header of a PNG.

@@ -43,25 +43,22 @@ pub(super) fn decode_heif(encoded: &[u8], file: &Path) -> Result<DynamicImage> {
                         macOS: brew install libheif)";
         Error::input(file, "the image", format!("undecodable ({why})"), expected)
     };
-    decode_by_libheif(encoded).map_err(undecodable)
-}
-
-fn decode_by_libheif(encoded: &[u8]) -> Result<DynamicImage, String> {
-    let given = |e: std::io::Error| format!("it can't be given to libheif: {e}");
-    let folder = tempfile::tempdir().map_err(given)?;
+    let not_given = |e: std::io::Error| undecodable(format!("it can't be given to libheif: {e}"));
+    let folder = tempfile::tempdir().map_err(not_given)?;
     let [heif, png] = ["photo.heif", "photo.png"].map(|name| folder.path().join(name));
-    std::fs::write(&heif, encoded).map_err(given)?;
+    std::fs::write(&heif, encoded).map_err(not_given)?;
     let run = |program| Command::new(program).args([&heif, &png]).stdin(Stdio::null()).output();
-    let output =
-        run(PROGRAMS[0]).or_else(|_| run(PROGRAMS[1])).map_err(|e| match is_program_missing(&e) {
+    let output = run(PROGRAMS[0]).or_else(|_| run(PROGRAMS[1])).map_err(|e| {
+        undecodable(match is_program_missing(&e) {
             true => "libheif isn't on the PATH".to_string(),
             false => format!("libheif can't be started: {e}"),
-        })?;
+        })
+    })?;
     let image = image::open(&png).ok().filter(|_| output.status.success());
     image.map(|image| image.into_rgb8().into()).ok_or_else(|| {
         let message = String::from_utf8_lossy(&output.stderr);
         let message = message.lines().map(str::trim).collect::<Vec<_>>().join("; ");
-        format!("libheif: {}", if message.is_empty() { output.status.to_string() } else { message })
+        undecodable(format!("libheif: {}", if message.is_empty() { output.status.to_string() } else { message }))
     })
 }
 

@@ -18,6 +18,7 @@ pub use metadata::{exif_focal, is_equirectangular};
 pub use planes::{CHANNELS, Planes};
 pub use resample::{Region, Resampler};
 pub use resize_and_crop::resize_and_crop;
+pub(crate) use resize_and_crop::source_window;
 
 pub(crate) use mask::multiply;
 pub use mask::{gray_to_rgb, read_mask};

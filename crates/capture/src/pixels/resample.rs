@@ -165,6 +165,11 @@ fn taps(cached: &mut Option<Taps>, key: (usize, f64, f64, usize)) -> &Taps {
     cached.get_or_insert_with(|| Taps::new(key))
 }
 
+/// Returns the range of inputs that the outputs of `key` read.
+pub(super) fn source_range(key: (usize, f64, f64, usize)) -> Range<usize> {
+    Taps::new(key).range()
+}
+
 /// Copies the pixels of [`ROWS`] rows from `top` on, within `columns`, to `tile`. Rows below the image repeat its last row.
 fn fill_tile(tile: &mut [[f32; LANES]], image: &RgbImage, columns: Range<usize>, top: usize) {
     let (width, height) = (image.width() as usize, image.height() as usize);

@@ -1,9 +1,10 @@
 //! Resizing and cropping of an image to the model's size (spec 9.2), with exact intrinsics.
 
 use super::planes::Planes;
-use super::resample::{Region, Resampler};
+use super::resample::{Region, Resampler, source_range};
 use crate::geometry::{Camera, ImageSize};
 use image::RgbImage;
+use std::ops::Range;
 
 /// The first resize rounds the width to a multiple of this, at least one (spec 9.2).
 const WIDTH_MULTIPLE: f64 = 8.;
@@ -50,6 +51,19 @@ impl Crop {
 
 fn has_size(camera: &Camera, size: ImageSize) -> bool {
     (camera.height, camera.width) == (size.height, size.width)
+}
+
+/// Returns the columns and the rows of a camera's image that [`resize_and_crop`] to `size` reads.
+pub(crate) fn source_window(camera: &Camera, size: ImageSize) -> [Range<usize>; 2] {
+    let [width, height] = [camera.width, camera.height].map(|count| count as usize);
+    if has_size(camera, size) {
+        return [0..width, 0..height];
+    }
+    let Crop { region, size, .. } = Crop::new(camera, size);
+    [
+        source_range((width, region.left, region.width, size.width as usize)),
+        source_range((height, region.top, region.height, size.height as usize)),
+    ]
 }
 
 /// Resizes the image to the height of `size` with the aspect ratio kept (width rounded to a multiple of 8), cuts out the largest
@@ -114,6 +128,20 @@ mod tests {
             let (width, height) = image.to_rgb().dimensions();
             assert_eq!(([height, width], [fitted.height, fitted.width]), (size, size));
         }
+    }
+
+    #[test]
+    fn pixels_outside_the_source_window_are_not_read() {
+        let (camera, size) = (camera(200, 360), [24, 24].into());
+        let [columns, rows] = source_window(&camera, size);
+        assert!(columns.len() == 200 && rows.len() < 330, "{columns:?} {rows:?}");
+        let image = RgbImage::from_fn(200, 360, |x, y| image::Rgb([(x * 7 + y * 13) as u8; 3]));
+        let mut window = image.clone();
+        let outside = window.enumerate_pixels_mut().filter(|(_, y, _)| !rows.contains(&(*y as usize)));
+        outside.for_each(|(_, _, pixel)| pixel.0 = [0; 3]);
+        assert_ne!(window, image);
+        let [whole, window] = [&image, &window].map(|image| resize_and_crop(image, &camera, size).0);
+        assert!(whole == window);
     }
 
     #[test]

@@ -1,13 +1,14 @@
 //! ffmpeg and ffprobe, run as processes.
 
 use super::motion::Gray;
+use crate::progress::KillOnDrop;
 use globalsplat_files::{Error, Result, is_program_missing};
 use serde_json::Value;
 use std::fs;
 use std::io::{BufRead, BufReader, Read};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdout, Command, Output, Stdio};
+use std::process::{ChildStdout, Command, Output, Stdio};
 use std::thread::JoinHandle;
 
 /// BT.2020 in PQ or HLG to BT.709, by linear light in which 1 is 100 cd/m².
@@ -144,9 +145,9 @@ impl<'a> Video<'a> {
         command.arg(absolute(self.path)?).args(["-map", &self.stream, "-vf", filter]);
         command.args([self.every_frame, "passthrough"]).args(output).current_dir(folder);
         let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
-        let mut child = child.map_err(not_started(self.path, "ffmpeg"))?;
-        let stdout = BufReader::new(child.stdout.take().expect("a pipe was requested"));
-        let stderr = child.stderr.take().expect("a pipe was requested");
+        let mut child = KillOnDrop(child.map_err(not_started(self.path, "ffmpeg"))?);
+        let stdout = BufReader::new(child.0.stdout.take().expect("a pipe was requested"));
+        let stderr = child.0.stderr.take().expect("a pipe was requested");
         let video = self.path.to_owned();
         let error = std::thread::spawn(move || first_message(stderr, &video));
         Ok(Pass { video: self, child, stdout, error: Some(error) })
@@ -158,10 +159,10 @@ impl<'a> Video<'a> {
     }
 }
 
-/// A run of ffmpeg, which is killed on drop.
+/// A run of ffmpeg.
 pub(super) struct Pass<'a> {
     video: &'a Video<'a>,
-    child: Child,
+    child: KillOnDrop,
     stdout: BufReader<ChildStdout>,
     /// First error that ffmpeg reports.
     error: Option<JoinHandle<Option<String>>>,
@@ -192,7 +193,7 @@ impl Pass<'_> {
     /// # Errors
     /// Returns the first error that ffmpeg reports if it fails.
     pub(super) fn finish(mut self) -> Result<()> {
-        let status = self.child.wait().map_err(Error::failed_with_context("ffmpeg failed"))?;
+        let status = self.child.0.wait().map_err(Error::failed_with_context("ffmpeg failed"))?;
         let error = self.error.take().and_then(|error| error.join().ok().flatten());
         match status.success() {
             true => Ok(()),
@@ -200,14 +201,6 @@ impl Pass<'_> {
                 .video
                 .failed(format!("ffmpeg failed: {}", error.unwrap_or_else(|| status.to_string())))),
         }
-    }
-}
-
-impl Drop for Pass<'_> {
-    fn drop(&mut self) {
-        // No-op if ffmpeg has ended already.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
     }
 }
 

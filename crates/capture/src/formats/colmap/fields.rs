@@ -88,13 +88,16 @@ pub fn read_entries<T>(
 impl<'a> Values<'a> {
     /// Reads a number. Error messages call it `name` in a text file, and `field` in a binary one.
     pub fn number<T: Number>(&mut self, name: &str, field: impl FnOnce() -> String) -> Result<T> {
-        if let Some(word) = self.word() {
-            return word.parse().map_err(|_| {
-                let found = if word.is_empty() { "missing".to_string() } else { format!("{word:?}") };
-                Error::input(self.file, self.in_line(name), found, T::NAME)
-            });
-        }
-        let Source::Binary { contents, at } = &mut self.source else { unreachable!("a text file has words") };
+        let (contents, at) = match &mut self.source {
+            Source::Binary { contents, at } => (contents, at),
+            Source::Text { number: line, rest, .. } => {
+                let word = next_word(rest);
+                return word.parse().map_err(|_| {
+                    let found = if word.is_empty() { "missing".to_string() } else { format!("{word:?}") };
+                    Error::input(self.file, format!("{name} in line {line}"), found, T::NAME)
+                });
+            }
+        };
         let number = T::read(&contents[*at..]).ok_or_else(|| {
             let found = format!("cut short by the end of the file after {} bytes", contents.len());
             Error::input(self.file, field(), found, format!("{} bytes", size_of::<T>()))
@@ -118,23 +121,15 @@ impl<'a> Values<'a> {
 
     /// Reads a word of a text file, which is empty at the end of the line. Returns `None` in a binary file.
     pub fn word(&mut self) -> Option<&'a str> {
-        let Source::Text { rest, .. } = &mut self.source else { return None };
-        let trimmed = rest.trim_start();
-        let (word, after) = trimmed.split_at(trimmed.find(char::is_whitespace).unwrap_or(trimmed.len()));
-        *rest = after;
-        Some(word)
+        match &mut self.source {
+            Source::Text { rest, .. } => Some(next_word(rest)),
+            Source::Binary { .. } => None,
+        }
     }
 
     /// Returns `true` if the line of a text file has more words.
     pub fn has_words(&self) -> bool {
         matches!(&self.source, Source::Text { rest, .. } if !rest.trim().is_empty())
-    }
-
-    fn in_line(&self, name: &str) -> String {
-        match &self.source {
-            Source::Text { number, .. } => format!("{name} in line {number}"),
-            Source::Binary { .. } => name.to_string(),
-        }
     }
 
     /// Reads a name: the rest of a line, which may contain spaces, or what a 0 ends in a binary file.
@@ -188,4 +183,12 @@ impl<'a> Values<'a> {
             Error::input(self.file, field, count, expected)
         })
     }
+}
+
+/// Takes the next word off a line, which is empty at its end.
+fn next_word<'a>(rest: &mut &'a str) -> &'a str {
+    let trimmed = rest.trim_start();
+    let (word, after) = trimmed.split_at(trimmed.find(char::is_whitespace).unwrap_or(trimmed.len()));
+    *rest = after;
+    word
 }
