@@ -676,7 +676,9 @@ fn fit_cameras_to_photos(file: &Path, frames: &mut [Frame]) -> Option<String> {
     }
     describe_photos(file, &names, |count| {
         let first = &sizes[0];
-        format!("{count} of {all} photos have another size than it says, the first {first}: their intrinsics are scaled")
+        format!(
+            "{count} of {all} photos have another size than it says, the first {first}: their intrinsics are scaled"
+        )
     })
 }
 

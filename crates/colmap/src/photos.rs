@@ -50,12 +50,6 @@ pub struct SkippedPhoto {
     pub reason: String,
 }
 
-impl SkippedPhoto {
-    fn new(name: &str, reason: String) -> Self {
-        SkippedPhoto { name: name.to_string(), reason }
-    }
-}
-
 /// Returns the photos in `folder` and its subfolders, in order of their names, and a line about the other files, if there are any.
 ///
 /// # Errors
@@ -97,7 +91,10 @@ pub(crate) fn import_photos(
         let first = *first_of.entry((photo.bytes, photo.checksum)).or_insert(&photo.name);
         match *first == photo.name {
             true => distinct.push((&photo.name, mask)),
-            false => skipped.push(SkippedPhoto::new(&photo.name, format!("identical to {first}"))),
+            false => {
+                let (name, reason) = (photo.name.clone(), format!("identical to {first}"));
+                skipped.push(SkippedPhoto { name, reason });
+            }
         }
     }
     let is_in_place =
@@ -113,7 +110,7 @@ pub(crate) fn import_photos(
             let Inspected { mut photo, contents, mask } = match inspected {
                 Ok(inspected) => inspected,
                 Err(reason) => {
-                    skipped.push(SkippedPhoto::new(name, reason));
+                    skipped.push(SkippedPhoto { name: name.clone(), reason });
                     continue;
                 }
             };
@@ -209,8 +206,8 @@ fn inspect(source: &Path, name: &str, mask: Option<&Path>, all_names: &[&str]) -
         name,
         width: pixels.width(),
         height: pixels.height(),
-        focal: exif_focal(path),
-        is_equirectangular: is_equirectangular(path),
+        focal: exif_focal(&encoded),
+        is_equirectangular: is_equirectangular(&encoded),
     };
     Ok(Inspected { photo, contents, mask })
 }

@@ -106,7 +106,8 @@ impl Raster {
                 let gaussians = Gaussians::from_splat(&splat);
                 let frame = gaussians.local_frame(splat.origin);
                 let views = load_all_views(&open_capture(scene)?, None)?;
-                let poses: Vec<_> = views.iter().map(|view| frame.pose_to_local(&view.camera.c2w)).collect();
+                let poses: Vec<_> =
+                    views.iter().map(|view| frame.camera_to_local(&view.camera).c2w).collect();
                 let gaussians = gaussians.to_local(&frame, splat.origin);
                 (gaussians, view_batch(&views, &poses, Device::Cpu).cameras())
             }

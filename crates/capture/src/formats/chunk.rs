@@ -104,9 +104,7 @@ impl Chunk {
         let (keys, count) = (self.keys().take(SHOWN).collect::<Vec<_>>().join(", "), self.scenes.len());
         let choice = format!("one of its {count}: {keys}{}", if count > SHOWN { ", …" } else { "" });
         Err(match key {
-            Some(key) => {
-                Error::input(&self.file, "the scene", format!("{key:?}, which is missing"), choice)
-            }
+            Some(key) => Error::input(&self.file, "the scene", format!("{key:?}, which is missing"), choice),
             None => {
                 let file = self.file.display();
                 Error::request(format!("{file}: it holds {count} scenes, expected {file}#KEY with {choice}"))

@@ -169,8 +169,7 @@ fn nearest_rigid(c2w: &DMat4) -> Result<DMat4, (String, String)> {
         let found = format!("a matrix that isn't rigid ({off:.4} off the nearest rotation)");
         return Err((found, "a rotation and a translation".into()));
     }
-    let column = |i: usize| rotation.col(i).extend(0.);
-    Ok(DMat4::from_cols(column(0), column(1), column(2), c2w.w_axis.truncate().extend(1.)))
+    Ok(DMat4::from_mat3_translation(rotation, c2w.w_axis.truncate()))
 }
 
 /// Returns [`nearest_rigid`] of a pose whose 3×3 part may be a rotation times a factor above 0, and that factor. Applying a

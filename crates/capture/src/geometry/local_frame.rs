@@ -56,15 +56,11 @@ impl LocalFrame {
         (point - self.origin) / self.scale
     }
 
-    /// Converts a camera-to-world pose to camera-to-local.
-    pub fn pose_to_local(&self, c2w: &DMat4) -> DMat4 {
-        DMat4 { w_axis: self.point_to_local(c2w.w_axis.truncate()).extend(1.), ..*c2w }
-    }
-
     /// Converts a camera in world coordinates to local coordinates. Camera coordinates, and so depths, are then in local units; the
     /// pose stays rigid.
     pub fn camera_to_local(&self, camera: &Camera) -> Camera {
-        Camera { c2w: self.pose_to_local(&camera.c2w), ..*camera }
+        let w_axis = self.point_to_local(camera.c2w.w_axis.truncate()).extend(1.);
+        Camera { c2w: DMat4 { w_axis, ..camera.c2w }, ..*camera }
     }
 
     /// Converts cameras in world coordinates to local coordinates.
@@ -111,7 +107,7 @@ mod tests {
             let moved = cameras(factor, offset);
             let other = LocalFrame::from_cameras(&moved);
             for (a, b) in plain.iter().zip(&moved) {
-                let (a, local) = (frame.pose_to_local(&a.c2w), other.pose_to_local(&b.c2w));
+                let (a, local) = (frame.camera_to_local(a).c2w, other.camera_to_local(b).c2w);
                 assert!(a.abs_diff_eq(local, tolerance), "{factor} {offset}: {a} {local}");
             }
         }

@@ -41,27 +41,6 @@ impl Projection {
     }
 }
 
-/// Bounds of a view: the least and the greatest x/z and y/z of its rays.
-#[derive(Debug, Clone, Copy)]
-struct Bounds {
-    least: DVec2,
-    greatest: DVec2,
-}
-
-impl Bounds {
-    /// Returns the bounds of `points` and of the view's axis, or `None` if there are no points.
-    fn new(points: impl IntoIterator<Item = DVec2>) -> Option<Self> {
-        let mut points = points.into_iter().peekable();
-        points.peek()?;
-        let axis = Bounds { least: DVec2::ZERO, greatest: DVec2::ZERO };
-        let join = |Bounds { least, greatest }, point| Bounds {
-            least: DVec2::min(least, point),
-            greatest: DVec2::max(greatest, point),
-        };
-        Some(points.fold(axis, join))
-    }
-}
-
 /// Returns pinhole views that together show every ray of the photos of `lens`. The views are the first of these that fit:
 ///
 /// 1. one view, if no ray is further than 55 degrees from the axis, horizontally and vertically;
@@ -137,12 +116,11 @@ fn views(
         let rays = rays.iter().filter(|&&ray| is_shown(index, ray)).map(|&ray| rotation.transpose() * ray);
         let is_within = |ray: &DVec3| ray.z > 0. && ray.truncate().abs().max_element() <= MAX_TANGENT * ray.z;
         let points = rays.map(|ray| Some(ray).filter(is_within).map(|ray| ray.truncate() / ray.z));
-        let mut bounds = Bounds::new(points.collect::<Option<Vec<_>>>()?)?;
+        let [least, greatest] = bounds(points.collect::<Option<Vec<_>>>()?)?;
         // Views beside or above each other meet in a plane through the photo's axis.
         let axis = rotation.transpose() * DVec3::Z;
-        bounds.least = bounds.least.min(axis.truncate() / axis.z);
-        bounds.greatest = bounds.greatest.max(axis.truncate() / axis.z);
-        Some(pinhole_view(suffix, rotation, bounds, focal, 0.5))
+        let meeting = axis.truncate() / axis.z;
+        Some(pinhole_view(suffix, rotation, [least.min(meeting), greatest.max(meeting)], focal, 0.5))
     };
     rotations.iter().enumerate().map(view).collect()
 }
@@ -165,24 +143,30 @@ fn cube(lens: &Lens, focal: f64) -> Vec<PinholeView> {
     let view = |(suffix, rotation)| {
         let points = (0..=PARTS).flat_map(|i| (0..=PARTS).map(move |j| DVec2::new(at(j), at(i))));
         let is_shown = |point: &DVec2| lens.project_into_photo(rotation * point.extend(1.)).is_some();
-        let mut bounds = Bounds::new(points.filter(is_shown))?;
-        bounds.least = (bounds.least - part).max(DVec2::NEG_ONE);
-        bounds.greatest = (bounds.greatest + part).min(DVec2::ONE);
+        let [least, greatest] = bounds(points.filter(is_shown))?;
+        let bounds = [(least - part).max(DVec2::NEG_ONE), (greatest + part).min(DVec2::ONE)];
         Some(pinhole_view(suffix, rotation, bounds, focal, 0.))
     };
     faces.into_iter().filter_map(view).collect()
 }
 
-/// Returns the view whose image contains `bounds` and `margin` pixels around them.
+/// Returns the least and the greatest x/z and y/z of `points` and of the view's axis, or `None` if there are no points.
+fn bounds(points: impl IntoIterator<Item = DVec2>) -> Option<[DVec2; 2]> {
+    let mut points = points.into_iter().peekable();
+    points.peek()?;
+    Some(points.fold([DVec2::ZERO; 2], |[least, greatest], point| [least.min(point), greatest.max(point)]))
+}
+
+/// Returns the view whose image contains the rays from `least` to `greatest`, as x/z and y/z, and `margin` pixels around them.
 fn pinhole_view(
     suffix: &'static str,
     rotation: DMat3,
-    bounds: Bounds,
+    [least, greatest]: [DVec2; 2],
     focal: f64,
     margin: f64,
 ) -> PinholeView {
-    let first = (bounds.least * focal - margin).floor();
-    let count = (bounds.greatest * focal + margin).ceil() - first;
+    let first = (least * focal - margin).floor();
+    let count = (greatest * focal + margin).ceil() - first;
     let [width, height] = count.to_array().map(|count| count.max(1.) as u32);
     let intrinsics = Intrinsics { fx: focal, fy: focal, cx: -first.x, cy: -first.y };
     PinholeView { suffix, rotation, intrinsics, size: ImageSize { width, height } }

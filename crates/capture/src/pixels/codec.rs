@@ -124,8 +124,7 @@ pub fn encode_photo(pixels: &RgbImage, as_jpeg: bool) -> Result<Vec<u8>> {
 }
 
 /// Returns (width, height) like [`read_image_size`], for an image in memory, or `None` if it isn't an image.
-#[cfg(feature = "chunks")]
-pub fn encoded_image_size(encoded: &[u8]) -> Option<(u32, u32)> {
+pub(crate) fn encoded_image_size(encoded: &[u8]) -> Option<(u32, u32)> {
     read_header(Cursor::new(encoded), Path::new("")).ok().map(|(size, _)| size)
 }
 

@@ -58,7 +58,10 @@ pub(super) fn decode_heif(encoded: &[u8], file: &Path) -> Result<DynamicImage> {
     image.map(|image| image.into_rgb8().into()).ok_or_else(|| {
         let message = String::from_utf8_lossy(&output.stderr);
         let message = message.lines().map(str::trim).collect::<Vec<_>>().join("; ");
-        undecodable(format!("libheif: {}", if message.is_empty() { output.status.to_string() } else { message }))
+        undecodable(format!(
+            "libheif: {}",
+            if message.is_empty() { output.status.to_string() } else { message }
+        ))
     })
 }
 

@@ -2,8 +2,8 @@
 //! as their photos.
 
 use super::codec::{decode_photo, multiply_levels};
-use super::planes::Planes;
-use super::resample::{Region, Resampler};
+use super::resample::Region;
+use super::resize_and_crop::resample_planes;
 use crate::geometry::ImageSize;
 use globalsplat_files::{Error, Result};
 use image::{GrayImage, Rgb, RgbImage};
@@ -24,12 +24,8 @@ pub fn read_mask(file: &Path, size: (u32, u32)) -> Result<RgbImage> {
     if mask.dimensions() == size {
         return Ok(mask);
     }
-    let mut resized = Planes::new(size.0, size.1);
-    let (width, height) = (f64::from(mask.width()), f64::from(mask.height()));
-    let whole = Region { left: 0., top: 0., width, height };
     let size = ImageSize { height: size.1, width: size.0 };
-    Resampler::default().resample(&mask, whole, size, resized.bytes_mut());
-    Ok(resized.to_rgb())
+    Ok(resample_planes(&mask, Region::whole(&mask), size).to_rgb())
 }
 
 /// Returns the image whose channels all are `image`.

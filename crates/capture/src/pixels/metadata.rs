@@ -1,24 +1,23 @@
 //! What a photo's metadata say about its camera.
 
-use super::codec::read_image_size;
+use super::codec::encoded_image_size;
 use exif::{In, Reader, Tag, Value};
 use image::{ImageDecoder, ImageReader};
-use std::fs::File;
-use std::io::BufReader;
-use std::path::Path;
+use std::io::Cursor;
 
 /// Diagonal of 35 mm film, 36 mm × 24 mm.
 const FILM_DIAGONAL: f64 = 43.266_615;
 
-/// Returns the focal length in pixels that a photo's EXIF data tell, at the size of the file, or `None` if they tell none.
+/// Returns the focal length in pixels that the EXIF data in `encoded`, the contents of a photo's file, tell, at the size of the file, or `None` if
+/// they tell none.
 ///
 /// The 35 mm equivalent f₃₅ comes first, since a photo may have been reduced after its EXIF data were written: f = f₃₅·√(W² + H²) /
 /// 43.27 mm (CIPA DCG-001). Otherwise f is the focal length times the sensor's pixels per millimetre (`FocalPlaneXResolution`), times
 /// the factor by which the longer side was reduced.
-pub fn exif_focal(path: &Path) -> Option<f64> {
-    let (width, height) = read_image_size(path).ok()?;
+pub fn exif_focal(encoded: &[u8]) -> Option<f64> {
+    let (width, height) = encoded_image_size(encoded)?;
     let (width, height) = (f64::from(width), f64::from(height));
-    let exif = Reader::new().read_from_container(&mut BufReader::new(File::open(path).ok()?)).ok()?;
+    let exif = Reader::new().read_from_container(&mut Cursor::new(encoded)).ok()?;
     let number = |tag| {
         let number = match &exif.get_field(tag, In::PRIMARY)?.value {
             Value::Rational(numbers) => numbers.first()?.to_f64(),
@@ -41,10 +40,11 @@ pub fn exif_focal(path: &Path) -> Option<f64> {
     Some(number(Tag::FocalLength)? * number(Tag::FocalPlaneXResolution)? / millimetres * reduction)
 }
 
-/// Returns `true` if a photo's XMP data declare a panorama of 360°: `GPano:ProjectionType` is `equirectangular`.
-pub fn is_equirectangular(path: &Path) -> bool {
+/// Returns `true` if the XMP data in `encoded`, the contents of a photo's file, declare a panorama of 360°: `GPano:ProjectionType` is
+/// `equirectangular`.
+pub fn is_equirectangular(encoded: &[u8]) -> bool {
     let xmp = || {
-        let reader = ImageReader::open(path).ok()?.with_guessed_format().ok()?;
+        let reader = ImageReader::new(Cursor::new(encoded)).with_guessed_format().ok()?;
         reader.into_decoder().ok()?.xmp_metadata().ok()?
     };
     let xmp = xmp().unwrap_or_default();

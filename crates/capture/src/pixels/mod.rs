@@ -11,7 +11,7 @@ mod resize_and_crop;
 mod undistort;
 
 #[cfg(feature = "chunks")]
-pub use codec::encoded_image_size;
+pub(crate) use codec::encoded_image_size;
 pub use codec::{DecodedPhoto, PHOTO_EXTENSIONS, decode_photo, encode_photo, read_image, read_image_size};
 pub(crate) use codec::{SUPPORTED_IMAGES, has_alpha_channel};
 pub use metadata::{exif_focal, is_equirectangular};

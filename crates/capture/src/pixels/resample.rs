@@ -34,6 +34,13 @@ pub struct Region {
     pub height: f64,
 }
 
+impl Region {
+    /// Returns the region of a whole image.
+    pub(super) fn whole(image: &RgbImage) -> Self {
+        Region { left: 0., top: 0., width: f64::from(image.width()), height: f64::from(image.height()) }
+    }
+}
+
 /// Filter taps along one axis: the inputs that contribute to each output, and their weights.
 #[derive(Debug, Clone, PartialEq)]
 struct Taps {
@@ -110,8 +117,7 @@ impl Resampler {
     pub fn resample(&mut self, image: &RgbImage, region: Region, size: ImageSize, planes: &mut [u8]) {
         let (width, height) = (image.width() as usize, image.height() as usize);
         let (out_width, out_height) = (size.width as usize, size.height as usize);
-        let whole = Region { left: 0., top: 0., width: width as f64, height: height as f64 };
-        if region == whole && (width, height) == (out_width, out_height) {
+        if region == Region::whole(image) && (width, height) == (out_width, out_height) {
             return split_channels(image, planes);
         }
         let columns = taps(&mut self.columns, (width, region.left, region.width, out_width));
@@ -198,10 +204,6 @@ mod tests {
         planes.to_rgb()
     }
 
-    fn whole(image: &RgbImage) -> Region {
-        Region { left: 0., top: 0., width: f64::from(image.width()), height: f64::from(image.height()) }
-    }
-
     /// Test image with levels from 64 to 191, so that no overshoot is clamped.
     fn waves(width: u32, height: u32) -> RgbImage {
         RgbImage::from_fn(width, height, |x, y| {
@@ -225,7 +227,7 @@ mod tests {
         ] {
             let (image, size) = (waves(width, height), ImageSize::from(size));
             let mut planes = Planes::new(size.width, size.height);
-            resampler.resample(&image, whole(&image), size, planes.bytes_mut());
+            resampler.resample(&image, Region::whole(&image), size, planes.bytes_mut());
             let theirs = imageops::resize(&image, size.width, size.height, FilterType::Lanczos3);
             // The image crate doesn't round between its passes, so that levels may differ by one.
             let ours = planes.to_rgb();
@@ -233,13 +235,13 @@ mod tests {
             assert!(difference <= Some(1), "{width}×{height} to {size:?}: {difference:?}");
         }
         let image = waves(13, 9);
-        assert_eq!(resample(&image, whole(&image), [9, 13]), image, "an image of the size is copied");
+        assert_eq!(resample(&image, Region::whole(&image), [9, 13]), image, "an image of the size is copied");
     }
 
     #[test]
     fn a_resampled_region_equals_a_crop_of_the_resampled_image() {
         let image = waves(64, 48);
-        let half = resample(&image, whole(&image), [24, 32]);
+        let half = resample(&image, Region::whole(&image), [24, 32]);
         let region = Region { left: 10., top: 6., width: 40., height: 24. };
         let crop = imageops::crop_imm(&half, 5, 3, 20, 12).to_image();
         assert_eq!(resample(&image, region, [12, 20]), crop);

@@ -81,15 +81,16 @@ pub fn resize_and_crop(image: &RgbImage, camera: &Camera, size: ImageSize) -> (P
     let (planes, intrinsics) = if crop.size == size {
         (planes, intrinsics)
     } else {
-        let (width, height) = (f64::from(crop.size.width), f64::from(crop.size.height));
-        let region = Region { left: 0., top: 0., width, height };
-        let scale = (f64::from(size.width) / width, f64::from(size.height) / height);
-        (resample_planes(&planes.to_rgb(), region, size), intrinsics.resized(scale.0, scale.1))
+        let cropped = planes.to_rgb();
+        let x = f64::from(size.width) / f64::from(cropped.width());
+        let y = f64::from(size.height) / f64::from(cropped.height());
+        (resample_planes(&cropped, Region::whole(&cropped), size), intrinsics.resized(x, y))
     };
     (planes, Camera { intrinsics, c2w: camera.c2w, width: size.width, height: size.height })
 }
 
-fn resample_planes(image: &RgbImage, region: Region, size: ImageSize) -> Planes {
+/// Returns `region` of the image, resampled to `size`.
+pub(super) fn resample_planes(image: &RgbImage, region: Region, size: ImageSize) -> Planes {
     let mut planes = Planes::new(size.width, size.height);
     Resampler::default().resample(image, region, size, planes.bytes_mut());
     planes

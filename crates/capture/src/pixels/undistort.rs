@@ -25,7 +25,9 @@ pub(crate) fn undistort(
             let (focal, center) = (DVec2::new(fx, fy), DVec2::new(cx, cy));
             sample(photo, camera, window, |point| distortion.apply(point) * focal + center)
         }
-        _ => sample(photo, camera, window, |point| projection.position(point.extend(1.)).unwrap_or(DVec2::NAN)),
+        _ => {
+            sample(photo, camera, window, |point| projection.position(point.extend(1.)).unwrap_or(DVec2::NAN))
+        }
     }
 }
 
