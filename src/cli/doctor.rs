@@ -3,7 +3,7 @@ use crate::config::Config;
 use crate::device::total_memory_bytes;
 use crate::distributed::{has_gloo, has_nccl};
 use crate::io::{WEIGHTS_VARIABLE, find_ffmpeg, find_pretrained};
-use crate::loss::LpipsNetwork;
+use crate::loss::PerceptualBackbone;
 use crate::model::Precision;
 use crate::reconstruct::BUNDLED_MODEL;
 use crate::render::cpu::{libtorch_simd_level, simd_level};
@@ -39,8 +39,8 @@ impl Doctor {
         let unusable = device::load_cuda().err().unwrap_or("it is for other GPUs, or another driver".into());
         let usable = tch::Cuda::device_count();
         let devices = std::iter::once("cpu".to_string()).chain((0..usable).map(|i| format!("cuda:{i}")));
-        let weights = LpipsNetwork::ALL.map(|network| {
-            let file = find_pretrained(network.file_name()).map(|path| path.display().to_string());
+        let weights = PerceptualBackbone::LPIPS.map(|network| {
+            let file = find_pretrained(&network.file_name()).map(|path| path.display().to_string());
             let absent = || format!("make weights makes it, {WEIGHTS_VARIABLE} names its folder");
             (network.metric().to_string(), found_or(file.ok_or_else(absent)))
         });

@@ -1,5 +1,6 @@
 //! Configuration of the loss: its terms and their weights.
 
+use super::perceptual_network::PerceptualBackbone;
 use crate::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
@@ -15,6 +16,18 @@ pub enum PerceptualKind {
     LpipsVgg,
     /// LPIPS with AlexNet.
     LpipsAlex,
+}
+
+impl PerceptualKind {
+    /// Returns the network; `None` if L_perc is left out.
+    pub fn backbone(self) -> Option<PerceptualBackbone> {
+        match self {
+            PerceptualKind::None => None,
+            PerceptualKind::Vgg19 => Some(PerceptualBackbone::Vgg19),
+            PerceptualKind::LpipsVgg => Some(PerceptualBackbone::LpipsVgg),
+            PerceptualKind::LpipsAlex => Some(PerceptualBackbone::LpipsAlex),
+        }
+    }
 }
 
 /// Weights of the loss terms (spec 7.1).

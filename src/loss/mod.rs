@@ -1,20 +1,16 @@
 //! Losses (spec 7.1): the terms and their weighted sum.
 
 mod config;
-mod lpips;
 mod perceptual;
+mod perceptual_network;
 mod terms;
-mod vgg19;
 
 pub use config::{LossConfig, PerceptualKind};
-pub use lpips::{Lpips, LpipsNetwork};
-pub use perceptual::PerceptualLoss;
+pub use perceptual_network::{PerceptualBackbone, PerceptualNetwork};
 pub use terms::{
-    DecoderRegularization, decoder_regularization, depth_smoothness, fill_masked, frustum,
-    masked_depth_smoothness, masked_mse, masked_photometric, mean_weight, mse, photometric, psnr_of_mse,
-    sh_soft_cap, ssim,
+    DecoderRegularization, decoder_regularization, depth_smoothness, fill_masked, frustum, masked_mse,
+    mean_weight, mse, photometric, psnr_of_mse, sh_soft_cap, ssim,
 };
-pub use vgg19::Vgg19;
 
 // Used by training, which may run the model in slices.
 pub(crate) use terms::{StepFraction, consistency, depth_pixels};
@@ -130,7 +126,7 @@ impl<T> Index<Term> for Losses<T> {
 /// large halves, so for a paired sample the sum is ½(L_a + L_b) + L_con. The losses of all shares of a step add up to the step's loss.
 pub(crate) fn losses(
     config: &LossConfig,
-    perceptual: Option<&PerceptualLoss>,
+    perceptual: Option<&PerceptualNetwork>,
     batch: &Batch,
     decoded: &Decoded,
     rendered: &RenderOutput,

@@ -1,8 +1,7 @@
 //! L_perc (spec 7.3 and 7.4): the difference between images and ground truth in the features of a network trained on photos.
 
 use super::config::{LossConfig, PerceptualKind};
-use super::lpips::{Lpips, LpipsNetwork};
-use super::vgg19::Vgg19;
+use super::perceptual_network::{PerceptualBackbone, PerceptualNetwork};
 use crate::error::{Error, Result};
 use crate::io::{expand_path, find_pretrained, pretrained_folders};
 use crate::model::{Precision, tracks_grad};
@@ -14,33 +13,23 @@ use tracing::trace_span;
 /// Number of 256×256 images that go through the network together on a GPU. VGG-19 keeps 0.2 GB in float32 for each.
 const GPU_CHUNK_SIZE: i64 = 16;
 
-/// Perceptual network with its weights.
-#[derive(Debug)]
-pub enum PerceptualLoss {
-    /// Features of VGG-19.
-    Vgg19(Vgg19),
-    /// LPIPS.
-    Lpips(Lpips),
-}
-
-impl PerceptualLoss {
+/// L_perc in training.
+impl PerceptualNetwork {
     /// Loads the network that `config` asks for, if any, from the configured file, for images of `size`.
     ///
     /// # Errors
     /// Returns an error if the file is missing (with instructions on how to get it), if it holds another network, or if the images are too
     /// small for the network.
-    pub fn load(config: &LossConfig, size: ImageSize, device: Device) -> Result<Option<Self>> {
+    pub fn from_config(config: &LossConfig, size: ImageSize, device: Device) -> Result<Option<Self>> {
         let file = &Self::weights_file(config)?;
-        let (expected, how) = match config.perceptual {
-            PerceptualKind::None => return Ok(None),
-            PerceptualKind::Vgg19 => (
+        let Some(backbone) = config.perceptual.backbone() else { return Ok(None) };
+        let (expected, how) = match backbone {
+            PerceptualBackbone::Vgg19 => (
                 "torchvision's vgg19 as a safetensors",
                 "save_file(torchvision.models.vgg19(weights=\"IMAGENET1K_V1\").features.state_dict(prefix=\"features.\"), FILE) \
                  creates it; loss.perceptual=\"lpips_vgg\" needs only the files that `make weights` creates",
             ),
-            PerceptualKind::LpipsVgg | PerceptualKind::LpipsAlex => {
-                ("the weights of LPIPS", "`make weights` creates it")
-            }
+            _ => ("the weights of LPIPS", "`make weights` creates it"),
         };
         if !file.is_file() {
             let found = format!("{}, which doesn't exist", file.display());
@@ -48,20 +37,15 @@ impl PerceptualLoss {
                 "loss.perceptual_weights is {found}, expected {expected} ({how})"
             )));
         }
-        let lpips = |network| Lpips::load(file, network, device).map(PerceptualLoss::Lpips);
-        let loss = match config.perceptual {
-            PerceptualKind::LpipsVgg => lpips(LpipsNetwork::Vgg16)?,
-            PerceptualKind::LpipsAlex => lpips(LpipsNetwork::AlexNet)?,
-            _ => PerceptualLoss::Vgg19(Vgg19::load(file, device)?),
-        };
-        let smallest = loss.smallest_side();
+        let network = PerceptualNetwork::load(file, backbone, device)?;
+        let smallest = backbone.smallest_side();
         if i64::from(size.height.min(size.width)) < smallest {
             return Err(Error::request(format!(
                 "data.image_size is [{}, {}], expected {smallest} or more for loss.perceptual",
                 size.height, size.width
             )));
         }
-        Ok(Some(loss))
+        Ok(Some(network))
     }
 
     /// Returns an upper bound on the memory of the network in bytes: its weights, and the activations of those of `images` images of
@@ -94,14 +78,6 @@ impl PerceptualLoss {
         }
     }
 
-    /// Converts the network to `precision`.
-    pub fn with_precision(self, precision: Precision) -> Self {
-        match self {
-            PerceptualLoss::Vgg19(network) => PerceptualLoss::Vgg19(network.with_precision(precision)),
-            PerceptualLoss::Lpips(lpips) => PerceptualLoss::Lpips(lpips.with_precision(precision)),
-        }
-    }
-
     /// Returns the configured weights file, with environment variables expanded. If none is configured, returns the file that `make
     /// weights` created, or the path at which it would create it.
     ///
@@ -111,19 +87,8 @@ impl PerceptualLoss {
         if !config.perceptual_weights.is_empty() {
             return Ok(expand_path(&config.perceptual_weights)?);
         }
-        let name = match config.perceptual {
-            PerceptualKind::LpipsVgg => LpipsNetwork::Vgg16.file_name(),
-            PerceptualKind::LpipsAlex => LpipsNetwork::AlexNet.file_name(),
-            PerceptualKind::Vgg19 | PerceptualKind::None => "vgg19.safetensors",
-        };
-        Ok(find_pretrained(name).unwrap_or_else(|| pretrained_folders()[0].join(name)))
-    }
-
-    fn smallest_side(&self) -> i64 {
-        match self {
-            PerceptualLoss::Vgg19(_) => Vgg19::SMALLEST_SIDE,
-            PerceptualLoss::Lpips(lpips) => lpips.network().smallest_side(),
-        }
+        let name = config.perceptual.backbone().unwrap_or(PerceptualBackbone::Vgg19).file_name();
+        Ok(find_pretrained(&name).unwrap_or_else(|| pretrained_folders()[0].join(name)))
     }
 
     /// Computes the mean loss over `rendered` [R·B, C, 3, H, W], which holds R renderings of `ground_truth` [B, C, 3, H, W] along the
@@ -137,7 +102,7 @@ impl PerceptualLoss {
         self.loss_by_chunks(rendered, ground_truth, chunk_size)
     }
 
-    /// Computes [`PerceptualLoss::loss`] with `chunk_size` images at a time.
+    /// Computes [`PerceptualNetwork::loss`] with `chunk_size` images at a time.
     fn loss_by_chunks(&self, rendered: &Tensor, ground_truth: &Tensor, chunk_size: i64) -> Tensor {
         let ground_truth = ground_truth.flatten(0, 1); // [B·C, 3, H, W]
         let (count, repeats) =
@@ -149,14 +114,14 @@ impl PerceptualLoss {
             let length = chunk_size.min(count - first);
             let share = length as f64 / (count * repeats) as f64;
             let ground_truth = ground_truth.narrow(0, first, length);
-            let ground_truth =
-                trace_span!("L_perc").in_scope(|| tch::no_grad(|| self.features(&ground_truth)));
+            let ground_truth: Vec<Tensor> =
+                trace_span!("L_perc").in_scope(|| tch::no_grad(|| self.features(&ground_truth).collect()));
             for turn in 0..repeats {
                 let place = |of: &Tensor| of.select(0, turn).narrow(0, first, length);
                 let image = place(&images).detach().set_requires_grad(gradient.is_some());
-                let loss = trace_span!("L_perc")
-                    .in_scope(|| self.compare(&self.features(&image), &ground_truth))
-                    * share;
+                let loss = trace_span!("L_perc").in_scope(|| {
+                    self.mean_distance(&self.features(&image).collect::<Vec<_>>(), &ground_truth)
+                }) * share;
                 if let Some(gradient) = &gradient {
                     loss.backward();
                     place(gradient).copy_(&image.grad());
@@ -173,24 +138,6 @@ impl PerceptualLoss {
             None => sum,
         }
     }
-
-    fn features(&self, images: &Tensor) -> Vec<Tensor> {
-        match self {
-            PerceptualLoss::Vgg19(network) => network.features(images),
-            PerceptualLoss::Lpips(lpips) => lpips.features(images).collect(),
-        }
-    }
-
-    /// Computes the mean loss over the images with these features.
-    fn compare(&self, image: &[Tensor], ground_truth: &[Tensor]) -> Tensor {
-        let each = |features: &[Tensor]| features.iter().map(Tensor::shallow_clone).collect::<Vec<_>>();
-        match self {
-            PerceptualLoss::Vgg19(network) => network.compare(image, ground_truth),
-            PerceptualLoss::Lpips(lpips) => {
-                lpips.compare(each(image).into_iter(), each(ground_truth).into_iter()).mean(None::<Kind>)
-            }
-        }
-    }
 }
 
 #[cfg(test)]
@@ -202,11 +149,10 @@ mod tests {
     fn loss_is_the_same_for_any_chunk_size() {
         tch::manual_seed(3);
         let vs = nn::VarStore::new(Device::Cpu);
-        let network = Lpips::new(&vs.root(), LpipsNetwork::AlexNet);
+        let loss = PerceptualNetwork::new(&vs.root(), PerceptualBackbone::LpipsAlex);
         vs.variables().into_values().for_each(|mut variable| {
             let _ = tch::no_grad(|| variable.uniform_(0., 0.05));
         });
-        let loss = PerceptualLoss::Lpips(network);
         // Two renderings of five images.
         let images = |scenes: i64| Tensor::rand([scenes, 5, 3, 40, 33], (Kind::Float, Device::Cpu));
         let (rendered, ground_truth) = (images(2), images(1));

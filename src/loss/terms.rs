@@ -33,34 +33,30 @@ pub fn psnr_of_mse(mse: f64) -> f64 {
 
 /// Computes `l1_weight` times the mean absolute difference plus `ssim_weight` times the mean SSIM. Both are means over images and channels;
 /// the first is over all pixels, the second over pixels whose 11×11 window lies inside the image. The result is a scalar, differentiable
-/// with respect to `image`; on the CPU, forward and backward take one pass each. Images are [.., H, W] in [0, 1] and of the same shape, H
+/// with respect to `image`; on the CPU, forward and backward take one pass each. Images are [.., C, H, W] in [0, 1] and of the same shape, H
 /// and W at least 11; float64 if `image` is, and float32 otherwise.
+///
+/// With a `mask` [.., 1, H, W], only the pixels that count do (spec 7.9): the absolute difference is weighted, and the mean SSIM is
+/// 1 − (1 − SSIM) / mean weight, where SSIM compares images that are equal where they are masked out.
 ///
 /// # Panics
 /// Panics if the shapes differ or the images are smaller.
-pub fn photometric(image: &Tensor, ground_truth: &Tensor, l1_weight: f64, ssim_weight: f64) -> Tensor {
-    let (image, ground_truth) = (image.as_ptr() as usize, ground_truth.as_ptr() as usize);
-    // SAFETY: the tensors outlive the call, which returns the address of a new one.
-    let loss = unsafe { tensor_ops::photometric(image, ground_truth, l1_weight, ssim_weight) };
-    unsafe { take_tensor(loss.unwrap_or_else(|error| panic!("{error}"))) }
-}
-
-/// Computes [`photometric`] over the pixels that count (spec 7.9): `l1_weight` times the mean absolute difference weighted by `mask`, plus
-/// `ssim_weight` times 1 − (1 − SSIM) / mean weight, where SSIM compares images that are equal where they are masked out. Images are [.., C, H, W]; masks are
-/// [.., 1, H, W].
-///
-/// # Panics
-/// Panics like [`photometric`].
-pub fn masked_photometric(
+pub fn photometric(
     image: &Tensor,
     ground_truth: &Tensor,
-    mask: &Tensor,
+    mask: Option<&Tensor>,
     l1_weight: f64,
     ssim_weight: f64,
 ) -> Tensor {
-    let filled = fill_masked(image, ground_truth, mask);
-    (photometric(&filled, ground_truth, l1_weight, ssim_weight) - ssim_weight) / mean_weight(mask)
-        + ssim_weight
+    let filled = mask.map(|mask| fill_masked(image, ground_truth, mask));
+    let addresses = [filled.as_ref().unwrap_or(image), ground_truth].map(|t| t.as_ptr() as usize);
+    // SAFETY: the tensors outlive the call, which returns the address of a new one.
+    let loss = unsafe { tensor_ops::photometric(addresses[0], addresses[1], l1_weight, ssim_weight) };
+    let loss = unsafe { take_tensor(loss.unwrap_or_else(|error| panic!("{error}"))) };
+    match mask {
+        Some(mask) => (loss - ssim_weight) / mean_weight(mask) + ssim_weight,
+        None => loss,
+    }
 }
 
 /// Computes the mean SSIM, with sample covariances; 1 for equal images. The requirements on the images are those of [`photometric`].
@@ -68,7 +64,7 @@ pub fn masked_photometric(
 /// # Panics
 /// Panics if the shapes differ or the images are smaller than 11×11.
 pub fn ssim(image: &Tensor, ground_truth: &Tensor) -> Tensor {
-    photometric(image, ground_truth, 0., 1.)
+    photometric(image, ground_truth, None, 0., 1.)
 }
 
 // L_con: the Gaussians of two subsets of the photos must agree in geometry (spec 7.7).
@@ -216,31 +212,30 @@ pub fn sh_soft_cap(sh: &Tensor) -> Tensor {
 
 // Edge-aware depth smoothness, which regularizes geometry if there are few photos (Godard et al. 2017, eq. 3).
 
+/// Minimum weight of a pixel whose depth is compared.
+const MIN_DEPTH_WEIGHT: f64 = 0.5;
+
 /// Computes `factor` times the mean of 2 |a − b| / (a + b) · exp(−10 |g − h|) over all pairs of horizontally or vertically neighbouring
 /// pixels, where a and b are the depths and g and h the photo's gray values at the two pixels. Pairs with a depth of 0, where nothing is
 /// visible, contribute 0. `depths` are [.., H, W], 0 or more; `photos` are [.., 3, H, W]. The result is a scalar, differentiable with
 /// respect to the depths; float64 if the depths are, and float32 otherwise.
 ///
-/// # Panics
-/// Panics if the shapes don't fit.
-pub fn depth_smoothness(depths: &Tensor, photos: &Tensor, factor: f64) -> Tensor {
-    let (depths, photos) = (depths.as_ptr() as usize, photos.as_ptr() as usize);
-    // SAFETY: the tensors outlive the call, which returns the address of a new one.
-    let loss = unsafe { tensor_ops::depth_smoothness(depths, photos, factor) };
-    unsafe { take_tensor(loss.unwrap_or_else(|error| panic!("{error}"))) }
-}
-
-/// Minimum weight of a pixel whose depth is compared.
-const MIN_DEPTH_WEIGHT: f64 = 0.5;
-
-/// Computes [`depth_smoothness`] over the pairs of pixels that both count: those with a weight of ½ or more in `mask` [.., H, W] (spec 7.9).
-/// The mean over all pairs is divided by the fraction of these pixels.
+/// With a `mask` [.., H, W], only pairs of pixels that both count do: those with a weight of ½ or more (spec 7.9). The mean over all pairs is
+/// then divided by the fraction of these pixels.
 ///
 /// # Panics
 /// Panics if the shapes don't fit.
-pub fn masked_depth_smoothness(depths: &Tensor, photos: &Tensor, mask: &Tensor, factor: f64) -> Tensor {
-    let counts = mask.ge(MIN_DEPTH_WEIGHT).to_kind(depths.kind());
-    depth_smoothness(&(depths * &counts), photos, factor) / mean_weight(&counts)
+pub fn depth_smoothness(depths: &Tensor, photos: &Tensor, mask: Option<&Tensor>, factor: f64) -> Tensor {
+    let counts = mask.map(|mask| mask.ge(MIN_DEPTH_WEIGHT).to_kind(depths.kind()));
+    let counted = counts.as_ref().map(|counts| depths * counts);
+    let addresses = [counted.as_ref().unwrap_or(depths), photos].map(|t| t.as_ptr() as usize);
+    // SAFETY: the tensors outlive the call, which returns the address of a new one.
+    let loss = unsafe { tensor_ops::depth_smoothness(addresses[0], addresses[1], factor) };
+    let loss = unsafe { take_tensor(loss.unwrap_or_else(|error| panic!("{error}"))) };
+    match counts {
+        Some(counts) => loss / mean_weight(&counts),
+        None => loss,
+    }
 }
 
 // Masks of photos (spec 7.9): a pixel that is masked out contributes nothing, and has no gradient.
@@ -284,10 +279,10 @@ mod tests {
         let depth = |image: &Tensor| image.select(1, 0);
         let losses: [(&str, MaskedLoss); 4] = [
             ("mse", &masked_mse),
-            ("l1", &|image, photo, mask| masked_photometric(image, photo, mask, 1., 0.)),
-            ("ssim", &|image, photo, mask| masked_photometric(image, photo, mask, 0., 1.)),
+            ("l1", &|image, photo, mask| photometric(image, photo, Some(mask), 1., 0.)),
+            ("ssim", &|image, photo, mask| photometric(image, photo, Some(mask), 0., 1.)),
             ("smoothness", &|image, photo, mask| {
-                masked_depth_smoothness(&depth(image), photo, &depth(mask), 1.)
+                depth_smoothness(&depth(image), photo, Some(&depth(mask)), 1.)
             }),
         ];
         for (name, loss) in losses {

@@ -6,7 +6,7 @@ use crate::data::View;
 use crate::device::{peak_device_memory_bytes, peak_memory_bytes};
 use crate::error::Result;
 use crate::io::{WEIGHTS_VARIABLE, find_pretrained, pretrained_folders};
-use crate::loss::{Lpips, LpipsNetwork, fill_masked};
+use crate::loss::{PerceptualBackbone, PerceptualNetwork, fill_masked};
 use crate::scene::ImageSize;
 use std::cell::OnceCell;
 use tch::{Device, Tensor};
@@ -16,7 +16,7 @@ use tch::{Device, Tensor};
 #[derive(Debug)]
 pub struct Perceptual {
     device: Device,
-    networks: OnceCell<Vec<Lpips>>,
+    networks: OnceCell<Vec<PerceptualNetwork>>,
     peak_memory: OnceCell<PeakMemory>,
 }
 
@@ -39,13 +39,13 @@ impl Perceptual {
     ///
     /// # Errors
     /// Fails if a file holds something else.
-    pub fn load(&self) -> Result<&[Lpips]> {
+    pub fn load(&self) -> Result<&[PerceptualNetwork]> {
         let peak = || PeakMemory { host: peak_memory_bytes(), device: peak_device_memory_bytes(self.device) };
         self.peak_memory.get_or_init(peak);
         if self.networks.get().is_none() {
-            let found = LpipsNetwork::ALL.into_iter();
-            let found = found.filter_map(|network| Some((network, find_pretrained(network.file_name())?)));
-            let loaded = found.map(|(network, path)| Lpips::load(&path, network, self.device));
+            let found = PerceptualBackbone::LPIPS.into_iter();
+            let found = found.filter_map(|network| Some((network, find_pretrained(&network.file_name())?)));
+            let loaded = found.map(|(network, path)| PerceptualNetwork::load(&path, network, self.device));
             self.networks.set(loaded.collect::<Result<_>>()?).expect("only this thread sets it");
         }
         Ok(self.networks.get().expect("set above"))
@@ -60,10 +60,11 @@ impl Perceptual {
     /// that count (spec 7.9). A distance is `None` if its network is missing or the view is too small for it.
     pub(super) fn add_to(&self, scores: &mut Scores, image: &Tensor, ground_truth: &View) -> Result<()> {
         for lpips in self.load()? {
-            *match lpips.network() {
-                LpipsNetwork::Vgg16 => &mut scores.lpips_vgg,
-                LpipsNetwork::AlexNet => &mut scores.lpips_alex,
-            } = distance(lpips, image, ground_truth);
+            let score = match lpips.backbone() {
+                PerceptualBackbone::LpipsAlex => &mut scores.lpips_alex,
+                _ => &mut scores.lpips_vgg,
+            };
+            *score = distance(lpips, image, ground_truth);
         }
         Ok(())
     }
@@ -72,14 +73,14 @@ impl Perceptual {
     pub fn could_add_to(scores: &Scores, size: ImageSize) -> bool {
         let side = i64::from(size.height.min(size.width));
         absent(scores)
-            .any(|network| side >= network.smallest_side() && find_pretrained(network.file_name()).is_some())
+            .any(|network| side >= network.smallest_side() && find_pretrained(&network.file_name()).is_some())
     }
 
     /// Explains why `scores`, to which the available distances have been added, lack a distance. Returns `None` if they lack none.
     pub fn explain_missing(scores: &Scores) -> Option<String> {
         let network = absent(scores).next()?;
-        let names = absent(scores).map(LpipsNetwork::metric).collect::<Vec<_>>().join(" and ");
-        Some(match find_pretrained(network.file_name()) {
+        let names = absent(scores).map(PerceptualBackbone::metric).collect::<Vec<_>>().join(" and ");
+        Some(match find_pretrained(&network.file_name()) {
             Some(_) => {
                 format!("left out: {names}, which needs views of {0}×{0} or more", network.smallest_side())
             }
@@ -95,14 +96,17 @@ impl Perceptual {
 }
 
 /// Returns the networks whose distances `scores` lack.
-fn absent(scores: &Scores) -> impl Iterator<Item = LpipsNetwork> {
-    let networks = [(LpipsNetwork::Vgg16, scores.lpips_vgg), (LpipsNetwork::AlexNet, scores.lpips_alex)];
+fn absent(scores: &Scores) -> impl Iterator<Item = PerceptualBackbone> {
+    let networks = [
+        (PerceptualBackbone::LpipsVgg, scores.lpips_vgg),
+        (PerceptualBackbone::LpipsAlex, scores.lpips_alex),
+    ];
     networks.into_iter().filter(|(_, score)| score.is_none()).map(|(network, _)| network)
 }
 
-fn distance(lpips: &Lpips, image: &Tensor, ground_truth: &View) -> Option<f64> {
+fn distance(lpips: &PerceptualNetwork, image: &Tensor, ground_truth: &View) -> Option<f64> {
     let size = image.size();
-    let smallest = lpips.network().smallest_side();
+    let smallest = lpips.backbone().smallest_side();
     if size[1] < smallest || size[2] < smallest {
         return None;
     }

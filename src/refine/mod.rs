@@ -30,7 +30,7 @@ use self::photos::TrainBatch;
 use crate::data::{View, ViewBatch};
 use crate::device::Stopwatch;
 use crate::error::{Error, Result};
-use crate::loss::{depth_smoothness, fill_masked, masked_depth_smoothness, masked_photometric, photometric};
+use crate::loss::{depth_smoothness, fill_masked, photometric};
 use crate::render::cpu::KernelThreads;
 use crate::render::{Cameras, RenderOutput, default_eps2d, render, render_views};
 use crate::scene::{Camera, Gaussians};
@@ -182,21 +182,14 @@ fn loss(
     depth: f64,
 ) -> Tensor {
     let (l1_weight, ssim_weight) = (1. - config.ssim_weight, -config.ssim_weight);
-    let difference = match (&photos.masks, background) {
-        (masks, Some(color)) => {
+    let difference = match background {
+        Some(color) => {
             let color = Tensor::from_slice(&color).view([3, 1, 1]).to_device(photos.images.device());
             let rgb = &rendered.rgb + (1. - rendered.alpha.unsqueeze(2)) * &color;
-            match masks {
-                Some(masks) => {
-                    photometric(&rgb, &fill_masked(&photos.images, &color, masks), l1_weight, ssim_weight)
-                }
-                None => photometric(&rgb, &photos.images, l1_weight, ssim_weight),
-            }
+            let filled = photos.masks.as_ref().map(|masks| fill_masked(&photos.images, &color, masks));
+            photometric(&rgb, filled.as_ref().unwrap_or(&photos.images), None, l1_weight, ssim_weight)
         }
-        (Some(masks), None) => {
-            masked_photometric(&rendered.rgb, &photos.images, masks, l1_weight, ssim_weight)
-        }
-        (None, None) => photometric(&rendered.rgb, &photos.images, l1_weight, ssim_weight),
+        None => photometric(&rendered.rgb, &photos.images, photos.masks.as_ref(), l1_weight, ssim_weight),
     };
     let mut loss = difference + config.ssim_weight;
     if config.opacity_reg > 0. {
@@ -206,13 +199,9 @@ fn loss(
         loss += gaussians.scales.mean(Kind::Float) * (config.scale_reg / depth);
     }
     if config.depth_smoothness_weight > 0. {
+        let masks = photos.masks.as_ref().map(|masks| masks.squeeze_dim(2));
         let weight = config.depth_smoothness_weight;
-        loss += match &photos.masks {
-            Some(masks) => {
-                masked_depth_smoothness(&rendered.depth, &photos.images, &masks.squeeze_dim(2), weight)
-            }
-            None => depth_smoothness(&rendered.depth, &photos.images, weight),
-        };
+        loss += depth_smoothness(&rendered.depth, &photos.images, masks.as_ref(), weight);
     }
     loss
 }

@@ -13,7 +13,7 @@ use crate::data::Batch;
 use crate::device::Stopwatch;
 use crate::distributed::ProcessGroup;
 use crate::error::Result;
-use crate::loss::{PerceptualLoss, StepFraction, depth_pixels, losses};
+use crate::loss::{PerceptualNetwork, StepFraction, depth_pixels, losses};
 use crate::model::{GlobalSplat, Stage, backward_from_grads, leaf};
 use crate::optim::zero_grad;
 use crate::render::{DEFAULT_EPS2D, RenderOutput, render};
@@ -26,7 +26,7 @@ use tch::{Kind, Tensor, nn, no_grad};
 pub(super) struct ForwardBackward<'a> {
     pub config: &'a Config,
     pub model: &'a GlobalSplat,
-    pub perceptual: Option<&'a PerceptualLoss>,
+    pub perceptual: Option<&'a PerceptualNetwork>,
     pub stage: Stage,
     /// Process group of the ranks that make the step together.
     pub group: &'a ProcessGroup,

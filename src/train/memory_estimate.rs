@@ -2,8 +2,8 @@
 
 use crate::config::{Config, OptimizerKind};
 use crate::error::Result;
-use crate::loss::PerceptualLoss;
-use crate::model::{GlobalSplat, ModelConfig, Precision, Streams};
+use crate::loss::PerceptualNetwork;
+use crate::model::{GlobalSplat, Precision, Streams};
 use serde::Serialize;
 use tch::{Device, nn};
 
@@ -34,12 +34,10 @@ impl MemoryEstimate {
     /// # Errors
     /// Returns an error if the model's settings don't fit together.
     pub fn new(config: &Config, device: Device) -> Result<Self> {
-        Ok(Self::with_parameters(config, count_parameters(&config.model)?, device))
-    }
-
-    /// Estimates the memory of a step for a model with `learned` trainable parameters.
-    fn with_parameters(config: &Config, learned: f64, device: Device) -> Self {
         const FLOAT: f64 = 4.;
+        let mut vs = nn::VarStore::new(Device::Cpu);
+        GlobalSplat::uninitialized(&mut vs, &config.model, Precision::F32)?;
+        let learned = vs.trainable_variables().iter().map(|variable| variable.numel()).sum::<usize>() as f64;
         let (model, data) = (&config.model, &config.data);
         let (batch, precision) = (config.train.batch_size, config.train.precision);
         let scenes_at_once = match config.train.micro_batch {
@@ -88,21 +86,21 @@ impl MemoryEstimate {
 
         let bytes = |numbers: f64| (FLOAT * numbers) as u64;
         let at_once = scenes_at_once as f64;
-        MemoryEstimate {
+        Ok(MemoryEstimate {
             batch,
             scenes_at_once,
             weights: bytes((1. + moments + gradients) * learned),
             photos: bytes(batch as f64 * (context + target) * 3. * pixels),
             encoder: bytes(at_once * per_scene + folded),
             pictures: bytes(at_once * pictures),
-            perceptual: PerceptualLoss::max_memory_bytes(
+            perceptual: PerceptualNetwork::max_memory_bytes(
                 &config.loss,
                 precision,
                 data.image_size,
                 scenes_at_once * data.target_views,
                 device,
             ),
-        }
+        })
     }
 
     /// Returns the sum of all items.
@@ -114,36 +112,4 @@ impl MemoryEstimate {
     pub fn fits_into(&self, bytes: u64) -> bool {
         self.total() + self.total() * 3 / 20 <= bytes
     }
-}
-
-/// Returns the batch size of `config`, halved until all scenes fit at once into `bytes` of memory on `device`, and the estimate of the last
-/// batch size that did not fit, if any. A batch size of 1 is accepted without a check.
-///
-/// # Errors
-/// Returns an error if the model's settings don't fit together.
-pub fn largest_fitting_batch(
-    config: &Config,
-    bytes: u64,
-    device: Device,
-) -> Result<(usize, Option<MemoryEstimate>)> {
-    let mut config = config.clone();
-    config.train.micro_batch = 0;
-    let learned = count_parameters(&config.model)?;
-    let mut refused = None;
-    while config.train.batch_size > 1 {
-        let estimate = MemoryEstimate::with_parameters(&config, learned, device);
-        if estimate.fits_into(bytes) {
-            break;
-        }
-        refused = Some(estimate);
-        config.train.batch_size /= 2;
-    }
-    Ok((config.train.batch_size, refused))
-}
-
-/// Returns the number of trainable parameters of a model of `config`.
-fn count_parameters(config: &ModelConfig) -> Result<f64> {
-    let mut vs = nn::VarStore::new(Device::Cpu);
-    GlobalSplat::uninitialized(&mut vs, config, Precision::F32)?;
-    Ok(vs.trainable_variables().iter().map(|variable| variable.numel()).sum::<usize>() as f64)
 }

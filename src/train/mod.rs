@@ -14,7 +14,7 @@ mod trainer;
 pub use crate::io::{CONFIG_FILE, METRICS_FILE};
 pub use checkpoint::{MODEL_FILE, best_checkpoint, latest_checkpoint, list_checkpoints};
 pub use logs::Curves;
-pub use memory_estimate::{MemoryEstimate, largest_fitting_batch};
+pub use memory_estimate::MemoryEstimate;
 pub use run::{Event, Outcome, Resume, Validator, add_run_inputs, retry_on_disk_full, run};
 pub use step::{Score, StepReport};
 pub use trainer::Trainer;

@@ -7,7 +7,9 @@ use crate::data::{Batch, Capture, LoadedScene};
 use crate::device::{Stopwatch, num_threads};
 use crate::distributed::ProcessGroup;
 use crate::distributed::tests::{require_gloo, run_on_ranks};
-use crate::loss::{LossConfig, Losses, PerceptualKind, PerceptualLoss, StepFraction, Term, Vgg19, losses};
+use crate::loss::{
+    LossConfig, Losses, PerceptualBackbone, PerceptualKind, PerceptualNetwork, StepFraction, Term, losses,
+};
 use crate::model::{ModelConfig, Precision, Stage, Streams};
 use crate::render::{DEFAULT_EPS2D, render};
 use crate::scene::{Camera, Intrinsics};
@@ -149,7 +151,7 @@ fn perturbed_trainer(config: &Config) -> Trainer {
     });
     // The weights of the perceptual network are in a file that may be missing in tests, so they are drawn here.
     let perceptual = nn::VarStore::new(Device::Cpu);
-    trainer.perceptual = Some(PerceptualLoss::Vgg19(Vgg19::new(&perceptual.root())));
+    trainer.perceptual = Some(PerceptualNetwork::new(&perceptual.root(), PerceptualBackbone::Vgg19));
     for (name, mut weight) in perceptual.variables().into_iter().collect::<BTreeMap<_, _>>() {
         if name.ends_with(".weight") {
             let inputs = weight.numel() as f64 / weight.size()[0] as f64;

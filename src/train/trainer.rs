@@ -9,7 +9,7 @@ use crate::data::{BadData, BadSceneReport, Batch, BatchShard, DataLoader, SceneG
 use crate::device::Stopwatch;
 use crate::distributed::{Buckets, ProcessGroup};
 use crate::error::{Error, Result};
-use crate::loss::{Losses, PerceptualLoss, StepFraction};
+use crate::loss::{Losses, PerceptualNetwork, StepFraction};
 use crate::model::{GlobalSplat, Growth, Precision, Stage};
 use crate::optim::Optimizer;
 use crate::reconstruct::{Model, ModelFile};
@@ -53,7 +53,7 @@ pub struct Trainer {
     /// Copies of the model for additional threads, created when they are first needed.
     pub(super) replicas: Vec<ModelReplica>,
     pub(super) optimizer: Optimizer,
-    pub(super) perceptual: Option<PerceptualLoss>,
+    pub(super) perceptual: Option<PerceptualNetwork>,
     /// File that has the initial weights, if they aren't drawn at random.
     weights: Option<PathBuf>,
     /// Number of steps done.
@@ -74,7 +74,7 @@ impl Trainer {
     /// # Errors
     /// Returns an error if the model can't be built, or if the weights of the perceptual loss are missing.
     pub fn new(config: &Config, scenes: Arc<dyn SceneGroups>, device: Device) -> Result<Self> {
-        let perceptual = PerceptualLoss::load(&config.loss, config.data.image_size, device)?
+        let perceptual = PerceptualNetwork::from_config(&config.loss, config.data.image_size, device)?
             .map(|network| network.with_precision(config.train.precision));
         tch::manual_seed(config.train.seed as i64);
         let vs = nn::VarStore::new(device);

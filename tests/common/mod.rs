@@ -9,13 +9,13 @@ pub use globalsplat_test_kit::formats;
 pub use globalsplat_test_kit::{captures, exit_code_of_test, fox, golden, rerun_test, skip};
 
 use globalsplat::io::find_pretrained;
-use globalsplat::loss::LpipsNetwork;
+use globalsplat::loss::PerceptualBackbone;
 use rand::{Rng, SeedableRng, rngs::StdRng};
 use tch::{Kind, Tensor};
 
 /// Returns `true` if the weights of LPIPS are available; otherwise, skips the test.
 pub fn has_lpips() -> bool {
-    let has = LpipsNetwork::ALL.iter().all(|network| find_pretrained(network.file_name()).is_some());
+    let has = PerceptualBackbone::LPIPS.iter().all(|network| find_pretrained(&network.file_name()).is_some());
     if !has {
         skip("the weights of LPIPS", "the LPIPS weights are missing; run make weights");
     }

@@ -19,7 +19,7 @@ use crate::error::Error;
 use crate::io::read_splat;
 use crate::refine::RefineConfig;
 use crate::scene::Gaussians;
-use crate::train::largest_fitting_batch;
+use crate::train::MemoryEstimate;
 use anyhow::Result;
 use clap::{Args, Subcommand};
 use serde_json::Value;
@@ -254,17 +254,25 @@ impl Train {
     }
 }
 
-/// Sets the batch size to the largest that fits into the memory of `device`, by the estimate.
+/// Halves the batch size until all scenes fit at once into the memory of `device`, by the estimate. A batch size of 1 isn't checked.
 fn take_what_fits(config: &mut Config, device: Device) -> Result<()> {
     let bytes = total_memory_bytes(device).unwrap_or(u64::MAX);
-    let (fits, refused) = largest_fitting_batch(config, bytes, device)?;
+    let (batch_size, mut refused) = (config.train.batch_size, None);
+    config.train.micro_batch = 0;
+    while config.train.batch_size > 1 {
+        let estimate = MemoryEstimate::new(config, device)?;
+        if estimate.fits_into(bytes) {
+            break;
+        }
+        refused = Some(estimate);
+        config.train.batch_size /= 2;
+    }
     if let Some(refused) = refused {
         let [more, bytes] = [refused.total(), bytes].map(|bytes| bytes as f64 * 1e-9);
         eprintln!(
-            "--batch auto: {fits} of {} scenes; {} would take {more:.1} GB, the device has {bytes:.1} GB",
+            "--batch auto: {} of {batch_size} scenes; {} would take {more:.1} GB, the device has {bytes:.1} GB",
             config.train.batch_size, refused.batch
         );
     }
-    (config.train.batch_size, config.train.micro_batch) = (fits, 0);
     Ok(())
 }

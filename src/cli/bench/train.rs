@@ -6,7 +6,7 @@ use crate::data::{Batch, Capture, LoadedScene};
 use crate::device::{Stopwatch, Upload, peak_memory_bytes_on};
 use crate::distributed::ProcessGroup;
 use crate::error::Result;
-use crate::loss::{PerceptualKind, PerceptualLoss};
+use crate::loss::{PerceptualKind, PerceptualNetwork};
 use crate::scene::{Camera, ImageSize, Intrinsics};
 use crate::train::{COMMUNICATION, Trainer};
 use glam::{DMat4, DVec3};
@@ -29,7 +29,7 @@ const FAR: f64 = 40.;
 pub fn bench_train(config: &Config, steps: usize, device: Device, group: ProcessGroup) -> Result<Value> {
     let mut config = config.clone();
     config.curriculum.full_capacity = true;
-    if !PerceptualLoss::weights_file(&config.loss)?.is_file() {
+    if !PerceptualNetwork::weights_file(&config.loss)?.is_file() {
         config.loss.perceptual = PerceptualKind::None;
     }
     let (rank, ranks) = (group.rank(), group.world_size());

@@ -48,17 +48,13 @@ pub(super) fn run(request: &Request) -> Result<Answer> {
         "photometric" => {
             let [image, ground_truth] = request.image_pair()?;
             let [l1_weight, ssim_weight] = [number("l1_weight")?, number("ssim_weight")?];
-            loss_of(match request.optional("mask") {
-                None => loss::photometric(&image, &ground_truth, l1_weight, ssim_weight),
-                Some(mask) => loss::masked_photometric(&image, &ground_truth, &mask, l1_weight, ssim_weight),
-            })
+            let mask = request.optional("mask");
+            loss_of(loss::photometric(&image, &ground_truth, mask.as_ref(), l1_weight, ssim_weight))
         }
         "depth_smoothness" => {
             let ([depth, photo], factor) = (request.inputs(["depth", "photo"])?, number("factor")?);
-            loss_of(match request.optional("mask") {
-                None => loss::depth_smoothness(&depth, &photo, factor),
-                Some(mask) => loss::masked_depth_smoothness(&depth, &photo, &mask, factor),
-            })
+            let mask = request.optional("mask");
+            loss_of(loss::depth_smoothness(&depth, &photo, mask.as_ref(), factor))
         }
         "depth_search" => depth_search(request, Search::PatchCorrelation, "correlation"),
         "semi_global_matching" => depth_search(request, Search::SemiGlobal, "confidence"),
@@ -320,9 +316,9 @@ fn frustum(request: &Request) -> Result<Answer> {
 
 fn lpips(request: &Request) -> Result<Answer> {
     let name: String = request.number("network")?;
-    let network = loss::LpipsNetwork::ALL.into_iter().find(|network| network.metric() == name);
+    let network = loss::PerceptualBackbone::LPIPS.into_iter().find(|network| network.metric() == name);
     let network = network.ok_or_else(|| Error::request(format!("{}: no network {name}", request.case)))?;
-    let (lpips, params) = request.build(|vs| loss::Lpips::new(vs, network))?;
+    let (lpips, params) = request.build(|vs| loss::PerceptualNetwork::new(vs, network))?;
     let [image, ground_truth] = request.image_pair()?;
     with_params([("distance", lpips.distance(&image, &ground_truth))], params)
 }
@@ -331,10 +327,11 @@ fn lpips(request: &Request) -> Result<Answer> {
 /// names.
 fn perceptual(request: &Request) -> Result<Answer> {
     let mut vs = nn::VarStore::new(request.device);
-    let network = match request.number::<String>("kind")?.as_str() {
-        "vgg19" => loss::PerceptualLoss::Vgg19(loss::Vgg19::new(&vs.root())),
-        _ => loss::PerceptualLoss::Lpips(loss::Lpips::new(&vs.root(), loss::LpipsNetwork::AlexNet)),
+    let backbone = match request.number::<String>("kind")?.as_str() {
+        "vgg19" => loss::PerceptualBackbone::Vgg19,
+        _ => loss::PerceptualBackbone::LpipsAlex,
     };
+    let network = loss::PerceptualNetwork::new(&vs.root(), backbone);
     let weights = request.inputs.iter().filter(|(name, _)| name.contains('.'));
     let tensors: Tensors = weights.map(|(name, t)| (name.clone(), t.shallow_clone())).collect();
     request.load(&mut vs, tensors)?;
