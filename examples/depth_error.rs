@@ -27,7 +27,7 @@ fn main() -> Result<()> {
     let index = EvaluationIndex::read(&folder.join("evaluation_index.json"))?;
 
     let mut errors = vec![];
-    for group in Dataset::open(folder, Split::Test)?.groups() {
+    for group in Dataset::open(folder, Split::Test)?.groups {
         let scenes = group.open()?;
         for (key, frames) in group.keys.iter().filter_map(|key| Some((key, index.scenes.get(key)?))) {
             let capture = scenes.capture(key)?;

@@ -259,7 +259,7 @@ impl Eval {
             return Err(Error::input(path, "what is to be scored", "no folder", expected).into());
         }
         let dataset = Dataset::open(data, Split::Test)?;
-        warn_of_many(dataset.warnings().iter());
+        warn_of_many(dataset.warnings.iter());
         let dataset_name = |index| DatasetEvaluation::dataset_name(self.dataset.as_deref(), data, index);
         let dataset_names = indices.iter().map(dataset_name).collect::<Result<Vec<_>, _>>()?;
         check_writable_dir(out)?;
@@ -387,23 +387,18 @@ fn folders(out: &Path, indices: &[EvaluationIndex]) -> Result<Vec<PathBuf>> {
 fn table(scores: &CaptureScores) -> Vec<String> {
     let gaussians = scores.gaussians.map_or(String::new(), |n| format!(", {n} Gaussians"));
     let mut lines = vec![format!("{}: {} views{gaussians}", scores.scene, scores.views.len())];
+    type Value = fn(&Scores) -> Option<f64>;
+    let lpips: [(_, Value); 2] =
+        [("LPIPS-VGG", |scores| scores.lpips_vgg), ("LPIPS-Alex", |scores| scores.lpips_alex)];
     // Columns without any value are left out.
-    let columns = [
-        ("LPIPS-VGG", scores.views.iter().any(|view| view.scores.lpips_vgg.is_some())),
-        ("LPIPS-Alex", scores.views.iter().any(|view| view.scores.lpips_alex.is_some())),
-    ];
-    let lpips = |values: [Option<f64>; 2]| -> String {
-        let shown = columns.iter().zip(values).filter(|((_, filled), _)| *filled);
-        shown
-            .map(|(_, value)| format!(" {:>10}", value.map_or(String::new(), |v| format!("{v:.4}"))))
-            .collect()
-    };
-    let names: String =
-        columns.iter().filter(|(_, filled)| *filled).map(|(name, _)| format!(" {name:>10}")).collect();
+    let has_values = |value: Value| scores.views.iter().any(|view| value(&view.scores).is_some());
+    let lpips: Vec<_> = lpips.into_iter().filter(|(_, value)| has_values(*value)).collect();
+    let names: String = lpips.iter().map(|(name, _)| format!(" {name:>10}")).collect();
     lines.push(format!("{:<24} {:>8} {:>8}{names}", "view", "PSNR", "SSIM"));
     let row = |name: &str, scores: &Scores| {
-        let lpips = lpips([scores.lpips_vgg, scores.lpips_alex]);
-        format!("{name:<24} {:>8.2} {:>8.4}{lpips}", scores.psnr, scores.ssim)
+        let shown = |value: Option<f64>| value.map_or(String::new(), |value| format!("{value:.4}"));
+        let lpips = lpips.iter().map(|(_, value)| format!(" {:>10}", shown(value(scores))));
+        format!("{name:<24} {:>8.2} {:>8.4}{}", scores.psnr, scores.ssim, lpips.collect::<String>())
     };
     lines.extend(scores.views.iter().map(|view| row(&view.image, &view.scores)));
     lines.push(row("mean", &scores.mean));

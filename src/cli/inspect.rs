@@ -171,13 +171,13 @@ fn chunk(path: &Path) -> Result<Value> {
 
 fn dataset(path: &Path) -> Result<Value> {
     let dataset = Dataset::open(path, Split::Test)?;
-    let groups = dataset.groups().iter();
+    let groups = dataset.groups.iter();
     let absent: Vec<_> =
         groups.filter(|group| !group.path().is_file()).map(|group| group.path().to_string_lossy()).collect();
     Ok(json!({
         "kind": "data set",
         "scenes": dataset.scenes(),
-        "chunks": dataset.groups().len(),
+        "chunks": dataset.groups.len(),
         "absent_chunks": absent,
     }))
 }

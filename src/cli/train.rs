@@ -85,14 +85,14 @@ impl Train {
             self.check_outputs(&config, &scenes)?;
         }
         let mut held_out = HeldOut::find(&config.data, &scenes)?;
-        if let ([first, others @ ..], true) = (held_out.trained_on(), is_main_process) {
+        if let ([first, others @ ..], true) = (held_out.trained_on.as_slice(), is_main_process) {
             let more = if others.is_empty() { String::new() } else { format!(" and {} more", others.len()) };
             eprintln!(
                 "{first}{more} of data.validation is also a training scene: its score says nothing about unseen scenes"
             );
         }
-        let captures = scenes.captures().iter().flat_map(Capture::warnings);
-        warn_of_many(scenes.warnings().iter().chain(captures).chain(held_out.warnings()));
+        let captures = scenes.captures.iter().flat_map(Capture::warnings);
+        warn_of_many(scenes.warnings.iter().chain(captures).chain(&held_out.warnings));
         let mut trainer = Trainer::new(&config, scenes, device)?;
         if let Some(weights) = &self.from {
             trainer = trainer.with_weights(weights);
@@ -126,7 +126,7 @@ impl Train {
             };
             anyhow::bail!("stopped; {checkpoint} is complete; {command} resumes");
         }
-        self.report(&outcome, seconds, held_out.scores(), &bad_data)
+        self.report(&outcome, seconds, &held_out.scores, &bad_data)
     }
 
     /// Returns an error for a folder whose files would replace an input. The configuration may be the run's own, since it is

@@ -56,8 +56,10 @@ enum Source {
 pub struct Dataset {
     /// Name of the folder.
     pub name: String,
-    groups: Vec<SceneGroup>,
-    warnings: Vec<String>,
+    /// All groups, ordered by path.
+    pub groups: Vec<SceneGroup>,
+    /// A line for each folder that couldn't be read.
+    pub warnings: Vec<String>,
 }
 
 /// A group in memory, with images still encoded.
@@ -95,16 +97,6 @@ impl Dataset {
             None => capture_groups(root, &other)?,
         };
         Ok(Dataset { name, groups, warnings })
-    }
-
-    /// Returns a line for each folder that couldn't be read.
-    pub fn warnings(&self) -> &[String] {
-        &self.warnings
-    }
-
-    /// Returns all groups, ordered by path.
-    pub fn groups(&self) -> &[SceneGroup] {
-        &self.groups
     }
 
     /// Returns what synthetic videos depend on besides their name: the version of their generator. Returns `None` for other datasets.

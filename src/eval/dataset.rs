@@ -188,7 +188,7 @@ impl DatasetEvaluation<'_> {
     fn begin(&self) -> Result<(Vec<SceneScores>, Vec<String>)> {
         self.claim_folder()?;
         let (mut kept, mut missing) = (vec![], vec![]);
-        for group in self.dataset.groups() {
+        for group in &self.dataset.groups {
             let open = LazyCell::new(|| group.open().ok());
             for key in group.keys.iter().filter(|key| self.index.scenes.contains_key(*key)) {
                 match self.read_valid_scores(key, || open.as_ref()) {
@@ -281,7 +281,7 @@ impl DatasetEvaluation<'_> {
         on_progress: &mut impl FnMut(usize, usize) -> bool,
     ) -> Result<RankResults> {
         let total = kept + own.len();
-        let groups = self.dataset.groups().iter().map(|group| {
+        let groups = self.dataset.groups.iter().map(|group| {
             let keys: Vec<&String> = group.keys.iter().filter_map(|key| own.take(key)).collect();
             (group, keys)
         });

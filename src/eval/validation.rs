@@ -18,9 +18,12 @@ use std::path::{Path, PathBuf};
 pub struct HeldOut {
     config: DataConfig,
     scenes: Vec<HeldOutScene>,
-    trained_on: Vec<String>,
-    warnings: Vec<String>,
-    scores: Vec<HeldOutScores>,
+    /// Names of the scenes that are held out as a whole although they are also trained on. Their scores say nothing about unseen scenes.
+    pub trained_on: Vec<String>,
+    /// Warnings about the scenes held out as a whole: a line for each kind of data that was left out or changed.
+    pub warnings: Vec<String>,
+    /// Scores of the last validation.
+    pub scores: Vec<HeldOutScores>,
 }
 
 /// Source of the context and target views of a validation scene.
@@ -55,19 +58,19 @@ impl HeldOut {
     pub fn find(config: &DataConfig, training: &TrainingScenes) -> Result<Self> {
         let mut scenes = vec![];
         let holds_out = |capture: &&Capture| config.holdout != Holdout::None || capture.has_test_part();
-        for capture in training.captures().iter().filter(holds_out) {
+        for capture in training.captures.iter().filter(holds_out) {
             split_views(capture, config.holdout)?;
             scenes.push(HeldOutScene::Views(capture.clone()));
         }
         if config.holdout != Holdout::None {
-            let others = spread(training.others(), config.validation_scenes);
+            let others = spread(&training.others, config.validation_scenes);
             scenes.extend(others.into_iter().map(|(group, key)| HeldOutScene::ViewsInGroup(group, key)));
         }
         let (mut groups, mut warnings) = (vec![], vec![]);
         for path in config.validation_paths()? {
             let dataset = Dataset::open(&path, Split::Test)?;
-            groups.extend_from_slice(dataset.groups());
-            warnings.extend_from_slice(dataset.warnings());
+            groups.extend(dataset.groups);
+            warnings.extend(dataset.warnings);
         }
         let (trained, mut trained_on) = (scene_ids(training), vec![]);
         for (group, key) in spread(&groups, config.validation_scenes) {
@@ -89,22 +92,6 @@ impl HeldOut {
     /// Returns `true` if nothing is held out.
     pub fn is_empty(&self) -> bool {
         self.scenes.is_empty()
-    }
-
-    /// Returns the names of the scenes that are held out as a whole although they are also trained on. Their scores say nothing about
-    /// unseen scenes.
-    pub fn trained_on(&self) -> &[String] {
-        &self.trained_on
-    }
-
-    /// Returns the warnings about the scenes held out as a whole: a line for each kind of data that was left out or changed.
-    pub fn warnings(&self) -> &[String] {
-        &self.warnings
-    }
-
-    /// Returns the scores of the last validation.
-    pub fn scores(&self) -> &[HeldOutScores] {
-        &self.scores
     }
 }
 
@@ -228,8 +215,8 @@ fn scene_id(file: &Path, key: Option<&String>) -> SceneId {
 
 /// Returns the identities of all scenes of `training`.
 fn scene_ids(training: &TrainingScenes) -> BTreeSet<SceneId> {
-    let captures = training.captures().iter().map(|capture| scene_id(capture.file(), None));
-    let others = training.others().iter();
+    let captures = training.captures.iter().map(|capture| scene_id(capture.file(), None));
+    let others = training.others.iter();
     let others = others.flat_map(|group| group.keys.iter().map(|key| scene_id(group.path(), Some(key))));
     captures.chain(others).collect()
 }

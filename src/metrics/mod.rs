@@ -6,7 +6,7 @@ mod psnr_ssim;
 
 pub use contact_sheet::{ContactSheet, comparison_image};
 pub use lpips::{PeakMemory, Perceptual};
-pub use psnr_ssim::{masked_psnr, masked_ssim, psnr, ssim};
+pub use psnr_ssim::{masked_psnr, masked_ssim, psnr};
 
 use crate::data::{Pixels, View};
 use crate::error::{Error, Result};

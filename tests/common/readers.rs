@@ -159,7 +159,7 @@ fn colmap_points(bytes: &[u8]) {
 fn dataset_index(bytes: &[u8]) {
     let file = file("dataset_index", "index.json", bytes);
     let Ok(dataset) = Dataset::open(file.parent().unwrap(), Split::Train) else { return };
-    for group in dataset.groups().iter().take(2) {
+    for group in dataset.groups.iter().take(2) {
         let _ = group.open();
     }
 }

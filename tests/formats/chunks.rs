@@ -42,8 +42,8 @@ fn packed_captures_round_trip() {
     let folder = tempfile::tempdir().unwrap();
     let chunks = packed(folder.path());
     let dataset = Dataset::open(&chunks, Split::Test).unwrap();
-    assert_eq!((dataset.scenes(), dataset.groups().len()), (3, 2));
-    for group in dataset.groups() {
+    assert_eq!((dataset.scenes(), dataset.groups.len()), (3, 2));
+    for group in &dataset.groups {
         let open = group.open().unwrap();
         for key in &group.keys {
             let (found, expected) =
@@ -65,7 +65,7 @@ fn packed_captures_round_trip() {
         open_capture(&PathBuf::from(format!("{}#room_1", chunks.join("000000.torch").display()))).unwrap();
     assert_eq!(one.names().collect::<Vec<_>>(), ["000000", "000001", "000002"]);
     let alone = open_capture(&chunks.join("000001.torch")).unwrap();
-    assert_same_cameras(&alone, &dataset.groups()[1].open().unwrap().capture("room_2").unwrap().cameras());
+    assert_same_cameras(&alone, &dataset.groups[1].open().unwrap().capture("room_2").unwrap().cameras());
     let root = folder.path().join("set");
     std::fs::create_dir(&root).unwrap();
     std::fs::rename(&chunks, root.join("test")).unwrap();
@@ -122,7 +122,7 @@ fn split_folders_contain_only_their_own_captures() {
     let write = |name: &str| write_room(&root.join(name), 0, 3, [24, 24].into()).unwrap();
     let scenes = |split: Split| -> Vec<String> {
         let dataset = Dataset::open(&root, split).unwrap();
-        dataset.groups().iter().flat_map(|group| group.keys.clone()).collect()
+        dataset.groups.iter().flat_map(|group| group.keys.clone()).collect()
     };
     write("test/seen_never");
     let error = Dataset::open(&root, Split::Train).unwrap_err().to_string();
@@ -305,7 +305,7 @@ fn what_is_wrong_with_a_scene_is_named() {
 
     std::fs::remove_file(&chunk).unwrap();
     let dataset = Dataset::open(&chunks, Split::Train).unwrap();
-    let error = dataset.groups()[0].open().unwrap_err().to_string();
+    let error = dataset.groups[0].open().unwrap_err().to_string();
     assert!(error.contains("000000.torch can't be read"), "{error}");
     for (index, found) in [
         ("[]", "unusable"),

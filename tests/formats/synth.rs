@@ -185,11 +185,11 @@ fn videos_are_data_like_any_other() {
     let written = Dataset::open(&out, Split::Test).unwrap();
     let named = Dataset::open(Path::new(name), Split::Train).unwrap();
     assert_eq!(written.scenes(), 2);
-    let keys = |data: &Dataset| data.groups().iter().flat_map(|g| g.keys.clone()).collect::<Vec<_>>();
+    let keys = |data: &Dataset| data.groups.iter().flat_map(|g| g.keys.clone()).collect::<Vec<_>>();
     assert_eq!(keys(&written), keys(&named));
     let views = |data: &Dataset| {
         let key = &keys(data)[1];
-        let group = data.groups().iter().find(|group| group.keys.contains(key)).unwrap();
+        let group = data.groups.iter().find(|group| group.keys.contains(key)).unwrap();
         load_all_views(&group.open().unwrap().capture(key).unwrap(), None).unwrap()
     };
     for (a, b) in views(&written).iter().zip(&views(&named)) {

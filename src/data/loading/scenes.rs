@@ -48,9 +48,12 @@ fn decoded_bytes(capture: &Capture) -> u64 {
 /// synthetic videos), which are opened when needed.
 #[derive(Debug)]
 pub struct TrainingScenes {
-    captures: Vec<Capture>,
-    others: Vec<SceneGroup>,
-    warnings: Vec<String>,
+    /// The open captures.
+    pub captures: Vec<Capture>,
+    /// The other groups: chunks and synthetic videos.
+    pub others: Vec<SceneGroup>,
+    /// A line for each folder that couldn't be read.
+    pub warnings: Vec<String>,
 }
 
 impl TrainingScenes {
@@ -63,20 +66,15 @@ impl TrainingScenes {
         let mut found = TrainingScenes { captures: vec![], others: vec![], warnings: vec![] };
         for path in paths {
             let dataset = Dataset::open(path, Split::Train)?;
-            found.warnings.extend_from_slice(dataset.warnings());
-            for group in dataset.groups() {
+            found.warnings.extend(dataset.warnings);
+            for group in dataset.groups {
                 match group.is_folder() {
                     true => found.captures.push(group.open()?.capture(&group.keys[0])?),
-                    false => found.others.push(group.clone()),
+                    false => found.others.push(group),
                 }
             }
         }
         Ok(found)
-    }
-
-    /// Returns a line for each folder that couldn't be read.
-    pub fn warnings(&self) -> &[String] {
-        &self.warnings
     }
 
     /// Adds the files of the captures to `inputs`, and of the other groups the files that writing below the folder `output` could
@@ -84,16 +82,6 @@ impl TrainingScenes {
     pub fn add_input_files(&self, output: &Path, inputs: &mut InputFiles) {
         self.captures.iter().for_each(|capture| capture.add_input_files(inputs));
         self.others.iter().for_each(|group| group.add_input_files(output, inputs));
-    }
-
-    /// Returns the open captures.
-    pub fn captures(&self) -> &[Capture] {
-        &self.captures
-    }
-
-    /// Returns the other groups: chunks and synthetic videos.
-    pub fn others(&self) -> &[SceneGroup] {
-        &self.others
     }
 }
 
