@@ -59,8 +59,8 @@ impl VideoWriter {
         Self::check(path, frames_per_second)?;
         let partial = PartialFile::create(path)?;
         let encoder = match format_of(path).as_str() {
-            "gif" => Encoder::Gif(Gif::begin(path, &partial.file, size, frames_per_second)?),
-            _ => Encoder::Mp4(Mp4::begin(path, &partial.temporary_path, size, frames_per_second)?),
+            "gif" => Encoder::Gif(Gif::begin(path, partial.temporary.as_file(), size, frames_per_second)?),
+            _ => Encoder::Mp4(Mp4::begin(path, partial.temporary.path(), size, frames_per_second)?),
         };
         Ok(VideoWriter { path: path.to_owned(), size, frames: 0, encoder, partial })
     }

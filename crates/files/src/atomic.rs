@@ -10,6 +10,7 @@ use serde::Serialize;
 use std::fs::{self, File, FileType, Metadata, OpenOptions};
 use std::io::{self, BufWriter, ErrorKind, Write};
 use std::path::{Path, PathBuf};
+use tempfile::{NamedTempFile, TempPath};
 
 /// Suffix of files and folders that are being written.
 const PARTIAL: &str = "globalsplat-partial";
@@ -40,7 +41,7 @@ pub fn write_temporary<E: From<Error>>(
     fill: impl FnOnce(&mut dyn Write) -> Result<(), E>,
 ) -> Result<PartialFile, E> {
     let partial = PartialFile::create(path)?;
-    let mut writer = BufWriter::new(&partial.file);
+    let mut writer = BufWriter::new(partial.temporary.as_file());
     fill(&mut writer)?;
     writer.into_inner().map_err(|e| Error::write(path)(e.into_error()))?;
     Ok(partial)
@@ -72,15 +73,12 @@ pub fn replace_dir<E: From<Error>>(
     unless_missing(fs::remove_dir_all(&temporary)).map_err(Error::write(path))?;
     fs::create_dir(&temporary).map_err(Error::write(path))?;
     let swap = || {
-        if retired.is_dir() && !target.exists() {
-            fs::rename(&retired, &target).map_err(Error::write(path))?;
-        }
-        retire(&retired, &target, own_entries)?;
+        recover_dir(&retired, &target, own_entries)?;
         if target.exists() {
             fs::rename(&target, &retired).map_err(Error::write(path))?;
         }
         fs::rename(&temporary, &target).map_err(Error::write(path))?;
-        retire(&retired, &target, own_entries)
+        recover_dir(&retired, &target, own_entries)
     };
     let filled = fill(&temporary);
     sync_dir(&temporary);
@@ -96,19 +94,21 @@ pub fn replace_dir<E: From<Error>>(
     Ok(())
 }
 
-/// Removes the entries `own_entries`, which belong to the program, from the folder `retired`, after moving its other entries to the folder
-/// `replacement`.
-fn retire(retired: &Path, replacement: &Path, own_entries: &[&str]) -> Result<()> {
+/// Moves the folder `retired` back to `path`, from which it was moved away. If another folder has taken this path, the entries `own_entries`,
+/// which belong to the program, are removed from `retired` instead, and its other entries are moved to the other folder. No-op if `retired`
+/// doesn't exist.
+fn recover_dir(retired: &Path, path: &Path, own_entries: &[&str]) -> Result<()> {
     if !retired.is_dir() {
         return Ok(());
     }
-    if replacement.is_dir() {
-        for entry in fs::read_dir(retired).map_err(Error::read(retired))? {
-            let name = entry.map_err(Error::read(retired))?.file_name();
-            let to = replacement.join(&name);
-            if !own_entries.iter().any(|own| name == *own) && !to.exists() {
-                fs::rename(retired.join(&name), &to).map_err(Error::write(&to))?;
-            }
+    if !path.exists() {
+        return fs::rename(retired, path).map_err(Error::write(path));
+    }
+    for entry in fs::read_dir(retired).map_err(Error::read(retired))? {
+        let name = entry.map_err(Error::read(retired))?.file_name();
+        let to = path.join(&name);
+        if !own_entries.iter().any(|own| name == *own) && !to.exists() {
+            fs::rename(retired.join(&name), &to).map_err(Error::write(&to))?;
         }
     }
     remove_own_entries(retired, own_entries)
@@ -159,11 +159,7 @@ pub fn recover_dirs(folder: &Path, own_entries: &[&str]) -> Result<()> {
         let name = left.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
         let Some(name) = name.strip_prefix('.').filter(|_| left.is_dir()) else { continue };
         if let Some(name) = name.strip_suffix(&format!(".{OLD}")) {
-            let path = folder.join(name);
-            match path.exists() {
-                false => fs::rename(&left, &path).map_err(Error::write(&path))?,
-                true => retire(&left, &path, own_entries)?,
-            }
+            recover_dir(&left, &folder.join(name), own_entries)?;
         } else if name.contains(&format!(".{PARTIAL}")) {
             fs::remove_dir_all(&left).map_err(Error::write(&left))?;
         }
@@ -178,12 +174,8 @@ pub struct PartialFile {
     path: PathBuf,
     /// Final path: `path` with links followed.
     target: PathBuf,
-    /// Temporary path, which only this process uses.
-    pub temporary_path: PathBuf,
-    /// Open file at `temporary_path`, initially empty.
-    pub file: File,
-    /// `true` if the file at `temporary_path` no longer exists.
-    is_gone: bool,
+    /// Open file, initially empty, at a temporary path that only this process uses.
+    pub temporary: NamedTempFile,
 }
 
 impl PartialFile {
@@ -194,38 +186,24 @@ impl PartialFile {
     /// Returns an error if something other than a regular file is at `path`, or if the file can't be written.
     pub fn create(path: &Path) -> Result<Self> {
         let target = target_of(path, Metadata::is_file, "the name of a file")?;
-        let (temporary_path, file) = claim(&target).map_err(Error::write(path))?;
+        let temporary = claim(&target).map_err(Error::write(path))?;
         if let Ok(replaced) = fs::metadata(&target) {
             // Best effort: some file systems have no permissions.
-            let _ = file.set_permissions(writable_by_owner(replaced.permissions()));
+            let _ = temporary.as_file().set_permissions(writable_by_owner(replaced.permissions()));
         }
-        Ok(PartialFile { path: path.to_owned(), target, temporary_path, file, is_gone: false })
+        Ok(PartialFile { path: path.to_owned(), target, temporary })
     }
 
     /// Renames the file to its final path.
     ///
     /// # Errors
     /// Returns an error if the file can't be written.
-    pub fn persist(mut self) -> Result<()> {
-        let whole = self.file.sync_all().and_then(|()| fs::rename(&self.temporary_path, &self.target));
-        whole.map_err(Error::write(&self.path))?;
-        self.is_gone = true;
-        sync_dir(parent_of(&self.target));
+    pub fn persist(self) -> Result<()> {
+        let PartialFile { path, target, temporary } = self;
+        temporary.as_file().sync_all().map_err(Error::write(&path))?;
+        temporary.persist(&target).map_err(|e| Error::write(&path)(e.error))?;
+        sync_dir(parent_of(&target));
         Ok(())
-    }
-
-    /// Removes the file.
-    fn remove(mut self) -> io::Result<()> {
-        self.is_gone = true;
-        unless_missing(fs::remove_file(&self.temporary_path))
-    }
-}
-
-impl Drop for PartialFile {
-    fn drop(&mut self) {
-        if !self.is_gone {
-            let _ = fs::remove_file(&self.temporary_path);
-        }
     }
 }
 
@@ -258,8 +236,8 @@ fn probe(file: &Path, named: &Path) -> Result<()> {
         Error::Write { source, .. } => Error::write(named)(source),
         other => other,
     };
-    let removed = PartialFile::create(file).map_err(named_so).map(PartialFile::remove);
-    removed.and_then(|removed| removed.map_err(Error::write(named))).map_err(refused)
+    let removed = PartialFile::create(file).map_err(named_so).map(|partial| partial.temporary.close());
+    removed.and_then(|removed| unless_missing(removed).map_err(Error::write(named))).map_err(refused)
 }
 
 /// Converts a write error into a request error, unless the disk is full.
@@ -322,7 +300,7 @@ fn writable_by_owner(mut permissions: fs::Permissions) -> fs::Permissions {
 
 /// Creates a temporary file beside `target` for this process alone. It stays locked until the returned file is closed. Files that killed
 /// processes left at the temporary paths are removed.
-fn claim(target: &Path) -> io::Result<(PathBuf, File)> {
+fn claim(target: &Path) -> io::Result<NamedTempFile> {
     let remove_abandoned = |number| remove_abandoned(&temporary_path(target, number)).unwrap_or(false);
     let mut number = 0;
     loop {
@@ -334,7 +312,7 @@ fn claim(target: &Path) -> io::Result<(PathBuf, File)> {
                 // Another process may have found it before it was locked, and removed it.
                 if is_at(&file, &place) {
                     (number + 1..).take_while(|later| remove_abandoned(*later)).for_each(drop);
-                    return Ok((place, file));
+                    return Ok(NamedTempFile::from_parts(file, TempPath::try_from_path(place)?));
                 }
             }
             Err(e) if e.kind() == ErrorKind::AlreadyExists => number += u32::from(!remove_abandoned(number)),
@@ -453,7 +431,7 @@ mod tests {
         let second = PartialFile::create(&file).unwrap();
         assert_eq!(names(root.path()), partial);
         for (writer, text) in [(second, b"second".as_slice()), (first, b"first")] {
-            (&writer.file).write_all(text).unwrap();
+            writer.temporary.as_file().write_all(text).unwrap();
             writer.persist().unwrap();
             assert_eq!(fs::read(&file).unwrap(), text);
         }
