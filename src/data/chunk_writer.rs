@@ -161,8 +161,8 @@ impl ChunkWriter {
 
 /// Returns the contents of a chunk: the list of its scenes as `torch.save` writes it.
 fn chunk_bytes(scenes: &[WaitingScene]) -> Result<Vec<u8>> {
-    fn tensor<'a>(dtype: Dtype, shape: &'a [usize], bytes: &'a [u8]) -> Item<'a> {
-        Item::Tensor(TensorView { name: "", dtype, shape, bytes })
+    fn tensor<'a>(dtype: Dtype, shape: &[usize], bytes: &'a [u8]) -> Item<'a> {
+        Item::Tensor(TensorView::new(dtype, shape.into(), bytes).expect("the bytes of all elements"))
     }
     let scenes = scenes.iter().map(|scene| {
         let images = scene.images.iter();

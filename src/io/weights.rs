@@ -3,8 +3,7 @@
 
 use super::write_atomically;
 use crate::error::{Error, Result};
-use globalsplat_torch_file as torch_file;
-use globalsplat_torch_file::{Array, Dtype, TorchFile, Value, is_torch_file, row_major};
+use globalsplat_torch_file::{self as torch_file, Array, Dtype, TorchFile, Value, is_torch_file, row_major};
 use memmap2::{Mmap, MmapOptions};
 use safetensors::tensor::TensorView;
 use safetensors::{SafeTensorError, SafeTensors};
@@ -42,12 +41,9 @@ pub fn write_weights(
     tensors: &BTreeMap<String, Tensor>,
     metadata: HashMap<String, String>,
 ) -> Result<()> {
-    let stored = Stored::all(tensors)?;
+    let contents = contents_of(tensors)?;
     let failed = |e| Error::failed(format!("{}: weights can't be serialized: {e}", path.display()));
-    let views =
-        stored.iter().map(|(name, s)| Ok((name, TensorView::new(s.dtype, s.shape.clone(), &s.bytes)?)));
-    let views = views.collect::<std::result::Result<Vec<_>, SafeTensorError>>().map_err(failed)?;
-    let mut bytes = safetensors::serialize(views, Some(metadata)).map_err(failed)?;
+    let mut bytes = safetensors::serialize(views(tensors, &contents)?, Some(metadata)).map_err(failed)?;
     sort_header(&mut bytes);
     write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
 }
@@ -73,34 +69,32 @@ const HEADER_LENGTH: usize = 8;
 /// # Errors
 /// Returns an error if a tensor's type can't be stored, or if the file can't be written.
 pub fn write_checkpoint(path: &Path, weights: &Weights) -> Result<()> {
-    let stored = Stored::all(&weights.tensors)?;
-    let tensors: Vec<_> = stored
-        .iter()
-        .map(|(name, s)| torch_file::TensorView { name, dtype: s.dtype, shape: &s.shape, bytes: &s.bytes })
-        .collect();
-    Ok(torch_file::write_checkpoint(path, &tensors, &weights.metadata)?)
+    let contents = contents_of(&weights.tensors)?;
+    Ok(torch_file::write_checkpoint(path, views(&weights.tensors, &contents)?, &weights.metadata)?)
 }
 
-/// A tensor's bytes in row-major order, with its type and shape.
-struct Stored {
-    dtype: Dtype,
-    shape: Vec<usize>,
-    bytes: Vec<u8>,
-}
-
-impl Stored {
-    fn all(tensors: &BTreeMap<String, Tensor>) -> Result<Vec<(&str, Self)>> {
-        tensors.iter().map(|(name, tensor)| Ok((name.as_str(), Stored::new(tensor)?))).collect()
-    }
-
-    fn new(tensor: &Tensor) -> Result<Self> {
+/// Returns the bytes of each tensor, in row-major order.
+fn contents_of(tensors: &BTreeMap<String, Tensor>) -> Result<Vec<Vec<u8>>> {
+    let bytes = |tensor: &Tensor| {
         let tensor = tensor.detach().to_device(Device::Cpu).contiguous();
-        let dtype = to_dtype(tensor.kind())?;
-        let mut bytes = vec![0; tensor.numel() * dtype.bitsize() / 8];
+        let mut bytes = vec![0; tensor.numel() * to_dtype(tensor.kind())?.bitsize() / 8];
         tensor.f_copy_data_u8(&mut bytes, tensor.numel())?;
-        let shape = tensor.size().iter().map(|&s| s as usize).collect();
-        Ok(Stored { dtype, shape, bytes })
-    }
+        Ok(bytes)
+    };
+    tensors.values().map(bytes).collect()
+}
+
+/// Returns the tensors, whose bytes are `contents`, with their types and shapes as they are stored.
+fn views<'a>(
+    tensors: &'a BTreeMap<String, Tensor>,
+    contents: &'a [Vec<u8>],
+) -> Result<Vec<(&'a str, TensorView<'a>)>> {
+    let view = |((name, tensor), bytes): ((&'a String, &Tensor), &'a Vec<u8>)| {
+        let shape = tensor.size().iter().map(|&side| side as usize).collect();
+        let view = TensorView::new(to_dtype(tensor.kind())?, shape, bytes);
+        Ok((name.as_str(), view.expect("the bytes of all elements")))
+    };
+    tensors.iter().zip(contents).map(view).collect()
 }
 
 /// Fills every variable of `vs` with `copy`, if the names and shapes are those of the tensors in `file`.

@@ -9,7 +9,8 @@ pub use array::{Array, row_major};
 pub use globalsplat_files::{Error, Result};
 pub use pickle::{Id, Value, Values};
 pub use safetensors::Dtype;
-pub use write::{Item, TensorView, serialize, write_checkpoint};
+pub use safetensors::tensor::TensorView;
+pub use write::{Item, serialize, write_checkpoint};
 
 use std::collections::HashMap;
 use std::ops::Range;

@@ -2,8 +2,9 @@
 //! entry with a pickle of protocol 2, and an uncompressed entry with the bytes of each tensor.
 
 use crate::pickle::STORAGES;
-use crate::{Dtype, Error, Result, row_major};
+use crate::{Error, Result, row_major};
 use globalsplat_files::write_atomically;
+use safetensors::tensor::TensorView;
 use std::collections::HashMap;
 use std::io::{Cursor, Write};
 use std::path::Path;
@@ -23,33 +24,6 @@ const LIGHTNING_VERSION: &str = "2.0.0";
 /// Other keys that Lightning requires. Their values are 0.
 const COUNTERS: [&str; 2] = ["epoch", "global_step"];
 
-/// A tensor to be written.
-#[derive(Debug, Clone, Copy)]
-pub struct TensorView<'a> {
-    /// Name in the state dict.
-    pub name: &'a str,
-    /// Type of the elements, one of those that torch has a class of storages for.
-    pub dtype: Dtype,
-    /// Size of each dimension.
-    pub shape: &'a [usize],
-    /// Elements, little-endian and in row-major order.
-    pub bytes: &'a [u8],
-}
-
-impl TensorView<'_> {
-    /// Returns the name of the class of storages for the type of the elements, after a check of the number of bytes.
-    fn storage_class(&self) -> Result<&'static str> {
-        let TensorView { name, dtype, shape, bytes } = self;
-        let class = STORAGES.iter().find(|(stored, _)| stored == dtype).map(|(_, class)| *class);
-        let class = class.ok_or_else(|| Error::failed(format!("tensors of type {dtype} are not stored")))?;
-        let size = shape.iter().try_fold(dtype.bitsize() / 8, |size, &count| size.checked_mul(count));
-        if size == Some(bytes.len()) {
-            return Ok(class);
-        }
-        Err(Error::failed(format!("tensor {name} has {} bytes for {dtype} {shape:?}", bytes.len())))
-    }
-}
-
 /// A value to be written.
 #[derive(Debug)]
 pub enum Item<'a> {
@@ -57,7 +31,7 @@ pub enum Item<'a> {
     Str(&'a str),
     /// Integer.
     Int(usize),
-    /// Tensor.
+    /// Tensor, whose bytes are little-endian and in row-major order, of one of the types that torch has a class of storages for.
     Tensor(TensorView<'a>),
     /// List.
     List(Vec<Item<'a>>),
@@ -67,20 +41,20 @@ pub enum Item<'a> {
     OrderedDict(Vec<(&'a str, Item<'a>)>),
 }
 
-/// Writes a checkpoint to `path` atomically. It is a dict: "state_dict" maps names to `tensors`, and every other key maps to a string of
-/// `metadata`. The keys that Lightning requires are added: "pytorch-lightning_version", "epoch" and "global_step".
+/// Writes a checkpoint to `path` atomically. It is a dict: "state_dict" maps names to `tensors`, as in [`Item::Tensor`], and every other key
+/// maps to a string of `metadata`. The keys that Lightning requires are added: "pytorch-lightning_version", "epoch" and "global_step".
 ///
 /// # Errors
-/// Returns an error if torch has no storages for a tensor's type, or its bytes don't fit its shape, or if the file can't be written.
+/// Returns an error if torch has no storages for a tensor's type, or if the file can't be written.
 pub fn write_checkpoint(
     path: &Path,
-    tensors: &[TensorView],
+    tensors: Vec<(&str, TensorView)>,
     metadata: &HashMap<String, String>,
 ) -> Result<()> {
     let mut strings: Vec<(&str, &str)> = metadata.iter().map(|(k, v)| (k.as_str(), v.as_str())).collect();
     strings.push((LIGHTNING_VERSION_KEY, LIGHTNING_VERSION));
     strings.sort();
-    let state = tensors.iter().map(|tensor| (tensor.name, Item::Tensor(*tensor))).collect();
+    let state = tensors.into_iter().map(|(name, tensor)| (name, Item::Tensor(tensor))).collect();
     let mut root = vec![("state_dict", Item::OrderedDict(state))];
     root.extend(strings.into_iter().map(|(key, text)| (key, Item::Str(text))));
     root.extend(COUNTERS.map(|key| (key, Item::Int(0))));
@@ -91,7 +65,7 @@ pub fn write_checkpoint(
 /// Returns the contents of a file that holds `root`.
 ///
 /// # Errors
-/// Returns an error if torch has no storages for a tensor's type, or its bytes don't fit its shape.
+/// Returns an error if torch has no storages for a tensor's type.
 pub fn serialize(root: &Item) -> Result<Vec<u8>> {
     // PROTO 2
     let mut pickle = Pickle { bytes: b"\x80\x02".into(), tensors: vec![] };
@@ -159,24 +133,26 @@ impl<'a> Pickle<'a> {
 
     fn tensor(&mut self, tensor: &TensorView<'a>) -> Result<()> {
         self.global("torch._utils", "_rebuild_tensor_v2");
+        let class = STORAGES.iter().find(|(stored, _)| *stored == tensor.dtype()).map(|(_, class)| *class);
+        let refused = || Error::failed(format!("tensors of type {} are not stored", tensor.dtype()));
         self.bytes.push(b'(');
         // BINPERSID: the persistent id that refers to a storage.
         self.bytes.push(b'(');
         self.text("storage");
-        self.global("torch", tensor.storage_class()?);
+        self.global("torch", class.ok_or_else(refused)?);
         self.text(&self.tensors.len().to_string());
         self.text("cpu");
-        self.integer(tensor.shape.iter().product());
+        self.integer(tensor.shape().iter().product());
         self.bytes.extend(b"tQ");
         // Arguments of the call: storage offset, size, stride, requires_grad (NEWFALSE), and an empty dict of backward hooks.
         self.integer(0);
-        self.tuple(tensor.shape);
-        self.tuple(&row_major(tensor.shape));
+        self.tuple(tensor.shape());
+        self.tuple(&row_major(tensor.shape()));
         self.bytes.push(0x89);
         self.ordered_dict();
         // TUPLE, REDUCE
         self.bytes.extend(b"tR");
-        self.tensors.push(tensor.bytes);
+        self.tensors.push(tensor.data());
         Ok(())
     }
 
@@ -204,6 +180,7 @@ impl<'a> Pickle<'a> {
     fn global(&mut self, module: &str, name: &str) {
         self.bytes.extend(format!("c{module}\n{name}\n").as_bytes());
     }
+
     /// Appends an empty OrderedDict: GLOBAL, EMPTY_TUPLE, REDUCE.
     fn ordered_dict(&mut self) {
         self.global("collections", "OrderedDict");
