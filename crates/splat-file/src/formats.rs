@@ -271,7 +271,12 @@ pub fn write_local_splat(path: &Path, splat: &Splat, options: &WriteOptions) -> 
     splat.check_lengths()?;
     let (rotated, _) = drop_missing_rotations(splat);
     write_with_origin(path, splat.origin, || {
-        rotated.check_finite(path)?;
+        if !InvalidGaussians::find(&rotated).rows.is_empty() {
+            return Err(Error::failed(format!(
+                "{}: the splat has numbers that aren't finite",
+                path.display()
+            )));
+        }
         (format.write)(path, &rotated, options)
     })
 }

@@ -10,7 +10,8 @@ const NAMED: usize = 6;
 /// Gaussians of a file that have an invalid value, one that isn't finite or is out of its range.
 #[derive(Debug, Default)]
 pub(crate) struct InvalidGaussians {
-    rows: BTreeSet<usize>,
+    /// Indices of the Gaussians.
+    pub rows: BTreeSet<usize>,
     properties: Vec<String>,
     /// Field, found value and expected value of the first invalid Gaussian.
     first: Option<[String; 3]>,

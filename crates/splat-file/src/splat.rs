@@ -5,7 +5,6 @@ use crate::{Error, Result};
 use glam::DVec3;
 use std::borrow::Cow;
 use std::fmt::Display;
-use std::path::Path;
 
 /// Spherical harmonic Y_0, which converts between a color and an SH coefficient: color = ½ + `SH_C0` · coefficient.
 pub const SH_C0: f64 = 0.28209479177387814;
@@ -226,16 +225,6 @@ impl Splat {
             )),
             None => Ok(()),
         }
-    }
-
-    /// Checks that all numbers, which are to be written at `path`, are finite. Logits may be infinite.
-    pub(crate) fn check_finite(&self, path: &Path) -> Result<()> {
-        let lists = [self.means.as_flattened(), self.quaternions.as_flattened(), self.sh.as_flattened()];
-        let is_finite = lists.iter().all(|numbers| numbers.iter().all(|number| number.is_finite()))
-            && (0..self.len()).all(|index| self.scale(index).iter().all(|scale| scale.is_finite()))
-            && !self.opacity_logits.iter().any(|logit| logit.is_nan());
-        let error = || Error::failed(format!("{}: the splat has numbers that aren't finite", path.display()));
-        if is_finite { Ok(()) } else { Err(error()) }
     }
 
     /// Appends the scales of a Gaussian to both lists of scales. The logarithm of 0 is −∞.
