@@ -6,7 +6,7 @@ use crate::work::run;
 use globalsplat::Result;
 use globalsplat::data::Holdout;
 use globalsplat::model::{Precision, Stage};
-use globalsplat::reconstruct::{LoadedModel, ModelDtype, ModelFile, load_context, model_weights};
+use globalsplat::reconstruct::{LoadedModel, ModelFile, load_context, model_weights};
 use numpy::{PyArray, PyArrayMethods};
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
@@ -55,7 +55,7 @@ type ModelParts<'py> = (Bound<'py, PyDict>, String, u32, f64);
 pub fn read_model(py: Python<'_>, weights: Option<PathBuf>) -> PyResult<ModelParts<'_>> {
     let model = run(py, || load(weights.as_deref(), Device::Cpu, Some(Precision::F32)))?;
     let dict = PyDict::new(py);
-    for (name, tensor) in model_weights(&model.vs, &model.config, model.stage, ModelDtype::F32).tensors {
+    for (name, tensor) in model_weights(&model.vs, &model.config, model.stage, Precision::F32).tensors {
         let shape: Vec<usize> = tensor.size().iter().map(|&size| size as usize).collect();
         let values = Vec::<f32>::try_from(tensor.flatten(0, -1));
         let values = values.map_err(|why| PyRuntimeError::new_err(why.to_string()))?;

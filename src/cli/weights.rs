@@ -3,10 +3,11 @@
 use super::{Output, model};
 use crate::config::Config;
 use crate::io::{InputFiles, check_writable_file, write_weights};
-use crate::model::{GlobalSplat, Precision, Stage};
-use crate::reconstruct::{ModelDtype, ModelFile, load_model, model_weights, save_checkpoint};
+use crate::model::{GlobalSplat, Precision};
+use crate::reconstruct::{LoadedModel, ModelFile, load_model, model_weights, save_checkpoint};
 use crate::train::{MODEL_FILE, add_run_inputs, best_checkpoint, latest_checkpoint};
 use anyhow::Result;
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{ArgGroup, Args, ValueEnum};
 use serde_json::json;
 use std::path::PathBuf;
@@ -52,20 +53,14 @@ impl Export {
             None => self.weights.clone(),
         };
         if let Some(weights) = weights {
-            let loaded = load_model(&weights, Device::Cpu)?;
-            return self.out.write(
-                &loaded.vs,
-                &loaded.config,
-                loaded.stage,
-                self.format,
-                (loaded.assumed, 0),
-            );
+            return self.out.write(load_model(&weights, Device::Cpu)?, self.format, 0);
         }
         let config = Config::read(self.config.as_ref().expect("clap asks for one of the three"), &[])?;
         tch::manual_seed(config.train.seed as i64);
         let vs = nn::VarStore::new(Device::Cpu);
-        GlobalSplat::new(&vs.root(), &config.model)?;
-        self.out.write(&vs, &config, config.curriculum.final_stage(), self.format, (None, 0))
+        let model = GlobalSplat::new(&vs.root(), &config.model)?;
+        let stage = config.curriculum.final_stage();
+        self.out.write(LoadedModel { model, config, stage, vs, assumed: None }, self.format, 0)
     }
 }
 
@@ -97,9 +92,7 @@ impl Import {
         self.out.check(&inputs)?;
         let file = ModelFile::open(&self.from, &self.set)?;
         let left_out = file.left_out;
-        let loaded = file.load(Device::Cpu, Precision::F32)?;
-        let (vs, config) = (&loaded.vs, &loaded.config);
-        self.out.write(vs, config, loaded.stage, Format::Safetensors, (loaded.assumed, left_out))
+        self.out.write(file.load(Device::Cpu, Precision::F32)?, Format::Safetensors, left_out)
     }
 }
 
@@ -109,14 +102,8 @@ struct WeightsOut {
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
     /// Data type of the stored weights
-    #[arg(long, value_enum, default_value = "f32")]
-    dtype: Dtype,
-}
-
-#[derive(Clone, Copy, ValueEnum)]
-enum Dtype {
-    F32,
-    Bf16,
+    #[arg(long, default_value = "f32", value_parser = PossibleValuesParser::new(["f32", "bf16"]).try_map(|dtype| dtype.parse::<Precision>()))]
+    dtype: Precision,
 }
 
 /// File format of weights.
@@ -134,20 +121,10 @@ impl WeightsOut {
         Ok(inputs.check_file(&self.out)?)
     }
 
-    /// Writes the variables of `vs`, and reports it with what was assumed about them and the number of tensors that were left out.
-    fn write(
-        &self,
-        vs: &nn::VarStore,
-        config: &Config,
-        stage: Stage,
-        format: Format,
-        (assumed, left_out): (Option<String>, usize),
-    ) -> Result<Output> {
-        let dtype = match self.dtype {
-            Dtype::F32 => ModelDtype::F32,
-            Dtype::Bf16 => ModelDtype::BF16,
-        };
-        let weights = model_weights(vs, config, stage, dtype);
+    /// Writes the weights of `loaded`, and reports it with the number of tensors that were left out of its file.
+    fn write(&self, loaded: LoadedModel, format: Format, left_out: usize) -> Result<Output> {
+        let LoadedModel { config, stage, vs, assumed, .. } = loaded;
+        let weights = model_weights(&vs, &config, stage, self.dtype);
         match format {
             Format::Safetensors => write_weights(&self.out, &weights.tensors, weights.metadata)?,
             Format::Torch => save_checkpoint(&self.out, weights)?,
@@ -155,7 +132,7 @@ impl WeightsOut {
         let (out, bytes) = (self.out.to_string_lossy(), std::fs::metadata(&self.out)?.len());
         let parameters: usize = vs.trainable_variables().iter().map(|t| t.numel()).sum();
         let notes = [
-            model::early_stage(stage, config),
+            model::early_stage(stage, &config),
             assumed.as_ref().map(|assumed| format!("taken for {assumed}")),
             (left_out > 0).then(|| format!("{left_out} other tensors left out")),
         ];

@@ -7,8 +7,8 @@ mod model_file;
 
 pub use context::{context_views, load_context, spread_over_path};
 pub use model_file::{
-    BUNDLED_MODEL, CONFIG_KEY, LoadedModel, ModelDtype, ModelFile, STAGE_KEY, bundled_model, load_model,
-    model_weights, save_checkpoint, save_model,
+    BUNDLED_MODEL, CONFIG_KEY, LoadedModel, ModelFile, STAGE_KEY, bundled_model, load_model, model_weights,
+    save_checkpoint, save_model,
 };
 
 // Used by the parity checks, too.

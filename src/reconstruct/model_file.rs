@@ -7,7 +7,7 @@ use crate::io::{Weights, WeightsFile, write_checkpoint, write_weights};
 use crate::model::{GlobalSplat, MODULES, ModelConfig, Precision, Stage};
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
-use tch::{Device, Kind, nn};
+use tch::{Device, nn};
 
 /// Prefix of this program's metadata keys.
 const OURS: &str = "globalsplat.";
@@ -17,15 +17,6 @@ pub const CONFIG_KEY: &str = "globalsplat.config";
 const VERSION_KEY: &str = "globalsplat.version";
 /// Metadata key of the stage that the weights were trained to, as JSON. Written only if it isn't the final stage.
 pub const STAGE_KEY: &str = "globalsplat.stage";
-
-/// Data type of stored weights.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum ModelDtype {
-    /// float32, which stores weights exactly.
-    F32,
-    /// bfloat16, which takes half the bytes and has 8 bits of mantissa.
-    BF16,
-}
 
 /// Model that was loaded from a file.
 #[derive(Debug)]
@@ -42,13 +33,10 @@ pub struct LoadedModel {
     pub assumed: Option<String>,
 }
 
-/// Returns the content of a model file: the variables of `vs`, which were trained to `stage`, and `config`.
-pub fn model_weights(vs: &nn::VarStore, config: &Config, stage: Stage, dtype: ModelDtype) -> Weights {
-    let kind = match dtype {
-        ModelDtype::F32 => Kind::Float,
-        ModelDtype::BF16 => Kind::BFloat16,
-    };
-    let tensors = vs.variables().into_iter().map(|(name, t)| (name, t.to_kind(kind))).collect();
+/// Returns the content of a model file: the variables of `vs`, which were trained to `stage`, and `config`. float32 stores weights exactly;
+/// bf16 takes half the bytes.
+pub fn model_weights(vs: &nn::VarStore, config: &Config, stage: Stage, precision: Precision) -> Weights {
+    let tensors = vs.variables().into_iter().map(|(name, t)| (name, t.to_kind(precision.kind()))).collect();
     let text = |key: &str, value: &str| (key.to_string(), value.to_string());
     let mut metadata = HashMap::from([
         text(CONFIG_KEY, &config.to_toml()),
@@ -71,9 +59,9 @@ pub fn save_model(
     vs: &nn::VarStore,
     config: &Config,
     stage: Stage,
-    dtype: ModelDtype,
+    precision: Precision,
 ) -> Result<()> {
-    let Weights { tensors, metadata } = model_weights(vs, config, stage, dtype);
+    let Weights { tensors, metadata } = model_weights(vs, config, stage, precision);
     write_weights(path, &tensors, metadata)
 }
 

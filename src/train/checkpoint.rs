@@ -11,7 +11,8 @@ use crate::io::{
     self, InputFiles, WeightsFile, read_weights, recover_dirs, remove_dir, replace_dir, write_atomically,
     write_weights,
 };
-use crate::reconstruct::{ModelDtype, save_model};
+use crate::model::Precision;
+use crate::reconstruct::save_model;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fs::{self, File, OpenOptions, TryLockError};
@@ -170,7 +171,7 @@ impl Trainer {
     pub(super) fn save(&self, run: &Path) -> Result<PathBuf> {
         let path = self.checkpoint(run);
         replace_dir(&path, &FILES, |folder| {
-            save_model(&folder.join(MODEL_FILE), &self.vs, &self.config, self.stage(), ModelDtype::F32)?;
+            save_model(&folder.join(MODEL_FILE), &self.vs, &self.config, self.stage(), Precision::F32)?;
             write_weights(&folder.join(OPTIMIZER_FILE), &self.optimizer.state(), Default::default())?;
             let files = CHECKED_FILES.map(|name| Ok((name.into(), checksum(&folder.join(name))?)));
             let files = files.into_iter().collect::<Result<_>>()?;

@@ -2,7 +2,7 @@
 
 use globalsplat::config::Config;
 use globalsplat::model::{GlobalSplat, ModelConfig, ModelInput, Precision, Stage, Streams};
-use globalsplat::reconstruct::{LoadedModel, ModelDtype, ModelFile, save_model};
+use globalsplat::reconstruct::{LoadedModel, ModelFile, save_model};
 use std::collections::BTreeMap;
 use tch::{Device, Kind, Tensor, nn};
 
@@ -119,7 +119,7 @@ fn weights_of_a_file_in_bf16_are_kept_in_it() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("model.safetensors");
     let stage = config.curriculum.final_stage();
-    save_model(&path, &vs, &config, stage, ModelDtype::BF16).unwrap();
+    save_model(&path, &vs, &config, stage, Precision::Bf16).unwrap();
     let load = |precision| ModelFile::open(&path, &[]).unwrap().load(Device::Cpu, precision).unwrap();
 
     let mut cast = load(Precision::F32);
