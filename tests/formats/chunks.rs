@@ -4,12 +4,11 @@
 mod pickles;
 
 use crate::common::formats::{HEIGHT, WIDTH, assert_same_cameras, cameras, names, transforms};
-use crate::common::program::{arg, refuse, run_json};
+use crate::common::program::{Sandbox, assert_says, number, refuse, run_json};
 use crate::common::room::write_room;
 use globalsplat::data::{Chunk, ChunkWriter, Dataset, Split, open_capture};
 use image::RgbImage;
 use pickles::{archive, int, tensor_of, text};
-use serde_json::Value;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 use zip::CompressionMethod;
@@ -138,25 +137,20 @@ fn split_folders_contain_only_their_own_captures() {
 
 #[test]
 fn pack_and_inspect_report_their_results() {
-    let folder = tempfile::tempdir().unwrap();
-    write_room(&folder.path().join("room"), 1, 3, [24, 24].into()).unwrap();
-    let (room, out) = (folder.path().join("room"), folder.path().join("out"));
-    let report = run_json(&["pack", arg(&room), "--out", arg(&out), "--json"]);
-    assert_eq!(
-        (report["scenes"].as_u64(), report["views"].as_u64(), report["chunks"].as_u64()),
-        (Some(1), Some(3), Some(1))
-    );
-    let chunk = out.join("000000.torch");
-    for (path, kind, field, count) in [(&chunk, "chunk", "/views/room", 3), (&out, "data set", "/scenes", 1)]
+    let sandbox = Sandbox::empty();
+    write_room(&sandbox.path("room"), 1, 3, [24, 24].into()).unwrap();
+    let report = sandbox.json("pack @room --out @out");
+    assert_eq!(["/scenes", "/views", "/chunks"].map(|key| number(&report, key)), [1., 3., 1.]);
+    for (path, kind, field, count) in
+        [("out/000000.torch", "chunk", "/views/room", 3.), ("out", "data set", "/scenes", 1.)]
     {
-        let report = run_json(&["inspect", arg(path), "--json"]);
-        let found = (report["kind"].as_str(), report.pointer(field).and_then(Value::as_u64));
-        assert_eq!(found, (Some(kind), Some(count)));
+        let report = sandbox.json(&format!("inspect @{path}"));
+        assert_eq!((report["kind"].as_str(), number(&report, field)), (Some(kind), count));
     }
-    let again = refuse(&["pack", arg(&room), "--out", arg(&out)]);
-    assert!(again.contains("a folder that already contains chunks"), "{again}");
-    let twice = refuse(&["pack", arg(&room), arg(&room), "--out", arg(&folder.path().join("twice"))]);
-    assert!(twice.contains("which is already in 000000.torch"), "{twice}");
+    let error = sandbox.refuse("pack @room --out @out");
+    assert_says(&error, &["a folder that already contains chunks"]);
+    let error = sandbox.refuse("pack @room @room --out @twice");
+    assert_says(&error, &["which is already in 000000.torch"]);
 }
 
 /// Asserts that a chunk with these bytes is refused, in a message that contains `for_what`.
@@ -269,9 +263,6 @@ fn corruption_is_detected() {
     let folder = tempfile::tempdir().unwrap();
     let file = packed(folder.path()).join("000001.torch");
     let bytes = std::fs::read(&file).unwrap();
-    for length in (0..bytes.len()).step_by(97) {
-        assert_refused(bytes[..length].to_vec(), "");
-    }
     // Any flipped bit in a chunk: the reader must not crash, and images must not change unnoticed.
     let image = bytes.windows(4).position(|window| window == b"\x89PNG").unwrap();
     for position in (0..bytes.len()).step_by(31).chain(image..image + 64) {

@@ -2,7 +2,7 @@
 //! coordinates, and bit-identical if the unit changes by a power of two (spec 2.5).
 
 use crate::common::has_viewer;
-use crate::common::program::{arg, globalsplat, refuse, room, run_json, succeed};
+use crate::common::program::{Sandbox, assert_says, number};
 use glam::{DMat3, DMat4, DVec3};
 use globalsplat::data::{open_capture, write_cameras_json};
 use globalsplat::io::{
@@ -62,28 +62,27 @@ fn least_psnr(a: &Path, b: &Path) -> f64 {
 
 /// Renders `splat` from the cameras of `scene`, along a smooth path through them and on orbits, to `pictures`. Returns the PSNR of the
 /// splat, and that of a copy with losses, which `convert` tells.
-fn render_and_score(splat: &Path, scene: &Path, pictures: &Path) -> [f64; 2] {
-    let copy = pictures.with_extension("compressed.ply");
-    let (splat, scene) = (arg(splat), arg(scene));
-    succeed(&["render", "--splat", splat, "--scene", scene, "--depth", "--out", arg(pictures)]);
-    for (name, cameras) in
-        [("around", &["--orbit"][..]), ("amid", &["--orbit", "--scene", scene]), ("path", &["--path", scene])]
-    {
-        let out = pictures.join(format!("{name}.png"));
-        let others = ["--splat", splat, "--frames", "3", "--size", "32x24", "--out", arg(&out)];
-        succeed(&[&["render"], cameras, &others].concat());
+fn render_and_score(sandbox: &Sandbox, splat: &str, scene: &str, pictures: &str) -> [f64; 2] {
+    sandbox.succeed(&format!("render --splat @{splat} --scene @{scene} --depth --out @{pictures}"));
+    for (name, cameras) in [
+        ("around", "--orbit".to_string()),
+        ("amid", format!("--orbit --scene @{scene}")),
+        ("path", format!("--path @{scene}")),
+    ] {
+        let out = format!("--frames 3 --size 32x24 --out @{pictures}/{name}.png");
+        sandbox.succeed(&format!("render --splat @{splat} {cameras} {out}"));
     }
-    let scores = run_json(&["eval", "--splat", splat, "--scene", scene, "--json"]);
-    let loss = run_json(&["convert", splat, arg(&copy), "--scene", scene, "--local-origin", "--json"]);
-    [scores, loss].map(|report| report["psnr"].as_f64().unwrap())
+    let copy = format!("@copy.compressed.ply --scene @{scene} --local-origin");
+    let scores = sandbox.json(&format!("eval --splat @{splat} --scene @{scene}"));
+    let loss = sandbox.json(&format!("convert @{splat} {copy}"));
+    [scores, loss].map(|report| number(&report, "/psnr"))
 }
 
 /// Returns what the page of `splat` and `scene` contains: it has a local origin, and a unit that suits a browser's precision and the page's
 /// step sizes.
-fn page_contents(splat: &Path, scene: &Path) -> Value {
-    let page = splat.with_extension("html");
-    succeed(&["render", "--splat", arg(splat), "--scene", arg(scene), "--html", arg(&page)]);
-    let text = fs::read_to_string(page).unwrap();
+fn page_contents(sandbox: &Sandbox, splat: &str, scene: &str) -> Value {
+    sandbox.succeed(&format!("render --splat @{splat} --scene @{scene} --html @page.html"));
+    let text = sandbox.text("page.html");
     let (_, json) = text.split_once("<script id=\"scene\" type=\"application/json\">").unwrap();
     serde_json::from_str(json.split_once("</script>").unwrap().0).unwrap()
 }
@@ -101,54 +100,52 @@ fn assert_same_page(a: &Value, b: &Value) {
 
 #[test]
 fn a_splat_looks_the_same_in_any_unit_and_place() {
-    let (folder, room) = room();
-    let ground_truth = room.join("truth.ply");
-    let [scene, splat, plain, pictures] =
-        ["scene", "a.ply", "plain", "pictures"].map(|name| folder.path().join(name));
-    let [plain_psnr, plain_loss] = render_and_score(&ground_truth, &room, &plain);
-    let plain_page = has_viewer().then(|| page_contents(&ground_truth, &room));
-    let read = read_splat(&ground_truth).unwrap();
+    let sandbox = Sandbox::new();
+    let [room, scene, splat] = ["room", "scene", "a.ply"].map(|name| sandbox.path(name));
+    let [plain_psnr, plain_loss] = render_and_score(&sandbox, "room/truth.ply", "room", "plain");
+    let plain_page = has_viewer().then(|| page_contents(&sandbox, "room/truth.ply", "room"));
+    let read = read_splat(&room.join("truth.ply")).unwrap();
     for place in PLACES {
         let to = to_place(place);
         write_moved(&room, &scene, &to);
         write_local_splat(&splat, &moved_splat(&read, &to), &WriteOptions::default()).unwrap();
         assert_eq!(origin_file(&splat).is_file(), to.translation != DVec3::ZERO);
-        let [psnr, loss] = render_and_score(&splat, &scene, &pictures);
-        let least = least_psnr(&plain, &pictures);
+        let [psnr, loss] = render_and_score(&sandbox, "a.ply", "scene", "pictures");
+        let least = least_psnr(&sandbox.path("plain"), &sandbox.path("pictures"));
         assert!(least >= 60., "{place:?}: {least:.2} dB");
         assert!((psnr - plain_psnr).abs() < 0.05, "{place:?}: {psnr:.2} instead of {plain_psnr:.2} dB");
         assert!((loss - plain_loss).abs() < 1., "{place:?}: {loss:.2} instead of {plain_loss:.2} dB");
         if let Some(plain) = &plain_page {
-            assert_same_page(plain, &page_contents(&splat, &scene));
+            assert_same_page(plain, &page_contents(&sandbox, "a.ply", "scene"));
         }
-        fs::remove_dir_all(&scene).unwrap();
-        fs::remove_dir_all(&pictures).unwrap();
+        for folder in ["scene", "pictures"] {
+            fs::remove_dir_all(sandbox.path(folder)).unwrap();
+        }
     }
 }
 
 /// A reconstruction and its file are bit-identical up to the exponent.
 #[test]
 fn powers_of_two_change_no_bit() {
-    let (folder, room) = room();
+    let sandbox = Sandbox::new();
+    let room = sandbox.path("room");
     let ground_truth = read_splat(&room.join("truth.ply")).unwrap();
-    let of = |name: &str| folder.path().join(name);
-    let made = |scene: &Path, name: &str| {
+    let made = |scene: &str| {
         // This format stores linear scales.
-        let (out, pictures) = (of(&format!("{name}.splat")), of(&format!("{name}.png")));
-        succeed(&["reconstruct", "--scene", arg(scene), "--views", "3", "--out", arg(&out)]);
-        let render = ["render", "--splat", arg(&out), "--scene", arg(scene), "--depth", "--alpha"];
-        succeed(&[&render[..], &["--out", arg(&pictures)]].concat());
-        (Gaussians::from_splat(&read_splat(&out).unwrap()), fs::read(&pictures).unwrap())
+        sandbox.succeed(&format!("reconstruct --scene @{scene} --views 3 --out @made.splat"));
+        let render = format!("render --splat @made.splat --scene @{scene} --depth --alpha --out @made.png");
+        sandbox.succeed(&render);
+        (Gaussians::from_splat(&read_splat(&sandbox.path("made.splat")).unwrap()), sandbox.read("made.png"))
     };
-    let (plain, pictures) = made(&room, "plain");
+    let (plain, pictures) = made("room");
     let cameras = open_capture(&room).unwrap().cameras();
     let seen = SplatRenderer::from_splat(&ground_truth).render(&cameras).unwrap();
     for exponent in [-20, 5] {
         let factor = f64::from(exponent).exp2();
-        let scene = of(&format!("scene{exponent}"));
+        let scene = sandbox.path(&format!("scene{exponent}"));
         let to = to_place((factor, [0.; 3]));
         write_moved(&room, &scene, &to);
-        let (gaussians, same) = made(&scene, "scaled");
+        let (gaussians, same) = made(&format!("scene{exponent}"));
         assert!(gaussians.means.equal(&(&plain.means * factor)), "2^{exponent}");
         assert!(gaussians.scales.equal(&(&plain.scales * factor)), "2^{exponent}");
         assert!(gaussians.quaternions.equal(&plain.quaternions) && gaussians.sh.equal(&plain.sh));
@@ -165,84 +162,71 @@ fn powers_of_two_change_no_bit() {
 /// Far from the origin, the loss in float32 is reported, and a local origin avoids it in all commands that read the splat.
 #[test]
 fn a_local_origin_keeps_the_detail() {
-    let (folder, room) = room();
-    let ground_truth = read_splat(&room.join("truth.ply")).unwrap();
-    let of = |name: &str| folder.path().join(name);
+    let sandbox = Sandbox::new();
+    let read = |name: &str| read_splat(&sandbox.path(name)).unwrap();
+    let has_origin = |name: &str| origin_file(&sandbox.path(name)).exists();
     let to = to_place(PLACES[2]);
     let offset = to.translation;
-    let (scene, local, world) = (of("scene"), of("local.ply"), of("world.ply"));
-    write_moved(&room, &scene, &to);
-    write_local_splat(&local, &moved_splat(&ground_truth, &to), &WriteOptions::default()).unwrap();
-    let psnr = |splat: &Path| {
-        run_json(&["eval", "--splat", arg(splat), "--scene", arg(&scene), "--json"])["psnr"].as_f64().unwrap()
-    };
+    let (scene, local) = (sandbox.path("scene"), sandbox.path("local.ply"));
+    write_moved(&sandbox.path("room"), &scene, &to);
+    write_local_splat(&local, &moved_splat(&read("room/truth.ply"), &to), &WriteOptions::default()).unwrap();
+    let psnr = |splat: &str| number(&sandbox.json(&format!("eval --splat @{splat} --scene @scene")), "/psnr");
 
-    let output = globalsplat(&["convert", arg(&local), arg(&world), "--scene", arg(&scene), "--json"]);
-    let said = String::from_utf8(output.stderr).unwrap();
-    assert!(output.status.success() && said.lines().count() == 1, "{said}");
-    for part in ["world.ply", "5.412e6 units", "every 0.5 units", "--local-origin"] {
-        assert!(said.contains(part), "{said}");
-    }
-    assert!(!origin_file(&world).exists());
-    assert!(psnr(&local) > psnr(&world) + 10., "{} {}", psnr(&local), psnr(&world));
+    let (_, said) = sandbox.succeed_with_messages("convert @local.ply @world.ply --scene @scene --json");
+    assert_eq!(said.lines().count(), 1, "{said}");
+    assert_says(&said, &["world.ply", "5.412e6 units", "every 0.5 units", "--local-origin"]);
+    assert!(!has_origin("world.ply"));
+    let [psnr_local, psnr_world] = ["local.ply", "world.ply"].map(psnr);
+    assert!(psnr_local > psnr_world + 10., "{psnr_local} {psnr_world}");
 
     // Relative to the capture's center, in every format; an older splat's origin is replaced.
-    for ending in ["ply", "spz"] {
-        let copy = of(&format!("copy.{ending}"));
-        let convert = ["convert", arg(&local), arg(&copy), "--scene", arg(&scene)];
-        let output = globalsplat(&[&convert[..], &["--local-origin"]].concat());
-        assert!(output.status.success() && output.stderr.is_empty(), "{output:?}");
+    for copy in ["copy.ply", "copy.spz"] {
+        let convert = format!("convert @local.ply @{copy} --scene @scene");
+        assert_eq!(sandbox.succeed_with_messages(&format!("{convert} --local-origin")).1, "");
         let center = LocalFrame::from_cameras(&open_capture(&scene).unwrap().cameras()).origin;
-        let written: Value = serde_json::from_slice(&fs::read(origin_file(&copy)).unwrap()).unwrap();
+        let written: Value =
+            serde_json::from_slice(&fs::read(origin_file(&sandbox.path(copy))).unwrap()).unwrap();
         assert_eq!(written, json!({"origin": center.to_array()}));
-        assert!(psnr(&copy) > psnr(&local).min(45.) - 12., "{ending}: {}", psnr(&copy));
-        let inspected = run_json(&["inspect", arg(&copy), "--json"]);
+        assert!(psnr(copy) > psnr_local.min(45.) - 12., "{copy}: {}", psnr(copy));
+        let inspected = sandbox.json(&format!("inspect @{copy}"));
         assert_eq!(inspected["local_origin"], json!(center.to_array()));
-        assert!((inspected["x"][1].as_f64().unwrap() - offset.x).abs() < 5., "{inspected}");
-        succeed(&convert);
-        assert!(!origin_file(&copy).exists(), "{ending}");
+        assert!((number(&inspected, "/x/1") - offset.x).abs() < 5., "{inspected}");
+        sandbox.succeed(&convert);
+        assert!(!has_origin(copy), "{copy}");
     }
 
     // Without a capture, a splat keeps its origin, and one without an origin gets its own center.
-    let copy = of("kept.ply");
-    succeed(&["convert", arg(&local), arg(&copy), "--local-origin"]);
-    assert_eq!(read_splat(&copy).unwrap().origin, offset);
-    succeed(&["convert", arg(&world), arg(&copy), "--local-origin"]);
-    assert!(read_splat(&copy).unwrap().origin.distance(offset) < 10.);
+    sandbox.succeed("convert @local.ply @kept.ply --local-origin");
+    assert_eq!(read("kept.ply").origin, offset);
+    sandbox.succeed("convert @world.ply @kept.ply --local-origin");
+    assert!(read("kept.ply").origin.distance(offset) < 10.);
 
     // A file name that is too long for the origin's file is refused before the work.
-    let long = of(&format!("{}.ply", "x".repeat(240)));
-    let said = refuse(&["convert", arg(&local), arg(&long), "--local-origin"]);
-    assert!(said.contains(".origin.json can't be written"), "{said}");
+    let said = sandbox.refuse(&format!("convert @local.ply @{}.ply --local-origin", "x".repeat(240)));
+    assert_says(&said, &[".origin.json can't be written"]);
 
     // A copy without its origin file still opens, at another position.
-    let lone = of("lone.ply");
-    fs::copy(&local, &lone).unwrap();
-    assert_eq!(read_splat(&lone).unwrap().origin, DVec3::ZERO);
+    sandbox.copy("local.ply", "lone.ply");
+    assert_eq!(read("lone.ply").origin, DVec3::ZERO);
     // Writing by the library in world coordinates removes the origin file.
-    write_splat(&local, &read_splat(&local).unwrap()).unwrap();
-    assert!(!origin_file(&local).exists() && read_splat(&local).unwrap().origin == DVec3::ZERO);
+    write_splat(&local, &read("local.ply")).unwrap();
+    assert!(!has_origin("local.ply") && read("local.ply").origin == DVec3::ZERO);
 }
 
 #[test]
 fn origins_that_are_none_are_refused() {
-    let (folder, room) = room();
-    let splat = room.join("truth.ply");
-    let out = folder.path().join("out.ply");
-    let (inspect, convert) = (["inspect", arg(&splat)], ["convert", arg(&splat), arg(&out)]);
+    let sandbox = Sandbox::new();
     for (bad, command) in [
-        ("", &inspect[..]),
-        ("[1, 2, 3]", &inspect),
-        ("{}", &inspect),
-        ("{\"origin\": [1, 2]}", &inspect),
-        ("{\"origin\": [1, 2, 1e999]}", &inspect),
-        ("{\"origin\": [1, \"2\", 3]}", &inspect),
-        ("{\"origin\": null}", &convert),
+        ("", "inspect @room/truth.ply"),
+        ("[1, 2, 3]", "inspect @room/truth.ply"),
+        ("{}", "inspect @room/truth.ply"),
+        ("{\"origin\": [1, 2]}", "inspect @room/truth.ply"),
+        ("{\"origin\": [1, 2, 1e999]}", "inspect @room/truth.ply"),
+        ("{\"origin\": [1, \"2\", 3]}", "inspect @room/truth.ply"),
+        ("{\"origin\": null}", "convert @room/truth.ply @out.ply"),
     ] {
-        fs::write(origin_file(&splat), bad).unwrap();
-        let said = refuse(command);
-        for part in ["truth.ply.origin.json: the JSON is ", "expected {\"origin\": [x, y, z]}"] {
-            assert!(said.contains(part), "{bad}: {said}");
-        }
+        sandbox.write("room/truth.ply.origin.json", bad);
+        let said = sandbox.refuse(command);
+        assert_says(&said, &["truth.ply.origin.json: the JSON is ", "expected {\"origin\": [x, y, z]}"]);
     }
 }
