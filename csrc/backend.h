@@ -5,6 +5,7 @@
 #include <ATen/core/Tensor.h>
 
 #include <memory>
+#include <type_traits>
 
 #include "kernels/types.h"
 
@@ -52,16 +53,6 @@ struct RenderOutput {
   Tensor rgb, alpha, depth;
 };
 
-// Outputs of project(); zeros for Gaussians that aren't visible.
-struct Projected {
-  Tensor mean2d;    // [B, C, N, 2], pixels
-  Tensor conic;     // [B, C, N, 3], xx, xy, yy of the inverse 2D covariance
-  Tensor depth;     // [B, C, N]
-  Tensor opacity;   // [B, C, N], of the splat, which antialiasing reduces
-  Tensor variance;  // [B, C, N, 2], the diagonal of the 2D covariance
-  Tensor visible;   // [B, C, N], int64, 1 if a Gaussian isn't dropped
-};
-
 struct SplatArguments;  // shared with Rust, see src/render.rs
 
 // Returns the arguments of a call from Rust.
@@ -72,13 +63,14 @@ struct SavedState {
   virtual ~SavedState() = default;
 };
 
-// Functions of a backend. New tensors have the device and the type of the inputs. Incoming gradients are contiguous. splat_backward() returns
-// the gradients of all five Gaussian tensors, and those that are requested. project() is the first step of splat() by itself.
+// Functions of a backend. Results have the device and the type of the inputs, and splat() and splat_backward() write them to allocated tensors.
+// Incoming gradients are contiguous. splat_backward() computes those gradients whose tensors are defined. project(), the first step of splat()
+// by itself, returns the projected Gaussians, [B, C, N, 16], with the fields of raster::Splat in their order.
 struct Backend {
   at::DeviceType device;
-  RenderOutput (*splat)(const Inputs&, std::unique_ptr<const SavedState>& saved);
-  Gradients (*splat_backward)(const Inputs&, const RenderOutput& outputs, const RenderOutput& gradients, const SavedState&, GradientRequest);
-  Projected (*project)(const Inputs&);
+  std::unique_ptr<const SavedState> (*splat)(const Inputs&, const RenderOutput& out);
+  void (*splat_backward)(const Inputs&, const RenderOutput& outputs, const RenderOutput& gradients, const SavedState&, const Gradients& out);
+  Tensor (*project)(const Inputs&);
 };
 
 namespace cpu {
@@ -94,5 +86,38 @@ const Backend* emulated_backend();
 // Returns the backend for tensors of this device and type. The CPU backend also serves devices without a backend of their own, and float64,
 // which exists to verify gradients.
 const Backend& backend_of(const Tensor& means);
+
+// Returns uninitialized outputs of the inputs' device and type.
+RenderOutput empty_output(const Inputs&);
+
+// Render the inputs with their backend, and compute the gradients of all five Gaussian tensors and those that are requested.
+RenderOutput render(const Inputs&, std::unique_ptr<const SavedState>& saved);
+Gradients render_backward(const Inputs&, const RenderOutput& outputs, const RenderOutput& gradients, const SavedState&, GradientRequest);
+
+// ---- tensors as plain memory, for backends ----
+
+// Returns the address of a tensor's elements; null if it is undefined.
+template <class Number>
+Number* data(const Tensor& t) {
+  return t.defined() ? t.data_ptr<std::remove_const_t<Number>>() : nullptr;
+}
+
+template <class T>
+raster::Arguments<T> arguments_of(const Inputs& in) {
+  const auto& [means, scales, quaternions, opacities, sh] = in.gaussians;
+  return {{data<T>(means), data<T>(scales), data<T>(quaternions), data<T>(opacities), data<T>(sh), in.count(), int(sh.size(2))},
+          data<T>(in.w2c), data<T>(in.intrinsics), in.scenes(), in.cameras(), int(in.width), int(in.height), in.projection};
+}
+
+template <class Pixel>
+raster::RenderOutput<Pixel> pictures_of(const RenderOutput& p) {
+  return {data<Pixel>(p.rgb), data<Pixel>(p.alpha), data<Pixel>(p.depth)};
+}
+
+template <class T>
+raster::GaussianGradients<T> gradients_of(const Gradients& of) {
+  const auto& [means, scales, quaternions, opacities, sh] = of.gaussians;
+  return {data<T>(means), data<T>(scales), data<T>(quaternions), data<T>(opacities), data<T>(sh), data<T>(of.means2d)};
+}
 
 }  // namespace globalsplat

@@ -1,6 +1,9 @@
 // The ops as PyTorch's dispatcher knows them, torch.ops.globalsplat: what the Python package calls. Their autograd formulas, and the shapes
 // of their results for fake tensors, are registered in Python (python/globalsplat/_ops.py).
+#include <ATen/TensorOperators.h>
 #include <ATen/ops/empty.h>
+#include <ATen/ops/stack.h>
+#include <ATen/ops/where.h>
 #include <torch/library.h>
 
 #include "backend.h"
@@ -56,7 +59,7 @@ void finish(Stack* stack, size_t arguments, const Results&... results) {
 void splat_op(const c10::OperatorHandle&, Stack* stack) {
   const Inputs in = inputs_of(torch::jit::last(*stack, kArguments + 1).slice(0, kArguments));
   std::unique_ptr<const SavedState> state;
-  const RenderOutput out = backend_of(in.gaussians.means).splat(in, state);
+  const RenderOutput out = render(in, state);
   finish(stack, kArguments + 1, out.rgb, out.alpha, out.depth);
   torch::jit::push(*stack, to_tensor(std::move(state)));
 }
@@ -68,24 +71,30 @@ void splat_backward_op(const c10::OperatorHandle&, Stack* stack) {
   const at::TensorOptions options = in.gaussians.means.options();
   const auto tensor = [&](size_t index) { return all[kArguments + index].toTensor().to(options).contiguous(); };
   RenderOutput outputs{tensor(0), tensor(1), tensor(2)};
-  const Backend& backend = backend_of(in.gaussians.means);
   const SavedState* state = state_of(all[kArguments + 3].toTensor());
   std::unique_ptr<const SavedState> repeated;
   if (state == nullptr) {
-    outputs = backend.splat(in, repeated);
+    outputs = render(in, repeated);
     state = repeated.get();
   }
   const GradientRequest request{all[kArguments + 7].toBool(), all[kArguments + 8].toBool()};
-  const Gradients d = backend.splat_backward(in, outputs, {tensor(4), tensor(5), tensor(6)}, *state, request);
+  const Gradients d = render_backward(in, outputs, {tensor(4), tensor(5), tensor(6)}, *state, request);
   const Gaussians& g = d.gaussians;
   const auto defined = [&](const Tensor& t) { return t.defined() ? t : at::empty({0}, options); };
   finish(stack, kAll, g.means, g.quaternions, g.scales, g.opacities, g.sh, defined(d.w2c), defined(d.means2d));
 }
 
+// Values of Gaussians that aren't visible are 0.
 void project_op(const c10::OperatorHandle&, Stack* stack) {
+  constexpr double kTwoLn2 = 2 / raster::kLog2E;
   const Inputs in = inputs_of(torch::jit::last(*stack, kArguments));
-  const Projected out = backend_of(in.gaussians.means).project(in);
-  finish(stack, kArguments, out.mean2d, out.conic, out.depth, out.opacity, out.variance, out.visible);
+  const std::vector<Tensor> s = backend_of(in.gaussians.means).project(in).unbind(-1);
+  const Tensor &u = s[0], &v = s[1], &a = s[2], &b = s[3], &c = s[4], &log2_opacity = s[5], &z = s[9], visible = z > 0;
+  const auto shown = [&](const Tensor& t) { return at::where(t.dim() > visible.dim() ? visible.unsqueeze(-1) : visible, t, 0); };
+  // Σ2D⁻¹ = 2 ln 2·UᵀU with U = [[a, b], [0, c]]. Variances are computed from U, since the inverse of a needle's conic loses all digits.
+  finish(stack, kArguments, shown(at::stack({u, v}, -1)), shown(kTwoLn2 * at::stack({a * a, a * b, b * b + c * c}, -1)), shown(z),
+         shown(log2_opacity.exp2()), shown(at::stack({(1 + (b / c).square()) / (kTwoLn2 * a * a), 1 / (kTwoLn2 * c * c)}, -1)),
+         visible.to(at::kLong));
 }
 
 // Shapes of results: rgb [B, C, 3, H, W], alpha and depth [B, C, H, W]; visible, depths and opacities [B, C, N], means2d and variances

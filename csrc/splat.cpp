@@ -1,5 +1,7 @@
 #include "splat.h"
 
+#include <ATen/ops/empty.h>
+#include <ATen/ops/empty_like.h>
 #include <torch/csrc/autograd/custom_function.h>
 
 #include <utility>
@@ -60,6 +62,30 @@ const Backend& backend_of(const Tensor& means) {
   return means.device().type() == cuda::backend.device ? cuda::backend : cpu::backend;
 }
 
+RenderOutput empty_output(const Inputs& in) {
+  const auto options = in.gaussians.means.options();
+  const Tensor alpha = at::empty({in.scenes(), in.cameras(), in.height, in.width}, options);
+  return {at::empty({in.scenes(), in.cameras(), 3, in.height, in.width}, options), alpha, at::empty_like(alpha)};
+}
+
+RenderOutput render(const Inputs& in, std::unique_ptr<const SavedState>& saved) {
+  const RenderOutput out = empty_output(in);
+  saved = backend_of(in.gaussians.means).splat(in, out);
+  return out;
+}
+
+Gradients render_backward(const Inputs& in, const RenderOutput& outputs, const RenderOutput& gradients, const SavedState& saved,
+                          GradientRequest request) {
+  const auto& [means, scales, quaternions, opacities, sh] = in.gaussians;
+  Gradients out{{at::empty_like(means), at::empty_like(scales), at::empty_like(quaternions), at::empty_like(opacities), at::empty_like(sh)},
+                {},
+                {}};
+  if (request.w2c) out.w2c = at::empty_like(in.w2c);
+  if (request.means2d) out.means2d = at::empty({in.scenes(), in.cameras(), in.count(), 2}, means.options());
+  backend_of(means).splat_backward(in, outputs, gradients, saved, out);
+  return out;
+}
+
 namespace {
 
 using torch::autograd::AutogradContext;
@@ -81,7 +107,7 @@ struct SplatFunction : torch::autograd::Function<SplatFunction> {
                              Tensor w2c, Tensor intrinsics, int64_t width, int64_t height, raster::ProjectionSettings projection) {
     const Inputs in{{means, scales, quaternions, opacities, sh}, w2c, intrinsics, width, height, projection};
     std::unique_ptr<const SavedState> state;
-    const RenderOutput out = backend_of(means).splat(in, state);
+    const RenderOutput out = render(in, state);
     ctx->save_for_backward({means, scales, quaternions, opacities, sh, w2c, intrinsics, out.rgb, out.alpha, out.depth});
     ctx->saved_data["call"] = c10::IValue::make_capsule(c10::make_intrusive<SavedCall>(in, std::move(state)));
     return {out.rgb, out.alpha, out.depth};
@@ -92,7 +118,7 @@ struct SplatFunction : torch::autograd::Function<SplatFunction> {
     const auto call = c10::static_intrusive_pointer_cast<SavedCall>(ctx->saved_data["call"].toCapsule());
     const Inputs in{{t[0], t[1], t[2], t[3], t[4]}, t[5], t[6], call->width, call->height, call->projection};
     const RenderOutput outputs{t[7], t[8], t[9]}, gradients{g[0].contiguous(), g[1].contiguous(), g[2].contiguous()};
-    const Gradients of = backend_of(t[0]).splat_backward(in, outputs, gradients, *call->state, {ctx->needs_input_grad(kW2c)});
+    const Gradients of = render_backward(in, outputs, gradients, *call->state, {ctx->needs_input_grad(kW2c)});
     const Gaussians& d = of.gaussians;
     tensor_list all = {d.means, d.scales, d.quaternions, d.opacities, d.sh, of.w2c};
     all.resize(kArguments);  // intrinsics and settings have no gradients

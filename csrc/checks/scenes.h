@@ -14,19 +14,22 @@
 
 namespace globalsplat::checks {
 
-// Arrays of Gaussians. Each is a separate vector, so that AddressSanitizer detects out-of-bounds reads.
-template <class T>
-struct Arrays {
-  std::vector<T> means, scales, quaternions, opacities, sh;
-};
-
+// Scenes with the same number of Gaussians and of cameras. The arrays have the layout of raster::Arguments. Each is a separate vector, so that
+// AddressSanitizer detects out-of-bounds reads.
 template <class T>
 struct Scene {
   std::string name;
-  int width, height, bases;            // bases: spherical harmonics per channel
-  std::vector<Arrays<T>> gaussians;    // one item per scene of the batch
-  std::vector<raster::View<T>> views;
+  int width, height, bases;  // bases: spherical harmonics per channel
+  int batch, cameras;        // scenes, and cameras of each
+  std::vector<T> means{}, scales{}, quaternions{}, opacities{}, sh{};
+  std::vector<T> w2c{}, intrinsics{};
   raster::ProjectionSettings projection{0.05};
+
+  raster::Arguments<T> arguments() const {
+    const int64_t count = batch == 0 ? 0 : int64_t(opacities.size()) / batch;
+    return {{means.data(), scales.data(), quaternions.data(), opacities.data(), sh.data(), count, bases},
+            w2c.data(), intrinsics.data(), batch, cameras, width, height, projection};
+  }
 };
 
 class Random {
@@ -60,43 +63,39 @@ bool have_same_bits(const std::vector<Item>& a, const std::vector<Item>& b) {
   return a.size() == b.size() && (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(Item)) == 0);
 }
 
-// Returns a camera at the origin with the rotation of the quaternion (1, x, y, z), not normalized.
-inline raster::Camera<double> rotated_camera(double x, double y, double z) {
+// Appends the camera with the rotation of the quaternion (1, x, y, z), not normalized.
+inline void add_camera(Scene<double>& scene, const double (&q)[3], const double (&t)[3], double fx, double fy, double cx, double cy) {
+  const auto [x, y, z] = q;
   const double s = 2 / (1 + x * x + y * y + z * z);
-  return {{1 - s * (y * y + z * z), s * (x * y - z), s * (x * z + y),      //
-           s * (x * y + z), 1 - s * (x * x + z * z), s * (y * z - x),      //
-           s * (x * z - y), s * (y * z + x), 1 - s * (x * x + y * y)},
-          {0, 0, 0}, 1, 1, 0, 0};
+  scene.w2c.insert(scene.w2c.end(), {1 - s * (y * y + z * z), s * (x * y - z), s * (x * z + y), t[0],      //
+                                     s * (x * y + z), 1 - s * (x * x + z * z), s * (y * z - x), t[1],      //
+                                     s * (x * z - y), s * (y * z + x), 1 - s * (x * x + y * y), t[2], 0, 0, 0, 1});
+  scene.intrinsics.insert(scene.intrinsics.end(), {fx, 0, cx, 0, fy, cy, 0, 0, 1});
 }
+
+inline void append(std::vector<double>& to, const std::vector<double>& more) { to.insert(to.end(), more.begin(), more.end()); }
 
 // Creates a scene whose splats have sizes from less than a pixel to a third of the image, and opacities from 0 to 1. Some are outside of
 // the image.
 inline Scene<double> random_scene(Random& random, std::string name, int width, int height, int batch, int cameras, size_t count,
                                   int bases) {
-  Scene<double> scene{name, width, height, bases, {}, {}};
+  Scene<double> scene{name, width, height, bases, batch, cameras};
   const double side = std::max(width, height);
   for (int b = 0; b < batch; ++b) {
-    Arrays<double> g;
     for (size_t i = 0; i < count; ++i) {
       const double depth = random.uniform(1, 5);
       for (int k = 0; k < 3; ++k) {
-        g.means.push_back(k == 2 ? depth : random.uniform(-0.8, 0.8) * depth);
-        g.scales.push_back(std::exp(random.uniform(std::log(0.3), std::log(0.3 * side + 1))) * depth / side);
+        scene.means.push_back(k == 2 ? depth : random.uniform(-0.8, 0.8) * depth);
+        scene.scales.push_back(std::exp(random.uniform(std::log(0.3), std::log(0.3 * side + 1))) * depth / side);
       }
     }
-    g.quaternions = random.normal(4 * count, random.uniform(0.2, 3));
-    g.opacities = random.uniform(count, 0, 1);
-    g.sh = random.normal(size_t(bases) * 3 * count, 0.3);
-    scene.gaussians.push_back(g);
-    for (int c = 0; c < cameras; ++c) {
-      raster::Camera<double> camera = rotated_camera(0.04 * random.normal(), 0.04 * random.normal(), 0.04 * random.normal());
-      for (double& t : camera.translation) t = 0.2 * random.normal();
-      camera.fx = side * random.uniform(0.8, 1.2);
-      camera.fy = side * random.uniform(0.8, 1.2);
-      camera.cx = width * random.uniform(0.4, 0.6);
-      camera.cy = height * random.uniform(0.4, 0.6);
-      scene.views.push_back({camera, b});
-    }
+    append(scene.quaternions, random.normal(4 * count, random.uniform(0.2, 3)));
+    append(scene.opacities, random.uniform(count, 0, 1));
+    append(scene.sh, random.normal(size_t(bases) * 3 * count, 0.3));
+    for (int c = 0; c < cameras; ++c)
+      add_camera(scene, {0.04 * random.normal(), 0.04 * random.normal(), 0.04 * random.normal()},
+                 {0.2 * random.normal(), 0.2 * random.normal(), 0.2 * random.normal()}, side * random.uniform(0.8, 1.2),
+                 side * random.uniform(0.8, 1.2), width * random.uniform(0.4, 0.6), height * random.uniform(0.4, 0.6));
   }
   return scene;
 }
@@ -107,11 +106,9 @@ inline Scene<double> make_scene(Random& random, std::string name, int bases, std
                                 std::vector<double> scales, std::vector<double> opacities, int cameras = 1, int width = 48,
                                 int height = 33) {
   const size_t count = opacities.size();
-  Scene<double> scene{name, width, height, bases, {}, {}};
-  scene.gaussians.push_back({means, scales, random.normal(4 * count, 1), opacities,
-                             random.normal(size_t(bases) * 3 * count, 0.3)});
-  for (int c = 0; c < cameras; ++c)
-    scene.views.push_back({{{1, 0, 0, 0, 1, 0, 0, 0, 1}, {0.25 * c, 0, -0.5 * c}, 32, 32, 0.5 * width, 0.5 * height}, 0});
+  Scene<double> scene{name, width, height, bases, 1, cameras, means, scales, random.normal(4 * count, 1), opacities,
+                      random.normal(size_t(bases) * 3 * count, 0.3)};
+  for (int c = 0; c < cameras; ++c) add_camera(scene, {0, 0, 0}, {0.25 * c, 0, -0.5 * c}, 32, 32, 0.5 * width, 0.5 * height);
   return scene;
 }
 
@@ -196,7 +193,7 @@ inline std::vector<Scene<double>> all_scenes(int bases) {
   add("no Gaussian", {}, {}, {});
 
   add_scattered("quaternions of any length", 48, 33, 1, 2, 45);
-  std::vector<double>& quaternions = scenes.back().gaussians[0].quaternions;
+  std::vector<double>& quaternions = scenes.back().quaternions;
   for (size_t k = 0; k < quaternions.size(); ++k) quaternions[k] *= std::exp2(25. * double(k / 4 % 9) - 100);
 
   // For each special value, 15 Gaussians that have it in one component each.
@@ -204,7 +201,7 @@ inline std::vector<Scene<double>> all_scenes(int bases) {
   const std::vector<double> special = {std::nan(""), infinity, -infinity, 0,     -1,   1e-45,
                                        1e-30,        1e30,     3e38,      -3e38, 1e18, 1e5};
   add_scattered("special values", 48, 33, 1, 2, 15 * special.size() + 4);
-  Arrays<double>& g = scenes.back().gaussians[0];
+  Scene<double>& g = scenes.back();
   for (size_t n = 0; n < special.size(); ++n) {
     size_t i = 15 * n;
     for (size_t k = 0; k < 3; ++k) g.means[3 * i++ + k] = special[n];
@@ -218,8 +215,8 @@ inline std::vector<Scene<double>> all_scenes(int bases) {
   // Cameras with each special value in four of their parameters.
   add_scattered("special values of cameras", 17, 9, 1, int(4 * special.size()), 6);
   for (size_t n = 0; n < 4 * special.size(); ++n) {
-    raster::Camera<double>& camera = scenes.back().views[n].camera;
-    double* const places[] = {&camera.fx, &camera.cy, &camera.rotation[4], &camera.translation[2]};
+    double *const k = scenes.back().intrinsics.data() + 9 * n, *const pose = scenes.back().w2c.data() + 16 * n;
+    double* const places[] = {k, k + 5, pose + 5, pose + 11};  // f_x, c_y, a diagonal element of the rotation, the depth of the origin
     *places[n % 4] = special[n / 4];
   }
 
@@ -241,19 +238,9 @@ inline Scene<double> many_gaussians(int bases) {
 
 // Converts a scene to numbers of type T.
 template <class T>
-Scene<T> as(const Scene<double>& scene) {
-  Scene<T> out{scene.name, scene.width, scene.height, scene.bases, {}, {}, scene.projection};
-  for (const Arrays<double>& g : scene.gaussians)
-    out.gaussians.push_back({converted<T>(g.means), converted<T>(g.scales), converted<T>(g.quaternions), converted<T>(g.opacities),
-                             converted<T>(g.sh)});
-  for (const raster::View<double>& view : scene.views) {
-    const raster::Camera<double>& from = view.camera;
-    raster::Camera<T> camera{{}, {}, T(from.fx), T(from.fy), T(from.cx), T(from.cy)};
-    std::transform(from.rotation, from.rotation + 9, camera.rotation, [](double x) { return T(x); });
-    std::transform(from.translation, from.translation + 3, camera.translation, [](double x) { return T(x); });
-    out.views.push_back({camera, view.scene});
-  }
-  return out;
+Scene<T> as(const Scene<double>& s) {
+  return {s.name, s.width, s.height, s.bases, s.batch, s.cameras, converted<T>(s.means), converted<T>(s.scales), converted<T>(s.quaternions),
+          converted<T>(s.opacities), converted<T>(s.sh), converted<T>(s.w2c), converted<T>(s.intrinsics), s.projection};
 }
 
 }  // namespace globalsplat::checks

@@ -14,40 +14,14 @@ namespace {
 
 using Numbers = std::vector<float>;
 
-void append(Numbers& to, const Numbers& more) { to.insert(to.end(), more.begin(), more.end()); }
-
-// Renders with the GPU kernels in the emulator, forward and backward from `gradients` of the images. `seed` determines the order of blocks and
+// Renders with the GPU kernels in the emulator, forward and backward from the images' `output_gradients`. `seed` determines the order of blocks and
 // threads. The results have the sizes of `like`.
-Results<float> render_emulated(const Scene<float>& scene, const Results<float>& gradients, const Results<float>& like, uint64_t seed) {
-  Numbers means, scales, quaternions, opacities, sh, w2c, intrinsics;
-  for (const Arrays<float>& g : scene.gaussians) {
-    append(means, g.means);
-    append(scales, g.scales);
-    append(quaternions, g.quaternions);
-    append(opacities, g.opacities);
-    append(sh, g.sh);
-  }
-  for (const raster::View<float>& view : scene.views) {
-    const raster::Camera<float>& c = view.camera;
-    for (int row = 0; row < 3; ++row) {
-      w2c.insert(w2c.end(), c.rotation + 3 * row, c.rotation + 3 * row + 3);
-      w2c.push_back(c.translation[row]);
-    }
-    append(w2c, {0, 0, 0, 1});
-    append(intrinsics, {c.fx, 0, c.cx, 0, c.fy, c.cy, 0, 0, 1});
-  }
-  const int64_t scenes = int64_t(scene.gaussians.size()), count = scenes == 0 ? 0 : int64_t(scene.gaussians[0].opacities.size());
-  const cuda::Arguments arguments{{means.data(), scales.data(), quaternions.data(), opacities.data(), sh.data(), count, scene.bases},
-                                  w2c.data(), intrinsics.data(), scenes,
-                                  scenes == 0 ? 0 : int64_t(scene.views.size()) / scenes, scene.width, scene.height,
-                                  scene.projection};
+Results<float> render_emulated(const Scene<float>& scene, const Results<float>& output_gradients, const Results<float>& like, uint64_t seed) {
   Results<float> out;
   for (const Numbers& numbers : like) out.emplace_back(numbers.size(), std::nanf(""));
   const cuda::emulated::Emulator device(seed);
-  const cuda::Frame frame(device, arguments, {out[0].data(), out[1].data(), out[2].data()});
-  frame.backward(device, arguments, {out[0].data(), out[1].data(), out[2].data()},
-                 {gradients[0].data(), gradients[1].data(), gradients[2].data()},
-                 {out[3].data(), out[4].data(), out[5].data(), out[6].data(), out[7].data(), out[8].data()}, out[9].data());
+  const cuda::Frame frame(device, scene.arguments(), {out[0].data(), out[1].data(), out[2].data()});
+  frame.backward(device, scene.arguments(), pictures(out), pictures(output_gradients), gradients(out), out[9].data());
   return out;
 }
 
@@ -69,8 +43,8 @@ void check_render(const Scene<float>& scene, const std::vector<uint64_t>& seeds)
   Render<float> render(scene, 2);
   render.draw();
   render.backward();
-  const Results<float> cpu = render.results(), gradients = render.output_gradients();
-  const Results<float> first = render_emulated(scene, gradients, cpu, seeds[0]);
+  const Results<float>& cpu = render.results();
+  const Results<float> first = render_emulated(scene, render.output_gradients(), cpu, seeds[0]);
   // Infinite values and NaN spread to other pixels: of a block on the CPU, of two blocks in the kernels. These scenes aren't compared.
   const bool has_special_values = scene.name.rfind("special", 0) == 0;
   double max_gradient = 0;
@@ -83,7 +57,7 @@ void check_render(const Scene<float>& scene, const std::vector<uint64_t>& seeds)
     expect(error <= tolerance, std::string(kResults[k]) + " differ from the CPU's by " + std::to_string(error));
   }
   for (size_t n = 1; n < seeds.size(); ++n) {
-    const Results<float> other = render_emulated(scene, gradients, cpu, seeds[n]);
+    const Results<float> other = render_emulated(scene, render.output_gradients(), cpu, seeds[n]);
     for (size_t k = 0; k < first.size(); ++k)
       expect(have_same_bits(first[k], other[k]),
              std::string(kResults[k]) + " change with the order of threads, seed " + std::to_string(seeds[n]));
@@ -180,8 +154,7 @@ int64_t orders(bool is_short) {
   for (const int bases : {1, 4, 9, 16}) {
     const std::vector<Scene<double>> scenes = all_scenes(bases);
     for (size_t i = 0; i < scenes.size(); ++i) {
-      const bool is_large = !scenes[i].gaussians.empty() &&
-                            int64_t(scenes[i].gaussians[0].opacities.size()) * scenes[i].width * scenes[i].height > 1'000'000;
+      const bool is_large = scenes[i].arguments().gaussians.count * scenes[i].width * scenes[i].height > 1'000'000;
       if (is_short && (i % 4 != turn || is_large)) continue;
       begin(scenes[i].name + ", in orders of kernels, " + std::to_string(bases) + " bases");
       check_render(as<float>(scenes[i]), seeds);

@@ -7,15 +7,8 @@
 
 namespace globalsplat::cuda {
 
-// Inputs of the op. Pointers are addresses in the device's memory, of arrays for all scenes and views.
-struct Arguments {
-  Gaussians<float> gaussians;  // of all B scenes; `count` is the number per scene
-  const float* w2c;            // [B, C, 4, 4]
-  const float* intrinsics;     // [B, C, 3, 3]
-  int64_t scenes, cameras;     // B, and C cameras per scene
-  int width, height;
-  ProjectionSettings projection;
-};
+// Inputs whose pointers are addresses in the device's memory.
+using Arguments = raster::Arguments<float>;
 
 // The Gaussians of every scene, projected into each of the scene's views.
 struct ProjectedScenes {

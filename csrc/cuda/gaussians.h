@@ -7,24 +7,6 @@
 
 namespace globalsplat::cuda {
 
-// Returns the Gaussians of one scene.
-inline Gaussians<float> scene_of(const Gaussians<float>& all, int64_t scene) {
-  const int64_t first = scene * all.count;
-  return {all.means + 3 * first,
-          all.scales + 3 * first,
-          all.quaternions + 4 * first,
-          all.opacities + first,
-          all.sh + 3 * all.bases * first,
-          all.count,
-          all.bases};
-}
-
-inline GaussianGradients<float> scene_of(const GaussianGradients<float>& all, const Gaussians<float>& of, int64_t scene) {
-  const int64_t first = scene * of.count;
-  return {all.means + 3 * first, all.scales + 3 * first, all.quaternions + 4 * first, all.opacities + first,
-          all.sh + 3 * of.bases * first, nullptr};
-}
-
 // Calls body(g) with a number of spherical harmonics that is a compile-time constant, so that loops over them keep values in registers.
 template <class Body>
 inline void with_bases(Gaussians<float> g, const Body& body) {
@@ -56,7 +38,7 @@ __global__ void __launch_bounds__(kGaussianThreads)
   if (i >= call.count) return;
   // Stored as a whole, four values at a time.
   Splat<float> own;
-  with_bases(scene_of(gaussians, view / call.cameras), [&](const Gaussians<float>& g) {
+  with_bases(gaussians.of_scene(view / call.cameras), [&](const Gaussians<float>& g) {
     Splat<float>* const place = &own;
     raster::lane::project({g.means + 3 * i, g.scales + 3 * i, g.quaternions + 4 * i, g.opacities + i, g.sh + 3 * g.bases * i,
                            1, g.bases},
@@ -97,7 +79,7 @@ __global__ void __launch_bounds__(kGaussianThreads, 4)
   float(&sums_of_sh)[kRow] = memory.sh[warp()][lane()];
   float(*const coefficients)[kRow] = is_dealt ? memory.of_all : memory.sh[warp()];
 
-  with_bases(scene_of(gaussians, blockIdx.y), [&](const Gaussians<float>& scene) {
+  with_bases(gaussians.of_scene(blockIdx.y), [&](const Gaussians<float>& scene) {
     const int width = 3 * scene.bases, own = lane() + member * kWarp;
     for (int k = own; k < there * width; k += sharing * kWarp)
       coefficients[k / width][k % width] = scene.sh[begin * width + k];
@@ -148,7 +130,7 @@ __global__ void __launch_bounds__(kGaussianThreads, 4)
 
     // Writes the sums over warps to global memory. The result of keep_in_register() can't have been computed earlier, so it has occupied no
     // registers.
-    const auto at = scene_of(out, scene, keep_in_register(int(blockIdx.y)));
+    const auto at = out.of_scene(scene, keep_in_register(int(blockIdx.y)));
     for (int k = own; k < there * width; k += sharing * kWarp) {
       float number = 0;
       for (int n = 0; n < sharing; ++n) number += memory.sh[warp() - member + n][k / width][k % width];

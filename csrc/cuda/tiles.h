@@ -56,13 +56,6 @@ struct Pixel {
   }
 };
 
-// Returns the images of one view.
-template <class Number>
-inline RenderOutput<Number> pictures_of(const RenderOutput<Number>& all, const Grid& grid, int64_t view) {
-  const int64_t plane = int64_t(grid.width) * grid.height;
-  return {all.rgb + 3 * plane * view, all.alpha + plane * view, all.depth + plane * view};
-}
-
 // Returns a splat whose α is 0 and whose values are all finite.
 inline Splat<float> invisible_splat() {
   Splat<float> splat{};
@@ -119,8 +112,8 @@ __global__ void GS_FORWARD_BOUNDS
     __syncwarp();
   }
   if (!pixel.inside) return;
-  const RenderOutput<float> out = pictures_of(pictures, call.grid, blockIdx.y);
   const int64_t plane = int64_t(call.grid.width) * call.grid.height;
+  const RenderOutput<float> out = pictures.of_view(blockIdx.y, plane);
   out.rgb[pixel.place] = sums.red;
   out.rgb[pixel.place + plane] = sums.green;
   out.rgb[pixel.place + 2 * plane] = sums.blue;
@@ -150,8 +143,7 @@ __global__ void __launch_bounds__(kTileThreads, kBackwardBlocks)
   const Pixel pixel(call.grid);
   raster::lane::PixelGradients<float> state{};
   if (pixel.inside) {
-    const RenderOutput<const float> outputs = pictures_of(pictures, call.grid, blockIdx.y);
-    const RenderOutput<const float> output_gradients = pictures_of(gradients, call.grid, blockIdx.y);
+    const RenderOutput<const float> outputs = pictures.of_view(blockIdx.y, plane), output_gradients = gradients.of_view(blockIdx.y, plane);
     const int64_t at = pixel.place;
     const float color[3] = {outputs.rgb[at], outputs.rgb[at + plane], outputs.rgb[at + 2 * plane]};
     const float g_color[3] = {output_gradients.rgb[at], output_gradients.rgb[at + plane], output_gradients.rgb[at + 2 * plane]};

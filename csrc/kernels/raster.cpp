@@ -53,21 +53,6 @@ struct Frame<T>::TaskOutput {
 };
 
 template <class T>
-Frame<T>::Frame(const std::vector<View<T>>& views, const std::vector<Gaussians<T>>& scenes, const Settings& settings)
-    : settings_(settings),
-      grid_{settings.width, settings.height, int(ceil_div(settings.width, kTile)), int(ceil_div(settings.height, kTile))},
-      count_(scenes.empty() ? 0 : scenes[0].count),
-      tasks_(ceil_div(count_, kTask)),
-      views_(views.size()),
-      first_view_(scenes.size() + 1, 0) {
-  for (const View<T>& view : views) {
-    projection_params_.push_back(make_projection_params(view.camera, settings.width, settings.height, settings.projection));
-    ++first_view_[size_t(view.scene) + 1];
-  }
-  for (size_t scene = 0; scene < scenes.size(); ++scene) first_view_[scene + 1] += first_view_[scene];
-}
-
-template <class T>
 Frame<T>::~Frame() = default;
 
 template <class T>
@@ -78,8 +63,8 @@ TileJob<T> Frame<T>::job(const PerView& view, int tile) const {
           int64_t(end) - int64_t(begin),
           tile % grid_.columns * kTile,
           tile / grid_.columns * kTile,
-          settings_.width,
-          settings_.height};
+          grid_.width,
+          grid_.height};
 }
 
 // Lists the tiles of one task's splats, while they are in the cache. first_record is relative to the part's own first pair.
@@ -107,7 +92,7 @@ void Frame<T>::list_touched_tiles(PerView& view, int64_t begin, int64_t end, Tas
 
 // Projects all Gaussians to splats, and lists the tiles that these touch: one part for every task of every view.
 template <class T>
-std::vector<typename Frame<T>::TaskOutput> Frame<T>::project(const std::vector<Gaussians<T>>& scenes) {
+std::vector<typename Frame<T>::TaskOutput> Frame<T>::project(const Arguments<T>& in) {
   std::vector<TaskOutput> task_outputs(views_.size() * size_t(tasks_));
   std::vector<Splat<T>*> splats;
   for (PerView& view : views_) {
@@ -115,10 +100,10 @@ std::vector<typename Frame<T>::TaskOutput> Frame<T>::project(const std::vector<G
     view.first_record = Buffer<uint32_t>(size_t(count_) + 1);
     splats.push_back(view.splats.data.get());
   }
-  parallel_for(settings_.num_threads, int64_t(scenes.size()) * tasks_, [&](int64_t task) {
-    const size_t scene = size_t(task / tasks_), first = first_view_[scene], last = first_view_[scene + 1];
-    const int64_t begin = task % tasks_ * kTask, end = std::min(begin + kTask, count_);
-    kernels().of<T>().project(scenes[scene], begin, end, projection_params_.data() + first, int64_t(last - first),
+  parallel_for(num_threads_, in.scenes * tasks_, [&](int64_t task) {
+    const int64_t scene = task / tasks_, begin = task % tasks_ * kTask, end = std::min(begin + kTask, count_);
+    const size_t first = size_t(scene * in.cameras), last = first + size_t(in.cameras);
+    kernels().of<T>().project(in.gaussians.of_scene(scene), begin, end, projection_params_.data() + first, in.cameras,
                               splats.data() + first);
     for (size_t k = first; k < last; ++k)
       list_touched_tiles(views_[k], begin, end, task_outputs[k * size_t(tasks_) + size_t(task % tasks_)]);
@@ -147,14 +132,14 @@ std::vector<Buffer<DepthItem<T>>> Frame<T>::sort(const std::vector<TaskOutput>& 
     const TaskOutput* last = tasks_ == 0 ? nullptr : &task_outputs[(k + 1) * size_t(tasks_) - 1];
     order.emplace_back(last == nullptr ? 0 : last->depths_before + size_t(last->depth_count));
   }
-  parallel_for(settings_.num_threads, int64_t(task_outputs.size()), [&](int64_t task) {
+  parallel_for(num_threads_, int64_t(task_outputs.size()), [&](int64_t task) {
     const TaskOutput& part = task_outputs[size_t(task)];
     const size_t k = size_t(task / tasks_);
     std::copy_n(part.depths.data.get(), part.depth_count, order[k].data.get() + part.depths_before);
     const int64_t begin = task % tasks_ * kTask, end = std::min(begin + kTask, count_);
     for (int64_t i = begin; i < end; ++i) views_[k].first_record[size_t(i)] += part.pairs_before;
   });
-  sort_by_depth<T>(settings_.num_threads, order, chunks());
+  sort_by_depth<T>(num_threads_, order, chunks());
   return order;
 }
 
@@ -182,7 +167,7 @@ void Frame<T>::bin(const std::vector<TaskOutput>& task_outputs, const std::vecto
     }
   };
   std::vector<Buffer<uint32_t>> starts = counting_sort(
-      settings_.num_threads, int64_t(views_.size()), chunks(), grid_.tiles(),
+      num_threads_, int64_t(views_.size()), chunks(), grid_.tiles(),
       [&](int64_t k, int64_t chunk, const auto& visit) {
         if (chunks() > 1) return each(k, chunk, [&](int64_t tile, const TileEntry&) { visit(tile); });
         // With a single chunk, all of a view's pairs are counted in memory order.
@@ -202,63 +187,68 @@ int64_t Frame<T>::chunks() const {
 }
 
 template <class T>
-std::unique_ptr<Frame<T>> Frame<T>::draw(const std::vector<Gaussians<T>>& scenes, const std::vector<View<T>>& views,
-                                         const Settings& settings, const std::vector<RenderOutput<T>>& out,
-                                         StageTimes& times) {
+Frame<T>::Frame(const Arguments<T>& in, int num_threads, const RenderOutput<T>& out, StageTimes& times)
+    : num_threads_(num_threads),
+      grid_{in.width, in.height, int(ceil_div(in.width, kTile)), int(ceil_div(in.height, kTile))},
+      count_(in.gaussians.count),
+      tasks_(ceil_div(count_, kTask)),
+      views_(size_t(in.scenes * in.cameras)) {
   Stopwatch watch;
-  std::unique_ptr<Frame> frame(new Frame(views, scenes, settings));
+  for (size_t k = 0; k < views_.size(); ++k)
+    projection_params_.push_back(make_projection_params(camera_of(in.w2c + 16 * k, in.intrinsics + 9 * k), in.width, in.height, in.projection));
   {
-    const std::vector<TaskOutput> task_outputs = frame->project(scenes);
+    const std::vector<TaskOutput> task_outputs = project(in);
     times.project = watch.lap();
-    const std::vector<Buffer<DepthItem<T>>> order = frame->sort(task_outputs);
+    const std::vector<Buffer<DepthItem<T>>> order = sort(task_outputs);
     times.sort = watch.lap();
-    frame->bin(task_outputs, order);
+    bin(task_outputs, order);
   }
   times.bin = watch.lap();
-  const int64_t tiles = frame->grid_.tiles();
-  parallel_for(settings.num_threads, int64_t(views.size()) * tiles, [&](int64_t task) {
-    const size_t k = size_t(task / tiles);
-    kernels().of<T>().blend(frame->job(frame->views_[k], int(task % tiles)), out[k]);
+  const int64_t tiles = grid_.tiles(), pixels = int64_t(in.width) * in.height;
+  parallel_for(num_threads_, int64_t(views_.size()) * tiles, [&](int64_t task) {
+    const int64_t k = task / tiles;
+    kernels().of<T>().blend(job(views_[size_t(k)], int(task % tiles)), out.of_view(k, pixels));
   });
   times.blend = watch.lap();
-  return frame;
 }
 
 template <class T>
-void Frame<T>::backward(const std::vector<Gaussians<T>>& scenes, const std::vector<RenderOutput<const T>>& pictures,
-                        const std::vector<RenderOutput<const T>>& gradients,
-                        const std::vector<GaussianGradients<T>>& out, CameraGradient<T>* cameras,
-                        StageTimes& times) const {
+void Frame<T>::backward(const Arguments<T>& in, const RenderOutput<const T>& pictures, const RenderOutput<const T>& gradients,
+                        const GaussianGradients<T>& out, T* w2c, StageTimes& times) const {
   Stopwatch watch;
-  const int64_t tiles = grid_.tiles();
+  const int64_t tiles = grid_.tiles(), pixels = int64_t(in.width) * in.height;
   std::vector<Buffer<SplatGradient<T>>> gathered;
   std::vector<SplatRecords<T>> records;
   for (const PerView& view : views_) {
     gathered.emplace_back(view.entries.size);
     records.push_back({gathered.back().data.get(), view.first_record.data.get()});
   }
-  parallel_for(settings_.num_threads, int64_t(views_.size()) * tiles, [&](int64_t task) {
-    const size_t k = size_t(task / tiles);
-    kernels().of<T>().blend_backward(job(views_[k], int(task % tiles)), pictures[k], gradients[k], gathered[k].data.get());
+  parallel_for(num_threads_, int64_t(views_.size()) * tiles, [&](int64_t task) {
+    const int64_t k = task / tiles;
+    kernels().of<T>().blend_backward(job(views_[size_t(k)], int(task % tiles)), pictures.of_view(k, pixels), gradients.of_view(k, pixels),
+                                     gathered[size_t(k)].data.get());
   });
   times.blend_backward = watch.lap();
 
   // Gradients of the cameras of a scene from each task's Gaussians: [tasks][views].
-  std::vector<CameraGradient<T>> camera_gradients(cameras == nullptr ? 0 : size_t(tasks_) * views_.size());
-  parallel_for(settings_.num_threads, int64_t(scenes.size()) * tasks_, [&](int64_t task) {
-    const size_t scene = size_t(task / tasks_), part = size_t(task % tasks_), first = first_view_[scene];
-    const int64_t begin = int64_t(part) * kTask, end = std::min(begin + kTask, count_);
-    kernels().of<T>().project_backward(scenes[scene], begin, end, projection_params_.data() + first,
-                                       int64_t(first_view_[scene + 1] - first), records.data() + first, out[scene],
-                                       cameras == nullptr ? nullptr : &camera_gradients[part * views_.size() + first]);
+  std::vector<CameraGradient<T>> camera_gradients(w2c == nullptr ? 0 : size_t(tasks_) * views_.size());
+  parallel_for(num_threads_, in.scenes * tasks_, [&](int64_t task) {
+    const int64_t scene = task / tasks_, part = task % tasks_, begin = part * kTask, end = std::min(begin + kTask, count_);
+    const size_t first = size_t(scene * in.cameras);
+    GaussianGradients<T> of_scene = out.of_scene(in.gaussians, scene);
+    if (out.means2d != nullptr) of_scene.means2d = out.means2d + 2 * scene * in.cameras * count_;
+    kernels().of<T>().project_backward(in.gaussians.of_scene(scene), begin, end, projection_params_.data() + first, in.cameras,
+                                       records.data() + first, of_scene,
+                                       w2c == nullptr ? nullptr : &camera_gradients[size_t(part) * views_.size() + first]);
   });
-  if (cameras != nullptr)
-    for (size_t k = 0; k < views_.size() * kCameraNumbers; ++k) {
-      double sum = 0;
-      for (size_t part = 0; part < size_t(tasks_); ++part)
-        sum += double(camera_gradients[part * views_.size() + k / kCameraNumbers].numbers[k % kCameraNumbers]);
-      cameras[k / kCameraNumbers].numbers[k % kCameraNumbers] = T(sum);
-    }
+  for (size_t k = 0; w2c != nullptr && k < views_.size(); ++k)
+    for (int row = 0; row < 4; ++row)
+      for (int column = 0; column < 4; ++column) {
+        double sum = 0;
+        for (size_t part = 0; row < 3 && part < size_t(tasks_); ++part)
+          sum += double(camera_gradients[part * views_.size() + k].numbers[column < 3 ? 3 * row + column : 9 + row]);
+        w2c[16 * k + size_t(4 * row + column)] = T(sum);
+      }
   times.project_backward = watch.lap();
 }
 

@@ -2,25 +2,12 @@
 // pass.
 #pragma once
 
-#include <memory>
 #include <vector>
 
 #include "counting_sort.h"
 #include "types.h"
 
 namespace globalsplat::raster {
-
-template <class T>
-struct View {
-  Camera<T> camera;
-  int scene;  // index of the scene
-};
-
-struct Settings {
-  int width, height;
-  ProjectionSettings projection;
-  int num_threads;
-};
 
 // Wall-clock seconds of the stages of one call, summed over all views.
 struct StageTimes {
@@ -32,18 +19,14 @@ struct StageTimes {
 template <class T>
 class Frame {
  public:
-  // Renders every view into its images: `out[k]` for `views[k]`. All scenes must have the same number of Gaussians, and a scene's views
-  // must be consecutive.
-  static std::unique_ptr<Frame> draw(const std::vector<Gaussians<T>>& scenes, const std::vector<View<T>>& views,
-                                     const Settings& settings, const std::vector<RenderOutput<T>>& out,
-                                     StageTimes& times);
+  // Renders every view, on several threads.
+  Frame(const Arguments<T>& in, int num_threads, const RenderOutput<T>& out, StageTimes& times);
 
-  // Computes every gradient of every Gaussian, and of every view's camera if `cameras` isn't null. `scenes` and `pictures` are the
-  // unchanged inputs and outputs of draw(). Sums run in order over a scene's cameras, a camera's tiles and, by tasks, its Gaussians, so
-  // results are bit-identical for any number of threads.
-  void backward(const std::vector<Gaussians<T>>& scenes, const std::vector<RenderOutput<const T>>& pictures,
-                const std::vector<RenderOutput<const T>>& gradients, const std::vector<GaussianGradients<T>>& out,
-                CameraGradient<T>* cameras, StageTimes& times) const;
+  // Computes every gradient of every Gaussian, and of w2c, [B, C, 4, 4], if that isn't null. `in` and `pictures` are the unchanged inputs and
+  // outputs of the forward pass. Sums run in order over a scene's cameras, a camera's tiles and, by tasks, its Gaussians, so results are
+  // bit-identical for any number of threads.
+  void backward(const Arguments<T>& in, const RenderOutput<const T>& pictures, const RenderOutput<const T>& gradients,
+                const GaussianGradients<T>& out, T* w2c, StageTimes& times) const;
 
   // Counts the pairs that blending all views processes, for benchmarks.
   PairCounts count_pairs() const;
@@ -53,21 +36,19 @@ class Frame {
  private:
   struct PerView;
   struct TaskOutput;
-  Frame(const std::vector<View<T>>& views, const std::vector<Gaussians<T>>& scenes, const Settings& settings);
-  std::vector<TaskOutput> project(const std::vector<Gaussians<T>>& scenes);
+  std::vector<TaskOutput> project(const Arguments<T>& in);
   void list_touched_tiles(PerView& view, int64_t begin, int64_t end, TaskOutput& part) const;
   std::vector<Buffer<DepthItem<T>>> sort(const std::vector<TaskOutput>& task_outputs);
   void bin(const std::vector<TaskOutput>& task_outputs, const std::vector<Buffer<DepthItem<T>>>& order);
   int64_t chunks() const;
   TileJob<T> job(const PerView& view, int tile) const;
 
-  Settings settings_;
+  int num_threads_;
   Grid grid_;
   int64_t count_;  // Gaussians per scene
   int64_t tasks_;  // into which a scene's Gaussians are split
   std::vector<PerView> views_;
   std::vector<ProjectionParams<T>> projection_params_;
-  std::vector<size_t> first_view_;  // [scenes + 1] first view of each scene
 };
 
 }  // namespace globalsplat::raster

@@ -25,7 +25,7 @@ inline constexpr int kBlock = 4;                    // edge in pixels of the blo
 inline constexpr int kSplatsPerTask = 512;          // maximum number of splats per call that lists tiles
 inline constexpr int kBlocks = 16;                  // blocks per tile
 
-// Gaussians of one scene: row-major arrays of `count` Gaussians.
+// Gaussians of one scene, or of several scenes one after the other, with `count` Gaussians each. Row-major.
 template <class T>
 struct Gaussians {
   const T* means;        // [N, 3] world
@@ -35,6 +35,11 @@ struct Gaussians {
   const T* sh;           // [N, bases, 3]
   int64_t count;
   int bases;             // (degree + 1)²: 1, 4, 9 or 16
+
+  Gaussians of_scene(int64_t scene) const {
+    const int64_t first = scene * count;
+    return {means + 3 * first, scales + 3 * first, quaternions + 4 * first, opacities + first, sh + 3 * bases * first, count, bases};
+  }
 };
 
 // Gradients with the layout of Gaussians; overwritten, not accumulated.
@@ -46,6 +51,12 @@ struct GaussianGradients {
   T* opacities;
   T* sh;
   T* means2d;  // [cameras of the scene, N, 2], of the projected means; null if not requested
+
+  // Returns the gradients of a scene of `all`, without means2d.
+  GaussianGradients of_scene(const Gaussians<T>& all, int64_t scene) const {
+    const int64_t first = scene * all.count;
+    return {means + 3 * first, scales + 3 * first, quaternions + 4 * first, opacities + first, sh + 3 * all.bases * first, nullptr};
+  }
 };
 
 // Gradient with respect to a camera's pose: of the nine entries of `rotation`, treated as independent, then of `translation`.
@@ -138,12 +149,28 @@ struct SplatRecords {
   const uint32_t* first;  // [N + 1]
 };
 
-// Images of one camera, planar: rgb is three planes of width × height. `Pixel` is T or const T.
+// Images of one camera, or of several one after the other. They are planar: rgb is three planes of width × height. `Pixel` is T or const T.
 template <class Pixel>
 struct RenderOutput {
   Pixel* rgb;
   Pixel* alpha;
   Pixel* depth;
+
+  // Returns the images of a camera, given the number of pixels of an image.
+  RenderOutput of_view(int64_t view, int64_t pixels) const {
+    return {rgb + 3 * pixels * view, alpha + pixels * view, depth + pixels * view};
+  }
+};
+
+// Inputs of a call: scenes with several cameras each. Arrays of all scenes, or of all cameras of all scenes, are one after the other.
+template <class T>
+struct Arguments {
+  Gaussians<T> gaussians;   // of all B scenes; `count` is the number per scene
+  const T* w2c;             // [B, C, 4, 4]
+  const T* intrinsics;      // [B, C, 3, 3], pixels
+  int64_t scenes, cameras;  // B, and C cameras per scene
+  int width, height;
+  ProjectionSettings projection;
 };
 
 // Numbers of (pixel, splat) pairs and of (tile, splat) pairs.
