@@ -6,8 +6,7 @@
 #include <ATen/ops/sum.h>
 #include <torch/csrc/autograd/custom_function.h>
 
-#include <type_traits>
-
+#include "backend.h"
 #include "cuda/frame.h"
 #include "cuda/torch_device.h"
 #include "globalsplat-csrc/src/tensor_ops.rs.h"
@@ -20,18 +19,6 @@ namespace {
 using at::Tensor;
 using torch::autograd::AutogradContext;
 using torch::autograd::tensor_list;
-
-// Return the jobs of the losses.
-template <class T>
-raster::PhotometricJob<T> photometric_job(const Tensor& picture, const Tensor& photo) {
-  const int64_t height = picture.size(-2), width = picture.size(-1);
-  return {picture.data_ptr<T>(), photo.data_ptr<T>(), picture.numel() / (height * width), int(width), int(height)};
-}
-template <class T>
-raster::SmoothnessJob<T> smoothness_job(const Tensor& depths, const Tensor& photos) {
-  const int64_t height = depths.size(-2), width = depths.size(-1);
-  return {depths.data_ptr<T>(), photos.data_ptr<T>(), depths.numel() / (height * width), int(width), int(height)};
-}
 
 // Loss of a tensor, given by a function that computes its value, a scalar tensor, and writes its gradient to a tensor unless that is
 // undefined. The gradient is computed in the forward pass.
@@ -52,27 +39,31 @@ struct LossFunction : torch::autograd::Function<LossFunction> {
   }
 };
 
-// Computes a loss of `first` on its device if that is supported, and on the CPU otherwise; `second` is constant. on_device(device, first,
-// second, gradient) and on_cpu(first, second, gradient) compute it; `gradient` points to its elements or is null. Returns the address of
-// the result, which is on the device of `first` and belongs to the caller.
+// Computes a loss of `images`, [.., H, W], on their device if that is supported, and on the CPU otherwise; `photos` are constant.
+// on_device(device, job, gradient) and on_cpu(job, gradient) compute it; `gradient` points to its elements or is null. Returns the address of
+// the result, which is on the device of `images` and belongs to the caller.
 template <class OnDevice, class OnCpu>
-size_t loss_of(const Tensor& first, const Tensor& second, const OnDevice& on_device, const OnCpu& on_cpu) {
-  const auto type = first.scalar_type() == at::kDouble ? at::kDouble : at::kFloat;
-  const bool is_on_gpu = type == at::kFloat && first.is_cuda() && cuda::emulation() == nullptr;
-  const at::Device place = is_on_gpu ? first.device() : at::Device(at::kCPU);
+size_t loss_of(const Tensor& images, const Tensor& photos, const OnDevice& on_device, const OnCpu& on_cpu) {
+  const auto type = images.scalar_type() == at::kDouble ? at::kDouble : at::kFloat;
+  const bool is_on_gpu = type == at::kFloat && images.is_cuda() && cuda::emulation() == nullptr;
+  const at::Device place = is_on_gpu ? images.device() : at::Device(at::kCPU);
   const auto there = [&](const Tensor& t) { return t.to(place, type).contiguous(); };
-  const Tensor other = there(second.detach());
+  const Tensor other = there(photos.detach());
+  const int64_t height = images.size(-2), width = images.size(-1), count = images.numel() / (height * width);
   const auto compute = [&](const Tensor& input, const Tensor& gradient) {
-    const auto data = [&](auto number) { return gradient.defined() ? gradient.data_ptr<decltype(number)>() : nullptr; };
+    const auto job = [&](auto number) {
+      using T = decltype(number);
+      return raster::LossJob<T>{data<T>(input), data<T>(other), count, int(width), int(height)};
+    };
     if (const auto device = cuda::kernel_device(input)) {
-      const cuda::PartialSums parts = on_device(*device, input, other, data(0.f));
+      const cuda::PartialSums parts = on_device(*device, job(0.f), data<float>(gradient));
       return cuda::tensor_of(parts.numbers.get(), {parts.count}, input.options().dtype(at::kDouble)).sum().to(type);
     }
-    const double value = type == at::kDouble ? on_cpu(input, other, data(0.)) : on_cpu(input, other, data(0.f));
+    const double value = type == at::kDouble ? on_cpu(job(0.), data<double>(gradient)) : on_cpu(job(0.f), data<float>(gradient));
     return at::empty({}, input.options()).fill_(value);
   };
-  const bool differentiable = at::GradMode::is_enabled() && first.requires_grad();
-  return owned(LossFunction::apply(there(first), compute, differentiable).to(first.device()));
+  const bool differentiable = at::GradMode::is_enabled() && images.requires_grad();
+  return owned(LossFunction::apply(there(images), compute, differentiable).to(images.device()));
 }
 
 }  // namespace
@@ -84,13 +75,10 @@ size_t photometric(size_t picture_address, size_t photo_address, double l1_weigh
               "the picture has shape ", picture.sizes(), ", expected [.., H, W] with H and W of ", raster::kWindow, " or more");
   return loss_of(
       picture, photo,
-      [&](const cuda::Device& device, const Tensor& a, const Tensor& b, float* gradient) {
-        return cuda::photometric(device, photometric_job<float>(a, b), l1_weight, ssim_weight, gradient);
+      [&](const cuda::Device& device, const auto& job, float* gradient) {
+        return cuda::photometric(device, job, l1_weight, ssim_weight, gradient);
       },
-      [&](const Tensor& a, const Tensor& b, auto* gradient) {
-        using T = std::remove_pointer_t<decltype(gradient)>;
-        return raster::photometric<T>(photometric_job<T>(a, b), l1_weight, ssim_weight, gradient, get_num_threads());
-      });
+      [&](const auto& job, auto* gradient) { return raster::photometric(job, l1_weight, ssim_weight, gradient, get_num_threads()); });
 }
 
 size_t depth_smoothness(size_t depths_address, size_t photos_address, double factor) {
@@ -102,13 +90,8 @@ size_t depth_smoothness(size_t depths_address, size_t photos_address, double fac
               at::IntArrayRef(expected));
   return loss_of(
       depths, photos,
-      [&](const cuda::Device& device, const Tensor& a, const Tensor& b, float* gradient) {
-        return cuda::depth_smoothness(device, smoothness_job<float>(a, b), factor, gradient);
-      },
-      [&](const Tensor& a, const Tensor& b, auto* gradient) {
-        using T = std::remove_pointer_t<decltype(gradient)>;
-        return raster::depth_smoothness<T>(smoothness_job<T>(a, b), factor, gradient, get_num_threads());
-      });
+      [&](const cuda::Device& device, const auto& job, float* gradient) { return cuda::depth_smoothness(device, job, factor, gradient); },
+      [&](const auto& job, auto* gradient) { return raster::depth_smoothness(job, factor, gradient, get_num_threads()); });
 }
 
 }  // namespace globalsplat

@@ -90,7 +90,7 @@ int64_t check_losses(const std::vector<int>& thread_counts) {
   for (const auto& [planes, height, width] : {std::array<int, 3>{1, 11, 11}, {3, 12, 37}, {6, 43, 48}}) {
     const size_t all = size_t(planes * height * width);
     const std::vector<T> pictures = numbers(all), photos = numbers(all);
-    const raster::PhotometricJob<T> job{pictures.data(), photos.data(), planes, width, height};
+    const raster::LossJob<T> job{pictures.data(), photos.data(), planes, width, height};
     for (const double ssim_weight : {0.0, -0.2})
       check("the photometric loss", all, [&](T* gradient, int num_threads) {
         return raster::photometric<T>(job, 0.8, ssim_weight, gradient, num_threads);
@@ -99,7 +99,7 @@ int64_t check_losses(const std::vector<int>& thread_counts) {
   for (const auto& [views, height, width] : {std::array<int, 3>{1, 1, 1}, {3, 12, 37}, {2, 43, 48}}) {
     const size_t all = size_t(views * height * width);
     const std::vector<T> depths = numbers(all), photos = numbers(3 * all);
-    const raster::SmoothnessJob<T> job{depths.data(), photos.data(), views, width, height};
+    const raster::LossJob<T> job{depths.data(), photos.data(), views, width, height};
     check("smoothness", all, [&](T* gradient, int num_threads) {
       return raster::depth_smoothness<T>(job, 0.3, gradient, num_threads);
     });

@@ -123,7 +123,7 @@ void check_losses(const std::vector<uint64_t>& seeds) {
     for (const auto& [l1_weight, ssim_weight] : {std::array<double, 2>{0.8, 0}, {0, 1}, {0.8, -0.2}}) {
       const size_t size = size_t(planes * height * width);
       const Numbers pictures = numbers(size), photos = numbers(size);
-      const raster::PhotometricJob<float> job{pictures.data(), photos.data(), planes, width, height};
+      const raster::LossJob<float> job{pictures.data(), photos.data(), planes, width, height};
       const double a = l1_weight, s = ssim_weight;
       compare(
           size, [&](float* gradient) { return raster::photometric<float>(job, a, s, gradient, 1); },
@@ -134,7 +134,7 @@ void check_losses(const std::vector<uint64_t>& seeds) {
     Numbers depths = numbers(size);
     const Numbers photos = numbers(3 * size);
     for (size_t k = 0; k < size; k += 7) depths[k] = 0;
-    const raster::SmoothnessJob<float> job{depths.data(), photos.data(), views, width, height};
+    const raster::LossJob<float> job{depths.data(), photos.data(), views, width, height};
     compare(
         size, [&](float* gradient) { return raster::depth_smoothness<float>(job, 0.3, gradient, 1); },
         [&](const cuda::Device& device, float* gradient) { return cuda::depth_smoothness(device, job, 0.3, gradient); });

@@ -11,7 +11,7 @@
 namespace globalsplat::cuda {
 
 using raster::CameraGradient;
-using raster::SmoothnessJob;
+using raster::LossJob;
 using raster::GaussianGradients;
 using raster::Gaussians;
 using raster::Grid;
@@ -85,7 +85,7 @@ __global__ void gs_project_backward(Call, Gaussians<float>, const ProjectionPara
 __global__ void gs_ssim(PhotometricPlanes, double each, float* slopes, double* parts);
 __global__ void gs_fit_gradient(PhotometricPlanes, const float* slopes, double l1_weight, float ssim_weight, float* gradient,
                                 double* parts);
-__global__ void gs_unevenness(SmoothnessJob<float>, double each, float* gradient, double* parts);
+__global__ void gs_unevenness(LossJob<float>, double each, float* gradient, double* parts);
 __global__ void gs_sum_cameras(int views, int warps, const CameraGradient<float>* camera_gradients, float* w2c);
 }
 

@@ -34,8 +34,8 @@ Call call_of(const Arguments& of) {
 // Returns the number of starts of the tiles' lists, including the end of the last one.
 int64_t places_of_tiles(const Call& call) { return int64_t(call.views) * call.grid.tiles() + 1; }
 
-PhotometricPlanes planes_of(const raster::PhotometricJob<float>& job) {
-  PhotometricPlanes planes{job.pictures, job.photos, job.width, job.height, {}};
+PhotometricPlanes planes_of(const raster::LossJob<float>& job) {
+  PhotometricPlanes planes{job.images, job.photos, job.width, job.height, {}};
   std::copy_n(raster::ssim_window<float>(), raster::kWindow, planes.window);
   return planes;
 }
@@ -125,14 +125,14 @@ void Frame::backward(const Device& device, const Arguments& of, const RenderOutp
   projected_.backward(device, of, as<SplatGradient<float>>(records), as<uint32_t>(first_), out, w2c);
 }
 
-PartialSums photometric(const Device& device, const raster::PhotometricJob<float>& job, double l1_weight, double ssim_weight,
+PartialSums photometric(const Device& device, const raster::LossJob<float>& job, double l1_weight, double ssim_weight,
                         float* gradient) {
   const PhotometricPlanes planes = planes_of(job);
   const int columns = job.width - raster::kWindow + 1, rows = job.height - raster::kWindow + 1;
-  const int64_t windows = int64_t(columns) * rows * job.planes, pixels = int64_t(job.width) * job.height * job.planes;
+  const int64_t windows = int64_t(columns) * rows * job.count, pixels = int64_t(job.width) * job.height * job.count;
   const double each_window = ssim_weight / double(windows), each_pixel = l1_weight / double(pixels);
-  const Blocks of_windows = ssim_weight != 0 ? tiles_of(job.planes, columns, rows) : Blocks{0};
-  const Blocks of_pixels = l1_weight != 0 || gradient != nullptr ? tiles_of(job.planes, job.width, job.height) : Blocks{0};
+  const Blocks of_windows = ssim_weight != 0 ? tiles_of(job.count, columns, rows) : Blocks{0};
+  const Blocks of_pixels = l1_weight != 0 || gradient != nullptr ? tiles_of(job.count, job.width, job.height) : Blocks{0};
   const int64_t count = of_windows.x + of_pixels.x;
   const Memory numbers = allocate_array<double>(device, count);
   const Memory slopes =
@@ -145,10 +145,10 @@ PartialSums photometric(const Device& device, const raster::PhotometricJob<float
   return {numbers, count};
 }
 
-PartialSums depth_smoothness(const Device& device, const raster::SmoothnessJob<float>& job, double factor, float* gradient) {
+PartialSums depth_smoothness(const Device& device, const raster::LossJob<float>& job, double factor, float* gradient) {
   const int64_t width = job.width, height = job.height;
-  const int64_t pairs = job.views * ((width - 1) * height + width * (height - 1));
-  const Blocks blocks = blocks_of((job.views * width * height + kLossThreads - 1) / kLossThreads);
+  const int64_t pairs = job.count * ((width - 1) * height + width * (height - 1));
+  const Blocks blocks = blocks_of((job.count * width * height + kLossThreads - 1) / kLossThreads);
   const Memory numbers = allocate_array<double>(device, blocks.x);
   GS_LAUNCH(device, gs_unevenness, blocks, kLossThreads, job, pairs > 0 ? factor / double(pairs) : 0, gradient,
             as<double>(numbers));

@@ -52,7 +52,7 @@ struct PartialSums {
 };
 
 // Compute raster::photometric() and raster::depth_smoothness(); addresses are in the device's memory.
-PartialSums photometric(const Device&, const raster::PhotometricJob<float>&, double l1_weight, double ssim_weight, float* gradient);
-PartialSums depth_smoothness(const Device&, const raster::SmoothnessJob<float>&, double factor, float* gradient);
+PartialSums photometric(const Device&, const raster::LossJob<float>&, double l1_weight, double ssim_weight, float* gradient);
+PartialSums depth_smoothness(const Device&, const raster::LossJob<float>&, double factor, float* gradient);
 
 }  // namespace globalsplat::cuda

@@ -117,21 +117,21 @@ __global__ void __launch_bounds__(kLossThreads)
 
 // Computes the unevenness of the pairs of one pixel per thread with the pixels to the right and below, times `each`; and the gradient from
 // all four pairs, [views, H, W], if it isn't null.
-__global__ void __launch_bounds__(kLossThreads) gs_unevenness(SmoothnessJob<float> of, double each, float* gradient, double* parts) {
+__global__ void __launch_bounds__(kLossThreads) gs_unevenness(LossJob<float> of, double each, float* gradient, double* parts) {
   const int64_t k = int64_t(blockIdx.x) * kLossThreads + threadIdx.x, pixels = int64_t(of.width) * of.height;
   double sum = 0;
-  if (k < of.views * pixels) {
+  if (k < of.count * pixels) {
     const int64_t view = k / pixels;
     const int row = int(k % pixels / of.width), column = int(k % of.width);
     const auto gray = [&](int64_t at) {
       const float* const photo = of.photos + 3 * view * pixels + at - view * pixels;
       return raster::lane::gray_of<float>(photo[0], photo[pixels], photo[2 * pixels]);
     };
-    const float a = of.depths[k], g = gray(k);
+    const float a = of.images[k], g = gray(k);
     float slope = 0;
     // Pixels beyond the border are empty.
     const auto pair = [&](bool is_there, int64_t other) {
-      return raster::lane::unevenness_of<float>(a, g, is_there ? of.depths[other] : 0, is_there ? gray(other) : 0, slope);
+      return raster::lane::unevenness_of<float>(a, g, is_there ? of.images[other] : 0, is_there ? gray(other) : 0, slope);
     };
     sum = pair(column + 1 < of.width, k + 1) + pair(row + 1 < of.height, k + of.width);
     if (gradient != nullptr) {

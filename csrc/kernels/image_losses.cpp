@@ -50,12 +50,12 @@ const T* ssim_window() {
 }
 
 template <class T>
-double photometric(const PhotometricJob<T>& job, double l1_weight, double ssim_weight, T* gradient, int num_threads) {
+double photometric(const LossJob<T>& job, double l1_weight, double ssim_weight, T* gradient, int num_threads) {
   const int64_t pixels = int64_t(job.width) * job.height;
   const int64_t windows = int64_t(job.width - kWindow + 1) * (job.height - kWindow + 1);
-  const Buffer<T> slopes(ssim_weight != 0 && gradient != nullptr ? size_t(3 * windows * job.planes) : 0);
+  const Buffer<T> slopes(ssim_weight != 0 && gradient != nullptr ? size_t(3 * windows * job.count) : 0);
   const auto plane_of = [&](int64_t plane) {
-    return PhotometricPlane<T>{job.pictures + plane * pixels,
+    return PhotometricPlane<T>{job.images + plane * pixels,
                                job.photos + plane * pixels,
                                slopes.size > 0 ? slopes.data.get() + 3 * windows * plane : nullptr,
                                gradient != nullptr ? gradient + plane * pixels : nullptr,
@@ -63,17 +63,17 @@ double photometric(const PhotometricJob<T>& job, double l1_weight, double ssim_w
                                job.width,
                                job.height};
   };
-  const double each_pixel = 1 / double(pixels * job.planes), each_window = 1 / double(windows * job.planes);
+  const double each_pixel = 1 / double(pixels * job.count), each_window = 1 / double(windows * job.count);
   double value = 0;
   if (ssim_weight != 0)
     value += ssim_weight * each_window *
-             sum_over_rows<T>(num_threads, job.planes, job.height - kWindow + 1, job.width,
+             sum_over_rows<T>(num_threads, job.count, job.height - kWindow + 1, job.width,
                               [&](int64_t plane, int begin, int end, T* scratch) {
                                 return kernels().of<T>().ssim(plane_of(plane), begin, end, scratch);
                               });
   if (l1_weight != 0 || gradient != nullptr)
     value += l1_weight * each_pixel *
-             sum_over_rows<T>(num_threads, job.planes, job.height, job.width, [&](int64_t plane, int begin, int end, T* scratch) {
+             sum_over_rows<T>(num_threads, job.count, job.height, job.width, [&](int64_t plane, int begin, int end, T* scratch) {
                return kernels().of<T>().photometric_gradient(plane_of(plane), T(l1_weight * each_pixel),
                                                              T(slopes.size > 0 ? ssim_weight * each_window : 0), begin, end, scratch);
              });
@@ -81,12 +81,12 @@ double photometric(const PhotometricJob<T>& job, double l1_weight, double ssim_w
 }
 
 template <class T>
-double depth_smoothness(const SmoothnessJob<T>& job, double factor, T* gradient, int num_threads) {
+double depth_smoothness(const LossJob<T>& job, double factor, T* gradient, int num_threads) {
   const int64_t width = job.width, height = job.height, pixels = width * height;
-  const int64_t pairs = job.views * ((width - 1) * height + width * (height - 1));
+  const int64_t pairs = job.count * ((width - 1) * height + width * (height - 1));
   const double each = pairs > 0 ? factor / double(pairs) : 0;
-  return each * sum_over_rows<T>(num_threads, job.views, job.height, job.width, [&](int64_t view, int begin, int end, T* scratch) {
-           const SmoothnessPlane<T> plane{job.depths + view * pixels, job.photos + 3 * view * pixels,
+  return each * sum_over_rows<T>(num_threads, job.count, job.height, job.width, [&](int64_t view, int begin, int end, T* scratch) {
+           const SmoothnessPlane<T> plane{job.images + view * pixels, job.photos + 3 * view * pixels,
                                           gradient != nullptr ? gradient + view * pixels : nullptr, job.width, job.height};
            return kernels().of<T>().unevenness(plane, T(each), begin, end, scratch);
          });
@@ -94,9 +94,9 @@ double depth_smoothness(const SmoothnessJob<T>& job, double factor, T* gradient,
 
 template const float* ssim_window();
 template const double* ssim_window();
-template double photometric(const PhotometricJob<float>&, double, double, float*, int);
-template double photometric(const PhotometricJob<double>&, double, double, double*, int);
-template double depth_smoothness(const SmoothnessJob<float>&, double, float*, int);
-template double depth_smoothness(const SmoothnessJob<double>&, double, double*, int);
+template double photometric(const LossJob<float>&, double, double, float*, int);
+template double photometric(const LossJob<double>&, double, double, double*, int);
+template double depth_smoothness(const LossJob<float>&, double, float*, int);
+template double depth_smoothness(const LossJob<double>&, double, double*, int);
 
 }  // namespace globalsplat::raster

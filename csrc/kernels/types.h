@@ -218,12 +218,12 @@ struct SmoothnessPlane {
   int width, height;
 };
 
-// Depths of several views, [views, H, W], and the photos, [views, 3, H, W].
+// Images of a loss, `count` planes [H, W], and the photos that it compares them with.
 template <class T>
-struct SmoothnessJob {
-  const T* depths;
+struct LossJob {
+  const T* images;
   const T* photos;
-  int64_t views;
+  int64_t count;
   int width, height;
 };
 
