@@ -117,7 +117,7 @@ void run_threads() {
   GS_ASAN(__sanitizer_finish_switch_fiber(nullptr, const_cast<const void**>(&block().scheduler.bottom), &block().scheduler.size));
   for (;;) {
     GS_TSAN(__tsan_acquire(&block().kernel));
-    block().kernel->run(block().arguments);
+    block().kernel->emulate(block().arguments);
     GS_TSAN(__tsan_release(&block().arguments));
     ++block().done;
     switch_stack(current().stack, block().scheduler);
@@ -234,9 +234,8 @@ Memory Emulator::allocate(size_t bytes) const {
   return Memory(memory, [alignment](void* p) { ::operator delete(p, alignment); });
 }
 
-void Emulator::launch(const char* kernel, Blocks blocks, int threads_per_block, void** arguments) const {
-  block().kernel = kernel_named(kernel);
-  if (block().kernel == nullptr) throw std::logic_error(std::string("there is no kernel ") + kernel);
+void Emulator::launch(const Kernel& kernel, Blocks blocks, int threads_per_block, void** arguments) const {
+  block().kernel = &kernel;
   block().arguments = arguments;
   block().size = {unsigned(threads_per_block), 1};
   if (threads_per_block > kMaxThreads || threads_per_block % 32 != 0)

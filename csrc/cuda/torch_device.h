@@ -35,11 +35,11 @@ class Gpu : public Device {
     return Memory(held.data_ptr(), [held](void*) {});
   }
 
-  void launch(const char* kernel, Blocks blocks, int threads_per_block, void** arguments) const override {
+  void launch(const Kernel& kernel, Blocks blocks, int threads_per_block, void** arguments) const override {
     const at::Device device = options_.device();
     const c10::Stream stream = c10::impl::VirtualGuardImpl(device.type()).getStream(device);
-    measured_launch(kernel, stream, [&] {
-      launch_kernel(device.index(), reinterpret_cast<size_t>(stream.native_handle()), kernel,
+    measured_launch(kernel.name, stream, [&] {
+      launch_kernel(device.index(), reinterpret_cast<size_t>(stream.native_handle()), kernel.name,
                     {uint32_t(blocks.x), uint32_t(blocks.y)}, uint32_t(threads_per_block), reinterpret_cast<size_t>(arguments));
     });
   }
