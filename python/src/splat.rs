@@ -5,7 +5,8 @@ use crate::error::to_python;
 use crate::work::run;
 use globalsplat::io::{ShLimits, Splat, check_writable_splat, fit_splat};
 use globalsplat::render::{ANTIALIASED_EPS2D, DEFAULT_EPS2D};
-use numpy::{PyArray, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
+use numpy::ndarray::Dimension;
+use numpy::{PyArray, PyArrayMethods, PyReadonlyArray, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -79,28 +80,18 @@ impl Parameters<'_> {
         }
         let splat = Splat::new(
             degree,
-            rows("means", self.means.as_slice())?,
-            rows("scales", self.log_scales.as_slice())?,
-            rows("quats", self.quats.as_slice())?,
-            rows::<1>("opacities", self.opacity_logits.as_slice())?.into_flattened(),
-            rows("colors", self.sh.as_slice())?,
+            rows(&self.means),
+            rows(&self.log_scales),
+            rows(&self.quats),
+            rows::<1>(&self.opacity_logits).into_flattened(),
+            rows(&self.sh),
         )
         .map_err(to_python)?;
         Ok(Splat { antialiased: self.antialiased, ..splat })
     }
 }
 
-/// Returns the numbers of a contiguous array in rows of N.
-fn rows<const N: usize>(
-    name: &str,
-    values: Result<&[f32], impl std::fmt::Display>,
-) -> PyResult<Vec<[f32; N]>> {
-    let values = values.map_err(|why| PyValueError::new_err(format!("{name}: {why}")))?;
-    match values.as_chunks() {
-        (rows, []) => Ok(rows.to_vec()),
-        _ => Err(PyValueError::new_err(format!(
-            "{name} has {} numbers, expected a multiple of {N}",
-            values.len()
-        ))),
-    }
+/// Returns the numbers of an array in rows of N. The Python side has checked its shape and made it contiguous.
+fn rows<const N: usize>(array: &PyReadonlyArray<'_, f32, impl Dimension>) -> Vec<[f32; N]> {
+    array.as_slice().expect("a contiguous array").as_chunks().0.to_vec()
 }
