@@ -25,6 +25,7 @@ import tempfile
 import time
 from collections import Counter
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 from tensorboard.compat.proto.event_pb2 import Event
@@ -170,11 +171,8 @@ class Tree:
             grows = isinstance(value, tuple) and isinstance(end, tuple) and end[: len(value)] == value
             if files not in known and not grows:
                 wrong.append(f"{unit} is neither old nor new")
-        moved = {
-            plain("/" + name)[1:]: value
-            for name, value in self.temporary.items()
-            if ".globalsplat-old/" in name and value
-        }
+        old = [(name, value) for name, value in self.temporary.items() if ".globalsplat-old/" in name and value]
+        moved = {plain("/" + name)[1:]: value for name, value in old}
         for unit, files in of[0].items():
             lies_beside = crashed and all(moved.get(name) == value for name, value in files.items())
             if unit in of[-1] and unit not in units and not lies_beside:
@@ -247,14 +245,12 @@ class Operation:
 
     def faults(self):
         """Returns (group, n, kind, sticky) for every kind of fault of evenly spaced calls of each group."""
-        count = Counter(group for _, group, _ in self.calls)
-        count["any"] = len(self.calls)
-        numbers = {
-            group: sorted({1 + i * (n - 1) // (MAX_CALLS - 1) for i in range(MAX_CALLS)}) for group, n in count.items()
-        }
-        return [
-            (group, n, *fault) for group, faults in FAULTS.items() for n in numbers.get(group, []) for fault in faults
-        ]
+        count = Counter(group for _, group, _ in self.calls) | Counter(any=len(self.calls))
+        chosen = []
+        for group, faults in FAULTS.items():
+            numbers = {1 + i * (count[group] - 1) // (MAX_CALLS - 1) for i in range(MAX_CALLS)} if count[group] else ()
+            chosen += [(group, n, *fault) for n in sorted(numbers) for fault in faults]
+        return chosen
 
     def again(self):
         """Runs the same command again without faults and returns the errors. Results are cached by initial state."""
@@ -272,12 +268,10 @@ class Done:
     """Result of a run: exit code or None, standard output and error, calls (failed, group, file)."""
 
     def __init__(self, code, output, errors, calls):
-        self.code, self.errors, self.calls = code, errors, calls
-        self.sentence = "\n".join(line for line in errors.splitlines() if not NOTICE.match(line))
-        try:
+        self.code, self.output, self.errors, self.calls = code, output, errors, calls
+        with suppress(ValueError):
             self.output = steady(json.loads(output))
-        except ValueError:
-            self.output = output
+        self.sentence = "\n".join(line for line in errors.splitlines() if not NOTICE.match(line))
         self.hit = [file for failed, _, file in calls if failed]
 
 
@@ -298,7 +292,7 @@ class Bench:
         (folder / "bin/ffmpeg").chmod(0o755)
         path = f"{folder / 'bin'}:{os.environ.get('PATH', '')}"
         ours = {"PATH": path, "OMP_NUM_THREADS": "1", "GLOBALSPLAT_WEIGHTS": str(folder / "none")}
-        self.environment = {**os.environ, **ours}
+        self.environment = dict(os.environ) | ours
 
     def make(self, *arguments):
         subprocess.run([PROGRAM, *map(str, arguments)], check=True, capture_output=True, env=self.environment)
@@ -307,11 +301,9 @@ class Bench:
         """Runs the program. `fault` is (group, n, kind, sticky); `into` is a file that gets standard output."""
         self.log.unlink(missing_ok=True)
         ours = {"LD_PRELOAD": self.library, "FAULT_ROOT": self.out, "FAULT_LOG": self.log}
-        environment = {**self.environment, **{key: str(value) for key, value in ours.items()}}
         if fault:
-            environment.update(
-                zip(["FAULT_CALL", "FAULT_N", "FAULT_KIND", "FAULT_STICKY"], map(str, fault), strict=True)
-            )
+            ours |= zip(["FAULT_CALL", "FAULT_N", "FAULT_KIND", "FAULT_STICKY"], fault, strict=True)
+        environment = self.environment | {key: str(value) for key, value in ours.items()}
         output, errors = self.folder / "output", self.folder / "errors"
         with (into or output).open("wb") as out, errors.open("wb") as err:
             process = subprocess.Popen([PROGRAM, *arguments], stdout=out, stderr=err, env=environment)
@@ -379,19 +371,13 @@ def operations(bench, only):
         op = Operation(bench, name, train, whole_checkpoint, waits=True)
         written = [file for _, group, file in bench.run(op.arguments).calls if group == "write"]
         at = [n for n, file in enumerate(written, 1) if file.endswith("/metrics.jsonl")]
-        for line in (5, 8):
+        for line in (8, 5):
             op.reset()
             assert bench.run(op.arguments, ("write", at[line - 1], "EIO", 0)).code == 1
             op.between.append(Tree(out))
-            if stopped and line == 5:
-                first = bench.folder / "first"
-                shutil.copytree(out, first)
-        if stopped:
-            shutil.rmtree(op.old)
-            first.rename(op.old)
-        return op
+        return op.take() if stopped else op
 
-    def packed():
+    def packed(name):
         # Scenes of more than a megabyte each, so that each chunk has one scene.
         make_rooms(inputs / "large", 2, 9, 256)
         command = ["pack", inputs / "large", "--out", out, "--chunk-size", 1, "--json"]
@@ -399,45 +385,45 @@ def operations(bench, only):
         bench.make(*command)
         (out / "000001.torch").unlink()
         (out / "index.json").unlink()
-        return Operation(bench, "pack", command, once=True).take()
+        return Operation(bench, name, command, once=True).take()
 
-    def filmed():
+    def filmed(name):
         more = ["--depth", "--contact-sheet", out / "sheet.png"]
         command = ["synth", "--out", out, "--scenes", 2, "--frames", 3, "--size", 16, *more, "--json"]
         # Older files, without the index that marks the folder as complete.
-        return Operation(bench, "synth", command, once=True).age(drop=["000000.torch", "index.json"])
+        return Operation(bench, name, command, once=True).age(drop=["000000.torch", "index.json"])
 
-    def converted():
+    def converted(name):
         shutil.copy(splat, out / "room.ply")
         command = ["convert", out / "room.ply", out / "room.ply", "--sh-degree", 1]
-        return Operation(bench, "convert, in place", command).take()
+        return Operation(bench, name, command).take()
 
-    def over_local_origin():
+    def over_local_origin(name):
         """Overwrites a splat that has a local origin with one that has none."""
         bench.make(*convert)
-        return Operation(bench, "convert, over a local origin", ["convert", splat, out / "far.spz", "--json"]).take()
+        return Operation(bench, name, ["convert", splat, out / "far.spz", "--json"]).take()
 
-    def aged(name, command, keep=(), **more):
-        return lambda: Operation(bench, name, command, **more).age(keep)
+    def aged(command, keep=(), **more):
+        return lambda name: Operation(bench, name, command, **more).age(keep)
 
     scored = ["evaluation.json", "scenes/room_000.json", "scenes/room_000.jpg"]
     made = {
-        "train": lambda: training("train", False),
-        "train, resumed": lambda: training("train, resumed", True),
-        "export": aged("export", export),
-        "reconstruct": aged("reconstruct", reconstruct),
-        "reconstruct --local-origin": aged("reconstruct --local-origin", [*reconstruct, "--local-origin"]),
-        "refine --local-origin": aged("refine --local-origin", refine),
+        "train": partial(training, stopped=False),
+        "train, resumed": partial(training, stopped=True),
+        "export": aged(export),
+        "reconstruct": aged(reconstruct),
+        "reconstruct --local-origin": aged([*reconstruct, "--local-origin"]),
+        "refine --local-origin": aged(refine),
         "convert, in place": converted,
-        "convert --local-origin": aged("convert --local-origin", convert),
+        "convert --local-origin": aged(convert),
         "convert, over a local origin": over_local_origin,
-        "render, a folder": aged("render, a folder", [*orbit, out / "views", "--depth"]),
-        "render, .gif": aged("render, .gif", [*orbit, out / "orbit.gif"]),
-        "render, .mp4": aged("render, .mp4", [*orbit, out / "orbit.mp4"]),
-        "eval --scene": aged("eval --scene", score),
-        "eval > file": aged("eval > file", score, into=out / "stdout"),
-        "eval --data": aged("eval --data", [*sweep, out], keep=scored),
-        "report": aged("report", report),
+        "render, a folder": aged([*orbit, out / "views", "--depth"]),
+        "render, .gif": aged([*orbit, out / "orbit.gif"]),
+        "render, .mp4": aged([*orbit, out / "orbit.mp4"]),
+        "eval --scene": aged(score),
+        "eval > file": aged(score, into=out / "stdout"),
+        "eval --data": aged([*sweep, out], keep=scored),
+        "report": aged(report),
         "pack": packed,
         "synth": filmed,
     }
@@ -445,7 +431,7 @@ def operations(bench, only):
         if not only or name in only:
             shutil.rmtree(out)
             out.mkdir()
-            op = make()
+            op = make(name)
             op.undisturbed()
             yield op
 
