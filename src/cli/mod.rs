@@ -62,7 +62,7 @@ enum Command {
     Eval(eval::Eval),
     Report(report::Report),
     Reconstruct(reconstruct::Reconstruct),
-    Refine(refine::Refine),
+    Refine(Box<refine::Refine>),
     Render(render::Render),
     View(view::View),
     Convert(convert::Convert),

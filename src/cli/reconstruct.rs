@@ -62,7 +62,7 @@ impl Reconstruct {
         let options = RefineOptions {
             seconds,
             holdout: parse_holdout(&self.holdout)?,
-            views: self.views,
+            max_views: self.views,
             ..Default::default()
         };
         let Reconstruct { weights, scene, masks, out, local_origin, device, .. } = self;

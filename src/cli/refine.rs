@@ -24,7 +24,6 @@ use crate::scene::{Camera, LocalFrame};
 use anyhow::Result;
 use clap::Args;
 use serde_json::json;
-use std::cell::RefCell;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
@@ -98,34 +97,26 @@ pub struct Reports {
 
 impl Refine {
     pub fn run(mut self) -> Result<Output> {
-        check_views(self.options.views)?;
+        check_views(self.options.max_views)?;
         self.options.device = device::parse(&self.device)?;
-        self.options.check()?;
+        self.options.resolve(self.splat.is_some())?;
         if self.init.as_deref() == Some("photos") && self.weights.is_some() {
             return Err(Error::request("--init photos uses no weights; --init model does").into());
         }
-        let age = process_age().unwrap_or_default();
-        let now = Instant::now();
+        let started = Instant::now().checked_sub(process_age().unwrap_or_default());
         check_writable_splat(&self.out)?;
         splat_out::check_origin(&self.out, self.local_origin)?;
-        if let Some(sheet) = &self.reports.contact_sheet {
-            check_writable_png(sheet)?;
-        }
+        self.reports.contact_sheet.iter().try_for_each(|sheet| check_writable_png(sheet))?;
         let state_file = RefineState::path_for(&self.out);
         if self.resume {
             check_writable_file(&state_file)?;
         }
-        if let Some(log) = &self.reports.log {
-            check_writable_dir(log)?;
-        }
+        self.reports.log.iter().try_for_each(|log| check_writable_dir(log))?;
         signals::handle_stop_requests()?;
         signals::end_at_request(1);
         let path = self.scene.path(self.masks.as_deref(), &self.out)?;
         // The time budget begins after the poses of photos are found.
-        let clock = match self.scene.is_unposed() {
-            true => Instant::now(),
-            false => now.checked_sub(age).unwrap_or(now),
-        };
+        let clock = started.filter(|_| !self.scene.is_unposed()).unwrap_or_else(Instant::now);
         self.options.started = Some(clock);
         let capture = open_masked_capture(&path, self.masks.as_deref())?;
         self.check_outputs(&capture)?;
@@ -149,22 +140,21 @@ impl Refine {
         };
         let bar = Bar::new(self.options.budget(), clock);
         let steps = if let SceneInit::State(state) = init { state.steps() } else { 0 };
-        let log = self.reports.log.as_ref().map(|folder| RefineLog::create(folder, steps)).transpose()?;
-        let log = RefCell::new(log);
+        let mut log = self.reports.log.as_ref().map(|folder| RefineLog::create(folder, steps)).transpose()?;
         let on_event = |event: RefineEvent| {
             bar.update(event);
-            write_event(&mut log.borrow_mut(), event);
+            if let Some(Err(error)) = log.as_mut().map(|log| log.write(&event)) {
+                eprintln!("{error}; the log ends here");
+                log = None;
+            }
             !signals::is_stop_requested()
         };
         let mut session = RefineSession::load(&capture, &self.options, init, on_event)?;
         if let (None, SceneInit::Photos, PhotoSize::Within(side)) =
             (self.options.gaussians, init, session.size())
         {
-            let count = session.gaussians();
-            let line = format!(
-                "{count} Gaussians, photos of at most {side} pixels; --gaussians and --size set others"
-            );
-            bar.bar.suspend(|| eprintln!("{line}"));
+            let line = format!("{} Gaussians, photos of at most {side} pixels", session.gaussians());
+            bar.bar.suspend(|| eprintln!("{line}; --gaussians and --size set others"));
         }
         // Depths of a subset of the photos are enough for an initial splat, too.
         signals::end_at_request(if matches!(init, SceneInit::Model(_)) { 1 } else { 2 });
@@ -267,20 +257,6 @@ impl Refine {
     }
 }
 
-/// Writes metrics and scores to the log, if there is one. If that fails, says so and ends the log.
-fn write_event(log: &mut Option<RefineLog>, event: RefineEvent) {
-    let Some(open) = log else { return };
-    let written = match event {
-        RefineEvent::Measured(metrics) => open.log_step(metrics),
-        RefineEvent::Scored(point) => open.log_scores(point),
-        _ => return,
-    };
-    if let Err(error) = written {
-        eprintln!("{error}; the log ends here");
-        *log = None;
-    }
-}
-
 /// Progress bar of a session.
 struct Bar {
     bar: Progress,
@@ -305,7 +281,7 @@ impl Bar {
                 Some(psnr) => format!("{steps} steps, held out {psnr:.2} dB"),
                 None => format!("{steps} steps"),
             },
-            RefineEvent::Scoring(_) | RefineEvent::Measured(_) | RefineEvent::Scored(_) => return,
+            RefineEvent::Scoring(_) | RefineEvent::Measured { .. } | RefineEvent::Scored(_) => return,
             RefineEvent::Warning(line) => return self.bar.suspend(|| eprintln!("{line}")),
         };
         self.bar.set_message(message);

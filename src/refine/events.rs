@@ -1,13 +1,10 @@
-//! Progress events of a session with its scores on a few views, and their log for TensorBoard.
+//! Progress events of a session, and their log for TensorBoard.
 
-use super::corrections::Corrections;
-use crate::data::View;
 use crate::error::{Error, Result};
 use crate::io::{AppendFile, CONFIG_FILE, EventFile, METRICS_FILE, write_atomically};
-use crate::metrics::{CaptureScores, Scores, score_views};
-use crate::scene::Gaussians;
+use crate::metrics::Scores;
 use serde::Serialize;
-use serde_json::{Value, json};
+use serde_json::{Map, Value, json};
 use std::path::Path;
 
 /// Progress event of a session.
@@ -30,29 +27,25 @@ pub enum RefineEvent<'a> {
         psnr: Option<f64>,
     },
     /// Metrics of a step that was just done, every 50 steps.
-    Measured(&'a RefineMetrics),
+    Measured {
+        /// Number of steps done.
+        steps: u64,
+        /// Time on the session's clock, in seconds.
+        seconds: f64,
+        /// Loss of the step's photos.
+        loss: f64,
+        /// Number of Gaussians.
+        gaussians: i64,
+        /// Learning rate of the means, in units of the scene's depth.
+        learning_rate: f64,
+    },
     /// A sample of the held-out views was scored.
     Scored(&'a EvalPoint),
-    /// Whole views are being scored; the value is the number of views that are done.
+    /// All held-out views are being scored; the value is the number of views that are done.
     Scoring(usize),
-    /// Warning to print, a sentence: photos that were left out, exposures that are corrected, missing depth information, or too little time.
-    /// The callback's answer to it is ignored.
+    /// Warning to print, a sentence: photos that were left out, exposures that are corrected, missing depth information, too little time, or
+    /// an initial splat that is kept.
     Warning(&'a str),
-}
-
-/// Metrics of a step.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct RefineMetrics {
-    /// Number of steps done.
-    pub step: u64,
-    /// Time on the session's clock, in seconds.
-    pub seconds: f64,
-    /// Loss of the step's photos.
-    pub loss: f64,
-    /// Number of Gaussians.
-    pub gaussians: i64,
-    /// Learning rate of the means, in units of the scene's depth.
-    pub learning_rate: f64,
 }
 
 /// Scores of the held-out views at one time during the optimization.
@@ -94,159 +87,29 @@ impl RefineLog {
         Ok(RefineLog { metrics, events })
     }
 
-    /// Writes the metrics of a step.
+    /// Writes the metrics or the scores of an event to both files. Other events aren't logged.
     ///
     /// # Errors
     /// Returns an error if a file can't be written.
-    pub fn log_step(&mut self, metrics: &RefineMetrics) -> Result<()> {
-        let RefineMetrics { step, seconds, loss, gaussians, learning_rate } = *metrics;
-        let values = [
-            ("loss", loss),
-            ("gaussians", gaussians as f64),
-            ("learning_rate", learning_rate),
-            ("seconds", seconds),
-        ];
-        self.write(step, "refine", &values, |object| object)
-    }
-
-    /// Writes scores of the held-out views.
-    ///
-    /// # Errors
-    /// Returns an error if a file can't be written.
-    pub fn log_scores(&mut self, point: &EvalPoint) -> Result<()> {
-        let values = [("psnr", point.scores.psnr), ("ssim", point.scores.ssim)];
-        self.write(point.steps, "validation", &values, |object| json!({ "validation": object }))
-    }
-
-    /// Writes `values` after `steps` steps to both files. `line_of` returns the line of the metrics from the object of the values. As in a log
-    /// of training, the step is the index of the last one.
-    fn write(
-        &mut self,
-        steps: u64,
-        group: &str,
-        values: &[(&str, f64)],
-        line_of: impl Fn(Value) -> Value,
-    ) -> Result<()> {
+    pub fn write(&mut self, event: &RefineEvent) -> Result<()> {
+        let (group, steps, values) = match *event {
+            RefineEvent::Measured { steps, seconds, loss, gaussians, learning_rate } => {
+                let (gaussians, rate) = (("gaussians", gaussians as f64), ("learning_rate", learning_rate));
+                ("refine", steps, vec![("loss", loss), gaussians, rate, ("seconds", seconds)])
+            }
+            RefineEvent::Scored(EvalPoint { steps, scores, .. }) => {
+                ("validation", *steps, vec![("psnr", scores.psnr), ("ssim", scores.ssim)])
+            }
+            _ => return Ok(()),
+        };
+        // As in a log of training, the step is the index of the last one.
         let step = steps.saturating_sub(1);
-        let object: serde_json::Map<String, Value> =
-            values.iter().map(|&(name, value)| (name.to_string(), value.into())).collect();
-        let mut line = line_of(object.into());
+        let tagged: Vec<_> = values.iter().map(|(name, value)| (format!("{group}/{name}"), *value)).collect();
+        let object: Map<String, Value> =
+            values.into_iter().map(|(name, value)| (name.into(), value.into())).collect();
+        let mut line = if group == "refine" { object.into() } else { json!({ group: object }) };
         line["step"] = step.into();
         self.metrics.append(format!("{line}\n").as_bytes())?;
-        let tagged: Vec<_> = values.iter().map(|&(name, value)| (format!("{group}/{name}"), value)).collect();
         self.events.write_scalars(step, &tagged)
-    }
-}
-
-/// Maximum number of views in a sample.
-const MAX_VIEWS: usize = 8;
-/// Minimum number of views in a small sample, if there are as many.
-const MIN_VIEWS: usize = 2;
-/// Maximum number of pixels of all views in a small sample, if there are more than [`MIN_VIEWS`].
-const MAX_PIXELS: u64 = 1_200_000;
-
-/// Evenly spread views of all. They are scored as a whole: a part of an image has other borders, near which large Gaussians are projected
-/// differently.
-#[derive(Debug)]
-pub(super) struct ViewSample {
-    /// Indices among all views.
-    indices: Vec<usize>,
-    views: Vec<View>,
-}
-
-impl ViewSample {
-    /// Chooses up to eight of `views`, fewer if they are large, to be scored several times.
-    pub fn small(views: &[View]) -> Self {
-        let pixels = |view: &View| u64::from(view.camera.width) * u64::from(view.camera.height);
-        let largest = views.iter().map(pixels).max().unwrap_or(1);
-        ViewSample::spread(views, ((MAX_PIXELS / largest) as usize).clamp(MIN_VIEWS, MAX_VIEWS))
-    }
-
-    /// Chooses up to eight of `views`.
-    pub fn large(views: &[View]) -> Self {
-        ViewSample::spread(views, MAX_VIEWS)
-    }
-
-    fn spread(views: &[View], count: usize) -> Self {
-        let every = views.len().div_ceil(count).max(1);
-        let indices: Vec<usize> = (0..views.len()).step_by(every).collect();
-        let views = indices.iter().map(|&index| views[index].shallow_clone());
-        ViewSample { views: views.collect(), indices }
-    }
-
-    /// Returns the number of views.
-    pub fn len(&self) -> usize {
-        self.views.len()
-    }
-
-    /// Returns the sample with the learned corrections of its photos applied.
-    pub(super) fn corrected(&self, corrections: &Corrections) -> Self {
-        let views = self.indices.iter().zip(&self.views).map(|(&index, view)| corrections.apply(index, view));
-        ViewSample { indices: self.indices.clone(), views: views.collect() }
-    }
-
-    /// Scores a splat; returns `None` if there are no views.
-    ///
-    /// # Errors
-    /// Fails if rendering fails.
-    pub fn score(&self, gaussians: &Gaussians) -> Result<Option<Scores>> {
-        Ok(score_views("sample", gaussians, &self.views, None, |_| true)?.map(|scores| scores.mean))
-    }
-
-    /// Returns the mean scores of the sample, given the `scores` of all views that it was chosen from.
-    pub fn select_scores(&self, scores: &CaptureScores) -> Scores {
-        Scores::mean(self.indices.iter().map(|&index| &scores.views[index].scores))
-    }
-}
-
-/// Returns the first few names, and the number of the others.
-pub(super) fn summarize_names(all: &[String]) -> String {
-    const FEW: usize = 3;
-    let few = all[..all.len().min(FEW)].join(", ");
-    if all.len() > FEW { format!("{few} and {} more", all.len() - FEW) } else { few }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::render::render_views;
-    use crate::scene::{Camera, Intrinsics};
-    use glam::DMat4;
-    use tch::{Device, Kind, Tensor};
-
-    #[test]
-    fn a_sample_has_few_pixels_and_its_scores_are_those_of_the_views() {
-        let gaussians = Gaussians {
-            means: Tensor::from_slice(&[0f32, 0., 3.]).view([1, 1, 3]),
-            scales: Tensor::full([1, 1, 3], 0.5, (Kind::Float, Device::Cpu)),
-            quaternions: Tensor::from_slice(&[1f32, 0., 0., 0.]).view([1, 1, 4]),
-            opacities: Tensor::full([1, 1], 0.7, (Kind::Float, Device::Cpu)),
-            sh: Tensor::ones([1, 1, 1, 3], (Kind::Float, Device::Cpu)),
-            antialiased: false,
-        };
-        let views = |width: u32, height: u32, count: usize| -> Vec<View> {
-            let intrinsics = Intrinsics { fx: 200., fy: 190., cx: 100., cy: 80. };
-            let camera = Camera { intrinsics, c2w: DMat4::IDENTITY, width, height };
-            let image = render_views(&gaussians, &[camera]).unwrap().remove(0).rgb;
-            let view = |index: usize| {
-                let image = (&image + 0.01 + 0.001 * index as f64).into();
-                View { name: String::new(), image, mask: None, camera }
-            };
-            (0..count).map(view).collect()
-        };
-        let all = views(210, 170, 20);
-        let small = ViewSample::small(&all);
-        assert_eq!(small.indices, [0, 3, 6, 9, 12, 15, 18]);
-        let large = views(1000, 600, 9);
-        assert_eq!(ViewSample::small(&large).indices, [0, 5]);
-        assert_eq!(ViewSample::large(&large).indices, [0, 2, 4, 6, 8]);
-        let scores = small.score(&gaussians).unwrap().unwrap();
-        let of_all = score_views("", &gaussians, &all, None, |_| true).unwrap().unwrap();
-        let first = &of_all.views[0].scores;
-        assert!((first.psnr - 40.).abs() < 0.01 && first.ssim > 0.9, "{of_all:?}");
-        let selected = small.select_scores(&of_all);
-        assert!((scores.psnr - selected.psnr).abs() < 1e-9 && (scores.ssim - selected.ssim).abs() < 1e-9);
-        assert!((scores.psnr - of_all.mean.psnr).abs() > 0.01, "{scores:?} {}", of_all.mean.psnr);
-        assert!(ViewSample::small(&[]).score(&gaussians).unwrap().is_none());
     }
 }

@@ -119,7 +119,7 @@ fn balance(ratios: &[Vec<Option<Ratio>>], indices: &[usize]) -> Vec<LogGains> {
     let of = |values: &[f64], columns: usize| Tensor::from_slice(values).view([n as i64, columns as i64]);
     let solution = Tensor::linalg_solve(&of(&matrix, n), &of(&right, 3), true);
     let numbers = Vec::<f64>::try_from(solution.contiguous().view([-1])).expect("numbers");
-    numbers.chunks_exact(3).map(|gain| [gain[0], gain[1], gain[2]]).collect()
+    numbers.as_chunks().0.to_vec()
 }
 
 impl<'a> ExposedPhoto<'a> {
@@ -189,24 +189,16 @@ mod tests {
     use crate::data::View;
     use crate::refine::init::small_photo;
     use crate::refine::{PhotoInit, gaussians_from_photos};
-    use crate::scene::{Intrinsics, SH_C0};
-    use glam::DMat4;
-    use tch::{Device, Kind};
+    use crate::scene::SH_C0;
+    use tch::Kind;
 
-    const SIDE: u32 = 64;
     const DEPTH: f64 = 4.;
 
-    /// Returns the view of a camera at `x` on a wall with a wave pattern, multiplied by `gains`.
+    /// Returns the view of a camera at `x` on a wall, multiplied by `gains`.
     fn wall(x: f64, gains: [f64; 3]) -> View {
-        let (side, options) = (f64::from(SIDE), (Kind::Float, Device::Cpu));
-        let axis = |offset: f64| (Tensor::arange(64, options) + 0.5 - side / 2.) / side * DEPTH + offset;
-        let (u, v) = (axis(x).view([1, -1]), axis(0.).view([-1, 1]));
-        let wave = ((&u * 5.).sin() * (&v * 4.).cos()) * 0.2 + 0.4;
+        let view = crate::refine::tests::wall(x);
         let gains = Tensor::from_slice(&gains).to_kind(Kind::Float).view([3, 1, 1]);
-        let intrinsics = Intrinsics { fx: side, fy: side, cx: side / 2., cy: side / 2. };
-        let c2w = DMat4::from_translation(DVec3::X * x);
-        let camera = Camera { intrinsics, c2w, width: SIDE, height: SIDE };
-        View { name: x.to_string(), image: (wave * gains).into(), mask: None, camera }
+        View { image: (view.image.to_float() * gains).into(), ..view }
     }
 
     /// Gains are measured of photos with and without a depth map, and 0 is assumed for one that shares nothing with the others.
@@ -216,7 +208,7 @@ mod tests {
         let views: Vec<View> = [-0.5, 0., 0.5, 90.].into_iter().zip(gains).map(|(x, g)| wall(x, g)).collect();
         let photos: Vec<SmallPhoto> = views.iter().map(|view| small_photo(view, 128.)).collect();
         let map = |index: usize| {
-            let map = DepthMap { camera: photos[index].camera, ..DepthMap::flat(SIDE, SIDE, DEPTH) };
+            let map = DepthMap { camera: photos[index].camera, ..DepthMap::flat(64, 64, DEPTH) };
             (index, map)
         };
         let found = measure_exposures(&photos, &[map(0), map(2)]);

@@ -1,8 +1,6 @@
-//! Optimizer of Gaussians: a learning rate per kind of parameter, the degree of the spherical harmonics, relocation.
+//! Parameters of the Gaussians and their optimizer: a learning rate per kind of parameter, the degree of the spherical harmonics, relocation.
 
-use super::config::RefineConfig;
-use super::gaussian_params::GaussianParams;
-use super::options::MIN_GAUSSIANS;
+use super::options::{MIN_GAUSSIANS, RefineOptions};
 use super::relocate::relocate;
 use super::state::{GAUSSIANS, Growth, Record, RefineState};
 use crate::error::{Error, Result};
@@ -10,7 +8,7 @@ use crate::optim::{Optimizer, ParameterGroup, UpdateRule};
 use crate::scene::{Gaussians, RawGaussians};
 use rand_chacha::ChaCha8Rng;
 use std::collections::BTreeMap;
-use tch::{Device, Tensor};
+use tch::{Kind, Tensor};
 
 /// Exponent with which the learning rate of the means falls with the number of Gaussians above [`MIN_GAUSSIANS`].
 const MEANS_POWER: f64 = 0.75;
@@ -19,14 +17,87 @@ const MIN_AVERAGE_WEIGHT: f64 = 0.01;
 /// Adam's ε, added to the root of the second moments. It is small because gradients of single Gaussians are small.
 const EPSILON: f64 = 1e-15;
 
+/// Opacity logit of Gaussians that wait for their relocation.
+const DEAD_LOGIT: f64 = -30.;
+
+/// Names of the parameters, as in gsplat where it has one: means, logarithms of scales, quaternions of any length, logits of opacities, and
+/// spherical harmonics of degree 0 and of higher degrees, which have a smaller learning rate.
+const NAMES: [&str; 6] = ["means", "log_scales", "quaternions", "opacity_logits", "sh0", "shN"];
+
+/// Gaussians of one scene before activation, [1, N, …] each, in the order of [`NAMES`].
+#[derive(Debug)]
+pub(super) struct GaussianParams(pub(super) [Tensor; 6]);
+
+impl GaussianParams {
+    /// Copies `raw` into float32 leaf tensors that require gradients. Coefficients up to `degree`, at least the degree of `raw`, are added
+    /// as zeros.
+    pub(super) fn from_raw(raw: &RawGaussians, degree: i64) -> Self {
+        let RawGaussians { means, log_scales, quaternions, opacity_logits, sh } = raw;
+        let (sh0, known) = (sh.narrow(2, 0, 1), sh.narrow(2, 1, sh.size()[2] - 1));
+        let missing = (degree + 1).pow(2) - sh.size()[2];
+        let sh_rest = known.constant_pad_nd([0, 0, 0, missing]);
+        GaussianParams([means, log_scales, quaternions, opacity_logits, &sh0, &sh_rest].map(leaf))
+    }
+
+    /// Returns the number of Gaussians.
+    fn count(&self) -> i64 {
+        self.0[0].size()[1]
+    }
+
+    /// Returns the parameters with their names.
+    fn named(&self) -> [(&'static str, &Tensor); 6] {
+        std::array::from_fn(|index| (NAMES[index], &self.0[index]))
+    }
+
+    /// Returns a copy that requires no gradients.
+    fn copy(&self) -> Self {
+        GaussianParams(self.0.each_ref().map(|t| t.detach().copy()))
+    }
+
+    /// Returns these Gaussians followed by `count` copies of the first one with almost no opacity (sigmoid(−30)), which the next relocation
+    /// moves. Requires at least one Gaussian.
+    fn append_dead(&self, count: i64) -> Self {
+        GaussianParams(std::array::from_fn(|index| {
+            let t = &self.0[index];
+            let mut size = t.size();
+            size[1] = count;
+            let more = match NAMES[index] {
+                "opacity_logits" => Tensor::full(&size, DEAD_LOGIT, (Kind::Float, t.device())),
+                _ => t.narrow(1, 0, 1).expand(&size, false),
+            };
+            Tensor::cat(&[t, &more], 1).detach().set_requires_grad(true)
+        }))
+    }
+
+    /// Returns the activated Gaussians, with spherical harmonics up to `degree`; differentiable. `degree` is at most the stored one.
+    fn activate(&self, degree: i64) -> Gaussians {
+        let [means, log_scales, quaternions, opacity_logits, sh0, sh_rest] =
+            self.0.each_ref().map(Tensor::shallow_clone);
+        let used_count = (degree + 1).pow(2) - 1;
+        let sh = match used_count {
+            0 => sh0,
+            // The gradient of a part takes another pass over memory.
+            _ if used_count == sh_rest.size()[2] => Tensor::cat(&[sh0, sh_rest], 2),
+            _ => Tensor::cat(&[sh0, sh_rest.narrow(2, 0, used_count)], 2),
+        };
+        RawGaussians { means, log_scales, quaternions, opacity_logits, sh }.activate()
+    }
+}
+
+/// Returns a float32 copy of a tensor that requires gradients.
+fn leaf(t: &Tensor) -> Tensor {
+    t.detach().to_kind(Kind::Float).copy().set_requires_grad(true)
+}
+
 /// Gaussians that are optimized, with the state of Adam.
 #[derive(Debug)]
-pub struct GaussianOptimizer {
+pub(crate) struct GaussianOptimizer {
     params: GaussianParams,
     optimizer: Optimizer,
-    config: RefineConfig,
-    depth: f64,
-    growth: Growth,
+    options: RefineOptions,
+    /// Depth of the scene, the unit of lengths.
+    pub(super) depth: f64,
+    pub(super) growth: Growth,
     /// Final number of Gaussians.
     last_count: i64,
     /// Average of the parameters over the last steps, once no Gaussian is moved any more.
@@ -34,71 +105,80 @@ pub struct GaussianOptimizer {
 }
 
 impl GaussianOptimizer {
-    /// Creates an optimizer of the initial Gaussians `raw`, which grow to at least `count`. `depth` is the depth of the scene, the unit of
-    /// lengths.
-    pub fn new(raw: &RawGaussians, depth: f64, config: &RefineConfig, count: i64) -> Self {
+    /// Creates an optimizer of the initial Gaussians `raw`, which grow to at least `count`. `depth` is the depth of the scene.
+    pub(crate) fn new(raw: &RawGaussians, depth: f64, options: &RefineOptions, count: i64) -> Self {
         let first = raw.sh.size()[2].isqrt() - 1;
-        let last_count = count.max(raw.means.size()[1]);
-        let degrees = [first, first.max(config.sh_degree_for(last_count))];
+        let first_count = raw.means.size()[1];
+        let degrees = [first, first.max(options.sh_degree_for(count.max(first_count)))];
         let params = GaussianParams::from_raw(raw, degrees[1]);
-        let growth = Growth { first_count: params.count(), degrees, degree: first, averaged_steps: 0 };
-        GaussianOptimizer::from_params(params, depth, config, growth, count)
+        let growth = Growth { first_count, degrees, degree: first, averaged_steps: 0 };
+        GaussianOptimizer::from_params(params, depth, options, growth, count)
     }
 
     /// Creates an optimizer of `params` without moments and averages.
     fn from_params(
         params: GaussianParams,
         depth: f64,
-        config: &RefineConfig,
+        options: &RefineOptions,
         growth: Growth,
         count: i64,
     ) -> Self {
-        let optimizer = Optimizer::new(params.named_parameters().map(alone).into()).with_epsilon(EPSILON);
+        // Each parameter is a group, whose learning rate is set before each step.
+        let group = |(name, t): (&str, &Tensor)| ParameterGroup {
+            rule: UpdateRule::AdamW,
+            parameters: vec![(name.into(), t.shallow_clone())],
+            learning_rate: 0.,
+            weight_decay: 0.,
+        };
+        let optimizer = Optimizer::new(params.named().map(group).into()).with_epsilon(EPSILON);
         let last_count = params.count().max(count);
-        let config = config.clone();
-        GaussianOptimizer { params, optimizer, config, depth, growth, last_count, average: None }
+        let options = options.clone();
+        GaussianOptimizer { params, optimizer, options, depth, growth, last_count, average: None }
     }
 
-    /// Creates the optimizer that `state` was made of, on `device`. The Gaussians grow to at least `count`.
+    /// Creates the optimizer that `state` was made of. The Gaussians grow to at least `count`.
     ///
     /// # Errors
     /// Returns an error if a tensor is missing or has another shape than the others.
     pub(super) fn from_state(
         state: &RefineState,
-        config: &RefineConfig,
+        options: &RefineOptions,
         count: i64,
-        device: Device,
     ) -> Result<Self> {
         let Record { depth, growth, .. } = state.record;
-        let read_params = |kind: &str| {
-            GaussianParams::from_named(|name| state.tensor(&format!("{GAUSSIANS}{kind}.{name}")), device)
+        let read = |kind: &str, expected: Option<&GaussianParams>| {
+            let tensor = |(index, name): (usize, &str)| {
+                let key = format!("{kind}.{name}");
+                let found = state.gaussians.get(&key);
+                let has_size = |t: &&Tensor| expected.is_none_or(|params| t.size() == params.0[index].size());
+                let refused = || {
+                    let found = found.map_or("missing".into(), |t| format!("of shape {:?}", t.size()));
+                    let field = format!("tensor {GAUSSIANS}{key}");
+                    Error::input(&state.file, field, found, "that of a refinement's state")
+                };
+                found.filter(has_size).map(|t| leaf(&t.to_device(options.device))).ok_or_else(refused)
+            };
+            let tensors = NAMES.into_iter().enumerate().map(tensor).collect::<Result<Vec<_>>>()?;
+            Ok::<_, Error>(GaussianParams(tensors.try_into().expect("a tensor for each name")))
         };
-        let params = read_params("value")?;
-        let average = if growth.averaged_steps > 0 { Some(read_params("average")?.copy()) } else { None };
-        let sizes = |params: &GaussianParams| params.named_parameters().map(|(_, t)| t.size());
-        if let Some(found) = average.as_ref().map(sizes).filter(|found| *found != sizes(&params)) {
-            let expected = format!("those of the parameters, {:?}", sizes(&params));
-            return Err(Error::input(
-                state.file(),
-                "the sizes of the averages",
-                format!("{found:?}"),
-                expected,
-            ));
-        }
-        let mut all = GaussianOptimizer::from_params(params, depth, config, growth, count);
-        all.optimizer.load_state(state.file(), &state.tensors_of(GAUSSIANS))?;
-        all.average = average;
-        Ok(all)
+        let params = read("value", None)?;
+        let average =
+            (growth.averaged_steps > 0).then(|| Ok::<_, Error>(read("average", Some(&params))?.copy()));
+        let average = average.transpose()?;
+        let mut all = GaussianOptimizer::from_params(params, depth, options, growth, count);
+        all.optimizer.load_state(&state.file, &state.gaussians)?;
+        Ok(GaussianOptimizer { average, ..all })
     }
 
-    /// Adds the parameters, their moments and their averages to `tensors`.
-    pub(super) fn add_to_state(&self, tensors: &mut BTreeMap<String, Tensor>) {
-        let named = |kind: &str, params: &GaussianParams| {
-            params.named_parameters().map(|(name, t)| (format!("{kind}.{name}"), t.detach()))
-        };
-        let averages = self.average.iter().flat_map(|average| named("average", average));
-        let all = named("value", &self.params).into_iter().chain(self.optimizer.state()).chain(averages);
-        tensors.extend(all.map(|(name, t)| (format!("{GAUSSIANS}{name}"), t)));
+    /// Returns the parameters, their moments and their averages with their names in a state.
+    pub(super) fn state(&self) -> BTreeMap<String, Tensor> {
+        let kinds = [("value", Some(&self.params)), ("average", self.average.as_ref())];
+        let mut state = self.optimizer.state();
+        for (kind, params) in kinds {
+            let named = params.into_iter().flat_map(GaussianParams::named);
+            state.extend(named.map(|(name, t)| (format!("{kind}.{name}"), t.detach())));
+        }
+        state
     }
 
     /// Returns the number of Gaussians.
@@ -106,13 +186,8 @@ impl GaussianOptimizer {
         self.params.count()
     }
 
-    /// Returns how the Gaussians have grown.
-    pub(super) fn growth(&self) -> Growth {
-        self.growth
-    }
-
     /// Returns the Gaussians, differentiable with respect to the parameters. `progress` goes from 0 to 1.
-    pub fn gaussians(&self, progress: f64) -> Gaussians {
+    pub(super) fn gaussians(&self, progress: f64) -> Gaussians {
         self.activate(&self.params, progress)
     }
 
@@ -123,26 +198,26 @@ impl GaussianOptimizer {
     }
 
     fn activate(&self, params: &GaussianParams, progress: f64) -> Gaussians {
-        Gaussians { antialiased: self.config.antialiased, ..params.activate(self.degree_at(progress)) }
+        Gaussians { antialiased: self.options.antialiased, ..params.activate(self.degree_at(progress)) }
     }
 
     /// Returns the degree of the spherical harmonics, at least the one that an earlier step used.
     fn degree_at(&self, progress: f64) -> i64 {
         let [first, last] = self.growth.degrees;
-        (first + (progress / self.config.sh_every_for(last)) as i64).min(last).max(self.growth.degree)
+        (first + (progress / self.options.sh_every_for(last)) as i64).min(last).max(self.growth.degree)
     }
 
     /// Returns the number of Gaussians that there should be, which grows exponentially.
     fn count_at(&self, progress: f64) -> i64 {
         let [first, last] = [self.growth.first_count, self.last_count].map(|count| count as f64);
-        (first * (last / first).powf((progress / self.config.grow_until).min(1.))) as i64
+        (first * (last / first).powf((progress / self.options.grow_until).min(1.))) as i64
     }
 
     /// Returns the learning rate of the means, in units of the scene's depth. Many Gaussians are small, so they move less.
     pub(super) fn means_learning_rate(&self, progress: f64) -> f64 {
         let relative_count = self.last_count as f64 / MIN_GAUSSIANS as f64;
         let by_count = relative_count.max(1.).powf(-MEANS_POWER);
-        self.config.lr_means * by_count * self.config.lr_means_final_factor.powf(progress)
+        self.options.lr_means * by_count * self.options.lr_means_final_factor.powf(progress)
     }
 
     /// Clears the gradients.
@@ -155,43 +230,43 @@ impl GaussianOptimizer {
     /// # Errors
     /// Returns an error if a GPU fails.
     pub(super) fn step(&mut self, progress: f64, step: u64, random: &mut ChaCha8Rng) -> Result<()> {
-        let config = &self.config;
-        let others = config.lr_final_factor.powf(progress);
-        // The order is that of `GaussianParams::named_parameters`.
+        let options = &self.options;
+        let others = options.lr_final_factor.powf(progress);
+        // In the order of `NAMES`.
         self.optimizer.set_learning_rates(&[
             self.means_learning_rate(progress) * self.depth,
-            config.lr_scales * others,
-            config.lr_quats * others,
-            config.lr_opacities * others,
-            config.lr_sh0 * others,
-            config.lr_sh0 * config.lr_shN_factor * others,
+            options.lr_scales * others,
+            options.lr_quats * others,
+            options.lr_opacities * others,
+            options.lr_sh0 * others,
+            options.lr_sh0 * options.lr_shN_factor * others,
         ]);
         self.optimizer.step()?;
         self.growth.degree = self.degree_at(progress);
         let missing = self.count_at(progress) - self.params.count();
-        let is_due = config.relocate_every > 0 && (step + 1).is_multiple_of(config.relocate_every);
+        let is_due = options.relocate_every > 0 && (step + 1).is_multiple_of(options.relocate_every);
         // With few steps, no relocation may be due after the growth has ended.
-        let is_late = missing > 0 && progress >= config.grow_until;
-        if is_due && progress < config.relocate_until || is_late {
+        let is_late = missing > 0 && progress >= options.grow_until;
+        if is_due && progress < options.relocate_until || is_late {
             if missing > 0 {
                 self.params = self.params.append_dead(missing);
-                self.optimizer.extend(self.params.named_parameters(), 1);
+                self.optimizer.extend(self.params.named(), 1);
             }
             let squared_gradients = self.optimizer.squared_gradients("means");
             let changed = relocate(
                 &self.params,
                 squared_gradients,
-                config.prune_opacity,
-                config.relocation_noise,
+                options.prune_opacity,
+                options.relocation_noise,
                 random,
             );
-            let changed = Tensor::from_slice(&changed).to_device(self.params.means.device());
+            let changed = Tensor::from_slice(&changed).to_device(self.params.0[0].device());
             for moment in self.optimizer.moments() {
                 let _ = moment.shallow_clone().index_fill_(1, &changed, 0.);
             }
         }
         // A refinement that continues with more steps has an average that isn't over its last steps.
-        if progress < config.relocate_until || is_late {
+        if progress < options.relocate_until || is_late {
             (self.average, self.growth.averaged_steps) = (None, 0);
         } else {
             self.update_average();
@@ -205,17 +280,9 @@ impl GaussianOptimizer {
         self.growth.averaged_steps += 1;
         let weight = (1. / self.growth.averaged_steps as f64).max(MIN_AVERAGE_WEIGHT);
         tch::no_grad(|| {
-            for ((_, average), (_, t)) in
-                average.named_parameters().iter().zip(self.params.named_parameters())
-            {
-                let _ = average.shallow_clone().lerp_(t, weight);
+            for (average, t) in average.0.iter_mut().zip(&self.params.0) {
+                let _ = average.lerp_(t, weight);
             }
         });
     }
-}
-
-/// Returns a parameter group with one parameter, whose learning rate is set before each step.
-fn alone((name, t): (&str, &Tensor)) -> ParameterGroup {
-    let parameters = vec![(name.into(), t.shallow_clone())];
-    ParameterGroup { rule: UpdateRule::AdamW, parameters, learning_rate: 0., weight_decay: 0. }
 }

@@ -40,7 +40,7 @@ pub enum SceneInit<'a> {
     Photos,
     /// Splat in the capture's world.
     Splat(&'a Splat),
-    /// Reconstruction of the photos by a model. It sees [`RefineOptions::views`] of them, or the number in its configuration.
+    /// Reconstruction of the photos by a model. It sees [`RefineOptions::max_views`] of them, or the number in its configuration.
     Model(&'a LoadedModel),
     /// State of an earlier refinement of the same capture, which continues. The time and the steps of [`RefineOptions`] include those of
     /// the earlier refinement.
@@ -64,7 +64,7 @@ impl SceneInit<'_> {
             SceneInit::State(state) if state.record.from_splat => state.count(),
             _ => options.gaussians.unwrap_or_else(|| options.gaussians_for(capture)),
         };
-        (gaussians, options.size.unwrap_or(RefineOptions::size_for(gaussians)))
+        (gaussians, options.size_for(gaussians))
     }
 }
 

@@ -1,5 +1,6 @@
 //! Loss between rendered depths and those that the plane sweep has found.
 
+use crate::scene::Camera;
 use crate::stereo::DepthMap;
 use tch::{Device, Kind, Tensor};
 
@@ -18,9 +19,10 @@ pub(super) struct KnownDepths {
 }
 
 impl KnownDepths {
-    /// Returns the depths of `map` on which the photos agree, at the pixels of a photo of `width`×`height` in which the centers of the map's
+    /// Returns the depths of `map` on which the photos agree, at the pixels of the photo of `camera` in which the centers of the map's
     /// pixels are. If the photo has fewer pixels, each gets one of the depths.
-    pub fn new(map: &DepthMap, width: i64, height: i64, device: Device) -> Self {
+    pub fn new(map: &DepthMap, camera: &Camera, device: Device) -> Self {
+        let (width, height) = (i64::from(camera.width), i64::from(camera.height));
         let size = map.depth.size();
         // The pixel of the photo, along one side, in which the center of each of the map's pixels is.
         let along = |count: i64, side: i64| -> Vec<i64> {
@@ -61,20 +63,22 @@ impl KnownDepths {
 mod tests {
     use super::*;
 
-    /// Returns a map of 2×2 pixels at depths 1 to 4, of which the last isn't sure and the first doesn't count.
-    fn map() -> DepthMap {
+    /// Returns the known depths of a photo of `width`×`height`, by a map of 2×2 pixels at depths 1 to 4, of which the last isn't sure and the
+    /// first doesn't count.
+    fn known(width: u32, height: u32) -> KnownDepths {
         let truths = |values: [bool; 4]| Tensor::from_slice(&values).view([2, 2]);
-        DepthMap {
+        let map = DepthMap {
             depth: Tensor::from_slice(&[1f32, 2., 3., 4.]).view([2, 2]),
             sure: truths([true, true, true, false]),
             counted: Some(truths([false, true, true, true])),
             ..DepthMap::flat(2, 2, 1.)
-        }
+        };
+        KnownDepths::new(&map, &Camera { width, height, ..map.camera }, Device::Cpu)
     }
 
     #[test]
     fn sure_depths_pull_where_their_pixels_are() {
-        let known = KnownDepths::new(&map(), 6, 4, Device::Cpu);
+        let known = known(6, 4);
         // In a photo of 6×4 pixels the centers of the map's pixels are in columns 1 and 4, and in rows 1 and 3.
         let rendered = Tensor::full([4, 6], 9., (Kind::Float, Device::Cpu));
         let put = |row: i64, column: i64, depth: f64| {
@@ -94,7 +98,7 @@ mod tests {
 
     #[test]
     fn each_pixel_of_a_small_photo_gets_one_depth() {
-        let known = KnownDepths::new(&map(), 1, 2, Device::Cpu);
+        let known = known(1, 2);
         // The first column has depths 1, which doesn't count, and 3.
         assert_eq!((Vec::<i64>::try_from(&known.pixels).unwrap(), known.share), (vec![1], 0.5));
         assert_eq!(known.depths.double_value(&[0]), 3.);
@@ -102,7 +106,7 @@ mod tests {
 
     #[test]
     fn depths_that_are_far_off_pull_nothing() {
-        let known = KnownDepths::new(&map(), 2, 2, Device::Cpu);
+        let known = known(2, 2);
         let rendered = Tensor::full([2, 2], 30., (Kind::Float, Device::Cpu)).set_requires_grad(true);
         let loss = known.loss(&rendered);
         loss.backward();

@@ -1,13 +1,13 @@
 //! Photos that a splat is refined on, at several sizes.
 
-use super::config::RefineConfig;
 use super::known_depths::KnownDepths;
+use super::options::RefineOptions;
 use crate::data::{
     Capture, MIN_SHORTER_SIDE, MIN_SIDE, PhotoSize, Pixels, View, ViewBatch, load_views, select_views,
     view_matrices,
 };
 use crate::error::{Error, Result};
-use crate::scene::{Camera, ImageSize};
+use crate::scene::{Camera, ImageSize, Intrinsics};
 use crate::stereo::{DepthMap, are_near_duplicates, pool_masked};
 use rand::Rng;
 use rand::seq::index::sample;
@@ -26,7 +26,7 @@ const NEARLY_EQUAL: f64 = 1e-4;
 /// # Errors
 /// Fails like [`Capture::load`], if a photo has fewer than [`MIN_SIDE`] pixels along a side, or if `should_continue` ends the work before
 /// all photos are read.
-pub fn load_photos(
+pub(super) fn load_photos(
     capture: &Capture,
     indices: &[usize],
     size: PhotoSize,
@@ -55,43 +55,44 @@ pub fn load_photos(
     Ok(views)
 }
 
-/// Returns the indices of the photos that aren't near duplicates of a photo before them. Near duplicates of a scene at `depth` show nearly
-/// the same pixels from nearly the same position: copies, or frames of a video in which the camera rests.
-pub(super) fn distinct(photos: &[View], depth: f64) -> Vec<usize> {
-    let small: Vec<Tensor> = photos
-        .iter()
-        .map(|View { image, mask, camera, .. }| {
-            let factor = (COMPARED_SIDE / f64::from(camera.width.max(camera.height))).min(1.);
-            let side = |pixels: u32| ((f64::from(pixels) * factor).round() as i64).max(1);
-            // A photo with another mask shows something else.
-            let image = match mask {
-                Some(mask) => {
-                    let mask = mask.to_float();
-                    Tensor::cat(&[image.to_float() * &mask, mask], 0)
-                }
-                None => image.to_float(),
-            };
-            image.unsqueeze(0).adaptive_avg_pool2d([side(camera.height), side(camera.width)])
-        })
-        .collect();
-    let mut kept: Vec<usize> = vec![];
-    for index in 0..photos.len() {
-        let is_nearly = |&other: &usize| {
-            are_near_duplicates(&photos[index].camera, &photos[other].camera, depth)
-                && small[index].size() == small[other].size()
-                && (&small[index] - &small[other]).square().mean(Kind::Float).double_value(&[])
-                    <= NEARLY_EQUAL
+/// Returns the longest side of the photos, in pixels.
+pub(super) fn longest_side(photos: &[View]) -> u32 {
+    photos.iter().map(|photo| photo.camera.width.max(photo.camera.height)).max().unwrap_or(0)
+}
+
+/// Returns for each photo whether it isn't a near duplicate of one before it. Near duplicates of a scene at `depth` show nearly the same pixels
+/// from nearly the same position: copies, or frames of a video in which the camera rests.
+pub(super) fn distinct(photos: &[View], depth: f64) -> Vec<bool> {
+    let small = |View { image, mask, camera, .. }: &View| {
+        let factor = (COMPARED_SIDE / f64::from(camera.width.max(camera.height))).min(1.);
+        let side = |pixels: u32| ((f64::from(pixels) * factor).round() as i64).max(1);
+        // A photo with another mask shows something else.
+        let image = match mask.as_ref().map(Pixels::to_float) {
+            Some(mask) => Tensor::cat(&[image.to_float() * &mask, mask], 0),
+            None => image.to_float(),
         };
-        if !kept.iter().any(is_nearly) {
-            kept.push(index);
+        image.unsqueeze(0).adaptive_avg_pool2d([side(camera.height), side(camera.width)])
+    };
+    let mut kept: Vec<(Camera, Tensor)> = vec![];
+    let is_kept = |view: &View| {
+        let small = small(view);
+        let is_nearly = |(camera, image): &(Camera, Tensor)| {
+            are_near_duplicates(&view.camera, camera, depth)
+                && small.size() == image.size()
+                && (&small - image).square().mean(Kind::Float).double_value(&[]) <= NEARLY_EQUAL
+        };
+        let is_distinct = !kept.iter().any(is_nearly);
+        if is_distinct {
+            kept.push((view.camera, small));
         }
-    }
-    kept
+        is_distinct
+    };
+    photos.iter().map(is_kept).collect()
 }
 
 /// Photos at several sizes, from the smallest to the full size. Photos of one size are grouped.
 #[derive(Debug)]
-pub struct Photos {
+pub(crate) struct Photos {
     sizes: Vec<Vec<Group>>,
     /// Fractions of the optimization at which the next size begins.
     schedule: Vec<f64>,
@@ -102,10 +103,8 @@ pub struct Photos {
 struct Group {
     /// Indices among all photos.
     indices: Vec<usize>,
-    /// Image of each photo, [3, H, W].
-    images: Vec<Pixels>,
-    /// Mask of each photo, [1, H, W]; `None` if every pixel of all photos counts.
-    masks: Option<Vec<Pixels>>,
+    /// Photos on the device of the optimization, all of them with a mask or none.
+    views: Vec<View>,
     /// Camera-to-world and world-to-camera matrices [1, V, 4, 4], and intrinsics [1, V, 3, 3].
     matrices: [Tensor; 3],
     /// Known depths of each photo.
@@ -123,111 +122,82 @@ pub(super) struct TrainBatch<'a> {
 }
 
 impl Group {
-    /// Creates a group of photos, some of which have a map in `depth_maps` at their index among all photos.
-    fn new(
-        indices: Vec<usize>,
-        images: Vec<Pixels>,
-        masks: Option<Vec<Pixels>>,
-        matrices: [Tensor; 3],
-        depth_maps: &[Option<&DepthMap>],
-    ) -> Self {
-        let (size, device) = (images[0].size(), matrices[0].device());
-        let known =
-            |&index: &usize| depth_maps[index].map(|map| KnownDepths::new(map, size[2], size[1], device));
-        Group { depths: indices.iter().map(known).collect(), indices, images, masks, matrices }
-    }
-
-    /// Creates a group of `views` of one size on `device`, which have the indices `indices` among all photos.
-    fn from_views(
-        indices: Vec<usize>,
-        views: &[&View],
-        depth_maps: &[Option<&DepthMap>],
-        device: Device,
-    ) -> Self {
-        let images: Vec<Pixels> = views.iter().map(|view| view.image.to_device(device)).collect();
-        let has_masks = views.iter().any(|view| view.mask.is_some());
-        let masks =
-            has_masks.then(|| views.iter().map(|view| view.mask_or_ones().to_device(device)).collect());
+    /// Creates a group of `views`, some of which have a map in `depth_maps`.
+    fn new(indices: &[usize], views: Vec<View>, depth_maps: &[Option<&DepthMap>], device: Device) -> Self {
         let cameras: Vec<Camera> = views.iter().map(|view| view.camera).collect();
-        Group::new(indices, images, masks, view_matrices(&cameras, device), depth_maps)
+        let known = |(&index, view): (&usize, &View)| {
+            depth_maps[index].map(|map| KnownDepths::new(map, &view.camera, device))
+        };
+        let depths = indices.iter().zip(&views).map(known).collect();
+        Group { depths, indices: indices.into(), matrices: view_matrices(&cameras, device), views }
     }
 
     /// Returns the photos at `positions` as a batch.
     fn select(&self, positions: &[usize]) -> ViewBatch {
-        let stack = |pixels: &[Pixels]| {
-            let chosen: Vec<&Pixels> = positions.iter().map(|&view| &pixels[view]).collect();
-            Pixels::stack(&chosen).unsqueeze(0)
-        };
+        let stack = |pixels: Vec<&Pixels>| Pixels::stack(&pixels).unsqueeze(0);
+        let masks: Option<Vec<&Pixels>> =
+            positions.iter().map(|&view| self.views[view].mask.as_ref()).collect();
         let [c2w, w2c, intrinsics] =
             self.matrices.each_ref().map(|matrices| select_views(matrices, positions));
-        let masks = self.masks.as_deref().map(stack);
-        ViewBatch { images: stack(&self.images), masks, depths: None, c2w, w2c, intrinsics }
-    }
-
-    /// Returns the photos at half their width and height, or as they are if they would become too small. Pixels are rounded to 8 bits.
-    fn halved(&self, depth_maps: &[Option<&DepthMap>]) -> Self {
-        let size = self.images[0].size();
-        let [c2w, w2c, intrinsics] = self.matrices.each_ref().map(Tensor::shallow_clone);
-        if size[1].min(size[2]) < 2 * i64::from(MIN_SHORTER_SIDE) {
-            let clones = |pixels: &[Pixels]| pixels.iter().map(Pixels::shallow_clone).collect();
-            let (images, masks) = (clones(&self.images), self.masks.as_deref().map(clones));
-            return Group::new(self.indices.clone(), images, masks, [c2w, w2c, intrinsics], depth_maps);
-        }
-        let half = |t: &Tensor| t.unsqueeze(0).avg_pool2d(2, 2, 0, false, true, None).squeeze_dim(0);
-        let allocate = |channels: i64| {
-            let shape = [channels, size[1] / 2, size[2] / 2];
-            Pixels::allocate(self.images.len() as i64, shape, c2w.device())
-        };
-        let (mut images, mut masks) = (allocate(3), self.masks.as_ref().map(|_| allocate(1)));
-        for (index, image) in self.images.iter().enumerate() {
-            let mask = self.masks.as_ref().map(|masks| masks[index].to_float());
-            let (image, mask) = pool_masked(&image.to_float(), mask.as_ref(), half);
-            images[index].copy_from_floats(&image);
-            if let (Some(masks), Some(mask)) = (&mut masks, mask) {
-                masks[index].copy_from_floats(&mask);
-            }
-        }
-        let intrinsics = intrinsics.copy();
-        let _ = intrinsics.narrow(2, 0, 2).g_mul_scalar_(0.5);
-        Group::new(self.indices.clone(), images, masks, [c2w, w2c, intrinsics], depth_maps)
+        let images = stack(positions.iter().map(|&view| &self.views[view].image).collect());
+        ViewBatch { images, masks: masks.map(stack), depths: None, c2w, w2c, intrinsics }
     }
 }
 
-impl Photos {
-    /// Creates photos from `views` at their own size only.
-    pub(crate) fn from_batch(views: ViewBatch) -> Self {
-        assert!(views.masks.is_none(), "no masks are expected here");
-        let (size, device) = (views.images.size(), views.images.device());
-        let mut images = Pixels::allocate(size[1], [size[2], size[3], size[4]], device);
-        for (index, image) in images.iter_mut().enumerate() {
-            image.copy_from_floats(&views.images.get(0).get(index as i64));
-        }
-        let matrices = [views.c2w, views.w2c, views.intrinsics];
-        let group =
-            Group::new((0..images.len()).collect(), images, None, matrices, &vec![None; size[1] as usize]);
-        Photos { sizes: vec![vec![group]], schedule: vec![] }
+/// Returns views of one size at half their width and height, or as they are if they would become too small. Pixels are rounded to 8 bits.
+fn halved(views: &[View], device: Device) -> Vec<View> {
+    let Camera { width, height, .. } = views[0].camera;
+    if width.min(height) < 2 * MIN_SHORTER_SIDE {
+        return views.iter().map(View::shallow_clone).collect();
     }
+    let half = |t: &Tensor| t.unsqueeze(0).avg_pool2d(2, 2, 0, false, true, None).squeeze_dim(0);
+    let (width, height) = (width / 2, height / 2);
+    let allocate = |channels: i64| {
+        Pixels::allocate(views.len() as i64, [channels, i64::from(height), i64::from(width)], device)
+    };
+    let mut masks = views[0].mask.is_some().then(|| allocate(1)).into_iter().flatten();
+    let halve = |(view, mut small): (&View, Pixels)| {
+        let mask = view.mask.as_ref().map(Pixels::to_float);
+        let (image, mask) = pool_masked(&view.image.to_float(), mask.as_ref(), half);
+        small.copy_from_floats(&image);
+        let mask = masks.next().zip(mask).map(|(mut small, mask)| {
+            small.copy_from_floats(&mask);
+            small
+        });
+        let Intrinsics { fx, fy, cx, cy } = view.camera.intrinsics;
+        let intrinsics = Intrinsics { fx: fx / 2., fy: fy / 2., cx: cx / 2., cy: cy / 2. };
+        let camera = Camera { intrinsics, width, height, ..view.camera };
+        View { name: view.name.clone(), image: small, mask, camera }
+    };
+    views.iter().zip(allocate(3)).map(halve).collect()
+}
 
-    /// Creates photos from `views`, at least one, at the sizes of `config`'s schedule, each half as wide and high as the next. Depths of
-    /// some of them are known from `depth_maps`.
-    pub fn new(views: &[View], depth_maps: &[DepthMap], config: &RefineConfig, device: Device) -> Self {
+impl Photos {
+    /// Creates photos from `views`, at least one, at the sizes of `options`' schedule, each half as wide and high as the next, on its device.
+    /// Depths of some of them are known from `depth_maps`.
+    pub(crate) fn new(views: &[View], depth_maps: &[DepthMap], options: &RefineOptions) -> Self {
+        let device = options.device;
         let map_of = |view: &View| depth_maps.iter().find(|map| map.photo == view.name);
         let depth_maps: Vec<Option<&DepthMap>> = views.iter().map(map_of).collect();
-        let longest_side = views.iter().map(|view| view.camera.width.max(view.camera.height)).max();
-        let schedule = config.schedule(longest_side.unwrap_or(0));
+        let schedule = options.schedule(longest_side(views));
         let mut groups: BTreeMap<(u32, u32), Vec<usize>> = BTreeMap::new();
         for (index, View { camera, .. }) in views.iter().enumerate() {
             groups.entry((camera.height, camera.width)).or_default().push(index);
         }
-        let group = |indices: Vec<usize>| {
-            let views: Vec<&View> = indices.iter().map(|&i| &views[i]).collect();
-            Group::from_views(indices, &views, &depth_maps, device)
+        let whole = |indices: Vec<usize>| {
+            let has_masks = indices.iter().any(|&index| views[index].mask.is_some());
+            let on_device = |&index: &usize| View {
+                image: views[index].image.to_device(device),
+                mask: has_masks.then(|| views[index].mask_or_ones().to_device(device)),
+                ..views[index].shallow_clone()
+            };
+            Group::new(&indices, indices.iter().map(on_device).collect(), &depth_maps, device)
         };
-        let whole = groups.into_values().map(group).collect();
-        let mut sizes: Vec<Vec<Group>> = vec![whole];
+        let mut sizes: Vec<Vec<Group>> = vec![groups.into_values().map(whole).collect()];
         for _ in &schedule {
-            let halves = sizes[sizes.len() - 1].iter().map(|group| group.halved(&depth_maps)).collect();
-            sizes.push(halves);
+            let half =
+                |group: &Group| Group::new(&group.indices, halved(&group.views, device), &depth_maps, device);
+            sizes.push(sizes[sizes.len() - 1].iter().map(half).collect());
         }
         sizes.reverse();
         Photos { sizes, schedule }
@@ -254,7 +224,6 @@ impl Photos {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::Intrinsics;
     use glam::DMat4;
 
     /// Smaller copies are means of four pixels, or of those that count, rounded to 8 bits; photos stay as they were read.
@@ -275,7 +244,7 @@ mod tests {
                 mask: mask.as_ref().map(|mask| mask.shallow_clone().into()),
                 camera,
             };
-            let photos = Photos::new(&[view], &[], &RefineConfig::default(), Device::Cpu);
+            let photos = Photos::new(&[view], &[], &RefineOptions::default());
             let [half, whole] = [1, 2].map(|size| photos.sizes[size][0].select(&[0]));
             assert!(whole.images.equal(&(&levels / 255.).view([1, 1, 3, height, width])));
             let halves = |t: &Tensor| t.unsqueeze(0).avg_pool2d(2, 2, 0, false, true, None).squeeze_dim(0);

@@ -1,6 +1,6 @@
 //! Relocation of dead Gaussians to where more are needed (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo").
 
-use super::gaussian_params::GaussianParams;
+use super::gaussian_optimizer::GaussianParams;
 use rand::Rng;
 use rand::distr::weighted::WeightedIndex;
 use rand::prelude::Distribution;
@@ -21,7 +21,7 @@ const SENSITIVITY_POWER: f64 = 0.5;
 /// opacities and scales of all Gaussians that then coincide so that together they look like the original one. Then displaces the moved
 /// Gaussians within the original one, by `spread` of its standard deviations, so that they get different gradients. Returns the indices of
 /// the changed Gaussians.
-pub fn relocate(
+pub(super) fn relocate(
     params: &GaussianParams,
     squared_gradients: &Tensor,
     dead: f64,
@@ -31,12 +31,13 @@ pub fn relocate(
     let numbers = |t: Tensor| {
         Vec::<f64>::try_from(t.view([-1]).to_kind(Kind::Double)).expect("one number per Gaussian")
     };
-    let opacities = numbers(params.opacity_logits.sigmoid());
+    let [means, log_scales, quaternions, opacity_logits, ..] = &params.0;
+    let opacities = numbers(opacity_logits.sigmoid());
     let (gone, alive): (Vec<usize>, Vec<usize>) = (0..opacities.len()).partition(|&i| opacities[i] <= dead);
     if gone.is_empty() || alive.is_empty() {
         return vec![];
     }
-    let sizes = params.log_scales.mean_dim([2].as_slice(), false, Kind::Double).exp();
+    let sizes = log_scales.mean_dim([2].as_slice(), false, Kind::Double).exp();
     let sensitivities =
         numbers(squared_gradients.sum_dim_intlist([2].as_slice(), false, Kind::Double).sqrt() * sizes);
     let weight = |&i: &usize| {
@@ -57,7 +58,7 @@ pub fn relocate(
         let opacity = opacity.clamp(MIN_OPACITY, 1. - 1e-6);
         logits.push((opacity / (1. - opacity)).ln() as f32);
     }
-    let device = params.means.device();
+    let device = means.device();
     let index = |of: &[usize]| {
         Tensor::from_slice(&of.iter().map(|&i| i as i64).collect::<Vec<_>>()).to_device(device)
     };
@@ -65,18 +66,17 @@ pub fn relocate(
     let (to, from, at) = (index(&gone), index(&sources), index(&changed));
     tch::no_grad(|| {
         let count = changed.len() as i64;
-        let _ = params.opacity_logits.shallow_clone().index_copy_(1, &at, &tensor(&logits).view([1, count]));
-        let smaller = params.log_scales.index_select(1, &at) + tensor(&shrink).view([1, count, 1]);
-        let _ = params.log_scales.shallow_clone().index_copy_(1, &at, &smaller);
-        for (_, tensor) in params.named_parameters() {
+        let _ = opacity_logits.shallow_clone().index_copy_(1, &at, &tensor(&logits).view([1, count]));
+        let smaller = log_scales.index_select(1, &at) + tensor(&shrink).view([1, count, 1]);
+        let _ = log_scales.shallow_clone().index_copy_(1, &at, &smaller);
+        for tensor in &params.0 {
             let _ = tensor.shallow_clone().index_copy_(1, &to, &tensor.index_select(1, &from));
         }
         let offsets: Vec<f32> =
             (0..3 * gone.len()).map(|_| random.random_range(-UNIT_SPREAD..UNIT_SPREAD)).collect();
-        let offsets =
-            tensor(&offsets).view([1, -1, 3]) * params.log_scales.index_select(1, &to).exp() * spread;
-        let moved = rotate(&params.quaternions.index_select(1, &to), &offsets);
-        let _ = params.means.shallow_clone().index_add_(1, &to, &moved);
+        let offsets = tensor(&offsets).view([1, -1, 3]) * log_scales.index_select(1, &to).exp() * spread;
+        let moved = rotate(&quaternions.index_select(1, &to), &offsets);
+        let _ = means.shallow_clone().index_add_(1, &to, &moved);
     });
     changed.extend(gone);
     changed.into_iter().map(|i| i as i64).collect()
@@ -131,80 +131,67 @@ mod tests {
         }
     }
 
-    /// Returns ten Gaussians in a row, of which the first four are dead.
-    fn ten_gaussians() -> GaussianParams {
+    /// Relocates the first four of ten Gaussians in a row, which are dead, with the squared gradients of `[10, 3]` means. Returns means, scales
+    /// and opacity logits, and the changed Gaussians.
+    fn relocated(squared_gradients: &Tensor, spread: f64) -> ([Tensor; 3], Vec<i64>) {
         let options = (Kind::Float, tch::Device::Cpu);
         let logits: Vec<f32> = (0..10).map(|i| if i < 4 { -8. } else { 2. }).collect();
-        GaussianParams::from_raw(
-            &RawGaussians {
-                means: Tensor::arange(30, options).view([1, 10, 3]),
-                log_scales: Tensor::from_slice(&[-3f32, -4., -5.]).expand([1, 10, 3], false).contiguous(),
-                // A quarter turn about z, at twice the length.
-                quaternions: Tensor::from_slice(&[1f32, 0., 0., 1.]).expand([1, 10, 4], false).contiguous(),
-                opacity_logits: Tensor::from_slice(&logits).view([1, 10]),
-                sh: Tensor::zeros([1, 10, 1, 3], options),
-            },
-            0,
-        )
+        let raw = RawGaussians {
+            means: Tensor::arange(30, options).view([1, 10, 3]),
+            log_scales: Tensor::from_slice(&[-3f32, -4., -5.]).expand([1, 10, 3], false).contiguous(),
+            // A quarter turn about z, at twice the length.
+            quaternions: Tensor::from_slice(&[1f32, 0., 0., 1.]).expand([1, 10, 4], false).contiguous(),
+            opacity_logits: Tensor::from_slice(&logits).view([1, 10]),
+            sh: Tensor::zeros([1, 10, 1, 3], options),
+        };
+        let params = GaussianParams::from_raw(&raw, 0);
+        let mut random = ChaCha8Rng::seed_from_u64(1);
+        let changed = relocate(&params, &squared_gradients.unsqueeze(0), 0.01, spread, &mut random);
+        let none = relocate(&params, &squared_gradients.unsqueeze(0), 0.01, spread, &mut random);
+        assert!(none.is_empty(), "none are dead any more");
+        let [means, log_scales, _, logits, ..] = params.0;
+        ([means.detach().get(0), log_scales.detach().exp().get(0), logits.detach().get(0)], changed)
     }
 
-    fn random() -> ChaCha8Rng {
-        ChaCha8Rng::seed_from_u64(1)
+    fn zeros() -> Tensor {
+        Tensor::zeros([10, 3], (Kind::Float, tch::Device::Cpu))
     }
 
     #[test]
     fn dead_gaussians_go_where_others_are() {
-        let params = ten_gaussians();
-        let still = params.means.zeros_like();
-        let mut changed = relocate(&params, &still, 0.01, 0., &mut random());
-        let means: Vec<f64> = Vec::try_from(params.means.to_kind(Kind::Double).view([-1])).unwrap();
+        let ([means, _, logits], mut changed) = relocated(&zeros(), 0.);
         for dead in 0..4 {
-            let at = means[3 * dead];
-            assert!(at >= 12., "Gaussian {dead} is still where it was");
-            let source = (at / 3.) as usize;
-            assert!(changed.contains(&(source as i64)) && changed.contains(&(dead as i64)));
-            let logit = |i: usize| params.opacity_logits.double_value(&[0, i as i64]);
+            let source = (4..10).find(|&source| means.get(dead).equal(&means.get(source))).expect("a source");
+            assert!(changed.contains(&source) && changed.contains(&dead));
+            let logit = |index: i64| logits.double_value(&[index]);
             assert!(logit(dead) == logit(source) && logit(source) < 2.);
         }
         changed.sort_unstable();
-        let before = changed.len();
-        changed.dedup();
-        assert_eq!(changed.len(), before);
-        assert!(relocate(&params, &still, 0.01, 0., &mut random()).is_empty());
+        assert!(changed.is_sorted_by(|a, b| a < b), "each once");
     }
 
     #[test]
     fn gaussians_move_onto_sensitive_ones() {
-        let params = ten_gaussians();
         // The root of the sensitivity of the last is a million times that of the others.
-        let gradients = params.means.ones_like() * 1e-24;
-        let _ = gradients.narrow(1, 9, 1).fill_(1.);
+        let gradients = zeros() + 1e-24;
+        let _ = gradients.get(9).fill_(1.);
         // One whose gradients have overflowed attracts nothing.
-        let _ = gradients.narrow(1, 8, 1).fill_(f64::INFINITY);
-        let _ = relocate(&params, &gradients, 0.01, 0., &mut random());
-        for dead in 0..4 {
-            assert!(params.means.get(0).get(dead).equal(&params.means.get(0).get(9)), "{dead}");
-        }
+        let _ = gradients.get(8).fill_(f64::INFINITY);
+        let ([means, ..], _) = relocated(&gradients, 0.);
+        assert!((0..4).all(|dead| means.get(dead).equal(&means.get(9))), "{means:?}");
     }
 
     #[test]
     fn moved_gaussians_are_spread_within_the_original_one() {
-        let [together, apart] = [0., 0.5].map(|spread| {
-            let params = ten_gaussians();
-            let _ = relocate(&params, &params.means.zeros_like(), 0.01, spread, &mut random());
-            params
-        });
-        let moved = (&apart.means - &together.means).abs().get(0);
-        let scales = together.log_scales.exp().get(0);
-        assert!(moved.narrow(0, 4, 6).eq(0.).all().int64_value(&[]) == 1);
-        for dead in 0..4 {
-            let value = |t: &Tensor, axis: i64| t.double_value(&[dead, axis]);
-            // The turn exchanges x and y. Coordinates up to 30 are rounded to 2e-6.
-            for (axis, own) in [(0, 1), (1, 0), (2, 2)] {
-                let most = 0.5 * f64::from(UNIT_SPREAD) * value(&scales, own) + 4e-6;
-                let shift = value(&moved, axis);
-                assert!(0. < shift && shift < most, "{dead}, {axis}: {shift} of {most}");
-            }
+        let [([together, scales, _], _), ([apart, ..], _)] =
+            [0., 0.5].map(|spread| relocated(&zeros(), spread));
+        let moved = (apart - together).abs();
+        assert_eq!(moved.narrow(0, 4, 6).max().double_value(&[]), 0.);
+        // The turn exchanges x and y. Coordinates up to 30 are rounded to 2e-6.
+        for (dead, (axis, own)) in (0..4).flat_map(|dead| [(0, 1), (1, 0), (2, 2)].map(|axes| (dead, axes))) {
+            let most = 0.5 * f64::from(UNIT_SPREAD) * scales.double_value(&[dead, own]) + 4e-6;
+            let shift = moved.double_value(&[dead, axis]);
+            assert!(0. < shift && shift < most, "{dead}, {axis}: {shift} of {most}");
         }
     }
 }

@@ -1,24 +1,25 @@
 //! Refinement session from a capture to Gaussians: reads the photos, creates the initial Gaussians, optimizes them, and scores them on a
 //! few views during the optimization. All of it shares one budget and uses a local frame of the capture (spec 2.5).
 
-use super::config::RefineConfig;
-use super::corrections::{Correction, Corrections};
-use super::events::{EvalPoint, RefineEvent, RefineMetrics, ViewSample, summarize_names};
+use super::events::{EvalPoint, RefineEvent};
 use super::exposures::LogGains;
 use super::gaussian_optimizer::GaussianOptimizer;
 use super::init::{PhotoInit, SceneInit, gaussians_from_photos, most_visible};
-use super::options::{Budget, ExposureCorrection, RefineOptions, TimeBudget};
+use super::options::{Budget, ExposureCorrection, RefineOptions};
+use super::photo_opt::{Correction, PhotoOpt};
 use super::photos::{Photos, distinct, load_photos};
 use super::state::{Record, RefineState};
+use super::time_budget::TimeBudget;
 use super::{OptimizeArgs, refine, scene_depth};
 use crate::data::{Capture, PhotoSize, Point, View, read_points};
+use crate::device::Stopwatch;
 use crate::error::{Error, Result};
 use crate::io::Splat;
 use crate::metrics::{CaptureScores, ContactSheet, Perceptual, Scores, score_views};
 use crate::reconstruct::{LoadedModel, Model, reconstruct, spread_over_path};
 use crate::scene::{Camera, Gaussians, LocalFrame, RawGaussians};
 use crate::stereo::DepthMap;
-use std::collections::BTreeMap;
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 use tch::Tensor;
 
@@ -30,6 +31,10 @@ const METRICS_EVERY: u64 = 50;
 const LPIPS_PHOTOS: usize = 8;
 /// Fractions of the optimization at which the held-out views are scored.
 const EVAL_FRACTIONS: [f64; 12] = [0., 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9];
+/// Maximum number of views in a sample.
+const MAX_SAMPLE: usize = 8;
+/// Maximum number of pixels of all views in a sample that is scored several times, if it has more than two.
+const MAX_SAMPLE_PIXELS: u64 = 1_200_000;
 
 /// Result of a session.
 #[derive(Debug)]
@@ -56,9 +61,6 @@ pub struct RefineResult {
     pub shown_photos: usize,
     /// Scores of a sample of the held-out views during the optimization.
     pub curve: Vec<EvalPoint>,
-    /// Scores of the initial Gaussians on whole held-out views; `None` if there are none, or if the callback ended the scoring.
-    /// [`RefineSession::score_held_out`] also scores the final Gaussians.
-    pub held_out_before: Option<CaptureScores>,
 }
 
 /// Initial Gaussians of a session.
@@ -102,10 +104,9 @@ struct Start {
 /// ```
 pub struct RefineSession<'a> {
     capture: &'a Capture,
-    options: &'a RefineOptions,
+    /// Options with their settings. `antialiased` is also set for an initial splat or state that is antialiased.
+    options: RefineOptions,
     init: SceneInit<'a>,
-    /// Hyperparameters of the options. `antialiased` is also set for an initial splat or state that is antialiased.
-    config: RefineConfig,
     /// Final number of Gaussians. A session that is ended early may have fewer.
     gaussians: usize,
     size: PhotoSize,
@@ -115,10 +116,8 @@ pub struct RefineSession<'a> {
     frame: LocalFrame,
     photos: Vec<View>,
     held_out: Vec<View>,
-    /// Views among `scored` that are scored during the optimization.
-    held_out_sample: ViewSample,
-    /// Held-out views that there is time to score as a whole.
-    scored: Vec<View>,
+    /// Interval between the held-out views that there is time to score as a whole.
+    scored_every: usize,
     start: Option<Start>,
     near_duplicates: usize,
     /// Depths of some photos, if Gaussians were created from them.
@@ -134,66 +133,57 @@ impl<'a> RefineSession<'a> {
     /// progress events and ends the work if it returns `false`.
     ///
     /// # Errors
-    /// Fails if an option is out of range, like [`load_photos`], and if `on_event` ends the work before all photos are read.
+    /// Fails if an option is out of range, if a photo can't be read or has fewer than [`MIN_SIDE`](crate::data::MIN_SIDE) pixels along a
+    /// side, and if `on_event` ends the work before all photos are read.
     pub fn load(
         capture: &'a Capture,
-        options: &'a RefineOptions,
+        options: &RefineOptions,
         init: SceneInit<'a>,
         mut on_event: impl FnMut(RefineEvent) -> bool + 'a,
     ) -> Result<Self> {
         let clock = options.started.unwrap_or_else(Instant::now);
-        options.check()?;
-        let config = options.config(init.is_splat())?;
-        let (gaussians, size) = init.sizes(capture, options);
+        let options = options.resolve(init.is_splat())?;
+        let (gaussians, size) = init.sizes(capture, &options);
         let ([shown, held_out], warning) = options.select_views(capture, size);
         if let Some(line) = warning {
-            let _ = on_event(RefineEvent::Warning(&line));
+            on_event(RefineEvent::Warning(&line));
         }
         let count = shown.len() + held_out.len();
         let mut should_continue = |done: usize| on_event(RefineEvent::Loading { done, count });
         let mut photos = load_photos(capture, &shown, size, &mut should_continue)?;
         let mut held_out =
             load_photos(capture, &held_out, size, |done| should_continue(photos.len() + done))?;
-        let frame = LocalFrame::from_cameras(&capture.cameras());
-        let masked_out = [&mut photos, &mut held_out].map(|views| {
-            let masked_out = views.extract_if(.., |view| view.is_masked_out());
-            masked_out.map(|view| view.name).collect::<Vec<String>>()
-        });
-        let masked_out = masked_out.concat();
+        let masked_out: Vec<String> = [&mut photos, &mut held_out]
+            .into_iter()
+            .flat_map(|views| views.extract_if(.., |view| view.is_masked_out()))
+            .map(|view| view.name)
+            .collect();
         if photos.is_empty() {
-            return Err(Error::input(
-                capture.file(),
-                "the masks",
-                "no pixel that counts",
-                "some in every photo",
-            ));
+            let expected = "some in every photo";
+            return Err(Error::input(capture.file(), "the masks", "no pixel that counts", expected));
         }
         if !masked_out.is_empty() {
-            let line = format!(
-                "{}: masked out as a whole, and left out: {}",
-                capture.name,
-                summarize_names(&masked_out)
-            );
+            let names = summarize_names(&masked_out);
+            let line = format!("{}: masked out as a whole, and left out: {names}", capture.name);
             on_event(RefineEvent::Warning(&line));
         }
+        let frame = LocalFrame::from_cameras(&capture.cameras());
         for view in photos.iter_mut().chain(&mut held_out) {
             view.camera = frame.camera_to_local(&view.camera);
         }
         Ok(RefineSession {
             capture,
-            options,
             init,
-            config,
             gaussians,
             size,
             time: TimeBudget::new(options.budget(), clock),
+            options,
             on_event: Box::new(on_event),
             is_stopped: false,
             frame,
-            held_out_sample: ViewSample::small(&[]),
             photos,
             held_out,
-            scored: vec![],
+            scored_every: 1,
             start: None,
             near_duplicates: 0,
             depth_maps: vec![],
@@ -257,27 +247,26 @@ impl<'a> RefineSession<'a> {
     /// # Errors
     /// Fails if the model or the rasterizer fails, if no camera sees the splat, or if `on_event` ends the work before there are Gaussians.
     pub fn start(&mut self) -> Result<Gaussians> {
-        let mut warnings = vec![];
-        let RefineOptions { correct_exposures, device, .. } = *self.options;
+        let (exposures, device) = (self.options.correct_exposures, self.options.device);
         let final_count = if self.init.is_splat() { 0 } else { self.gaussians as i64 };
         // Gaussians of a new optimizer, or the optimizer of a state.
         let (mut raw, mut optimizer) = (None, None);
         let gaussians = match self.init {
             SceneInit::Splat(splat) => {
-                self.config.antialiased |= splat.antialiased;
+                self.options.antialiased |= splat.antialiased;
                 let local = Gaussians::from_splat(splat).to_local(&self.frame, splat.origin);
                 let local = raw.insert(RawGaussians::from_gaussians(&local.to_device(device)));
                 Gaussians { antialiased: splat.antialiased, ..local.activate() }
             }
             SceneInit::State(state) => {
-                self.config.antialiased |= state.record.antialiased;
+                self.options.antialiased |= state.record.antialiased;
                 if state.record.has_depths {
-                    let _ = self.gaussians_from_photos(self.initial_count())?.ok_or_else(stopped)?;
+                    self.gaussians_from_photos(self.initial_count())?.ok_or_else(stopped)?;
                 }
-                if correct_exposures == ExposureCorrection::Auto {
+                if exposures == ExposureCorrection::Auto {
                     self.log_exposures = state.has_exposures().then(|| self.equal_exposures());
                 }
-                let known = GaussianOptimizer::from_state(state, &self.config, final_count, device)?;
+                let known = GaussianOptimizer::from_state(state, &self.options, final_count)?;
                 optimizer.insert(known).averaged_gaussians()
             }
             SceneInit::Model(loaded) => self.reconstruct(loaded)?,
@@ -286,29 +275,28 @@ impl<'a> RefineSession<'a> {
                     let why = "one photo gives no depth: expected two or more, or an initial splat";
                     return Err(Error::request(why));
                 }
-                if self.are_in_one_place() {
+                let center = |view: &View| view.camera.c2w.w_axis;
+                if self.photos.iter().all(|view| center(view) == center(&self.photos[0])) {
                     let line = "the photos were all taken from one position, so that depth can't be estimated: everything is placed at one distance";
-                    warnings.push(format!("{}: {line}", self.capture.name));
+                    self.warn(&format!("{}: {line}", self.capture.name));
                 }
                 let new = self.gaussians_from_photos(self.initial_count())?.ok_or_else(stopped)?;
-                warnings.extend(self.exposure_warning());
-                Gaussians { antialiased: self.config.antialiased, ..raw.insert(new).activate() }
+                Gaussians { antialiased: self.options.antialiased, ..raw.insert(new).activate() }
             }
         };
-        if correct_exposures == ExposureCorrection::On && self.log_exposures.is_none() {
+        if exposures == ExposureCorrection::On && self.log_exposures.is_none() {
             self.log_exposures = Some(self.equal_exposures());
         }
         let depth = match self.init {
             SceneInit::State(state) => state.record.depth,
             _ => scene_depth(&gaussians, &self.photos)?,
         };
-        warnings.extend(self.leave_out_near_duplicates(depth));
+        self.leave_out_near_duplicates(depth);
         if let SceneInit::State(state) = self.init {
             self.check_state(state)?;
         }
-        warnings.iter().for_each(|line| self.warn(line));
-        let new = || Some(GaussianOptimizer::new(raw.as_ref()?, depth, &self.config, final_count));
-        let optimizer = optimizer.or_else(new);
+        let new = |raw: RawGaussians| GaussianOptimizer::new(&raw, depth, &self.options, final_count);
+        let optimizer = optimizer.or_else(|| raw.map(new));
         self.start = Some(Start { gaussians: gaussians.map(Tensor::shallow_clone), depth, optimizer });
         Ok(gaussians)
     }
@@ -316,9 +304,9 @@ impl<'a> RefineSession<'a> {
     /// Returns the reconstruction of the photos by a model.
     fn reconstruct(&self, loaded: &LoadedModel) -> Result<Gaussians> {
         let data = &loaded.config.data;
-        let all: Vec<usize> = (0..self.photos.len()).collect();
-        let count = self.options.views.unwrap_or(data.context_views);
-        let context = spread_over_path(&self.cameras(), &all, count)
+        let cameras: Vec<Camera> = self.photos.iter().map(|photo| photo.camera).collect();
+        let all: Vec<usize> = (0..cameras.len()).collect();
+        let context = spread_over_path(&cameras, &all, self.options.max_views.unwrap_or(data.context_views))
             .into_iter()
             .map(|index| self.photos[index].fitted(data.image_size))
             .collect::<Result<Vec<_>>>()?;
@@ -331,11 +319,10 @@ impl<'a> RefineSession<'a> {
 
     /// Returns the number of Gaussians to create from photos.
     fn initial_count(&self) -> usize {
-        self.options.initial_gaussians(self.gaussians, &self.config)
+        self.options.initial_gaussians_for(self.gaussians)
     }
 
-    /// Scores the result of [`RefineSession::start`] on the held-out views, optimizes it, and scores a sample of the photos before and
-    /// after.
+    /// Optimizes the result of [`RefineSession::start`], and scores a sample of the photos before and after.
     ///
     /// # Errors
     /// Fails if rendering fails.
@@ -345,18 +332,18 @@ impl<'a> RefineSession<'a> {
     pub fn run(&mut self) -> Result<RefineResult> {
         let Start { gaussians: initial, depth, optimizer } =
             self.start.take().expect("a session that was started");
-        self.scored = self.affordable_views(&initial)?;
-        self.held_out_sample = ViewSample::small(&self.scored);
-        let scoring = Instant::now();
-        let held_out_before = self.score_whole(&initial, &self.scored_views(), None)?;
-        self.reserve(scoring.elapsed());
+        if let Some(view) = self.held_out.first().map(View::shallow_clone) {
+            let begun = Instant::now();
+            self.score_whole(&initial, &[view], None)?;
+            self.scored_every = self.time.reserve_for_held_out(begun.elapsed(), self.held_out.len());
+        }
         self.time.reserve_for_writing(initial.count().max(self.gaussians as i64));
         let begun_scoring = Instant::now();
-        let sample = ViewSample::large(&self.photos);
-        let before = sample.corrected(&self.corrections(depth)?).score(&initial)?.expect("photos");
+        let before = self.score_photos(&initial, &self.photo_opt(depth)?)?;
         let time = begun_scoring.elapsed();
         self.reserve(time);
-        self.time.last_scoring = time.mul_f64(self.held_out_sample.len() as f64 / sample.len() as f64);
+        let shown_photos = self.photos.len().div_ceil(sample_interval(&self.photos, u64::MAX));
+        self.time.last_scoring = time.mul_f64(self.held_out_sample().len() as f64 / shown_photos as f64);
         if let Some(line) = self.time.late_start_warning() {
             self.warn(&line);
         }
@@ -364,18 +351,18 @@ impl<'a> RefineSession<'a> {
             self.add_eval_point(&initial)?;
         }
         let begun = self.time.seconds();
-        let (gaussians, learned, state) = if self.is_stopped {
-            (initial.map(Tensor::shallow_clone), Corrections::none(), None)
-        } else {
-            let (gaussians, learned, state) = self.optimize(&initial, optimizer, depth)?;
-            (gaussians, learned, Some(state))
-        };
-        let ended = self.time.seconds();
-        let after = sample.corrected(&learned).score(&gaussians)?.expect("photos");
-        let is_initial = after.psnr.is_nan() || after.psnr < before.psnr;
-        let corrections =
-            if learned.has_any() && !is_initial { learned.report(&self.photos) } else { vec![] };
-        let gaussians = if is_initial { initial.map(Tensor::shallow_clone) } else { gaussians };
+        let mut ended = begun;
+        let (mut gaussians, mut after) = (initial.map(Tensor::shallow_clone), before);
+        let (mut is_initial, mut corrections, mut state) = (true, vec![], None);
+        if !self.is_stopped {
+            let (optimized, photo_opt, its_state) = self.optimize(&initial, optimizer)?;
+            ended = self.time.seconds();
+            let scores = self.score_photos(&optimized, &photo_opt)?;
+            if !(scores.psnr.is_nan() || scores.psnr < before.psnr) {
+                (gaussians, after, is_initial) = (optimized, scores, false);
+                (corrections, state) = (photo_opt.report(&self.photos), Some(its_state));
+            }
+        }
         let splat = match self.init {
             SceneInit::Splat(splat) if is_initial => Splat { warnings: vec![], ..splat.clone() },
             _ => gaussians.to_world_units(&self.frame).to_splat(self.frame.origin)?,
@@ -385,36 +372,29 @@ impl<'a> RefineSession<'a> {
             initial,
             gaussians,
             is_initial,
-            state: state.filter(|_| !is_initial),
             corrections,
             steps: self.steps,
             seconds: [begun, ended],
-            shown_photos: sample.len(),
-            shown: if is_initial { [before; 2] } else { [before, after] },
+            state,
+            shown: [before, after],
+            shown_photos,
             curve: std::mem::take(&mut self.curve),
-            held_out_before,
         })
     }
 
-    /// Scores a result on whole held-out views: those that [`RefineSession::run`] scored before the optimization. With a time budget there
-    /// may be fewer than all. Returns the scores before and after the optimization; `None` if no views are held out, or if `on_event` ended
-    /// the scoring.
+    /// Scores a result on whole held-out views, with a time budget those that there is time for. Returns the scores before and after the
+    /// optimization; `None` if no views are held out, or if `on_event` ended the scoring.
     ///
     /// # Errors
     /// Fails if rendering fails.
     pub fn score_held_out(&mut self, result: &RefineResult) -> Result<Option<[CaptureScores; 2]>> {
-        let before = result.held_out_before.clone();
-        let after = if result.is_initial {
-            before.clone()
-        } else {
-            self.score_whole(&result.gaussians, &self.scored_views(), None)?
-        };
-        Ok(before.zip(after).map(<[CaptureScores; 2]>::from))
+        let views = every(&self.held_out, self.scored_every);
+        self.score_before_and_after(result, &views, None)
     }
 
     /// Returns the mean scores of the sample of [`EvalPoint`], given the scores of all views by [`RefineSession::score_held_out`].
     pub fn sample_scores(&self, scores: &CaptureScores) -> Scores {
-        self.held_out_sample.select_scores(scores)
+        mean_of_every(scores, self.held_out_sample_interval())
     }
 
     /// Scores the initial and the final Gaussians by LPIPS, with the networks whose weights are installed: on all held-out views, or on a
@@ -424,15 +404,15 @@ impl<'a> RefineSession<'a> {
     /// Fails if rendering fails, or if a file of weights is invalid.
     pub fn score_lpips(&mut self, result: &RefineResult) -> Result<Option<[CaptureScores; 2]>> {
         let perceptual = Perceptual::new(result.initial.means.device());
-        let count = if self.held_out.is_empty() { LPIPS_PHOTOS } else { self.held_out.len() };
-        let views: Vec<View> =
-            self.representative_views().iter().take(count).map(View::shallow_clone).collect();
-        let before = self.score_whole(&result.initial, &views, Some(&perceptual))?;
-        let after = self.score_whole(&result.gaussians, &views, Some(&perceptual))?;
-        if let Some(line) = after.as_ref().and_then(|after| Perceptual::explain_missing(&after.mean)) {
+        let mut views = every(self.representative_views(), 1);
+        if self.held_out.is_empty() {
+            views.truncate(LPIPS_PHOTOS);
+        }
+        let scores = self.score_before_and_after(result, &views, Some(&perceptual))?;
+        if let Some(line) = scores.as_ref().and_then(|[_, after]| Perceptual::explain_missing(&after.mean)) {
             self.warn(&line);
         }
-        Ok(before.zip(after).map(<[CaptureScores; 2]>::from))
+        Ok(scores)
     }
 
     /// Renders the held-out views, or else the photos, beside their photos: a row per view.
@@ -443,24 +423,22 @@ impl<'a> RefineSession<'a> {
         ContactSheet::render(&result.gaussians, self.representative_views())
     }
 
-    /// Returns an evenly spaced subset of the held-out views that can be scored within a time budget.
-    fn affordable_views(&mut self, gaussians: &Gaussians) -> Result<Vec<View>> {
-        let every = match self.options.budget() {
-            Budget::Time(_) if !self.held_out.is_empty() => {
-                let begun = Instant::now();
-                self.score_whole(gaussians, &[self.held_out[0].shallow_clone()], None)?;
-                self.time.affordable_every(begun.elapsed() * self.held_out.len() as u32)
-            }
-            _ => 1,
+    /// Scores the initial and the final Gaussians on whole views. Returns `None` if there are no views, or if `on_event` ends the scoring.
+    fn score_before_and_after(
+        &mut self,
+        result: &RefineResult,
+        views: &[View],
+        perceptual: Option<&Perceptual>,
+    ) -> Result<Option<[CaptureScores; 2]>> {
+        let before = self.score_whole(&result.initial, views, perceptual)?;
+        let after = match &before {
+            Some(before) if result.is_initial => Some(before.clone()),
+            Some(_) => self.score_whole(&result.gaussians, views, perceptual)?,
+            None => None,
         };
-        Ok(self.held_out.iter().step_by(every).map(View::shallow_clone).collect())
+        Ok(before.zip(after).map(<[CaptureScores; 2]>::from))
     }
 
-    fn scored_views(&self) -> Vec<View> {
-        self.scored.iter().map(View::shallow_clone).collect()
-    }
-
-    /// Scores Gaussians on whole views. Returns `None` if there are no views, or if `on_event` ends the scoring.
     fn score_whole(
         &mut self,
         gaussians: &Gaussians,
@@ -472,12 +450,25 @@ impl<'a> RefineSession<'a> {
         Ok(scores.filter(|scores| scores.views.len() == views.len()))
     }
 
-    fn warn(&mut self, line: &str) {
-        let _ = (self.on_event)(RefineEvent::Warning(line));
+    /// Scores Gaussians on a sample of the photos, to which corrections are applied.
+    fn score_photos(&self, gaussians: &Gaussians, photo_opt: &PhotoOpt) -> Result<Scores> {
+        let sample = self.photos.iter().enumerate().step_by(sample_interval(&self.photos, u64::MAX));
+        let views: Vec<View> = sample.map(|(index, view)| photo_opt.apply(index, view)).collect();
+        Ok(score_views("sample", gaussians, &views, None, |_| true)?.expect("at least one photo").mean)
     }
 
-    fn cameras(&self) -> Vec<Camera> {
-        self.photos.iter().map(|photo| photo.camera).collect()
+    /// Returns the interval between the views of the sample that is scored during the optimization, among those that are scored as a whole.
+    fn held_out_sample_interval(&self) -> usize {
+        sample_interval(&every(&self.held_out, self.scored_every), MAX_SAMPLE_PIXELS)
+    }
+
+    /// Returns the held-out views that are scored during the optimization.
+    fn held_out_sample(&self) -> Vec<View> {
+        every(&self.held_out, self.scored_every * self.held_out_sample_interval())
+    }
+
+    fn warn(&mut self, line: &str) {
+        let _ = (self.on_event)(RefineEvent::Warning(line));
     }
 
     fn photo_names(&self) -> Vec<String> {
@@ -490,65 +481,52 @@ impl<'a> RefineSession<'a> {
         [x, y, z, self.frame.scale]
     }
 
-    fn are_in_one_place(&self) -> bool {
-        let center = |view: &View| view.camera.c2w.w_axis;
-        self.photos.iter().all(|view| center(view) == center(&self.photos[0]))
-    }
-
-    /// Removes near duplicates from the photos. Returns a warning that names them, if there are any.
-    fn leave_out_near_duplicates(&mut self, depth: f64) -> Option<String> {
-        let keep = distinct(&self.photos, depth);
-        if keep.len() == self.photos.len() {
-            return None;
+    /// Removes near duplicates from the photos of a scene at `depth`, and names them.
+    fn leave_out_near_duplicates(&mut self, depth: f64) {
+        let all = self.photos.len();
+        let is_kept = distinct(&self.photos, depth);
+        let mut kept = is_kept.iter();
+        let left_out: Vec<String> = self
+            .photos
+            .extract_if(.., |_| !kept.next().expect("one for each photo"))
+            .map(|photo| photo.name)
+            .collect();
+        if let Some(exposures) = &mut self.log_exposures {
+            let mut kept = is_kept.iter();
+            exposures.retain(|_| *kept.next().expect("one for each photo"));
         }
-        let mut is_kept = vec![false; self.photos.len()];
-        keep.iter().for_each(|&index| is_kept[index] = true);
-        let mut left_out = vec![];
-        let photos = std::mem::take(&mut self.photos);
-        for (photo, is_kept) in photos.into_iter().zip(is_kept) {
-            if is_kept { self.photos.push(photo) } else { left_out.push(photo.name) }
-        }
-        let kept = |all: Vec<LogGains>| keep.iter().map(|&index| all[index]).collect();
-        self.log_exposures = self.log_exposures.take().map(kept);
         self.near_duplicates = left_out.len();
-        let (count, all) = (left_out.len(), left_out.len() + self.photos.len());
-        Some(format!(
-            "{}: {count} of {all} photos are nearly equal to others, and left out: {}",
-            self.capture.name,
-            summarize_names(&left_out)
-        ))
+        if !left_out.is_empty() {
+            let (name, count, names) = (&self.capture.name, left_out.len(), summarize_names(&left_out));
+            let line = "photos are nearly equal to others, and left out";
+            self.warn(&format!("{name}: {count} of {all} {line}: {names}"));
+        }
     }
 
-    /// Creates `count` Gaussians on the session's device. Returns `None` if the work is ended before any photo has depths.
+    /// Creates `count` Gaussians on the session's device, and says that exposures are corrected if this was not requested. Returns `None` if
+    /// the work is ended before any photo has depths.
     fn gaussians_from_photos(&mut self, count: usize) -> Result<Option<RawGaussians>> {
         let to_local = |point: Point| Point { position: self.frame.point_to_local(point.position), ..point };
         let points: Vec<Point> = read_points(self.capture)?.into_iter().map(to_local).collect();
-        let (time, on_event) = (&self.time, &mut self.on_event);
         let mut is_stopped = false;
         let should_continue = |done: usize| {
-            is_stopped |= !on_event(RefineEvent::Starting(done));
-            !is_stopped && !time.is_late_for_depths(done)
+            is_stopped |= !(self.on_event)(RefineEvent::Starting(done));
+            !is_stopped && !self.time.is_late_for_depths(done)
         };
-        let RefineOptions { seed, correct_exposures: correction, .. } = *self.options;
+        let RefineOptions { seed, correct_exposures: correction, .. } = self.options;
         let init = gaussians_from_photos(&self.photos, &points, count, seed, correction, should_continue);
         self.is_stopped |= is_stopped;
         let Some(PhotoInit { gaussians, depth_maps, log_exposures }) = init else { return Ok(None) };
+        let is_continued = matches!(self.init, SceneInit::State(_));
+        if let (Some(gains), ExposureCorrection::Auto, false) = (&log_exposures, correction, is_continued) {
+            let factors = gains.as_flattened().iter().map(|gain| gain.exp());
+            let [min, max] = [factors.clone().fold(f64::MAX, f64::min), factors.fold(0., f64::max)];
+            let line = "the exposures of neighboring photos differ, and all are corrected";
+            self.warn(&format!("{}: {line}: {min:.2} to {max:.2} times the average", self.capture.name));
+        }
         self.depth_maps = depth_maps;
         self.log_exposures = log_exposures;
         Ok(Some(gaussians.to_device(self.options.device)))
-    }
-
-    /// Returns a line that says that exposures are corrected, if this was not requested.
-    fn exposure_warning(&self) -> Option<String> {
-        let gains = self.log_exposures.as_ref()?;
-        let factors = gains.as_flattened().iter().map(|gain| gain.exp());
-        let [min, max] = [factors.clone().fold(f64::MAX, f64::min), factors.fold(0., f64::max)];
-        (self.options.correct_exposures == ExposureCorrection::Auto).then(|| {
-            format!(
-                "{}: the exposures of neighboring photos differ, and all are corrected: {min:.2} to {max:.2} times the average",
-                self.capture.name
-            )
-        })
     }
 
     /// Returns the exposures of photos that don't differ.
@@ -557,73 +535,60 @@ impl<'a> RefineSession<'a> {
     }
 
     /// Returns the corrections with which the optimization begins, those of a state if it continues from one.
-    fn corrections(&self, depth: f64) -> Result<Corrections> {
-        let (RefineOptions { correct_poses, device, .. }, config) = (self.options, &self.config);
-        let (count, exposures) = (self.photos.len(), self.log_exposures.as_deref());
-        let sides = self.photos.iter().map(|photo| photo.camera.width.max(photo.camera.height));
-        let lr_poses = config.lr_poses_for(sides.max().unwrap_or(0));
-        let config = RefineConfig { lr_poses, ..config.clone() };
-        let mut corrections = Corrections::new(count, *correct_poses, exposures, depth, &config, *device);
+    fn photo_opt(&self, depth: f64) -> Result<PhotoOpt> {
+        let mut photo_opt = PhotoOpt::new(&self.photos, self.log_exposures.as_deref(), depth, &self.options);
         if let SceneInit::State(state) = self.init {
-            corrections.load_state(state)?;
+            photo_opt.load_state(state)?;
         }
-        Ok(corrections)
+        Ok(photo_opt)
     }
 
-    /// Optimizes the Gaussians of `optimizer`, or those of a model and others, and the corrections of the photos. `depth` is the depth of the
-    /// `initial` Gaussians.
+    /// Optimizes the Gaussians of `optimizer`, or the `initial` ones of a model and others, and the corrections of the photos.
     fn optimize(
         &mut self,
         initial: &Gaussians,
         optimizer: Option<GaussianOptimizer>,
-        mut depth: f64,
-    ) -> Result<(Gaussians, Corrections, RefineState)> {
+    ) -> Result<(Gaussians, PhotoOpt, RefineState)> {
         let mut optimizer = match optimizer {
             Some(optimizer) => optimizer,
             None => {
                 let raw = self.with_gaussians_from_photos(initial)?;
-                depth = scene_depth(&raw.activate(), &self.photos)?;
-                GaussianOptimizer::new(&raw, depth, &self.config, self.gaussians as i64)
+                let depth = scene_depth(&raw.activate(), &self.photos)?;
+                GaussianOptimizer::new(&raw, depth, &self.options, self.gaussians as i64)
             }
         };
-        let (RefineOptions { seed, device, .. }, config) = (self.options, self.config.clone());
-        let mut corrections = self.corrections(depth)?;
+        let mut photo_opt = self.photo_opt(optimizer.depth)?;
         let (progress, earlier_total) = match self.init {
             SceneInit::State(state) => (state.record.progress, state.record.total),
             _ => Default::default(),
         };
-        let photos = Photos::new(&self.photos, &self.depth_maps, &config, *device);
-        let budget = self.time.remaining(progress.time, earlier_total);
-        let background = self.options.mask_background;
+        let options = self.options.clone();
         let args = OptimizeArgs {
-            photos: &photos,
-            depth,
-            config: &config,
-            budget,
-            seed: *seed,
-            background,
+            photos: &Photos::new(&self.photos, &self.depth_maps, &options),
+            options: &options,
+            budget: self.time.remaining(progress.time, earlier_total),
             progress,
         };
         let mut fractions = EVAL_FRACTIONS.iter().peekable();
         let (mut is_due, mut failure) = (false, None);
-        let (gaussians, progress) = refine(&mut optimizer, &mut corrections, &args, |now| {
+        let progress = refine(&mut optimizer, &mut photo_opt, &args, &mut Stopwatch::default(), |now| {
             self.steps = now.step;
             while fractions.next_if(|&&fraction| now.progress >= fraction).is_some() {
                 is_due = true;
             }
             if is_due && self.time.may_score() {
                 is_due = false;
-                failure = self.add_eval_point(&now.gaussians()).err();
+                failure = self.add_eval_point(&now.optimizer.averaged_gaussians()).err();
             }
             if now.step.is_multiple_of(METRICS_EVERY) {
-                let metrics = RefineMetrics {
-                    step: now.step,
+                let metrics = RefineEvent::Measured {
+                    steps: now.step,
                     seconds: self.time.seconds(),
-                    loss: now.loss(),
-                    gaussians: now.count(),
-                    learning_rate: now.means_learning_rate(),
+                    loss: now.loss.double_value(&[]),
+                    gaussians: now.optimizer.count(),
+                    learning_rate: now.optimizer.means_learning_rate(now.progress),
                 };
-                self.is_stopped |= !(self.on_event)(RefineEvent::Measured(&metrics));
+                self.is_stopped |= !(self.on_event)(metrics);
             }
             let psnr = self.curve.last().map(|point| point.scores.psnr);
             self.is_stopped |= !(self.on_event)(RefineEvent::Optimizing { steps: self.steps, psnr });
@@ -632,21 +597,20 @@ impl<'a> RefineSession<'a> {
         if let Some(error) = failure {
             return Err(error);
         }
-        let mut tensors = BTreeMap::new();
-        optimizer.add_to_state(&mut tensors);
-        corrections.add_to_state(&mut tensors);
         let record = Record {
             photos: self.photo_names(),
             frame: self.frame_numbers(),
             progress,
             total: earlier_total + self.time.elapsed(),
-            depth,
+            depth: optimizer.depth,
             has_depths: !self.depth_maps.is_empty(),
-            antialiased: config.antialiased,
+            antialiased: self.options.antialiased,
             from_splat: self.init.is_splat(),
-            growth: optimizer.growth(),
+            growth: optimizer.growth,
         };
-        Ok((gaussians, corrections, RefineState::new(record, tensors)))
+        let (gaussians, corrections) = (optimizer.state(), photo_opt.state());
+        let state = RefineState { record, gaussians, corrections, file: PathBuf::new() };
+        Ok((optimizer.averaged_gaussians(), photo_opt, state))
     }
 
     /// Returns an error if `state` is that of other photos or cameras, or if the budget has been used up already.
@@ -656,7 +620,7 @@ impl<'a> RefineSession<'a> {
             let found = format!("that of another refinement, {} photos", photos.len());
             let expected =
                 format!("that of the {} photos of this one, with the same poses", self.photos.len());
-            return Err(Error::input(state.file(), "the list of photos", found, expected));
+            return Err(Error::input(&state.file, "the list of photos", found, expected));
         }
         let (used, expected) = match self.options.budget() {
             Budget::Steps(steps) if steps <= progress.steps => {
@@ -667,7 +631,7 @@ impl<'a> RefineSession<'a> {
             }
             _ => return Ok(()),
         };
-        Err(Error::input(state.file(), "the refinement", format!("one of {used} already"), expected))
+        Err(Error::input(&state.file, "the refinement", format!("one of {used} already"), expected))
     }
 
     /// Returns the Gaussians of a model that the photos show best, and new ones at the depths on which the photos agree. As few as from photos
@@ -682,17 +646,14 @@ impl<'a> RefineSession<'a> {
         let count = self.initial_count();
         let of_model = count / MODEL_SHARE;
         let Some(new) = self.gaussians_from_photos(count - of_model)? else { return Ok(raw) };
-        if let Some(line) = self.exposure_warning() {
-            self.warn(&line);
-        }
         Ok(most_visible(&raw, &self.depth_maps, of_model)?.to_device(self.options.device).concat(&new))
     }
 
     /// Scores the sample of the held-out views, if there are any, and appends the scores to the curve.
     fn add_eval_point(&mut self, gaussians: &Gaussians) -> Result<()> {
         let begun = Instant::now();
-        if let Some(scores) = self.held_out_sample.score(gaussians)? {
-            let point = EvalPoint { seconds: self.time.seconds(), steps: self.steps, scores };
+        if let Some(scores) = score_views("sample", gaussians, &self.held_out_sample(), None, |_| true)? {
+            let point = EvalPoint { seconds: self.time.seconds(), steps: self.steps, scores: scores.mean };
             self.is_stopped |= !(self.on_event)(RefineEvent::Scored(&point));
             self.curve.push(point);
         }
@@ -704,4 +665,60 @@ impl<'a> RefineSession<'a> {
 /// Returns the error of a session that is ended before there is a result.
 fn stopped() -> Error {
     Error::failed("stopped before there was a splat: nothing is written")
+}
+
+/// Returns the interval between the views of an evenly spread sample of `views`: at most [`MAX_SAMPLE`] views, and two or so many that they
+/// have at most `max_pixels` in all. Views are scored as a whole: a part of an image has other borders, near which large Gaussians are
+/// projected differently.
+fn sample_interval(views: &[View], max_pixels: u64) -> usize {
+    let pixels = |view: &View| u64::from(view.camera.width) * u64::from(view.camera.height);
+    let largest = views.iter().map(pixels).max().unwrap_or(1);
+    let count = (max_pixels / largest).clamp(2, MAX_SAMPLE as u64) as usize;
+    views.len().div_ceil(count).max(1)
+}
+
+/// Returns the first of every `interval` views.
+fn every(views: &[View], interval: usize) -> Vec<View> {
+    views.iter().step_by(interval).map(View::shallow_clone).collect()
+}
+
+/// Returns the mean scores of the first of every `interval` views.
+fn mean_of_every(scores: &CaptureScores, interval: usize) -> Scores {
+    Scores::mean(scores.views.iter().step_by(interval).map(|view| &view.scores))
+}
+
+/// Returns the first few names, and the number of the others.
+fn summarize_names(all: &[String]) -> String {
+    const FEW: usize = 3;
+    let few = all[..all.len().min(FEW)].join(", ");
+    if all.len() > FEW { format!("{few} and {} more", all.len() - FEW) } else { few }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::refine::tests::{start, wall};
+
+    /// A sample that is scored several times has few pixels, and its scores are those of its views.
+    #[test]
+    fn a_sample_has_few_pixels_and_its_scores_are_those_of_the_views() {
+        let views = |width: u32, height: u32, count: usize| -> Vec<View> {
+            let view = |index: usize| {
+                let view = wall(0.02 * index as f64);
+                View { camera: Camera { width, height, ..view.camera }, ..view }
+            };
+            (0..count).map(view).collect()
+        };
+        assert_eq!(sample_interval(&views(210, 170, 20), MAX_SAMPLE_PIXELS), 3);
+        let large = views(1000, 600, 9);
+        assert_eq!([MAX_SAMPLE_PIXELS, u64::MAX].map(|pixels| sample_interval(&large, pixels)), [5, 2]);
+        assert_eq!((sample_interval(&[], MAX_SAMPLE_PIXELS), every(&[], 1).len()), (1, 0));
+        let all = views(64, 64, 5);
+        let gaussians = start(&all, 40, 0).activate();
+        let score = |views: &[View]| score_views("", &gaussians, views, None, |_| true).unwrap().unwrap();
+        let (sample, of_all) = (score(&every(&all, 2)).mean, score(&all));
+        let selected = mean_of_every(&of_all, 2);
+        assert!((sample.psnr - selected.psnr).abs() < 1e-9 && (sample.ssim - selected.ssim).abs() < 1e-9);
+        assert!((sample.psnr - of_all.mean.psnr).abs() > 1e-3, "{sample:?} {}", of_all.mean.psnr);
+    }
 }

@@ -8,16 +8,16 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 use tch::Tensor;
 
-/// Beginning of the names of the tensors of the Gaussians' optimizer.
+/// Beginning of the names of the tensors of the Gaussians' optimizer in a file.
 pub(super) const GAUSSIANS: &str = "gaussians.";
-/// Beginning of the names of the tensors of the corrections.
-pub(super) const CORRECTIONS: &str = "corrections.";
+/// Beginning of the names of the tensors of the corrections of the photos in a file.
+const CORRECTIONS: &str = "corrections.";
 /// Key of the metadata under which the file has the [`Record`].
 const RECORD: &str = "refinement";
 
 /// How far an optimization has come.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
-pub struct TrainProgress {
+pub(crate) struct TrainProgress {
     /// Number of steps done.
     pub steps: u64,
     /// Time that the optimization took.
@@ -67,22 +67,15 @@ pub(super) struct Growth {
 #[derive(Debug)]
 pub struct RefineState {
     pub(super) record: Record,
-    /// Parameters and moments, by names that begin with [`GAUSSIANS`] or [`CORRECTIONS`].
-    pub(super) tensors: BTreeMap<String, Tensor>,
+    /// Parameters of the Gaussians, their averages and their moments.
+    pub(super) gaussians: BTreeMap<String, Tensor>,
+    /// Parameters of the corrections of the photos and their moments.
+    pub(super) corrections: BTreeMap<String, Tensor>,
     /// File for error messages.
-    file: PathBuf,
+    pub(super) file: PathBuf,
 }
 
 impl RefineState {
-    pub(super) fn new(record: Record, tensors: BTreeMap<String, Tensor>) -> Self {
-        RefineState { record, tensors, file: PathBuf::new() }
-    }
-
-    /// Returns `true` if it has corrections of exposures.
-    pub(super) fn has_exposures(&self) -> bool {
-        self.tensors.contains_key(&format!("{CORRECTIONS}value.exposures"))
-    }
-
     /// Returns the path of the state that belongs to the splat at `path`: `room.state.safetensors` for `room.ply`.
     pub fn path_for(splat: &Path) -> PathBuf {
         splat.with_extension("state.safetensors")
@@ -96,14 +89,17 @@ impl RefineState {
         let weights = read_weights(path)?;
         let record = weights.metadata.get(RECORD).and_then(|text| serde_json::from_str(text).ok());
         let record = record.ok_or_else(|| {
-            Error::input(
-                path,
-                format!("the metadata {RECORD}"),
-                "missing or invalid",
-                "that of a refinement's state",
-            )
+            let field = format!("the metadata {RECORD}");
+            Error::input(path, field, "missing or invalid", "that of a refinement's state")
         })?;
-        Ok(RefineState { record, tensors: weights.tensors, file: path.to_owned() })
+        let with_prefix = |prefix: &str| {
+            let tensors = weights.tensors.iter();
+            let named =
+                |(name, t): (&String, &Tensor)| Some((name.strip_prefix(prefix)?.into(), t.shallow_clone()));
+            tensors.filter_map(named).collect()
+        };
+        let (gaussians, corrections) = (with_prefix(GAUSSIANS), with_prefix(CORRECTIONS));
+        Ok(RefineState { record, gaussians, corrections, file: path.to_owned() })
     }
 
     /// Writes the state to a safetensors file, atomically.
@@ -112,7 +108,11 @@ impl RefineState {
     /// Returns an error if the file can't be written.
     pub fn write(&self, path: &Path) -> Result<()> {
         let record = serde_json::to_string(&self.record).expect("numbers and names");
-        write_weights(path, &self.tensors, HashMap::from([(RECORD.into(), record)]))
+        let tensors = [(GAUSSIANS, &self.gaussians), (CORRECTIONS, &self.corrections)];
+        let named = tensors.into_iter().flat_map(|(prefix, tensors)| {
+            tensors.iter().map(move |(name, t)| (format!("{prefix}{name}"), t.shallow_clone()))
+        });
+        write_weights(path, &named.collect(), HashMap::from([(RECORD.into(), record)]))
     }
 
     /// Returns the number of steps that led to the state.
@@ -122,25 +122,11 @@ impl RefineState {
 
     /// Returns the number of Gaussians.
     pub fn count(&self) -> usize {
-        self.tensors.get(&format!("{GAUSSIANS}value.means")).map_or(0, |means| means.size()[1] as usize)
+        self.gaussians.get("value.means").map_or(0, |means| means.size()[1] as usize)
     }
 
-    /// Returns the tensor with this name.
-    pub(super) fn tensor(&self, name: &str) -> Result<&Tensor> {
-        self.tensors.get(name).ok_or_else(|| {
-            Error::input(&self.file, format!("tensor {name}"), "missing", "that of a refinement's state")
-        })
-    }
-
-    /// Returns the tensors whose names begin with `prefix`, without it.
-    pub(super) fn tensors_of(&self, prefix: &str) -> BTreeMap<String, Tensor> {
-        let without = |(name, tensor): (&String, &Tensor)| {
-            Some((name.strip_prefix(prefix)?.to_string(), tensor.shallow_clone()))
-        };
-        self.tensors.iter().filter_map(without).collect()
-    }
-
-    pub(super) fn file(&self) -> &Path {
-        &self.file
+    /// Returns `true` if it has corrections of exposures.
+    pub(super) fn has_exposures(&self) -> bool {
+        self.corrections.contains_key("value.exposures")
     }
 }

@@ -3,7 +3,7 @@
 //! `GLOBALSPLAT_WRITE_REFERENCE=1 cargo test --release --test program book` writes docs/configuration.md.
 
 use globalsplat::config::Config;
-use globalsplat::refine::RefineConfig;
+use globalsplat::refine::RefineOptions;
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -33,9 +33,9 @@ struct Key {
     text: String,
 }
 
-/// Returns the public fields of a struct in `source`, with their doc comments.
-fn parse_keys(source: &str, name: &str) -> Vec<Key> {
-    let body = source.split(&format!("pub struct {name} {{\n")).nth(1).expect("a struct");
+/// Returns the public fields of a struct after the line `opening` of `source`, with their doc comments.
+fn parse_keys(source: &str, opening: &str) -> Vec<Key> {
+    let body = source.split(opening).nth(1).expect("a struct");
     let (mut keys, mut text) = (vec![], String::new());
     for line in body.lines().map(str::trim).take_while(|line| *line != "}") {
         if let Some(more) = line.strip_prefix("///") {
@@ -44,7 +44,7 @@ fn parse_keys(source: &str, name: &str) -> Vec<Key> {
             keys.push(Key { name: field.into(), text: std::mem::take(&mut text).trim().into() });
         }
     }
-    assert!(keys.iter().all(|key| !key.text.is_empty()), "{name}");
+    assert!(keys.iter().all(|key| !key.text.is_empty()), "{opening}");
     keys
 }
 
@@ -85,13 +85,13 @@ fn configuration_page_matches_source() {
         page.push_str(&format!(
             "\n## [{}]\n\n{}",
             path.join("."),
-            table(&parse_keys(&read(file), name), &section(path))
+            table(&parse_keys(&read(file), &format!("pub struct {name} {{\n")), &section(path))
         ));
     }
-    let refine = toml::Table::try_from(RefineConfig::default()).expect("plain values");
+    let refine = toml::Table::try_from(RefineOptions::default()).expect("plain values");
     page.push_str(&format!(
         "\n## refine\n\n`globalsplat refine --set key=value` changes these.\n\n{}",
-        table(&parse_keys(&read("src/refine/config.rs"), "RefineConfig"), &refine)
+        table(&parse_keys(&read("src/refine/options.rs"), "\n        both:\n"), &refine)
     ));
     let file = "docs/configuration.md";
     if std::env::var_os("GLOBALSPLAT_WRITE_REFERENCE").is_some() {

@@ -17,7 +17,7 @@ use crate::data::{load_all_views, view_batch};
 use crate::device::total_memory_bytes;
 use crate::error::Error;
 use crate::io::read_splat;
-use crate::refine::RefineConfig;
+use crate::refine::RefineOptions;
 use crate::scene::Gaussians;
 use crate::train::MemoryEstimate;
 use anyhow::Result;
@@ -199,9 +199,9 @@ pub struct Refine {
 impl Refine {
     fn run(self) -> Result<Value> {
         keep_freed_memory();
-        let config = RefineConfig::with(&self.set, true)?;
-        let (size, device) = (parse_size(&self.size)?, device::parse(&self.device)?);
-        Ok(bench_refine(self.gaussians as usize, size, &config, self.steps, device)?)
+        let device = device::parse(&self.device)?;
+        let options = RefineOptions { set: self.set, device, ..Default::default() }.resolve(true)?;
+        Ok(bench_refine(self.gaussians as usize, parse_size(&self.size)?, &options, self.steps)?)
     }
 }
 

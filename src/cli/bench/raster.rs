@@ -1,12 +1,13 @@
 //! Benchmark of the rasterizer: from tensors of Gaussians to images, and back to gradients.
 
 use super::measure::{Measured, Section, TimingStats, Work};
+use crate::data::view_matrices;
 use crate::device::{Stopwatch, peak_memory_bytes_on, reset_peak_memory, resident_memory_bytes};
 use crate::error::Result;
 use crate::render::cpu::{StageTimes, count_pairs, multiply_add_peak, simd_level, stage_times};
 use crate::render::cuda::{kernel_times, measure_kernels};
 use crate::render::{Cameras, RenderOutput, default_eps2d, render};
-use crate::scene::{Gaussians, ImageSize};
+use crate::scene::{Camera, Gaussians, ImageSize, Intrinsics};
 use glam::{DMat4, DQuat, DVec3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -194,7 +195,7 @@ fn blending_rates(stages: &[Section], contributing_pairs: f64) -> Value {
 pub fn synthetic_gaussians(count: usize, views: usize, size: ImageSize) -> (Gaussians, Cameras) {
     let mut random = ChaCha8Rng::seed_from_u64(0);
     let (width, height) = (f64::from(size.width), f64::from(size.height));
-    let focal = 0.9 * width.max(height);
+    let focal = focal_length(size);
     let scale_factor = (16_384. / count.max(1) as f64).sqrt();
     let [mut means, mut scales, mut quaternions, mut opacities, mut sh] = [(); 5].map(|()| Vec::<f32>::new());
     for _ in 0..count {
@@ -217,30 +218,26 @@ pub fn synthetic_gaussians(count: usize, views: usize, size: ImageSize) -> (Gaus
         sh: Tensor::from_slice(&sh).view([1, n, 16, 3]),
         antialiased: false,
     };
-    (gaussians, camera_path(views, focal, width, height))
+    let [_, w2c, intrinsics] = view_matrices(&camera_path(views, size), Device::Cpu);
+    (gaussians, Cameras { w2c, intrinsics, width: size.width.into(), height: size.height.into() })
 }
 
 /// Returns `views` cameras that move sideways and forward while they turn.
-fn camera_path(views: usize, focal: f64, width: f64, height: f64) -> Cameras {
-    let (mut w2c, mut intrinsics) = (vec![], vec![]);
-    for i in 0..views {
+pub fn camera_path(views: usize, size: ImageSize) -> Vec<Camera> {
+    let ImageSize { width, height } = size;
+    let camera = |i: usize| {
         let t = i as f64 / (views.max(2) - 1) as f64 - 0.5;
-        let c2w = DMat4::from_rotation_translation(
-            DQuat::from_rotation_y(-0.2 * t),
-            DVec3::new(0.6 * t, 0., 0.2 * t),
-        );
-        w2c.extend(c2w.inverse().transpose().to_cols_array());
-        intrinsics.extend([focal, 0., width / 2., 0., focal, height / 2., 0., 0., 1.]);
-    }
-    let tensor = |values: &[f64], n: i64| {
-        Tensor::from_slice(values).view([1, views as i64, n, n]).to_kind(Kind::Float)
+        let (rotation, center) = (DQuat::from_rotation_y(-0.2 * t), DVec3::new(0.6 * t, 0., 0.2 * t));
+        let (focal, cx, cy) = (focal_length(size), f64::from(width) / 2., f64::from(height) / 2.);
+        let intrinsics = Intrinsics { fx: focal, fy: focal, cx, cy };
+        Camera { intrinsics, c2w: DMat4::from_rotation_translation(rotation, center), width, height }
     };
-    Cameras {
-        w2c: tensor(&w2c, 4),
-        intrinsics: tensor(&intrinsics, 3),
-        width: width as i64,
-        height: height as i64,
-    }
+    (0..views).map(camera).collect()
+}
+
+/// Returns the focal length of the synthetic cameras, in pixels.
+fn focal_length(size: ImageSize) -> f64 {
+    0.9 * f64::from(size.width.max(size.height))
 }
 
 /// Samples a standard normal value with the Box-Muller transform.
