@@ -79,19 +79,12 @@ pub(crate) fn zero_grad<'a>(leaves: impl IntoIterator<Item = &'a Tensor>) {
     unsafe { ffi::zero_grad(&addresses(leaves)) }.expect("leaves");
 }
 
-/// Settings that the parameters of a group share.
-#[derive(Debug, Clone, Copy)]
-struct Settings {
-    rule: UpdateRule,
-    learning_rate: f64,
-    weight_decay: f64,
-}
-
 /// Optimizer over groups of named parameters. Gradients are iterated in the order of the parameters' names, whatever the groups.
 #[derive(Debug)]
 pub struct Optimizer {
     parameters: Vec<Parameter>,
-    groups: Vec<Settings>,
+    /// Groups without their parameters, which are in `parameters`.
+    groups: Vec<ParameterGroup>,
     epsilon: f64,
     steps: i64,
 }
@@ -101,20 +94,18 @@ impl Optimizer {
     ///
     /// # Panics
     /// Panics if two parameters have the same name.
-    pub fn new(groups: Vec<ParameterGroup>) -> Self {
-        let (mut parameters, mut settings) = (BTreeMap::new(), vec![]);
-        for (group, of) in groups.into_iter().enumerate() {
-            for (name, value) in of.parameters {
+    pub fn new(mut groups: Vec<ParameterGroup>) -> Self {
+        let mut parameters = BTreeMap::new();
+        for (index, group) in groups.iter_mut().enumerate() {
+            for (name, value) in group.parameters.drain(..) {
                 let zeros = || value.zeros_like().detach();
-                let (first, second) = (zeros(), (of.rule == UpdateRule::AdamW).then(zeros));
-                let parameter = Parameter { name: name.clone(), value, first, second, group };
+                let (first, second) = (zeros(), (group.rule == UpdateRule::AdamW).then(zeros));
+                let parameter = Parameter { name: name.clone(), value, first, second, group: index };
                 assert!(parameters.insert(name, parameter).is_none(), "each parameter once");
             }
-            let ParameterGroup { rule, learning_rate, weight_decay, .. } = of;
-            settings.push(Settings { rule, learning_rate, weight_decay });
         }
         let parameters = parameters.into_values().collect();
-        Optimizer { parameters, groups: settings, epsilon: EPS, steps: 0 }
+        Optimizer { parameters, groups, epsilon: EPS, steps: 0 }
     }
 
     /// Sets the ε that is added to the root of the second moments, instead of 1e-8.
@@ -235,7 +226,7 @@ impl Optimizer {
     fn update_on_the_cpu(&self, group: usize) {
         let bias_correction1 = 1. - BETA1.powi(self.steps as i32);
         let bias_correction2_sqrt = (1. - BETA2.powi(self.steps as i32)).sqrt();
-        let Settings { learning_rate, weight_decay, .. } = self.groups[group];
+        let ParameterGroup { learning_rate, weight_decay, .. } = self.groups[group];
         let (step_size, decay) = (learning_rate / bias_correction1, learning_rate * weight_decay);
         let (parameters, gradients) = self.with_gradients(group);
         for (p, gradient) in parameters.iter().zip(&gradients) {
@@ -259,7 +250,7 @@ impl Optimizer {
 
     /// Updates a group by libtorch's fused AdamW kernel.
     fn update_fused(&self, group: usize) -> Result<()> {
-        let Settings { learning_rate, weight_decay, .. } = self.groups[group];
+        let ParameterGroup { learning_rate, weight_decay, .. } = self.groups[group];
         let (parameters, gradients) = self.with_gradients(group);
         let values = addresses(parameters.iter().map(|p| &p.value));
         let first = addresses(parameters.iter().map(|p| &p.first));
@@ -278,7 +269,7 @@ impl Optimizer {
 
     /// Updates a group of matrices by Muon.
     fn update_matrices(&self, group: usize, parts: i64) {
-        let Settings { learning_rate, weight_decay, .. } = self.groups[group];
+        let ParameterGroup { learning_rate, weight_decay, .. } = self.groups[group];
         let (parameters, gradients) = self.with_gradients(group);
         let matrices = Matrices {
             values: parameters.iter().map(|p| &p.value).collect(),

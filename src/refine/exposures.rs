@@ -1,8 +1,9 @@
 //! Exposures of photos relative to each other, measured where photos show the same surface, as panoramas are balanced (Brown and Lowe 2007).
 
+use super::init::pixel_and_depth;
 use super::options::ExposureCorrection;
 use crate::scene::Camera;
-use crate::stereo::{DepthMap, SmallPhoto, nearest_to, numbers, projection, truths};
+use crate::stereo::{DepthMap, SmallPhoto, nearest_to, numbers, truths};
 use glam::DVec3;
 use std::ops::Range;
 use tch::Tensor;
@@ -153,11 +154,10 @@ impl<'a> ExposedPhoto<'a> {
 
     /// Returns the median ratio of this photo's colors to those of `points`; `None` if it shows too few of them.
     fn ratio_to(&self, points: &[(DVec3, [f32; 3])]) -> Option<Ratio> {
-        let project = projection(&self.photo.camera);
+        let seen = pixel_and_depth(&self.photo.camera);
         let mut logs: [Vec<f32>; 3] = Default::default();
         for (point, color) in points {
-            let Some([u, v, z]) = project(*point) else { continue };
-            let pixel = v as usize * self.photo.camera.width as usize + u as usize;
+            let Some((pixel, z)) = seen(*point) else { continue };
             let is_surface = |depths: &Vec<f32>| (z / f64::from(depths[pixel]) - 1.).abs() < SAME_SURFACE;
             if let Some(shown) = self.color(pixel).filter(|_| self.depths.as_ref().is_none_or(is_surface)) {
                 (0..3).for_each(|c| logs[c].push((shown[c] / color[c]).ln()));

@@ -140,11 +140,7 @@ impl GaussianOptimizer {
     ///
     /// # Errors
     /// Returns an error if a tensor is missing or has another shape than the others.
-    pub(super) fn from_state(
-        state: &RefineState,
-        options: &RefineOptions,
-        count: i64,
-    ) -> Result<Self> {
+    pub(super) fn from_state(state: &RefineState, options: &RefineOptions, count: i64) -> Result<Self> {
         let Record { depth, growth, .. } = state.record;
         let read = |kind: &str, expected: Option<&GaussianParams>| {
             let tensor = |(index, name): (usize, &str)| {

@@ -132,21 +132,24 @@ pub(super) fn most_visible(
     Ok(supported.select(&kept.collect::<Vec<_>>()))
 }
 
+/// Returns a function from a point to the index of its pixel in a map and its depth there; `None` for points that the map doesn't show.
+pub(super) fn pixel_and_depth(camera: &Camera) -> impl Fn(DVec3) -> Option<(usize, f64)> + use<> {
+    let (project, width) = (projection(camera), camera.width as usize);
+    move |point| project(point).map(|[u, v, z]| (v as usize * width + u as usize, z))
+}
+
 /// Returns the indices of the Gaussians that the photos support. A Gaussian must not be in front of a depth that a photo is sure of, and at
 /// least one photo must see it unoccluded or not be sure of the depth there.
 fn supported(raw: &RawGaussians, depth_maps: &[DepthMap]) -> Vec<i64> {
     let means =
         Vec::<f64>::try_from(raw.means.to_kind(Kind::Double).contiguous().view([-1])).expect("numbers");
-    let map = |of: &DepthMap| {
-        let width = of.camera.width as usize;
-        (projection(&of.camera), width, of.depths(), of.sure_pixels(), of.counted_pixels())
-    };
+    let map =
+        |of: &DepthMap| (pixel_and_depth(&of.camera), of.depths(), of.sure_pixels(), of.counted_pixels());
     let maps: Vec<_> = depth_maps.iter().map(map).collect();
     let holds = |mean: DVec3| {
         let mut shown = false;
-        for (seen, width, depth, sure, counted) in &maps {
-            let Some([u, v, z]) = seen(mean) else { continue };
-            let pixel = v as usize * width + u as usize;
+        for (seen, depth, sure, counted) in &maps {
+            let Some((pixel, z)) = seen(mean) else { continue };
             if counted.as_ref().is_some_and(|counted| !counted[pixel]) {
                 continue;
             }
@@ -163,12 +166,12 @@ fn supported(raw: &RawGaussians, depth_maps: &[DepthMap]) -> Vec<i64> {
 
 /// Returns `points` without those that photos show only where they are masked out.
 fn points_that_count<'a>(points: &'a [Point], depth_maps: &[DepthMap]) -> Vec<&'a Point> {
-    let map = |of: &DepthMap| (projection(&of.camera), of.camera.width as usize, of.counted_pixels());
+    let map = |of: &DepthMap| (pixel_and_depth(&of.camera), of.counted_pixels());
     let maps: Vec<_> = depth_maps.iter().map(map).collect();
     let counts = |point: &&Point| {
-        let mut places = maps.iter().filter_map(|(seen, width, counted)| {
-            let [u, v, _] = seen(point.position)?;
-            Some(counted.as_ref().is_none_or(|counted| counted[v as usize * width + u as usize]))
+        let mut places = maps.iter().filter_map(|(seen, counted)| {
+            let (pixel, _) = seen(point.position)?;
+            Some(counted.as_ref().is_none_or(|counted| counted[pixel]))
         });
         places.next().is_none_or(|first| first || places.any(|counts| counts))
     };

@@ -432,10 +432,11 @@ impl RefineOptions {
         };
         let largest = cameras.iter().map(bytes).max().unwrap_or(1);
         let fitting = |bytes: u64| (bytes / largest).max(2) as usize;
-        let shown = spread_over_path(&cameras, &all_shown, self.max_views.unwrap_or(fitting(MAX_PHOTO_BYTES)));
+        let shown =
+            spread_over_path(&cameras, &all_shown, self.max_views.unwrap_or(fitting(MAX_PHOTO_BYTES)));
         let held_out = spread_over_path(&cameras, &all_held_out, fitting(MAX_HELD_OUT_BYTES));
-        let is_limited =
-            (self.max_views.is_none() && shown.len() < all_shown.len()) || held_out.len() < all_held_out.len();
+        let is_limited = (self.max_views.is_none() && shown.len() < all_shown.len())
+            || held_out.len() < all_held_out.len();
         let warning = is_limited.then(|| {
             format!(
                 "{}: {} of {} photos are matched and {} of {} scored, spread along the camera path, as more need more than about 2 GB of memory",
@@ -557,7 +558,8 @@ mod tests {
     #[test]
     fn many_gaussians_have_spherical_harmonics_of_degree_2() {
         let plan = |overrides: &[String], from_splat: bool, count: i64| {
-            let options = RefineOptions { set: overrides.into(), ..Default::default() }.resolve(from_splat).unwrap();
+            let options =
+                RefineOptions { set: overrides.into(), ..Default::default() }.resolve(from_splat).unwrap();
             let degree = options.sh_degree_for(count);
             (degree, options.sh_every_for(degree))
         };
@@ -574,6 +576,8 @@ mod tests {
         for (assignment, expected) in [
             ("views=0", "expected 1 or more"),
             ("views=-1", "invalid"),
+            ("views=\"a\"", "invalid"),
+            ("views", "expected KEY=VALUE"),
             ("resolution_schedule=[0.1, 0.1]", "expected numbers that increase"),
             ("resolution_schedule=[0.3, 0.1]", "expected numbers that increase"),
             ("resolution_schedule=[0.1, nan]", "expected numbers above 0 and below 1"),
@@ -592,6 +596,7 @@ mod tests {
             ("ssim_weight=1.5", "expected 0 to 1"),
             ("depth_smoothness_weight=-1", "expected 0 to 1000"),
             ("prune_opacity=1", "expected 0 or more, below 1"),
+            ("prune_opacity=-1", "expected 0 or more, below 1"),
             ("relocate_until=nan", "expected 0 to 1"),
             ("grow_until=1.0", "expected above 0 and below 1"),
             ("initial_gaussians=0.0", "expected above 0, up to 1"),

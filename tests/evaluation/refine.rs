@@ -488,14 +488,7 @@ fn invalid_refinements_are_refused_with_one_sentence() {
     write_splat(&sandbox.path("elsewhere.ply"), &splat).unwrap();
     for (options, expected) in [
         ("--set view=3", "--set view=3: unknown field"),
-        ("--set views='\"a\"'", "--set views"),
-        ("--set views", "expected KEY=VALUE"),
-        ("--set views=0", "--set views=0: expected "),
-        ("--set sh_every=0", "--set sh_every=0: expected "),
-        ("--set resolution_schedule=[0.1,0.1]", "--set resolution_schedule=[0.1,0.1]: expected "),
         ("--set lr_means=nan", "--set lr_means=nan: expected "),
-        ("--set prune_opacity=-1", "--set prune_opacity=-1: expected "),
-        ("--seconds 0", "seconds is 0, expected more than 0"),
         ("--seconds 1e300", "seconds is 1000"),
         ("--init photos --weights a.safetensors", "uses no weights"),
         ("--views 1", "--views is 1, expected 2 or more"),
