@@ -151,9 +151,9 @@ impl Refine {
         };
         let mut session = RefineSession::load(&capture, &self.options, init, on_event)?;
         if let (None, SceneInit::Photos, PhotoSize::Within(side)) =
-            (self.options.gaussians, init, session.size())
+            (self.options.gaussians, init, session.size)
         {
-            let line = format!("{} Gaussians, photos of at most {side} pixels", session.gaussians());
+            let line = format!("{} Gaussians, photos of at most {side} pixels", session.gaussians);
             bar.bar.suspend(|| eprintln!("{line}; --gaussians and --size set others"));
         }
         // Depths of a subset of the photos are enough for an initial splat, too.
@@ -161,7 +161,7 @@ impl Refine {
         let gaussians = session.start()?;
         signals::end_at_request(2);
         if self.resume {
-            let count = gaussians.count().max(session.gaussians() as i64);
+            let count = gaussians.count().max(session.gaussians as i64);
             session.reserve(STATE_TIME_PER_GAUSSIAN * count as u32);
         }
         if self.reports.contact_sheet.is_some() {
@@ -211,7 +211,7 @@ impl Refine {
         let out = self.out.to_string_lossy();
         let of = |scores: &Scores, lpips: Option<f64>| json!({ "psnr": scores.psnr, "ssim": scores.ssim, "lpips_vgg": lpips });
         let mut json = json!({
-            "splat": out, "gaussians": count, "photos": photos, "near_duplicates": session.near_duplicates(),
+            "splat": out, "gaussians": count, "photos": photos, "near_duplicates": session.near_duplicates,
             "steps": steps, "seconds": ended, "begin_seconds": begun, "corrections": corrections,
             "shown": { "before": of(before, of_photos[0]), "after": of(after, of_photos[1]) },
         });

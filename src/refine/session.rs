@@ -107,9 +107,10 @@ pub struct RefineSession<'a> {
     /// Options with their settings. `antialiased` is also set for an initial splat or state that is antialiased.
     options: RefineOptions,
     init: SceneInit<'a>,
-    /// Final number of Gaussians. A session that is ended early may have fewer.
-    gaussians: usize,
-    size: PhotoSize,
+    /// Number of Gaussians that the optimization ends with if it isn't ended early.
+    pub gaussians: usize,
+    /// Size that the photos were loaded at.
+    pub size: PhotoSize,
     time: TimeBudget,
     on_event: Box<dyn FnMut(RefineEvent) -> bool + 'a>,
     is_stopped: bool,
@@ -119,7 +120,8 @@ pub struct RefineSession<'a> {
     /// Interval between the held-out views that there is time to score as a whole.
     scored_every: usize,
     start: Option<Start>,
-    near_duplicates: usize,
+    /// Number of photos that were left out as near duplicates.
+    pub near_duplicates: usize,
     /// Depths of some photos, if Gaussians were created from them.
     depth_maps: Vec<DepthMap>,
     /// Initial exposures of the photos, if they are corrected.
@@ -193,16 +195,6 @@ impl<'a> RefineSession<'a> {
         })
     }
 
-    /// Returns the number of Gaussians that the optimization ends with if it isn't ended early.
-    pub fn gaussians(&self) -> usize {
-        self.gaussians
-    }
-
-    /// Returns the size that the photos were loaded at.
-    pub fn size(&self) -> PhotoSize {
-        self.size
-    }
-
     /// Returns the photos that the splat has to match, in the session's frame. After [`RefineSession::start`], near duplicates are removed.
     pub fn photos(&self) -> &[View] {
         &self.photos
@@ -216,11 +208,6 @@ impl<'a> RefineSession<'a> {
     /// Returns the views that represent the splat's quality, in the session's frame: the held-out views if there are any, else the photos.
     fn representative_views(&self) -> &[View] {
         if self.held_out.is_empty() { &self.photos } else { &self.held_out }
-    }
-
-    /// Returns the number of photos that were left out as near duplicates.
-    pub fn near_duplicates(&self) -> usize {
-        self.near_duplicates
     }
 
     /// Reserves a further part of the time budget for work after the optimization. Writing the splat and scoring the held-out views are
