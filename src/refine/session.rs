@@ -319,18 +319,15 @@ impl<'a> RefineSession<'a> {
     pub fn run(&mut self) -> Result<RefineResult> {
         let Start { gaussians: initial, depth, optimizer } =
             self.start.take().expect("a session that was started");
-        if let Some(view) = self.held_out.first().map(View::shallow_clone) {
-            let begun = Instant::now();
-            self.score_whole(&initial, &[view], None)?;
-            self.scored_every = self.time.reserve_for_held_out(begun.elapsed(), self.held_out.len());
-        }
         self.time.reserve_for_writing(initial.count().max(self.gaussians as i64));
         let begun_scoring = Instant::now();
         let before = self.score_photos(&initial, &self.photo_opt(depth)?)?;
         let time = begun_scoring.elapsed();
         self.reserve(time);
         let shown_photos = self.photos.len().div_ceil(sample_interval(&self.photos, u64::MAX));
-        self.time.last_scoring = time.mul_f64(self.held_out_sample().len() as f64 / shown_photos as f64);
+        let each = time / shown_photos as u32;
+        self.scored_every = self.time.reserve_for_held_out(each, self.held_out.len());
+        self.time.last_scoring = each * self.held_out_sample().len() as u32;
         if let Some(line) = self.time.late_start_warning() {
             self.warn(&line);
         }
