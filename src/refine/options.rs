@@ -555,6 +555,16 @@ mod tests {
         }
     }
 
+    /// JSON, in which the Python package passes options, has the number of photos as `views`, and settings in `set` alone.
+    #[test]
+    fn json_has_the_options_of_the_command_line() {
+        let read = |text: &str| serde_json::from_str::<RefineOptions>(text);
+        let options = read(r#"{"views": 4, "antialiased": true, "set": ["views=2"]}"#).unwrap();
+        let resolved = options.resolve(false).unwrap();
+        assert_eq!((resolved.max_views, resolved.views, resolved.antialiased), (Some(4), 2, true));
+        assert!(read(r#"{"lr_means": 0.1}"#).is_err());
+    }
+
     #[test]
     fn many_gaussians_have_spherical_harmonics_of_degree_2() {
         let plan = |overrides: &[String], from_splat: bool, count: i64| {
