@@ -53,24 +53,24 @@ def reference_rasterization(
     means, quats, scales, opacities, colors, viewmats, Ks, *, near_plane=0.01, far_plane=1e10, eps2d=0.3, sh_degree=None,
     backgrounds=None, render_mode="RGB", rasterize_mode="classic",
 ):  # fmt: skip
-    """Returns images, alphas and projected means, a tensor per camera, of the reference, with the conventions of `rasterization`."""
-    images, alphas, means2d = [], [], []
+    """Returns images and alphas of the reference, and the projected Gaussians of each camera, with the conventions of `rasterization`."""
+    images, alphas, cameras = [], [], []
     for camera, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
         is_antialiased = rasterize_mode == "antialiased"
         projected = reference.project(means, scales, quats, viewmat, K, WIDTH, HEIGHT, eps2d, is_antialiased)
         projected["visible"] &= (projected["depth"] > near_plane) & (projected["depth"] < far_plane)
-        means2d.append(projected["mean2d"])
+        cameras.append({**projected, "opacity": opacities * projected["compensation"]})
         bases = None if sh_degree is None else (sh_degree + 1) ** 2
         seen = colors if bases is None else reference.sh_color(means, colors[:, :bases], viewmat)
         pixels = reference.pixel_centers(WIDTH, HEIGHT, means.dtype)
-        image, alpha, depth = reference.composite(projected, opacities * projected["compensation"], seen, pixels)
+        image, alpha, depth = reference.composite(projected, cameras[-1]["opacity"], seen, pixels)
         if backgrounds is not None:
             image = image + (1.0 - alpha[:, None]) * backgrounds[camera]
         depth = depth if render_mode.endswith("ED") else depth * alpha
         parts = {"RGB": image, "D": depth[:, None], "ED": depth[:, None]}
         images.append(torch.cat([parts[part] for part in render_mode.split("+")], -1).reshape(HEIGHT, WIDTH, -1))
         alphas.append(alpha.reshape(HEIGHT, WIDTH, 1))
-    return torch.stack(images), torch.stack(alphas), means2d
+    return torch.stack(images), torch.stack(alphas), cameras
 
 
 def assert_close(name, ours, theirs):
@@ -80,7 +80,7 @@ def assert_close(name, ours, theirs):
 
 
 def compare(inputs, Ks, **options):
-    """Compares images, alphas, projected means and all gradients."""
+    """Compares images, alphas, projected Gaussians and all gradients."""
     expected, ours = leaves(inputs), leaves(inputs)
     theirs = reference_rasterization(*expected, Ks, **options)
     image, alpha, meta = globalsplat.rasterization(*ours, Ks, WIDTH, HEIGHT, **options)
@@ -88,11 +88,15 @@ def compare(inputs, Ks, **options):
     assert_close("alpha", alpha, theirs[1])
     is_visible = (meta["radii"] > 0).all(-1)
     assert is_visible.any()
-    assert_close("means2d", meta["means2d"][is_visible], torch.stack(theirs[2])[is_visible])
+    for name, key in {"means2d": "mean2d", "conics": "conic", "depths": "depth", "opacities": "opacity"}.items():
+        assert_close(name, meta[name][is_visible], torch.stack([camera[key] for camera in theirs[2]])[is_visible])
     weights = normals(3, *image.shape), normals(4, *alpha.shape)
     gradients = [
         torch.autograd.grad((image * weights[0]).sum() + (alpha * weights[1]).sum(), tensors)
-        for image, alpha, tensors in ((image, alpha, [*ours, meta["means2d"]]), (*theirs[:2], [*expected, *theirs[2]]))
+        for image, alpha, tensors in (
+            (image, alpha, [*ours, meta["means2d"]]),
+            (*theirs[:2], [*expected, *(camera["mean2d"] for camera in theirs[2])]),
+        )
     ]
     assert_close("gradient of means2d", gradients[0][6], torch.stack(gradients[1][6:]))
     names = ["means", "quats", "scales", "opacities", "colors", "viewmats"]
