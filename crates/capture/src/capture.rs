@@ -238,17 +238,16 @@ impl Capture {
             };
             return Err(Error::input(&file, field, found, expected));
         }
-        let described = file.clone();
         let empty = Capture {
             name,
-            file,
+            file: file.clone(),
             frames: vec![],
             views: vec![],
             train: 0,
             is_complete: true,
             warnings: vec![],
         };
-        let capture = empty.with_test(&described, frames, changes, purpose)?;
+        let capture = empty.with_test(&file, frames, changes, purpose)?;
         Ok(Capture { train: capture.views.len(), ..capture })
     }
 
@@ -417,7 +416,10 @@ impl Capture {
 
     /// Adds the files that the capture is read from to `inputs`: those that describe it, and its photos.
     pub fn add_input_files(&self, inputs: &mut InputFiles) {
-        let described = description_file(&self.file);
+        // The path may end in `#` and the key of one of the file's scenes.
+        let files = split_keyed_path(&self.file).rev().map(|(file, _)| file);
+        let described = std::iter::once(self.file.clone()).chain(files).find(|file| file.is_file());
+        let described = described.unwrap_or_default();
         inputs.add(&described);
         // A COLMAP model consists of several files.
         let form = described.extension().filter(|form| *form == "bin" || *form == "txt");
@@ -440,30 +442,27 @@ impl Capture {
     /// # Errors
     /// Fails if an image or a mask is missing or can't be decoded, if an image has another size than the capture declares.
     pub fn load(&self, indices: &[usize], size: Option<ImageSize>) -> Result<Vec<Photo>> {
-        // Positions in `indices` of the views of each photo.
-        let mut photos: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+        // The views of each photo, with their positions in `indices`.
+        let mut photos: BTreeMap<usize, Vec<(usize, &View)>> = BTreeMap::new();
         for (position, &index) in indices.iter().enumerate() {
-            photos.entry(self.views[index].frame).or_default().push(position);
+            let view = &self.views[index];
+            photos.entry(view.frame).or_default().push((position, view));
         }
-        let photos: Vec<Vec<usize>> = photos.into_values().collect();
-        let views = |positions: &[usize]| -> Vec<&View> {
-            positions.iter().map(|&position| &self.views[indices[position]]).collect()
-        };
-        let pixels = |positions: &Vec<usize>| {
-            let views = views(positions);
+        let pixels = |(&frame, views): (&usize, &Vec<(usize, &View)>)| {
             let area = |camera: &Camera| u64::from(camera.width) * u64::from(camera.height);
-            let distorted = views.iter().filter(|view| !view.projection.is_identity());
-            area(&self.frames[views[0].frame].camera) + distorted.map(|view| area(&view.camera)).sum::<u64>()
+            let distorted = views.iter().filter(|(_, view)| !view.projection.is_identity());
+            area(&self.frames[frame].camera) + distorted.map(|(_, view)| area(&view.camera)).sum::<u64>()
         };
         let largest = photos.iter().map(pixels).max().unwrap_or(0).max(1);
         let at_once = (DECODED_BYTES / (DECODED_BYTES_PER_PIXEL * largest)).max(1) as usize;
+        let photos: Vec<_> = photos.into_iter().collect();
         let mut loaded: Vec<(usize, Photo)> = vec![];
         for photos in photos.chunks(at_once) {
-            let load = |positions: &Vec<usize>| self.load_views(&views(positions), size);
+            let load = |(frame, views): &(usize, Vec<_>)| self.load_views(*frame, views, size);
             let all: Vec<_> = photos.par_iter().map(load).collect();
             // If several images can't be read, the error is that of the first one.
-            for (positions, views) in photos.iter().zip(all) {
-                loaded.extend(positions.iter().copied().zip(views?));
+            for views in all {
+                loaded.extend(views?);
             }
         }
         loaded.sort_by_key(|(position, _)| *position);
@@ -499,10 +498,15 @@ impl Capture {
         Ok(hasher.finalize())
     }
 
-    /// Loads `views`, all of one photo.
-    fn load_views(&self, views: &[&View], size: Option<ImageSize>) -> Result<Vec<Photo>> {
-        let (photo, mask) = self.read_photo(&self.frames[views[0].frame])?;
-        let load = |view: &&View| {
+    /// Loads `views` of the photo `frame`, each with a number.
+    fn load_views(
+        &self,
+        frame: usize,
+        views: &[(usize, &View)],
+        size: Option<ImageSize>,
+    ) -> Result<Vec<(usize, Photo)>> {
+        let (photo, mask) = self.read_photo(&self.frames[frame])?;
+        let load = |&(number, view): &(usize, &View)| {
             let fit = |image: &RgbImage| match size {
                 Some(size) => resize_and_crop(image, &view.camera, size),
                 None => (Planes::from_rgb(image), view.camera),
@@ -511,7 +515,7 @@ impl Capture {
             let (image, camera) = fit(&image);
             let mask = mask.map(|mask| fit(&mask).0.into_first_channel());
             let mask = mask.filter(|mask| mask.iter().any(|&weight| weight < u8::MAX));
-            Photo { name: view.name.clone(), image, mask, camera }
+            (number, Photo { name: view.name.clone(), image, mask, camera })
         };
         Ok(views.iter().map(load).collect())
     }
@@ -651,12 +655,6 @@ fn views_of_frames(file: &Path, frames: &[Frame], purpose: Purpose) -> Result<(V
         )
     });
     Ok((views, line))
-}
-
-/// Returns the existing file in `path`, which may end in `#` and the key of one of the file's scenes.
-fn description_file(path: &Path) -> PathBuf {
-    let files = split_keyed_path(path).rev().map(|(file, _)| file);
-    std::iter::once(path.to_owned()).chain(files).find(|file| file.is_file()).unwrap_or_default()
 }
 
 /// Scales the intrinsics of `frames` to photos whose size differs from that in `file` but whose aspect ratio agrees with it, and

@@ -1,7 +1,7 @@
 //! Estimates the poses of the photos of a capture, step by step.
 
 use crate::colmap::Colmap;
-use crate::photos::{Photo, SkippedPhoto, import_photos};
+use crate::photos::{Photo, import_photos};
 use crate::progress::{Interrupt, Reporter, Step};
 use crate::record::{CaptureReport, Matching, Record, format_first};
 use globalsplat_capture::{COLMAP_MODELS, MASKS_FOLDER, read_colmap_models};
@@ -67,7 +67,11 @@ impl Estimate<'_, '_> {
         let masks = self.record.masks.as_deref();
         let (photos, skipped) = import_photos(source, &self.record.found, masks, self.images, self.reporter)?;
         if photos.len() < 2 {
-            return Err(too_few(source, self.record.found.len(), &skipped).into());
+            let reasons = skipped.iter().map(|photo| format!("{} is {}", photo.name, photo.reason));
+            let (total, reasons) = (self.record.found.len(), format_first(reasons));
+            let found = format!("{total}, of which {} can't be used ({reasons})", skipped.len());
+            let expected = "2 or more different ones";
+            return Err(Error::input(source, "the number of photos", found, expected).into());
         }
         (self.record.photos, self.record.skipped) = (Some(photos), skipped);
         Ok(())
@@ -330,13 +334,6 @@ fn sequential_pairs(count: usize, overlap: usize, spread: usize) -> Vec<(usize, 
         .into_iter()
         .map(|(first, second)| (first * step, second * step));
     (0..count).flat_map(near).chain(far.filter(|(first, second)| second - first > overlap)).collect()
-}
-
-/// Returns the error for a folder of `total` photos of which fewer than two aren't `skipped`.
-fn too_few(folder: &Path, total: usize, skipped: &[SkippedPhoto]) -> Error {
-    let reasons = skipped.iter().map(|photo| format!("{} is {}", photo.name, photo.reason));
-    let found = format!("{total}, of which {} can't be used ({})", skipped.len(), format_first(reasons));
-    Error::input(folder, "the number of photos", found, "2 or more different ones")
 }
 
 /// Returns the error if none of `count` photos was registered.

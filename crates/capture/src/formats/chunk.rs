@@ -3,7 +3,7 @@
 
 use super::CaptureOpener;
 use crate::capture::{Capture, Changes, Frame, ImageLocation, Purpose};
-use crate::geometry::{Camera, Intrinsics};
+use crate::geometry::{Camera, Intrinsics, pose_to_rows};
 use crate::pixels::{SUPPORTED_IMAGES, encoded_image_size};
 use glam::{DMat4, DVec4};
 use globalsplat_files::{Error, Result, split_keyed_path};
@@ -149,11 +149,9 @@ pub fn camera_numbers(camera: &Camera) -> [f32; CAMERA_NUMBERS] {
     let (w, h) = (f64::from(camera.width), f64::from(camera.height));
     let k = camera.intrinsics;
     let mut numbers = [0f32; CAMERA_NUMBERS];
-    for (number, value) in numbers.iter_mut().zip([k.fx / w, k.fy / h, k.cx / w, k.cy / h]) {
-        *number = value as f32;
-    }
-    let rows = crate::geometry::pose_to_rows(&camera.c2w.inverse());
-    for (number, value) in numbers[6..].iter_mut().zip(rows) {
+    let intrinsics = [k.fx / w, k.fy / h, k.cx / w, k.cy / h, 0., 0.];
+    let rows = pose_to_rows(&camera.c2w.inverse());
+    for (number, value) in numbers.iter_mut().zip(intrinsics.into_iter().chain(rows)) {
         *number = value as f32;
     }
     numbers
