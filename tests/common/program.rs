@@ -55,12 +55,19 @@ pub fn command(arguments: &[&str]) -> Command {
     command
 }
 
+/// Runs a process that must succeed, and returns its standard output and its standard error.
+#[track_caller]
+pub fn run_process(command: &mut Command) -> (String, String) {
+    let output = command.output().unwrap_or_else(|e| panic!("{command:?}: {e}"));
+    let [out, err] = [output.stdout, output.stderr].map(|bytes| String::from_utf8(bytes).expect("text"));
+    assert_eq!(output.status.code(), Some(0), "{command:?}: {err}");
+    (out, err)
+}
+
 /// Returns the standard output of a run that must succeed.
+#[track_caller]
 pub fn succeed(arguments: &[&str]) -> String {
-    let output = globalsplat(arguments);
-    let (out, err) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
-    assert!(output.status.success(), "{arguments:?}: {err}");
-    out.into_owned()
+    run_process(&mut command(arguments)).0
 }
 
 /// Runs the program and returns the JSON that it prints.
@@ -251,9 +258,7 @@ impl Sandbox {
     /// Returns the standard output and the standard error of a process that must succeed.
     #[track_caller]
     pub fn succeed_with_messages(&self, line: &str) -> (String, String) {
-        let (code, out, err) = self.output(line);
-        assert_eq!(code, Some(0), "{line}: {err}");
-        (out, err)
+        run_process(&mut self.command(line))
     }
 
     /// Returns the one JSON object that a process prints with `--json`.

@@ -1,6 +1,6 @@
 //! Videos of synthetic scenes are reproducible, consistent with their cameras, and usable like any other data.
 
-use crate::common::program::{arg, command, refuse, succeed, tiny_config};
+use crate::common::program::{arg, command, refuse, run_process, succeed, tiny_config};
 use glam::{DMat3, DVec3};
 use globalsplat::data::{Dataset, Split, SyntheticDataset, load_all_views};
 use globalsplat::scene::{Camera, ImageSize};
@@ -19,12 +19,8 @@ fn a_seed_makes_the_same_bytes() {
     let folder = tempfile::tempdir().unwrap();
     let bytes = |name: &str, threads: &str, seed: &str| {
         let out = folder.path().join(name);
-        let done = command(&["synth", "--scenes", "3", "--frames", "3", "--size", "24", "--seed", seed])
-            .args(["--out", arg(&out)])
-            .env("RAYON_NUM_THREADS", threads)
-            .output()
-            .unwrap();
-        assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+        let mut synth = command(&["synth", "--scenes", "3", "--frames", "3", "--size", "24", "--seed", seed]);
+        run_process(synth.args(["--out", arg(&out)]).env("RAYON_NUM_THREADS", threads));
         std::fs::read(out.join("000000.torch")).unwrap()
     };
     let one = bytes("one", "1", "5");

@@ -1,6 +1,6 @@
 //! Every command, run as a user runs it.
 
-use crate::common::program::{Sandbox, TINY_CONFIG, WAIT_PASSIVELY, assert_says, number, rooms};
+use crate::common::program::{Sandbox, TINY_CONFIG, WAIT_PASSIVELY, assert_says, number, rooms, run_process};
 use crate::common::{has_lpips, skip};
 use serde_json::{Value, json};
 
@@ -61,9 +61,7 @@ fn threads_do_not_change_a_splat() {
     for precision in ["f32", "bf16"] {
         let splat = |threads: &str| {
             let line = format!("reconstruct --scene @room --precision {precision} --out @{threads}.ply");
-            let output =
-                sandbox.command(&line).envs([("OMP_NUM_THREADS", threads), WAIT_PASSIVELY]).output().unwrap();
-            assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+            run_process(sandbox.command(&line).envs([("OMP_NUM_THREADS", threads), WAIT_PASSIVELY]));
             sandbox.read(&format!("{threads}.ply"))
         };
         assert!(splat("1") == splat("3"), "{precision}: threads change the bytes");
@@ -177,12 +175,7 @@ fn lpips_is_reported_where_its_weights_are() {
         return;
     }
     let sandbox = Sandbox::new();
-    let eval = |line: &str| {
-        let output = sandbox.command(line).env_remove("GLOBALSPLAT_WEIGHTS").output().unwrap();
-        let [out, err] = [output.stdout, output.stderr].map(|bytes| String::from_utf8(bytes).unwrap());
-        assert!(output.status.success(), "{err}");
-        (out, err)
-    };
+    let eval = |line: &str| run_process(sandbox.command(line).env_remove("GLOBALSPLAT_WEIGHTS"));
     let (table, _) = eval("eval --splat @room/truth.ply --scene @room");
     let lines: Vec<&str> = table.lines().skip(1).collect();
     assert!(lines[0].ends_with(" LPIPS-VGG LPIPS-Alex"), "{table}");

@@ -1,5 +1,6 @@
 //! GPU kernels, as far as they can be tested without a GPU.
 
+use crate::common::program::run_process;
 use crate::common::{rerun_test, skip};
 use globalsplat::render::cuda::{CodeFormat, Driver, Nvrtc, cache_folder, load_kernels};
 use std::path::Path;
@@ -106,14 +107,10 @@ fn kernels_are_compiled_once() {
 fn doctor_reports_missing_libraries() {
     let driver = fake_driver();
     let doctor = |error: &str| {
-        let output = Command::new(env!("CARGO_BIN_EXE_globalsplat"))
-            .arg("doctor")
-            .envs([("LD_LIBRARY_PATH", driver.path()), ("XDG_CACHE_HOME", driver.path())])
-            .env("GLOBALSPLAT_FAKE_DRIVER", error)
-            .output()
-            .expect("a program that starts");
-        assert!(output.status.success());
-        String::from_utf8(output.stdout).expect("text")
+        let mut doctor = Command::new(env!("CARGO_BIN_EXE_globalsplat"));
+        doctor.arg("doctor").env("GLOBALSPLAT_FAKE_DRIVER", error);
+        doctor.envs([("LD_LIBRARY_PATH", driver.path()), ("XDG_CACHE_HOME", driver.path())]);
+        run_process(&mut doctor).0
     };
     let found = doctor("");
     assert!(

@@ -1,6 +1,6 @@
 //! The programs in `examples/`, run as a user runs them.
 
-use crate::common::program::{arg, command, room, tiny_weights};
+use crate::common::program::{arg, command, room, run_process, tiny_weights};
 use std::path::Path;
 use std::process::Command;
 
@@ -11,11 +11,7 @@ const SAME_BITS: (&str, &str) = ("MKL_CBWR", "COMPATIBLE");
 /// builds only the examples.
 fn run(name: &str, arguments: &[&str]) -> String {
     let program = Path::new(env!("CARGO_BIN_EXE_globalsplat")).with_file_name("examples").join(name);
-    let output =
-        Command::new(&program).args(arguments).env("OMP_NUM_THREADS", "1").envs([SAME_BITS]).output();
-    let output = output.unwrap_or_else(|e| panic!("{}: {e}", program.display()));
-    assert!(output.status.success(), "{name}: {}", String::from_utf8_lossy(&output.stderr));
-    String::from_utf8_lossy(&output.stdout).into_owned()
+    run_process(Command::new(&program).args(arguments).env("OMP_NUM_THREADS", "1").envs([SAME_BITS])).0
 }
 
 #[test]
@@ -27,8 +23,7 @@ fn reconstruct_makes_the_programs_splat() {
     assert!(printed.contains("64 Gaussians from 3 photos"), "{printed}");
     let given = ["--weights", arg(&weights), "--scene", arg(&room), "--out", arg(&theirs)];
     let arguments = [&["reconstruct", "--precision", "f32"], &given[..]].concat();
-    let output = command(&arguments).envs([SAME_BITS]).output().unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    run_process(command(&arguments).envs([SAME_BITS]));
     assert_eq!(std::fs::read(ours).unwrap(), std::fs::read(theirs).unwrap());
 }
 

@@ -2,7 +2,7 @@
 #![cfg(unix)]
 
 use crate::common::browser::Browser;
-use crate::common::program::{arg, command, room, succeed};
+use crate::common::program::{arg, command, room, run_process, succeed};
 use crate::common::{captures, has_viewer, write_script};
 use crate::{LEAST, assert_like, own_picture, picture_from_base64};
 use globalsplat::data::{load_views, open_capture};
@@ -261,10 +261,10 @@ fn view_opens_a_page_of_a_splat_alone() {
     let opened = folder.path().join("opened");
     write_script(&opener, &format!("printf %s \"$1\" > {opened:?}"));
     let path = format!("{}:/usr/bin:/bin", folder.path().display());
-    let done =
-        command(&["view", arg(&splat)]).env("PATH", path).env("TMPDIR", folder.path()).output().unwrap();
-    assert!(done.status.success() && done.stderr.is_empty(), "{}", String::from_utf8_lossy(&done.stderr));
-    let page = PathBuf::from(String::from_utf8(done.stdout).unwrap().trim_end());
+    let mut view = command(&["view", arg(&splat)]);
+    let (out, err) = run_process(view.env("PATH", path).env("TMPDIR", folder.path()));
+    assert_eq!(err, "");
+    let page = PathBuf::from(out.trim_end());
     let begun = Instant::now();
     while std::fs::read_to_string(&opened).unwrap_or_default() != arg(&page) {
         assert!(begun.elapsed() < Duration::from_secs(20), "the page was not opened");
@@ -297,15 +297,10 @@ fn pages_are_private_and_replaced_by_the_next() {
     let splat = room.join("truth.ply");
     let mut before: Option<PathBuf> = None;
     for _ in 0..2 {
-        let done = command(&["view", arg(&splat), "--scene", arg(&room), "--json"])
-            .env("PATH", &empty)
-            .env("TMPDIR", &temporary)
-            .output()
-            .unwrap();
-        assert!(done.status.success());
-        let err = String::from_utf8(done.stderr).unwrap();
+        let mut view = command(&["view", arg(&splat), "--scene", arg(&room), "--json"]);
+        let (out, err) = run_process(view.env("PATH", &empty).env("TMPDIR", &temporary));
         assert!(err.starts_with("no browser could be started (") && err.lines().count() == 1, "{err}");
-        let report: Value = serde_json::from_slice(&done.stdout).unwrap();
+        let report: Value = serde_json::from_str(&out).unwrap();
         assert_eq!(report["opened"], false);
         let page = PathBuf::from(report["page"].as_str().unwrap());
         assert_eq!(std::fs::metadata(&page).unwrap().permissions().mode() & 0o777, 0o600);
