@@ -147,7 +147,7 @@ pub(super) fn writing(random: &Random, purpose: Purpose) -> Surface {
 
 /// Draws a texture of curly lines drawn by hand, as with chalk, crayons or spray paint.
 pub(super) fn scribbles(random: &Random, purpose: Purpose) -> Surface {
-    let palette = Palette::draw_between(random, purpose, 2, 5);
+    let palette = Palette::draw(random, purpose, random.count(2, 5));
     let mut canvas = Canvas::filled(SIZE, palette.color(0));
     for _ in 0..random.count(1, 12) {
         let color = palette.any(random);

@@ -202,7 +202,7 @@ pub(super) fn shingles(random: &Random, _: Purpose) -> Surface {
 /// Draws a mosaic of small stones in many colors.
 pub(super) fn mosaic(random: &Random, purpose: Purpose) -> Surface {
     let across = random.count(16, 40);
-    let palette = Palette::draw_between(random, purpose, 2, 5);
+    let palette = Palette::draw(random, purpose, random.count(2, 5));
     let drift = smooth(random, SIZE, [4; 2]);
     let seed = random.seed();
     let joint = joint_color(random, GRAYS);

@@ -73,11 +73,6 @@ impl Palette {
         Palette::among(random, THEMES[purpose as usize], count)
     }
 
-    /// Draws `low` to `high` colors that are likely for `purpose`.
-    pub fn draw_between(random: &Random, purpose: Purpose, low: usize, high: usize) -> Palette {
-        Palette::draw(random, purpose, random.count(low, high))
-    }
-
     /// Draws `count` colors of one of the themes with the given weights.
     pub fn among(random: &Random, themes: &[(Theme, f32)], count: usize) -> Palette {
         Palette::from_theme(random, random.weighted(themes), count)

@@ -260,7 +260,7 @@ pub(super) fn cupboards(random: &Random, purpose: Purpose) -> Surface {
 /// Draws a texture of keys, switches, buttons or vents: small rounded boxes in rows, some of them labelled.
 pub(super) fn keys(random: &Random, purpose: Purpose) -> Surface {
     let ground = Palette::draw(random, purpose, 1).color(0);
-    let palette = Palette::draw_between(random, Purpose::Thing, 1, 3);
+    let palette = Palette::draw(random, Purpose::Thing, random.count(1, 3));
     let mut canvas = Canvas::filled(SIZE, ground * random.uniform(0.3, 1.));
     let (columns, rows) = (random.count(2, 16), random.count(2, 12));
     let cell = Vec2::new(1. / columns as f32, 1. / rows as f32);
@@ -335,7 +335,7 @@ pub(super) fn ceiling_boards(random: &Random, _: Purpose) -> Surface {
 
 /// Draws a texture of bars or wires over a background: fences, grates, nets, trellis.
 pub(super) fn grids(random: &Random, purpose: Purpose) -> Surface {
-    let palette = Palette::draw_between(random, purpose, 2, 3);
+    let palette = Palette::draw(random, purpose, random.count(2, 3));
     let behind = fractal(random, SIZE, [3; 2], 4, 0.6);
     let dark = random.uniform(0.1, 0.8);
     let bar = palette.color(1);

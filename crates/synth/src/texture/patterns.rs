@@ -10,7 +10,7 @@ use super::{Canvas, Purpose, SIZE, Surface};
 
 /// Draws stripes of different widths, horizontal, upright or oblique.
 pub(super) fn stripes(random: &Random, purpose: Purpose) -> Surface {
-    let palette = Palette::draw_between(random, purpose, 2, 5);
+    let palette = Palette::draw(random, purpose, random.count(2, 5));
     let bands = bands(random, &palette);
     let (across, along) = random.one_of(&[(1., 0.), (1., 0.), (0., 1.), (1., 1.), (1., -1.), (2., 1.)]);
     let times = random.sqrt_uniform(1., 12.).floor();
@@ -32,7 +32,7 @@ pub(super) fn stripes(random: &Random, purpose: Purpose) -> Surface {
 
 /// Draws stripes in both directions, woven into each other.
 pub(super) fn plaid(random: &Random, purpose: Purpose) -> Surface {
-    let palette = Palette::draw_between(random, purpose, 2, 4);
+    let palette = Palette::draw(random, purpose, random.count(2, 4));
     let bands_across = bands(random, &palette);
     let bands_along = if random.chance(0.7) { bands_across.clone() } else { bands(random, &palette) };
     let times = random.sqrt_uniform(1., 8.).floor();
@@ -113,7 +113,7 @@ pub(super) fn pieces(random: &Random, purpose: Purpose) -> Surface {
 
 /// Draws dots, rings, stars, flowers and polygons on a straight, staggered or loose grid.
 pub(super) fn motifs(random: &Random, purpose: Purpose) -> Surface {
-    let palette = Palette::draw_between(random, purpose, 2, 5);
+    let palette = Palette::draw(random, purpose, random.count(2, 5));
     let mut canvas = Canvas::filled(SIZE, palette.color(0));
     let rows = 2 * random.sqrt_uniform(1., 8.) as usize;
     let cell = 1. / rows as f32;
@@ -181,7 +181,7 @@ impl Motif {
 
 /// Draws ornaments with mirror symmetry, as on old wallpaper: tendrils, leaves and flowers.
 pub(super) fn ornament(random: &Random, purpose: Purpose) -> Surface {
-    let palette = Palette::draw_between(random, purpose, 2, 4);
+    let palette = Palette::draw(random, purpose, random.count(2, 4));
     let mut canvas = Canvas::filled(SIZE, palette.color(0));
     let columns = random.one_of(&[1usize, 2, 2, 3, 4]);
     let cell = 1. / columns as f32;
@@ -226,7 +226,7 @@ pub(super) fn ornament(random: &Random, purpose: Purpose) -> Surface {
 
 /// Draws threads that pass over and under each other.
 pub(super) fn weave(random: &Random, purpose: Purpose) -> Surface {
-    let palette = Palette::draw_between(random, purpose, 1, 3);
+    let palette = Palette::draw(random, purpose, random.count(1, 3));
     let threads = random.one_of(&[24, 32, 40, 48, 64]);
     let twill = random.one_of(&[1, 1, 2, 3]);
     let (seed, spread) = (random.seed(), random.uniform(0.05, 0.5));
@@ -247,7 +247,7 @@ pub(super) fn weave(random: &Random, purpose: Purpose) -> Surface {
 
 /// Draws knitted rows of loops.
 pub(super) fn knit(random: &Random, purpose: Purpose) -> Surface {
-    let palette = Palette::draw_between(random, purpose, 1, 3);
+    let palette = Palette::draw(random, purpose, random.count(1, 3));
     let columns = random.one_of(&[12, 16, 24, 32]);
     let seed = random.seed();
     let banded = random.chance(0.4);
@@ -267,7 +267,7 @@ pub(super) fn knit(random: &Random, purpose: Purpose) -> Surface {
 
 /// Draws carpet pile, felt or fur: fine and soft, brushed in some places.
 pub(super) fn pile(random: &Random, purpose: Purpose) -> Surface {
-    let palette = Palette::draw_between(random, purpose, 1, 3);
+    let palette = Palette::draw(random, purpose, random.count(1, 3));
     let fine = random.one_of(&[64, 96, 128, 200]);
     let stretch = random.one_of(&[[1, 1], [1, 1], [1, 3], [3, 1]]);
     let tufts = fractal(random, SIZE, stretch.map(|share| fine / share), 2, 0.8);
@@ -281,7 +281,7 @@ pub(super) fn pile(random: &Random, purpose: Purpose) -> Surface {
 
 /// Draws cloth hanging in folds along v.
 pub(super) fn folds(random: &Random, purpose: Purpose) -> Surface {
-    let palette = Palette::draw_between(random, purpose, 1, 3);
+    let palette = Palette::draw(random, purpose, random.count(1, 3));
     let depth = random.uniform(0.15, 0.7);
     let (coarse, fine) = (random.count(4, 10), random.count(12, 28));
     let mut folds = smooth(random, SIZE, [coarse, 1]);

@@ -133,7 +133,7 @@ fn portrait(random: &Random) -> Canvas {
 
 /// Draws an abstract picture of large flat shapes.
 fn shapes(random: &Random) -> Canvas {
-    let palette = Palette::draw_between(random, Purpose::Poster, 3, 5);
+    let palette = Palette::draw(random, Purpose::Poster, random.count(3, 5));
     let mut canvas = Canvas::filled(SIZE, palette.color(0)).without_wrapping();
     let straight = random.chance(0.4);
     let line = if random.chance(0.4) { random.uniform(0.003, 0.015) } else { 0. };
@@ -230,7 +230,7 @@ fn painting(random: &Random) -> Canvas {
 
 /// Draws overlapping shapes of all sizes, more of the small ones, as in the statistics of photos (dead leaves model).
 fn dead_leaves(random: &Random) -> Canvas {
-    let palette = Palette::draw_between(random, Purpose::Thing, 3, 5);
+    let palette = Palette::draw(random, Purpose::Thing, random.count(3, 5));
     let other = Palette::draw(random, Purpose::Poster, 3);
     let mut canvas = Canvas::filled(SIZE, palette.color(0)).without_wrapping();
     let light = random.direction();

@@ -22,7 +22,7 @@ pub(super) fn paint(random: &Random, purpose: Purpose) -> Surface {
 
 /// Draws a soft gradient from one color to others and back.
 pub(super) fn gradient(random: &Random, purpose: Purpose) -> Surface {
-    let palette = Palette::draw_between(random, purpose, 2, 4);
+    let palette = Palette::draw(random, purpose, random.count(2, 4));
     let (across, along) = random.one_of(&[(0., 1.), (1., 0.), (1., 1.), (1., -1.), (0., 2.)]);
     let drift = smooth(random, SIZE, [random.count(1, 3); 2]);
     let strength = random.sqrt_uniform(0.001, 0.25);
@@ -67,7 +67,7 @@ pub(super) fn glossy(random: &Random, purpose: Purpose) -> Surface {
 
 /// Draws a texture of a random kind of noise.
 pub(super) fn clouds(random: &Random, purpose: Purpose) -> Surface {
-    let palette = Palette::draw_between(random, purpose, 2, 5);
+    let palette = Palette::draw(random, purpose, random.count(2, 5));
     let mut field = raw(random);
     if random.chance(0.4) {
         field = warped(random, &field, random.count(1, 6), random.sqrt_uniform(0.01, 0.2));

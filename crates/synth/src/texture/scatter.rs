@@ -150,7 +150,7 @@ pub(super) fn earth(random: &Random, _: Purpose) -> Surface {
 
 /// Draws confetti, splashes or brush strokes: bits of any shape in several colors.
 pub(super) fn confetti(random: &Random, purpose: Purpose) -> Surface {
-    let palette = Palette::draw_between(random, purpose, 3, 5);
+    let palette = Palette::draw(random, purpose, random.count(3, 5));
     let mut canvas = Canvas::filled(SIZE, palette.color(0));
     let length = random.sqrt_uniform(0.02, 0.3);
     let bits = (random.uniform(0.2, 2.) / (length * length)).min(800.) as usize;
