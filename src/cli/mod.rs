@@ -35,10 +35,7 @@ use crate::scene::ImageSize;
 use clap::{Parser, Subcommand};
 use serde_json::Value;
 use std::backtrace::{Backtrace, BacktraceStatus};
-use std::env;
 use std::io::{ErrorKind, Write, stdout};
-#[cfg(target_os = "linux")]
-use std::os::unix::process::CommandExt;
 use std::panic;
 use std::path::Path;
 use std::process::ExitCode;
@@ -117,12 +114,6 @@ impl Command {
         output.failure.map_or(Ok(()), |failure| Err(failure.into()))
     }
 
-    /// Returns `true` if the command runs many short operations of libtorch, between which threads wait for each other.
-    fn runs_small_operations(&self) -> bool {
-        use Command::{Bench, Eval, Reconstruct, Refine, Train};
-        matches!(self, Bench(_) | Eval(_) | Reconstruct(_) | Refine(_) | Train(_))
-    }
-
     /// Returns `true` if the processes that `torchrun` started share the work of this command.
     fn is_shared(&self) -> bool {
         match self {
@@ -146,9 +137,6 @@ pub fn main() -> ExitCode {
             return ExitCode::from(e.exit_code() as u8);
         }
     };
-    if cli.command.runs_small_operations() {
-        limit_spinning();
-    }
     // Denormals halve the speed of training on some processors. This must precede the start of other threads.
     globalsplat_csrc::runtime::flush_denormals();
     // Errors of libtorch that the library's own checks don't catch arrive as panics: the user still gets one sentence, and with
@@ -167,21 +155,6 @@ pub fn main() -> ExitCode {
             }
             ExitCode::from(code)
         }
-    }
-}
-
-/// Lets OpenMP's threads sleep after some microseconds of waiting instead of milliseconds, unless the user has set how they wait. While they
-/// spin, our own kernels and other processes lack their cores (docs/robustness.md). OpenMP reads the variable before `main`, so the program
-/// starts once more, in the same process; if it can't, it only runs slower.
-fn limit_spinning() {
-    #[cfg(all(target_os = "linux", target_env = "gnu"))]
-    if ["OMP_WAIT_POLICY", "GOMP_SPINCOUNT"].iter().all(|name| env::var_os(name).is_none()) {
-        let mut arguments = env::args_os();
-        let _error = std::process::Command::new("/proc/self/exe")
-            .arg0(arguments.next().unwrap_or_default())
-            .args(arguments)
-            .env("GOMP_SPINCOUNT", "1000")
-            .exec();
     }
 }
 
