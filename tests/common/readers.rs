@@ -12,13 +12,13 @@ use globalsplat::io::{
 use globalsplat::reconstruct::load_model;
 use globalsplat::scene::Gaussians;
 use globalsplat::train::latest_checkpoint;
+use globalsplat_files::stored_zip;
 use globalsplat_test_kit::formats::{cameras, names, pinhole, write_colmap_binary, write_colmap_text};
 use std::fs;
-use std::io::{Cursor, Write};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 use tch::Device;
-use zip::write::{FileOptions, ZipWriter};
 
 /// Function that reads arbitrary bytes.
 pub type Reader = fn(&[u8]);
@@ -219,17 +219,9 @@ fn weights(bytes: &[u8]) {
 
 /// Returns a torch.save archive of `pickle` and of the numbered storages.
 fn torch_archive(pickle: &[u8], storages: &[&[u8]]) -> Vec<u8> {
-    let mut zip = ZipWriter::new(Cursor::new(vec![]));
-    let mut add = |name: String, contents: &[u8]| {
-        let options = FileOptions::default().compression_method(zip::CompressionMethod::Stored);
-        zip.start_file(name, options).unwrap();
-        zip.write_all(contents).unwrap();
-    };
-    add("archive/data.pkl".into(), pickle);
-    for (key, contents) in storages.iter().enumerate() {
-        add(format!("archive/data/{key}"), contents);
-    }
-    zip.finish().unwrap().into_inner()
+    let storages = storages.iter().enumerate();
+    let storages = storages.map(|(key, contents)| (format!("archive/data/{key}"), *contents));
+    stored_zip([("archive/data.pkl".into(), pickle)].into_iter().chain(storages), 1)
 }
 
 /// Reads a chunk with the pickle `bytes`; storages 0 to 2 are a photo, two cameras and two timestamps.

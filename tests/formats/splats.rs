@@ -9,8 +9,10 @@ use globalsplat::data::open_capture;
 use globalsplat::io::{ShLimits, fit_splat, read_image, read_splat, tensor_from_rgb};
 use globalsplat::metrics::{psnr, psnr_between};
 use globalsplat::scene::{Gaussians, RawGaussians};
+use rand::SeedableRng;
+use rand::rngs::StdRng;
 use serde_json::Value;
-use splat_files::{Random, files_with_invalid_values, files_without_a_rotation, random_splat, written};
+use splat_files::{files_with_invalid_values, files_without_a_rotation, random_splat, symmetric, written};
 
 /// Gaussians keep the bits of a splat's parameters, and give them back unless they are infinite.
 #[test]
@@ -141,9 +143,9 @@ fn convert_edits_in_the_given_order() {
 fn convert_preserves_the_views_of_a_capture() {
     let sandbox = Sandbox::new();
     let mut splat = read_splat(&sandbox.path("room/truth.ply")).unwrap().with_sh_degree(3);
-    let mut random = Random::new(3);
+    let random = &mut StdRng::seed_from_u64(3);
     for of_one in splat.sh.chunks_exact_mut(16) {
-        of_one[1..].iter_mut().for_each(|color| *color = random.symmetric().map(|number: f32| 3. * number));
+        of_one[1..].iter_mut().for_each(|color| *color = symmetric(random).map(|number| 3. * number));
     }
     written(sandbox.folder(), "strong.ply", &splat);
     let cameras = open_capture(&sandbox.path("room")).unwrap().cameras();

@@ -1,6 +1,7 @@
 #![doc = include_str!("../README.md")]
 
 mod append;
+mod archive;
 mod atomic;
 mod error;
 mod inputs;
@@ -8,6 +9,7 @@ mod paths;
 mod read;
 
 pub use append::AppendFile;
+pub use archive::stored_zip;
 pub use atomic::{
     PartialFile, check_regular, check_writable_dir, check_writable_file, parent_of, recover_dirs, remove_dir,
     replace_dir, write_atomically, write_json, write_temporary,

@@ -1,18 +1,15 @@
 //! antimatter15's `.splat` format: 32 bytes per Gaussian and nothing else (spec 10.14).
 
+use crate::formats::recognized;
 use crate::numbers::f32_at;
 use crate::rotations::normalized;
 use crate::splat::{color_to_sh0, logit_of_opacity, sh0_to_color};
-use crate::{Error, Result, SH_C0, ShLimits, Splat, WriteOptions, gltf, ply, sog, spz};
+use crate::{Error, Result, SH_C0, ShLimits, Splat, WriteOptions};
 use globalsplat_files::write_atomically;
 use std::path::Path;
 
 /// Number of bytes of a Gaussian: position and scale, float32 each, then color, opacity and rotation, a byte each.
 const BYTES: usize = 32;
-
-/// Functions that recognize the other formats by their first bytes.
-const MAGICS: [fn(&[u8]) -> bool; 4] =
-    [ply::recognizes, sog::recognizes, spz::recognizes, gltf::recognizes_glb];
 
 /// Reads a `.splat`, whose colors don't depend on the view direction.
 pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
@@ -65,7 +62,7 @@ pub(crate) fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> 
             gaussian.extend(splat.unit_quaternion(index).map(|part| (part * 128. + 128.).round() as u8));
             // If the first bytes are the magic number of another format, the lowest bit of the position is flipped, so that readers don't
             // take the file for that format.
-            if place == 0 && MAGICS.iter().any(|recognizes| recognizes(&gaussian)) {
+            if place == 0 && recognized(&gaussian).is_some() {
                 gaussian[0] ^= 1;
             }
             writer.write_all(&gaussian).map_err(Error::write(path))?;

@@ -3,6 +3,7 @@
 
 use crate::invalid::InvalidGaussians;
 use crate::origin::{origin_file, read_origin, write_with_origin};
+use crate::ply_table::Header;
 use crate::rotations::drop_missing_rotations;
 use crate::{Error, Result, ShLimits, Splat, compressed_ply, dot_splat, gltf, ksplat, ply, sog, spz};
 use glam::DVec3;
@@ -79,7 +80,7 @@ static FORMATS: [SplatFormat; 9] = [
     },
     SplatFormat {
         ending: ".ply",
-        recognizes: ply::recognizes,
+        recognizes: Header::begins,
         marks_antialiased: true,
         read: ply::read,
         find_invalid: ply::find_invalid,
@@ -146,6 +147,11 @@ fn format_of(path: &Path) -> Result<&'static SplatFormat> {
         let found = path.extension().map_or("missing".into(), |ending| format!(".{}", ending.display()));
         Error::input(path, "the ending", found, ENDINGS)
     })
+}
+
+/// Returns the format that `bytes` are certainly in.
+pub(crate) fn recognized(bytes: &[u8]) -> Option<&'static SplatFormat> {
+    FORMATS.iter().find(|format| (format.recognizes)(bytes))
 }
 
 /// Returns the format in which a splat is written at `path`, which the extension selects.
@@ -234,7 +240,7 @@ pub fn read_splat_without_invalid(path: &Path) -> Result<Splat> {
 fn read_contents(path: &Path) -> Result<(Splat, InvalidGaussians)> {
     let named = format_of(path)?;
     let bytes = std::fs::read(path).map_err(Error::read(path))?;
-    let format = FORMATS.iter().find(|format| (format.recognizes)(&bytes)).unwrap_or(named);
+    let format = recognized(&bytes).unwrap_or(named);
     let splat = (format.read)(path, &bytes)?;
     let invalid = (format.find_invalid)(&splat);
     Ok((splat, invalid))

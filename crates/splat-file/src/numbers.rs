@@ -1,4 +1,13 @@
-//! Little-endian numbers in the bytes of a file.
+//! Little-endian numbers in the bytes of a file, and how many of them it may hold.
+
+/// Maximum ratio of the size in memory to that of the file, with `MAX_SMALL` bytes allowed in addition. Real splats reach a ratio of ten.
+pub(crate) const MAX_RATIO: usize = 256;
+const MAX_SMALL: usize = 1 << 20;
+
+/// Returns `true` if a file of `file_length` bytes may hold what takes `size` bytes in memory. It is checked before memory is allocated.
+pub(crate) fn may_hold(file_length: usize, size: u128) -> bool {
+    size <= MAX_SMALL as u128 + MAX_RATIO as u128 * file_length as u128
+}
 
 /// Type of a number.
 #[derive(Debug, Clone, Copy, PartialEq)]

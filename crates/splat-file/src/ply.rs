@@ -18,11 +18,6 @@ const MAX_LOG_SCALE: f32 = 88.;
 const COLORS: [[&str; 3]; 3] =
     [["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"]];
 
-/// Returns `true` if `bytes` begin like a PLY.
-pub(crate) fn recognizes(bytes: &[u8]) -> bool {
-    Header::begins(bytes)
-}
-
 /// Reads a 3DGS splat of any SH degree, in text or binary of either byte order. Properties are found by name, so their order doesn't
 /// matter, and others may be present. Without `scale_2`, as in 2DGS, Gaussians are flat in their third direction; without `f_dc_*` their
 /// colors are those of `red`, `green` and `blue`.

@@ -3,14 +3,10 @@
 
 use crate::pickle::STORAGES;
 use crate::{Error, Result, row_major};
-use globalsplat_files::write_atomically;
+use globalsplat_files::{stored_zip, write_atomically};
 use safetensors::tensor::TensorView;
 use std::collections::HashMap;
-use std::io::{Cursor, Write};
 use std::path::Path;
-use zip::result::ZipError;
-use zip::write::{FileOptions, ZipWriter};
-use zip::{CompressionMethod, DateTime};
 
 /// Alignment of each tensor's bytes in the file. Files that torch writes have the same.
 const ALIGNMENT: u16 = 64;
@@ -72,26 +68,12 @@ pub fn serialize(root: &Item) -> Result<Vec<u8>> {
     pickle.item(root)?;
     // STOP
     pickle.bytes.push(b'.');
-    let mut zip = ZipWriter::new(Cursor::new(vec![]));
-    let mut add = |name: &str, contents: &[u8]| {
-        let options = FileOptions::default()
-            .compression_method(CompressionMethod::Stored)
-            // The same contents have the same bytes at any time.
-            .last_modified_time(DateTime::default())
-            .large_file(contents.len() > u32::MAX as usize);
-        zip.start_file_aligned(format!("archive/{name}"), options, ALIGNMENT)?;
-        zip.write_all(contents).map_err(ZipError::from)
-    };
-    let written = (|| {
-        add("data.pkl", &pickle.bytes)?;
-        add("byteorder", b"little")?;
-        for (key, bytes) in pickle.tensors.iter().enumerate() {
-            add(&format!("data/{key}"), bytes)?;
-        }
-        add("version", VERSION)
-    })();
-    let finished = written.and_then(|()| zip.finish());
-    Ok(finished.map_err(Error::failed_with_context("a file of torch.save"))?.into_inner())
+    let mut entries = vec![("archive/data.pkl".to_string(), &pickle.bytes[..])];
+    entries.push(("archive/byteorder".into(), b"little"));
+    let storages = pickle.tensors.iter().enumerate();
+    entries.extend(storages.map(|(key, bytes)| (format!("archive/data/{key}"), *bytes)));
+    entries.push(("archive/version".into(), VERSION));
+    Ok(stored_zip(entries, ALIGNMENT))
 }
 
 /// Pickle under construction.

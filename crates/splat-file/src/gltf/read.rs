@@ -3,16 +3,13 @@
 use super::document::{Document, Primitive, quoted};
 use super::{COLOR_SPACE, EXTENSION, KERNEL, POINTS, SPZ_EXTENSION, rotation_from_gltf, sh_attribute};
 use crate::axes::Axes;
+use crate::numbers::{MAX_RATIO, may_hold};
 use crate::splat::{color_to_sh0, logit_of_opacity};
 use crate::{Error, Result, Splat, spz};
 use glam::{DMat4, DQuat, DVec3};
 use serde_json::Value;
 use std::collections::BTreeSet;
 use std::path::Path;
-
-/// Maximum ratio of the size in memory to that of the file, with `MAX_SMALL` bytes allowed in addition: nodes can share meshes.
-const MAX_RATIO: u128 = 256;
-const MAX_SMALL: u128 = 1 << 20;
 
 /// Reads the Gaussians of all primitives in the default scene, at the places of their nodes.
 pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
@@ -145,13 +142,13 @@ impl PrimitiveReader<'_> {
         })
     }
 
-    /// Adds the size of Gaussians in memory to `memory`, before it is allocated, and checks that the sum isn't more than the file can
-    /// reasonably hold.
+    /// Adds the size of Gaussians in memory to `memory`, before it is allocated, and checks that the file may hold the sum: nodes can share
+    /// meshes.
     fn add_size(&self, memory: &mut u128, count: usize, bases: usize) -> Result<()> {
         let numbers = 3 + 3 + 3 + 4 + 1 + 3 * bases;
         *memory += count as u128 * (numbers * size_of::<f32>()) as u128;
         let size = self.document.size;
-        if *memory > MAX_SMALL + MAX_RATIO * size as u128 {
+        if !may_hold(size, *memory) {
             let found = format!("more than fit: {memory} bytes of them in files of {size}");
             let expected = format!("{MAX_RATIO} times the files' bytes at most");
             return Err(Error::input(self.document.path, "the number of Gaussians", found, expected));

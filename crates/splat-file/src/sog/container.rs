@@ -2,13 +2,14 @@
 
 use super::IMAGES;
 use crate::{Error, Result};
-use globalsplat_files::{PartialFile, check_regular, parent_of, write_atomically, write_temporary};
+use globalsplat_files::{
+    PartialFile, check_regular, parent_of, stored_zip, write_atomically, write_temporary,
+};
 use image_webp::{ColorType, EncoderParams, WebPDecoder, WebPEncoder};
 use rayon::prelude::*;
 use std::io::{Cursor, Read, Write};
 use std::path::Path;
-use zip::write::FileOptions;
-use zip::{CompressionMethod, ZipArchive, ZipWriter};
+use zip::ZipArchive;
 
 /// Maximum ratio of decompressed to compressed size of the archive, with `MAX_SMALL` bytes allowed in addition.
 const MAX_RATIO: u64 = 64;
@@ -120,14 +121,8 @@ fn encode_webp(image: &Image) -> std::result::Result<Vec<u8>, image_webp::Encodi
 /// Writes `meta.json` and the images to a ZIP archive.
 pub fn write_zip(path: &Path, meta: &[u8], images: &[(&'static str, Vec<u8>)]) -> Result<()> {
     // WebP can't be compressed further.
-    let options = FileOptions::default().compression_method(CompressionMethod::Stored);
-    let mut archive = ZipWriter::new(Cursor::new(vec![]));
     let files = images.iter().map(|(name, file)| (*name, &file[..])).chain([("meta.json", meta)]);
-    for (name, file) in files {
-        archive.start_file(name, options).expect("a short name");
-        archive.write_all(file).expect("memory");
-    }
-    let archive = archive.finish().expect("memory").into_inner();
+    let archive = stored_zip(files, 1);
     write_atomically(path, |writer| writer.write_all(&archive).map_err(Error::write(path)))
 }
 

@@ -6,6 +6,7 @@ mod container;
 mod palette;
 
 use crate::morton::morton_order;
+use crate::numbers::may_hold;
 use crate::rotations::{from_smallest_three, smallest_three};
 use crate::splat::{bounds, logit_of_opacity};
 use crate::{Error, Result, Splat, WriteOptions};
@@ -42,10 +43,6 @@ const GAUSSIANS_PER_CENTROID: usize = 3;
 const MAX_LOG_SCALE: f32 = 20.;
 /// Number of image pixels that are allowed in addition to one per Gaussian, as a factor and as a constant.
 const MAX_PIXELS: (usize, usize) = (4, 1 << 16);
-
-/// Maximum number of bytes of the pixels of positions for each byte of their file, with `MAX_SMALL` bytes allowed in addition.
-const MAX_RATIO: usize = 256;
-const MAX_SMALL: usize = 1 << 20;
 
 /// Contents of `meta.json`.
 #[derive(Serialize, Deserialize)]
@@ -127,7 +124,7 @@ fn read(path: &Path, mut reader: Reader, meta: &[u8]) -> Result<Splat> {
     let mut image = |name: &str| -> Result<Image> {
         let image = reader.image(name, |pixels, bytes| {
             // The lower bytes of positions hardly compress, and all other images have as many pixels.
-            let is_small = name != lower_name || 4 * pixels <= MAX_SMALL + MAX_RATIO * bytes;
+            let is_small = name != lower_name || may_hold(bytes, 4 * pixels as u128);
             is_small && pixels / MAX_PIXELS.0 <= meta.count.saturating_add(MAX_PIXELS.1)
         })?;
         if image.pixels.len() < meta.count {

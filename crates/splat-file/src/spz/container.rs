@@ -1,8 +1,8 @@
 //! Container of SPZ: a header and six streams, together in gzip up to version 3, each in Zstandard since version 4.
 
 use crate::axes::Axes;
-use crate::numbers::u32_at;
-use crate::{Error, Result, Splat};
+use crate::numbers::{MAX_RATIO, may_hold, u32_at};
+use crate::{Error, Result};
 use flate2::Compression;
 use flate2::bufread::GzDecoder;
 use flate2::write::GzEncoder;
@@ -27,9 +27,6 @@ const HAS_EXTENSIONS: u8 = 2;
 const COORDINATE_SYSTEM: u32 = 0xADBE_0003;
 /// Maximum size of the extensions in bytes.
 const MAX_EXTENSIONS: usize = 1 << 16;
-/// Maximum ratio of decompressed to compressed size, with `MAX_SMALL` bytes allowed in addition. Real splats reach a ratio of ten.
-const MAX_RATIO: u128 = 256;
-const MAX_SMALL: u128 = 1 << 20;
 /// Level of Zstandard: higher ones take three times as long and save a hundredth.
 const ZSTD_LEVEL: i32 = 12;
 
@@ -47,15 +44,10 @@ pub struct Header {
     pub fractional_bits: u32,
     pub antialiased: bool,
     /// `true` if there are extensions. None are written.
-    has_extensions: bool,
+    pub has_extensions: bool,
 }
 
 impl Header {
-    pub fn new(version: u32, splat: &Splat, fractional_bits: u32) -> Self {
-        let Splat { sh_degree, antialiased, .. } = *splat;
-        Header { version, count: splat.len(), sh_degree, fractional_bits, antialiased, has_extensions: false }
-    }
-
     /// Parses the header of `length` bytes at the beginning of `bytes`, in a file of `file_length` bytes. The version must be one of
     /// `versions`. Checks that the file may decompress to the size that it claims, before memory is allocated for it.
     fn parse(
@@ -77,8 +69,7 @@ impl Header {
         let (version, count) = (u32_at(bytes, 4), u32_at(bytes, 8) as usize);
         let [sh_degree, fractional_bits, flags] = [12, 13, 14].map(|at| bytes[at]);
         if !versions.contains(&version) {
-            let expected = "1 to 3 in gzip, 4 outside of it";
-            return refuse("the version", &version, expected);
+            return refuse("the version", &version, "1 to 3 in gzip, 4 outside of it");
         }
         if sh_degree > 3 {
             return refuse("the SH degree", &sh_degree, "0 to 3");
@@ -95,13 +86,10 @@ impl Header {
             has_extensions: flags & HAS_EXTENSIONS != 0,
         };
         let size = header.widths().iter().sum::<usize>() as u128 * count as u128;
-        if size > MAX_SMALL + MAX_RATIO * file_length as u128 {
+        if !may_hold(file_length, size) {
             let found = format!("{count}, {size} bytes of them in a file of {file_length}");
-            return refuse(
-                "the number of Gaussians",
-                &found,
-                &format!("{MAX_RATIO} times the file's bytes at most"),
-            );
+            let expected = format!("{MAX_RATIO} times the file's bytes at most");
+            return refuse("the number of Gaussians", &found, &expected);
         }
         Ok(header)
     }

@@ -160,7 +160,10 @@ pub(crate) fn write(path: &Path, splat: &Splat, options: &WriteOptions) -> Resul
         },
         harmonics.collect(),
     ];
-    container::write(path, &Header::new(version, splat, fractional_bits), streams)
+    let Splat { sh_degree, antialiased, .. } = *splat;
+    let count = splat.len();
+    let header = Header { version, count, sh_degree, fractional_bits, antialiased, has_extensions: false };
+    container::write(path, &header, streams)
 }
 
 /// Rounds to the nearest of 2^`bits` values, one of which is 0.

@@ -2,47 +2,31 @@
 #![allow(dead_code)] // the program's tests use only a part
 
 use globalsplat_splat_file::{Error, SH_C0, Splat, read_splat, write_splat};
+use rand::rngs::StdRng;
+use rand::{Rng, SeedableRng};
 use std::path::{Path, PathBuf};
 
 /// Extensions of all formats that are written.
 pub const ENDINGS: [&str; 7] = ["ply", "compressed.ply", "sog", "spz", "splat", "glb", "gltf"];
 
-/// Random numbers (SplitMix64).
-pub struct Random(u64);
-
-impl Random {
-    /// Creates the generator of a seed.
-    pub fn new(seed: u64) -> Self {
-        Random(seed)
-    }
-
-    /// Returns a number in [0, 1).
-    pub fn uniform(&mut self) -> f32 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mixed = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        let mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        ((mixed ^ (mixed >> 31)) >> 40) as f32 / (1 << 24) as f32
-    }
-
-    /// Returns numbers in [-1, 1).
-    pub fn symmetric<const N: usize>(&mut self) -> [f32; N] {
-        std::array::from_fn(|_| 2. * self.uniform() - 1.)
-    }
+/// Returns random numbers in [-1, 1).
+pub fn symmetric<const N: usize>(random: &mut StdRng) -> [f32; N] {
+    std::array::from_fn(|_| random.random_range(-1. ..1.))
 }
 
 /// Returns a splat whose values are within the range of every format: coefficients within ±0.9, displayable colors.
 pub fn random_splat(count: usize, degree: usize, seed: u64) -> Splat {
-    let mut random = Random::new(seed);
+    let random = &mut StdRng::seed_from_u64(seed);
     let (mut means, mut log_scales, mut quaternions) = (vec![], vec![], vec![]);
     let (mut opacity_logits, mut sh) = (vec![], vec![]);
     for _ in 0..count {
-        let [x, y, z] = random.symmetric().map(|number: f32| 3. * number);
+        let [x, y, z] = symmetric(random).map(|number| 3. * number);
         means.push([x, y, z + 6.]);
-        log_scales.push(random.symmetric().map(|number: f32| number - 2.));
-        quaternions.push(random.symmetric());
-        let opacity = random.uniform();
+        log_scales.push(symmetric(random).map(|number| number - 2.));
+        quaternions.push(symmetric(random));
+        let opacity: f32 = random.random();
         opacity_logits.push((opacity / (1. - opacity)).ln());
-        sh.extend((0..(degree + 1).pow(2)).map(|_| random.symmetric().map(|number: f32| 0.9 * number)));
+        sh.extend((0..(degree + 1).pow(2)).map(|_| symmetric(random).map(|number| 0.9 * number)));
     }
     Splat::new(degree, means, log_scales, quaternions, opacity_logits, sh).unwrap()
 }

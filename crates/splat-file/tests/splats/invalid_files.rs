@@ -1,11 +1,13 @@
 //! Invalid files, and files of which only a part of the Gaussians can be drawn.
 
 use super::common::{
-    ENDINGS, Random, assert_bytes_refused, assert_refused, assert_says, body_of_ply, bytes_of,
+    ENDINGS, assert_bytes_refused, assert_refused, assert_says, body_of_ply, bytes_of,
     files_with_invalid_values, files_without_a_rotation, random_splat, read_bytes, round_trip, set,
     small_gaussians, write_changed_ply, write_ply,
 };
 use globalsplat_splat_file::{read_splat, read_splat_without_invalid, write_splat};
+use rand::rngs::StdRng;
+use rand::{Rng, SeedableRng};
 
 /// Replaces a part of a header.
 fn replace(bytes: &mut Vec<u8>, from: &str, to: &str) {
@@ -25,31 +27,29 @@ fn assert_headers_are_refused(ending: &str, cases: &[(&str, &str, &str)]) {
 
 #[test]
 fn bad_plys() {
-    assert_headers_are_refused(
-        "ply",
-        &[
-            ("little", "middle", "the format is binary_middle_endian"),
-            ("format", "comment", "the line format is missing"),
-            ("vertex 300", "vertex many", "rows of the element vertex is many, expected a whole number"),
-            ("element vertex 300\n", "", "the property x is without an element"),
-            ("element vertex", "element point", "the element vertex is missing"),
-            ("float opacity", "float half opacity", "the type of opacity is \"float half\""),
-            ("float opacity", "list float opacity", "the type of opacity"),
-            ("float opacity", "list uchar float opacity", "property opacity is a list"),
-            ("f_rest_8", "f_rest_9", "f_rest_* is 8 properties"),
-            (
-                "vertex 300",
-                "vertex 18446744073709551615",
-                "x in row 300 of vertex is cut short, expected numbers",
-            ),
-            ("binary_little_endian", "ascii", "in row 0 of vertex is"),
-            (
-                "element vertex",
-                "element face 1000000000000\nproperty list uchar int i\nelement vertex",
-                "of face is cut short, expected numbers in 1000000000000 rows",
-            ),
-        ],
-    );
+    let cases = [
+        ("little", "middle", "the format is binary_middle_endian"),
+        ("format", "comment", "the line format is missing"),
+        ("vertex 300", "vertex many", "rows of the element vertex is many, expected a whole number"),
+        ("element vertex 300\n", "", "the property x is without an element"),
+        ("element vertex", "element point", "the element vertex is missing"),
+        ("float opacity", "float half opacity", "the type of opacity is \"float half\""),
+        ("float opacity", "list float opacity", "the type of opacity"),
+        ("float opacity", "list uchar float opacity", "property opacity is a list"),
+        ("f_rest_8", "f_rest_9", "f_rest_* is 8 properties"),
+        (
+            "vertex 300",
+            "vertex 18446744073709551615",
+            "x in row 300 of vertex is cut short, expected numbers",
+        ),
+        ("binary_little_endian", "ascii", "in row 0 of vertex is"),
+        (
+            "element vertex",
+            "element face 1000000000000\nproperty list uchar int i\nelement vertex",
+            "of face is cut short, expected numbers in 1000000000000 rows",
+        ),
+    ];
+    assert_headers_are_refused("ply", &cases);
     for (length, message) in [
         (-1., "i in row 0 of face is a list of the length -1, expected numbers"),
         (f64::NAN, "i in row 0 of face is a list of the length NaN"),
@@ -65,27 +65,17 @@ fn bad_plys() {
 
 #[test]
 fn bad_compressed_plys() {
-    assert_headers_are_refused(
-        "compressed.ply",
-        &[
-            ("element chunk", "element chunks", "the element chunk is missing"),
-            ("element chunk 2", "element chunk 1", "the number of chunks is 1, expected 2 for 300"),
-            (
-                "vertex 300",
-                "vertex 4000000000",
-                "of vertex is cut short, expected numbers in 4000000000 rows",
-            ),
-            ("float max_b", "float most_b", "property max_b is missing"),
-            (
-                "uint packed_scale",
-                "int packed_scale",
-                "property packed_scale is of another type, expected uint",
-            ),
-            ("uchar f_rest_3", "char f_rest_3", "property f_rest_3 is of another type, expected uchar"),
-            ("element sh 300", "element sh 299", "rows of the element sh is 299, expected 300"),
-            ("uchar f_rest_8", "uchar f_rest_x", "f_rest_* is 8 properties"),
-        ],
-    );
+    let cases = [
+        ("element chunk", "element chunks", "the element chunk is missing"),
+        ("element chunk 2", "element chunk 1", "the number of chunks is 1, expected 2 for 300"),
+        ("vertex 300", "vertex 4000000000", "of vertex is cut short, expected numbers in 4000000000 rows"),
+        ("float max_b", "float most_b", "property max_b is missing"),
+        ("uint packed_scale", "int packed_scale", "property packed_scale is of another type, expected uint"),
+        ("uchar f_rest_3", "char f_rest_3", "property f_rest_3 is of another type, expected uchar"),
+        ("element sh 300", "element sh 299", "rows of the element sh is 299, expected 300"),
+        ("uchar f_rest_8", "uchar f_rest_x", "f_rest_* is 8 properties"),
+    ];
+    assert_headers_are_refused("compressed.ply", &cases);
 }
 
 #[test]
@@ -97,7 +87,7 @@ fn bad_splats() {
 /// No truncated or changed file of any format makes its reader panic, or allocate what the file can't hold.
 #[test]
 fn random_changes_are_read_or_refused() {
-    let mut random = Random::new(8);
+    let mut random = StdRng::seed_from_u64(8);
     let splat = random_splat(40, 1, 9);
     let mut files = Vec::from(ENDINGS.map(|ending| (ending, bytes_of(ending, &splat))));
     files.push(("ksplat", include_bytes!("../files/level_1.ksplat").to_vec()));
@@ -107,10 +97,10 @@ fn random_changes_are_read_or_refused() {
             // Headers are at the beginning of most files.
             let limit = if round % 2 == 0 { bytes.len().min(512) } else { bytes.len() };
             for _ in 0..3 {
-                bytes[(random.uniform() * limit as f32) as usize] = (random.uniform() * 256.) as u8;
+                bytes[random.random_range(0..limit)] = random.random();
             }
             if round % 4 == 0 {
-                bytes.truncate((random.uniform() * bytes.len() as f32) as usize);
+                bytes.truncate(random.random_range(0..bytes.len()));
             }
             if let Err(error) = read_bytes(ending, &bytes) {
                 assert_eq!(error.to_string().lines().count(), 1, "{error}");

@@ -55,13 +55,7 @@ fn older_versions_of_spz_are_read() {
     let two = [head(2), hex("00100000e0ff00d0ff"), shape.clone(), hex("8d6558"), harmonics.clone()].concat();
     let three = [head(3), hex("00100000e0ff00d0ff"), shape, hex("de52aac4"), harmonics].concat();
     // File written by Niantic's library.
-    let four = hex(
-        "4e4753500400000001000000010c000620000000000000000000000000000000120000000000000009000000000000000a0000000000000\
-         001000000000000000c0000000000000003000000000000000c0000000000000003000000000000000d000000000000000400000000000\
-         00012000000000000000900000000000000\
-         28b52ffd200949000000100000e0ff00d0ff28b52ffd20010900009f28b52ffd200319000083878b28b52ffd200319000090807028b52ff\
-         d2004210000de52aac428b52ffd2009490000706858504030d8e8f0",
-    );
+    let four = include_bytes!("../files/version_4.spz").to_vec();
     for (version, bytes) in [(1, gzip(&one)), (2, gzip(&two)), (3, gzip(&three)), (4, four)] {
         let splat = read_bytes("spz", &bytes).unwrap_or_else(|e| panic!("{e}"));
         let near = |found: &[f32], expected: &[f32], step: f64| {

@@ -1,8 +1,6 @@
 //! Handwritten pickles, and archives of them.
 
-use std::io::{Cursor, Write};
-use zip::CompressionMethod;
-use zip::write::{FileOptions, ZipWriter};
+use globalsplat_files::stored_zip;
 
 /// Returns a BINUNICODE opcode with its argument.
 pub fn text(text: &str) -> Vec<u8> {
@@ -32,11 +30,6 @@ pub fn tensor_of(id: &[Vec<u8>], offset: u32, size: &[u32], stride: &[u32]) -> V
 }
 
 /// Returns a torch.save archive with `pickle` and the bytes of one tensor.
-pub fn archive(pickle: &[u8], data: &[u8], method: CompressionMethod) -> Vec<u8> {
-    let mut zip = ZipWriter::new(Cursor::new(vec![]));
-    for (name, contents) in [("archive/data.pkl", pickle), ("archive/data/0", data)] {
-        zip.start_file(name, FileOptions::default().compression_method(method)).unwrap();
-        zip.write_all(contents).unwrap();
-    }
-    zip.finish().unwrap().into_inner()
+pub fn archive(pickle: &[u8], data: &[u8]) -> Vec<u8> {
+    stored_zip([("archive/data.pkl", pickle), ("archive/data/0", data)], 1)
 }

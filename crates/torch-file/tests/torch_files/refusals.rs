@@ -3,11 +3,10 @@
 use crate::pickles::{archive, int, tensor_of, text};
 use globalsplat_torch_file::{Array, TorchFile, Value};
 use std::path::Path;
-use zip::CompressionMethod;
 
 /// Reads an archive of `pickle` and of a tensor of 64 bytes.
 fn read(pickle: &[u8]) -> Result<TorchFile<'static>, String> {
-    let file = archive(pickle, &[0; 64], CompressionMethod::Stored).leak();
+    let file = archive(pickle, &[0; 64]).leak();
     TorchFile::parse(Path::new("a.pt"), file).map_err(|error| error.to_string())
 }
 
@@ -146,23 +145,23 @@ fn archives_that_inflate_are_refused() {
         assert!(error.is_invalid_request(), "{error}");
         error.to_string()
     };
-    let pickle = b"\x80\x02}.";
-    let error = refusal(&archive(pickle, &[0; 1 << 20], CompressionMethod::Deflated));
-    assert!(error.contains("archive/data.pkl is compressed"), "{error}");
-    let mut bytes = archive(pickle, &[0; 64], CompressionMethod::Stored);
-    // The central directory's second entry claims 4 GB at its offset.
-    let entry = bytes.windows(4).rposition(|window| window == b"PK\x01\x02").unwrap();
-    bytes[entry + 20..entry + 28].copy_from_slice(&[0xff, 0xff, 0xff, 0xf0, 0xff, 0xff, 0xff, 0xf0]);
-    assert!(refusal(&bytes).contains("expected inside the file"));
-    // Two entries at the same offset are refused, because entries that share bytes could make the reader compute many checksums.
-    let mut bytes = archive(pickle, pickle, CompressionMethod::Stored);
-    let entry = bytes.windows(4).rposition(|window| window == b"PK\x01\x02").unwrap();
-    bytes[entry + 42..entry + 46].copy_from_slice(&[0; 4]);
-    assert!(refusal(&bytes).contains("in one place with another entry"));
-    // A changed byte of the tensor.
-    let mut bytes = archive(pickle, &[7; 64], CompressionMethod::Stored);
-    let data = bytes.windows(64).position(|window| window == [7; 64]).unwrap();
-    bytes[data] = 8;
-    assert!(refusal(&bytes).contains("archive/data/0 is damaged: its checksum differs"));
-    assert!(refusal(&bytes[..bytes.len() - 30]).contains("no whole zip archive"));
+    let whole = archive(b"\x80\x02}.", &[7; 64]);
+    let data = whole.windows(64).position(|window| window == [7; 64]).unwrap();
+    // The entry of the tensor in the central directory.
+    let entry = whole.windows(4).rposition(|window| window == b"PK\x01\x02").unwrap();
+    for (at, changed, message) in [
+        // Deflated, with another size after decompression.
+        (entry + 10, &[8][..], "archive/data/0 is compressed"),
+        (entry + 24, &[1], "archive/data/0 is compressed"),
+        (entry + 20, &[0xff, 0xff, 0xff, 0xf0, 0xff, 0xff, 0xff, 0xf0], "expected inside the file"),
+        // At the offset of the pickle: entries that share bytes could make the reader compute many checksums.
+        (entry + 42, &[0; 4], "in one place with another entry"),
+        (data, &[8], "archive/data/0 is damaged: its checksum differs"),
+    ] {
+        let mut bytes = whole.clone();
+        bytes[at..][..changed.len()].copy_from_slice(changed);
+        let error = refusal(&bytes);
+        assert!(error.contains(message), "{error}");
+    }
+    assert!(refusal(&whole[..whole.len() - 30]).contains("no whole zip archive"));
 }
