@@ -69,12 +69,6 @@ fn sky(direction: DVec3) -> [f64; 3] {
     [wave(DVec3::new(1., 0.3, 0.)), wave(DVec3::new(0., 1., -0.4)), wave(DVec3::new(-0.2, 0., 1.))]
 }
 
-/// Returns the cameras of five photos of `lens`.
-fn cameras_of(lens: &Lens) -> Vec<Camera> {
-    let ImageSize { height, width } = lens.size();
-    cameras().into_iter().map(|camera| Camera { width, height, ..camera }).collect()
-}
-
 /// Writes photos of the sky that `lens` takes at the poses of [`cameras`]. Pixels that the lens doesn't define repeat those at the border
 /// of what it does.
 fn write_photos(folder: &Path, lens: &Lens) {
@@ -101,7 +95,9 @@ fn capture_of(model: &str, size: [u32; 2]) -> TempDir {
     let parameters: Vec<f64> = parameters.split(' ').map(|number| number.parse().unwrap()).collect();
     let lens = Lens::from_colmap(name, &parameters, size.into()).unwrap();
     write_photos(&folder.path().join("images"), &lens);
-    write_colmap_text(&folder.path().join("sparse/0"), &names(), &cameras_of(&lens), model);
+    let [height, width] = size;
+    let cameras: Vec<_> = cameras().into_iter().map(|camera| Camera { width, height, ..camera }).collect();
+    write_colmap_text(&folder.path().join("sparse/0"), &names(), &cameras, model);
     folder
 }
 
