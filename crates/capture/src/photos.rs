@@ -130,20 +130,10 @@ const SYSTEM_FILES: [&str; 2] = ["Thumbs.db", "desktop.ini"];
 pub struct PhotoList {
     /// Paths of the photos, with numbers in paths compared by value.
     pub photos: Vec<PathBuf>,
-    /// Paths of the other files, in the same order.
-    pub others: Vec<PathBuf>,
-    folder: PathBuf,
-}
-
-impl PhotoList {
-    /// Returns a line about the files that are no photos, if there are any.
-    pub fn warning(&self) -> Option<String> {
-        let name = |path: &PathBuf| path.strip_prefix(&self.folder).unwrap_or(path).display().to_string();
-        let names: Vec<String> = self.others.iter().map(name).collect();
-        describe_photos(&self.folder, &names, |count| {
-            format!("{count} of {} files are no photos and left out", count + self.photos.len())
-        })
-    }
+    /// Paths of the other files relative to the folder, in the same order.
+    pub others: Vec<String>,
+    /// Line about the other files, if there are any.
+    pub warning: Option<String>,
 }
 
 /// Lists the photos in `folder` and its subfolders, as COLMAP does.
@@ -158,16 +148,17 @@ pub fn list_photos(folder: &Path) -> Result<PhotoList> {
     let mut files = vec![];
     collect_files(folder, &mut files)?;
     files.sort_by(natural_order);
-    let are_photos: Vec<bool> = files.par_iter().map(|file| is_photo(file)).collect();
-    let (mut photos, mut others) = (vec![], vec![]);
-    for (file, is_photo) in files.into_iter().zip(are_photos) {
-        if is_photo { photos.push(file) } else { others.push(file) }
-    }
+    let (photos, others): (Vec<_>, Vec<_>) = files.into_par_iter().partition(|file| is_photo(file));
     if photos.is_empty() {
         let found = format!("without photos, of {} files", others.len());
         return Err(Error::input(folder, "the folder", found, format!("photos, each {SUPPORTED_IMAGES}")));
     }
-    Ok(PhotoList { photos, others, folder: folder.to_owned() })
+    let name = |file: &PathBuf| file.strip_prefix(folder).unwrap_or(file).display().to_string();
+    let others: Vec<String> = others.iter().map(name).collect();
+    let warning = describe_photos(folder, &others, |count| {
+        format!("{count} of {} files are no photos and left out", count + photos.len())
+    });
+    Ok(PhotoList { photos, others, warning })
 }
 
 /// Adds the files below `folder`. Links to folders count as files, so that no folder is visited twice.
@@ -233,14 +224,13 @@ pub(crate) fn describe_photos(
     describe: impl FnOnce(usize) -> String,
 ) -> Option<String> {
     (!names.is_empty())
-        .then(|| format!("{}: {}: {}", file.display(), describe(names.len()), format_names(names)))
+        .then(|| format!("{}: {}: {}", file.display(), describe(names.len()), format_names(names, 3)))
 }
 
-/// Formats the first few of `names` and the number of the remaining ones.
-pub(crate) fn format_names(names: &[impl AsRef<str>]) -> String {
-    const SHOWN: usize = 3;
-    let shown = names.iter().take(SHOWN).map(AsRef::as_ref).collect::<Vec<_>>().join(", ");
-    match names.len().saturating_sub(SHOWN) {
+/// Formats the first `count` of `names` and the number of the remaining ones.
+pub fn format_names(names: &[impl AsRef<str>], count: usize) -> String {
+    let shown = names.iter().take(count).map(AsRef::as_ref).collect::<Vec<_>>().join(", ");
+    match names.len().saturating_sub(count) {
         0 => shown,
         more => format!("{shown} and {more} more"),
     }

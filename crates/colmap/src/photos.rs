@@ -62,7 +62,7 @@ pub(crate) fn find_photos(folder: &Path) -> Result<(Vec<FoundPhoto>, Option<Stri
         Ok(FoundPhoto { name: name.into_owned(), bytes, checksum: checksum([path])? })
     };
     let found = list.photos.par_iter().map(describe).collect::<Result<_>>()?;
-    Ok((found, list.warning()))
+    Ok((found, list.warning))
 }
 
 /// Brings the photos `found` in `source` into the folder `images`, by a hard link where the file system allows it. COLMAP
@@ -245,6 +245,7 @@ fn link(source: &Path, target: &Path) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::progress::unless_stopped;
     use globalsplat_capture::read_image;
     use image::{Rgb, RgbImage, Rgba, RgbaImage};
 
@@ -276,23 +277,13 @@ mod tests {
         fn import(&self, masks: Option<&str>) -> Result<(Vec<Photo>, Vec<String>), String> {
             let masks = masks.map(|masks| self.root.path().join(masks));
             let found = find_photos(&self.source).unwrap().0;
-            let mut go_on = |_| true;
-            let imported = import_photos(
-                &self.source,
-                &found,
-                masks.as_deref(),
-                &self.images,
-                &mut Reporter(&mut go_on),
-            );
-            match imported {
-                Ok((photos, skipped)) => {
-                    let skipped =
-                        skipped.into_iter().map(|photo| format!("{} is {}", photo.name, photo.reason));
-                    Ok((photos, skipped.collect()))
-                }
-                Err(Interrupt::Failed(error)) => Err(error.to_string()),
-                Err(Interrupt::Stopped) => unreachable!("nothing stops it"),
-            }
+            let (mut go_on, masks) = (|_| true, masks.as_deref());
+            let imported =
+                import_photos(&self.source, &found, masks, &self.images, &mut Reporter(&mut go_on));
+            let imported = unless_stopped(imported).map_err(|error| error.to_string())?;
+            let (photos, skipped) = imported.expect("nothing stops it");
+            let skipped = skipped.into_iter().map(|photo| format!("{} is {}", photo.name, photo.reason));
+            Ok((photos, skipped.collect()))
         }
 
         fn mask(&self, name: &str) -> PathBuf {

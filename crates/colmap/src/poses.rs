@@ -1,10 +1,10 @@
 //! Estimates the poses of the photos of a capture, step by step.
 
 use crate::colmap::Colmap;
-use crate::photos::{Photo, import_photos};
+use crate::photos::{Photo, SkippedPhoto, import_photos};
 use crate::progress::{Interrupt, Reporter, Step};
-use crate::record::{CaptureReport, Matching, Record, format_first};
-use globalsplat_capture::{COLMAP_MODELS, MASKS_FOLDER, read_colmap_models};
+use crate::record::{CaptureReport, Matching, Record, SHOWN_NAMES};
+use globalsplat_capture::{COLMAP_MODELS, MASKS_FOLDER, format_names, read_colmap_models};
 use globalsplat_files::{Error, Result, write_atomically};
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
@@ -67,8 +67,9 @@ impl Estimate<'_, '_> {
         let masks = self.record.masks.as_deref();
         let (photos, skipped) = import_photos(source, &self.record.found, masks, self.images, self.reporter)?;
         if photos.len() < 2 {
-            let reasons = skipped.iter().map(|photo| format!("{} is {}", photo.name, photo.reason));
-            let (total, reasons) = (self.record.found.len(), format_first(reasons));
+            let explain = |photo: &SkippedPhoto| format!("{} is {}", photo.name, photo.reason);
+            let reasons: Vec<String> = skipped.iter().map(explain).collect();
+            let (total, reasons) = (self.record.found.len(), format_names(&reasons, SHOWN_NAMES));
             let found = format!("{total}, of which {} can't be used ({reasons})", skipped.len());
             let expected = "2 or more different ones";
             return Err(Error::input(source, "the number of photos", found, expected).into());

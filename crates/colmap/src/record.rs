@@ -3,6 +3,7 @@
 use crate::photos::{FoundPhoto, Photo, SkippedPhoto};
 use crate::progress::Step;
 use crate::video::VideoFrames;
+use globalsplat_capture::format_names;
 use globalsplat_files::{Error, Result, read_text, write_json};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -13,6 +14,9 @@ use std::time::UNIX_EPOCH;
 
 /// Name of the file, in the capture's folder.
 pub(crate) const FILE: &str = "capture.json";
+
+/// Number of photos that messages name.
+pub(crate) const SHOWN_NAMES: usize = 5;
 
 /// How pairs of photos to match are chosen.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -124,22 +128,15 @@ impl fmt::Display for CaptureReport {
         }
         self.other_files.iter().try_for_each(|line| write!(f, "\n{line}"))?;
         if !self.skipped.is_empty() {
-            let skipped = self.skipped.iter().map(|photo| format!("{} ({})", photo.name, photo.reason));
-            write!(f, "\nnot used: {}", format_first(skipped))?;
+            let skip = |photo: &SkippedPhoto| format!("{} ({})", photo.name, photo.reason);
+            let skipped: Vec<String> = self.skipped.iter().map(skip).collect();
+            write!(f, "\nnot used: {}", format_names(&skipped, SHOWN_NAMES))?;
         }
         if !self.unregistered.is_empty() {
-            write!(f, "\nnot registered: {}", format_first(self.unregistered.iter().cloned()))?;
+            write!(f, "\nnot registered: {}", format_names(&self.unregistered, SHOWN_NAMES))?;
         }
         self.advice.iter().try_for_each(|sentence| write!(f, "\n{sentence}"))
     }
-}
-
-/// Joins the first few of `items`, and the number of the others.
-pub(crate) fn format_first(items: impl ExactSizeIterator<Item = String>) -> String {
-    const SHOWN: usize = 5;
-    let others = items.len().saturating_sub(SHOWN);
-    let shown = items.take(SHOWN).collect::<Vec<_>>().join(", ");
-    if others > 0 { format!("{shown} and {others} more") } else { shown }
 }
 
 /// How far a capture has come, and for which photos and settings.

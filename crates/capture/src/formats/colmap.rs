@@ -165,7 +165,7 @@ fn read_largest(folder: &Path, models: &[Model], purpose: Purpose) -> Result<Cap
         })
         .collect();
     let lines = (!smaller.is_empty()).then(|| {
-        let (count, photos, left_out) = (models.len(), images.len(), format_names(&smaller));
+        let (count, photos, left_out) = (models.len(), images.len(), format_names(&smaller, 3));
         format!("the largest of {count} models is taken, with {photos} photos; left out: {left_out}")
     });
     read(folder, &models[largest], images, lines.into_iter().collect(), purpose)

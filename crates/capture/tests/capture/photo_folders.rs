@@ -1,17 +1,14 @@
 //! Folders of photos without poses, and what the photos' metadata say.
 
-use crate::photos::encode_with_exif;
+use crate::photos::{encode, encode_with_exif};
 use exif::experimental::Writer;
 use exif::{Field, In, Rational, Tag, Value};
 use globalsplat_capture::{exif_focal, is_equirectangular, list_photos};
 use image::{ImageFormat, RgbImage};
 use std::io::Cursor;
-use std::path::PathBuf;
 
-fn encode(format: ImageFormat) -> Vec<u8> {
-    let mut bytes = Cursor::new(vec![]);
-    RgbImage::new(24, 16).write_to(&mut bytes, format).unwrap();
-    bytes.into_inner()
+fn encode_black(format: ImageFormat) -> Vec<u8> {
+    encode(&RgbImage::new(24, 16).into(), format)
 }
 
 #[test]
@@ -22,7 +19,8 @@ fn photos_are_told_from_other_files_by_their_contents() {
         std::fs::create_dir_all(root.join(name).parent().unwrap()).unwrap();
         std::fs::write(root.join(name), contents).unwrap();
     };
-    let (jpeg, png, tiff) = (encode(ImageFormat::Jpeg), encode(ImageFormat::Png), encode(ImageFormat::Tiff));
+    let (jpeg, png, tiff) =
+        (encode_black(ImageFormat::Jpeg), encode_black(ImageFormat::Png), encode_black(ImageFormat::Tiff));
     let photos = ["10.JPG", "9.jpeg", "b/2.png", "b/c/1.tif", "no_extension", "png_named.jpg"];
     for (photo, contents) in photos.iter().zip([&jpeg, &jpeg, &png, &tiff, &jpeg, &png]) {
         write(photo, contents);
@@ -41,18 +39,12 @@ fn photos_are_told_from_other_files_by_their_contents() {
     }
     std::os::unix::fs::symlink(root.join("b"), root.join("link")).unwrap();
     let list = list_photos(root).unwrap();
-    let below = |paths: &[PathBuf]| -> Vec<String> {
-        paths.iter().map(|path| path.strip_prefix(root).unwrap().display().to_string()).collect()
-    };
     let expected = ["9.jpeg", "10.JPG", "b/2.png", "b/c/1.tif", "no_extension", "png_named.jpg"];
-    assert_eq!(below(&list.photos), expected);
-    assert_eq!(
-        below(&list.others),
-        ["9.jpeg_original", "b/notes.jpg", "cut.png", "film.mov", "link", "raw.dng"]
-    );
+    assert_eq!(list.photos, expected.map(|name| root.join(name)));
+    assert_eq!(list.others, ["9.jpeg_original", "b/notes.jpg", "cut.png", "film.mov", "link", "raw.dng"]);
     let line = ": 6 of 12 files are no photos and left out: 9.jpeg_original, b/notes.jpg, cut.png and 3 more";
-    assert!(list.warning().unwrap().ends_with(line), "{:?}", list.warning());
-    assert!(list_photos(&root.join("b/c")).unwrap().warning().is_none());
+    assert!(list.warning.as_ref().unwrap().ends_with(line), "{:?}", list.warning);
+    assert!(list_photos(&root.join("b/c")).unwrap().warning.is_none());
     let empty = root.join("none");
     assert!(list_photos(&empty).unwrap_err().to_string().contains("none"));
     std::fs::create_dir(&empty).unwrap();
@@ -114,7 +106,7 @@ fn exif_data_tell_the_focal_length() {
 #[test]
 fn panoramas_are_known_by_their_xmp_data() {
     let is_panorama = |xmp: &str| {
-        let mut jpeg = encode(ImageFormat::Jpeg);
+        let mut jpeg = encode_black(ImageFormat::Jpeg);
         let packet = format!("http://ns.adobe.com/xap/1.0/\0<x:xmpmeta><rdf:Description {xmp}</x:xmpmeta>");
         let mut segment = vec![0xff, 0xe1];
         segment.extend((packet.len() as u16 + 2).to_be_bytes());
@@ -126,5 +118,5 @@ fn panoramas_are_known_by_their_xmp_data() {
     assert!(is_panorama("><GPano:ProjectionType> equirectangular</GPano:ProjectionType>"));
     assert!(!is_panorama("GPano:ProjectionType=\"cylindrical\" other=\"equirectangular\"/>"));
     assert!(!is_panorama("/>"));
-    assert!(!is_equirectangular(&encode(ImageFormat::Png)) && !is_equirectangular(b"text"));
+    assert!(!is_equirectangular(&encode_black(ImageFormat::Png)) && !is_equirectangular(b"text"));
 }

@@ -179,7 +179,7 @@ const LOSSLESS: [(&str, ImageFormat); 4] = [
     ("bmp", ImageFormat::Bmp),
 ];
 
-fn encode(image: &DynamicImage, format: ImageFormat) -> Vec<u8> {
+pub fn encode(image: &DynamicImage, format: ImageFormat) -> Vec<u8> {
     let mut bytes = Cursor::new(vec![]);
     image.write_to(&mut bytes, format).unwrap();
     bytes.into_inner()
