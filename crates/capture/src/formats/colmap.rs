@@ -82,15 +82,8 @@ fn numbered(folder: &Path) -> Vec<PathBuf> {
 /// Maximum deviation of a quaternion's length from 1 that causes no warning.
 const UNIT_TOLERANCE: f64 = 1e-3;
 
-/// A line of cameras.txt.
-struct CameraEntry {
-    id: u32,
-    /// Name of the camera model. It may be unknown if no image uses the camera.
-    model: String,
-    width: u64,
-    height: u64,
-    parameters: Vec<f64>,
-}
+/// A camera at the origin and its lens, or (field, what was found, what was expected), which matters only if an image uses the camera.
+type CameraEntry = Result<(Camera, LensModel), (String, String, String)>;
 
 /// The first line of an image in images.txt.
 struct ImageEntry {
@@ -181,8 +174,7 @@ fn read(
     purpose: Purpose,
 ) -> Result<Capture> {
     let mut cameras = BTreeMap::new();
-    for camera in read_cameras(&model.cameras)? {
-        let id = camera.id;
+    for (id, camera) in read_cameras(&model.cameras)? {
         if cameras.insert(id, camera).is_some() {
             return Err(Error::input(&model.cameras, "the camera ids", format!("{id} twice"), "each once"));
         }
@@ -200,7 +192,6 @@ fn read(
         }
         Purpose::Cameras(_) => vec![None; images.len()],
     };
-    let mut lenses = BTreeMap::new();
     let (mut frames, mut changes) = (vec![], Changes { lines, ..Changes::default() });
     for ((image, photo), mask) in images.into_iter().zip(photos).zip(masks) {
         let (photo, declared) =
@@ -210,13 +201,15 @@ fn read(
             let field = format!("{field} of image {} ({})", image.id, image.name);
             Err(Error::input(&model.images, field, found, expected))
         };
-        let Some(camera) = cameras.get(&image.camera) else {
-            let expected = format!("one of the {} in {}", cameras.len(), model.cameras.display());
-            return refuse("camera id", image.camera.to_string(), expected);
-        };
-        let (camera, lens) = match lenses.get(&camera.id) {
-            Some(lens) => *lens,
-            None => *lenses.entry(camera.id).or_insert(lens(&model.cameras, camera)?),
+        let (camera, lens) = match cameras.get(&image.camera) {
+            Some(Ok(camera)) => *camera,
+            Some(Err((field, found, expected))) => {
+                return Err(Error::input(&model.cameras, field, found, expected));
+            }
+            None => {
+                let expected = format!("one of the {} in {}", cameras.len(), model.cameras.display());
+                return refuse("camera id", image.camera.to_string(), expected);
+            }
         };
         let [w, x, y, z] = image.quaternion;
         let rotation = DQuat::from_xyzw(x, y, z, w);
@@ -248,24 +241,21 @@ fn read(
     Capture::new(folder_name(folder), model.images.clone(), frames, changes, purpose)
 }
 
-/// Returns the camera, at the origin, and its lens.
-fn lens(file: &Path, entry: &CameraEntry) -> Result<(Camera, LensModel)> {
-    let refuse = |name: &str, found: String, expected: String| {
-        Error::input(file, format!("{name} of camera {}", entry.id), found, expected)
+/// Returns the camera with the given name of its model, size and parameters.
+fn camera(model: &str, sides: [(&str, u64); 2], parameters: &[f64]) -> CameraEntry {
+    let side = |(name, side): (&str, u64)| match u32::try_from(side) {
+        Ok(side) if side > 0 => Ok(side),
+        _ => Err((name.to_string(), side.to_string(), "a number of pixels".to_string())),
     };
-    let size = |name: &str, size: u64| match u32::try_from(size) {
-        Ok(size) if size > 0 => Ok(size),
-        _ => Err(refuse(name, size.to_string(), "a number of pixels".into())),
-    };
-    let (width, height) = (size("width", entry.width)?, size("height", entry.height)?);
-    let lens = Lens::from_colmap(&entry.model, &entry.parameters, ImageSize { width, height })
-        .map_err(|(name, found, expected)| refuse(&name, found, expected))?;
+    let (width, height) = (side(sides[0])?, side(sides[1])?);
+    let lens = Lens::from_colmap(model, parameters, ImageSize { width, height })?;
     let camera = Camera { intrinsics: lens.intrinsics, c2w: DMat4::IDENTITY, width, height };
     Ok((camera, lens.model))
 }
 
-/// Reads the entries CAMERA_ID MODEL WIDTH HEIGHT PARAMS… The model is a name in a text file and an i32 in a binary file.
-fn read_cameras(file: &Path) -> Result<Vec<CameraEntry>> {
+/// Reads the entries CAMERA_ID MODEL WIDTH HEIGHT PARAMS…, and returns the cameras with their ids. The model is a name in a text file and an
+/// i32 in a binary file.
+fn read_cameras(file: &Path) -> Result<Vec<(u32, CameraEntry)>> {
     const MIN_ENTRY_BYTES: usize = 4 + 4 + 8 + 8 + 2 * 8;
     read_entries(file, 1, "the number of cameras", MIN_ENTRY_BYTES, |values, index| {
         let id = values.number("CAMERA_ID", || format!("the id of camera {index}, counted from 0,"))?;
@@ -288,7 +278,11 @@ fn read_cameras(file: &Path) -> Result<Vec<CameraEntry>> {
         while count.map_or(values.has_words(), |count| parameters.len() < count) {
             parameters.push(values.number("PARAMS", || format!("the parameters of camera {id}"))?);
         }
-        Ok(CameraEntry { id, model: model.to_string(), width, height, parameters })
+        let camera = camera(model, [("width", width), ("height", height)], &parameters);
+        Ok((
+            id,
+            camera.map_err(|(name, found, expected)| (format!("{name} of camera {id}"), found, expected)),
+        ))
     })
 }
 
