@@ -47,13 +47,26 @@ pub fn write_temporary<E: From<Error>>(
     Ok(partial)
 }
 
+/// Writes `files`, which are paths and contents, like [`write_atomically`]. No file is replaced before all of them are written.
+///
+/// # Errors
+/// Returns the errors of [`write_atomically`].
+pub fn write_files<'a>(files: impl IntoIterator<Item = (impl AsRef<Path>, &'a [u8])>) -> Result<()> {
+    let mut partials = vec![];
+    for (path, contents) in files {
+        let path = path.as_ref();
+        partials.push(write_temporary(path, |writer| writer.write_all(contents).map_err(Error::write(path)))?);
+    }
+    partials.into_iter().try_for_each(PartialFile::persist)
+}
+
 /// Writes `value`, which consists of numbers, strings, lists and maps with string keys, as pretty-printed JSON, atomically.
 ///
 /// # Errors
 /// Returns an error if the file can't be written.
 pub fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
     let json = serde_json::to_vec_pretty(value).expect("numbers and texts");
-    write_atomically(path, |writer| writer.write_all(&json).map_err(Error::write(path)))
+    write_files([(path, &json[..])])
 }
 
 /// Replaces the folder at `path` by one that `fill` creates: it is filled under a temporary name and then renamed. `own_entries` lists the
@@ -393,7 +406,7 @@ mod tests {
     }
 
     fn write(path: &Path, text: &str) -> Result<()> {
-        write_atomically(path, |writer| writer.write_all(text.as_bytes()).map_err(Error::write(path)))
+        write_files([(path, text.as_bytes())])
     }
 
     #[test]

@@ -4,7 +4,7 @@ use super::{COLOR_SPACE, EXTENSION, KERNEL, MAGIC, POINTS, rotation_to_gltf, sh_
 use crate::axes::Axes;
 use crate::splat::{bounds, sh0_to_color};
 use crate::{Error, Result, Splat, WriteOptions};
-use globalsplat_files::{write_atomically, write_temporary};
+use globalsplat_files::{write_atomically, write_files};
 use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
 use serde_json::{Map, Value, json};
 use std::path::{Path, PathBuf};
@@ -54,12 +54,7 @@ pub(crate) fn write_gltf(path: &Path, splat: &Splat, _: &WriteOptions) -> Result
     };
     json["buffers"][0]["uri"] = json!(utf8_percent_encode(name, ENCODED).to_string());
     let json = format!("{json:#}\n");
-    let write = |path: &Path, contents: &[u8]| {
-        write_temporary(path, |writer| writer.write_all(contents).map_err(Error::write(path)))
-    };
-    let (buffer, json) = (write(&file, &buffer)?, write(path, json.as_bytes())?);
-    buffer.persist()?;
-    json.persist()
+    write_files([(file.as_path(), &buffer[..]), (path, json.as_bytes())])
 }
 
 /// Returns the JSON and the buffer, which has the attributes one after the other. The size of each is a multiple of 4 bytes.

@@ -2,12 +2,10 @@
 
 use super::IMAGES;
 use crate::{Error, Result};
-use globalsplat_files::{
-    PartialFile, check_regular, parent_of, stored_zip, write_atomically, write_temporary,
-};
+use globalsplat_files::{check_regular, parent_of, stored_zip, write_files};
 use image_webp::{ColorType, EncoderParams, WebPDecoder, WebPEncoder};
 use rayon::prelude::*;
-use std::io::{Cursor, Read, Write};
+use std::io::{Cursor, Read};
 use std::path::Path;
 use zip::ZipArchive;
 
@@ -123,18 +121,13 @@ pub fn write_zip(path: &Path, meta: &[u8], images: &[(&'static str, Vec<u8>)]) -
     // WebP can't be compressed further.
     let files = images.iter().map(|(name, file)| (*name, &file[..])).chain([("meta.json", meta)]);
     let archive = stored_zip(files, 1);
-    write_atomically(path, |writer| writer.write_all(&archive).map_err(Error::write(path)))
+    write_files([(path, &archive[..])])
 }
 
 /// Writes `meta.json` to `path` and the images beside it. No file is replaced before all of them are written.
-pub fn write_files(path: &Path, meta: &[u8], images: &[(&'static str, Vec<u8>)]) -> Result<()> {
+pub fn write_folder(path: &Path, meta: &[u8], images: &[(&'static str, Vec<u8>)]) -> Result<()> {
     let beside = images.iter().map(|(name, file)| (parent_of(path).join(name), &file[..]));
-    let mut partials = vec![];
-    for (path, contents) in beside.chain([(path.to_owned(), meta)]) {
-        let write = |writer: &mut dyn Write| writer.write_all(contents).map_err(Error::write(&path));
-        partials.push(write_temporary(&path, write)?);
-    }
-    partials.into_iter().try_for_each(PartialFile::persist)?;
+    write_files(beside.chain([(path.to_owned(), meta)]))?;
     // Images of an older splat of a higher SH degree.
     let is_old = |name: &&&str| images.iter().all(|(written, _)| written != *name);
     let old = IMAGES.iter().filter(is_old).map(|name| path.with_file_name(name));

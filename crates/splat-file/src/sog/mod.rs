@@ -10,7 +10,7 @@ use crate::numbers::may_hold;
 use crate::rotations::{from_smallest_three, smallest_three};
 use crate::splat::{bounds, logit_of_opacity};
 use crate::{Error, Result, Splat, WriteOptions};
-use container::{Image, Reader, encode_all, write_files, write_zip};
+use container::{Image, Reader, encode_all, write_zip};
 use palette::{Codebook, Palette};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
@@ -213,7 +213,7 @@ pub(crate) fn write_bundle(path: &Path, splat: &Splat, _: &WriteOptions) -> Resu
 /// Writes a `meta.json` and the images beside it.
 pub(crate) fn write_folder(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
     let (meta, images) = encode(splat);
-    write_files(path, &meta, &encode_all(path, images)?)
+    container::write_folder(path, &meta, &encode_all(path, images)?)
 }
 
 /// Returns the centroids of the coefficients above degree 0, with the values that they are rounded to, and labels in the order of `order`.

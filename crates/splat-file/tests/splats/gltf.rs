@@ -97,11 +97,6 @@ const ROTATION: &str = "KHR_gaussian_splatting:ROTATION";
 const SCALE: &str = "KHR_gaussian_splatting:SCALE";
 const OPACITY: &str = "KHR_gaussian_splatting:OPACITY";
 
-/// Half a turn about z, from the axes of other formats to those of glTF and back.
-fn half_turn() -> DMat4 {
-    DMat4::from_scale(DVec3::new(-1., -1., 1.))
-}
-
 /// Checks that two splats have the same Gaussians but for rounding.
 fn assert_same(what: &str, a: &Splat, b: &Splat) {
     assert_eq!(a.sh_degree, b.sh_degree, "{what}");
@@ -150,7 +145,9 @@ fn nodes_move_gaussians() {
         {"matrix": matrix.to_cols_array(), "children": [1]},
     ]);
     glb.json["scenes"][0]["nodes"] = json!([2]);
-    let world = half_turn() * matrix * parts * half_turn();
+    // Half a turn about z, from the axes of other formats to those of glTF and back.
+    let half_turn = DMat4::from_scale(DVec3::new(-1., -1., 1.));
+    let world = half_turn * matrix * parts * half_turn;
     let expected = splat.transformed(&world).unwrap();
     let read = glb.read();
     assert_same("nodes", &expected, &read);

@@ -1,6 +1,6 @@
 //! SOG: its files, and invalid ones. PlayCanvas' splat-transform reads what is written in parity/tests/test_splat_formats.py.
 
-use super::common::{assert_bytes_refused, assert_refused, assert_says, bytes_of, written};
+use super::common::{assert_bytes_refused, assert_refused, assert_says, bytes_of, random_splat, written};
 use globalsplat_splat_file::{Splat, read_splat, read_splat_without_invalid, splat_files};
 use image_webp::{ColorType, WebPEncoder};
 use rand::rngs::StdRng;
@@ -16,17 +16,9 @@ fn write_pixels(path: &Path, width: u32, pixels: &[[u8; 4]]) {
     fs::write(path, file).unwrap();
 }
 
-/// Returns three Gaussians whose largest component of the rotation is w, x and z, and the path of their `meta.json`.
+/// Returns three Gaussians, and the path of their `meta.json`.
 fn three(folder: &Path) -> (Splat, PathBuf) {
-    let splat = Splat::new(
-        1,
-        vec![[0., -1., 10.], [1., 0., 20.], [-3., 1., 30.]],
-        vec![[-1., -2., -3.], [-4., -5., -6.], [-1., -1., -1.]],
-        vec![[0.9, 0.1, 0.2, 0.3], [0.1, -0.9, 0.2, 0.3], [0.1, 0.2, 0.3, 0.9]],
-        vec![0., 2., -30.],
-        (0..12).map(|k| [0, 1, 2].map(|channel| (3 * k + channel) as f32 / 40. - 0.4)).collect(),
-    )
-    .unwrap();
+    let splat = random_splat(3, 1, 1);
     let path = written(folder, "meta.json", &splat);
     (splat, path)
 }

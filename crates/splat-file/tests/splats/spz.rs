@@ -38,22 +38,25 @@ fn ungzip(bytes: &[u8]) -> Vec<u8> {
     inside
 }
 
-fn hex(text: &str) -> Vec<u8> {
-    let digits = text.as_bytes().chunks_exact(2);
-    digits.map(|two| u8::from_str_radix(std::str::from_utf8(two).unwrap(), 16).unwrap()).collect()
+/// Streams of a Gaussian: positions 1, 2 and 3 with 12 fractional bits, opacity, color and scale, rotation, spherical harmonics.
+const POSITIONS: &[u8] = b"\x00\x10\x00\x00\xe0\xff\x00\xd0\xff";
+const SHAPE: &[u8] = b"\x9f\x83\x87\x8b\x90\x80\x70";
+const ROTATION: &[u8] = b"\xde\x52\xaa\xc4";
+const HARMONICS: &[u8] = b"\x70\x68\x58\x50\x40\x30\xd8\xe8\xf0";
+
+/// Returns the header of a Gaussian of SH degree 1 in a version before 4.
+fn head_of_one(version: u8, flags: u8) -> Vec<u8> {
+    [b"NGSP", &[version, 0, 0, 0, 1, 0, 0, 0, 1, 12, flags, 0][..]].concat()
 }
 
 /// Each of the four versions of SPZ gives the same Gaussian, from bytes written by the format's documentation.
 #[test]
 fn older_versions_of_spz_are_read() {
-    let head = |version: u8| [b"NGSP", &[version, 0, 0, 0, 1, 0, 0, 0, 1, 12, 0, 0][..]].concat();
-    let shape = hex("9f83878b908070");
-    let harmonics = hex("706858504030d8e8f0");
-    // Positions 1, 2 and 3 as half-precision floats, and with 12 fractional bits; x, y and z of the rotation in a byte each.
-    let halves = [0x3c00u16, 0xc000, 0xc200].map(u16::to_le_bytes).concat();
-    let one = [head(1), halves, shape.clone(), hex("8d6558"), harmonics.clone()].concat();
-    let two = [head(2), hex("00100000e0ff00d0ff"), shape.clone(), hex("8d6558"), harmonics.clone()].concat();
-    let three = [head(3), hex("00100000e0ff00d0ff"), shape, hex("de52aac4"), harmonics].concat();
+    // Positions as half-precision floats; x, y and z of the rotation in a byte each.
+    let (halves, xyz) = ([0x3c00u16, 0xc000, 0xc200].map(u16::to_le_bytes).concat(), b"\x8d\x65\x58");
+    let one = [&head_of_one(1, 0), &halves, SHAPE, xyz, HARMONICS].concat();
+    let two = [&head_of_one(2, 0), POSITIONS, SHAPE, xyz, HARMONICS].concat();
+    let three = [&head_of_one(3, 0), POSITIONS, SHAPE, ROTATION, HARMONICS].concat();
     // File written by Niantic's library.
     let four = include_bytes!("../files/version_4.spz").to_vec();
     for (version, bytes) in [(1, gzip(&one)), (2, gzip(&two)), (3, gzip(&three)), (4, four)] {
@@ -82,11 +85,10 @@ fn gzip(bytes: &[u8]) -> Vec<u8> {
 #[test]
 fn the_axes_of_an_spz_are_applied() {
     let with_axes = |number: u32| {
-        let head = [b"NGSP", &[3, 0, 0, 0, 1, 0, 0, 0, 1, 12, 2, 0][..]].concat();
         let extension = [0xADBE_0003u32, 4, number].map(u32::to_le_bytes).concat();
         let unknown = [0x1234_0001u32, 4, 0].map(u32::to_le_bytes).concat();
-        let streams = hex("00100000e0ff00d0ff9f83878b908070de52aac4706858504030d8e8f0");
-        gzip(&[head, streams, unknown, extension].concat())
+        let head = head_of_one(3, 2);
+        gzip(&[&head, POSITIONS, SHAPE, ROTATION, HARMONICS, &unknown, &extension].concat())
     };
     let [rub, rdf] = [4, 6].map(|number| read_bytes("spz", &with_axes(number)).unwrap());
     let [x, y, z] = rub.means[0];
