@@ -55,7 +55,8 @@ pub fn write_files<'a>(files: impl IntoIterator<Item = (impl AsRef<Path>, &'a [u
     let mut partials = vec![];
     for (path, contents) in files {
         let path = path.as_ref();
-        partials.push(write_temporary(path, |writer| writer.write_all(contents).map_err(Error::write(path)))?);
+        partials
+            .push(write_temporary(path, |writer| writer.write_all(contents).map_err(Error::write(path)))?);
     }
     partials.into_iter().try_for_each(PartialFile::persist)
 }
