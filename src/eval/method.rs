@@ -83,9 +83,8 @@ impl Method<'_> {
         let splat_bytes = splat.as_ref().map(Splat::ply_bytes);
         let mut warnings = splat.map(|splat| splat.warnings).unwrap_or_default();
         let mut views = vec![];
-        for i in 0..scene.frames.target.len() {
-            let view = scene.load_target(i)?;
-            let (image, rendered) = source.image(scene, i, &view)?;
+        scene.for_each_target(|i, view| {
+            let (image, rendered) = source.image(scene, i, view)?;
             if let Some(perceptual) = perceptual {
                 // The memory of a method includes the first image, but not the networks that score it.
                 perceptual.load()?;
@@ -93,12 +92,13 @@ impl Method<'_> {
             if view.is_masked_out() {
                 let (scene, view) = (&scene.name, &view.name);
                 warnings.push(format!("{scene}: {view} is masked out as a whole, and not scored"));
-                continue;
+                return Ok(());
             }
-            let score = score_view(&image, &view, perceptual)?;
-            on_image(&view, &image, rendered.as_ref(), &score)?;
+            let score = score_view(&image, view, perceptual)?;
+            on_image(view, &image, rendered.as_ref(), &score)?;
             views.push(score);
-        }
+            Ok(())
+        })?;
         if views.is_empty() {
             let why = format!("{}: every view to score is masked out as a whole", scene.name);
             return Err(Error::request(why));

@@ -6,7 +6,7 @@ use crate::error::{Error, Result};
 use crate::io::{read_text, write_json};
 use crate::metrics::{CaptureScores, score_view};
 use crate::reconstruct::{context_views, load_context};
-use crate::scene::ImageSize;
+use crate::scene::{Camera, ImageSize};
 use glam::DMat4;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -109,7 +109,10 @@ impl EvaluationIndex {
     }
 }
 
-/// A scene: photos that a method may see, and photos that it has to match. The latter are decoded one at a time, so that large photos don't
+/// Number of target photos that are decoded together.
+const DECODED_TOGETHER: usize = 4;
+
+/// A scene: photos that a method may see, and photos that it has to match. The latter are decoded a few at a time, so that large photos don't
 /// fill the memory all at once.
 #[derive(Debug)]
 pub struct EvalScene {
@@ -206,16 +209,26 @@ impl EvalScene {
         Ok(EvalScene { name: key.into(), target_names: names.clone(), render_names: names, ..scene })
     }
 
-    /// Loads target photo number `i`.
-    pub(super) fn load_target(&self, i: usize) -> Result<View> {
-        let view = self.load(self.frames.target[i])?;
-        Ok(View { name: self.target_names[i].clone(), ..view })
+    /// Calls `visit` with the number of every target photo and the photo.
+    ///
+    /// # Errors
+    /// Fails if a photo can't be read or `visit` fails.
+    pub(super) fn for_each_target(&self, mut visit: impl FnMut(usize, &View) -> Result<()>) -> Result<()> {
+        let mut numbers = 0..;
+        let of_one_size = self.frames.target.chunk_by(|&a, &b| self.scored_size(a) == self.scored_size(b));
+        for photos in of_one_size.flat_map(|photos| photos.chunks(DECODED_TOGETHER)) {
+            let views = load_views(&self.capture, photos, self.scored_size(photos[0]))?;
+            // In this order, the end of `views` takes no number.
+            for (view, i) in views.into_iter().zip(&mut numbers) {
+                visit(i, &View { name: self.target_names[i].clone(), ..view })?;
+            }
+        }
+        Ok(())
     }
 
-    /// Loads a photo of the capture at the size of the targets.
-    fn load(&self, photo: usize) -> Result<View> {
-        let size = self.target_size.resized(&self.capture.camera(photo));
-        Ok(load_views(&self.capture, &[photo], size)?.remove(0))
+    /// Returns the size at which a photo of the capture is scored; `None` if it is its own.
+    fn scored_size(&self, photo: usize) -> Option<ImageSize> {
+        self.target_size.resized(&self.capture.camera(photo))
     }
 
     /// Returns the poses of the target photos, camera-to-world.
@@ -228,13 +241,17 @@ impl EvalScene {
     /// # Errors
     /// Fails if a photo can't be read.
     pub fn score_nearest_photo(&self) -> Result<CaptureScores> {
-        let center = |photo: usize| self.capture.camera(photo).c2w.w_axis.truncate();
-        self.score_baseline(|i| {
-            let target = center(self.frames.target[i]);
-            let distance = |&of: &usize| center(self.frames.context[of]).distance(target);
-            let nearest = (0..self.context.len()).min_by(|a, b| distance(a).total_cmp(&distance(b)));
-            self.context_image(nearest.expect("a context view"))
-        })
+        self.score_baseline(|target| self.nearest_photo(target))
+    }
+
+    /// Returns the context photo whose camera center is nearest to that of `target`, at the size of the targets, `[3, H, W]`.
+    pub(super) fn nearest_photo(&self, target: &View) -> Result<Tensor> {
+        let center = |camera: Camera| camera.c2w.w_axis.truncate();
+        let distance = |&of: &usize| {
+            center(self.capture.camera(self.frames.context[of])).distance(center(target.camera))
+        };
+        let nearest = (0..self.context.len()).min_by(|a, b| distance(a).total_cmp(&distance(b)));
+        self.context_image(nearest.expect("a context view"))
     }
 
     /// Scores a baseline that shows the mean of all context photos at every target.
@@ -250,15 +267,15 @@ impl EvalScene {
         self.score_baseline(|_| Ok(mean.shallow_clone()))
     }
 
-    /// Scores the images that `image` returns for the targets, by number.
-    fn score_baseline(&self, image: impl Fn(usize) -> Result<Tensor>) -> Result<CaptureScores> {
+    /// Scores the images that `image` returns for the targets.
+    fn score_baseline(&self, image: impl Fn(&View) -> Result<Tensor>) -> Result<CaptureScores> {
         let mut scores = vec![];
-        for i in 0..self.frames.target.len() {
-            let view = self.load_target(i)?;
+        self.for_each_target(|_, view| {
             if !view.is_masked_out() {
-                scores.push(score_view(&image(i)?, &view, None)?);
+                scores.push(score_view(&image(view)?, view, None)?);
             }
-        }
+            Ok(())
+        })?;
         Ok(CaptureScores::from_views(&self.name, scores, None))
     }
 
@@ -266,7 +283,11 @@ impl EvalScene {
     fn context_image(&self, i: usize) -> Result<Tensor> {
         match PhotoSize::Exactly(size_of(&self.context[i])) == self.target_size {
             true => Ok(self.context[i].image.to_float()),
-            false => Ok(self.load(self.frames.context[i])?.image.to_float()),
+            false => {
+                let photo = self.frames.context[i];
+                let views = load_views(&self.capture, &[photo], self.scored_size(photo))?;
+                Ok(views[0].image.to_float())
+            }
         }
     }
 }

@@ -6,7 +6,7 @@ use crate::data::{
     Capture, DataConfig, Dataset, Holdout, PhotoSize, SceneGroup, Split, TrainingScenes, load_views,
 };
 use crate::error::{Error, Result};
-use crate::metrics::CaptureScores;
+use crate::metrics::{CaptureScores, score_view};
 use crate::reconstruct::spread_over_path;
 use crate::train::{Score, Trainer, Validator};
 use serde::{Deserialize, Serialize};
@@ -118,8 +118,13 @@ impl HeldOutScene {
     /// Scores the model on the scene.
     fn score(&self, trainer: &Trainer, config: &DataConfig) -> Result<HeldOutScores> {
         let (scene, model) = (self.load(config)?, trainer.as_model());
-        let ours = Method::Model(model).score(&scene, model.device, None, |_, _, _, _| Ok(()))?.scores;
-        Ok(HeldOutScores { ours, nearest: scene.score_nearest_photo()? })
+        let mut nearest = vec![];
+        let ours = Method::Model(model).score(&scene, model.device, None, |view, _, _, _| {
+            nearest.push(score_view(&scene.nearest_photo(view)?, view, None)?);
+            Ok(())
+        })?;
+        let nearest = CaptureScores::from_views(&scene.name, nearest, None);
+        Ok(HeldOutScores { ours: ours.scores, nearest })
     }
 }
 
@@ -285,6 +290,13 @@ mod tests {
         let SceneFrames { context, target } = &scene.frames;
         assert_eq!((context.len(), scene.context.len(), target.as_slice()), (4, 4, &[1, 4, 7, 10][..]));
         assert_eq!((context[0], context[3]), (0, 11));
-        assert_eq!(scene.load_target(3).unwrap().name, "000010");
+        let mut names = vec![];
+        scene
+            .for_each_target(|_, view| {
+                names.push(view.name.clone());
+                Ok(())
+            })
+            .unwrap();
+        assert_eq!(names, ["000001", "000004", "000007", "000010"]);
     }
 }

@@ -87,8 +87,8 @@ pub fn run(
     validator: Option<&mut dyn Validator>,
     mut on_event: impl FnMut(Event) -> bool,
 ) -> Result<Outcome> {
-    let opened = trainer.group.is_main_process();
-    let opened = opened.then(|| RunLogger::open(trainer, out, resume, &mut on_event)).transpose()?;
+    let is_main = trainer.group.is_main_process();
+    let opened = is_main.then(|| RunLogger::open(trainer, out, resume, &mut on_event)).transpose()?;
     trainer.broadcast_state()?;
     let held_out = validator.as_ref().map_or(0, |validator| validator.scenes());
     let (logger, start) =
