@@ -53,7 +53,8 @@ gpu-bundle: build
 # The checks for the edit loop: formatting, lints, types of the Python, unit tests.
 .PHONY: quick
 quick: check-format check-lints check-python
-	$(CARGO) test $(ALL) --lib
+	@# With --lib, cargo also runs the tests of the native module, which finds libtorch by no path of its own.
+	LD_LIBRARY_PATH="$${LIBTORCH:-.venv/libtorch}/lib" $(CARGO) test $(ALL) --lib
 
 # What every change has to pass. Runs all checks, even after one has failed; the last line reports how many tests were skipped and which
 # requirement each lacked.

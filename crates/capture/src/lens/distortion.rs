@@ -63,12 +63,21 @@ impl Distortion {
 mod tests {
     use super::*;
 
-    /// nerfstudio's k₄, which no model of COLMAP has; the tests with pycolmap's reference cameras cover the other coefficients.
     #[test]
-    fn the_fourth_radial_coefficient_multiplies_the_eighth_power() {
-        let lens = Distortion { radial: [-0.12, 0.05, -0.01, 0.002], ..Distortion::default() };
-        // Computed by hand: r² = 0.25, L = 1 − 0.03 + 0.003125 − 0.00015625 + 0.0000078125.
-        let (point, l) = (DVec2::new(0.3, -0.4), 0.9729765625);
-        assert!(lens.apply(point).abs_diff_eq(point * l, 1e-12), "{}", lens.apply(point));
+    fn distorted_points_follow_the_equations() {
+        let lens = Distortion {
+            radial: [-0.12, 0.05, -0.01, 0.002],
+            denominator: [0.; 3],
+            tangential: [0.003, -0.002],
+        };
+        let rational = Distortion { denominator: [0.3, -0.07, 0.02], ..lens };
+        // Computed by hand: r² = 0.25, L = 1 − 0.03 + 0.003125 − 0.00015625 + 0.0000078125, and the denominator of the rational lens is
+        // 1 + 0.075 − 0.004375 + 0.0003125.
+        let l = 0.9729765625;
+        for (lens, l) in [(lens, l), (rational, l / 1.0709375)] {
+            let expected = DVec2::new(0.3 * l - 0.00072 - 0.002 * 0.43, -0.4 * l + 0.003 * 0.57 + 0.00048);
+            let found = lens.apply(DVec2::new(0.3, -0.4));
+            assert!(found.abs_diff_eq(expected, 1e-12), "{found} {expected}");
+        }
     }
 }

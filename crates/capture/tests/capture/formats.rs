@@ -255,6 +255,12 @@ fn transforms_specify_intrinsics_in_several_ways() {
         let expected: Vec<_> = cameras.map(|(camera, intrinsics)| Camera { intrinsics, ..camera }).collect();
         assert_same_cameras(&open_transforms(photos_alone().path(), change).unwrap(), &expected);
     }
+    // The second frame has its own coefficients, all 0.
+    let folder = photos_alone();
+    let views = |change: Change| open_transforms(folder.path(), change).unwrap().load(&[0, 1], None).unwrap();
+    let undistorted = views(|_| ());
+    let distorted = views(|t| (t["k1"], t["frames"][1]["k2"]) = (json!(-0.2), json!(0.)));
+    assert!(distorted[0].image != undistorted[0].image && distorted[1].image == undistorted[1].image);
 }
 
 #[test]
