@@ -254,6 +254,23 @@ fn tensors_stay_inside_their_data() {
 }
 
 #[test]
+fn corruption_is_detected() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = packed(folder.path()).join("000001.torch");
+    let bytes = std::fs::read(&file).unwrap();
+    // Any flipped bit in a chunk: the reader must not crash, and images must not change unnoticed.
+    let image = bytes.windows(4).position(|window| window == b"\x89PNG").unwrap();
+    for position in (0..bytes.len()).step_by(31).chain(image..image + 64) {
+        let mut flipped = bytes.clone();
+        flipped[position] ^= 1 << (position % 8);
+        let read = Chunk::parse(Path::new("chunk.torch"), flipped);
+        if (image..image + 64).contains(&position) {
+            assert!(read.unwrap_err().to_string().contains("its checksum differs"));
+        }
+    }
+}
+
+#[test]
 fn what_is_wrong_with_a_scene_is_named() {
     let folder = tempfile::tempdir().unwrap();
     let chunks = packed(folder.path());

@@ -6,7 +6,7 @@ use crate::common::program::{Sandbox, assert_says, number};
 use glam::{DMat3, DMat4, DVec3};
 use globalsplat::data::{open_capture, write_cameras_json};
 use globalsplat::io::{
-    Splat, WriteOptions, origin_file, read_image, read_splat, tensor_from_rgb, write_local_splat,
+    Splat, WriteOptions, origin_file, read_image, read_splat, tensor_from_rgb, write_local_splat, write_splat,
 };
 use globalsplat::metrics::psnr;
 use globalsplat::render::{SplatRenderer, transform};
@@ -204,6 +204,13 @@ fn a_local_origin_keeps_the_detail() {
     // A file name that is too long for the origin's file is refused before the work.
     let said = sandbox.refuse(&format!("convert @local.ply @{}.ply --local-origin", "x".repeat(240)));
     assert_says(&said, &[".origin.json can't be written"]);
+
+    // A copy without its origin file still opens, at another position.
+    sandbox.copy("local.ply", "lone.ply");
+    assert_eq!(read("lone.ply").origin, DVec3::ZERO);
+    // Writing by the library in world coordinates removes the origin file.
+    write_splat(&local, &read("local.ply")).unwrap();
+    assert!(!has_origin("local.ply") && read("local.ply").origin == DVec3::ZERO);
 }
 
 #[test]
