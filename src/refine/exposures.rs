@@ -1,9 +1,8 @@
 //! Exposures of photos relative to each other, measured where photos show the same surface, as panoramas are balanced (Brown and Lowe 2007).
 
-use super::init::pixel_and_depth;
 use super::options::ExposureCorrection;
 use crate::scene::Camera;
-use crate::stereo::{DepthMap, SmallPhoto, nearest_to, numbers, truths};
+use crate::stereo::{DepthMap, SmallPhoto, nearest_to, numbers, pixel_and_depth, truths};
 use glam::DVec3;
 use std::ops::Range;
 use tch::Tensor;

@@ -9,7 +9,7 @@ use crate::io::Splat;
 use crate::reconstruct::LoadedModel;
 use crate::render::{contributions, largest_contributions};
 use crate::scene::{Camera, RawGaussians, SH_C0};
-use crate::stereo::{DepthMap, PlaneSweepOutput, SWEEP_SIDE, SmallPhoto, projection, sweep};
+use crate::stereo::{DepthMap, PlaneSweepOutput, SWEEP_SIDE, SmallPhoto, pixel_and_depth, sweep};
 use glam::DVec3;
 use rand::seq::index::sample;
 use rand::{Rng, SeedableRng};
@@ -130,12 +130,6 @@ pub(super) fn most_visible(
     let contributions = contributions(&supported.activate(), &cameras)?;
     let kept = largest_contributions(&contributions, count).into_iter().map(|index| index as i64);
     Ok(supported.select(&kept.collect::<Vec<_>>()))
-}
-
-/// Returns a function from a point to the index of its pixel in a map and its depth there; `None` for points that the map doesn't show.
-pub(super) fn pixel_and_depth(camera: &Camera) -> impl Fn(DVec3) -> Option<(usize, f64)> + use<> {
-    let (project, width) = (projection(camera), camera.width as usize);
-    move |point| project(point).map(|[u, v, z]| (v as usize * width + u as usize, z))
 }
 
 /// Returns the indices of the Gaussians that the photos support. A Gaussian must not be in front of a depth that a photo is sure of, and at

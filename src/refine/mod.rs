@@ -4,6 +4,7 @@
 mod events;
 mod exposures;
 mod gaussian_optimizer;
+mod gaussian_params;
 mod init;
 mod known_depths;
 mod options;

@@ -1,6 +1,6 @@
 //! Relocation of dead Gaussians to where more are needed (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo").
 
-use super::gaussian_optimizer::GaussianParams;
+use super::gaussian_params::GaussianParams;
 use rand::Rng;
 use rand::distr::weighted::WeightedIndex;
 use rand::prelude::Distribution;

@@ -12,4 +12,4 @@ pub use sweep::DepthMap;
 pub(crate) use depth_search::{SmallPhoto, pool_masked};
 pub(crate) use pixel_depths::pixel_depths;
 pub(crate) use sweep::{PlaneSweepOutput, SWEEP_SIDE, numbers, sweep, truths};
-pub(crate) use view_selection::{are_near_duplicates, nearest_to, projection};
+pub(crate) use view_selection::{are_near_duplicates, nearest_to, pixel_and_depth};

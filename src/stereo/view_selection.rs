@@ -34,6 +34,12 @@ pub fn projection(camera: &Camera) -> impl Fn(DVec3) -> Option<[f64; 3]> + use<>
     }
 }
 
+/// Returns a function from a point to the index of its pixel in a map and its depth there; `None` for points that the map of `camera` doesn't show.
+pub fn pixel_and_depth(camera: &Camera) -> impl Fn(DVec3) -> Option<(usize, f64)> + use<> {
+    let (project, width) = (projection(camera), camera.width as usize);
+    move |point| project(point).map(|[u, v, z]| (v as usize * width + u as usize, z))
+}
+
 /// Returns the maximum distance between the first camera and another. It is the unit of lengths before a depth is known.
 pub fn extent(cameras: &[Camera]) -> f64 {
     cameras.iter().map(|camera| distance(camera, &cameras[0])).fold(0., f64::max)

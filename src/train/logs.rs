@@ -1,7 +1,7 @@
 //! Logs of a run: `metrics.jsonl`, with one line for every step and for every validation, and `RUN/tensorboard`, with one event file for
 //! every time that the run was started or resumed.
 
-use super::run::{Event, retry_on_disk_full};
+use super::event::{Event, retry_on_disk_full};
 use super::step::{Score, StepReport};
 use super::{METRICS_FILE, is_due};
 use crate::error::{Error, Result};

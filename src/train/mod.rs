@@ -1,6 +1,7 @@
 //! Training: the step, the run with its checkpoints and logs, and resumption.
 
 mod checkpoint;
+mod event;
 mod gradients;
 mod logs;
 mod memory_estimate;
@@ -13,9 +14,10 @@ mod trainer;
 
 pub use crate::io::{CONFIG_FILE, METRICS_FILE};
 pub use checkpoint::{MODEL_FILE, best_checkpoint, latest_checkpoint, list_checkpoints};
+pub use event::{Event, retry_on_disk_full};
 pub use logs::Curves;
 pub use memory_estimate::MemoryEstimate;
-pub use run::{Event, Outcome, Resume, Validator, add_run_inputs, retry_on_disk_full, run};
+pub use run::{Outcome, Resume, Validator, add_run_inputs, run};
 pub use step::{Score, StepReport};
 pub use trainer::Trainer;
 

@@ -4,6 +4,7 @@ use super::checkpoint::{
     RunLock, Validation, add_checkpoints, best_score, check, keep_best, latest_checkpoint, list_checkpoints,
     prune_checkpoints, recover,
 };
+use super::event::{Event, retry_on_disk_full};
 use super::is_due;
 use super::logs::RunLog;
 use super::step::{Score, StepReport};
@@ -13,7 +14,7 @@ use crate::config::{TrainConfig, changed_keys};
 use crate::error::{Error, Result};
 use crate::io::{InputFiles, event_files, write_atomically};
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 /// Starting point of a run.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -24,24 +25,6 @@ pub enum Resume {
     Never,
     /// Checkpoint in the given folder.
     From(PathBuf),
-}
-
-/// Event that a run reports.
-#[derive(Debug)]
-pub enum Event<'a> {
-    /// Completed step.
-    Step {
-        /// Report of the step.
-        report: &'a StepReport,
-        /// Speed of the step, in samples per second.
-        samples_per_second: f64,
-    },
-    /// Score of a completed validation.
-    Validation(&'a Score),
-    /// Message for the user, in one sentence.
-    Notice(String),
-    /// No progress to report: the run waits for disk space, or is inside of a step or a validation.
-    Waiting,
 }
 
 /// Result of a run.
@@ -367,42 +350,6 @@ fn begin(
             }
             let found = format!("broken, all {} of them", checkpoints.len());
             Err(Error::input(out, "the run's checkpoints", found, "a whole one (choose another --out)"))
-        }
-    }
-}
-
-/// Time between attempts to write to a full disk.
-const PAUSE: Duration = Duration::from_millis(500);
-
-/// Calls `write`, and repeats it as long as the disk is full and `on_event` returns `true`.
-///
-/// # Errors
-/// Returns the errors of `write`.
-pub fn retry_on_disk_full<T>(
-    on_event: &mut impl FnMut(Event) -> bool,
-    mut write: impl FnMut() -> Result<T>,
-) -> Result<T> {
-    let mut waited = false;
-    loop {
-        match write() {
-            Err(e) if e.is_out_of_space() => {
-                if !waited {
-                    on_event(Event::Notice(format!(
-                        "training paused: {e}; it resumes when there is disk space"
-                    )));
-                    waited = true;
-                }
-                if !on_event(Event::Waiting) {
-                    return Err(e);
-                }
-                std::thread::sleep(PAUSE);
-            }
-            result => {
-                if waited && result.is_ok() {
-                    on_event(Event::Notice("disk space is available again: training resumes".into()));
-                }
-                return result;
-            }
         }
     }
 }

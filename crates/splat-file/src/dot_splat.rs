@@ -1,10 +1,10 @@
 //! antimatter15's `.splat` format: 32 bytes per Gaussian and nothing else (spec 10.14).
 
-use crate::formats::recognized;
 use crate::numbers::f32_at;
+use crate::ply_table::Header;
 use crate::rotations::normalized;
 use crate::splat::{color_to_sh0, logit_of_opacity, sh0_to_color};
-use crate::{Error, Result, SH_C0, ShLimits, Splat, WriteOptions};
+use crate::{Error, Result, SH_C0, ShLimits, Splat, WriteOptions, gltf, sog, spz};
 use globalsplat_files::write_atomically;
 use std::path::Path;
 
@@ -35,6 +35,10 @@ pub(crate) fn limits() -> ShLimits {
     ShLimits { degree: 0, dc: -0.5 / SH_C0..=0.5 / SH_C0, rest: 0. ..=0. }
 }
 
+/// Functions that recognize the magic numbers of other formats.
+const MAGIC_NUMBERS: [fn(&[u8]) -> bool; 4] =
+    [Header::begins, sog::recognizes, spz::recognizes, gltf::recognizes_glb];
+
 /// Writes a `.splat`. The Gaussians of the largest volume times opacity come first, for viewers that show a file while it loads.
 pub(crate) fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> {
     if splat.is_empty() {
@@ -62,7 +66,7 @@ pub(crate) fn write(path: &Path, splat: &Splat, _: &WriteOptions) -> Result<()> 
             gaussian.extend(splat.unit_quaternion(index).map(|part| (part * 128. + 128.).round() as u8));
             // If the first bytes are the magic number of another format, the lowest bit of the position is flipped, so that readers don't
             // take the file for that format.
-            if place == 0 && recognized(&gaussian).is_some() {
+            if place == 0 && MAGIC_NUMBERS.iter().any(|begins| begins(&gaussian)) {
                 gaussian[0] ^= 1;
             }
             writer.write_all(&gaussian).map_err(Error::write(path))?;

@@ -149,11 +149,6 @@ fn format_of(path: &Path) -> Result<&'static SplatFormat> {
     })
 }
 
-/// Returns the format that `bytes` are certainly in.
-pub(crate) fn recognized(bytes: &[u8]) -> Option<&'static SplatFormat> {
-    FORMATS.iter().find(|format| (format.recognizes)(bytes))
-}
-
 /// Returns the format in which a splat is written at `path`, which the extension selects.
 ///
 /// # Errors
@@ -240,7 +235,8 @@ pub fn read_splat_without_invalid(path: &Path) -> Result<Splat> {
 fn read_contents(path: &Path) -> Result<(Splat, InvalidGaussians)> {
     let named = format_of(path)?;
     let bytes = std::fs::read(path).map_err(Error::read(path))?;
-    let format = recognized(&bytes).unwrap_or(named);
+    let recognized = FORMATS.iter().find(|format| (format.recognizes)(&bytes));
+    let format = recognized.unwrap_or(named);
     let splat = (format.read)(path, &bytes)?;
     let invalid = (format.find_invalid)(&splat);
     Ok((splat, invalid))
