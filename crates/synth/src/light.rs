@@ -112,8 +112,6 @@ pub(super) struct Material {
     pub tint: Vec3,
     /// Emitted light, as a factor on the texture.
     pub emission: f32,
-    /// Share of light that is mirrored at perpendicular incidence. The rest is scattered.
-    pub mirror_reflectance: f32,
     /// Strength of highlights.
     pub specular: f32,
     /// Exponent of highlights. Larger values give smaller highlights.
@@ -124,15 +122,7 @@ impl Material {
     /// Creates a matte material with `texture` at its natural size.
     pub fn matte(texture: Arc<Texture>) -> Material {
         let repeats = Affine2::from_scale(Vec2::splat(1. / texture.repeat_metres));
-        Material {
-            texture,
-            repeats,
-            tint: Vec3::ONE,
-            emission: 0.,
-            mirror_reflectance: 0.,
-            specular: 0.,
-            shininess: 1.,
-        }
+        Material { texture, repeats, tint: Vec3::ONE, emission: 0., specular: 0., shininess: 1. }
     }
 
     /// Returns the diffuse reflectance at `uv` metres along the surface, blurred over `footprint` metres.

@@ -201,14 +201,6 @@ pub(super) fn height_field(size: Vec2, cells: usize, height: impl Fn(f32, f32) -
     })
 }
 
-/// Creates a piece of cloth that hangs from y = 0, `width` × `height`, in `folds` waves of `depth` metres.
-pub(super) fn curtain(width: f32, height: f32, folds: f32, depth: f32) -> Mesh {
-    Mesh::grid((6. * folds) as usize + 2, 4, Vec2::new(1.3 * width, height), |u, v| {
-        let wave = (TAU * folds * u).sin() + 0.3 * (3.1 * folds * u).sin();
-        Vec3::new((u - 0.5) * width, (v - 1.) * height, depth * wave * (1.2 - 0.4 * v))
-    })
-}
-
 /// Moves every point by up to `strength` metres, with wavelengths of `1 / frequency`.
 pub(super) fn roughen(mesh: Mesh, noise: &Noise, frequency: f32, strength: f32) -> Mesh {
     mesh.warped(|p| {

@@ -43,7 +43,7 @@ impl Sensor {
             noise: (0.012 * noisy, 0.03 * noisy),
             exposure_range: builder.within(0. ..1f32).powi(3) * 0.25,
             exposure_noise: builder.noise(),
-            seed: builder.within(0..u32::MAX),
+            seed: builder.seed(),
         }
     }
 

@@ -15,8 +15,6 @@ const GATHER_DIRECTIONS: usize = 24;
 const GATHER_SPREAD: f32 = 0.3;
 /// Offset of the start of a ray from the surface that it leaves, in metres.
 const RAY_OFFSET: f32 = 1e-3;
-/// Maximum number of mirror reflections along a ray.
-const MAX_REFLECTIONS: u32 = 3;
 
 /// Meshes with their materials, and the light sources.
 #[derive(Default)]
@@ -97,41 +95,17 @@ impl Tracer {
 
     /// Returns the radiance that arrives at `origin` along a ray in `direction` (unit), for a pixel `spread` radians wide.
     pub fn trace(&self, origin: Vec3, direction: Vec3, spread: f32, choice: SampleChoice) -> Vec3 {
-        self.radiance(origin, direction, spread, choice, MAX_REFLECTIONS)
+        let Some(hit) = self.bvh.closest_hit(origin, direction, f32::INFINITY) else {
+            return self.sky.radiance(direction);
+        };
+        let surface = self.surface(origin, direction, hit, spread);
+        let (direct, highlight) = self.sample_direct_light(&surface, direction, choice);
+        surface.reflectance * (surface.indirect + direct + surface.material.emission) + highlight
     }
 
     /// Returns the distance to the nearest surface in `direction` (unit), at most `limit`.
     pub fn free_distance(&self, origin: Vec3, direction: Vec3, limit: f32) -> f32 {
         self.bvh.closest_hit(origin, direction, limit).map_or(limit, |hit| hit.distance)
-    }
-
-    fn radiance(
-        &self,
-        origin: Vec3,
-        direction: Vec3,
-        spread: f32,
-        choice: SampleChoice,
-        reflections_left: u32,
-    ) -> Vec3 {
-        let Some(hit) = self.bvh.closest_hit(origin, direction, f32::INFINITY) else {
-            return self.sky.radiance(direction);
-        };
-        let surface = self.surface(origin, direction, hit, spread);
-        let material = surface.material;
-        let (direct, highlight) = self.sample_direct_light(&surface, direction, choice);
-        let mut radiance = surface.reflectance * (surface.indirect + direct + material.emission) + highlight;
-        // Schlick's approximation of the Fresnel reflectance, with its grazing term weighted by the square root of the reflectance at
-        // perpendicular incidence, so that matte surfaces, where it is 0, don't become mirrors.
-        let perpendicular = material.mirror_reflectance;
-        let one_minus_cos = 1. + direction.dot(surface.normal);
-        let fresnel = perpendicular + (1. - perpendicular) * perpendicular.sqrt() * one_minus_cos.powi(5);
-        if fresnel > 0.02 && reflections_left > 0 {
-            let away = direction - 2. * direction.dot(surface.normal) * surface.normal;
-            let start = surface.point + RAY_OFFSET * surface.geometric_normal;
-            let mirrored = self.radiance(start, away, 2. * spread, choice, reflections_left - 1);
-            radiance = radiance.lerp(mirrored, fresnel);
-        }
-        radiance
     }
 
     /// Estimates the direct light with one light source, number `choice.sample_index` modulo the number of lights, scaled by the number
@@ -317,21 +291,6 @@ mod tests {
             let ratio = radiance_at(&tracer, 0.02, 0.01) / radiance_at(&tracer, 2., 0.01);
             assert!((ratio / expected - 1.).abs() < 0.0175, "{source:?}: {ratio}");
         }
-    }
-
-    #[test]
-    fn mirrors_reflect_the_scene() {
-        let tracer = floor_scene(DARK, 0.5, |contents, material| {
-            contents.lights.push(sun(Vec3::Y, 2.));
-            let mirror = Mesh::rectangle(Vec3::new(2., 0., -1.), 2. * Vec3::Z, 2. * Vec3::Y, 1.);
-            let silver = Material { mirror_reflectance: 1., tint: Vec3::ZERO, ..material.clone() };
-            contents.meshes.push((mirror, silver));
-        });
-        // The ray goes from the mirror down to the floor.
-        let direction = Vec3::new(2., -0.5, 0.).normalize();
-        let mirrored = tracer.trace(Vec3::new(0., 1., 0.3), direction, 1e-3, CENTER).x;
-        let floor = radiance_at(&tracer, 0., 0.3);
-        assert!(floor > 0.1 && (mirrored / floor - 1.).abs() < 0.02, "{mirrored} {floor}");
     }
 
     /// Highlights follow the Blinn–Phong lobe, for an eye in the mirror direction of the sun.

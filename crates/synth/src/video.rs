@@ -5,7 +5,7 @@ use super::scene_builder::SceneBuilder;
 use super::sensor::{PixelRng, Sensor};
 use super::tracer::{SampleChoice, Tracer};
 use super::walk::{CameraSpace, OrbitTarget, walk};
-use super::{objects, outdoors, room};
+use super::{objects, places};
 use glam::{DMat3, DMat4, DVec2, DVec3, Vec2, Vec3, vec2};
 use globalsplat_capture::{Camera, ImageSize, Intrinsics, Lens};
 use image::RgbImage;
@@ -63,7 +63,7 @@ impl Video {
         let cameras = cameras(&builder, poses, settings.size);
         let seen = mean_light(&tracer, &cameras);
         let sensor = Sensor::draw(&builder, seen);
-        let seed = builder.within(0..u32::MAX);
+        let seed = builder.seed();
         Some(Video { tracer, sensor, cameras, seed })
     }
 
@@ -149,11 +149,10 @@ impl fmt::Debug for Video {
 
 /// Builds a random scene, mostly rooms: people often photograph them, and they are the hardest to reconstruct.
 fn world(builder: &SceneBuilder) -> (CameraSpace, Option<OrbitTarget>, Sky) {
-    let mut sky = outdoors::sky(builder);
-    let place = match builder.within(0..100) {
-        0..55 => room::room(builder, &mut sky),
-        55..75 => room::box_of_shapes(builder, &mut sky),
-        _ => outdoors::landscape(builder, &sky),
+    let mut sky = places::sky(builder);
+    let place = match builder.chance(0.75) {
+        true => places::room(builder, &mut sky),
+        false => places::landscape(builder, &sky),
     };
     let orbit_target = builder.chance(EXHIBITS).then(|| match place.walls {
         Some(behind) if builder.chance(HUNG) => {

@@ -32,7 +32,8 @@ impl Fixture {
 
     /// Writes photos of a synthetic scene, through `lens` or without distortion, and returns the poses of their cameras.
     fn write_photos(&self, count: usize, lens: Option<&Lens>) -> Vec<DMat4> {
-        let video = Video::new(1, 3, &VideoSettings { frames: count, size: [360, 480].into() });
+        // A scene with enough texture.
+        let video = Video::new(1, 2, &VideoSettings { frames: count, size: [360, 480].into() });
         for index in 0..count {
             let photo = match lens {
                 Some(lens) => video.photo_through(index, lens),

@@ -1,8 +1,8 @@
 //! Layouts of pieces over one repeat: bricks, tiles, planks, stones.
 
-use glam::{IVec2, UVec2, Vec2, Vec2Swizzles};
+use glam::{IVec2, Vec2, Vec2Swizzles};
 
-use super::noise::Random;
+use crate::random::Random;
 
 /// Arrangement of pieces, as a function that returns the piece at a position.
 pub(super) struct Layout(Box<dyn Fn(Vec2) -> Piece>);
@@ -33,7 +33,7 @@ impl Layout {
 
     /// Creates rows of about equal height, each with about `columns` pieces of different lengths.
     pub fn ragged(random: &Random, rows: usize, columns: f32, unequal_rows: f32, upright: bool) -> Layout {
-        let heights: Vec<f32> = (0..rows).map(|_| 1. + unequal_rows * random.uniform(-0.5, 0.5)).collect();
+        let heights: Vec<f32> = (0..rows).map(|_| 1. + unequal_rows * random.within(-0.5..0.5)).collect();
         let mut tops = vec![0.];
         let sum: f32 = heights.iter().sum();
         tops.extend(heights.iter().scan(0., |top, height| {
@@ -41,11 +41,11 @@ impl Layout {
             Some(*top)
         }));
         let cuts = (0..rows).map(|_| {
-            let pieces = (columns * random.uniform(0.7, 1.3)).round().max(1.) as usize;
-            let start = random.unit();
+            let pieces = (columns * random.within(0.7..1.3)).round().max(1.) as usize;
+            let start = random.within(0. ..1.);
             let mut cuts: Vec<f32> = (0..pieces)
                 .map(|piece| {
-                    (start + (piece as f32 + random.uniform(-0.3, 0.3)) / pieces as f32).rem_euclid(1.)
+                    (start + (piece as f32 + random.within(-0.3..0.3)) / pieces as f32).rem_euclid(1.)
                 })
                 .collect();
             cuts.sort_by(f32::total_cmp);
@@ -70,41 +70,6 @@ impl Layout {
         }))
     }
 
-    /// Creates strips `long` times as long as wide, in a zigzag. A repeat is `across` strip widths wide, a multiple of 2 `long`.
-    pub fn herringbone(across: usize, long: usize) -> Layout {
-        let scale = across as f32;
-        let (long, across) = (long as i32, across as i32);
-        Layout(Box::new(move |uv| {
-            let cell = (uv * scale).floor().as_ivec2();
-            let part = uv * scale - cell.as_vec2();
-            let phase = (cell.x - cell.y).rem_euclid(2 * long);
-            let (start, at) = if phase < long {
-                (cell - IVec2::new(phase, 0), part + Vec2::new(phase as f32, 0.))
-            } else {
-                let passed = 2 * long - 1 - phase;
-                (cell - IVec2::new(0, passed), part.yx() + Vec2::new(passed as f32, 0.))
-            };
-            let id = start.x.rem_euclid(across) * across + start.y.rem_euclid(across);
-            Piece::within(id as u32, at / scale, Vec2::new(long as f32, 1.) / scale)
-        }))
-    }
-
-    /// Creates squares of `long` strips each, alternately horizontal and upright. A repeat has `squares` of them per side, an even
-    /// number.
-    pub fn basket(squares: usize, long: usize) -> Layout {
-        let (scale, long) = (squares as f32, long as f32);
-        Layout(Box::new(move |uv| {
-            let cell = (uv * scale).floor().min(Vec2::splat(scale - 1.));
-            let part = uv * scale - cell;
-            let is_upright = (cell.x + cell.y) as usize % 2 == 1;
-            let part = if is_upright { part.yx() } else { part };
-            let strip = (part.y * long).floor();
-            let at = Vec2::new(part.x, part.y - strip / long) / scale;
-            let id = ((cell.y * scale + cell.x) * long + strip) as u32;
-            Piece::within(id, at, Vec2::new(1., 1. / long) / scale)
-        }))
-    }
-
     /// Creates squares standing on their corners, `across` per repeat.
     pub fn diamonds(across: usize) -> Layout {
         let count = across as f32;
@@ -117,41 +82,6 @@ impl Layout {
             let difference = (cell.x - cell.y).rem_euclid(double);
             let side = std::f32::consts::FRAC_1_SQRT_2 / count;
             Piece::within((sum * double + difference) as u32, (turned - cell) * side, Vec2::splat(side))
-        }))
-    }
-
-    /// Creates rectangles of up to `largest` squares per side that fill a repeat.
-    pub fn quilt(random: &Random, squares: usize, largest: usize) -> Layout {
-        const FREE: u32 = u32::MAX;
-        let mut owners = vec![FREE; squares * squares];
-        let mut pieces = Vec::new();
-        for first in 0..squares * squares {
-            if owners[first] != FREE {
-                continue;
-            }
-            let (x, y) = (first % squares, first / squares);
-            let (wide, high) = (random.count(1, largest), random.count(1, largest));
-            let covered = |wide: usize, high: usize| {
-                (0..high).flat_map(move |j| {
-                    (0..wide).map(move |i| (y + j) % squares * squares + (x + i) % squares)
-                })
-            };
-            let fits = |wide: usize, high: usize| covered(wide, high).all(|square| owners[square] == FREE);
-            let wide = (1..=wide).take_while(|&wide| fits(wide, 1)).last().unwrap_or(1);
-            let high = (1..=high).take_while(|&high| fits(wide, high)).last().unwrap_or(1);
-            for square in covered(wide, high).collect::<Vec<_>>() {
-                owners[square] = pieces.len() as u32;
-            }
-            let scale = 1. / squares as f32;
-            let corner = Vec2::new(x as f32, y as f32) * scale;
-            pieces.push((corner, Vec2::new(wide as f32, high as f32) * scale));
-        }
-        Layout(Box::new(move |uv| {
-            let cell = (uv * squares as f32).as_uvec2().min(UVec2::splat(squares as u32 - 1));
-            let owner = owners[cell.y as usize * squares + cell.x as usize];
-            let (corner, extent) = pieces[owner as usize];
-            let at = uv - corner;
-            Piece::within(owner, at - at.floor(), extent)
         }))
     }
 

@@ -4,24 +4,20 @@
 //! weathered.
 
 mod canvas;
+mod figures;
 mod layout;
-mod marks;
-mod masonry;
 mod noise;
 mod palette;
-mod panels;
-mod patterns;
 mod pictures;
-mod plain;
-mod scatter;
+mod pieces;
+mod surfaces;
 
 use glam::{Vec2, Vec3};
-use rand_chacha::ChaCha8Rng;
 
+use crate::random::Random;
 use canvas::Canvas;
-use noise::Random;
 
-/// Width in pixels of all textures except pictures.
+/// Width in pixels of all textures, a power of two.
 const SIZE: usize = 256;
 
 /// Minimum and maximum reflectance: no surface is perfectly black or white.
@@ -74,76 +70,36 @@ type Family = fn(&Random, Purpose) -> Surface;
 
 /// All families and their weights by purpose, in the order of [`Purpose`] without pictures.
 #[rustfmt::skip]
-const FAMILIES: [(Family, [f32; 7]); 41] = [
-    //                            floor wall ceil grnd faca thing leaf
-    (plain::paint,               [1.0, 9.0, 9.0, 0.5, 2.0, 6.0, 0.3]),
-    (plain::gradient,            [0.2, 0.7, 0.5, 0.1, 0.3, 1.5, 0.2]),
-    (plain::brushed,             [0.2, 0.2, 0.2, 0.1, 1.0, 2.0, 0.0]),
-    (plain::glossy,              [0.3, 0.1, 0.1, 0.1, 0.3, 1.0, 0.1]),
-    (plain::clouds,             [1.5, 1.5, 0.5, 1.5, 0.8, 2.0, 1.5]),
-    (patterns::stripes,          [0.7, 1.8, 0.3, 0.1, 0.5, 1.7, 0.0]),
-    (patterns::plaid,            [0.5, 0.6, 0.0, 0.0, 0.0, 1.5, 0.0]),
-    (patterns::pieces,           [1.5, 1.0, 0.2, 0.4, 0.3, 1.2, 0.0]),
-    (patterns::motifs,           [0.7, 1.5, 0.2, 0.0, 0.2, 1.3, 0.0]),
-    (patterns::ornament,         [0.5, 1.6, 0.2, 0.0, 0.1, 0.8, 0.0]),
-    (masonry::bricks,            [0.6, 1.5, 0.1, 1.2, 5.0, 0.4, 0.0]),
-    (masonry::tiles,             [4.0, 2.0, 0.4, 1.5, 1.0, 0.5, 0.0]),
-    (masonry::stones,            [0.8, 0.6, 0.0, 2.5, 2.0, 0.3, 0.0]),
-    (masonry::shingles,          [0.0, 0.1, 0.0, 0.1, 2.0, 0.2, 0.0]),
-    (masonry::mosaic,            [0.7, 0.6, 0.1, 0.3, 0.2, 0.5, 0.0]),
-    (panels::boards,               [7.0, 1.3, 1.2, 0.8, 1.8, 2.0, 0.0]),
-    (panels::veneer,               [0.3, 0.6, 0.3, 0.1, 0.3, 4.0, 0.2]),
-    (masonry::marble,              [1.2, 0.5, 0.1, 0.2, 0.4, 1.2, 0.0]),
-    (masonry::terrazzo,            [1.0, 0.3, 0.0, 0.4, 0.3, 0.5, 0.0]),
-    (masonry::speckle,             [1.0, 0.3, 0.3, 1.0, 0.5, 1.2, 0.0]),
-    (masonry::concrete,            [1.5, 1.0, 0.8, 2.0, 2.0, 0.6, 0.0]),
-    (masonry::plaster,             [0.2, 3.0, 3.0, 0.2, 3.0, 0.5, 0.0]),
-    (masonry::asphalt,             [0.2, 0.0, 0.0, 2.5, 0.1, 0.1, 0.0]),
-    (patterns::weave,             [1.2, 0.6, 0.0, 0.0, 0.0, 3.0, 0.0]),
-    (patterns::knit,              [0.2, 0.0, 0.0, 0.0, 0.0, 0.8, 0.0]),
-    (patterns::pile,              [3.0, 0.1, 0.0, 0.2, 0.0, 1.5, 0.2]),
-    (patterns::folds,             [0.0, 0.8, 0.0, 0.0, 0.0, 1.0, 0.0]),
-    (patterns::quilted,           [0.1, 0.2, 0.1, 0.0, 0.0, 1.2, 0.0]),
-    (patterns::carpet,            [2.5, 0.1, 0.0, 0.0, 0.0, 0.7, 0.0]),
-    (scatter::leaves,            [0.1, 0.1, 0.0, 2.0, 0.4, 0.2, 8.0]),
-    (scatter::grass,             [0.0, 0.0, 0.0, 5.0, 0.1, 0.1, 2.0]),
-    (scatter::gravel,            [0.1, 0.1, 0.0, 3.0, 0.4, 0.3, 0.1]),
-    (scatter::earth,             [0.0, 0.0, 0.0, 2.5, 0.1, 0.0, 0.1]),
-    (scatter::confetti,          [0.5, 0.6, 0.0, 0.2, 0.1, 1.2, 0.3]),
-    (marks::writing,             [0.0, 0.3, 0.0, 0.1, 0.2, 1.2, 0.0]),
-    (marks::scribbles,           [0.1, 0.3, 0.0, 0.1, 0.4, 0.5, 0.0]),
-    (panels::windows,            [0.0, 0.3, 0.0, 0.0, 4.0, 0.3, 0.0]),
-    (panels::shelves,            [0.0, 0.9, 0.0, 0.0, 0.0, 1.5, 0.0]),
-    (panels::cupboards,          [0.0, 0.8, 0.2, 0.0, 0.3, 2.5, 0.0]),
-    (panels::slats,              [0.2, 0.7, 0.6, 0.2, 1.5, 1.2, 0.0]),
-    (rows_of_things,             [0.1, 0.2, 2.0, 0.2, 0.7, 1.3, 0.0]),
+const FAMILIES: [(Family, [f32; 7]); 20] = [
+    //                     floor wall ceil grnd faca thing leaf
+    (surfaces::paint,     [1.0, 9.0, 9.0, 0.5, 3.0, 8.0, 0.3]),
+    (surfaces::gradient,  [0.2, 0.7, 0.5, 0.1, 0.3, 2.0, 0.2]),
+    (surfaces::clouds,    [2.0, 1.5, 0.5, 4.0, 0.8, 2.5, 1.5]),
+    (surfaces::relief,    [3.0, 4.0, 4.0, 1.0, 3.0, 3.0, 0.2]),
+    (surfaces::marble,    [1.2, 0.5, 0.1, 0.2, 0.4, 1.5, 0.0]),
+    (surfaces::speckle,   [3.0, 1.0, 1.0, 4.5, 2.0, 2.0, 0.0]),
+    (pieces::bricks,      [0.6, 1.5, 0.1, 1.2, 5.0, 0.4, 0.0]),
+    (pieces::tiles,       [5.0, 2.5, 1.0, 1.8, 1.0, 1.5, 0.0]),
+    (pieces::stones,      [0.8, 0.6, 0.0, 2.5, 2.0, 0.3, 0.0]),
+    (pieces::boards,      [7.0, 2.0, 2.0, 0.8, 3.0, 7.0, 0.0]),
+    (pieces::checks,      [1.5, 1.0, 0.2, 0.4, 0.3, 1.5, 0.0]),
+    (pieces::windows,     [0.0, 1.0, 1.0, 0.0, 5.0, 2.5, 0.0]),
+    (figures::stripes,    [1.0, 2.4, 0.6, 0.1, 1.5, 3.5, 0.0]),
+    (figures::weave,      [2.0, 0.6, 0.0, 0.0, 0.0, 4.0, 0.0]),
+    (figures::motifs,     [1.5, 3.0, 0.4, 0.0, 0.3, 2.5, 0.0]),
+    (figures::leaves,     [0.1, 0.1, 0.0, 2.0, 0.4, 0.3, 8.0]),
+    (figures::grass,      [0.0, 0.0, 0.0, 5.0, 0.1, 0.1, 2.0]),
+    (figures::gravel,     [0.3, 0.1, 0.0, 3.0, 0.4, 0.5, 0.1]),
+    (figures::confetti,   [1.5, 0.9, 0.0, 0.6, 0.3, 1.7, 0.3]),
+    (figures::writing,    [0.1, 0.6, 0.0, 0.2, 0.6, 1.8, 0.0]),
 ];
-
-/// Draws boards for ceilings, and keys or grids for other purposes.
-fn rows_of_things(random: &Random, purpose: Purpose) -> Surface {
-    let family: Family = match purpose {
-        Purpose::Ceiling => panels::ceiling_boards,
-        Purpose::Floor | Purpose::Wall | Purpose::Ground | Purpose::Facade => panels::grids,
-        _ => random.weighted(&[(panels::keys as Family, 2.), (panels::grids, 1.)]),
-    };
-    family(random, purpose)
-}
-
-/// Draws a house wall that other elements are set into.
-fn masonry_or_paint(random: &Random) -> Surface {
-    let family: Family = random.one_of(&[
-        masonry::bricks as Family,
-        masonry::plaster,
-        masonry::concrete,
-        plain::paint,
-        panels::slats,
-    ]);
-    family(random, Purpose::Facade)
-}
 
 /// Draws one surface of one family.
 fn surface(random: &Random, purpose: Purpose) -> Surface {
-    let family = random.weighted(&FAMILIES.map(|(family, weights)| (family, weights[purpose as usize])));
+    let family = match purpose {
+        Purpose::Poster => pictures::picture,
+        _ => random.weighted(&FAMILIES.map(|(family, weights)| (family, weights[purpose as usize]))),
+    };
     family(random, purpose)
 }
 
@@ -151,8 +107,8 @@ fn surface(random: &Random, purpose: Purpose) -> Surface {
 fn combined(random: &Random, purpose: Purpose) -> Surface {
     let Surface { mut canvas, repeat_metres } = surface(random, purpose);
     let other = surface(random, purpose).canvas;
-    let mask = noise::fractal(random, SIZE, [random.count(1, 4); 2], 6, random.uniform(0.3, 0.8));
-    let (level, soft) = (random.uniform(-0.6, 0.8), random.sqrt_uniform(0.03, 1.));
+    let mask = noise::fractal(random, [random.within(1..=4); 2], 6, random.within(0.3..0.8));
+    let (level, soft) = (random.within(-0.6..0.8), random.sqrt_uniform(0.03, 1.));
     let tints = random.chance(0.35);
     let mean = other.mean();
     canvas.update(|uv, pixel| {
@@ -167,22 +123,18 @@ fn combined(random: &Random, purpose: Purpose) -> Surface {
 }
 
 impl Texture {
-    /// Draws a texture of a random family. The result depends only on `purpose` and the state of `generator`.
-    pub fn draw(generator: &mut ChaCha8Rng, purpose: Purpose) -> Texture {
-        let random = &Random::new(generator);
-        if purpose == Purpose::Poster {
-            return Texture::from_surface(pictures::picture(random));
-        }
+    /// Draws a texture of a random family. The result depends only on `purpose` and the state of `random`.
+    pub fn draw(random: &Random, purpose: Purpose) -> Texture {
         let mut surface =
             if random.chance(0.12) { combined(random, purpose) } else { surface(random, purpose) };
-        plain::weather(random, &mut surface.canvas, purpose);
+        surfaces::weather(random, &mut surface.canvas);
         Texture::from_surface(surface)
     }
 
     /// Creates a texture of one color.
     #[cfg(test)]
     pub fn uniform(color: Vec3) -> Texture {
-        Texture::from_surface(Surface { canvas: Canvas::filled(1, color), repeat_metres: 1. })
+        Texture::from_surface(Surface { canvas: Canvas::filled(color), repeat_metres: 1. })
     }
 
     /// Samples trilinearly at `uv` in repeats, for a footprint of width `footprint` in repeats.
@@ -227,9 +179,9 @@ impl Texture {
 
     fn from_surface(Surface { canvas, repeat_metres }: Surface) -> Texture {
         let (low, high) = REFLECTANCE;
-        let mut size = canvas.size;
+        let mut size = SIZE;
         let mut texels: Vec<Vec3> =
-            canvas.values.iter().map(|pixel| pixel.clamp(Vec3::splat(low), Vec3::splat(high))).collect();
+            canvas.0.iter().map(|pixel| pixel.clamp(Vec3::splat(low), Vec3::splat(high))).collect();
         let mut levels = Vec::new();
         loop {
             levels.push(texels.iter().map(|&color| texel_of(color)).collect());

@@ -3,7 +3,7 @@
 use glam::Vec3;
 
 use super::Purpose;
-use super::noise::Random;
+use crate::random::Random;
 
 /// Colors of one kind in sRGB, as 0xrrggbb.
 pub(super) type Theme = &'static [u32];
@@ -81,7 +81,7 @@ impl Palette {
     /// Draws `count` colors of one theme: shades of one color, several colors, one with accents, or rarely arbitrary colors.
     pub fn from_theme(random: &Random, theme: Theme, count: usize) -> Palette {
         let base = random_theme_color(random, theme);
-        let kind = random.unit();
+        let kind = random.within(0. ..1.);
         let mut colors = vec![base];
         while colors.len() < count {
             colors.push(if kind < 0.4 {
@@ -139,7 +139,7 @@ pub(super) fn random_color_of_themes(random: &Random, themes: &[(Theme, f32)]) -
 /// Returns `color` made brighter or darker by about `spread`, with small random changes of saturation and hue.
 pub(super) fn shade(random: &Random, color: Vec3, spread: f32) -> Vec3 {
     let gray = Vec3::splat(luminance(color));
-    let saturation = random.uniform(0.65, 1.2);
+    let saturation = random.within(0.65..1.2);
     let hue = Vec3::new(random.approx_normal(), random.approx_normal(), random.approx_normal()) * 0.05 + 1.;
     let light = random.approx_normal() * 1.8 * spread;
     // Darken and brighten by the same ratio, and never beyond white.
@@ -150,9 +150,9 @@ pub(super) fn shade(random: &Random, color: Vec3, spread: f32) -> Vec3 {
 
 /// Returns a color of random hue, brightness and saturation.
 pub(super) fn random_color(random: &Random) -> Vec3 {
-    let color = Vec3::new(random.unit(), random.unit(), random.unit());
+    let color = Vec3::new(random.within(0. ..1.), random.within(0. ..1.), random.within(0. ..1.));
     let gray = Vec3::splat(luminance(color));
-    (gray + (color - gray) * random.uniform(0.3, 1.3)).clamp(Vec3::splat(0.01), Vec3::splat(0.92))
+    (gray + (color - gray) * random.within(0.3..1.3)).clamp(Vec3::splat(0.01), Vec3::splat(0.92))
 }
 
 /// Returns the luminance of a linear color, with Rec. 709's weights.
