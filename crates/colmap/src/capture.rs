@@ -3,7 +3,7 @@
 use crate::colmap::Colmap;
 use crate::photos::find_photos;
 use crate::poses::Estimate;
-use crate::progress::{Interrupt, Progress, Reporter, Step, unless_stopped};
+use crate::progress::{Progress, Reporter, Step};
 use crate::record::{CaptureReport, FILE, Matching, Record, VideoRecord};
 use crate::video::write_sharpest_frames;
 use globalsplat_capture::COLMAP_MODELS;
@@ -49,7 +49,7 @@ pub fn make_capture(
     colmap: &Colmap,
     on_progress: &mut dyn FnMut(Progress) -> bool,
 ) -> Result<Option<CaptureReport>> {
-    unless_stopped(run_steps(source, out, options, colmap, &mut Reporter(on_progress)))
+    Reporter::run(on_progress, |reporter| run_steps(source, out, options, colmap, reporter))
 }
 
 fn run_steps(
@@ -58,10 +58,10 @@ fn run_steps(
     options: &CaptureOptions,
     colmap: &Colmap,
     reporter: &mut Reporter,
-) -> Result<CaptureReport, Interrupt> {
+) -> Result<CaptureReport> {
     let models = COLMAP_MODELS.map(|(model, _)| model);
     if let Some(model) = options.camera_model.as_ref().filter(|model| !models.contains(&model.as_str())) {
-        return Err(Error::setting("the camera model", model, format!("one of {}", models.join(", "))).into());
+        return Err(Error::setting("the camera model", model, format!("one of {}", models.join(", "))));
     }
     let (images, is_video) = (out.join("images"), source.is_file());
     let photos = if is_video { &images } else { source };
@@ -73,7 +73,7 @@ fn run_steps(
     };
     let (found, other_files) = find_photos(photos)?;
     if found.len() < 2 {
-        return Err(Error::input(photos, "the number of photos", found.len(), "2 or more").into());
+        return Err(Error::input(photos, "the number of photos", found.len(), "2 or more"));
     }
     let new = Record {
         video,
@@ -95,7 +95,7 @@ fn run_steps(
                 new.found.len(),
                 photos.display()
             );
-            return Err(Error::input(out.join(FILE), "the list of photos", found, expected).into());
+            return Err(Error::input(out.join(FILE), "the list of photos", found, expected));
         }
         Some(old) => old.update(new, options.keeps_finished),
         None => new,
@@ -171,7 +171,7 @@ fn frames_of_video(
     options: &CaptureOptions,
     old: Option<&Record>,
     reporter: &mut Reporter,
-) -> Result<VideoRecord, Interrupt> {
+) -> Result<VideoRecord> {
     let mut record = VideoRecord::new(video, options.frames)?;
     let Some(old) = old else {
         record.chosen = write_sharpest_frames(video, &out.join("images"), options.frames, reporter)?;
@@ -182,7 +182,7 @@ fn frames_of_video(
         other => {
             let found = other.as_ref().map_or("none".to_string(), VideoRecord::to_string);
             let expected = format!("{record}, or a folder without a capture");
-            Err(Error::input(out.join(FILE), "the video", found, expected).into())
+            Err(Error::input(out.join(FILE), "the video", found, expected))
         }
     }
 }

@@ -1,16 +1,15 @@
 //! COLMAP, as a program or as the Python package pycolmap: found, and its commands run.
 
-use crate::progress::{Interrupt, KillOnDrop};
+use crate::process::Process;
+use crate::progress::{Progress, Reporter};
 use globalsplat_files::{Error, Result};
 use serde_json::Value;
 use std::fmt;
 use std::fs::OpenOptions;
-use std::io::{BufRead, BufReader, Write, pipe};
+use std::io::Write;
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::sync::mpsc::{RecvTimeoutError, channel};
-use std::time::Duration;
 
 /// Environment variable that names the COLMAP to use: the path of a `colmap` program, or of a Python that has pycolmap.
 const VARIABLE: &str = "GLOBALSPLAT_COLMAP";
@@ -24,13 +23,6 @@ const OLDEST_PYCOLMAP: (u32, u32) = (4, 0);
 const PRINT_VERSION: &str = "import sys; sys.path = [p for p in sys.path if p]; import pycolmap; print('COLMAP', pycolmap.__version__)";
 /// Program that runs a command by pycolmap.
 const RUN_COMMAND: &str = include_str!("pycolmap_command.py");
-
-/// Sections of options that were named after SIFT before COLMAP 3.13, with their present names.
-const RENAMED: [(&str, &str); 2] =
-    [("FeatureExtraction.", "SiftExtraction."), ("FeatureMatching.", "SiftMatching.")];
-
-/// Maximum time between two calls of the callback.
-const PAUSE: Duration = Duration::from_millis(100);
 
 /// An installed COLMAP.
 #[derive(Debug, Clone)]
@@ -110,19 +102,21 @@ impl Colmap {
         }
     }
 
-    /// Runs a command of COLMAP and appends what it prints to the file `log`. `options` have the names that COLMAP 4 gives them. Calls `on_count`
-    /// for every count of photos in the log, and regularly with `None` in between; the command is stopped as soon as it fails.
+    /// Runs a command of COLMAP and appends what it prints to the file `log`. `options` have the names that COLMAP 4 gives them. Reports progress
+    /// regularly, from `start` by the number of photos in the log.
     ///
     /// # Errors
-    /// Returns the error of `on_count`, or one that quotes COLMAP's if the command can't be started or fails.
+    /// Returns an error that quotes COLMAP's if the command can't be started or fails, or the one of [`Reporter::stop`].
     pub(crate) fn run(
         &self,
         name: &str,
         options: &Value,
         log: &Path,
-        on_count: &mut dyn FnMut(Option<usize>) -> Result<(), Interrupt>,
-    ) -> Result<(), Interrupt> {
+        start: Progress,
+        reporter: &mut Reporter,
+    ) -> Result<()> {
         let failed_start = || Error::failed_with_context(format!("{self} can't be started"));
+        reporter.report(start)?;
         let mut command = Command::new(&self.program);
         if self.is_python {
             command.args(["-c", RUN_COMMAND, name, &options.to_string()]);
@@ -131,46 +125,34 @@ impl Colmap {
             let help = help.args([name, "-h"]).stdin(Stdio::null()).output().map_err(failed_start())?;
             command.arg(name).args(arguments(options, &String::from_utf8_lossy(&help.stdout)));
         }
-        let (output, writer) = pipe().map_err(failed_start())?;
-        let errors = writer.try_clone().map_err(failed_start())?;
         // Python ends when its standard input closes.
-        let child = command.stdin(Stdio::piped()).stdout(writer).stderr(errors).spawn();
-        let mut child = KillOnDrop(child.map_err(failed_start())?);
-        // It holds the end of the pipe for writing.
-        drop(command);
-        let (sender, lines) = channel();
-        std::thread::spawn(move || {
-            let lines = BufReader::new(output).split(b'\n').map_while(std::io::Result::ok);
-            // Nobody listens any more after a stop.
-            lines.for_each(|line| drop(sender.send(String::from_utf8_lossy(&line).trim_end().to_string())));
-        });
+        command.stdin(Stdio::piped());
+        let process = Process::start(command, false).map_err(failed_start())?;
         let mut log_file =
             OpenOptions::new().create(true).append(true).open(log).map_err(Error::write(log))?;
-        let mut last_words = "without a message".to_string();
-        loop {
-            match lines.recv_timeout(PAUSE) {
-                Ok(line) => {
-                    writeln!(log_file, "{line}").map_err(Error::write(log))?;
-                    if let Some(message) = message_in(&line) {
-                        last_words = message.to_string();
-                    }
-                    on_count(count_in(&line))?;
+        let (mut current, mut last_words) = (start, "without a message".to_string());
+        let status = process.wait(|line| {
+            if let Some(line) = line {
+                writeln!(log_file, "{line}").map_err(Error::write(log))?;
+                if let Some(message) = message_in(&line) {
+                    last_words = message.to_string();
                 }
-                Err(RecvTimeoutError::Timeout) => on_count(None)?,
-                Err(RecvTimeoutError::Disconnected) => break,
+                if let Some(count) = count_in(&line) {
+                    current.done = (start.done + count).min(start.total);
+                }
             }
-        }
-        let status = child.0.wait().map_err(Error::failed_with_context(self))?;
+            reporter.report(current)
+        })?;
         if status.success() {
             return Ok(());
         }
         // Ctrl-C (SIGINT), SIGTERM and SIGHUP reach COLMAP, too, possibly before this process knows of them.
         if matches!(status.signal(), Some(1 | 2 | 15)) {
-            return Err(Interrupt::Stopped);
+            return reporter.stop();
         }
-        on_count(None)?;
+        reporter.report(current)?;
         let log = log.display();
-        Err(Error::failed(format!("COLMAP's {name} failed: {last_words} ({status}); see {log}")).into())
+        Err(Error::failed(format!("COLMAP's {name} failed: {last_words} ({status}); see {log}")))
     }
 }
 
@@ -203,17 +185,17 @@ fn python_programs() -> Vec<PathBuf> {
     pythons.filter(|python| python.is_file()).chain(["python3".into()]).collect()
 }
 
-/// Returns the arguments of COLMAP's program for `options`, in the version whose help for the command is `help`.
+/// Returns the arguments of COLMAP's program for `options`, in the version whose help for the command is `help`. Sections that are named
+/// `Feature…` were named after SIFT before COLMAP 3.13.
 fn arguments(options: &Value, help: &str) -> Vec<String> {
     let arguments = options.as_object().into_iter().flatten().flat_map(|(name, value)| {
-        let rename = |(section, before)| Some(format!("{before}{}", name.strip_prefix(section)?));
-        let old_name = RENAMED.into_iter().find_map(rename).filter(|_| !help.contains(&format!("--{name}")));
+        let option = format!("--{name}");
         let value = match value {
             Value::Bool(is_on) => u8::from(*is_on).to_string(),
             Value::String(text) => text.clone(),
             other => other.to_string(),
         };
-        [format!("--{}", old_name.as_ref().unwrap_or(name)), value]
+        [if help.contains(&option) { option } else { option.replacen("--Feature", "--Sift", 1) }, value]
     });
     arguments.collect()
 }

@@ -4,6 +4,7 @@ mod capture;
 mod colmap;
 mod photos;
 mod poses;
+mod process;
 mod progress;
 mod record;
 mod video;

@@ -1,6 +1,6 @@
 //! Photos of a folder, checked and brought into a capture's folder of images.
 
-use crate::progress::{Interrupt, Reporter, Step};
+use crate::progress::{Progress, Reporter, Step};
 use globalsplat_capture::{
     MASKS_FOLDER, decode_photo, encode_photo, exif_focal, find_masks, find_masks_in, gray_to_rgb,
     is_equirectangular, list_photos, read_image_size, read_mask,
@@ -79,7 +79,7 @@ pub(crate) fn import_photos(
     masks: Option<&Path>,
     images: &Path,
     reporter: &mut Reporter,
-) -> Result<(Vec<Photo>, Vec<SkippedPhoto>), Interrupt> {
+) -> Result<(Vec<Photo>, Vec<SkippedPhoto>)> {
     let all_names: Vec<&str> = found.iter().map(|photo| photo.name.as_str()).collect();
     let mask_files = match masks {
         Some(folder) => find_masks_in(folder, &all_names)?,
@@ -118,7 +118,7 @@ pub(crate) fn import_photos(
             if is_in_place && (contents.is_some() || photo.name != *name) {
                 let found = "one that COLMAP can't read as it is, by its name, format or rotation";
                 let expected = "an output whose images aren't the photos themselves";
-                return Err(Error::input(path, "the photo", found, expected).into());
+                return Err(Error::input(path, "the photo", found, expected));
             }
             let target = images.join(&photo.name);
             match contents {
@@ -136,7 +136,7 @@ pub(crate) fn import_photos(
             photos.push(photo);
         }
         done += few.len();
-        reporter.report(Step::Photos, done, found.len())?;
+        reporter.report(Progress { step: Step::Photos, done, total: found.len() })?;
     }
     Ok((photos, skipped))
 }
@@ -245,7 +245,6 @@ fn link(source: &Path, target: &Path) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::progress::unless_stopped;
     use globalsplat_capture::read_image;
     use image::{Rgb, RgbImage, Rgba, RgbaImage};
 
@@ -277,10 +276,10 @@ mod tests {
         fn import(&self, masks: Option<&str>) -> Result<(Vec<Photo>, Vec<String>), String> {
             let masks = masks.map(|masks| self.root.path().join(masks));
             let found = find_photos(&self.source).unwrap().0;
-            let (mut go_on, masks) = (|_| true, masks.as_deref());
-            let imported =
-                import_photos(&self.source, &found, masks, &self.images, &mut Reporter(&mut go_on));
-            let imported = unless_stopped(imported).map_err(|error| error.to_string())?;
+            let imported = Reporter::run(&mut |_| true, |reporter| {
+                import_photos(&self.source, &found, masks.as_deref(), &self.images, reporter)
+            });
+            let imported = imported.map_err(|error| error.to_string())?;
             let (photos, skipped) = imported.expect("nothing stops it");
             let skipped = skipped.into_iter().map(|photo| format!("{} is {}", photo.name, photo.reason));
             Ok((photos, skipped.collect()))

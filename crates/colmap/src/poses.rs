@@ -2,7 +2,7 @@
 
 use crate::colmap::Colmap;
 use crate::photos::{Photo, SkippedPhoto, import_photos};
-use crate::progress::{Interrupt, Reporter, Step};
+use crate::progress::{Progress, Reporter, Step};
 use crate::record::{CaptureReport, Matching, Record, SHOWN_NAMES};
 use globalsplat_capture::{COLMAP_MODELS, MASKS_FOLDER, format_names, read_colmap_models};
 use globalsplat_files::{Error, Result, write_atomically};
@@ -60,7 +60,7 @@ pub(crate) struct Estimate<'a, 'b> {
 
 impl Estimate<'_, '_> {
     /// Brings the photos in `source` into the folder of images.
-    pub fn import(&mut self, source: &Path) -> Result<(), Interrupt> {
+    pub fn import(&mut self, source: &Path) -> Result<()> {
         if self.record.photos.is_some() {
             return Ok(());
         }
@@ -72,7 +72,7 @@ impl Estimate<'_, '_> {
             let (total, reasons) = (self.record.found.len(), format_names(&reasons, SHOWN_NAMES));
             let found = format!("{total}, of which {} can't be used ({reasons})", skipped.len());
             let expected = "2 or more different ones";
-            return Err(Error::input(source, "the number of photos", found, expected).into());
+            return Err(Error::input(source, "the number of photos", found, expected));
         }
         (self.record.photos, self.record.skipped) = (Some(photos), skipped);
         Ok(())
@@ -82,26 +82,22 @@ impl Estimate<'_, '_> {
         self.record.photos.as_deref().unwrap_or_default()
     }
 
-    /// Runs a command of COLMAP on the database. `before` is added to the counts that it reports of `step`.
+    /// Runs a command of COLMAP on the database, in a step of which `done` of `total` photos or pairs are finished.
     fn run(
         &mut self,
         command: &str,
         mut options: Value,
         step: Step,
-        before: usize,
+        done: usize,
         total: usize,
-    ) -> Result<(), Interrupt> {
+    ) -> Result<()> {
         options["database_path"] = text(&self.out.join("database.db"));
-        let mut done = before;
-        self.reporter.report(step, done, total)?;
-        self.colmap.run(command, &options, &self.out.join("colmap.log"), &mut |count| {
-            done = count.map_or(done, |count| (before + count).min(total));
-            self.reporter.report(step, done, total)
-        })
+        let (log, start) = (self.out.join("colmap.log"), Progress { step, done, total });
+        self.colmap.run(command, &options, &log, start, self.reporter)
     }
 
     /// Detects features. Photos of one size and focal length share a camera, whose number is that of their group.
-    pub fn extract_features(&mut self) -> Result<(), Interrupt> {
+    pub fn extract_features(&mut self) -> Result<()> {
         if self.record.has_features {
             return Ok(());
         }
@@ -175,7 +171,7 @@ impl Estimate<'_, '_> {
     }
 
     /// Matches features, some pairs of photos at a time.
-    pub fn match_pairs(&mut self) -> Result<(), Interrupt> {
+    pub fn match_pairs(&mut self) -> Result<()> {
         let count = self.photos().len();
         let is_exhaustive = match self.record.matching {
             Matching::Auto => count <= EXHAUSTIVE_PHOTOS,
@@ -203,7 +199,7 @@ impl Estimate<'_, '_> {
     }
 
     /// Registers the photos.
-    pub fn run_mapper(&mut self) -> Result<(), Interrupt> {
+    pub fn run_mapper(&mut self) -> Result<()> {
         let [sparse, partial] = ["sparse", "sparse.partial"].map(|name| self.out.join(name));
         let remove = |folder: &Path| match folder.is_dir() {
             true => fs::remove_dir_all(folder).map_err(Error::write(folder)),
@@ -222,14 +218,16 @@ impl Estimate<'_, '_> {
         });
         match self.run("mapper", options, Step::Poses, 0, total) {
             // COLMAP's program fails with this message if it registers no photo, which is reported in other words.
-            Err(Interrupt::Failed(why))
-                if why.to_string().contains("sparse model")
-                    && read_colmap_models(&partial).is_ok_and(|models| models.is_empty()) => {}
+            Err(why) if why.to_string().contains("sparse model") => {}
             outcome => outcome?,
         }
         let models = read_colmap_models(&partial)?;
-        if models.is_empty() {
-            return Err(none_registered(total, self.out).into());
+        if models.first().is_none_or(|largest| largest.photos.len() < 2) {
+            return Err(Error::failed(format!(
+                "COLMAP registered none of the {total} photos: they may overlap too little, be blurred, lack texture, show different places, \
+                 or be taken from a single point; see {}",
+                self.out.join("colmap.log").display()
+            )));
         }
         // The robust loss weighs wrong matches less than the squared errors by which COLMAP has registered the photos. COLMAP's program has no
         // option for it.
@@ -249,9 +247,7 @@ impl Estimate<'_, '_> {
     /// Returns the result.
     pub fn report(&self) -> Result<CaptureReport> {
         let models = read_colmap_models(&self.out.join("sparse"))?;
-        let Some(largest) = models.first().filter(|model| model.photos.len() >= 2) else {
-            return Err(none_registered(self.photos().len(), self.out));
-        };
+        let largest = &models[0];
         let registered: BTreeSet<&String> = largest.photos.iter().collect();
         let unregistered = self.photos().iter().filter(|photo| !registered.contains(&photo.name));
         let is_few = (largest.photos.len() as f64) < FEW_REGISTERED * self.photos().len() as f64;
@@ -335,15 +331,6 @@ fn sequential_pairs(count: usize, overlap: usize, spread: usize) -> Vec<(usize, 
         .into_iter()
         .map(|(first, second)| (first * step, second * step));
     (0..count).flat_map(near).chain(far.filter(|(first, second)| second - first > overlap)).collect()
-}
-
-/// Returns the error if none of `count` photos was registered.
-fn none_registered(count: usize, out: &Path) -> Error {
-    Error::failed(format!(
-        "COLMAP registered none of the {count} photos: they may overlap too little, be blurred, lack texture, show different places, or be \
-         taken from a single point; see {}",
-        out.join("colmap.log").display()
-    ))
 }
 
 #[cfg(test)]

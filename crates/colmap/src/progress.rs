@@ -2,7 +2,6 @@
 
 use globalsplat_files::{Error, Result};
 use serde::{Deserialize, Serialize};
-use std::process::Child;
 
 /// Steps of making a capture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -47,49 +46,39 @@ pub struct Progress {
     pub total: usize,
 }
 
-/// Reason why work ended early.
-#[derive(Debug)]
-pub(crate) enum Interrupt {
-    /// The caller stopped it.
-    Stopped,
-    /// It failed.
-    Failed(Error),
-}
-
-impl From<Error> for Interrupt {
-    fn from(error: Error) -> Self {
-        Interrupt::Failed(error)
-    }
-}
-
-/// A process that is killed on drop unless it has ended.
-pub(crate) struct KillOnDrop(pub Child);
-
-impl Drop for KillOnDrop {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
-/// Returns `None` if the work was stopped.
-pub(crate) fn unless_stopped<T>(result: Result<T, Interrupt>) -> Result<Option<T>> {
-    match result {
-        Ok(value) => Ok(Some(value)),
-        Err(Interrupt::Stopped) => Ok(None),
-        Err(Interrupt::Failed(error)) => Err(error),
-    }
-}
-
 /// The function that receives the progress, and returns `false` to stop the work.
-pub(crate) struct Reporter<'a>(pub &'a mut dyn FnMut(Progress) -> bool);
+pub(crate) struct Reporter<'a> {
+    on_progress: &'a mut dyn FnMut(Progress) -> bool,
+    is_stopped: bool,
+}
 
 impl Reporter<'_> {
+    /// Does `work` with a reporter to `on_progress`. Returns `None` if the work was stopped.
+    pub fn run<T>(
+        on_progress: &mut dyn FnMut(Progress) -> bool,
+        work: impl FnOnce(&mut Reporter) -> Result<T>,
+    ) -> Result<Option<T>> {
+        let mut reporter = Reporter { on_progress, is_stopped: false };
+        match work(&mut reporter) {
+            Err(_) if reporter.is_stopped => Ok(None),
+            result => result.map(Some),
+        }
+    }
+
     /// Reports progress.
     ///
     /// # Errors
-    /// Returns [`Interrupt::Stopped`] if the work is to be stopped.
-    pub fn report(&mut self, step: Step, done: usize, total: usize) -> Result<(), Interrupt> {
-        if (self.0)(Progress { step, done, total }) { Ok(()) } else { Err(Interrupt::Stopped) }
+    /// Returns the error of [`Reporter::stop`] if the work is to be stopped.
+    pub fn report(&mut self, progress: Progress) -> Result<()> {
+        if (self.on_progress)(progress) { Ok(()) } else { self.stop() }
+    }
+
+    /// Stops the work.
+    ///
+    /// # Errors
+    /// Returns an error, which ends the work and which [`Reporter::run`] doesn't return.
+    pub fn stop(&mut self) -> Result<()> {
+        self.is_stopped = true;
+        Err(Error::failed("stopped"))
     }
 }

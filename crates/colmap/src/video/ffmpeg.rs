@@ -1,15 +1,14 @@
 //! ffmpeg and ffprobe, run as processes.
 
-use super::motion::Gray;
-use crate::progress::KillOnDrop;
+use crate::process::Process;
 use globalsplat_files::{Error, Result, is_program_missing};
+use image::GrayImage;
 use serde_json::Value;
 use std::fs;
-use std::io::{BufRead, BufReader, Read};
+use std::io::{self, BufRead, ErrorKind};
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{ChildStdout, Command, Output, Stdio};
-use std::thread::JoinHandle;
+use std::process::{Command, Output, Stdio};
 
 /// BT.2020 in PQ or HLG to BT.709, by linear light in which 1 is 100 cd/m².
 const TONEMAP: &str = "zscale=t=linear:npl=100,format=gbrpf32le,zscale=p=bt709,tonemap=hable:desat=0,\
@@ -48,7 +47,8 @@ impl<'a> Video<'a> {
         let output = run(path, probe)?;
         let no_video = |found: &str| Err(Error::input(path, "the content", found, "a video"));
         if !output.status.success() {
-            let why = first_message(&*output.stderr, path).unwrap_or_default();
+            let errors = String::from_utf8_lossy(&output.stderr);
+            let why = message_in(errors.lines().next().unwrap_or_default(), path);
             return no_video(&format!("not readable by ffmpeg ({why})"));
         }
         let found: Value = serde_json::from_slice(&output.stdout)
@@ -123,84 +123,58 @@ impl<'a> Video<'a> {
         })
     }
 
-    /// Starts the first pass: every frame as a gray image of up to 640 pixels a side.
-    pub(super) fn decode_small(&self) -> Result<Pass<'_>> {
+    /// Calls `on_frame` with every frame as a gray image of up to 640 pixels a side, and ends if it fails.
+    pub(super) fn decode_small(&self, mut on_frame: impl FnMut(&GrayImage) -> Result<()>) -> Result<()> {
         let scale = "scale=w='min(640,iw)':h='min(640,ih)':force_original_aspect_ratio=decrease:flags=area";
         let filter = format!("{}{scale},format=gray", self.deinterlace);
-        self.start(&filter, &["-f", "image2pipe", "-c:v", "pgm", "-"], Path::new("."))
+        let mut process = self.start(&filter, &["-f", "image2pipe", "-c:v", "pgm", "-"], Path::new("."))?;
+        let mut frames = process.take_output();
+        let context = format!("{}: no frames from ffmpeg", self.path.display());
+        while let Some(frame) = read_pgm(&mut frames).map_err(Error::failed_with_context(&context))? {
+            on_frame(&frame)?;
+        }
+        self.finish(process, || Ok(()))
     }
 
-    /// Starts the second pass: the frames `chosen` as `frame_00001.jpg`, … in `folder`.
-    pub(super) fn write(&self, chosen: &[usize], folder: &Path) -> Result<Pass<'_>> {
+    /// Writes the frames `chosen` as `frame_00001.jpg`, … to `folder`. Calls `watch` several times a second, and ends if it fails.
+    pub(super) fn write(
+        &self,
+        chosen: &[usize],
+        folder: &Path,
+        watch: impl FnMut() -> Result<()>,
+    ) -> Result<()> {
         let filter = format!("{}select='{}',{}", self.deinterlace, expression_of(chosen), self.to_jpeg);
         let (count, jpeg) = (chosen.len().to_string(), ["-c:v", "mjpeg", "-q:v", "2", "-f", "image2"]);
-        let output = [&["-progress", "pipe:1", "-frames:v", &count], &jpeg[..], &["frame_%05d.jpg"]].concat();
         // The name of the folder may have a %, too.
-        self.start(&filter, &output, folder)
+        let output = [&["-frames:v", &count], &jpeg[..], &["frame_%05d.jpg"]].concat();
+        self.finish(self.start(&filter, &output, folder)?, watch)
     }
 
-    fn start(&self, filter: &str, output: &[&str], folder: &Path) -> Result<Pass<'_>> {
+    fn start(&self, filter: &str, output: &[&str], folder: &Path) -> Result<Process> {
         let mut command = command("ffmpeg");
         command.args(["-hide_banner", "-nostdin", "-nostats", "-v", "error", "-y", "-i"]);
         command.arg(absolute(self.path)?).args(["-map", &self.stream, "-vf", filter]);
         command.args([self.every_frame, "passthrough"]).args(output).current_dir(folder);
-        let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
-        let mut child = KillOnDrop(child.map_err(not_started(self.path, "ffmpeg"))?);
-        let stdout = BufReader::new(child.0.stdout.take().expect("a pipe was requested"));
-        let stderr = child.0.stderr.take().expect("a pipe was requested");
-        let video = self.path.to_owned();
-        let error = std::thread::spawn(move || first_message(stderr, &video));
-        Ok(Pass { video: self, child, stdout, error: Some(error) })
-    }
-
-    /// Returns the error that the work on the video failed.
-    pub(super) fn failed(&self, why: impl std::fmt::Display) -> Error {
-        Error::failed(format!("{}: {why}", self.path.display()))
-    }
-}
-
-/// A run of ffmpeg.
-pub(super) struct Pass<'a> {
-    video: &'a Video<'a>,
-    child: KillOnDrop,
-    stdout: BufReader<ChildStdout>,
-    /// First error that ffmpeg reports.
-    error: Option<JoinHandle<Option<String>>>,
-}
-
-impl Pass<'_> {
-    /// Returns the next image of [`Video::decode_small`]; `None` at the end of the video.
-    pub(super) fn next_frame(&mut self) -> Result<Option<Gray>> {
-        let context = format!("{}: no frames from ffmpeg", self.video.path.display());
-        Gray::read(&mut self.stdout).map_err(Error::failed_with_context(context))
-    }
-
-    /// Waits for the next number of frames that [`Video::write`] has written, twice a second; `None` at the end.
-    pub(super) fn next_count(&mut self) -> Result<Option<usize>> {
-        let context = format!("{}: no progress from ffmpeg", self.video.path.display());
-        let mut line = String::new();
-        while self.stdout.read_line(&mut line).map_err(Error::failed_with_context(&context))? > 0 {
-            if let Some(count) = line.strip_prefix("frame=").and_then(|count| count.trim().parse().ok()) {
-                return Ok(Some(count));
-            }
-            line.clear();
-        }
-        Ok(None)
+        Process::start(command, true).map_err(not_started(self.path, "ffmpeg"))
     }
 
     /// Waits for the end of ffmpeg.
     ///
     /// # Errors
-    /// Returns the first error that ffmpeg reports if it fails.
-    pub(super) fn finish(mut self) -> Result<()> {
-        let status = self.child.0.wait().map_err(Error::failed_with_context("ffmpeg failed"))?;
-        let error = self.error.take().and_then(|error| error.join().ok().flatten());
-        match status.success() {
-            true => Ok(()),
-            false => Err(self
-                .video
-                .failed(format!("ffmpeg failed: {}", error.unwrap_or_else(|| status.to_string())))),
-        }
+    /// Returns the error of `watch`, or the first error that ffmpeg reports if it fails.
+    fn finish(&self, process: Process, mut watch: impl FnMut() -> Result<()>) -> Result<()> {
+        let mut message = None;
+        let status = process.wait(|line| {
+            message = message.take().or(line);
+            watch()
+        })?;
+        let why = message.map_or(status.to_string(), |message| message_in(&message, self.path));
+        if status.success() { Ok(()) } else { Err(self.failed(format!("ffmpeg failed: {why}"))) }
+    }
+
+    /// Returns the error that the work on the video failed.
+    pub(super) fn failed(&self, why: impl std::fmt::Display) -> Error {
+        Error::failed(format!("{}: {why}", self.path.display()))
     }
 }
 
@@ -245,17 +219,29 @@ fn absolute(path: &Path) -> Result<PathBuf> {
     std::path::absolute(path).map_err(Error::read(path))
 }
 
-/// Reads the errors that ffmpeg reports to their end. Returns the first one without its prefixes: the module, such as "[mov @ 0x55aa]", and the
-/// path of the video.
-fn first_message(errors: impl Read, video: &Path) -> Option<String> {
-    let mut lines = BufReader::new(errors).split(b'\n').map_while(std::io::Result::ok);
-    let first = lines.next()?;
-    lines.for_each(drop);
-    let first = String::from_utf8_lossy(&first);
-    let mut rest = first.trim();
-    while let Some((_, after)) = rest.strip_prefix('[').and_then(|prefix| prefix.split_once("] ")) {
-        rest = after;
+/// Returns an error of ffmpeg without its prefixes: the module, such as "[mov @ 0x55aa]", and the path of the video.
+fn message_in(line: &str, video: &Path) -> String {
+    let mut message = line.trim();
+    while let Some((_, after)) = message.strip_prefix('[').and_then(|prefix| prefix.split_once("] ")) {
+        message = after;
     }
     let video = absolute(video).unwrap_or_default();
-    Some(rest.strip_prefix(&format!("{}: ", video.display())).unwrap_or(rest).into())
+    message.strip_prefix(&format!("{}: ", video.display())).unwrap_or(message).into()
+}
+
+/// Reads a binary PGM as ffmpeg writes it: "P5", the size and the maximum, 255, in a line each. Returns `None` at the end of the data.
+fn read_pgm(reader: &mut impl BufRead) -> io::Result<Option<GrayImage>> {
+    if reader.fill_buf()?.is_empty() {
+        return Ok(None);
+    }
+    let mut header = String::new();
+    for _ in 0..3 {
+        reader.read_line(&mut header)?;
+    }
+    let words: Vec<&str> = header.split_whitespace().collect();
+    let ["P5", width, height, "255"] = words[..] else { return Err(ErrorKind::InvalidData.into()) };
+    let parse = |word: &str| word.parse().map_err(|_| io::Error::from(ErrorKind::InvalidData));
+    let mut image = GrayImage::new(parse(width)?, parse(height)?);
+    reader.read_exact(&mut image)?;
+    Ok(Some(image))
 }

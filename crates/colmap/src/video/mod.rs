@@ -7,11 +7,11 @@ mod ffmpeg;
 mod frame_selection;
 mod motion;
 
-use crate::progress::{Interrupt, Progress, Reporter, Step, unless_stopped};
+use crate::progress::{Progress, Reporter, Step};
 use ffmpeg::Video;
 use frame_selection::{positions, select_frames};
 use globalsplat_files::{Error, Result, replace_dir};
-use motion::MotionTracker;
+use motion::{MotionTracker, sharpness_of};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
@@ -49,7 +49,7 @@ pub fn extract_frames(
     count: Option<usize>,
     on_progress: &mut dyn FnMut(Progress) -> bool,
 ) -> Result<Option<VideoFrames>> {
-    unless_stopped(write_sharpest_frames(video, folder, count, &mut Reporter(on_progress)))
+    Reporter::run(on_progress, |reporter| write_sharpest_frames(video, folder, count, reporter))
 }
 
 pub(crate) fn write_sharpest_frames(
@@ -57,15 +57,15 @@ pub(crate) fn write_sharpest_frames(
     folder: &Path,
     count: Option<usize>,
     reporter: &mut Reporter,
-) -> Result<VideoFrames, Interrupt> {
+) -> Result<VideoFrames> {
     if let Some(count) = count.filter(|count| !(1..=MAX_FRAMES).contains(count)) {
-        return Err(Error::setting("the number of frames", count, format!("1 to {MAX_FRAMES}")).into());
+        return Err(Error::setting("the number of frames", count, format!("1 to {MAX_FRAMES}")));
     }
     let source = Video::open(video)?;
     let (sharpness, motion) = measure(&source, reporter)?;
     let total = sharpness.len();
     if total < 2 {
-        return Err(Error::input(video, "the number of frames", total, "2 or more").into());
+        return Err(Error::input(video, "the number of frames", total, "2 or more"));
     }
     let indices = select_frames(&positions(&motion, count), &sharpness);
     let chosen = indices.len();
@@ -88,36 +88,29 @@ pub(crate) fn write_sharpest_frames(
 
 /// Runs the first pass over the video. Returns the sharpness of each frame, and how far the picture moves from the frame before to it, in
 /// units of the longer side.
-fn measure(video: &Video, reporter: &mut Reporter) -> Result<(Vec<f64>, Vec<f64>), Interrupt> {
+fn measure(video: &Video, reporter: &mut Reporter) -> Result<(Vec<f64>, Vec<f64>)> {
     let (mut sharpness, mut motion, mut tracker) = (vec![], vec![], MotionTracker::default());
-    let mut pass = video.decode_small()?;
-    while let Some(frame) = pass.next_frame()? {
-        sharpness.push(frame.sharpness());
-        motion.push(tracker.add(&frame));
+    video.decode_small(|frame| {
+        sharpness.push(sharpness_of(frame));
+        motion.push(tracker.add(frame));
         // The number that the file declares is an estimate.
         let done = motion.len();
-        reporter.report(Step::Measure, done, video.expected_frames.max(done))?;
-    }
-    pass.finish()?;
+        reporter.report(Progress { step: Step::Measure, done, total: video.expected_frames.max(done) })
+    })?;
     Ok((sharpness, motion))
 }
 
 /// Runs the second pass over the video, which writes the frames `chosen` to `folder`.
-fn write_frames(
-    video: &Video,
-    chosen: &[usize],
-    folder: &Path,
-    reporter: &mut Reporter,
-) -> Result<(), Interrupt> {
-    let mut pass = video.write(chosen, folder)?;
-    while let Some(done) = pass.next_count()? {
-        reporter.report(Step::Frames, done.min(chosen.len()), chosen.len())?;
-    }
-    pass.finish()?;
-    let written = own_frames(folder)?.len();
-    match written == chosen.len() {
-        true => Ok(()),
-        false => Err(video.failed(format!("ffmpeg wrote {written} of {} frames", chosen.len())).into()),
+fn write_frames(video: &Video, chosen: &[usize], folder: &Path, reporter: &mut Reporter) -> Result<()> {
+    let total = chosen.len();
+    let mut report_written = || {
+        let done = own_frames(folder)?.len();
+        reporter.report(Progress { step: Step::Frames, done, total }).map(|()| done)
+    };
+    video.write(chosen, folder, || report_written().map(drop))?;
+    match report_written()? {
+        written if written == total => Ok(()),
+        written => Err(video.failed(format!("ffmpeg wrote {written} of {total} frames"))),
     }
 }
 
