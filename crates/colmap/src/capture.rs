@@ -1,16 +1,15 @@
 //! Captures from photos or a video: which folders may be used, what an earlier call has made, and the steps in their order.
 
 use crate::colmap::Colmap;
-use crate::photos::find_photos;
+use crate::photos::{find_photos, is_same_folder};
 use crate::poses::Estimate;
-use crate::progress::{Progress, Reporter, Step};
+use crate::progress::{Progress, Reporter};
 use crate::record::{CaptureReport, FILE, Matching, Record, VideoRecord};
 use crate::video::write_sharpest_frames;
 use globalsplat_capture::COLMAP_MODELS;
 use globalsplat_files::{Error, Result};
 use std::fs::{self, DirEntry};
 use std::path::{Path, PathBuf};
-use std::time::Instant;
 
 /// Options of [`make_capture`].
 #[derive(Debug, Clone, Default)]
@@ -49,10 +48,10 @@ pub fn make_capture(
     colmap: &Colmap,
     on_progress: &mut dyn FnMut(Progress) -> bool,
 ) -> Result<Option<CaptureReport>> {
-    Reporter::run(on_progress, |reporter| run_steps(source, out, options, colmap, reporter))
+    Reporter::run(on_progress, |reporter| make_or_continue(source, out, options, colmap, reporter))
 }
 
-fn run_steps(
+fn make_or_continue(
     source: &Path,
     out: &Path,
     options: &CaptureOptions,
@@ -67,10 +66,8 @@ fn run_steps(
     let photos = if is_video { &images } else { source };
     let old = Record::read(out)?;
     check_output(photos, out, is_video, old.is_none())?;
-    let video = match is_video {
-        true => Some(frames_of_video(source, out, options, old.as_ref(), reporter)?),
-        false => None,
-    };
+    let write_frames = || frames_of_video(source, out, options, old.as_ref(), reporter);
+    let video = is_video.then(write_frames).transpose()?;
     let (found, other_files) = find_photos(photos)?;
     if found.len() < 2 {
         return Err(Error::input(photos, "the number of photos", found.len(), "2 or more"));
@@ -102,28 +99,11 @@ fn run_steps(
     };
     fs::create_dir_all(out).map_err(Error::write(out))?;
     record.write(out)?;
-    let mut estimate = Estimate { out, images: &images, colmap, record, reporter };
-    for step in [Step::Photos, Step::Features, Step::Pairs, Step::Poses] {
-        if estimate.record.report.is_some() {
-            break;
-        }
-        let start = Instant::now();
-        let outcome = match step {
-            Step::Photos => estimate.import(photos),
-            Step::Features => estimate.extract_features(),
-            Step::Pairs => estimate.match_pairs(),
-            _ => estimate.run_mapper(),
-        };
-        *estimate.record.seconds.entry(step).or_default() += start.elapsed().as_secs_f64();
-        estimate.record.write(out)?;
-        outcome?;
-    }
-    let report = match estimate.record.report.take() {
+    let mut estimate = Estimate { photos, out, images: &images, colmap, record, reporter };
+    let report = match estimate.record.report.clone() {
         Some(report) => report,
-        None => estimate.report()?,
+        None => estimate.run_steps()?,
     };
-    estimate.record.report = Some(report.clone());
-    estimate.record.write(out)?;
     Ok(CaptureReport { video: estimate.record.video, other_files, ..report })
 }
 
@@ -131,17 +111,11 @@ fn run_steps(
 /// folder of photos may contain the capture, which would then be found among the photos. If `is_new`, the folder `out` may only contain
 /// hidden files and these photos, or what a call left that was killed before it had recorded the frames of a video.
 fn check_output(photos: &Path, out: &Path, is_video: bool, is_new: bool) -> Result<()> {
-    let canonical = match photos.canonicalize() {
-        Ok(folder) => Some(folder),
-        // The frames of a video are written later.
-        Err(_) if is_video => None,
-        Err(error) => return Err(Error::read(photos)(error)),
-    };
-    if let Some(photos_folder) = canonical.as_ref().filter(|_| !is_video) {
-        let existing = out.ancestors().find_map(|folder| {
-            let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
-            folder.canonicalize().ok()
-        });
+    // The frames of a video are written later.
+    if !is_video {
+        let photos_folder = photos.canonicalize().map_err(Error::read(photos))?;
+        let absolute = std::path::absolute(out).map_err(Error::write(out))?;
+        let existing = absolute.ancestors().find_map(|folder| folder.canonicalize().ok());
         if existing.is_some_and(|out| out.starts_with(photos_folder)) {
             let expected = format!("a folder outside of {}", photos.display());
             return Err(Error::input(out, "the output", "inside the folder of photos", expected));
@@ -151,7 +125,7 @@ fn check_output(photos: &Path, out: &Path, is_video: bool, is_new: bool) -> Resu
     let starts_with =
         |entry: &DirEntry, start: &str| entry.file_name().as_encoded_bytes().starts_with(start.as_bytes());
     let are_photos = |folder: &Path| {
-        folder.canonicalize().is_ok_and(|folder| canonical.as_ref() == Some(&folder))
+        is_same_folder(folder, photos)
             && (!is_video || entries(folder).all(|frame| starts_with(&frame, "frame_")))
     };
     let other = entries(out).find(|entry| !starts_with(entry, ".") && !are_photos(&entry.path()));

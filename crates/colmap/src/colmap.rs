@@ -217,19 +217,14 @@ fn count_in(line: &str) -> Option<usize> {
 
 /// Returns the text of a warning, an error or an exception in COLMAP's log.
 fn message_in(line: &str) -> Option<&str> {
-    if let Some(message) =
-        ["ERROR: ", "WARNING: "].iter().find_map(|start| line.trim_start().strip_prefix(start))
-    {
-        return Some(message);
+    // "E20261127 01:56:37.250 1405 mapper.cc:270] …"; older versions print "ERROR: …", and Python "ValueError: …".
+    if line.starts_with("E20") || line.starts_with("F20") {
+        return Some(line.split_once("] ")?.1);
     }
-    let is_logged = |level: char| {
-        let rest = line.strip_prefix(level)?;
-        rest.starts_with("20").then_some(())?;
-        Some(rest.split_once("] ")?.1)
-    };
-    let exception =
-        || line.split_once("Error: ").filter(|(class, _)| !class.contains(' ')).map(|(_, text)| text);
-    ['E', 'F'].into_iter().find_map(is_logged).or_else(exception)
+    let (start, text) = line.trim_start().split_once(": ")?;
+    let is_message =
+        start == "ERROR" || start == "WARNING" || start.ends_with("Error") && !start.contains(' ');
+    is_message.then_some(text)
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@ use globalsplat_capture::{
     MASKS_FOLDER, decode_photo, encode_photo, exif_focal, find_masks, find_masks_in, gray_to_rgb,
     is_equirectangular, list_photos, read_image_size, read_mask,
 };
-use globalsplat_files::{Error, Result, checksum, parent_of, write_atomically};
+use globalsplat_files::{Error, Result, checksum, parent_of, write_files};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::collections::{HashMap, HashSet};
@@ -89,16 +89,14 @@ pub(crate) fn import_photos(
     let mut first_of = HashMap::new();
     for (photo, mask) in found.iter().zip(&mask_files) {
         let first = *first_of.entry((photo.bytes, photo.checksum)).or_insert(&photo.name);
-        match *first == photo.name {
-            true => distinct.push((&photo.name, mask)),
-            false => {
-                let (name, reason) = (photo.name.clone(), format!("identical to {first}"));
-                skipped.push(SkippedPhoto { name, reason });
-            }
+        if *first == photo.name {
+            distinct.push((&photo.name, mask));
+        } else {
+            let (name, reason) = (photo.name.clone(), format!("identical to {first}"));
+            skipped.push(SkippedPhoto { name, reason });
         }
     }
-    let is_in_place =
-        source.canonicalize().is_ok_and(|source| images.canonicalize().is_ok_and(|images| images == source));
+    let is_in_place = is_same_folder(source, images);
     let mut names = HashSet::new();
     let mut done = skipped.len();
     // Few photos at a time, for progress and memory.
@@ -139,6 +137,11 @@ pub(crate) fn import_photos(
         reporter.report(Progress { step: Step::Photos, done, total: found.len() })?;
     }
     Ok((photos, skipped))
+}
+
+/// Returns `true` if both paths lead to the same folder.
+pub(crate) fn is_same_folder(a: &Path, b: &Path) -> bool {
+    a.canonicalize().is_ok_and(|a| b.canonicalize().is_ok_and(|b| a == b))
 }
 
 /// Returns a name that COLMAP's lists can hold, and that differs from `taken`, to which it is added.
@@ -227,7 +230,7 @@ fn check_aspect(file: &Path, size: (u32, u32)) -> Result<()> {
 /// Writes a file, and its folder.
 fn write_file(target: &Path, contents: &[u8]) -> Result<()> {
     fs::create_dir_all(parent_of(target)).map_err(Error::write(target))?;
-    write_atomically(target, |writer| writer.write_all(contents).map_err(Error::write(target)))
+    write_files([(target, contents)])
 }
 
 /// Links `target` to the file `source`, copying it if it can't be linked.
@@ -240,171 +243,4 @@ fn link(source: &Path, target: &Path) -> Result<()> {
         fs::copy(&source, target).map_err(Error::write(target))?;
     }
     Ok(())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use globalsplat_capture::read_image;
-    use image::{Rgb, RgbImage, Rgba, RgbaImage};
-
-    /// Folders of photos, their masks, and a capture in a temporary folder, and the test's access to them.
-    struct Folders {
-        root: tempfile::TempDir,
-        source: PathBuf,
-        images: PathBuf,
-    }
-
-    impl Folders {
-        fn new() -> Self {
-            let root = tempfile::tempdir().unwrap();
-            let [source, images] = ["photos", "out/images"].map(|name| root.path().join(name));
-            fs::create_dir_all(source.join("masks")).unwrap();
-            Folders { root, source, images }
-        }
-
-        fn write(&self, name: &str, pixel: impl Fn(u32, u32) -> [u8; 3]) {
-            let photo = RgbImage::from_fn(16, 8, |x, y| Rgb(pixel(x, y)));
-            photo.save_with_format(self.source.join(name), image::ImageFormat::Png).unwrap();
-        }
-
-        fn write_photo(&self, name: &str, seed: u8) {
-            self.write(name, |x, y| [x as u8 * 9, y as u8 * 9, seed]);
-        }
-
-        /// Returns the names of the photos, and those that are skipped with the reason.
-        fn import(&self, masks: Option<&str>) -> Result<(Vec<Photo>, Vec<String>), String> {
-            let masks = masks.map(|masks| self.root.path().join(masks));
-            let found = find_photos(&self.source).unwrap().0;
-            let imported = Reporter::run(&mut |_| true, |reporter| {
-                import_photos(&self.source, &found, masks.as_deref(), &self.images, reporter)
-            });
-            let imported = imported.map_err(|error| error.to_string())?;
-            let (photos, skipped) = imported.expect("nothing stops it");
-            let skipped = skipped.into_iter().map(|photo| format!("{} is {}", photo.name, photo.reason));
-            Ok((photos, skipped.collect()))
-        }
-
-        fn mask(&self, name: &str) -> PathBuf {
-            self.root.path().join("out/masks").join(name)
-        }
-    }
-
-    fn names(photos: &[Photo]) -> Vec<&str> {
-        photos.iter().map(|photo| photo.name.as_str()).collect()
-    }
-
-    #[test]
-    fn useless_photos_are_skipped_and_named() {
-        use std::os::unix::ffi::OsStrExt;
-        let folders = Folders::new();
-        let at = |name: &str| folders.source.join(name);
-        fs::create_dir(at("b")).unwrap();
-        for (seed, name) in ["a 1.png", "a_1.png", "b/2.png", "é.png"].into_iter().enumerate() {
-            folders.write_photo(name, seed as u8);
-        }
-        fs::copy(at("b/2.png"), at("b/3.png")).unwrap();
-        folders.write("black.png", |_, _| [3; 3]);
-        fs::write(at("cut.png"), &fs::read(at("a 1.png")).unwrap()[..60]).unwrap();
-        fs::write(at("notes.txt"), "no photo").unwrap();
-        fs::write(at(".hidden.png"), "no photo").unwrap();
-        folders.write_photo("z.png", 9);
-        let is_foreign =
-            fs::rename(at("z.png"), folders.source.join(std::ffi::OsStr::from_bytes(b"z\xe9.png"))).is_ok();
-        if !is_foreign {
-            fs::remove_file(at("z.png")).unwrap();
-        }
-        let (photos, skipped) = folders.import(None).unwrap();
-        assert_eq!(names(&photos), ["a_1.png", "_a_1.png", "b/2.png", "é.png"]);
-        assert_eq!((photos[0].width, photos[0].height), (16, 8));
-        assert_eq!(fs::read(folders.images.join("_a_1.png")).unwrap(), fs::read(at("a_1.png")).unwrap());
-        let reasons = [
-            "b/3.png is identical to b/2.png",
-            "black.png is of a single color",
-            "cut.png is undecodable (",
-            "is named in another encoding than UTF-8",
-        ];
-        let expected = if is_foreign { 4 } else { 3 };
-        assert!(
-            skipped.len() == expected && skipped.iter().zip(reasons).all(|(a, b)| a.contains(b)),
-            "{skipped:?}"
-        );
-    }
-
-    #[test]
-    fn photos_that_colmap_may_not_read_are_converted_with_their_opacity_and_orientation() {
-        let folders = Folders::new();
-        let photo = RgbaImage::from_fn(16, 8, |x, y| {
-            Rgba([x as u8 * 15, y as u8 * 30, 90, if x < 8 { 0 } else { 255 }])
-        });
-        photo.save(folders.source.join("a.webp")).unwrap();
-        folders.write_photo("a.png", 1);
-        // The contents of a PNG under another extension, with a mask of half its size.
-        folders.write_photo("b.jpg", 2);
-        RgbImage::from_fn(8, 4, |x, _| Rgb([if x < 4 { 255 } else { 0 }; 3]))
-            .save(folders.source.join("masks/b.png"))
-            .unwrap();
-        // EXIF with one entry: orientation (0x0112), a SHORT, is 6, a clockwise turn by 90°.
-        let exif = b"Exif\0\0MM\0\x2a\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0";
-        let rotated = RgbImage::from_fn(16, 8, |x, _| Rgb([if x < 8 { 0 } else { 250 }; 3]));
-        let jpeg = encode_photo(&rotated, true).unwrap();
-        let length = (exif.len() as u16 + 2).to_be_bytes();
-        let rotated = [&jpeg[..2], &[0xff, 0xe1], &length, exif, &jpeg[2..]].concat();
-        fs::write(folders.source.join("c.jpg"), rotated).unwrap();
-
-        let (photos, skipped) = folders.import(None).unwrap();
-        assert!(skipped.is_empty(), "{skipped:?}");
-        assert_eq!(names(&photos), ["a.png", "a.jpg", "b.jpg.jpg", "c.jpg"]);
-        let mask = read_image(&folders.mask("a.jpg.png")).unwrap();
-        assert!(mask.enumerate_pixels().all(|(x, _, level)| level[0] == if x < 8 { 0 } else { 255 }));
-        let converted = read_image(&folders.images.join("a.jpg")).unwrap();
-        assert!(converted.get_pixel(12, 4)[0].abs_diff(180) < 12, "{:?}", converted.get_pixel(12, 4));
-        let mask = read_image(&folders.mask("b.jpg.jpg.png")).unwrap();
-        assert_eq!((mask.dimensions(), mask.get_pixel(2, 2)[0], mask.get_pixel(13, 5)[0]), ((16, 8), 255, 0));
-        let upright = read_image(&folders.images.join("c.jpg")).unwrap();
-        assert_eq!((upright.dimensions(), photos[3].width, photos[3].height), ((8, 16), 8, 16));
-        assert!(upright.get_pixel(4, 2).0[0] < 50 && upright.get_pixel(4, 13).0[0] > 200);
-    }
-
-    #[test]
-    fn masks_of_another_folder_replace_those_of_an_earlier_run() {
-        let folders = Folders::new();
-        let masks = folders.root.path().join("other");
-        fs::create_dir(&masks).unwrap();
-        folders.write_photo("a.png", 1);
-        folders.write_photo("b.png", 2);
-        folders.write_photo("masks/a.png", 3);
-        let have_masks = || ["a.png.png", "b.png.png"].map(|name| folders.mask(name).exists());
-        folders.import(None).unwrap();
-        assert_eq!(have_masks(), [true, false]);
-        let error = folders.import(Some("other")).unwrap_err();
-        assert!(
-            error.ends_with("other: the folder is without a mask for any photo, expected a.png.png"),
-            "{error}"
-        );
-        fs::copy(folders.source.join("b.png"), masks.join("b.png.png")).unwrap();
-        folders.import(Some("other")).unwrap();
-        assert_eq!(have_masks(), [false, true]);
-        RgbImage::new(8, 16).save(masks.join("b.png.png")).unwrap();
-        let error = folders.import(Some("other")).unwrap_err();
-        assert!(error.contains("the mask is 8×16 pixels, expected 16×8 pixels"), "{error}");
-        fs::write(masks.join("b.png.png"), "no image").unwrap();
-        let error = folders.import(Some("other")).unwrap_err();
-        assert!(error.contains("b.png.png: the image"), "{error}");
-    }
-
-    #[test]
-    fn photos_in_the_folder_of_images_are_left_as_they_are() {
-        let mut folders = Folders::new();
-        folders.images.clone_from(&folders.source);
-        folders.write_photo("a_1.png", 1);
-        folders.write_photo("b.png", 2);
-        let before = fs::read(folders.images.join("a_1.png")).unwrap();
-        assert_eq!(folders.import(None).unwrap().0.len(), 2);
-        folders.write_photo("a 1.png", 3);
-        let error = folders.import(None).unwrap_err();
-        assert!(error.contains("a 1.png: the photo is one that COLMAP can't read"), "{error}");
-        assert_eq!(fs::read(folders.images.join("a_1.png")).unwrap(), before);
-        assert_eq!(find_photos(&folders.images).unwrap().0.len(), 3);
-    }
 }

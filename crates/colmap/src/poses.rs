@@ -5,11 +5,12 @@ use crate::photos::{Photo, SkippedPhoto, import_photos};
 use crate::progress::{Progress, Reporter, Step};
 use crate::record::{CaptureReport, Matching, Record, SHOWN_NAMES};
 use globalsplat_capture::{COLMAP_MODELS, MASKS_FOLDER, format_names, read_colmap_models};
-use globalsplat_files::{Error, Result, write_atomically};
+use globalsplat_files::{Error, Result, write_files};
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::Path;
+use std::time::Instant;
 
 /// Maximum number of photos of which every pair is matched by default.
 const EXHAUSTIVE_PHOTOS: usize = 200;
@@ -50,6 +51,8 @@ const BLOCK: usize = 16;
 
 /// A capture in the making.
 pub(crate) struct Estimate<'a, 'b> {
+    /// Folder of the user's photos, or of the frames of a video.
+    pub photos: &'a Path,
     pub out: &'a Path,
     /// Folder of the photos that COLMAP reads.
     pub images: &'a Path,
@@ -59,20 +62,39 @@ pub(crate) struct Estimate<'a, 'b> {
 }
 
 impl Estimate<'_, '_> {
-    /// Brings the photos in `source` into the folder of images.
-    pub fn import(&mut self, source: &Path) -> Result<()> {
-        if self.record.photos.is_some() {
-            return Ok(());
-        }
-        let masks = self.record.masks.as_deref();
-        let (photos, skipped) = import_photos(source, &self.record.found, masks, self.images, self.reporter)?;
+    /// Runs the steps that aren't finished. Returns the result, which is recorded.
+    pub fn run_steps(&mut self) -> Result<CaptureReport> {
+        self.run_step(Step::Photos, Self::import)?;
+        self.run_step(Step::Features, Self::extract_features)?;
+        self.run_step(Step::Pairs, Self::match_pairs)?;
+        self.run_step(Step::Poses, Self::run_mapper)?;
+        let report = self.report()?;
+        self.record.report = Some(report.clone());
+        self.record.write(self.out)?;
+        Ok(report)
+    }
+
+    /// Runs a step, and records how far it came in which time, even if it was stopped.
+    fn run_step(&mut self, step: Step, run: impl FnOnce(&mut Self) -> Result<()>) -> Result<()> {
+        let start = Instant::now();
+        let outcome = run(self);
+        *self.record.seconds.entry(step).or_default() += start.elapsed().as_secs_f64();
+        self.record.write(self.out)?;
+        outcome
+    }
+
+    /// Brings the photos into the folder of images.
+    fn import(&mut self) -> Result<()> {
+        let Record { photos: None, found, masks, .. } = &self.record else { return Ok(()) };
+        let (photos, skipped) =
+            import_photos(self.photos, found, masks.as_deref(), self.images, self.reporter)?;
         if photos.len() < 2 {
             let explain = |photo: &SkippedPhoto| format!("{} is {}", photo.name, photo.reason);
             let reasons: Vec<String> = skipped.iter().map(explain).collect();
-            let (total, reasons) = (self.record.found.len(), format_names(&reasons, SHOWN_NAMES));
-            let found = format!("{total}, of which {} can't be used ({reasons})", skipped.len());
+            let reasons = format_names(&reasons, SHOWN_NAMES);
+            let unusable = format!("{}, of which {} can't be used ({reasons})", found.len(), skipped.len());
             let expected = "2 or more different ones";
-            return Err(Error::input(source, "the number of photos", found, expected));
+            return Err(Error::input(self.photos, "the number of photos", unusable, expected));
         }
         (self.record.photos, self.record.skipped) = (Some(photos), skipped);
         Ok(())
@@ -82,27 +104,19 @@ impl Estimate<'_, '_> {
         self.record.photos.as_deref().unwrap_or_default()
     }
 
-    /// Runs a command of COLMAP on the database, in a step of which `done` of `total` photos or pairs are finished.
-    fn run(
-        &mut self,
-        command: &str,
-        mut options: Value,
-        step: Step,
-        done: usize,
-        total: usize,
-    ) -> Result<()> {
+    /// Runs a command of COLMAP on the database, from the progress `start`.
+    fn run(&mut self, command: &str, mut options: Value, start: Progress) -> Result<()> {
         options["database_path"] = text(&self.out.join("database.db"));
-        let (log, start) = (self.out.join("colmap.log"), Progress { step, done, total });
-        self.colmap.run(command, &options, &log, start, self.reporter)
+        self.colmap.run(command, &options, &self.out.join("colmap.log"), start, self.reporter)
     }
 
     /// Detects features. Photos of one size and focal length share a camera, whose number is that of their group.
-    pub fn extract_features(&mut self) -> Result<()> {
+    fn extract_features(&mut self) -> Result<()> {
         if self.record.has_features {
             return Ok(());
         }
         let (shared, single) = group_by_camera(self.photos(), self.record.camera_model.as_deref());
-        let total = self.photos().len();
+        let mut progress = Progress { step: Step::Features, done: 0, total: self.photos().len() };
         if !self.record.has_cameras {
             // COLMAP would give photos a second camera if it was stopped between writing the first one and its photo.
             for suffix in ["", "-wal", "-shm"] {
@@ -110,22 +124,21 @@ impl Estimate<'_, '_> {
             }
             for (number, group) in shared.iter().enumerate() {
                 let options = self.extraction(&group[..1], group.len())?;
-                self.run("feature_extractor", options, Step::Features, number, total)?;
+                self.run("feature_extractor", options, Progress { done: number, ..progress })?;
             }
             self.record.has_cameras = true;
             self.record.write(self.out)?;
         }
-        let mut before = 0;
         for (number, group) in shared.iter().enumerate() {
             let mut options = self.extraction(group, group.len())?;
             options["ImageReader.existing_camera_id"] = (number + 1).into();
-            self.run("feature_extractor", options, Step::Features, before, total)?;
-            before += group.len();
+            self.run("feature_extractor", options, progress)?;
+            progress.done += group.len();
         }
         if !single.is_empty() {
             let mut options = self.extraction(&single, 1)?;
             options["ImageReader.single_camera_per_image"] = true.into();
-            self.run("feature_extractor", options, Step::Features, before, total)?;
+            self.run("feature_extractor", options, progress)?;
         }
         self.record.has_features = true;
         Ok(())
@@ -166,12 +179,12 @@ impl Estimate<'_, '_> {
     /// Writes a list for COLMAP, and returns its path.
     fn write_list(&self, name: &str, lines: impl Iterator<Item = String>) -> Result<Value> {
         let (path, lines) = (self.out.join(name), lines.collect::<Vec<_>>().join("\n") + "\n");
-        write_atomically(&path, |writer| writer.write_all(lines.as_bytes()).map_err(Error::write(&path)))?;
+        write_files([(&path, lines.as_bytes())])?;
         Ok(text(&path))
     }
 
     /// Matches features, some pairs of photos at a time.
-    pub fn match_pairs(&mut self) -> Result<()> {
+    fn match_pairs(&mut self) -> Result<()> {
         let count = self.photos().len();
         let is_exhaustive = match self.record.matching {
             Matching::Auto => count <= EXHAUSTIVE_PHOTOS,
@@ -180,26 +193,28 @@ impl Estimate<'_, '_> {
         let pairs =
             if is_exhaustive { exhaustive_pairs(count) } else { sequential_pairs(count, OVERLAP, SPREAD) };
         while self.record.matched_pairs < pairs.len() {
-            let done = self.record.matched_pairs;
-            let next = &pairs[done..pairs.len().min(done + PAIRS_PER_CALL)];
-            let names: Vec<&str> = self.photos().iter().map(|photo| photo.name.as_str()).collect();
-            let lines = next.iter().map(|&(a, b)| format!("{} {}", names[a], names[b]));
+            let progress =
+                Progress { step: Step::Pairs, done: self.record.matched_pairs, total: pairs.len() };
+            let next = &pairs[progress.done..pairs.len().min(progress.done + PAIRS_PER_CALL)];
+            let name = |photo: usize| &self.photos()[photo].name;
+            let lines = next.iter().map(|&(first, second)| format!("{} {}", name(first), name(second)));
             let list = self.write_list("pairs.txt", lines)?;
             let options = json!({ "match_list_path": list, "FeatureMatching.use_gpu": false });
-            self.run("matches_importer", options, Step::Pairs, done, pairs.len())?;
-            if done + next.len() == pairs.len() && !is_exhaustive {
+            self.run("matches_importer", options, progress)?;
+            let matched = progress.done + next.len();
+            if matched == pairs.len() && !is_exhaustive {
                 // Does nothing if no photo has a position.
                 let options = json!({ "FeatureMatching.use_gpu": false });
-                self.run("spatial_matcher", options, Step::Pairs, pairs.len(), pairs.len())?;
+                self.run("spatial_matcher", options, Progress { done: matched, ..progress })?;
             }
-            self.record.matched_pairs += next.len();
+            self.record.matched_pairs = matched;
             self.record.write(self.out)?;
         }
         Ok(())
     }
 
     /// Registers the photos.
-    pub fn run_mapper(&mut self) -> Result<()> {
+    fn run_mapper(&mut self) -> Result<()> {
         let [sparse, partial] = ["sparse", "sparse.partial"].map(|name| self.out.join(name));
         let remove = |folder: &Path| match folder.is_dir() {
             true => fs::remove_dir_all(folder).map_err(Error::write(folder)),
@@ -208,6 +223,7 @@ impl Estimate<'_, '_> {
         remove(&partial)?;
         fs::create_dir(&partial).map_err(Error::write(&partial))?;
         let total = self.photos().len();
+        let progress = Progress { step: Step::Poses, done: 0, total };
         let reduction = (f64::from(longest_side(self.photos())) / f64::from(MAX_SIDE)).max(1.);
         let refines_center = is_fisheye(self.record.camera_model.as_deref()) && total >= CENTER_PHOTOS;
         let options = json!({
@@ -216,7 +232,7 @@ impl Estimate<'_, '_> {
             "Mapper.filter_max_reproj_error": MAX_REPROJECTION_ERROR * reduction,
             "Mapper.ba_refine_principal_point": refines_center,
         });
-        match self.run("mapper", options, Step::Poses, 0, total) {
+        match self.run("mapper", options, progress) {
             // COLMAP's program fails with this message if it registers no photo, which is reported in other words.
             Err(why) if why.to_string().contains("sparse model") => {}
             outcome => outcome?,
@@ -237,7 +253,7 @@ impl Estimate<'_, '_> {
                 "output_path": text(&model.folder),
                 "refine_principal_point": refines_center,
             });
-            self.run("bundle_adjuster", options, Step::Poses, models[0].photos.len(), total)?;
+            self.run("bundle_adjuster", options, Progress { done: models[0].photos.len(), ..progress })?;
         }
         remove(&sparse)?;
         fs::rename(&partial, &sparse).map_err(Error::write(&sparse))?;
@@ -245,7 +261,7 @@ impl Estimate<'_, '_> {
     }
 
     /// Returns the result.
-    pub fn report(&self) -> Result<CaptureReport> {
+    fn report(&self) -> Result<CaptureReport> {
         let models = read_colmap_models(&self.out.join("sparse"))?;
         let largest = &models[0];
         let registered: BTreeSet<&String> = largest.photos.iter().collect();

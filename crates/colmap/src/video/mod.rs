@@ -79,7 +79,7 @@ pub(crate) fn write_sharpest_frames(
     if let Some(declared) = source.declared_frames.filter(|declared| total * 20 < declared * 19) {
         warnings.push(format!("{total} of {declared} frames can be decoded"));
     }
-    let own_names = own_frames(folder)?;
+    let own_names = own_frames(folder);
     let own_names: Vec<&str> = own_names.iter().map(String::as_str).collect();
     replace_dir(folder, &own_names, |place| write_frames(&source, &indices, place, reporter))?;
     let summary = format!("{chosen} of {total} frames, the sharpest of each segment of equal motion");
@@ -104,7 +104,7 @@ fn measure(video: &Video, reporter: &mut Reporter) -> Result<(Vec<f64>, Vec<f64>
 fn write_frames(video: &Video, chosen: &[usize], folder: &Path, reporter: &mut Reporter) -> Result<()> {
     let total = chosen.len();
     let mut report_written = || {
-        let done = own_frames(folder)?.len();
+        let done = own_frames(folder).len();
         reporter.report(Progress { step: Step::Frames, done, total }).map(|()| done)
     };
     video.write(chosen, folder, || report_written().map(drop))?;
@@ -114,18 +114,13 @@ fn write_frames(video: &Video, chosen: &[usize], folder: &Path, reporter: &mut R
     }
 }
 
-/// Returns the names of the frames that an earlier call wrote to `folder`.
-fn own_frames(folder: &Path) -> Result<Vec<String>> {
-    let Ok(entries) = std::fs::read_dir(folder) else { return Ok(vec![]) };
-    let mut names = vec![];
-    for entry in entries {
-        let name = entry.map_err(Error::read(folder))?.file_name().to_string_lossy().into_owned();
+/// Returns the names of the frames in `folder`, which this call or an earlier one wrote.
+fn own_frames(folder: &Path) -> Vec<String> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let names = entries.map(|entry| entry.file_name().to_string_lossy().into_owned());
+    let is_own = |name: &String| {
         let number = name.strip_prefix("frame_").and_then(|rest| rest.strip_suffix(".jpg"));
-        if number
-            .is_some_and(|number| number.len() >= 5 && number.bytes().all(|digit| digit.is_ascii_digit()))
-        {
-            names.push(name);
-        }
-    }
-    Ok(names)
+        number.is_some_and(|number| number.len() >= 5 && number.bytes().all(|digit| digit.is_ascii_digit()))
+    };
+    names.filter(is_own).collect()
 }

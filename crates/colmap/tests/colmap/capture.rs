@@ -1,26 +1,10 @@
 //! Captures up to the first command of COLMAP: requests that are refused, and videos whose frames are chosen once.
 
-use crate::{has_ffmpeg, make, write_noise};
+use crate::{failing_colmap, has_ffmpeg, make, write_noise};
 use globalsplat_colmap::{CaptureOptions, Colmap, Step, make_capture};
 use std::fs;
 use std::path::Path;
 use std::process::Command;
-
-/// Returns a COLMAP whose commands all fail.
-fn failing_colmap() -> Colmap {
-    Colmap::at(&Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/colmap")).unwrap()
-}
-
-#[test]
-fn a_program_that_is_named_but_missing_is_an_error() {
-    let error = Colmap::at(Path::new("/no/such/python3")).unwrap_err();
-    assert!(error.is_invalid_request());
-    assert_eq!(
-        error.to_string(),
-        "/no/such/python3: the program is a Python without pycolmap, expected a colmap program or a Python with pycolmap \
-         (pip install pycolmap, or apt install colmap)"
-    );
-}
 
 #[test]
 fn bad_requests_are_refused_in_one_sentence() {
@@ -33,41 +17,45 @@ fn bad_requests_are_refused_in_one_sentence() {
     for index in 1..4 {
         fs::copy(at("same/0.png"), at(&format!("same/{index}.png"))).unwrap();
     }
-    let plain = CaptureOptions::default();
-    let unknown = CaptureOptions { camera_model: Some("FISH".into()), ..plain.clone() };
-    for (source, out, options, expected) in [
+    for (source, out, camera_model, expected) in [
         (
             "empty",
             "out",
-            &plain,
-            "empty: the folder is without photos, of 0 files, expected photos, each a JPEG, PNG, WebP, TIFF, BMP, HEIC or AVIF",
+            None,
+            "empty: the folder is without photos, of 0 files, expected photos, each a JPEG",
         ),
         (
             "same",
             "same_out",
-            &plain,
+            None,
             "same: the number of photos is 4, of which 3 can't be used (1.png is identical to 0.png, 2.png is identical to 0.png, \
              3.png is identical to 0.png), expected 2 or more different ones",
         ),
         (
             "photos",
             "full",
-            &plain,
+            None,
             "full: the output is a folder with thesis.tex, expected a new folder, or one with such a capture",
         ),
         (
             "photos",
             "photos/out",
-            &plain,
+            None,
             "photos/out: the output is inside the folder of photos, expected a folder outside of photos",
         ),
-        ("photos", "out", &unknown, "the camera model is FISH, expected one of SIMPLE_PINHOLE, "),
+        ("photos", "out", Some("FISH"), "the camera model is FISH, expected one of SIMPLE_PINHOLE, "),
     ] {
-        let error = make(&at(source), &at(out), options, &failing_colmap()).unwrap_err();
+        let options = CaptureOptions { camera_model: camera_model.map(String::from), ..Default::default() };
+        let error = make(&at(source), &at(out), &options, &failing_colmap()).unwrap_err();
         assert!(error.is_invalid_request(), "{error}");
         let error = error.to_string().replace(&format!("{}/", folder.path().display()), "");
         assert!(error.starts_with(expected), "{error}");
     }
+    let error = Colmap::at(Path::new("/no/such/python3")).unwrap_err();
+    assert!(error.is_invalid_request());
+    let expected = "/no/such/python3: the program is a Python without pycolmap, expected a colmap program or a Python with pycolmap \
+                    (pip install pycolmap, or apt install colmap)";
+    assert_eq!(error.to_string(), expected);
 }
 
 #[test]

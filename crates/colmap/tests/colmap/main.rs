@@ -1,6 +1,7 @@
 //! Captures of photos and videos.
 
 mod capture;
+mod photos;
 mod poses;
 mod video;
 
@@ -27,6 +28,11 @@ fn write_noise(folder: &Path) {
 /// Makes a capture without stopping.
 fn make(source: &Path, out: &Path, options: &CaptureOptions, colmap: &Colmap) -> Result<CaptureReport> {
     make_capture(source, out, options, colmap, &mut |_| true).map(|report| report.expect("nothing stops it"))
+}
+
+/// Returns a COLMAP whose commands all fail.
+fn failing_colmap() -> Colmap {
+    Colmap::at(&Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/colmap")).unwrap()
 }
 
 /// Returns `true` if there is an ffmpeg with ffprobe; otherwise, skips the test.
