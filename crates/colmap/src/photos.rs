@@ -119,17 +119,17 @@ pub(crate) fn import_photos(
                 return Err(Error::input(path, "the photo", found, expected));
             }
             let target = images.join(&photo.name);
-            match contents {
-                Some(contents) => write_file(&target, &contents)?,
-                None if is_in_place => {}
-                None => link(&path, &target)?,
+            if let Some(contents) = contents {
+                write_file(&target, &contents)?;
+            } else if !is_in_place {
+                link(&path, &target)?;
             }
             let target = images.with_file_name(MASKS_FOLDER).join(format!("{}.png", photo.name));
-            match mask? {
-                Some(mask) => write_file(&target, &mask)?,
+            if let Some(mask) = mask? {
+                write_file(&target, &mask)?;
+            } else if !is_in_place {
                 // A run with other masks may have left one.
-                None if !is_in_place => drop(fs::remove_file(target)),
-                None => {}
+                let _ = fs::remove_file(target);
             }
             photos.push(photo);
         }

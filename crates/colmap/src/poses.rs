@@ -234,7 +234,7 @@ impl Estimate<'_, '_> {
         });
         match self.run("mapper", options, progress) {
             // COLMAP's program fails with this message if it registers no photo, which is reported in other words.
-            Err(why) if why.to_string().contains("sparse model") => {}
+            Err(why) if why.to_string().contains("mapper failed: failed to create sparse model") => {}
             outcome => outcome?,
         }
         let models = read_colmap_models(&partial)?;
