@@ -323,6 +323,7 @@ fn what_is_no_video_is_refused() {
     fixture.write_video("video.mkv", &views, &[]);
     fixture.write_video("one.mkv", &views[..1], &[]);
     views[0].save(at("photo.png")).unwrap();
+    views[0].save(at("photo.jpg")).unwrap();
     assert!(fixture.ffmpeg(&["-f", "lavfi", "-i", "anullsrc", "-t", "1", "sound.wav"]));
     let cover = ["-i", "sound.wav", "-i", "photo.png", "-map", "0", "-map", "1", "-c:v", "copy"];
     assert!(fixture.ffmpeg(&[&cover[..], &["-disposition:v", "attached_pic", "cover.flac"]].concat()));
@@ -338,6 +339,7 @@ fn what_is_no_video_is_refused() {
     for (name, expected) in [
         ("one.mkv", "the number of frames is 1, expected 2 or more"),
         ("photo.png", "the content is a photo, expected a video"),
+        ("photo.jpg", "the content is a photo, expected a video"),
         ("sound.wav", "the content is sound without pictures, expected a video"),
         ("cover.flac", "the content is sound without pictures, expected a video"),
         ("broken.mov", "(moov atom not found), expected a video"),
