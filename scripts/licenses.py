@@ -15,7 +15,6 @@ import re
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable
 from importlib.metadata import distributions
 from pathlib import Path
 
@@ -25,8 +24,6 @@ ALLOWED = {
     *("0BSD", "Apache-2.0", "BSD-2-Clause", "BSD-3-Clause", "BSL-1.0", "CC0-1.0", "IJG", "ISC", "MIT", "Unicode-3.0"),
     *("Unlicense", "Zlib"),
 }
-# Bundlers of web/, which are not in the bundle.
-BUILD_TOOLS = {"esbuild"}
 # NVIDIA's licenses let libraries be redistributed as parts of a program.
 CPU_WHEELS = ["torch", "nvidia-cuda-cupti", "nvidia-cuda-runtime"]
 LIBGOMP = (
@@ -59,49 +56,34 @@ def texts(folder: Path, depth: int = 1) -> list[str]:
     return found
 
 
-def reachable(roots: Iterable[str], successors: Callable[[str], Iterable[str]]) -> set[str]:
-    """Returns the roots and everything that they depend on, directly or through others."""
-    reached: set[str] = set()
-    waiting = list(roots)
-    while waiting:
-        name = waiting.pop()
-        if name not in reached:
-            reached.add(name)
-            waiting += successors(name)
-    return reached
-
-
 def crates() -> list[Package]:
     """Returns every crate that the program links."""
-    command = [os.environ.get("CARGO", "cargo"), "metadata", "--locked", "--format-version", "1"]
-    command += ["--filter-platform", f"{os.uname().machine}-unknown-linux-gnu"]
-    metadata = json.loads(subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, check=True).stdout)
-    packages = {package["id"]: package for package in metadata["packages"]}
-    dependencies = {node["id"]: node["deps"] for node in metadata["resolve"]["nodes"]}
-    linked = reachable(
-        [name for name in metadata["workspace_members"] if packages[name]["name"] == "globalsplat"],
-        lambda name: [d["pkg"] for d in dependencies[name] if any(kind["kind"] is None for kind in d["dep_kinds"])],
-    )
+
+    def cargo(*command: str) -> str:
+        command = (os.environ.get("CARGO", "cargo"), *command, "--locked")
+        return subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, check=True, text=True).stdout
+
+    tree = cargo("tree", "--package", "globalsplat", "--edges", "normal", "--prefix", "none", "--format", "{p}")
+    linked = {tuple(line.split()[:2]) for line in tree.splitlines()}
     found = []
-    for package in sorted((packages[name] for name in linked), key=lambda p: (p["name"], p["version"])):
-        if package["source"]:
+    for package in json.loads(cargo("metadata", "--format-version", "1"))["packages"]:
+        if package["source"] and (package["name"], f"v{package['version']}") in linked:
             # A package without a text has a license whose text is the same for everyone, or asks for the authors' names.
             authors = ", ".join(package["authors"]) or package["repository"]
             written = texts(Path(package["manifest_path"]).parent)
             written = written or [f"By {authors}. The text is that of {package['license']}.\n"]
             found.append((f"{package['name']} {package['version']}", package["license"] or "", written))
-    return found
+    return sorted(found)
 
 
 def npm_packages(with_texts: bool) -> list[Package]:
-    """Returns every npm package that web/ bundles."""
-    lock = json.loads((ROOT / "web/package-lock.json").read_text())["packages"]
+    """Returns every npm package that web/ bundles: all but those for development."""
     found = []
-    roots = lock[""]["dependencies"].keys() - BUILD_TOOLS
-    for name in sorted(reachable(roots, lambda name: lock[f"node_modules/{name}"].get("dependencies", {}))):
-        package = lock[f"node_modules/{name}"]
-        written = texts(ROOT / "web/node_modules" / name, 0) if with_texts else []
-        found.append((f"{name} {package['version']}", package.get("license", ""), written))
+    for folder, package in json.loads((ROOT / "web/package-lock.json").read_text())["packages"].items():
+        if folder and not package.get("dev"):
+            written = texts(ROOT / "web" / folder, 0) if with_texts else []
+            name = folder.removeprefix("node_modules/")
+            found.append((f"{name} {package['version']}", package.get("license", ""), written))
     return found
 
 
