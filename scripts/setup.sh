@@ -13,15 +13,16 @@ missing() {
     exit 2
 }
 
-# Downloads the LPIPS weights.
+# Downloads the LPIPS weights, or fails.
 weights() {
     local python=.venv/bin/python
     [ -x "$python" ] || python="${PYTHON:-python3}"
-    if ! command -v "$python" >/dev/null; then
-        [ "${1:-}" = --if-possible ] || missing "no Python found, which is needed to download the LPIPS weights"
-        return 0
-    fi
-    "$python" scripts/lpips_weights.py "$@"
+    command -v "$python" >/dev/null || missing "no Python found, which is needed to download the LPIPS weights"
+    "$python" scripts/lpips_weights.py
+}
+
+weights_if_possible() {
+    (weights) || echo "setup: LPIPS is left out (make weights tries again)" >&2
 }
 
 # Makes .venv, unless it is there, and checks the version of the Python that it needs.
@@ -68,7 +69,7 @@ page
 if [ -n "${LIBTORCH:-}" ]; then
     [ -e "$LIBTORCH/include/torch" ] || missing "LIBTORCH is $LIBTORCH, which has no include/torch; set it to a libtorch 2.11 folder, or unset it"
     if [ "${1:-}" != venv ]; then
-        weights --if-possible
+        weights_if_possible
         exit
     fi
 fi
@@ -102,7 +103,7 @@ if [ "$(node -p 'process.versions.node.split(".")[0] >= 20' 2>/dev/null)" = true
     fi
 fi
 
-weights --if-possible
+weights_if_possible
 if [ -n "${early:-}" ]; then
     echo "setup: compiling the crates that don't need libtorch" >&2
     wait "$early" || true
