@@ -166,9 +166,8 @@ class Operation:
         (found, temporary), old = read_files(self.bench.out), self.states[0]
         wrong = []
         for name, value in found.items():
-            is_begun_log = isinstance(value, list) and (
-                value == ["whole"] or self.new.get(name, [])[: len(value)] == value
-            )
+            is_log = isinstance(value, list)
+            is_begun_log = is_log and value in (["whole"], self.new.get(name, [])[: len(value)])
             if not is_begun_log and value not in [state.get(name) for state in self.states]:
                 wrong.append(f"{name} is neither old nor new")
         for name in old.keys() & self.new.keys() - found.keys():
@@ -197,15 +196,16 @@ class Operation:
             wrong += ["it reports an error, and succeeds"] * bool(messages)
             wrong += ["its output isn't whole"] * (not output.endswith("}\n"))
         else:
-            # A folder that is removed is named instead of its files.
-            named = [path for call, file in hit for path in [file, *(file.parents if call == "remove" else ())]]
-            named = [final_name(path) for path in named if path.is_relative_to(self.bench.out)]
+            named = [file for _, file in hit]
+            for call, file in hit:
+                # A folder that is removed is named instead of its files.
+                named += [folder for folder in file.parents if call == "remove" and self.bench.out in folder.parents]
             # Training waits for space, but not when it checks that it may write, nor to print its result.
             is_check = re.search(r"/out(/\.globalsplat-probe\.[^/]*|/\.lock|/stdout)?$", first)
             goes_on = kind == "short" or (kind == "EINTR" and group in INTERRUPTIBLE)
             message = final_name(messages[0]) if messages == errors.splitlines()[-1:] else ""
             wrong += ["it doesn't say why in one sentence at the end"] * (not message)
-            wrong += [f"it doesn't name {final_name(first)}"] * (not any(path in message for path in named))
+            wrong += [f"it doesn't name {final_name(first)}"] * (not any(final_name(path) in message for path in named))
             wrong += ["it prints a result, and fails"] * (output != "" and not first.endswith("/stdout"))
             wrong += ["it doesn't go on"] * goes_on
             wrong += ["it doesn't wait for space"] * (self.waits and fills_disk and not sticky and not is_check)
