@@ -1,10 +1,6 @@
 #include "distributed.h"
 
 #include <ATen/core/grad_mode.h>
-#include <ATen/ops/cat.h>
-#include <ATen/ops/zeros.h>
-#include <torch/csrc/autograd/function_hook.h>
-#include <torch/csrc/autograd/variable.h>
 #include <torch/csrc/distributed/c10d/Backend.hpp>
 #include <torch/csrc/distributed/c10d/PrefixStore.hpp>
 #include <torch/csrc/distributed/c10d/Store.hpp>
@@ -155,123 +151,6 @@ void ProcessGroup::broadcast(size_t tensor) const {
   const at::NoGradGuard no_grad;
   std::vector<at::Tensor> tensors{borrowed(tensor).detach()};
   start_one_at_a_time([&] { return ranks_->broadcast(tensors); })->wait();
-}
-
-// State that the parameters' hooks change. Backward passes of one step run one after the other, each in one thread.
-struct Buckets::State {
-  // Notifies a state that a parameter has its gradient.
-  struct Hook final : torch::autograd::PostAccumulateGradHook {
-    Hook(std::shared_ptr<State> state, size_t parameter) : state(std::move(state)), parameter(parameter) {}
-    void operator()(const at::Tensor&) override { state->on_gradient(parameter); }
-
-    std::shared_ptr<State> state;
-    size_t parameter;
-  };
-  struct Bucket {
-    size_t first, end;  // range of parameters
-    size_t missing;     // gradients not yet computed
-  };
-
-  Ranks ranks;
-  std::vector<at::Tensor> parameters;
-  std::vector<size_t> bucket_of;
-  std::vector<Bucket> buckets;
-  bool waiting = false;  // true while gradients are collected
-  size_t sent = 0;       // number of buckets sent
-  std::vector<bool> has_gradient;
-  std::vector<c10::intrusive_ptr<c10d::Work>> works;
-  std::exception_ptr error;
-
-  void on_gradient(size_t parameter);
-  void send(const Bucket& bucket);
-};
-
-void Buckets::State::on_gradient(size_t parameter) {
-  if (!waiting || error) return;
-  // An exception must not leave a hook in the middle of the backward pass.
-  try {
-    TORCH_CHECK(!has_gradient[parameter], "a parameter has had its gradient twice in a step");
-    has_gradient[parameter] = true;
-    --buckets[bucket_of[parameter]].missing;
-    while (sent < buckets.size() && buckets[sent].missing == 0) send(buckets[sent]);
-  } catch (...) {
-    error = std::current_exception();
-  }
-}
-
-void Buckets::State::send(const Bucket& bucket) {
-  const at::NoGradGuard no_grad;
-  std::vector<at::Tensor> pieces;
-  for (size_t i = bucket.first; i < bucket.end; ++i) {
-    const at::Tensor& gradient = parameters[i].grad();
-    // All ranks must send the same amount of data, so missing gradients are sent as zeros.
-    pieces.push_back(gradient.defined() ? gradient.reshape(-1) : at::zeros({parameters[i].numel()}, parameters[i].options()));
-  }
-  const at::Tensor flat = at::cat(pieces);
-  pieces.clear();
-  int64_t offset = 0;
-  for (size_t i = bucket.first; i < bucket.end; ++i) {
-    const at::Tensor& parameter = parameters[i];
-    // The sum replaces the gradient that the optimizer reads.
-    if (parameter.grad().defined()) parameter.mutable_grad() = flat.narrow(0, offset, parameter.numel()).view(parameter.sizes());
-    offset += parameter.numel();
-  }
-  std::vector<at::Tensor> tensors{flat};
-  works.push_back(start_one_at_a_time([&] { return ranks->allreduce(tensors); }));
-  ++sent;
-}
-
-Buckets::Buckets(Ranks ranks, std::vector<at::Tensor> parameters, int64_t bytes) : state_(std::make_shared<State>()) {
-  State& state = *state_;
-  state.ranks = std::move(ranks);
-  state.parameters = std::move(parameters);
-  state.has_gradient.resize(state.parameters.size());
-  int64_t size = 0;
-  for (size_t i = 0; i < state.parameters.size(); ++i) {
-    const at::Tensor& parameter = state.parameters[i];
-    TORCH_CHECK(parameter.is_leaf() && parameter.requires_grad() && parameter.options().type_equal(state.parameters[0].options()),
-                "parameters must be leaves of one type");
-    if (state.buckets.empty() || size >= bytes) {
-      state.buckets.push_back({i, i, 0});
-      size = 0;
-    }
-    state.buckets.back().end = i + 1;
-    state.bucket_of.push_back(state.buckets.size() - 1);
-    size += int64_t(parameter.nbytes());
-    torch::autograd::impl::set_post_acc_grad_hooks(parameter, std::make_unique<State::Hook>(state_, i));
-  }
-}
-
-Buckets::~Buckets() {
-  for (const at::Tensor& parameter : state_->parameters) torch::autograd::impl::set_post_acc_grad_hooks(parameter, nullptr);
-}
-
-void Buckets::begin() const {
-  State& state = *state_;
-  for (auto& bucket : state.buckets) bucket.missing = bucket.end - bucket.first;
-  state.has_gradient.assign(state.parameters.size(), false);
-  state.sent = 0;
-  state.works.clear();
-  state.error = nullptr;
-  state.waiting = true;
-}
-
-size_t Buckets::finish() const {
-  State& state = *state_;
-  state.waiting = false;
-  if (state.error) std::rethrow_exception(state.error);
-  while (state.sent < state.buckets.size()) state.send(state.buckets[state.sent]);
-  for (const auto& work : state.works) work->wait();
-  state.works.clear();
-  size_t gradients = 0;
-  for (const at::Tensor& parameter : state.parameters) gradients += parameter.grad().defined();
-  return gradients;
-}
-
-std::unique_ptr<Buckets> buckets(const ProcessGroup& group, rust::Slice<const size_t> parameters, int64_t bytes) {
-  std::vector<at::Tensor> tensors;
-  for (const size_t address : parameters) tensors.push_back(borrowed(address));
-  return std::make_unique<Buckets>(group.ranks(), std::move(tensors), bytes);
 }
 
 }  // namespace globalsplat

@@ -1,5 +1,4 @@
-// Communication among processes that train together, the ranks: a key-value store, collectives, and gradients that are summed while the
-// backward pass still runs. All of it uses libtorch's c10d, and Rust calls it through cxx. Tensors are passed as addresses of live tensors.
+// Communication among processes that train together, the ranks: a key-value store and collectives. All of it uses libtorch's c10d, and Rust calls it through cxx. Tensors are passed as addresses of live tensors.
 #pragma once
 
 #include <c10/util/intrusive_ptr.h>
@@ -62,8 +61,6 @@ class ProcessGroup {
   // Waits for pending work. To be called on all ranks after the last successful collective; otherwise NCCL aborts.
   void shutdown() const;
 
-  const Ranks& ranks() const { return ranks_; }
-
  private:
   Ranks ranks_;
 };
@@ -71,27 +68,5 @@ class ProcessGroup {
 // Creates a group for tensors on GPUs (NCCL; libtorch's CUDA library must have been loaded) or on CPUs (Gloo). Collectives that take longer
 // than `seconds` fail.
 std::unique_ptr<ProcessGroup> new_group(bool is_on_gpus, const Store& store, int32_t rank, int32_t ranks, int64_t seconds);
-
-// Gradients of a step, summed over all ranks in buckets. A bucket is sent as soon as the backward pass has computed all of its gradients
-// and the previous bucket has been sent, so the order is the same on all ranks.
-class Buckets {
- public:
-  // Takes `parameters` in the approximate order in which their gradients are computed, and splits them into buckets of `bytes` bytes.
-  Buckets(Ranks ranks, std::vector<at::Tensor> parameters, int64_t bytes);
-  ~Buckets();
-  Buckets(const Buckets&) = delete;
-
-  // Announces that the next backward pass is the last of this step.
-  void begin() const;
-  // Sends the remaining buckets and waits for all (work on a GPU is enqueued, not waited for). Gradients are now sums over the ranks.
-  // Returns the number of gradients, which must be the same on all ranks.
-  size_t finish() const;
-
- private:
-  struct State;
-  std::shared_ptr<State> state_;
-};
-
-std::unique_ptr<Buckets> buckets(const ProcessGroup& group, rust::Slice<const size_t> parameters, int64_t bytes);
 
 }  // namespace globalsplat

@@ -53,22 +53,6 @@ mod ffi {
 
         /// Shuts the process group down in order; see `csrc/distributed.h`.
         fn shutdown(self: &ProcessGroup) -> Result<()>;
-
-        /// Gradient buckets that are reduced during the backward pass; see `csrc/distributed.h`.
-        type Buckets;
-
-        /// Creates gradient buckets; see `csrc/distributed.h`.
-        unsafe fn buckets(
-            group: &ProcessGroup,
-            parameters: &[usize],
-            bytes: i64,
-        ) -> Result<UniquePtr<Buckets>>;
-
-        /// Announces the last backward pass of a step; see `csrc/distributed.h`.
-        fn begin(self: &Buckets);
-
-        /// Reduces the remaining buckets and waits for all; see `csrc/distributed.h`.
-        fn finish(self: &Buckets) -> Result<usize>;
     }
 }
 
@@ -78,5 +62,3 @@ unsafe impl Send for Store {}
 unsafe impl Sync for Store {}
 // SAFETY: c10d's process groups are not bound to a thread.
 unsafe impl Send for ProcessGroup {}
-// SAFETY: buckets share nothing but parameters, which may be sent between threads.
-unsafe impl Send for Buckets {}

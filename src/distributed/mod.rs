@@ -6,7 +6,7 @@ mod process_group;
 
 pub use env::{DistributedEnv, Rendezvous};
 pub use globalsplat_csrc::distributed::{has_gloo, has_nccl};
-pub use process_group::{Buckets, ProcessGroup};
+pub use process_group::ProcessGroup;
 
 #[cfg(test)]
 pub(crate) mod tests {
@@ -87,60 +87,27 @@ pub(crate) mod tests {
         }
     }
 
-    /// Buckets sum the gradients of leaves that are used once, in two backward passes of a step, or not at all.
     #[test]
-    fn gradients_are_added_up_in_buckets() {
+    fn gradients_are_summed_and_those_that_a_rank_lacks_count_as_0() {
         if !require_gloo() {
             return;
         }
         let found = run_on_ranks(3, |group| {
-            let leaf = |size: i64| Tensor::ones([size], (Kind::Float, Device::Cpu)).set_requires_grad(true);
-            let leaves = [leaf(5), leaf(3), leaf(7), leaf(2)];
-            // One bucket for each of the first two leaves, and one for the others.
-            let buckets = Buckets::with_bucket_bytes(&group, &leaves, 4 * 5);
-            let mut steps = vec![];
-            for step in 1..3 {
-                for leaf in &leaves {
-                    leaf.grad().defined().then(|| leaf.grad().zero_());
-                }
-                let factor = (step * (group.rank() + 1)) as f64;
-                let pass = |leaf: &Tensor, factor: f64| (leaf * factor).sum(Kind::Float).backward();
-                // A backward pass of an earlier slice: its gradients stay local until the end of the step.
-                pass(&leaves[0], factor);
-                buckets.begin();
-                // The order of these passes differs from that of the buckets.
-                pass(&leaves[1], 10. * factor);
-                pass(&leaves[0], factor);
-                pass(&leaves[2], 100. * factor);
-                let defined = buckets.finish().expect("sums");
-                let sums = leaves[..3].iter().map(|leaf| Vec::<f32>::try_from(leaf.grad()).unwrap());
-                steps.push((defined, sums.collect::<Vec<_>>(), leaves[3].grad().defined()));
-            }
-            steps
+            let leaf =
+                |size: [i64; 2]| Tensor::ones(size, (Kind::Float, Device::Cpu)).set_requires_grad(true);
+            let leaves = [leaf([5, 1]), leaf([1, 3]), leaf([2, 2])];
+            // The third leaf has a gradient on the second rank alone, and the second leaf has none on the last rank.
+            let used = [&leaves[..1], &leaves, &leaves[..1]][group.rank()];
+            used.iter().for_each(|leaf| (leaf * (group.rank() + 1) as f64).sum(Kind::Float).backward());
+            let count = group.all_reduce_gradients(&leaves).expect("sums");
+            let sums = used.iter().map(|leaf| (leaf.grad().size(), leaf.grad().double_value(&[0, 0])));
+            (count, sums.collect::<Vec<_>>())
         });
-        for steps in found {
-            for (step, (defined, sums, unused)) in steps.into_iter().enumerate() {
-                let all = 6. * (step + 1) as f32;
-                assert_eq!((defined, unused), (3, false), "a leaf that is not used has no gradient");
-                assert_eq!(sums, [vec![2. * all; 5], vec![10. * all; 3], vec![100. * all; 7]]);
-            }
-        }
-    }
-
-    #[test]
-    fn a_second_gradient_of_a_parameter_is_an_error() {
-        if !require_gloo() {
-            return;
-        }
-        let found = run_on_ranks(2, |group| {
-            let leaf = Tensor::from_slice(&[1f32]).set_requires_grad(true);
-            let buckets = Buckets::new(&group, &[leaf.shallow_clone()]);
-            buckets.begin();
-            (&leaf * 1.).backward();
-            (&leaf * 1.).backward();
-            buckets.finish().map_err(|e| e.to_string())
-        });
-        assert!(found.iter().all(|e| e.as_ref().unwrap_err().contains("twice")), "{found:?}");
+        let [first, second, third] = [(vec![5, 1], 6.), (vec![1, 3], 2.), (vec![2, 2], 2.)];
+        assert_eq!(
+            found,
+            [(1, vec![first.clone()]), (3, vec![first.clone(), second, third]), (1, vec![first])]
+        );
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Collectives of all ranks and their summed gradients, by c10d. Every rank calls them in the same order.
+//! Collectives of all ranks, by c10d. Every rank calls them in the same order.
 
 use super::env::Rendezvous;
 use crate::error::{Error, Result};
@@ -7,18 +7,11 @@ use globalsplat_csrc::distributed as ffi;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use std::fmt;
-use tch::{Device, Tensor};
+use tch::{Device, Tensor, no_grad};
 
 /// Timeout of a collective, in seconds. It also covers waiting for a rank that has more scenes to evaluate, so it is longer than c10d's
 /// default of half an hour.
 const COLLECTIVE_TIMEOUT_SECONDS: i64 = 2 * 60 * 60;
-/// Maximum size of a bucket, in bytes: the bucket size of torch's DistributedDataParallel.
-const MAX_BUCKET_BYTES: i64 = 25 << 20;
-/// Minimum size of a bucket, in bytes. Smaller buckets take longer to start than to send.
-const MIN_BUCKET_BYTES: i64 = 1 << 20;
-/// Number of buckets of a small network, so that all but the last can be sent while the backward pass is running.
-const MIN_BUCKETS: i64 = 8;
-
 /// Process group of all ranks, as seen by one of them.
 pub struct ProcessGroup {
     /// C++ implementation, or `None` if the group has only one rank.
@@ -126,6 +119,35 @@ impl ProcessGroup {
         self.call(|group| unsafe { group.all_reduce(tensor.as_ptr() as usize) })
     }
 
+    /// Replaces the gradients of `parameters` by their sums over all ranks, in one message. A gradient that a rank lacks counts as 0. Returns
+    /// the number of gradients of this rank, which must be the same on all ranks.
+    ///
+    /// # Errors
+    /// Returns an error if another rank is gone.
+    pub fn all_reduce_gradients(&self, parameters: &[Tensor]) -> Result<usize> {
+        let gradients: Vec<Tensor> = parameters.iter().map(Tensor::grad).collect();
+        let count = gradients.iter().filter(|gradient| gradient.defined()).count();
+        if self.inner.is_none() {
+            return Ok(count);
+        }
+        no_grad(|| {
+            let flat =
+                gradients.iter().zip(parameters).map(|(gradient, parameter)| match gradient.defined() {
+                    true => gradient.reshape([-1]),
+                    false => parameter.zeros_like().reshape([-1]),
+                });
+            let flat = Tensor::cat(&flat.collect::<Vec<_>>(), 0);
+            self.all_reduce(&flat)?;
+            let sizes: Vec<i64> = parameters.iter().map(|parameter| parameter.numel() as i64).collect();
+            for (mut gradient, sum) in gradients.into_iter().zip(flat.split_with_sizes(sizes, 0)) {
+                if gradient.defined() {
+                    gradient.copy_(&sum.view_as(&gradient));
+                }
+            }
+            Ok(count)
+        })
+    }
+
     /// Replaces `tensor` by that of the first rank, in place. It has the same shape and kind on all ranks.
     ///
     /// # Errors
@@ -175,53 +197,5 @@ impl ProcessGroup {
         rows.get(self.rank as i64).copy_(numbers);
         self.all_reduce(&rows)?;
         Ok(rows.to_device(Device::Cpu))
-    }
-}
-
-/// Gradient buckets of a network's parameters, which are summed over all ranks while the backward pass is still running.
-pub struct Buckets {
-    /// C++ implementation, or `None` if the group has only one rank.
-    inner: Option<UniquePtr<ffi::Buckets>>,
-}
-
-impl fmt::Debug for Buckets {
-    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
-        f.write_str("Buckets")
-    }
-}
-
-impl Buckets {
-    /// Creates the buckets of `parameters`, leaf tensors of one kind on one device. They are approximately in the order in which the
-    /// backward pass computes their gradients; the order must be the same on all ranks.
-    ///
-    /// # Panics
-    /// Panics if the parameters differ in kind or device, or aren't leaves that require gradients.
-    pub fn new(group: &ProcessGroup, parameters: &[Tensor]) -> Self {
-        let bytes: usize = parameters.iter().map(|t| t.numel() * t.kind().elt_size_in_bytes()).sum();
-        let bytes = (bytes as i64 / MIN_BUCKETS).clamp(MIN_BUCKET_BYTES, MAX_BUCKET_BYTES);
-        Buckets::with_bucket_bytes(group, parameters, bytes)
-    }
-
-    pub(super) fn with_bucket_bytes(group: &ProcessGroup, parameters: &[Tensor], bytes: i64) -> Self {
-        let addresses: Vec<usize> = parameters.iter().map(|t| t.as_ptr() as usize).collect();
-        // SAFETY: the tensors outlive the call; the C++ side holds references of its own to what it keeps.
-        let inner = group.inner.as_deref().map(|group| unsafe { ffi::buckets(group, &addresses, bytes) });
-        Buckets { inner: inner.transpose().expect("leaves of one kind") }
-    }
-
-    /// Marks the start of the last backward pass of a step. From now on it computes each parameter's gradient once, or not at all.
-    pub fn begin(&self) {
-        if let Some(inner) = &self.inner {
-            inner.begin();
-        }
-    }
-
-    /// Waits until the gradients are the sums over all ranks. Returns the number of gradients, which must be the same on all ranks.
-    ///
-    /// # Errors
-    /// Returns an error if another rank is gone.
-    pub fn finish(&self) -> Result<usize> {
-        let Some(inner) = &self.inner else { return Ok(0) };
-        inner.finish().map_err(distributed_error)
     }
 }

@@ -5,7 +5,8 @@ use crate::config::{CurriculumConfig, OptimizerKind, TrainConfig};
 use crate::model::Stage;
 use crate::optim::{ParameterGroup, UpdateRule};
 use std::f64::consts::PI;
-use tch::{Tensor, nn};
+use tch::Tensor;
+use tch::nn;
 
 /// Learning rate at the start of the warm-up, as a share of the peak.
 const WARMUP_START: f64 = 1e-3;
@@ -81,25 +82,6 @@ pub fn parameter_groups(vs: &nn::VarStore, config: &TrainConfig) -> Vec<Paramete
         group(UpdateRule::Muon { parts: 1 }, matrices, config.weight_decay),
         group(UpdateRule::Muon { parts: 3 }, threefold, config.weight_decay),
     ]
-}
-
-/// Returns the trained variables of `vs` approximately in the order in which the backward pass computes their gradients: the decoder, the
-/// encoder's rounds from the last to the first, and the rest. The order depends only on the names, so it is the same in all processes.
-pub fn in_backward_order(vs: &nn::VarStore) -> Vec<(String, Tensor)> {
-    let mut trained: Vec<_> = vs.variables().into_iter().filter(|(_, value)| value.requires_grad()).collect();
-    trained.sort_by_cached_key(|(name, _)| (turn(name), name.clone()));
-    trained
-}
-
-/// Returns the sort key of a variable in [`in_backward_order`]. Gradients of lower keys come earlier.
-fn turn(name: &str) -> i64 {
-    let mut words = name.split('.');
-    match (words.next(), words.next(), words.next().and_then(|word| word.parse::<i64>().ok())) {
-        (Some("gaussian_decoder"), ..) => i64::MIN,
-        (Some("slot_encoder"), Some("geo_rounds" | "tex_rounds" | "pair_adapters"), Some(round)) => -round,
-        (Some("slot_encoder"), ..) => 1,
-        _ => 2,
-    }
 }
 
 #[cfg(test)]

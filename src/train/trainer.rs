@@ -2,12 +2,12 @@
 
 use super::gradients::{ForwardBackward, ModelReplica, gradients_in_parallel};
 use super::is_due;
-use super::schedule::{in_backward_order, learning_rate, parameter_groups, stage_at, subsets};
+use super::schedule::{learning_rate, parameter_groups, stage_at, subsets};
 use super::step::{StepReport, StepSums, preview, to_summed_tensor};
 use crate::config::{Config, changed_keys};
 use crate::data::{BadData, BadSceneReport, Batch, BatchShard, DataLoader, SceneGroups};
 use crate::device::Stopwatch;
-use crate::distributed::{Buckets, ProcessGroup};
+use crate::distributed::ProcessGroup;
 use crate::error::{Error, Result};
 use crate::loss::{Losses, PerceptualNetwork, StepFraction};
 use crate::model::{GlobalSplat, Growth, Precision, Stage};
@@ -65,7 +65,6 @@ pub struct Trainer {
     loader: Option<DataLoader>,
     /// Process group of the ranks that make every step together, each with its own samples.
     pub(super) group: ProcessGroup,
-    buckets: Buckets,
 }
 
 impl Trainer {
@@ -81,7 +80,6 @@ impl Trainer {
         let mut model = GlobalSplat::new(&vs.root(), &config.model)?;
         model.set_precision(config.train.precision);
         let optimizer = Optimizer::new(parameter_groups(&vs, &config.train));
-        let group = ProcessGroup::single();
         Ok(Trainer {
             config: config.clone(),
             vs,
@@ -94,20 +92,14 @@ impl Trainer {
             samples: 0,
             scenes,
             loader: None,
-            buckets: Buckets::new(&group, &[]),
-            group,
+            group: ProcessGroup::single(),
         })
     }
 
     /// Makes this trainer a rank of `group`. `train.batch_size` is the batch size of each rank. A step equals that of a single process with
     /// the samples of all ranks.
-    pub fn with_group(mut self, group: ProcessGroup) -> Self {
-        // Parameters notify only one set of buckets, so the old one is dropped first.
-        self.buckets = Buckets::new(&ProcessGroup::single(), &[]);
-        let parameters: Vec<Tensor> =
-            in_backward_order(&self.vs).into_iter().map(|(_, value)| value).collect();
-        let buckets = Buckets::new(&group, &parameters);
-        Trainer { group, buckets, ..self }
+    pub fn with_group(self, group: ProcessGroup) -> Self {
+        Trainer { group, ..self }
     }
 
     /// Makes [`run`](super::run) start from the weights in the file `path`, which [`ModelFile`] reads, if it has no checkpoint yet. They
@@ -239,9 +231,9 @@ impl Trainer {
         Ok(report)
     }
 
-    /// Waits for the sums of the gradients over all ranks. Returns the sums of the tensors of [`to_summed_tensor`].
+    /// Sums the gradients over all ranks. Returns the sums of the tensors of [`to_summed_tensor`].
     fn all_reduce(&self, losses: Tensor, should_continue: &mut dyn FnMut() -> bool) -> Result<Tensor> {
-        let gradients = self.buckets.finish()?;
+        let gradients = self.add_gradients_up()?;
         let is_asked_to_stop = !should_continue();
         let has_bad_data =
             self.loader.as_ref().is_some_and(|loader| loader.bad_data_log().has_bad_scene_reports());
@@ -262,10 +254,9 @@ impl Trainer {
         Ok(())
     }
 
-    /// Repeats the sum of the gradients over all ranks, with no other work at the same time. For benchmarks.
-    pub(crate) fn add_gradients_up(&self) -> Result<()> {
-        self.buckets.begin();
-        self.buckets.finish().map(|_| ())
+    /// Sums the gradients over all ranks, and returns their number.
+    pub(crate) fn add_gradients_up(&self) -> Result<usize> {
+        self.group.all_reduce_gradients(&self.vs.trainable_variables())
     }
 
     /// Returns the size of the gradients that the last step left, in bytes.
@@ -371,9 +362,6 @@ impl Trainer {
         stopwatch.time("zero gradients", || self.optimizer.zero_grad());
         let mut losses = Tensor::zeros([Losses::COUNT as i64], (Kind::Double, self.vs.device()));
         for first in firsts {
-            if first + count >= scenes {
-                self.buckets.begin();
-            }
             let depth_pixels = depth_pixels.as_ref().map(Tensor::shallow_clone);
             let slice = stopwatch.time("data", || slice(first));
             losses += part.gradients(&slice, &StepFraction { depth_pixels, ..share(first) }, stopwatch)?;
@@ -383,8 +371,7 @@ impl Trainer {
 
     /// Returns the number of slices of a step of `scenes` scenes that are computed in parallel. It is more than 1 only on the CPU: one
     /// slice keeps a GPU busy. Steps with a perceptual loss stay whole because its network has operations that are large enough to be split
-    /// among threads, and steps with a depth loss because depths are compared over all scenes. Several ranks already run in parallel, and
-    /// send their gradients during the backward pass.
+    /// among threads, and steps with a depth loss because depths are compared over all scenes. Several ranks already run in parallel.
     pub(crate) fn slices_at_once(&self, scenes: usize) -> usize {
         let apart = self.vs.device() == Device::Cpu
             && self.group.world_size() == 1

@@ -49,10 +49,9 @@ pub fn bench_train(config: &Config, steps: usize, device: Device, group: Process
     tch::set_num_threads(threads);
     let peak_gflops = peak_gflops?;
     let (milliseconds, sections) = (measured.total(), measured.sections());
-    let waited = sections.iter().find(|section| section.name == COMMUNICATION);
-    let together = waited.map(|waited| {
+    let together = (ranks > 1).then(|| {
         let scenes_per_second = 1e3 * (ranks * scenes.len()) as f64 / milliseconds.median;
-        measure_distributed_cost(trainer, &scenes, steps, &upload, scenes_per_second, waited.milliseconds.min)
+        measure_distributed_cost(trainer, &scenes, steps, &upload, scenes_per_second)
     });
     let mut report = json!({
         "scenes": scenes.len(),
@@ -101,15 +100,13 @@ fn measure(
     Ok(measured)
 }
 
-/// Times the ranks' communication without steps, and their steps without communication. `waited` is the shortest time in milliseconds that a
-/// step waited for communication: `hidden` is the share of the communication that overlaps with that step's backward pass.
+/// Times the ranks' communication without steps, and their steps without communication.
 fn measure_distributed_cost(
     trainer: Trainer,
     scenes: &[LoadedScene],
     steps: usize,
     upload: &Upload,
     scenes_per_second: f64,
-    waited: f64,
 ) -> Result<Value> {
     let ranks = trainer.group().world_size();
     let mut communication = Measured::default();
@@ -130,7 +127,6 @@ fn measure_distributed_cost(
         "scenes_per_second": scenes_per_second,
         "apart_milliseconds": apart.total(),
         "communication_milliseconds": communication,
-        "hidden": (1. - waited / communication.median).clamp(0., 1.),
         "gradient_bytes": gradient_bytes,
     }))
 }
