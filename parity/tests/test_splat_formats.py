@@ -17,6 +17,9 @@ PROGRAM = REPOSITORY / "target/release/globalsplat"
 NPM = REPOSITORY / "parity/npm"
 COUNT = 300  # more than a chunk of a compressed PLY
 C0 = 0.28209479177387814
+# Properties of a PLY.
+POSITION, COLOR, SCALE = ["x", "y", "z"], ["f_dc_0", "f_dc_1", "f_dc_2"], ["scale_0", "scale_1", "scale_2"]
+ROTATION = ["rot_0", "rot_1", "rot_2", "rot_3"]
 # Half of each format's quantization step: positions, logarithms of scales, rotations, opacities, colors, coefficients.
 STEPS = {
     "ply": (1e-6, 1e-5, 1e-5, 1e-5, 1e-6, 1e-6),
@@ -53,14 +56,13 @@ def made(degree):
     These are opacity logits, logarithms of scales, and channel-major coefficients.
     """
     random = np.random.default_rng(degree)
-    names = ["x", "y", "z", *(f"f_dc_{k}" for k in range(3))]
-    names += [f"f_rest_{k}" for k in range(3 * ((degree + 1) ** 2 - 1))]
-    names += ["opacity", *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4))]
+    rest = [f"f_rest_{k}" for k in range(3 * ((degree + 1) ** 2 - 1))]
+    names = [*POSITION, *COLOR, *rest, "opacity", *SCALE, *ROTATION]
     splat = {name: random.uniform(-0.9, 0.9, COUNT) for name in names}
-    for name in "xyz":
+    for name in POSITION:
         splat[name] *= 4
-    for k in range(3):
-        splat[f"scale_{k}"] -= 3
+    for name in SCALE:
+        splat[name] -= 3
     return {name: values.astype("<f4") for name, values in splat.items()}
 
 
@@ -77,32 +79,37 @@ def read_ply(path):
     return {name: rows[:, column] for column, name in enumerate(names)}
 
 
-def columns(splat, *names):
-    return np.stack([splat[name].astype(np.float64) for name in names], 1)
+def columns(splat, names):
+    """Returns the properties `names`, [N, names]."""
+    return np.stack([splat[name].astype(np.float64) for name in names], 1) if names else np.zeros((len(splat["x"]), 0))
 
 
 def rest(splat):
-    names = [name for name in splat if name.startswith("f_rest_")]
-    return columns(splat, *(f"f_rest_{k}" for k in range(len(names)))) if names else np.zeros((len(splat["x"]), 0))
+    count = sum(name.startswith("f_rest_") for name in splat)
+    return columns(splat, [f"f_rest_{k}" for k in range(count)])
+
+
+def unit_quaternions(splat):
+    """Returns the rotations (w, x, y, z) with length 1."""
+    rotations = columns(splat, ROTATION)
+    return rotations / np.linalg.norm(rotations, axis=1, keepdims=True)
 
 
 def assert_same(splat, other, steps):
     """Asserts that two splats are equal up to `steps`, in any order: each Gaussian is compared with the nearest one."""
-    places, others = columns(splat, *"xyz"), columns(other, *"xyz")
+    places, others = columns(splat, POSITION), columns(other, POSITION)
     nearest = ((places[:, None] - others) ** 2).sum(-1).argmin(1)
     assert len(others) == COUNT and len(set(nearest)) == COUNT
     other = {name: values[nearest] for name, values in other.items()}
-    scales, colors = [[f"{name}_{k}" for k in range(3)] for name in ("scale", "f_dc")]
-    turns = [columns(one, *(f"rot_{k}" for k in range(4))) for one in (splat, other)]
-    turns = [turn / np.linalg.norm(turn, axis=1, keepdims=True) for turn in turns]
-    turns[1] *= np.sign((turns[0] * turns[1]).sum(1, keepdims=True))  # q and −q are the same rotation
+    rotations = [unit_quaternions(one) for one in (splat, other)]
+    rotations[1] *= np.sign((rotations[0] * rotations[1]).sum(1, keepdims=True))  # q and −q are the same rotation
     opacities = [1 / (1 + np.exp(-one["opacity"].astype(np.float64))) for one in (splat, other)]
     for what, a, b, step in [
         ("positions", places, others[nearest], steps[0]),
-        ("scales", columns(splat, *scales), columns(other, *scales), steps[1]),
-        ("rotations", *turns, steps[2]),
+        ("scales", columns(splat, SCALE), columns(other, SCALE), steps[1]),
+        ("rotations", *rotations, steps[2]),
         ("opacities", *opacities, steps[3]),
-        ("colors", columns(splat, *colors), columns(other, *colors), steps[4]),
+        ("colors", columns(splat, COLOR), columns(other, COLOR), steps[4]),
         ("coefficients", rest(splat), rest(other), steps[5]),
     ]:
         np.testing.assert_allclose(b, a, rtol=0, atol=step, err_msg=what)
@@ -125,32 +132,28 @@ def transformed(source, target, *options):
 
 def cloud(splat):
     """Converts a splat to the layout of Niantic's library: basis-major coefficients, real part of a rotation last."""
-    count = rest(splat).shape[1]
-    turns = columns(splat, "rot_1", "rot_2", "rot_3", "rot_0")
-    return {
-        "numPoints": COUNT,
-        "shDegree": [0, 9, 24, 45].index(count),
-        "antialiased": False,
-        "positions": columns(splat, *"xyz").ravel().tolist(),
-        "scales": columns(splat, *(f"scale_{k}" for k in range(3))).ravel().tolist(),
-        "rotations": (turns / np.linalg.norm(turns, axis=1, keepdims=True)).ravel().tolist(),
-        "alphas": splat["opacity"].astype(np.float64).tolist(),
-        "colors": columns(splat, *(f"f_dc_{k}" for k in range(3))).ravel().tolist(),
-        "sh": rest(splat).reshape(COUNT, 3, -1).swapaxes(1, 2).ravel().tolist(),
+    sh = rest(splat)
+    lists = {
+        "positions": columns(splat, POSITION),
+        "scales": columns(splat, SCALE),
+        "rotations": np.roll(unit_quaternions(splat), -1, axis=1),
+        "alphas": columns(splat, ["opacity"]),
+        "colors": columns(splat, COLOR),
+        "sh": sh.reshape(COUNT, 3, -1).swapaxes(1, 2),
     }
+    about = {"numPoints": COUNT, "shDegree": [0, 9, 24, 45].index(sh.shape[1]), "antialiased": False}
+    return about | {name: values.ravel().tolist() for name, values in lists.items()}
 
 
 def splat_of(cloud):
+    """Converts a splat of that layout to a PLY's properties."""
     count = cloud["numPoints"]
-    three = {name: np.array(cloud[name]).reshape(count, 3) for name in ("positions", "scales", "colors")}
-    turns = np.array(cloud["rotations"]).reshape(count, 4)
     sh = np.array(cloud["sh"]).reshape(count, -1, 3).swapaxes(1, 2).reshape(count, -1)
-    splat = {name: three["positions"][:, k] for k, name in enumerate("xyz")}
-    splat |= {f"f_dc_{k}": three["colors"][:, k] for k in range(3)}
-    splat |= {f"f_rest_{k}": sh[:, k] for k in range(sh.shape[1])}
-    splat |= {"opacity": np.array(cloud["alphas"])}
-    splat |= {f"scale_{k}": three["scales"][:, k] for k in range(3)}
-    return splat | {f"rot_{k}": turns[:, (k - 1) % 4] for k in range(4)}
+    rotations = np.roll(np.reshape(cloud["rotations"], (count, 4)), 1, axis=1)
+    splat = {f"f_rest_{k}": column for k, column in enumerate(sh.T)} | {"opacity": np.array(cloud["alphas"])}
+    for names, list_of in [(POSITION, "positions"), (COLOR, "colors"), (SCALE, "scales")]:
+        splat |= zip(names, np.reshape(cloud[list_of], (count, 3)).T, strict=True)
+    return splat | dict(zip(ROTATION, rotations.T, strict=True))
 
 
 def read_by(program, file, folder):
@@ -189,13 +192,13 @@ def test_splat_transform_reads_ours(tmp_path, ending, degree):
 
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize(
-    "ending, options", [("ply", []), ("compressed.ply", []), ("spz", ["3"]), ("spz", ["4"]), ("glb", [])]
+    "ending, options",
+    [("ply", []), ("compressed.ply", []), ("spz", ["--spz-version", 3]), ("spz", ["--spz-version", 4]), ("glb", [])],
 )
 def test_we_read_splat_transforms(tmp_path, ending, options, degree):
     splat = made(degree)
     write_ply(tmp_path / "a.ply", splat)
-    version = [word for number in options for word in ("--spz-version", number)]
-    transformed(tmp_path / "a.ply", tmp_path / f"b.{ending}", *version)
+    transformed(tmp_path / "a.ply", tmp_path / f"b.{ending}", *options)
     ours(tmp_path / f"b.{ending}", tmp_path / "c.ply")
     assert_same(splat, read_ply(tmp_path / "c.ply"), STEPS["their spz" if ending == "spz" else ending])
 
@@ -258,8 +261,7 @@ def test_niantics_library_and_we_mark_antialiased_splats_alike(tmp_path):
 def test_babylon_reads_our_gltf_as_it_reads_splat_transforms(tmp_path, degree):
     splat = made(degree)
     # splat-transform doesn't normalize rotations, of which Babylon.js keeps bytes.
-    length = np.linalg.norm(columns(splat, *(f"rot_{k}" for k in range(4))), axis=1).astype("<f4")
-    splat |= {f"rot_{k}": splat[f"rot_{k}"] / length for k in range(4)}
+    splat |= zip(ROTATION, unit_quaternions(splat).T.astype("<f4"), strict=True)
     write_ply(tmp_path / "a.ply", splat)
     for convert, name in [(transformed, "theirs.glb"), (ours, "ours.glb"), (ours, "ours.gltf")]:
         convert(tmp_path / "a.ply", tmp_path / name)
@@ -286,8 +288,6 @@ def test_edits_are_those_of_splat_transform(tmp_path, edit, their_edit):
     found, expected = read_ply(tmp_path / "b.ply"), read_ply(tmp_path / "c.ply")
     assert len(found["x"]) == len(expected["x"]) > 0
     assert "crop" not in edit[0] or len(found["x"]) < COUNT
-    turns = [columns(one, *(f"rot_{k}" for k in range(4))) for one in (found, expected)]
-    turns = [turn / np.linalg.norm(turn, axis=1, keepdims=True) for turn in turns]
-    np.testing.assert_allclose(np.abs((turns[0] * turns[1]).sum(1)), 1, atol=1e-6)
-    for name in set(expected) - {f"rot_{k}" for k in range(4)} - {"nx", "ny", "nz"}:
+    np.testing.assert_allclose(np.abs((unit_quaternions(found) * unit_quaternions(expected)).sum(1)), 1, atol=1e-6)
+    for name in set(expected) - {*ROTATION, "nx", "ny", "nz"}:
         np.testing.assert_allclose(found[name], expected[name], rtol=0, atol=1e-5, err_msg=name)
