@@ -8,9 +8,11 @@ pub mod room;
 pub use globalsplat_test_kit::formats;
 pub use globalsplat_test_kit::{captures, exit_code_of_test, fox, golden, rerun_test, skip};
 
-use globalsplat::io::find_pretrained;
+use globalsplat::io::{find_pretrained, read_image, tensor_from_rgb};
 use globalsplat::loss::PerceptualBackbone;
+use image::RgbImage;
 use rand::{Rng, SeedableRng, rngs::StdRng};
+use std::path::Path;
 use tch::{Kind, Tensor};
 
 /// Returns `true` if the weights of LPIPS are available; otherwise, skips the test.
@@ -24,7 +26,7 @@ pub fn has_lpips() -> bool {
 
 /// Returns `true` if the program contains the viewer; otherwise, skips the test.
 pub fn has_viewer() -> bool {
-    let found = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("web/dist/page.js").exists();
+    let found = Path::new(env!("CARGO_MANIFEST_DIR")).join("web/dist/page.js").exists();
     if !found {
         skip(
             "the page's viewer",
@@ -36,10 +38,22 @@ pub fn has_viewer() -> bool {
 
 /// Writes the shell script `lines` to `path`, as a program.
 #[cfg(unix)]
-pub fn write_script(path: &std::path::Path, lines: &str) {
+pub fn write_script(path: &Path, lines: &str) {
     use std::os::unix::fs::PermissionsExt;
     std::fs::write(path, format!("#!/bin/sh\n{lines}\n")).unwrap();
     std::fs::set_permissions(path, PermissionsExt::from_mode(0o755)).unwrap();
+}
+
+/// Returns the images in `folder`, sorted by name.
+pub fn pictures(folder: &Path) -> Vec<RgbImage> {
+    let mut files: Vec<_> = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+    files.sort();
+    files.iter().map(|file| read_image(file).unwrap()).collect()
+}
+
+/// Returns the PSNR of two images in dB.
+pub fn psnr(a: &RgbImage, b: &RgbImage) -> f64 {
+    globalsplat::metrics::psnr(&tensor_from_rgb(a), &tensor_from_rgb(b))
 }
 
 /// Returns the relative error ‖a − b‖ / ‖b‖.

@@ -1,10 +1,13 @@
 //! Running the program as a user does, on a small capture that it generates itself.
 
+use super::room::write_rooms;
 use serde_json::Value;
 use std::collections::BTreeMap;
+use std::ffi::{OsStr, OsString};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::{Child, Command};
 use std::sync::OnceLock;
+use std::time::Duration;
 use tempfile::TempDir;
 
 /// Configuration of a small model that trains quickly.
@@ -43,11 +46,6 @@ checkpoint_every = 2
 /// Setting with which several threads don't slow down the other tests.
 pub const WAIT_PASSIVELY: (&str, &str) = ("OMP_WAIT_POLICY", "passive");
 
-/// Runs `globalsplat` with `arguments` and returns its output.
-pub fn globalsplat(arguments: &[&str]) -> Output {
-    command(arguments).output().expect("a program that starts")
-}
-
 /// Returns the command `globalsplat` with `arguments`, limited to one thread because tests run concurrently.
 pub fn command(arguments: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_globalsplat"));
@@ -64,15 +62,38 @@ pub fn run_process(command: &mut Command) -> (String, String) {
     (out, err)
 }
 
+/// Returns `program` with a limit of 8 kB for the size of its files, which acts like a full disk.
+pub fn limit_file_size(program: &Command) -> Command {
+    // If SIGXFSZ is ignored, the system refuses a write beyond the limit instead of ending the program.
+    let mut limited = Command::new("bash");
+    limited.args(["-c", "trap '' XFSZ; ulimit -S -f 8; exec \"$@\"", "bash"]);
+    limited.arg(program.get_program()).args(program.get_args()).env("OMP_NUM_THREADS", "1");
+    limited
+}
+
+/// Polls `find` until it returns a value, while all `processes` are running.
+#[track_caller]
+pub fn wait_for<T>(processes: &mut [Child], mut find: impl FnMut() -> Option<T>) -> T {
+    loop {
+        if let Some(found) = find() {
+            return found;
+        }
+        assert!(processes.iter_mut().all(|process| process.try_wait().unwrap().is_none()), "one has ended");
+        std::thread::sleep(Duration::from_micros(200));
+    }
+}
+
+/// Sends a signal to a process, or to none if it has ended.
+#[cfg(unix)]
+pub fn send_signal(process: u32, signal: libc::c_int) {
+    // SAFETY: the process was started by the test, and nobody has waited for it.
+    unsafe { libc::kill(process as i32, signal) };
+}
+
 /// Returns the standard output of a run that must succeed.
 #[track_caller]
 pub fn succeed(arguments: &[&str]) -> String {
     run_process(&mut command(arguments)).0
-}
-
-/// Runs the program and returns the JSON that it prints.
-pub fn run_json(arguments: &[&str]) -> Value {
-    serde_json::from_str(&succeed(arguments)).expect("JSON")
 }
 
 /// Returns the one-sentence error of a run that must be refused with exit code 2.
@@ -94,9 +115,8 @@ pub fn arg(path: &Path) -> &str {
     path.to_str().expect("an UTF-8 path")
 }
 
-/// Writes the rooms `room_000`, … to `folder`, each with `frames` photos of `size` × `size`.
-pub fn rooms(folder: &Path, scenes: u32, frames: u32, size: u32) {
-    super::room::write_rooms(folder, scenes, frames, size).expect("rooms");
+fn text(word: &OsString) -> &str {
+    word.to_str().expect("a word in UTF-8")
 }
 
 /// Returns a capture of nine 40×40 photos of a procedural room, with `ground_truth.ply` beside them; every caller gets its own copy.
@@ -104,7 +124,7 @@ pub fn room() -> (TempDir, PathBuf) {
     static ORIGINAL: OnceLock<TempDir> = OnceLock::new();
     let original = ORIGINAL.get_or_init(|| {
         let folder = tempfile::tempdir().expect("a folder");
-        rooms(folder.path(), 1, 9, 40);
+        write_rooms(folder.path(), 1, 9, 40);
         folder
     });
     let folder = tempfile::tempdir().expect("a folder");
@@ -145,34 +165,34 @@ pub fn tiny_weights(folder: &Path, capture: &Path) -> PathBuf {
     weights
 }
 
-/// Returns the arguments that train the model of `config` in `run`, with `settings`.
-pub fn train(config: &Path, run: &Path, settings: &[&str]) -> Vec<String> {
-    let mut arguments = vec!["train", "--config", arg(config), "--out", arg(run)];
-    arguments.extend(settings.iter().flat_map(|setting| ["--set", setting]));
-    arguments.into_iter().map(String::from).collect()
-}
-
-/// Returns the arguments as string slices.
-pub fn text(arguments: &[String]) -> Vec<&str> {
-    arguments.iter().map(String::as_str).collect()
-}
-
 /// A temporary folder for the commands of a test. In their lines, words that begin with @ are files in the folder, and LPIPS is off, because
 /// it takes longer than all the rest.
-pub struct Sandbox(TempDir);
+pub struct Sandbox {
+    _temporary: TempDir,
+    folder: PathBuf,
+}
 
 impl Sandbox {
     pub fn empty() -> Self {
-        Sandbox(tempfile::tempdir().expect("a folder"))
+        Sandbox::named("sandbox")
+    }
+
+    /// Returns an empty folder called `name`.
+    pub fn named(name: impl AsRef<OsStr>) -> Self {
+        let temporary = tempfile::tempdir().expect("a folder");
+        let folder = temporary.path().join(name.as_ref());
+        std::fs::create_dir(&folder).expect("a folder");
+        Sandbox { _temporary: temporary, folder }
     }
 
     /// Contains the capture `room` of nine 40×40 photos with its splat `room/truth.ply`, and the configuration `tiny.toml`, which trains with
     /// it.
     pub fn new() -> Self {
-        let (folder, original) = room();
-        std::fs::rename(original, folder.path().join("room")).expect("a folder");
-        tiny_config(folder.path(), &folder.path().join("room"));
-        Sandbox(folder)
+        let sandbox = Sandbox::empty();
+        let (_folder, room) = room();
+        std::fs::rename(room, sandbox.path("room")).expect("a folder");
+        tiny_config(sandbox.folder(), &sandbox.path("room"));
+        sandbox
     }
 
     /// Also contains untrained weights, `tiny.safetensors`.
@@ -183,11 +203,11 @@ impl Sandbox {
     }
 
     pub fn folder(&self) -> &Path {
-        self.0.path()
+        &self.folder
     }
 
     pub fn path(&self, name: &str) -> PathBuf {
-        self.0.path().join(name)
+        self.folder.join(name)
     }
 
     pub fn read(&self, name: &str) -> Vec<u8> {
@@ -196,6 +216,10 @@ impl Sandbox {
 
     pub fn text(&self, name: &str) -> String {
         String::from_utf8(self.read(name)).expect("text")
+    }
+
+    pub fn read_json(&self, name: &str) -> Value {
+        serde_json::from_slice(&self.read(name)).expect("JSON")
     }
 
     /// Writes a file, and the folders that lead to it.
@@ -211,7 +235,7 @@ impl Sandbox {
 
     /// Changes the JSON object in the file `name`.
     pub fn change_json(&self, name: &str, change: impl FnOnce(&mut Value)) {
-        let mut json = serde_json::from_slice(&self.read(name)).expect("JSON");
+        let mut json = self.read_json(name);
         change(&mut json);
         self.write(name, json.to_string());
     }
@@ -230,15 +254,17 @@ impl Sandbox {
         contents(self.folder())
     }
 
-    fn words(&self, line: &str) -> Vec<String> {
-        let words = shlex::split(line).expect("words");
-        words.into_iter().map(|word| word.replace('@', &format!("{}/", arg(self.folder())))).collect()
+    fn words(&self, line: &str) -> Vec<OsString> {
+        let folder = self.folder.join("").into_os_string();
+        let with_folder =
+            |word: String| word.split('@').map(OsStr::new).collect::<Vec<_>>().join(folder.as_os_str());
+        shlex::split(line).expect("words").into_iter().map(with_folder).collect()
     }
 
     /// Returns the command of `line`, to run it in a process of its own.
     pub fn command(&self, line: &str) -> Command {
-        let mut command = command(&text(&self.words(line)));
-        command.env("GLOBALSPLAT_WEIGHTS", self.folder());
+        let mut command = command(&[]);
+        command.args(self.words(line)).env("GLOBALSPLAT_WEIGHTS", self.folder());
         command
     }
 
@@ -272,7 +298,8 @@ impl Sandbox {
     /// Runs a command that must succeed in this process, which saves the start of another. Its output is lost.
     #[track_caller]
     pub fn run(&self, line: &str) {
-        if let Err((_, message)) = globalsplat::run(&text(&self.words(line))) {
+        let words = self.words(line);
+        if let Err((_, message)) = globalsplat::run(&words.iter().map(text).collect::<Vec<_>>()) {
             panic!("{line}: {message}");
         }
     }
@@ -286,7 +313,8 @@ impl Sandbox {
     /// Returns the one-sentence error of a command that must end with `code`, in this process.
     #[track_caller]
     pub fn fail(&self, line: &str, code: u8) -> String {
-        fail(&text(&self.words(line)), code)
+        let words = self.words(line);
+        fail(&words.iter().map(text).collect::<Vec<_>>(), code)
     }
 }
 

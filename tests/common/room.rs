@@ -2,44 +2,38 @@
 
 use glam::{DMat4, DQuat, DVec3};
 use globalsplat::data::write_cameras_json;
-use globalsplat::io::{write_png, write_splat};
+use globalsplat::io::{Splat, write_png, write_splat};
 use globalsplat::render::render_views;
 use globalsplat::scene::{Camera, Gaussians, ImageSize, Intrinsics};
 use globalsplat_splat_file::SH_C0;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::path::Path;
-use tch::{Kind, Tensor};
 
 /// Distance between the Gaussians of a surface, in metres.
 const SPACING: f64 = 0.06;
 
 /// Writes a capture of the room of `seed` at `path`: `cameras.json`, `frames` photos of `size` in `images`, and the splat, `truth.ply`.
-///
-/// # Errors
-/// Returns an error if a file can't be written.
-pub fn write_room(path: &Path, seed: u64, frames: usize, size: ImageSize) -> globalsplat::Result<()> {
+pub fn write_room(path: &Path, seed: u64, frames: usize, size: ImageSize) {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let gaussians = surfaces(&mut random);
+    let splat = surfaces(&mut random);
     let cameras = walk(&mut random, frames, size);
     let names: Vec<String> = (0..frames).map(|i| format!("images/{i:03}.png")).collect();
-    std::fs::create_dir_all(path.join("images")).map_err(globalsplat::Error::write(path))?;
-    for (name, view) in names.iter().zip(render_views(&gaussians, &cameras)?) {
-        write_png(&path.join(name), &view.rgb)?;
+    std::fs::create_dir_all(path.join("images")).unwrap();
+    let views = render_views(&Gaussians::from_splat(&splat), &cameras).unwrap();
+    for (name, view) in names.iter().zip(views) {
+        write_png(&path.join(name), &view.rgb).unwrap();
     }
-    write_splat(&path.join("truth.ply"), &gaussians.to_splat(DVec3::ZERO)?)?;
-    Ok(write_cameras_json(&path.join("cameras.json"), &names, &cameras)?)
+    write_splat(&path.join("truth.ply"), &splat).unwrap();
+    write_cameras_json(&path.join("cameras.json"), &names, &cameras).unwrap();
 }
 
 /// Writes the rooms `room_000`, … to `folder`, each with `frames` photos of `size` × `size`.
-///
-/// # Errors
-/// Returns an error if a file can't be written.
-pub fn write_rooms(folder: &Path, scenes: u32, frames: u32, size: u32) -> globalsplat::Result<()> {
-    (0..scenes).try_for_each(|scene| {
+pub fn write_rooms(folder: &Path, scenes: u32, frames: u32, size: u32) {
+    for scene in 0..scenes {
         let room = folder.join(format!("room_{scene:03}"));
-        write_room(&room, scene.into(), frames as usize, [size, size].into())
-    })
+        write_room(&room, scene.into(), frames as usize, [size, size].into());
+    }
 }
 
 /// Returns cameras on a path to the right with a slight turn, looking into the room.
@@ -66,7 +60,7 @@ struct Patch {
     color: DVec3,
 }
 
-fn surfaces(random: &mut impl Rng) -> Gaussians {
+fn surfaces(random: &mut impl Rng) -> Splat {
     let mut patches = vec![];
     let mut colors = || [(); 2].map(|()| DVec3::from_array([(); 3].map(|()| random.random_range(0.2..0.9))));
     // The back wall, floor, ceiling and two side walls, each a checkerboard of two colors.
@@ -83,7 +77,7 @@ fn surfaces(random: &mut impl Rng) -> Gaussians {
         let center = DVec3::new(-1.2 + 0.8 * i, 0.2 + 0.25 * (i * 1.7).sin(), 2.4 + 0.5 * (i * 2.3).cos());
         striped_sphere(&mut patches, center, 0.35, colors());
     }
-    gaussians_of(&patches)
+    splat_of(&patches)
 }
 
 fn checkerboard(patches: &mut Vec<Patch>, corner: DVec3, along: DVec3, across: DVec3, colors: [DVec3; 2]) {
@@ -115,27 +109,19 @@ fn striped_sphere(patches: &mut Vec<Patch>, center: DVec3, radius: f64, colors: 
     }
 }
 
-fn gaussians_of(patches: &[Patch]) -> Gaussians {
-    let count = patches.len() as i64;
-    let tensor = |values: Vec<f64>, width: i64| {
-        Tensor::from_slice(&values).view([1, count, width]).to_kind(Kind::Float)
+fn splat_of(patches: &[Patch]) -> Splat {
+    let log_scales = [0.6 * SPACING, 0.6 * SPACING, 0.05 * SPACING].map(|scale| scale.ln() as f32);
+    let quaternion = |patch: &Patch| {
+        let [x, y, z, w] = DQuat::from_rotation_arc(DVec3::Z, patch.normal).as_quat().to_array();
+        [w, x, y, z]
     };
-    let flatten =
-        |value: fn(&Patch) -> DVec3| patches.iter().flat_map(|p| value(p).to_array()).collect::<Vec<f64>>();
-    let quaternions = patches
-        .iter()
-        .flat_map(|p| {
-            let [x, y, z, w] = DQuat::from_rotation_arc(DVec3::Z, p.normal).to_array();
-            [w, x, y, z]
-        })
-        .collect();
-    let scale = [0.6 * SPACING, 0.6 * SPACING, 0.05 * SPACING];
-    Gaussians {
-        means: tensor(flatten(|p| p.mean), 3),
-        scales: tensor(scale.repeat(patches.len()), 3),
-        quaternions: tensor(quaternions, 4),
-        opacities: tensor(vec![0.95; patches.len()], 1).squeeze_dim(-1),
-        sh: tensor(flatten(|p| (p.color - 0.5) / SH_C0), 3).unsqueeze(2),
-        antialiased: false,
-    }
+    Splat::new(
+        0,
+        patches.iter().map(|patch| patch.mean.as_vec3().to_array()).collect(),
+        vec![log_scales; patches.len()],
+        patches.iter().map(quaternion).collect(),
+        vec![(0.95f32 / 0.05).ln(); patches.len()],
+        patches.iter().map(|patch| ((patch.color - 0.5) / SH_C0).as_vec3().to_array()).collect(),
+    )
+    .unwrap()
 }

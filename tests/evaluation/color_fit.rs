@@ -1,6 +1,6 @@
 //! The colors of a reconstruction are fitted to its photos (spec 9.9).
 
-use crate::common::program::{arg, succeed};
+use crate::common::program::Sandbox;
 use crate::common::room::write_room;
 use globalsplat::data::{Holdout, View, open_capture};
 use globalsplat::loss::{mse, psnr_of_mse};
@@ -24,7 +24,7 @@ fn psnr(reconstruction: &Reconstruction, views: &[View]) -> f64 {
 #[test]
 fn fitted_colors_show_held_out_views_better() {
     let folder = tempfile::tempdir().unwrap();
-    write_room(folder.path(), 3, 8, [96, 96].into()).unwrap();
+    write_room(folder.path(), 3, 8, [96, 96].into());
     let capture = open_capture(folder.path()).unwrap();
     let mut model = bundled_model(Device::Cpu).unwrap();
     assert!(model.config.data.color_steps > 0);
@@ -51,9 +51,6 @@ fn fitted_colors_show_held_out_views_better() {
 
 #[test]
 fn reconstruct_says_that_colors_are_fitted() {
-    let folder = tempfile::tempdir().unwrap();
-    let (room, out) = (folder.path().join("room"), folder.path().join("room.ply"));
-    write_room(&room, 3, 6, [96, 96].into()).unwrap();
-    let report = succeed(&["reconstruct", "--scene", arg(&room), "--out", arg(&out)]);
+    let report = Sandbox::new().succeed("reconstruct --scene @room --out @room.ply");
     assert!(report.contains("forward pass and fit of colors "), "{report}");
 }

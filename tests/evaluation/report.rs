@@ -1,7 +1,7 @@
 //! The report: contents of the file, and its appearance in a browser.
 
 use crate::common::browser::Browser;
-use crate::common::program::{arg, refuse, run_json};
+use crate::common::program::{arg, refuse, succeed};
 use globalsplat::eval::{
     Efficiency, Evaluation, Failure, SceneScores, Summary, comparison_path, read_evaluation,
     write_evaluation, write_report,
@@ -159,7 +159,8 @@ fn the_command_writes_the_page_and_refuses_in_a_sentence() {
     let evaluations = made_up(folder.path());
     let page = folder.path().join("new/report.html");
     let (whole, part) = (arg(&evaluations[0].0), arg(&evaluations[1].0));
-    let object = run_json(&["report", whole, part, "--out", arg(&page), "--json"]);
+    let printed = succeed(&["report", whole, part, "--out", arg(&page), "--json"]);
+    let object: Value = serde_json::from_str(&printed).unwrap();
     assert_eq!(object["bytes"], page.metadata().unwrap().len());
     assert_eq!(object["evaluations"][0]["scenes"], 64);
     assert_eq!(object["evaluations"][1]["failures"], 1);

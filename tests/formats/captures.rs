@@ -7,8 +7,8 @@ use globalsplat::data::{PhotoSize, open_capture};
 use globalsplat::eval::{EvalScene, Method};
 use globalsplat::io::read_splat;
 use globalsplat::metrics::{Perceptual, psnr};
-use globalsplat::render::{render_views, transform};
-use globalsplat::scene::{Camera, Gaussians, Similarity};
+use globalsplat::render::{move_cameras, render_views, transform};
+use globalsplat::scene::{Gaussians, Similarity};
 use std::path::Path;
 
 /// Mean PSNR, SSIM, and LPIPS by VGG-16 and AlexNet over a capture's views that the published splat must reach.
@@ -61,14 +61,8 @@ fn a_moved_splat_looks_the_same_to_moved_cameras() {
         };
         let moved = transform(&splat, &to);
         let cameras = &capture.cameras()[..2];
-        let moved_cameras: Vec<_> = cameras
-            .iter()
-            .map(|camera| {
-                let center = to.scale * (to.rotation * camera.c2w.w_axis.truncate()) + to.translation;
-                let c2w = DMat4::from_mat3_translation(to.rotation * DMat3::from_mat4(camera.c2w), center);
-                Camera { c2w, ..*camera }
-            })
-            .collect();
+        let matrix = DMat4::from_mat3_translation(to.rotation * to.scale, to.translation);
+        let moved_cameras = move_cameras(cameras, &matrix);
         let before = render_views(&splat, cameras).expect("pictures");
         let after = render_views(&moved, &moved_cameras).expect("pictures");
         for (a, b) in before.iter().zip(&after) {

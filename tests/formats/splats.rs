@@ -5,9 +5,10 @@
 mod splat_files;
 
 use crate::common::program::{Sandbox, assert_says};
+use crate::common::psnr;
 use globalsplat::data::open_capture;
-use globalsplat::io::{ShLimits, fit_splat, read_image, read_splat, tensor_from_rgb};
-use globalsplat::metrics::{psnr, psnr_between};
+use globalsplat::io::{ShLimits, fit_splat, read_image, read_splat};
+use globalsplat::metrics::psnr_between;
 use globalsplat::scene::{Gaussians, RawGaussians};
 use rand::SeedableRng;
 use rand::rngs::StdRng;
@@ -93,7 +94,7 @@ fn convert_edits_in_the_given_order() {
     let [before, after] =
         [("room/truth.ply", "room/cameras.json"), ("edited.ply", "moved.json")].map(|(splat, path)| {
             sandbox.succeed(&format!("render --splat @{splat} --path @{path} --out @views.png"));
-            tensor_from_rgb(&read_image(&sandbox.path("views.png")).unwrap())
+            read_image(&sandbox.path("views.png")).unwrap()
         });
     let psnr = psnr(&before, &after);
     assert!(psnr > 33., "{psnr} dB");

@@ -30,18 +30,8 @@ fn cameras(scenes: i64, count: i64, width: i64, height: i64, kind: Kind) -> Came
     for i in 0..scenes * count {
         let (sin, cos) = (0.12 * i as f64).sin_cos();
         w2c.extend([cos, 0., sin, -0.1 * i as f64, 0., 1., 0., 0.05, -sin, 0., cos, 0.1, 0., 0., 0., 1.]);
-        let focal = 0.9 * width as f64;
-        intrinsics.extend([
-            focal,
-            0.,
-            width as f64 / 2. + 0.3,
-            0.,
-            focal * 1.1,
-            height as f64 / 2.,
-            0.,
-            0.,
-            1.,
-        ]);
+        let (focal, cx, cy) = (0.9 * width as f64, width as f64 / 2. + 0.3, height as f64 / 2.);
+        intrinsics.extend([focal, 0., cx, 0., focal * 1.1, cy, 0., 0., 1.]);
     }
     Cameras {
         w2c: Tensor::from_slice(&w2c).view([scenes, count, 4, 4]).to_kind(kind),
@@ -174,11 +164,8 @@ fn instruction_sets_agree() {
         }
         let g = gaussians(1, 4096, 3, Kind::Float, 4);
         // Small Gaussians: with many of them behind each pixel, gradients would magnify the rounding.
-        let g = leaves(&Gaussians { scales: &g.scales * 0.1, ..of_any_length(&g) });
-        let p = draw(&g, &cameras(1, 12, 128, 128, Kind::Float));
-        objective(&p).backward();
-        let mut tensors = vec![("rgb", p.rgb), ("alpha", p.alpha), ("depth", p.depth)];
-        tensors.extend(fields(&g).map(|(name, leaf)| (name, leaf.grad())));
+        let g = Gaussians { scales: &g.scales * 0.1, ..of_any_length(&g) };
+        let tensors = tensors(&g, &cameras(1, 12, 128, 128, Kind::Float));
         return Tensor::write_safetensors(&tensors, out).expect("a writable file");
     }
     let levels = ["avx512", "avx2", "neon", "portable"];

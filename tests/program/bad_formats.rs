@@ -43,21 +43,9 @@ fn transforms_with_invalid_contents() {
     broken("{\"frames\": 3}", &["frames is 3", "a list of frames"]);
     broken("{\"frames\": []}", &["number of views is 0", "two or more"]);
     broken("{\"frames\": [3]}", &["file_path of frame 0 is missing", "the path of an image"]);
-}
-
-#[test]
-fn transforms_without_photos() {
     refused_transforms(
         |t| t["frames"][3]["file_path"] = json!(["a"]),
         &["file_path of frame 3 is a list of 1", "the path of an image"],
-    );
-    refused_transforms(
-        |t| {
-            for frame in t["frames"].as_array_mut().unwrap().iter_mut().skip(1) {
-                frame["file_path"] = json!("images/gone.png");
-            }
-        },
-        &["number of frames with an image is 1 of 9", "\"images/gone.png\" is missing", "two or more"],
     );
 }
 
@@ -102,11 +90,6 @@ fn transforms_with_lenses_that_are_none() {
     set("k5", json!(0.1), &["k5 is 0.1", "FULL_OPENCV as camera_model"]);
     set("k1", json!(-9.), &["the distortion of frame 0 is k1 -9", "folds", "every pixel"]);
     set("camera_model", json!("VR180_L"), &["camera_model is \"VR180_L\"", "PINHOLE", "EQUIRECTANGULAR"]);
-    set(
-        "camera_model",
-        json!("EQUIRECTANGULAR"),
-        &["the size of frame 0 is 40×40 pixels", "twice the height"],
-    );
     set("camera_model", json!("EUCM"), &["the parameters of frame 0 is [", "6 parameters for EUCM"]);
     set("is_fisheye", json!("yes"), &["is_fisheye is \"yes\"", "true or false"]);
     set("distortion_params", json!([0.1, 0.]), &["distortion_params is 2 numbers", "k1, k2, k3, k4, p1, p2"]);
@@ -143,22 +126,11 @@ fn colmap_text_with_cameras_that_are_none() {
     let cameras = |from: &str, to: &str, parts: &[&str]| refused_text("cameras", from, to, parts);
     let known = "SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, OPENCV_FISHEYE, FULL_OPENCV";
     cameras("PINHOLE", "ORTHOPHOTO", &["model of camera 7 is ORTHOPHOTO", known]);
-    cameras(
-        "PINHOLE 40 40 36 36 20 20",
-        "EQUIRECTANGULAR 40 40 40 40",
-        &["the size of camera 7 is 40×40", "twice"],
-    );
-    cameras(
-        "PINHOLE",
-        "FULL_OPENCV",
-        &["the parameters of camera 7 is [36.0,", "12 parameters for FULL_OPENCV"],
-    );
     cameras("PINHOLE", "RADIAL", &["the parameters of camera 7 is [36.0, 36.0, 20.0, 20.0]", "5 parameters"]);
     cameras("7 PINHOLE", "seven PINHOLE", &["CAMERA_ID in line 3 is \"seven\"", "a whole number"]);
     cameras("PINHOLE 40 40", "PINHOLE 40 4e1", &["HEIGHT in line 3 is \"4e1\"", "a whole number"]);
     cameras("PINHOLE 40 40", "PINHOLE 40 0", &["height of camera 7 is 0", "a number of pixels"]);
     cameras("40 40 36", "40 40 nan", &["focal length fx of camera 7 is NaN", "above 0"]);
-    cameras("40 40 36 36 20", "40 40 36 36 -20", &["principal point cx of camera 7 is -20", "0 to 40"]);
     cameras("40 40 36", "40 40 36x", &["PARAMS in line 3 is \"36x\"", "a number"]);
     cameras(" 40 40 36 36 20 20", "", &["WIDTH in line 3 is missing", "a whole number"]);
     let twice = "7 PINHOLE 40 40 36 36 20 20";

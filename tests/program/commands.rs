@@ -1,6 +1,9 @@
 //! Every command, run as a user runs it.
 
-use crate::common::program::{Sandbox, TINY_CONFIG, WAIT_PASSIVELY, assert_says, number, rooms, run_process};
+use crate::common::program::{
+    Sandbox, TINY_CONFIG, WAIT_PASSIVELY, assert_says, number, run_process, send_signal, wait_for,
+};
+use crate::common::room::write_rooms;
 use crate::common::{has_lpips, skip};
 use serde_json::{Value, json};
 
@@ -188,7 +191,7 @@ fn lpips_is_reported_where_its_weights_are() {
         assert!(mean < 0.01 && (mean - values[9]).abs() < 1e-4, "{table}");
     }
     // Without values for views that are too small.
-    rooms(&sandbox.path("small"), 1, 3, 24);
+    write_rooms(&sandbox.path("small"), 1, 3, 24);
     let (out, err) = eval("eval --splat @small/room_000/truth.ply --scene @small/room_000 --json");
     let scores: Value = serde_json::from_str(&out).unwrap();
     assert!(scores["lpips_vgg"].is_f64() && scores.get("lpips_alex").is_none());
@@ -289,20 +292,13 @@ fn interrupted_training_saves_a_checkpoint() {
         let sandbox = Sandbox::new();
         let mut train = sandbox.command("train --config @tiny.toml --out @run --set train.steps=1000000");
         let mut child = train.stderr(std::process::Stdio::piped()).spawn().expect("a program that starts");
-        // Wait until it has done a few steps.
         let metrics = sandbox.path("run/metrics.jsonl");
         let steps = || std::fs::read_to_string(&metrics).map_or(0, |text| text.lines().count());
-        while steps() < 3 {
-            assert!(child.try_wait().expect("a child").is_none(), "it ended by itself");
-            std::thread::sleep(std::time::Duration::from_millis(20));
-        }
+        wait_for(std::slice::from_mut(&mut child), || (steps() >= 3).then_some(()));
         // Signals arrive far more often than in practice: a handler must not write to memory in which a matrix product is being
         // computed.
         while child.try_wait().expect("a child").is_none() {
-            for &signal in signals {
-                // SAFETY: sends a signal to a child process that has not been waited for.
-                unsafe { libc::kill(child.id() as i32, signal) };
-            }
+            signals.iter().for_each(|&signal| send_signal(child.id(), signal));
             std::thread::sleep(std::time::Duration::from_micros(50));
         }
         let output = child.wait_with_output().expect("a child");
@@ -331,7 +327,7 @@ fn doctor_estimates_memory_and_bench_train_fits_the_batch() {
 #[test]
 fn training_on_chunks_reports_skipped_scenes() {
     let sandbox = Sandbox::empty();
-    rooms(&sandbox.path("captures"), 3, 6, 40);
+    write_rooms(&sandbox.path("captures"), 3, 6, 40);
     // The smallest possible chunks: two of the rooms share one.
     sandbox.run("pack @captures/room_000 @captures/room_001 --out @set/train");
     sandbox.run("pack @captures/room_002 --out @more");

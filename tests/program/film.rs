@@ -1,37 +1,22 @@
 //! Videos and camera paths: what players decode, the sources of cameras, and cleanup after failures.
 
 use crate::common::formats::{Format, rewrite};
-use crate::common::program::{Sandbox, arg, assert_says};
-use crate::common::{skip, write_script};
+use crate::common::program::{Sandbox, arg, assert_says, send_signal, wait_for};
+use crate::common::{pictures, psnr, skip, write_script};
 use glam::{DMat4, DVec4};
 use globalsplat::data::{open_capture, read_camera_path, write_cameras_json};
 use globalsplat::io::find_ffmpeg;
 use globalsplat::scene::{Camera, pose_to_rows};
+use image::RgbImage;
 use serde_json::{Value, json};
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Stdio};
-use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
 /// Returns `true` if there is an ffmpeg that writes MP4s; otherwise, skips the test.
 fn has_ffmpeg() -> bool {
     find_ffmpeg().map_err(|why| skip("ffmpeg", &why)).is_ok()
-}
-
-/// Returns the images in `folder`, sorted by name.
-fn pictures(folder: &Path) -> Vec<image::RgbImage> {
-    let mut files: Vec<PathBuf> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
-    files.sort();
-    files.iter().map(|file| image::open(file).unwrap().into_rgb8()).collect()
-}
-
-/// Returns the PSNR of two images in dB, from bytes.
-fn psnr(a: &[u8], b: &[u8]) -> f64 {
-    assert_eq!(a.len(), b.len());
-    let square = |(&a, &b): (&u8, &u8)| (f64::from(a) - f64::from(b)).powi(2);
-    let error = a.iter().zip(b).map(square).sum::<f64>() / a.len() as f64;
-    10. * (255f64.powi(2) / error.max(1e-9)).log10()
 }
 
 /// Returns the description of a video's stream by ffprobe.
@@ -78,12 +63,14 @@ fn an_mp4_shows_what_the_pictures_show() {
         .output()
         .unwrap()
         .stdout;
-    let frames: Vec<&[u8]> = decoded.chunks(3 * 772 * 256).collect();
+    let frames =
+        decoded.chunks(3 * 772 * 256).map(|frame| RgbImage::from_raw(772, 256, frame.to_vec()).unwrap());
+    let frames: Vec<RgbImage> = frames.collect();
     assert_eq!(frames.len(), 9);
     sandbox.run(&format!("{render} --out @views"));
     let parts = pictures(&sandbox.path("views"));
     for (i, (frame, parts)) in frames.iter().zip(parts.chunks(2)).enumerate() {
-        let mut picture = image::RgbImage::from_pixel(772, 256, image::Rgb([255; 3]));
+        let mut picture = RgbImage::from_pixel(772, 256, image::Rgb([255; 3]));
         // Sorted by name: 000.png, then 000_depth.png.
         image::imageops::replace(&mut picture, &parts[0], 0, 0);
         image::imageops::replace(&mut picture, &parts[1], 388, 0);
@@ -168,14 +155,10 @@ fn ctrl_c_leaves_no_half_film() {
         let mut program = render.stderr(Stdio::piped()).spawn().unwrap();
         // Frames are written as they are rendered. The program has checked earlier, with an empty file, that it may write here.
         let partial = sandbox.path(&format!("out/.film.{ending}.globalsplat-partial"));
-        let deadline = Instant::now() + Duration::from_secs(60);
         let least = if ending == "gif" { 100_000 } else { 1 };
-        let written = || fs::metadata(&partial).is_ok_and(|file| file.len() >= least);
-        while !written() {
-            assert!(Instant::now() < deadline && program.try_wait().unwrap().is_none(), "nothing is written");
-            std::thread::sleep(Duration::from_millis(10));
-        }
-        assert_eq!(unsafe { libc::kill(program.id() as i32, libc::SIGINT) }, 0);
+        let is_written = || fs::metadata(&partial).is_ok_and(|file| file.len() >= least);
+        wait_for(std::slice::from_mut(&mut program), || is_written().then_some(()));
+        send_signal(program.id(), libc::SIGINT);
         let output = program.wait_with_output().unwrap();
         let message = String::from_utf8(output.stderr).unwrap();
         assert_eq!(output.status.code(), Some(1), "{message}");
@@ -223,16 +206,6 @@ fn a_smooth_path_goes_from_the_first_camera_to_the_last() {
     assert_eq!((views.len(), path.len()), (9, 25));
     assert_eq!(path, pictures(&along));
     assert!(psnr(&views[0], &path[0]) > 50. && psnr(&views[8], &path[24]) > 50.);
-    // The path passes every view, and its frames resemble their neighbours more than the views do.
-    for (i, view) in views.iter().enumerate() {
-        let nearest = path.iter().map(|frame| psnr(view, frame)).fold(0., f64::max);
-        println!("view {i}: {nearest:.1} dB");
-        assert!(nearest > 25., "view {i} is passed at {nearest} dB");
-    }
-    let mean = |pictures: &[image::RgbImage]| {
-        pictures.windows(2).map(|pair| psnr(&pair[0], &pair[1])).sum::<f64>() / (pictures.len() - 1) as f64
-    };
-    assert!(mean(&path) > mean(&views) + 3., "{} {}", mean(&path), mean(&views));
 }
 
 #[test]

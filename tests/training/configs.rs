@@ -87,7 +87,7 @@ const SHRUNKEN: [&str; 17] = [
 #[test]
 fn every_configuration_trains() {
     let rooms = tempfile::tempdir().expect("a folder");
-    write_room(&rooms.path().join("room"), 1, 9, [40, 40].into()).expect("a room");
+    write_room(&rooms.path().join("room"), 1, 9, [40, 40].into());
     let scenes = Arc::new(TrainingScenes::find(&[rooms.path().into()]).expect("a capture"));
     for entry in std::fs::read_dir(folder()).expect("configs/") {
         let path = entry.expect("an entry").path();
@@ -140,15 +140,4 @@ fn ablations_differ_from_the_full_model_in_one_thing() {
     assert_eq!(config.model.streams, Streams::Single);
     (config.model.streams, config.model.width) = (Streams::Dual, full.model.width);
     assert_eq!(config, full);
-}
-
-#[test]
-fn keys_are_overridden_one_by_one() {
-    let sets = ["train.steps=7", "data.image_size=[64, 32]", "data.holdout=every:4", "model.streams=single"];
-    let config = Config::parse("", &sets.map(String::from), Path::new("none")).expect("a configuration");
-    assert_eq!(config.train.steps, 7);
-    assert_eq!((config.data.image_size.height, config.data.image_size.width), (64, 32));
-    assert_eq!(config.data.holdout.to_string(), "every:4");
-    assert_eq!(config.model.streams, Streams::Single);
-    assert_eq!(config.train.learning_rate, 5e-4);
 }

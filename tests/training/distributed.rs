@@ -1,13 +1,14 @@
 //! Distributed processes: they compute what one process computes, and they survive failures.
 #![cfg(target_os = "linux")]
 
-use crate::common::program::{Sandbox, arg, assert_says, rooms, tiny_config, tiny_weights};
-use crate::common::skip;
+use crate::common::program::{Sandbox, arg, assert_says, send_signal, tiny_config, tiny_weights, wait_for};
+use crate::common::room::write_rooms;
+use crate::common::{skip, write_script};
 use crate::{assert_same_bits, checkpoints, metrics, steps, train};
 use serde_json::{Value, json};
 use std::fs;
 use std::net::TcpListener;
-use std::os::unix::fs::{PermissionsExt, symlink};
+use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -81,17 +82,6 @@ fn start_by_torchrun(torchrun: &Path, sandbox: &Sandbox, options: &[&str], line:
     start(command.arg(program.get_program()).args(program.get_args()).env("OMP_NUM_THREADS", "1"))
 }
 
-/// Polls `find` until it returns a value, while all `processes` are running.
-fn wait_for<T>(processes: &mut [Child], mut find: impl FnMut() -> Option<T>) -> T {
-    loop {
-        if let Some(found) = find() {
-            return found;
-        }
-        assert!(processes.iter_mut().all(|process| process.try_wait().unwrap().is_none()), "one has ended");
-        sleep(Duration::from_micros(200));
-    }
-}
-
 /// Waits until all `processes` have ended.
 fn end(processes: Vec<Child>) -> Vec<Ended> {
     let end = |process: Child| {
@@ -106,11 +96,6 @@ fn end(processes: Vec<Child>) -> Vec<Ended> {
 fn children(process: u32) -> Vec<u32> {
     let children = fs::read_to_string(format!("/proc/{process}/task/{process}/children"));
     children.unwrap_or_default().split_whitespace().map(|child| child.parse().unwrap()).collect()
-}
-
-fn signal(process: u32, signal: libc::c_int) {
-    // SAFETY: sends a signal to a process that this test started and nobody has waited for, or to none.
-    unsafe { libc::kill(process as i32, signal) };
 }
 
 /// Returns the output of `count` ranks that succeed; all but the first print nothing.
@@ -143,7 +128,7 @@ fn sentence(err: &str) -> &str {
 /// Returns a folder of rooms, `captures`, and a configuration that trains on them.
 fn data(scenes: u32) -> Sandbox {
     let sandbox = Sandbox::empty();
-    rooms(&sandbox.path("captures"), scenes, 9, 40);
+    write_rooms(&sandbox.path("captures"), scenes, 9, 40);
     tiny_config(sandbox.folder(), &sandbox.path("captures"));
     sandbox
 }
@@ -178,12 +163,9 @@ fn ranks_of_slurm_s_script_train_like_one() {
     let settings = "train.steps=12 train.validate_every=5 train.learning_rate=2e-4 train.batch_size=";
     sandbox.succeed(&train("one", &format!("{settings}2")));
 
-    for (name, does) in
-        [("scontrol", "[ \"$*\" = 'show hostnames here' ] && echo 127.0.0.1"), ("srun", "exec \"$@\"")]
-    {
-        sandbox.write(&format!("bin/{name}"), format!("#!/bin/sh\n{does}\n"));
-        fs::set_permissions(tools.join(name), fs::Permissions::from_mode(0o755)).unwrap();
-    }
+    fs::create_dir(&tools).unwrap();
+    write_script(&tools.join("scontrol"), "[ \"$*\" = 'show hostnames here' ] && echo 127.0.0.1");
+    write_script(&tools.join("srun"), "exec \"$@\"");
     // The folder from which the job is submitted contains the program.
     fs::create_dir_all(checkout.join("target/release")).unwrap();
     symlink(env!("CARGO_BIN_EXE_globalsplat"), checkout.join("target/release/globalsplat")).unwrap();
@@ -225,7 +207,7 @@ fn a_run_goes_on_with_another_number_of_ranks() {
     let mut ranks = start_ranks(&sandbox, &vec![train("many", &format!("{settings}3")); 2]);
     wait_for(&mut ranks, || (metrics(&many).0.len() >= 4).then_some(()));
     // A stop request to any rank stops all.
-    signal(ranks[1].id(), libc::SIGTERM);
+    send_signal(ranks[1].id(), libc::SIGTERM);
     let ended = end(ranks);
     assert_eq!((ended[0].code, ended[1].code), (Some(1), Some(0)), "{}", ended[1].err);
     let sentence = sentence(&ended[0].err);
@@ -250,16 +232,16 @@ fn ranks_that_die_are_survived_to_the_same_bits() {
     // Kill a rank within a step.
     wait_for(&mut started, || (metrics(&run).0.len() >= 3).then_some(()));
     let second = find_rank(&mut started, 1, 0);
-    signal(second, libc::SIGKILL);
+    send_signal(second, libc::SIGKILL);
     // Kill a rank within a save. A suspended process doesn't finish the save before it is killed.
     let first = find_rank(&mut started, 0, 1);
     loop {
         wait_for(&mut started, || unfinished_save(&run));
         hold(first);
         if unfinished_save(&run).is_some() {
-            break signal(first, libc::SIGKILL);
+            break send_signal(first, libc::SIGKILL);
         }
-        signal(first, libc::SIGCONT);
+        send_signal(first, libc::SIGCONT);
     }
     let ended = end(started.into()).remove(0);
     assert_eq!(ended.code, Some(0), "{}", ended.err);
@@ -291,7 +273,7 @@ fn find_rank(started: &mut [Child; 1], rank: usize, restarts: usize) -> u32 {
 
 /// Suspends a process, so that its state can be examined.
 fn hold(process: u32) {
-    signal(process, libc::SIGSTOP);
+    send_signal(process, libc::SIGSTOP);
     // The process name, in brackets, may contain anything.
     let is_running = |stat: String| stat.rsplit_once(')').is_some_and(|(_, state)| !state.starts_with(" T"));
     while fs::read_to_string(format!("/proc/{process}/stat")).is_ok_and(is_running) {
@@ -323,7 +305,7 @@ fn an_error_is_printed_once() {
     let Some(_turn) = turn() else { return };
     let sandbox = data(2);
     sandbox.write("run/config.toml", "");
-    rooms(&sandbox.path("more"), 3, 9, 40);
+    write_rooms(&sandbox.path("more"), 3, 9, 40);
     let line = |setting: &str| train("run", setting);
     let both = |setting: &str| [line(setting), line(setting)];
     let mistakes = [
@@ -357,7 +339,7 @@ fn an_error_is_printed_once() {
 
 /// Returns the result of an evaluation, without times and memory.
 fn evaluation(sandbox: &Sandbox, out: &str) -> (Value, Vec<String>) {
-    let mut scores: Value = serde_json::from_slice(&sandbox.read(&format!("{out}/scores.json"))).unwrap();
+    let mut scores = sandbox.read_json(&format!("{out}/scores.json"));
     for scene in scores["scenes"].as_array_mut().unwrap() {
         for measured in ["forward_seconds", "warm_up", "peak_memory_bytes"] {
             scene.as_object_mut().unwrap().remove(measured);
@@ -375,7 +357,7 @@ fn evaluation(sandbox: &Sandbox, out: &str) -> (Value, Vec<String>) {
 fn ranks_evaluate_like_one() {
     let Some(_turn) = turn() else { return };
     let sandbox = Sandbox::empty();
-    rooms(&sandbox.path("captures"), 5, 5, 40);
+    write_rooms(&sandbox.path("captures"), 5, 5, 40);
     tiny_weights(sandbox.folder(), &sandbox.path("captures"));
     let names: Vec<String> = (0..5).map(|room| format!("room_{room:03}")).collect();
     let frames = names.iter().map(|name| (name.clone(), json!({"context": [0, 2, 4], "target": [1, 3]})));

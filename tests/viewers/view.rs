@@ -2,7 +2,7 @@
 #![cfg(unix)]
 
 use crate::common::browser::Browser;
-use crate::common::program::{arg, command, room, run_process, succeed};
+use crate::common::program::{Sandbox, arg, run_process, succeed};
 use crate::common::{captures, has_viewer, write_script};
 use crate::{LEAST, assert_like, own_picture, picture_from_base64};
 use globalsplat::data::{load_views, open_capture};
@@ -252,17 +252,15 @@ fn view_opens_a_page_of_a_splat_alone() {
     if !has_viewer() {
         return;
     }
-    let (folder, room) = room();
+    let sandbox = Sandbox::new();
     // Names are escaped as text.
-    let splat = folder.path().join("a <b>room&.ply");
-    std::fs::copy(room.join("truth.ply"), &splat).unwrap();
+    sandbox.copy("room/truth.ply", "a <b>room&.ply");
     // A program `xdg-open` that records the path it is asked to open.
-    let opener = folder.path().join("xdg-open");
-    let opened = folder.path().join("opened");
-    write_script(&opener, &format!("printf %s \"$1\" > {opened:?}"));
-    let path = format!("{}:/usr/bin:/bin", folder.path().display());
-    let mut view = command(&["view", arg(&splat)]);
-    let (out, err) = run_process(view.env("PATH", path).env("TMPDIR", folder.path()));
+    let opened = sandbox.path("opened");
+    write_script(&sandbox.path("xdg-open"), &format!("printf %s \"$1\" > {opened:?}"));
+    let path = format!("{}:/usr/bin:/bin", sandbox.folder().display());
+    let mut view = sandbox.command("view '@a <b>room&.ply'");
+    let (out, err) = run_process(view.env("PATH", path).env("TMPDIR", sandbox.folder()));
     assert_eq!(err, "");
     let page = PathBuf::from(out.trim_end());
     let begun = Instant::now();
@@ -270,7 +268,7 @@ fn view_opens_a_page_of_a_splat_alone() {
         assert!(begun.elapsed() < Duration::from_secs(20), "the page was not opened");
         std::thread::sleep(Duration::from_millis(20));
     }
-    assert_eq!(page.parent().unwrap(), folder.path());
+    assert_eq!(page.parent().unwrap(), sandbox.folder());
 
     let Some(mut shown) = Shown::open(&page) else { return };
     assert_eq!(shown.value("document.querySelector('h1').textContent"), "a <b>room&");
@@ -288,17 +286,13 @@ fn pages_are_private_and_replaced_by_the_next() {
     if !has_viewer() {
         return;
     }
-    let (folder, room) = room();
-    let (empty, temporary) = (folder.path().join("empty"), folder.path().join("temporary"));
-    std::fs::create_dir(&empty).unwrap();
-    std::fs::create_dir(&temporary).unwrap();
-    let other = temporary.join("page.html");
-    std::fs::write(&other, "somebody's").unwrap();
-    let splat = room.join("truth.ply");
+    let sandbox = Sandbox::new();
+    sandbox.write("temporary/page.html", "somebody's");
+    let temporary = sandbox.path("temporary");
     let mut before: Option<PathBuf> = None;
     for _ in 0..2 {
-        let mut view = command(&["view", arg(&splat), "--scene", arg(&room), "--json"]);
-        let (out, err) = run_process(view.env("PATH", &empty).env("TMPDIR", &temporary));
+        let mut view = sandbox.command("view @room/truth.ply --scene @room --json");
+        let (out, err) = run_process(view.env("PATH", "").env("TMPDIR", &temporary));
         assert!(err.starts_with("no browser could be started (") && err.lines().count() == 1, "{err}");
         let report: Value = serde_json::from_str(&out).unwrap();
         assert_eq!(report["opened"], false);
@@ -308,5 +302,5 @@ fn pages_are_private_and_replaced_by_the_next() {
         assert!(before.is_none_or(|before| !before.exists()));
         before = Some(page);
     }
-    assert!(other.exists());
+    assert!(temporary.join("page.html").exists());
 }

@@ -32,6 +32,7 @@ fn bad_plys() {
         ("format", "comment", "the line format is missing"),
         ("vertex 300", "vertex many", "rows of the element vertex is many, expected a whole number"),
         ("element vertex 300\n", "", "the property x is without an element"),
+        ("end_header", "end_headers", "the header is without its end, expected a line end_header"),
         ("element vertex", "element point", "the element vertex is missing"),
         ("float opacity", "float half opacity", "the type of opacity is \"float half\""),
         ("float opacity", "list float opacity", "the type of opacity"),
@@ -50,6 +51,7 @@ fn bad_plys() {
         ),
     ];
     assert_headers_are_refused("ply", &cases);
+    assert_bytes_refused("ply", b"hello", &["the file is no PLY"]);
     for (length, message) in [
         (-1., "i in row 0 of face is a list of the length -1, expected numbers"),
         (f64::NAN, "i in row 0 of face is a list of the length NaN"),
