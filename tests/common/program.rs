@@ -1,6 +1,6 @@
 //! Running the program as a user does, on a small capture that it generates itself.
 
-use super::room::write_rooms;
+use super::room::write_room;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::ffi::{OsStr, OsString};
@@ -119,20 +119,6 @@ fn text(word: &OsString) -> &str {
     word.to_str().expect("a word in UTF-8")
 }
 
-/// Returns a capture of nine 40×40 photos of a procedural room, with `ground_truth.ply` beside them; every caller gets its own copy.
-pub fn room() -> (TempDir, PathBuf) {
-    static ORIGINAL: OnceLock<TempDir> = OnceLock::new();
-    let original = ORIGINAL.get_or_init(|| {
-        let folder = tempfile::tempdir().expect("a folder");
-        write_rooms(folder.path(), 1, 9, 40);
-        folder
-    });
-    let folder = tempfile::tempdir().expect("a folder");
-    let room = folder.path().join("room_000");
-    copy_dir(&original.path().join("room_000"), &room);
-    (folder, room)
-}
-
 pub fn copy_dir(from: &Path, to: &Path) {
     std::fs::create_dir_all(to).expect("a folder");
     for entry in std::fs::read_dir(from).expect("a folder") {
@@ -188,9 +174,14 @@ impl Sandbox {
     /// Contains the capture `room` of nine 40×40 photos with its splat `room/truth.ply`, and the configuration `tiny.toml`, which trains with
     /// it.
     pub fn new() -> Self {
+        static ORIGINAL: OnceLock<Sandbox> = OnceLock::new();
+        let original = ORIGINAL.get_or_init(|| {
+            let sandbox = Sandbox::empty();
+            write_room(&sandbox.path("room"), 0, 9, [40, 40].into());
+            sandbox
+        });
         let sandbox = Sandbox::empty();
-        let (_folder, room) = room();
-        std::fs::rename(room, sandbox.path("room")).expect("a folder");
+        copy_dir(original.folder(), sandbox.folder());
         tiny_config(sandbox.folder(), &sandbox.path("room"));
         sandbox
     }

@@ -1,6 +1,6 @@
 //! Published splats of real captures, rendered from the captures' own cameras.
 
-use crate::common::program::room;
+use crate::common::program::Sandbox;
 use crate::common::{captures, has_lpips, relative_error, rerun_test, skip};
 use glam::{DMat3, DMat4, DVec3};
 use globalsplat::data::{PhotoSize, open_capture};
@@ -75,12 +75,11 @@ fn a_moved_splat_looks_the_same_to_moved_cameras() {
 
 #[test]
 fn missing_captures_are_reported() {
-    let (another, _) = room();
-    let empty = tempfile::tempdir().expect("a folder");
+    let (another, empty) = (Sandbox::new(), Sandbox::empty());
     for (name, captures, what) in [
-        ("captures::published_splats_reach_their_scores", another.path(), "captures with known scores\n"),
-        ("captures::published_splats_reach_their_scores", empty.path(), "captures\n"),
-        ("captures::a_moved_splat_looks_the_same_to_moved_cameras", empty.path(), "captures\n"),
+        ("captures::published_splats_reach_their_scores", another.folder(), "captures with known scores\n"),
+        ("captures::published_splats_reach_their_scores", empty.folder(), "captures\n"),
+        ("captures::a_moved_splat_looks_the_same_to_moved_cameras", empty.folder(), "captures\n"),
     ] {
         let run = |strict: &str| {
             let variables = [("GLOBALSPLAT_CAPTURES", captures), ("GLOBALSPLAT_NO_SKIPS", Path::new(strict))];

@@ -199,17 +199,19 @@ fn a_local_origin_keeps_the_detail() {
 #[test]
 fn origins_that_are_none_are_refused() {
     let sandbox = Sandbox::new();
-    for (bad, command) in [
-        ("", "inspect @room/truth.ply"),
-        ("[1, 2, 3]", "inspect @room/truth.ply"),
-        ("{}", "inspect @room/truth.ply"),
-        ("{\"origin\": [1, 2]}", "inspect @room/truth.ply"),
-        ("{\"origin\": [1, 2, 1e999]}", "inspect @room/truth.ply"),
-        ("{\"origin\": [1, \"2\", 3]}", "inspect @room/truth.ply"),
-        ("{\"origin\": null}", "convert @room/truth.ply @out.ply"),
+    for bad in [
+        "",
+        "[1, 2, 3]",
+        "{}",
+        r#"{"origin": [1, 2]}"#,
+        r#"{"origin": [1, 2, 1e999]}"#,
+        r#"{"origin": [1, "2", 3]}"#,
+        r#"{"origin": null}"#,
     ] {
         sandbox.write("room/truth.ply.origin.json", bad);
-        let said = sandbox.refuse(command);
-        assert_says(&said, &["truth.ply.origin.json: the JSON is ", "expected {\"origin\": [x, y, z]}"]);
+        for command in ["inspect @room/truth.ply", "convert @room/truth.ply @out.ply"] {
+            let said = sandbox.refuse(command);
+            assert_says(&said, &["truth.ply.origin.json: the JSON is ", "expected {\"origin\": [x, y, z]}"]);
+        }
     }
 }

@@ -2,26 +2,23 @@
 //! exit code 2.
 
 use crate::common::formats::{Format, rewrite};
-use crate::common::program::{Sandbox, arg, room};
+use crate::common::program::{Sandbox, arg, assert_says};
 use globalsplat::data::open_capture;
 use serde_json::{Value, json};
 
 /// Asserts that the room in `format`, with `file` changed, is refused, and that the message contains all of `parts` and the
 /// file.
 fn refused(format: Format, file: &str, change: impl FnOnce(&mut Vec<u8>), parts: &[&str]) {
-    let (_folder, room) = room();
-    rewrite(&room, format);
-    let path = room.join(file);
-    let mut bytes = std::fs::read(&path).unwrap();
+    let (sandbox, file) = (Sandbox::new(), format!("room/{file}"));
+    rewrite(&sandbox.path("room"), format);
+    let mut bytes = sandbox.read(&file);
     change(&mut bytes);
-    std::fs::write(&path, bytes).unwrap();
-    let error = open_capture(&room).expect_err("a capture that can't be right");
+    sandbox.write(&file, bytes);
+    let error = open_capture(&sandbox.path("room")).expect_err("a capture that can't be right");
     assert!(error.is_invalid_request(), "exit code 2: {error:?}");
     let error = error.to_string();
     assert_eq!(error.lines().count(), 1, "one sentence: {error}");
-    for part in parts.iter().chain([&arg(&path)]) {
-        assert!(error.contains(part), "{part:?} is not in: {error}");
-    }
+    assert_says(&error, &[parts, &[arg(&sandbox.path(&file))]].concat());
 }
 
 fn refused_transforms(change: impl FnOnce(&mut Value), parts: &[&str]) {
@@ -196,13 +193,12 @@ fn colmap_binaries_with_values_that_are_none() {
 #[test]
 fn damaged_colmap_binaries_never_panic() {
     for name in ["cameras.bin", "images.bin"] {
-        let (_folder, room) = room();
-        rewrite(&room, Format::ColmapBinary);
-        let file = room.join("sparse/0").join(name);
-        let whole = std::fs::read(&file).unwrap();
+        let (sandbox, file) = (Sandbox::new(), format!("room/sparse/0/{name}"));
+        rewrite(&sandbox.path("room"), Format::ColmapBinary);
+        let whole = sandbox.read(&file);
         let open = |bytes: &[u8]| {
-            std::fs::write(&file, bytes).unwrap();
-            open_capture(&room).map(drop).map_err(|error| {
+            sandbox.write(&file, bytes);
+            open_capture(&sandbox.path("room")).map(drop).map_err(|error| {
                 assert!(error.is_invalid_request() && error.to_string().contains("sparse/0/"), "{error}");
                 error.to_string()
             })

@@ -140,27 +140,16 @@ fn options_that_do_not_apply() {
 #[test]
 fn invalid_options() {
     let sandbox = Sandbox::with_weights();
-    for (line, parts) in [
-        ("reconstruct --precision f16 --scene @room --out @out.ply", ["--precision: f16", "f32 or bf16"]),
-        (
-            "eval --precision f16 --weights @tiny.safetensors --scene @room",
-            ["--precision: f16", "f32 or bf16"],
-        ),
-        (
-            "eval --weights @tiny.safetensors --scene @room --device tpu",
-            ["--device tpu", "cpu, cuda or cuda:N"],
-        ),
-        (
-            "eval --weights @tiny.safetensors --scene @room --device cuda:99",
-            ["--device cuda:99", "CUDA devices"],
-        ),
-        (
-            "eval --weights @tiny.safetensors --scene @room --holdout none",
-            ["0 target views", "--holdout or data.holdout, every:N"],
-        ),
-        ("bench train --set train.batch_size=4", ["--set train.batch_size=4", "--batch N"]),
+    let eval = "eval --weights @tiny.safetensors --scene @room";
+    for (command, option, parts) in [
+        ("reconstruct --scene @room --out @out.ply", "--precision f16", ["--precision: f16", "f32 or bf16"]),
+        (eval, "--precision f16", ["--precision: f16", "f32 or bf16"]),
+        (eval, "--device tpu", ["--device tpu", "cpu, cuda or cuda:N"]),
+        (eval, "--device cuda:99", ["--device cuda:99", "CUDA devices"]),
+        (eval, "--holdout none", ["0 target views", "--holdout or data.holdout, every:N"]),
+        ("bench train", "--set train.batch_size=4", ["--set train.batch_size=4", "--batch N"]),
     ] {
-        assert_says(&sandbox.refuse(line), &parts);
+        assert_says(&sandbox.refuse(&format!("{command} {option}")), &parts);
     }
     let doctor = sandbox.command("doctor").env("GLOBALSPLAT_SIMD", "mmx").output().unwrap();
     assert_ne!(doctor.status.code(), Some(0));
@@ -258,26 +247,19 @@ fn invalid_weights_of_lpips() {
 #[test]
 fn perceptual_losses_without_their_weights() {
     let sandbox = Sandbox::with_weights();
+    let missing = ["loss.perceptual_weights is", "vgg19.safetensors, which doesn't exist", "torchvision"];
+    let file = "--set loss.perceptual_weights";
     for (settings, parts) in [
-        (
-            "--set loss.perceptual=vgg19",
-            &["loss.perceptual_weights is", "vgg19.safetensors, which doesn't exist", "torchvision"][..],
-        ),
-        ("--set loss.perceptual=lpips_vgg", &["lpips_vgg.safetensors", "`make weights` creates it"]),
-        (
-            "--set loss.perceptual=vgg19 --set loss.perceptual_weights=elsewhere/v.safetensors",
-            &["is elsewhere/v.safetensors"],
-        ),
+        ("vgg19", &missing[..]),
+        ("lpips_vgg", &["lpips_vgg.safetensors", "`make weights` creates it"]),
+        (&format!("vgg19 {file}=elsewhere/v.safetensors"), &["is elsewhere/v.safetensors"]),
         // The file exists but contains the weights of another network.
-        (
-            "--set loss.perceptual=vgg19 --set loss.perceptual_weights=@tiny.safetensors",
-            &["tiny.safetensors", "features.0."],
-        ),
+        (&format!("vgg19 {file}=@tiny.safetensors"), &["tiny.safetensors", "features.0."]),
+        ("vgg16", &["unknown variant `vgg16`"]),
     ] {
-        let (code, _, error) = sandbox.output(&format!("train --config @tiny.toml --out @run {settings}"));
+        let train = "train --config @tiny.toml --out @run --set loss.perceptual";
+        let (code, _, error) = sandbox.output(&format!("{train}={settings}"));
         assert_eq!(code, Some(2), "{error}");
         assert_says(&error, parts);
     }
-    let error = sandbox.refuse("train --config @tiny.toml --out @run --set loss.perceptual=vgg16");
-    assert_says(&error, &["unknown variant `vgg16`"]);
 }
