@@ -9,6 +9,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 form=${1:-long}
 out=target/sanitize
+rm -rf "$out"
 mkdir -p "$out"
 
 # The instruction sets, as in csrc/build.rs.
@@ -49,12 +50,8 @@ for sanitizer in $sanitizers; do
     esac
 done | xargs -P "$(nproc)" -d '\n' -n 1 bash -c
 for sanitizer in $sanitizers; do
-    objects=()
-    for part in $isas raster multi_head_attention image_losses depth_search optim parallel kernels frame emulated_kernels emulator checks schedules; do
-        objects+=("$out/$sanitizer-$part.o")
-    done
     # shellcheck disable=SC2086
-    ${CXX:-g++} ${flags_of[$sanitizer]} "${objects[@]}" -pthread -o "$out/$sanitizer"
+    ${CXX:-g++} ${flags_of[$sanitizer]} "$out/$sanitizer"-*.o -pthread -o "$out/$sanitizer"
 done
 
 # Newer Linux kernels randomize addresses over a wider range than the sanitizers' shadow memory supports.
@@ -70,17 +67,16 @@ for sanitizer in $sanitizers; do
     # ThreadSanitizer doesn't follow a child that starts threads.
     [ "$sanitizer" != thread ] || checks=${checks% children}
     for isa in $isas; do
-        export GLOBALSPLAT_SIMD=$isa
-        "${unscattered[@]}" "$out/$sanitizer" simd >/dev/null || continue
-        for check in $checks; do
-            if count=$("${unscattered[@]}" "$out/$sanitizer" "$check" "$form" 2>"$out/log"); then
-                echo "$sanitizer, $isa, $check: $count"
-            else
-                echo "$sanitizer, $isa, $check: FAILED"
-                failed=1
-                head -60 "$out/log" >&2
-            fi
-        done
+        status=0
+        # shellcheck disable=SC2086
+        GLOBALSPLAT_SIMD=$isa "${unscattered[@]}" "$out/$sanitizer" "$form" $checks >"$out/counts" 2>"$out/log" || status=$?
+        [ $status -ne 3 ] || continue # not an instruction set of this machine
+        sed "s/^/$sanitizer, $isa, /" "$out/counts"
+        if [ $status -ne 0 ]; then
+            echo "$sanitizer, $isa: FAILED"
+            failed=1
+            head -60 "$out/log" >&2
+        fi
         [ "$form" != short ] || checks="bits callers"
     done
 done

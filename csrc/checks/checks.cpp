@@ -1,31 +1,30 @@
 // Robustness checks of the kernels for all inputs: no data race, no out-of-bounds access, no deadlock, no memory leak, and results that
 // don't depend on the number of threads. scripts/sanitize.sh builds and runs this with sanitizers.
 //
-//   checks CHECK short|long     prints how many renders, forward and backward, or calls were checked
-//   checks simd                 prints the instruction set
+//   checks short|long CHECK…
+//
+// prints for each check how many renders, forward and backward, or calls were checked. Ends with exit code 3 if the instruction set that
+// GLOBALSPLAT_SIMD names isn't available. Arrays have their exact sizes, so that out-of-bounds reads are detected.
+#include "checks.h"
+
 #include <signal.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
-#include <algorithm>
-#include <array>
 #include <atomic>
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
-#include <cstring>
 #include <functional>
+#include <map>
 #include <stdexcept>
-#include <string>
 #include <thread>
 #include <type_traits>
 
 #include "../kernels/attention_types.h"
-#include "../kernels/jobs.h"
 #include "../kernels/kernels.h"
 #include "../kernels/multi_head_attention.h"
 #include "../kernels/parallel.h"
-#include "render.h"
 
 namespace globalsplat::checks {
 namespace {
@@ -43,80 +42,39 @@ void on_timeout(int) {
 }
 
 template <class T>
-void expect_same(const Results<T>& found, const Results<T>& one) {
-  const bool is_render = one.size() == std::size(kResults);
-  for (size_t k = 0; k < one.size(); ++k)
-    if (!have_same_bits(found[k], one[k])) fail(std::string(is_render ? kResults[k] : "results") + " differ from one thread's");
-}
-
-// Checks that run(num_threads) returns the same bits for each number of threads as for one thread. Returns the number of runs.
-template <class Run>
-int64_t same_bits(const std::string& name, const std::vector<int>& thread_counts, const Run& run) {
-  begin(name);
-  const auto one = run(1);
-  for (const int num_threads : thread_counts) {
-    begin(name + ", " + std::to_string(num_threads) + " threads");
-    expect_same(run(num_threads), one);
-  }
-  return 1 + int64_t(thread_counts.size());
+int64_t check_scene(const Scene<double>& scene, const std::vector<int>& thread_counts) {
+  const std::string name = scene.name + ", " + std::to_string(sizeof(T)) + " bytes, " + std::to_string(scene.bases) + " bases";
+  return check_same_bits(name, thread_counts, [scene = as<T>(scene)](int num_threads) { return rendered(scene, num_threads); });
 }
 
 template <class T>
-std::string type_name() {
-  return sizeof(T) == sizeof(float) ? "float32" : "float64";
-}
-
-template <class T>
-int64_t check_scene(const Scene<T>& scene, const std::vector<int>& thread_counts) {
-  return same_bits(scene.name + ", " + type_name<T>() + ", " + std::to_string(scene.bases) + " bases", thread_counts,
-                   [&](int num_threads) { return rendered(scene, num_threads); });
-}
-
-// Losses and their gradients, and a step of Adam. Arrays have their exact sizes, so that out-of-bounds reads are detected.
-template <class T>
-int64_t check_losses(const std::vector<int>& thread_counts) {
-  Random random(11);
-  const auto numbers = [&](size_t count) { return converted<T>(random.uniform(count, 0, 1)); };
-  int64_t count = 0;
-  // evaluate(gradient, num_threads) returns a loss, and writes the gradient's `all` values unless it is null.
-  const auto check = [&](const std::string& what, size_t all, const auto& evaluate) {
-    count += same_bits(what + ", " + type_name<T>(), thread_counts, [&](int num_threads) {
-      std::vector<T> gradient(all, T(num_threads));
-      const double value = evaluate(gradient.data(), num_threads);
-      expect(evaluate(nullptr, num_threads) == value, "the gradient changes the value");
-      return Results<double>{{value}, {gradient.begin(), gradient.end()}};
-    });
-  };
-  for (const auto& [planes, height, width] : {std::array<int, 3>{1, 11, 11}, {3, 12, 37}, {6, 43, 48}}) {
-    const size_t all = size_t(planes * height * width);
-    const std::vector<T> pictures = numbers(all), photos = numbers(all);
-    const raster::LossJob<T> job{pictures.data(), photos.data(), planes, width, height};
-    for (const double ssim_weight : {0.0, -0.2})
-      check("the photometric loss", all, [&](T* gradient, int num_threads) {
-        return raster::photometric<T>(job, 0.8, ssim_weight, gradient, num_threads);
+int64_t check_losses_of_cpu(const std::vector<int>& thread_counts) {
+  return check_losses<T>(
+      thread_counts,
+      [](int num_threads, const raster::LossJob<T>& job, double l1_weight, double ssim_weight, T* gradient) {
+        return raster::photometric<T>(job, l1_weight, ssim_weight, gradient, num_threads);
+      },
+      [](int num_threads, const raster::LossJob<T>& job, T* gradient) {
+        return raster::depth_smoothness<T>(job, 0.3, gradient, num_threads);
       });
-  }
-  for (const auto& [views, height, width] : {std::array<int, 3>{1, 1, 1}, {3, 12, 37}, {2, 43, 48}}) {
-    const size_t all = size_t(views * height * width);
-    const std::vector<T> depths = numbers(all), photos = numbers(3 * all);
-    const raster::LossJob<T> job{depths.data(), photos.data(), views, width, height};
-    check("smoothness", all, [&](T* gradient, int num_threads) {
-      return raster::depth_smoothness<T>(job, 0.3, gradient, num_threads);
-    });
-  }
-  const size_t many = 40'000;
-  const std::vector<T> gradient = numbers(many), start = numbers(many);
-  return count + same_bits("a step of Adam, " + type_name<T>(), thread_counts, [&](int num_threads) {
-    Results<T> state(3, start);
+}
+
+template <class T>
+int64_t check_adam(const std::vector<int>& thread_counts) {
+  return check_same_bits("a step of Adam", thread_counts, [&](int num_threads) {
+    Random random(11);
+    const size_t size = 40'000;
+    const std::vector<T> gradient = converted<T>(random.uniform(size, 0, 1));
+    Results<T> state(3, converted<T>(random.uniform(size, 0, 1)));
     raster::adam<T>({0.1, 0.5, 0.01, 0.9, 0.999, 1e-8}, {state[0].data(), gradient.data(), state[1].data(), state[2].data()},
-                    int64_t(many), num_threads);
+                    int64_t(size), num_threads);
     return state;
   });
 }
 
-// Steps of Muon on matrices of all shapes, with exactly the scratch memory that they request. parity/ compares their values.
+// Steps of Muon on matrices of all shapes, with exactly the scratch memory that they request.
 int64_t check_muon(const std::vector<int>& thread_counts) {
-  return same_bits("steps of Muon", thread_counts, [](int num_threads) {
+  return check_same_bits("steps of Muon", thread_counts, [](int num_threads) {
     Random random(12);
     Results<float> numbers;
     std::vector<raster::MuonMatrix> all;
@@ -141,13 +99,9 @@ void multiply_bf16(int64_t m, int64_t n, int64_t k, int64_t a_row, int64_t b_row
     }
 }
 
-float as_float(float number) { return number; }
-float as_float(raster::Bf16 number) { return raster::to_float(number); }
-
-// Computes attention, forward and backward, of random heads and a random gradient of the output. Returns all outputs. Arrays have their
-// exact sizes here, too.
+// Attention, forward and backward, of random heads and a random gradient of the output.
 template <class Number>
-Results<Number> attended(const raster::AttentionShape& shape, int num_threads) {
+int64_t check_attention(const raster::AttentionShape& shape, const std::vector<int>& thread_counts) {
   Random random(12);
   const int64_t row = shape.heads * shape.width, in = shape.queries * row, seen = shape.keys * row;
   const auto numbers = [&](int64_t count) {
@@ -161,111 +115,91 @@ Results<Number> attended(const raster::AttentionShape& shape, int num_threads) {
     return drawn;
   };
   const std::vector<Number> q = numbers(in), k = numbers(seen), v = numbers(seen), grad_out = numbers(in);
-  const auto unwritten = [&](const std::vector<Number>& like) { return std::vector<Number>(like.size(), Number(num_threads)); };
-  Results<Number> all{unwritten(q), unwritten(q), unwritten(k), unwritten(v)};
-  std::vector<float> log_sums(size_t(shape.scenes * shape.heads * shape.queries), float(num_threads));
   const raster::AttentionInputs<Number> inputs{{q.data(), in, row}, {k.data(), seen, row}, {v.data(), seen, row}};
   const raster::Bf16Gemm gemm = {multiply_bf16, [] {}};
-  raster::multi_head_attention<Number>(shape, inputs, {all[0].data(), in, row}, log_sums.data(), gemm, num_threads);
-  raster::multi_head_attention_backward<Number>(shape, inputs, {all[0].data(), in, row}, log_sums.data(), {grad_out.data(), in, row},
-                                                {{all[1].data(), in, row}, {all[2].data(), seen, row}, {all[3].data(), seen, row}}, gemm,
-                                                num_threads);
-  return all;
+  const std::string name = "attention of " + std::to_string(shape.queries) + " to " + std::to_string(shape.keys);
+  return check_same_bits(name, thread_counts, [&](int num_threads) {
+    const auto unwritten = [&](const std::vector<Number>& like) { return std::vector<Number>(like.size(), Number(num_threads)); };
+    Results<Number> all{unwritten(q), unwritten(q), unwritten(k), unwritten(v)};
+    std::vector<float> log_sums(size_t(shape.scenes * shape.heads * shape.queries), float(num_threads));
+    raster::multi_head_attention<Number>(shape, inputs, {all[0].data(), in, row}, log_sums.data(), gemm, num_threads);
+    raster::multi_head_attention_backward<Number>(shape, inputs, {all[0].data(), in, row}, log_sums.data(), {grad_out.data(), in, row},
+                                                  {{all[1].data(), in, row}, {all[2].data(), seen, row}, {all[3].data(), seen, row}}, gemm,
+                                                  num_threads);
+    return all;
+  });
 }
 
-template <class Number>
-int64_t check_attention(const std::vector<int>& thread_counts) {
-  int64_t count = 0;
+// Every scene's images and gradients, and all other results, are the same for any number of threads.
+int64_t check_bits(bool is_short) {
+  std::vector<int> thread_counts = {1, 2, 3, 16};
+  if (!is_short)
+    for (int num_threads = 4; num_threads < 16; ++num_threads) thread_counts.push_back(num_threads);
+  int64_t count = check_losses_of_cpu<float>(thread_counts) + check_losses_of_cpu<double>(thread_counts);
+  count += check_adam<float>(thread_counts) + check_adam<double>(thread_counts) + check_muon(thread_counts);
   for (const raster::AttentionShape& shape : {raster::AttentionShape{1, 1, 1, 1, 8},
                                               {2, 3, 7, 65, 8},
                                               {1, 2, 103, 385, 24},
                                               {1, 1, 1100, 300, 32},
                                               {1, 2, 50, 800, 64},
                                               {1, 1, 9, 20, raster::kAttentionWidth}})
-    count += same_bits("attention of " + std::to_string(shape.queries) + " to " + std::to_string(shape.keys), thread_counts,
-                       [&](int num_threads) {
-                         const Results<Number> all = attended<Number>(shape, num_threads);
-                         for (const auto& numbers : all)
-                           for (const Number number : numbers) expect(std::isfinite(as_float(number)), "attention isn't finite");
-                         return all;
-                       });
-  return count;
-}
-
-// Every scene's images and gradients are the same for any number of threads.
-int64_t bits(bool is_short) {
-  std::vector<int> thread_counts = {2, 3, 16};
-  if (!is_short)
-    for (int num_threads = 4; num_threads < 16; ++num_threads) thread_counts.push_back(num_threads);
-  int64_t count = check_losses<float>(thread_counts) + check_losses<double>(thread_counts) + check_muon(thread_counts);
-  count += check_attention<float>(thread_counts) + check_attention<raster::Bf16>(thread_counts);
-  size_t turn = 0;  // the short form covers all degrees, but one per scene
-  for (const int bases : {1, 4, 9, 16}) {
-    const std::vector<Scene<double>> scenes = all_scenes(bases);
-    for (size_t i = 0; i < scenes.size(); ++i)
-      if (!is_short || i % 4 == turn)
-        count += check_scene(as<float>(scenes[i]), thread_counts) + check_scene(scenes[i], thread_counts);
-    ++turn;
-  }
-  const Scene<double> many = many_gaussians(1);
-  return count + check_scene(as<float>(many), {16}) + check_scene(many, {16});
+    count += check_attention<float>(shape, thread_counts) + check_attention<raster::Bf16>(shape, thread_counts);
+  const auto check = [](const Scene<double>& scene, const std::vector<int>& thread_counts) {
+    return check_scene<float>(scene, thread_counts) + check_scene<double>(scene, thread_counts);
+  };
+  count += for_all_scenes(is_short, [&](const Scene<double>& scene) { return check(scene, thread_counts); });
+  return count + check(many_gaussians(1), {1, 16});
 }
 
 // Several threads render at the same time, each on several threads if available. The backward passes run in any order, on other threads
 // than the forward passes, or not at all.
 template <class T>
-int64_t callers_of(const std::vector<Scene<double>>& all, int rounds) {
-  std::vector<Scene<T>> scenes;
+int64_t check_callers(const std::vector<Scene<T>>& scenes, int rounds) {
   std::vector<Results<T>> one;
   begin("one thread");
-  for (const Scene<double>& scene : all) scenes.push_back(as<T>(scene));
   for (const Scene<T>& scene : scenes) one.push_back(rendered(scene, 1));
   const size_t count = scenes.size();
-  int64_t checked = 0;
   for (int round = 0; round < rounds; ++round) {
-    begin("several callers, " + type_name<T>());
     std::vector<Render<T>> renders;
     for (const Scene<T>& scene : scenes) renders.emplace_back(scene, 2 + round % 3);
-    const auto at_once = [&](const auto& act) {
+    // Calls act(i) for all renders at once. Afterwards, `finish` calls what remains to be done.
+    const auto check = [&](const char* name, const auto& act, const std::function<void()>& finish) {
+      begin(name);
       std::vector<std::thread> callers;
-      for (size_t i = 0; i < count; ++i) callers.emplace_back([&, i] { act(i); });
+      for (size_t i = 0; i < count; ++i) callers.emplace_back([&, i] { act(renders[i], i); });
       for (std::thread& caller : callers) caller.join();
+      finish();
+      for (size_t i = 0; i < count; ++i) expect_same(renders[i].results, one[i]);
     };
-    at_once([&](size_t i) {
-      renders[i].draw();
-      renders[i].backward();
+    check("several callers", [](Render<T>& render, size_t) { render.draw(), render.backward(); }, [] {});
+    check("frames out of order", [](Render<T>& render, size_t) { render.draw(); }, [&] {
+      for (size_t i = 0; i < count; ++i) std::thread([&] { renders[(i + 1 + size_t(round)) % count].backward(); }).join();
     });
-    for (size_t i = 0; i < count; ++i) expect_same(renders[i].results(), one[i]);
-
-    begin("frames out of order, " + type_name<T>());
-    at_once([&](size_t i) { renders[i].draw(); });
-    for (size_t i = 0; i < count; ++i) std::thread([&] { renders[(i + 1 + size_t(round)) % count].backward(); }).join();
-    for (size_t i = 0; i < count; ++i) expect_same(renders[i].results(), one[i]);
-
-    begin("frames dropped while others are drawn, " + type_name<T>());
-    at_once([&](size_t i) {
-      if (i % 2 == 0) renders[i].backward();
-      renders[i].drop();
-      renders[i].draw();
-      if (i % 2 == 1) renders[i].backward();
-    });
-    for (size_t i = 0; i < count; ++i) expect_same(renders[i].results(), one[i]);
-    checked += 3 * int64_t(count);
+    check("frames dropped while others are drawn", [](Render<T>& render, size_t i) {
+      if (i % 2 == 0) render.backward();
+      render.frame.reset();
+      render.draw();
+      if (i % 2 == 1) render.backward();
+    }, [] {});
   }
-  return checked;
+  return rounds * 3 * int64_t(count);
 }
 
-int64_t callers(bool is_short) {
-  std::vector<Scene<double>> scenes;
+int64_t check_callers(bool is_short) {
+  std::vector<Scene<float>> singles;
+  std::vector<Scene<double>> doubles;
   for (const Scene<double>& scene : all_scenes(4))
     for (const char* name : {"two scenes, two views", "17x3", "several tasks", "opaque stack", "no Gaussian"})
-      if (scene.name == name) scenes.push_back(scene);
+      if (scene.name == name) {
+        singles.push_back(as<float>(scene));
+        doubles.push_back(scene);
+      }
   const int rounds = is_short ? 3 : 12;
-  return callers_of<float>(scenes, rounds) + callers_of<double>(scenes, rounds);
+  return check_callers(singles, rounds) + check_callers(doubles, rounds);
 }
 
 // Calls from tasks, and tasks that fail.
-int64_t threads(bool is_short) {
+int64_t check_threads(bool is_short) {
   std::atomic<int64_t> sum{0};
   const std::function<void(int64_t)> add = [&](int64_t i) { sum += i; };
   const int rounds = is_short ? 20 : 1000;
@@ -293,7 +227,7 @@ int64_t threads(bool is_short) {
 }
 
 // A child process renders correctly; it has a copy of everything but the threads.
-int64_t children(bool is_short) {
+int64_t check_children(bool is_short) {
   Random random(10);
   const Scene<float> scene = as<float>(random_scene(random, "small", 20, 20, 2, 2, 40, 4));
   const Results<float> one = rendered(scene, 1);
@@ -322,8 +256,9 @@ void begin(std::string what) {
   alarm(kTimeoutSeconds);
 }
 
-void fail(const std::string& what) {
-  std::fprintf(stderr, "FOUND: %s: %s\n", now.c_str(), what.c_str());
+void expect(bool holds, const char* what) {
+  if (holds) return;
+  std::fprintf(stderr, "FOUND: %s: %s\n", now.c_str(), what);
   std::_Exit(1);
 }
 
@@ -331,29 +266,19 @@ void fail(const std::string& what) {
 
 int main(int count, char** arguments) {
   using namespace globalsplat;
-  const struct {
-    const char* name;
-    int64_t (*run)(bool is_short);
-  } known[] = {{"bits", checks::bits},
-               {"callers", checks::callers},
-               {"threads", checks::threads},
-               {"orders", checks::orders},
-               {"children", checks::children}};
+  const std::map<std::string, int64_t (*)(bool is_short)> known = {{"bits", checks::check_bits},
+                                                                   {"callers", checks::check_callers},
+                                                                   {"threads", checks::check_threads},
+                                                                   {"orders", checks::check_orders},
+                                                                   {"children", checks::check_children}};
   signal(SIGALRM, checks::on_timeout);
-  const std::string check = count > 1 ? arguments[1] : "";
-  if (check == "simd") {
-    try {
-      std::puts(raster::kernels().name);
-      return 0;
-    } catch (const std::invalid_argument&) {
-      return 1;  // GLOBALSPLAT_SIMD names a set that isn't available
-    }
+  try {
+    raster::kernels();
+  } catch (const std::invalid_argument&) {
+    return 3;
   }
-  for (const auto& one : known)
-    if (check == one.name && count == 3) {
-      std::printf("%lld\n", static_cast<long long>(one.run(std::strcmp(arguments[2], "short") == 0)));
-      return 0;
-    }
-  std::fprintf(stderr, "checks simd, or bits, callers, threads, orders or children, and short or long\n");
-  return 2;
+  for (int k = 2; k < count; ++k) {
+    const bool is_short = std::strcmp(arguments[1], "short") == 0;
+    std::printf("%s: %lld\n", arguments[k], static_cast<long long>(known.at(arguments[k])(is_short)));
+  }
 }
