@@ -241,7 +241,20 @@ def operations(bench, only):
         "train": train,
         "train, resumed": train,
         "eval": [*evaluate, out],
-        "synth": ["synth", "--out", out, "--scenes", 2, "--frames", 3, "--size", 16, "--depth"],
+        "synth": [
+            "synth",
+            "--out",
+            out,
+            "--scenes",
+            2,
+            "--frames",
+            3,
+            "--size",
+            16,
+            "--depth",
+            "--contact-sheet",
+            out / "sheet.png",
+        ],
     }
     replacing = {
         "reconstruct": [*reconstruct, out / "room.ply"],

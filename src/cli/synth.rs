@@ -90,7 +90,11 @@ impl Synth {
                 if self.depth && !file.exists() {
                     self.write_depths(&file, &videos.capture(number)?)?;
                 }
-                note(capture)
+                // The images of the chunk are JPEGs: the sheet shows what they were made of.
+                match self.contact_sheet.is_some() && number < SHEET.0 {
+                    true => note(&videos.capture(number)?),
+                    false => note(capture),
+                }
             },
         )?;
         let numbers: Vec<usize> = (made_before..self.scenes as usize).collect();

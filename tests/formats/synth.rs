@@ -38,15 +38,16 @@ fn interrupted_synth_resumes() {
         let settings = ["--scenes", scenes, "--frames", frames, "--size", size, "--seed", seed, "--depth"];
         [&["synth", "--out", arg(&out)][..], &settings].concat()
     };
-    let arguments = synth(["2", "3", "24", "0"]);
+    let sheet = folder.path().join("sheet.png");
+    let arguments = [&synth(["2", "3", "24", "0"])[..], &["--contact-sheet", arg(&sheet)]].concat();
     succeed(&arguments);
-    let files = [&indices[0], &indices[1], &out.join("depth/0_000001.npy"), &chunk];
+    let files = [&indices[0], &indices[1], &out.join("depth/0_000001.npy"), &sheet, &chunk];
     let read = || files.map(|file| std::fs::read(file).unwrap());
     let (before, written) = (read(), || chunk.metadata().unwrap().modified().unwrap());
     let when = written();
 
     // Simulates a process that was stopped before it wrote the index, and a lost file.
-    files[..3].iter().for_each(|lost| std::fs::remove_file(lost).unwrap());
+    files[..4].iter().for_each(|lost| std::fs::remove_file(lost).unwrap());
     succeed(&arguments);
     assert!(read() == before);
     assert_eq!(written(), when, "made anew");
@@ -57,7 +58,7 @@ fn interrupted_synth_resumes() {
         let error = refuse(&synth(other));
         assert!(error.contains("000000.torch: the output is an existing chunk"), "{other:?}: {error}");
     }
-    assert!(std::fs::read(&chunk).unwrap() == before[3], "lost");
+    assert!(std::fs::read(&chunk).unwrap() == before[4], "lost");
 }
 
 /// Projects a pixel of `from` at `depth` metres into `to`; returns its position in pixels, and its depth there.
