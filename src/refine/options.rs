@@ -1,4 +1,5 @@
-//! Options of a refinement. docs/refine.md has the measurements by which the defaults of the settings were chosen.
+//! Options of a refinement. docs/experiments.md has the measurements by which the defaults of the settings
+//! were chosen.
 
 use crate::data::{Capture, Holdout, PhotoSize};
 use crate::error::{Error, Result};
