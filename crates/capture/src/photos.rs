@@ -323,11 +323,7 @@ mod tests {
         for (i, &a) in names.iter().enumerate() {
             assert!(natural_order(a, a).is_eq(), "{a}");
             for &b in &names[i + 1..] {
-                assert_eq!(
-                    (natural_order(a, b), natural_order(b, a)),
-                    (Ordering::Less, Ordering::Greater),
-                    "{a} {b}"
-                );
+                assert!(natural_order(a, b).is_lt() && natural_order(b, a).is_gt(), "{a} {b}");
             }
         }
     }

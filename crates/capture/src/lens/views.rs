@@ -219,15 +219,13 @@ mod tests {
     const THIN_PRISM: [f64; 12] =
         [250., 249., 178., 123., -0.03, 0.01, 0.001, -0.002, 0.001, 0.0, 0.002, -0.001];
 
-    /// Returns the position of `ray`, in the photo's axes, in the image of `view`, or `None` if it is outside.
-    fn position_in(view: &PinholeView, ray: DVec3) -> Option<DVec2> {
-        let ray = view.rotation.transpose() * ray;
+    /// Returns `true` if the image of `view` shows `ray`, in the view's axes.
+    fn is_inside(view: &PinholeView, ray: DVec3) -> bool {
         let Intrinsics { fx, fy, cx, cy } = view.intrinsics;
         let point = DVec2::new(fx * ray.x / ray.z + cx, fy * ray.y / ray.z + cy);
         let size = DVec2::new(view.size.width.into(), view.size.height.into());
         let rounding = 1e-9;
-        let is_inside = point.min_element() >= -rounding && (size - point).min_element() >= -rounding;
-        (ray.z > 0. && is_inside).then_some(point)
+        ray.z > 0. && point.min_element() >= -rounding && (size - point).min_element() >= -rounding
     }
 
     #[test]
@@ -241,13 +239,11 @@ mod tests {
                 let pixel = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
                 let Some(ray) = lens.unproject_used(pixel) else { continue };
                 count += 1;
-                let seen = views.iter().filter_map(|view| Some((view, position_in(view, ray)?)));
-                let mut seen = seen.peekable();
-                assert!(seen.peek().is_some(), "{pixel} of {lens:?} in {views:?}");
-                for (view, point) in seen {
-                    // The view takes the color of its point from the pixel.
-                    let Intrinsics { fx, fy, cx, cy } = view.intrinsics;
-                    let ray = DVec3::new((point.x - cx) / fx, (point.y - cy) / fy, 1.);
+                let rays = views.iter().map(|view| (view, view.rotation.transpose() * ray));
+                let mut shown = rays.filter(|(view, ray)| is_inside(view, *ray)).peekable();
+                assert!(shown.peek().is_some(), "{pixel} of {lens:?} in {views:?}");
+                for (view, ray) in shown {
+                    // The view takes the color of its ray from the pixel.
                     let projection = Projection { lens, rotation: view.rotation };
                     let found = projection.position(ray).unwrap_or_else(|| panic!("{pixel} of {lens:?}"));
                     assert!((found - pixel).length() < 1e-6, "{found} for {pixel} of {lens:?}");
@@ -260,14 +256,14 @@ mod tests {
     /// A file can claim any parameters, and views have to fit into memory.
     #[test]
     fn views_have_no_more_pixels_than_the_photo_has_many_times() {
-        for (lens, width, height) in [
-            (lens("EUCM", &[1e6, 1e6, 32., 24., 0.99, 1e10], 64, 48), 64, 48),
-            (lens("EUCM", &[1e9, 1e9, 0.5, 0.5, 0.99, 1e16], 1, 1), 1, 1),
+        let pixels = |size: ImageSize| size.width * size.height;
+        for lens in [
+            lens("EUCM", &[1e6, 1e6, 32., 24., 0.99, 1e10], 64, 48),
+            lens("EUCM", &[1e9, 1e9, 0.5, 0.5, 0.99, 1e16], 1, 1),
         ] {
-            let pixels =
-                split_into_views(&lens).iter().map(|view| view.size.width * view.size.height).sum::<u32>();
+            let found: u32 = split_into_views(&lens).iter().map(|view| pixels(view.size)).sum();
             // Sizes are rounded up.
-            assert!(pixels <= 16 * width * height + 6 * 64, "{pixels} pixels");
+            assert!(found <= 16 * pixels(lens.size) + 6 * 64, "{found} pixels");
         }
     }
 
@@ -296,11 +292,9 @@ mod tests {
                     along(width).any(|u| is_shown(u, margin)),
                     along(width).any(|u| is_shown(u, height - margin)),
                 ];
-                let is_axis = extents.map(|extent| extent < margin);
-                assert!(
-                    shows.iter().zip(is_axis).all(|(shows, is_axis)| *shows || is_axis),
-                    "{view:?} of {lens:?}"
-                );
+                for (shows, extent) in shows.into_iter().zip(extents) {
+                    assert!(shows || extent < margin, "{view:?} of {lens:?}");
+                }
             }
         }
     }

@@ -100,7 +100,7 @@ pub(super) fn resample_planes(image: &RgbImage, region: Region, size: ImageSize)
 mod tests {
     use super::*;
     use crate::geometry::Intrinsics;
-    use glam::DMat4;
+    use glam::{DMat4, DVec2};
 
     fn camera(width: u32, height: u32) -> Camera {
         let (w, h) = (f64::from(width), f64::from(height));
@@ -116,12 +116,13 @@ mod tests {
             // 1080×1920 → 72×128 → 72×48 → 192×128.
             (1080, 1920, [128, 192], [500. * 192. / 1080., 510. * 128. / 1920. * 128. / 48.]),
         ] {
-            let k = resize_and_crop(&RgbImage::new(width, height), &camera(width, height), size.into())
-                .1
-                .intrinsics;
-            assert!((k.fx - fx).abs() < 1e-9 && (k.fy - fy).abs() < 1e-9, "{k:?}");
+            let image = RgbImage::new(width, height);
+            let (_, Camera { intrinsics: k, .. }) =
+                resize_and_crop(&image, &camera(width, height), size.into());
             let [cy, cx] = size.map(|count| f64::from(count) / 2.);
-            assert!((k.cx - cx).abs() < 1e-9 && (k.cy - cy).abs() < 1e-9, "{k:?}");
+            for (found, expected) in [(k.fx, fx), (k.fy, fy), (k.cx, cx), (k.cy, cy)] {
+                assert!((found - expected).abs() < 1e-9, "{k:?}");
+            }
         }
         // At least a pixel of a row or a column is left.
         for size in [[1, 4000], [4000, 1], [11, 2000]] {
@@ -148,26 +149,19 @@ mod tests {
     #[test]
     fn resizing_keeps_the_rays_of_pixels() {
         // A bright dot on black keeps its ray. The dot's position in the fitted image is its centroid.
-        let (x, y) = (300u32, 200u32);
-        let mut image = RgbImage::new(640, 360);
-        for dy in 0..8 {
-            for dx in 0..8 {
-                image.put_pixel(x + dx, y + dy, image::Rgb([255; 3]));
-            }
-        }
+        let is_dot = |x, y| (300..308).contains(&x) && (200..208).contains(&y);
+        let image = RgbImage::from_fn(640, 360, |x, y| image::Rgb([if is_dot(x, y) { 255 } else { 0 }; 3]));
         let before = camera(640, 360);
         let (fitted, after) = resize_and_crop(&image, &before, [128, 128].into());
-        let (mut weight, mut sx, mut sy) = (0., 0., 0.);
-        for (px, py, p) in fitted.to_rgb().enumerate_pixels() {
-            let v = f64::from(p.0[0]);
-            (weight, sx, sy) = (weight + v, sx + v * (f64::from(px) + 0.5), sy + v * (f64::from(py) + 0.5));
+        let (mut weight, mut sum) = (0., DVec2::ZERO);
+        for (x, y, pixel) in fitted.to_rgb().enumerate_pixels() {
+            let level = f64::from(pixel[0]);
+            weight += level;
+            sum += level * (DVec2::new(x.into(), y.into()) + 0.5);
         }
-        let ray = |k: Intrinsics, u: f64, v: f64| ((u - k.cx) / k.fx, (v - k.cy) / k.fy);
-        let found = ray(after.intrinsics, sx / weight, sy / weight);
-        let expected = ray(before.intrinsics, f64::from(x) + 4., f64::from(y) + 4.);
-        assert!(
-            (found.0 - expected.0).abs() < 2e-3 && (found.1 - expected.1).abs() < 2e-3,
-            "{found:?} {expected:?}"
-        );
+        let ray = |k: Intrinsics, pixel: DVec2| (pixel - DVec2::new(k.cx, k.cy)) / DVec2::new(k.fx, k.fy);
+        let found = ray(after.intrinsics, sum / weight);
+        let expected = ray(before.intrinsics, DVec2::new(304., 204.));
+        assert!(found.abs_diff_eq(expected, 2e-3), "{found} {expected}");
     }
 }
