@@ -81,18 +81,12 @@ fn files_of_torch_are_read() {
     assert_eq!(array("weight").bytes, array("transposed").bytes);
 }
 
+/// Truncated files are refused. No flipped bit makes the reader panic, and none changes a tensor unnoticed.
 #[test]
-fn files_that_were_cut_off_are_refused() {
-    for length in 0..BYTES.len() {
-        let error = TorchFile::parse(Path::new("zip.pt"), &BYTES[..length]).expect_err("a refusal");
-        assert!(error.is_invalid_request() && error.to_string().starts_with("zip.pt"), "{error}");
-    }
-}
-
-/// No flipped bit makes the reader panic, and none changes a tensor unnoticed.
-#[test]
-fn damaged_files_do_not_panic() {
+fn truncated_and_damaged_files_do_no_harm() {
     for position in 0..BYTES.len() {
+        let error = TorchFile::parse(Path::new("zip.pt"), &BYTES[..position]).expect_err("a refusal");
+        assert!(error.is_invalid_request() && error.to_string().starts_with("zip.pt"), "{error}");
         let mut flipped = BYTES.to_vec();
         flipped[position] ^= 1 << (position % 8);
         let Ok(file) = TorchFile::parse(Path::new("zip.pt"), &flipped) else { continue };
