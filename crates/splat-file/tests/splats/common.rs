@@ -1,6 +1,7 @@
 //! Test utilities: splats, files that other programs would write, and checks of error messages.
 #![allow(dead_code)] // the program's tests use only a part
 
+use glam::{DVec4, Vec3};
 use globalsplat_splat_file::{Error, SH_C0, Splat, read_splat, write_splat};
 use rand::rngs::StdRng;
 use rand::{Rng, SeedableRng};
@@ -46,26 +47,19 @@ pub fn largest_error(a: &[f32], b: &[f32]) -> f64 {
 
 /// Returns the difference between rotations, from quaternions of any length; q and −q are the same rotation.
 fn rotation_error(a: &Splat, b: &Splat) -> f64 {
-    let unit = |quaternion: &[f32; 4]| {
-        let length = quaternion.iter().map(|&part| f64::from(part).powi(2)).sum::<f64>().sqrt();
-        quaternion.map(|part| f64::from(part) / length)
-    };
+    let unit = |quaternion: &[f32; 4]| DVec4::from(quaternion.map(f64::from)).normalize();
     let errors = a.quaternions.iter().zip(&b.quaternions).map(|(a, b)| {
         let (a, b) = (unit(a), unit(b));
-        let sign = a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>().signum();
-        a.iter().zip(b).map(|(a, b)| (a - sign * b).abs()).fold(0., f64::max)
+        (a - a.dot(b).signum() * b).abs().max_element()
     });
     errors.fold(0., f64::max)
 }
 
 /// Reorders the Gaussians of `to` to match `from`, each to its nearest.
 pub fn matched(from: &Splat, to: &Splat) -> Splat {
-    let distance =
-        |a: &[f32; 3], b: &[f32; 3]| -> f32 { a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum() };
-    let nearest_to = |mean| {
-        let nearer =
-            |a: &usize, b: &usize| distance(mean, &to.means[*a]).total_cmp(&distance(mean, &to.means[*b]));
-        (0..to.len()).min_by(nearer).expect("a Gaussian")
+    let nearest_to = |&mean: &[f32; 3]| {
+        let distance = |index: usize| Vec3::from(mean).distance_squared(to.means[index].into());
+        (0..to.len()).min_by(|&a, &b| distance(a).total_cmp(&distance(b))).expect("a Gaussian")
     };
     let nearest: Vec<usize> = from.means.iter().map(nearest_to).collect();
     let distinct: std::collections::HashSet<_> = nearest.iter().collect();
@@ -174,6 +168,16 @@ pub fn assert_bytes_refused(ending: &str, bytes: &[u8], parts: &[&str]) {
     let error = refusal(read_bytes(ending, bytes));
     assert_says(&error, &[&format!("a.{ending}: ")]);
     assert_says(&error, parts);
+}
+
+/// Checks that a file of the format `ending` is refused after bytes at an offset are replaced, each case with a message of its own.
+#[track_caller]
+pub fn assert_changes_refused(ending: &str, whole: &[u8], cases: &[(usize, &[u8], &str)]) {
+    for (at, replacement, message) in cases {
+        let mut bytes = whole.to_vec();
+        bytes[*at..][..replacement.len()].copy_from_slice(replacement);
+        assert_bytes_refused(ending, &bytes, &[message]);
+    }
 }
 
 /// Returns the offset of the first byte after the header of a PLY.

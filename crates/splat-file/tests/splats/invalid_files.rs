@@ -27,6 +27,8 @@ fn assert_headers_are_refused(ending: &str, cases: &[(&str, &str, &str)]) {
 
 #[test]
 fn bad_plys() {
+    let huge = "vertex 18446744073709551615";
+    let faces = "element face 1000000000000\nproperty list uchar int i\nelement vertex";
     let cases = [
         ("little", "middle", "the format is binary_middle_endian"),
         ("format", "comment", "the line format is missing"),
@@ -38,17 +40,9 @@ fn bad_plys() {
         ("float opacity", "list float opacity", "the type of opacity"),
         ("float opacity", "list uchar float opacity", "property opacity is a list"),
         ("f_rest_8", "f_rest_9", "f_rest_* is 8 properties"),
-        (
-            "vertex 300",
-            "vertex 18446744073709551615",
-            "x in row 300 of vertex is cut short, expected numbers",
-        ),
+        ("vertex 300", huge, "x in row 300 of vertex is cut short, expected numbers"),
         ("binary_little_endian", "ascii", "in row 0 of vertex is"),
-        (
-            "element vertex",
-            "element face 1000000000000\nproperty list uchar int i\nelement vertex",
-            "of face is cut short, expected numbers in 1000000000000 rows",
-        ),
+        ("element vertex", faces, "of face is cut short, expected numbers in 1000000000000 rows"),
     ];
     assert_headers_are_refused("ply", &cases);
     assert_bytes_refused("ply", b"hello", &["the file is no PLY"]);

@@ -172,15 +172,35 @@ fn files_are_recognized() {
     }
     assert_eq!(find_splat(folder.path(), "a"), folder.path().join("a.compressed.ply"));
     assert_eq!(find_splat(folder.path(), "b"), folder.path().join("b.ply"));
-    assert!(is_splat_name(Path::new("A.Compressed.PLY")) && is_splat_name(Path::new("a.spz")));
-    assert!(!is_splat_name(Path::new("a.obj")));
-    for (name, message) in [("a.obj", "the ending is .obj"), ("a", "the ending is missing")] {
-        let error = write_splat(&folder.path().join(name), &splat).unwrap_err();
-        assert!(error.is_invalid_request());
-        let expected =
-            "expected .ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf, .ksplat or meta.json";
-        assert_says(&error.to_string(), &[message, expected]);
+}
+
+/// Every function that writes refuses a name that stands for no format that is written.
+#[test]
+fn names_without_a_format_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let splat = random_splat(3, 0, 1);
+    let written = "expected .ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf";
+    let read = format!("{written}, .ksplat or meta.json");
+    for (name, message, formats) in [
+        ("a.obj", "the ending is .obj", &*read),
+        ("a", "the ending is missing", &read),
+        ("a.ksplat", "the format is .ksplat, which is only read", written),
+    ] {
+        let path = folder.path().join(name);
+        for error in [
+            write_splat(&path, &splat).unwrap_err(),
+            check_writable_splat(&path).unwrap_err(),
+            output_format(&path).err().unwrap(),
+        ] {
+            assert!(error.is_invalid_request());
+            assert_says(&error.to_string(), &[message, formats]);
+        }
     }
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+    for name in ["A.Compressed.PLY", "a.spz", "a.ksplat"] {
+        assert!(is_splat_name(Path::new(name)), "{name}");
+    }
+    assert!(!is_splat_name(Path::new("a.obj")));
 }
 
 /// The origin keeps the precision of positions far from zero, and a splat in world coordinates has none.

@@ -112,8 +112,7 @@ fn bad_images_and_archives() {
     fs::write(&file, b"RIFF").unwrap();
     assert_refused(&path, &["quats.webp is damaged"]);
     fs::remove_file(&file).unwrap();
-    let error = read_splat(&path).unwrap_err().to_string();
-    assert_says(&error, &["quats.webp"]);
+    assert_says(&read_splat(&path).unwrap_err().to_string(), &["quats.webp"]);
     let bundle = bytes_of("sog", &splat);
     assert_bytes_refused("sog", &bundle[..300], &["the file is damaged", "a ZIP archive"]);
     assert_bytes_refused("sog", b"no archive", &["the file is damaged"]);

@@ -1,8 +1,8 @@
 //! Values that the properties and bytes of files stand for.
 
 use super::common::{
-    assert_bytes_refused, assert_says, body_of_ply, bytes_of, largest_error, random_splat, read_bytes,
-    round_trip, small_gaussians, write_ply,
+    assert_refused, assert_says, body_of_ply, bytes_of, largest_error, random_splat, read_bytes, round_trip,
+    set, small_gaussians, write_changed_ply, write_ply,
 };
 use globalsplat_splat_file::{MIN_SCALE, OPACITY_MARGIN, SH_C0, read_splat};
 
@@ -58,15 +58,13 @@ fn a_ply_is_read_however_it_is_written() {
 /// are kept in memory, and written as finite numbers.
 #[test]
 fn infinite_logits_are_opacities_of_0_and_1() {
-    let mut bytes = bytes_of("ply", &random_splat(1, 0, 3));
-    let body = bytes.len() - 17 * 4;
-    let set = |bytes: &mut Vec<u8>, column: usize, number: f32| {
-        bytes[body + 4 * column..][..4].copy_from_slice(&number.to_le_bytes());
-    };
+    let folder = tempfile::tempdir().unwrap();
     for (logit, opacity) in [(f32::INFINITY, 1.), (f32::NEG_INFINITY, 0.)] {
-        set(&mut bytes, 9, logit);
-        set(&mut bytes, 10, f32::NEG_INFINITY);
-        let splat = read_bytes("ply", &bytes).unwrap();
+        let file = write_changed_ply(folder.path(), "infinite.ply", |columns| {
+            set(columns, "opacity", 0, logit.into());
+            set(columns, "scale_0", 0, f64::NEG_INFINITY);
+        });
+        let splat = read_splat(&file).unwrap().select(&[0]);
         assert_eq!((splat.opacity_logits[0], splat.log_scales[0][0]), (logit, f32::NEG_INFINITY));
         assert_eq!((splat.opacity(0), splat.scale(0)[0]), (opacity, 0.));
         let copy = round_trip("ply", &splat);
@@ -77,8 +75,8 @@ fn infinite_logits_are_opacities_of_0_and_1() {
             assert_eq!((copy.opacity_logits[0], copy.log_scales[0][0]), (logit, f32::NEG_INFINITY));
         }
     }
-    set(&mut bytes, 10, 89.);
-    assert_bytes_refused("ply", &bytes, &["scale_0 of vertex 0 is 89", "at most 88"]);
+    let file = write_changed_ply(folder.path(), "large.ply", |columns| set(columns, "scale_0", 0, 89.));
+    assert_refused(&file, &["scale_0 of vertex 0 is 89", "at most 88"]);
 }
 
 /// Bytes are the colors themselves in older files, without bounds of colors.
@@ -86,11 +84,10 @@ fn infinite_logits_are_opacities_of_0_and_1() {
 fn older_compressed_plys_are_read() {
     let bytes = bytes_of("compressed.ply", &random_splat(2, 0, 4));
     let (header, body) = bytes.split_at(body_of_ply(&bytes));
-    let header = ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"]
-        .iter()
-        .fold(String::from_utf8(header.to_vec()).unwrap(), |header, name| {
-            header.replace(&format!("property float {name}\n"), "")
-        });
+    let mut header = String::from_utf8(header.to_vec()).unwrap();
+    for name in ["min_r", "min_g", "min_b", "max_r", "max_g", "max_b"] {
+        header = header.replace(&format!("property float {name}\n"), "");
+    }
     let vertices = &body[18 * 4..];
     let read = read_bytes("ply", &[header.as_bytes(), &body[..12 * 4], vertices].concat()).unwrap();
     let red = f64::from(vertices[15]) / 255.; // the highest byte of the fourth word
