@@ -110,7 +110,7 @@ fn threads_do_not_change_the_bytes() {
     for options in ["--gaussians 500", "--init model --gaussians 6000"] {
         let bytes = |threads: &str, seed: &str| {
             let line = format!(
-                "refine --scene @world/000000.torch#7_000000 --out @a.ply --steps 60 --seed {seed} \
+                "refine --scene @world/000000.torch#7_000000 --out @a.ply --steps 120 --seed {seed} \
                  --set relocate_every=7 {options}"
             );
             let done =

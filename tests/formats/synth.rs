@@ -76,7 +76,7 @@ fn depths_and_poses_carry_one_view_into_the_next() {
     const SIDE: u32 = 96;
     let mut compared = 0;
     for index in 0..6 {
-        let video = Video::new(11, index, &settings(24, SIDE));
+        let video = Video::new(3, index, &settings(24, SIDE));
         // Near enough that little of what one view sees is occluded in the other.
         let frames = [6, 12];
         let [from, to] = frames.map(|i| &video.cameras()[i]);
