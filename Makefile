@@ -97,7 +97,7 @@ check-op: build
 	scripts/check_op.sh
 
 # Everything: `make test`, and what takes longer than it finds. CONTRIBUTING.md says which change needs which part.
-SLOW_CHECKS := check-ignored check-docs check-features check-packages check-licenses check-robustness check-machines check-demos check-dist check-wheel
+SLOW_CHECKS := check-ignored check-docs check-features check-packages check-licenses check-robustness check-machines check-demos dist check-wheel
 .PHONY: test-all slow-checks $(SLOW_CHECKS)
 test-all: build
 	@scripts/count_skips.sh $(MAKE) --no-print-directory --keep-going SELF_TEST=0/1 checks slow-checks
@@ -139,8 +139,7 @@ check-demos: build
 	OUT=target/demo_training scripts/demo_training.sh --dry-run
 	DEVICE=cpu OUT=target/on_a_gpu scripts/on_a_gpu.sh --dry-run
 # Packs the program with all that it needs to run on another Linux without a GPU, into target/dist. See docs/start.md.
-.PHONY: dist
-dist check-dist: setup
+dist: setup
 	@scripts/dist.sh
 # Builds the wheel of the Python package, python/, into target/wheels; check-wheel tests it in a fresh virtual environment.
 .PHONY: wheel

@@ -290,7 +290,7 @@ def main():
     one = ("GROUP", "N", "KIND", "STICKY")
     parser.add_argument("--fault", nargs=4, metavar=one, help="inject only this fault, as printed with a failure")
     arguments = parser.parse_args()
-    failures = 0
+    failures = injected = 0
     print("| operation | calls | faults injected | failures |\n|---|---|---|---|")
     with tempfile.TemporaryDirectory(prefix="faults-") as folder:
         for op in operations(Bench(Path(folder).resolve()), arguments.only):
@@ -309,6 +309,9 @@ def main():
             counts = ", ".join(f"{group} {op.groups[group]}" for group in FAULTS if op.groups[group])
             print(f"| {op.name} | {counts} | {len(results)} | {failed} |", flush=True)
             failures += failed
+            injected += len(results)
+    if injected == 0:
+        parser.error("no operation of this name, or no call of this fault")
     return int(failures > 0)
 
 

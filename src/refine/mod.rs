@@ -1,5 +1,5 @@
-//! Refinement of a splat on the photos that it has to match, in seconds. Without a splat, refinement starts from the depths on which the photos agree. [`RefineSession`] does all of it, from a capture to a
-//! splat and its scores.
+//! Optimizes a splat on posed photos, in seconds. Without an initial splat, Gaussians are initialized where the depths of several photos
+//! agree. [`RefineSession`] runs everything, from a capture to a splat and its scores.
 
 mod events;
 mod exposures;
@@ -61,12 +61,12 @@ pub(crate) struct OptimizeArgs<'a> {
     pub options: &'a RefineOptions,
     /// Number of steps, or time.
     pub budget: Budget,
-    /// Where an earlier optimization has ended that this one continues. The budget includes its steps and its time.
+    /// Progress of the earlier optimization that this one continues. The budget includes its steps and its time.
     pub progress: TrainProgress,
 }
 
 /// Optimizes the Gaussians of `optimizer` and the corrections of the photos, and records the time of each part of a step in `stopwatch`.
-/// `on_step` is called after every step and ends the work if it returns `false`. Returns where it has ended.
+/// `on_step` is called after every step and ends the work if it returns `false`. Returns the progress at the end.
 ///
 /// # Errors
 /// Fails if rendering fails.

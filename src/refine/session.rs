@@ -19,12 +19,15 @@ use crate::metrics::{CaptureScores, ContactSheet, Perceptual, Scores, score_view
 use crate::reconstruct::{LoadedModel, Model, reconstruct, spread_over_path};
 use crate::scene::{Camera, Gaussians, LocalFrame, RawGaussians};
 use crate::stereo::DepthMap;
+use globalsplat_capture::format_names;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 use tch::Tensor;
 
 /// Divisor of the maximum number of initial Gaussians of a model: 1/`MODEL_SHARE` of all.
 const MODEL_SHARE: usize = 3;
+/// Number of photos that a warning names.
+const SHOWN_NAMES: usize = 3;
 /// Number of steps between metrics.
 const METRICS_EVERY: u64 = 50;
 /// Maximum number of photos that LPIPS compares if no views are held out.
@@ -39,7 +42,7 @@ const MAX_SAMPLE_PIXELS: u64 = 1_200_000;
 /// Result of a session.
 #[derive(Debug)]
 pub struct RefineResult {
-    /// Splat in the capture's world. If it is a splat that the session started from, it is unchanged.
+    /// Splat in the capture's world. An initial splat that matches the photos better than the optimized one is returned unchanged.
     pub splat: Splat,
     /// Initial Gaussians in the session's frame, on its device.
     pub initial: Gaussians,
@@ -165,7 +168,7 @@ impl<'a> RefineSession<'a> {
             return Err(Error::input(capture.file(), "the masks", "no pixel that counts", expected));
         }
         if !masked_out.is_empty() {
-            let names = summarize_names(&masked_out);
+            let names = format_names(&masked_out, SHOWN_NAMES);
             let line = format!("{}: masked out as a whole, and left out: {names}", capture.name);
             on_event(RefineEvent::Warning(&line));
         }
@@ -481,7 +484,8 @@ impl<'a> RefineSession<'a> {
         }
         self.near_duplicates = left_out.len();
         if !left_out.is_empty() {
-            let (name, count, names) = (&self.capture.name, left_out.len(), summarize_names(&left_out));
+            let (name, count, names) =
+                (&self.capture.name, left_out.len(), format_names(&left_out, SHOWN_NAMES));
             let line = "photos are nearly equal to others, and left out";
             self.warn(&format!("{name}: {count} of {all} {line}: {names}"));
         }
@@ -669,13 +673,6 @@ fn every(views: &[View], interval: usize) -> Vec<View> {
 /// Returns the mean scores of the first of every `interval` views.
 fn mean_of_every(scores: &CaptureScores, interval: usize) -> Scores {
     Scores::mean(scores.views.iter().step_by(interval).map(|view| &view.scores))
-}
-
-/// Returns the first few names, and the number of the others.
-fn summarize_names(all: &[String]) -> String {
-    const FEW: usize = 3;
-    let few = all[..all.len().min(FEW)].join(", ");
-    if all.len() > FEW { format!("{few} and {} more", all.len() - FEW) } else { few }
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! COLMAP and ffmpeg as processes: what they print, line by line, and their end with the work.
+//! Runs COLMAP and ffmpeg, reads what they print by line, and kills them if the work ends early.
 
 use globalsplat_files::{Error, Result};
 use std::io::{self, BufRead, BufReader, pipe};
@@ -7,7 +7,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::time::Duration;
 
 /// Maximum time between two calls of the function that watches a process.
-const PAUSE: Duration = Duration::from_millis(100);
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
 
 /// A running program. It is killed on drop unless it has ended.
 pub(crate) struct Process {
@@ -43,7 +43,7 @@ impl Process {
     /// Returns the error of `watch`.
     pub fn wait(mut self, mut watch: impl FnMut(Option<String>) -> Result<()>) -> Result<ExitStatus> {
         loop {
-            match self.lines.recv_timeout(PAUSE) {
+            match self.lines.recv_timeout(POLL_INTERVAL) {
                 Ok(line) => watch(Some(line))?,
                 Err(RecvTimeoutError::Timeout) => watch(None)?,
                 Err(RecvTimeoutError::Disconnected) => break,

@@ -40,7 +40,7 @@ impl FromStr for Matching {
     }
 }
 
-/// Which video the frames of a capture are from, and which frames were chosen.
+/// Source video of a capture and its chosen frames.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct VideoRecord {
     /// Name of the file.
@@ -139,7 +139,7 @@ impl fmt::Display for CaptureReport {
     }
 }
 
-/// How far a capture has come, and for which photos and settings.
+/// Progress of a capture, with its photos and settings.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Record {
     /// The video that the photos are frames of.

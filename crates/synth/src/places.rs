@@ -15,10 +15,10 @@ const CELL: f32 = 0.35;
 /// be.
 pub(super) fn room(builder: &SceneBuilder, sky: &mut Sky) -> CameraSpace {
     let size = vec3(builder.log_uniform(2.6, 10.), builder.within(2.3..4.), builder.log_uniform(2.6, 10.));
-    // Before what also glows: only the first four lights light a scene directly.
+    // Before luminous pictures: only the first four lights of a scene light it directly.
     add_lamps(builder, size, sky);
     let (x, y, z) = (Vec3::X * size.x, Vec3::Y * size.y, Vec3::Z * size.z);
-    // Each surface begins at a corner; its inside is in the direction of the product of its sides.
+    // Each surface begins at a corner; its inside is in the direction of the cross product of its sides.
     let walls = [(z, -z, y), (Vec3::ZERO, x, y), (x, z, y), (x + z, -x, y)];
     let material = builder.material(Purpose::Wall);
     let add = |(corner, along, up), material: &Material| {
@@ -74,7 +74,7 @@ pub(super) fn room(builder: &SceneBuilder, sky: &mut Sky) -> CameraSpace {
     CameraSpace { min, max, eye_heights: (1., 1.75), clearance: 0.3, walls: Some(behind) }
 }
 
-/// Adds lamps of one color tone, on the ceiling or hanging, and sets the indirect light that doesn't come from them directly.
+/// Adds lamps of one color tone, on the ceiling or hanging, and sets the ambient light.
 fn add_lamps(builder: &SceneBuilder, size: Vec3, sky: &mut Sky) {
     let warmth = builder.within(0. ..1.);
     let tone = vec3(1., 1. - 0.25 * warmth, 1. - 0.55 * warmth);

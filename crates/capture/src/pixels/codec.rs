@@ -21,7 +21,7 @@ pub const PHOTO_EXTENSIONS: [&str; 10] =
 /// Description of the supported formats for error messages.
 pub(crate) const SUPPORTED_IMAGES: &str = "a JPEG, PNG, WebP, TIFF, BMP, HEIC or AVIF";
 
-/// Reads any image as 8-bit RGB, with pixels as they are stored: gray is repeated, transparent pixels are composited over black, 16 bits
+/// Reads any image as 8-bit RGB, with pixels as they are stored, but HEIC and AVIF upright: gray is repeated, transparent pixels are composited over black, 16 bits
 /// are rounded to 8. HEIC and AVIF are decoded by libheif's program on the PATH.
 ///
 /// # Errors
@@ -58,8 +58,8 @@ pub struct DecodedPhoto {
 /// Returns the errors of [`read_image`].
 pub fn decode_photo(encoded: &[u8], file: &Path, size: (u32, u32)) -> Result<DecodedPhoto> {
     if heif_size(encoded).is_some() {
-        let (pixels, alpha) = split_alpha(decode_heif(encoded, file)?);
-        return Ok(DecodedPhoto { pixels, alpha, is_verbatim: false, is_jpeg: false, is_png: false });
+        let pixels = decode_heif(encoded, file)?;
+        return Ok(DecodedPhoto { pixels, alpha: None, is_verbatim: false, is_jpeg: false, is_png: false });
     }
     let reader = ImageReader::new(Cursor::new(encoded)).with_guessed_format().map_err(Error::read(file))?;
     let format = reader.format();
@@ -128,7 +128,7 @@ pub(crate) fn encoded_image_size(encoded: &[u8]) -> Option<(u32, u32)> {
     read_header(Cursor::new(encoded), Path::new("")).ok().map(|(size, _)| size)
 }
 
-/// Returns (width, height) of the pixels as stored, from the image's header alone.
+/// Returns (width, height) of the image that [`read_image`] returns, from its header alone.
 ///
 /// # Errors
 /// Returns an error if the file is missing or isn't an image.

@@ -1,7 +1,7 @@
 //! HEIC and AVIF: files of boxes (ISO/IEC 14496-12, 23008-12). The size is read from them; libheif's program decodes the pixels.
 
 use globalsplat_files::{Error, Result, is_program_missing};
-use image::DynamicImage;
+use image::{DynamicImage, RgbImage};
 use std::path::Path;
 use std::process::{Command, Stdio};
 
@@ -37,7 +37,7 @@ pub(super) fn heif_size(start: &[u8]) -> Option<(u32, u32)> {
 ///
 /// # Errors
 /// Returns an error if the file is truncated or damaged, or if the program isn't installed.
-pub(super) fn decode_heif(encoded: &[u8], file: &Path) -> Result<DynamicImage> {
+pub(super) fn decode_heif(encoded: &[u8], file: &Path) -> Result<RgbImage> {
     let undecodable = |why: String| {
         let expected = "a JPEG or PNG, to which sips converts it, or libheif on the PATH (Debian and Ubuntu: apt install libheif-examples; \
                         macOS: brew install libheif)";
@@ -55,7 +55,7 @@ pub(super) fn decode_heif(encoded: &[u8], file: &Path) -> Result<DynamicImage> {
         })
     })?;
     let image = image::open(&png).ok().filter(|_| output.status.success());
-    image.map(|image| image.into_rgb8().into()).ok_or_else(|| {
+    image.map(DynamicImage::into_rgb8).ok_or_else(|| {
         let message = String::from_utf8_lossy(&output.stderr);
         let message = message.lines().map(str::trim).collect::<Vec<_>>().join("; ");
         undecodable(format!(

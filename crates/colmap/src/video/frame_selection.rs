@@ -3,9 +3,9 @@
 /// Motion from one chosen frame to the next, if it leads to a usual number of frames.
 const DEFAULT_MOTION: f64 = 0.06;
 /// Number of frames below which [`DEFAULT_MOTION`] is reduced, though not below [`MIN_MOTION`].
-const MIN_FRAMES: usize = 30;
+const MIN_DEFAULT_FRAMES: usize = 30;
 /// Number of frames above which [`DEFAULT_MOTION`] is increased.
-const MAX_FRAMES: usize = 300;
+const MAX_DEFAULT_FRAMES: usize = 300;
 /// Smallest total motion of a moving camera; noise stays below it. Also the smallest spacing of frames by default.
 const MIN_MOTION: f64 = 0.01;
 /// Smallest motion from one chosen frame to the next, in segments. Without it, two segments could give the frames on either side of
@@ -26,7 +26,7 @@ pub(super) fn positions(motion: &[f64], wanted: Option<usize>) -> Vec<f64> {
     let motion: Vec<f64> = std::iter::once(start).chain(motion.iter().skip(1).copied()).collect();
     let count = wanted.unwrap_or_else(|| {
         let count = |length| count_segments(&motion, length).round() as usize;
-        count(DEFAULT_MOTION).clamp(MIN_FRAMES.min(count(MIN_MOTION)).max(1), MAX_FRAMES)
+        count(DEFAULT_MOTION).clamp(MIN_DEFAULT_FRAMES.min(count(MIN_MOTION)).max(1), MAX_DEFAULT_FRAMES)
     });
     let length = segment_length(&motion, count);
     let mut position = 0.;

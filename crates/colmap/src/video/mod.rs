@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 use std::path::Path;
 
 /// Maximum number of frames: the filter of the second pass, which lists them, has to fit into a command line.
-const MAX_FRAMES: usize = 2000;
+const MAX_REQUESTED_FRAMES: usize = 2000;
 
 /// Frames that were chosen from a video.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -58,8 +58,8 @@ pub(crate) fn write_sharpest_frames(
     count: Option<usize>,
     reporter: &mut Reporter,
 ) -> Result<VideoFrames> {
-    if let Some(count) = count.filter(|count| !(1..=MAX_FRAMES).contains(count)) {
-        return Err(Error::setting("the number of frames", count, format!("1 to {MAX_FRAMES}")));
+    if let Some(count) = count.filter(|count| !(1..=MAX_REQUESTED_FRAMES).contains(count)) {
+        return Err(Error::setting("the number of frames", count, format!("1 to {MAX_REQUESTED_FRAMES}")));
     }
     let source = Video::open(video)?;
     let (sharpness, motion) = measure(&source, reporter)?;

@@ -198,7 +198,7 @@ pub(super) fn write(random: &Random, canvas: &mut Canvas, corner: Vec2, extent: 
     for line in 0..(extent.y / spacing) as usize {
         let letters = (extent.x / advance * random.one_of(&[1., 1., random.within(0.2..1.)])) as usize;
         for letter in 0..letters {
-            // One glyph in six is a space.
+            // About one glyph in five is a space.
             let Some(glyph) = glyphs.get(random.within(0..=(glyphs.len() * 6 / 5))) else { continue };
             let place = corner + Vec2::new(letter as f32 * advance, line as f32 * spacing);
             for [from, to] in glyph {
