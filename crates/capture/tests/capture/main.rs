@@ -16,7 +16,7 @@ use tempfile::TempDir;
 /// Writes photos called `names`, whose pixels differ from photo to photo.
 fn write_photos(folder: &Path, names: &[String]) {
     for (i, name) in names.iter().enumerate() {
-        let photo = RgbImage::from_fn(WIDTH, HEIGHT, |x, y| Rgb([x as u8 * 9, y as u8 * 12, 40 * i as u8]));
+        let photo = RgbImage::from_fn(WIDTH, HEIGHT, |x, y| Rgb([x as u8 * 9, y as u8 * 12, (40 * i) as u8]));
         let file = folder.join(name);
         std::fs::create_dir_all(file.parent().unwrap()).unwrap();
         photo.save(file).unwrap();

@@ -52,8 +52,4 @@ fn tensors_that_cannot_be_stored_are_refused() {
     let error = write_checkpoint(&path, vec![("a", tensor)], &HashMap::new()).unwrap_err();
     assert_eq!(error.to_string(), "tensors of type U64 are not stored");
     assert!(!path.exists());
-    // Tensors of a size that overflows, or of fewer bytes, can't be created.
-    for shape in [vec![2], vec![usize::MAX, 4]] {
-        assert!(TensorView::new(Dtype::F32, shape, &[0; 7]).is_err());
-    }
 }
