@@ -232,7 +232,7 @@ fn tensors_stay_inside_their_data() {
     let few = archive(&one_view(&good_cameras(), &image(0, 4, 1)), &[0; 64]);
     assert_refused(few, "cameras of scene 0 reaches beyond its data of 64 bytes");
     let double = tensor("DoubleStorage", 0, &[1, 8], &[8, 1]);
-    assert_refused(archive(&one_view(&double, &image(0, 4, 1)), &[0; 64]), "expected F32 [1, 18]");
+    assert_refused(archive(&one_view(&double, &image(0, 4, 1)), &[0; 64]), "expected floats [1, 18]");
     let whole = |image: &[u8]| archive(&one_view(&good_cameras(), image), &[0; 72]);
     for (image, found) in [
         (image(0, 73, 1), "images of scene 0 reaches beyond its data of 72 bytes"),
@@ -277,6 +277,10 @@ fn what_is_wrong_with_a_scene_is_named() {
     assert!(error.contains(expected), "{error}");
     let error = open_capture(&chunk).unwrap_err().to_string();
     assert!(error.contains("it holds 2 scenes, expected") && error.contains("#KEY"), "{error}");
+
+    std::fs::write(&chunk, archive(b"\x80\x02].", &[])).unwrap();
+    let error = open_capture(&chunk).unwrap_err().to_string();
+    assert!(error.contains("the list of scenes is empty, expected one scene at least"), "{error}");
 
     // 18 float32 of a camera and an image.
     let png = std::fs::read(folder.path().join("room_0/images/000.png")).unwrap();

@@ -66,7 +66,7 @@ pub(super) fn heap(builder: &SceneBuilder, size: Vec3, transform: Affine3A, coun
             false => Quat::from_axis_angle(builder.direction(), builder.angle()),
         };
         let place = transform * Affine3A::from_rotation_translation(turn, spot);
-        builder.add_mesh(mesh, &builder.thing(), place);
+        builder.add_mesh(mesh, &builder.object_material(), place);
     }
 }
 
@@ -76,14 +76,14 @@ pub(super) fn clutter(builder: &SceneBuilder, size: Vec2, height: f32, transform
         let spot = vec3(builder.within(-0.5..0.5) * size.x, 0., builder.within(-0.5..0.5) * size.y);
         let extent = builder.log_vector([(0.1, 1.); 3]) * height;
         let place = transform * standing(spot, builder.angle());
-        builder.add_mesh(plain(builder, extent), &builder.thing(), place);
+        builder.add_mesh(plain(builder, extent), &builder.object_material(), place);
     }
 }
 
 /// Adds boards on top of each other between sides or legs, with small objects on them: a table or a shelf.
 fn boards(builder: &SceneBuilder, transform: Affine3A) {
     let size = builder.vector([(0.4, 2.), (0.3, 2.), (0.3, 0.9)]);
-    let (board, side) = (builder.thing(), builder.thing());
+    let (board, side) = (builder.object_material(), builder.object_material());
     let levels = builder.within(1..=(3. * size.y) as usize + 1);
     let gap = size.y / levels as f32;
     let (thick, round) = (builder.within(0.02..0.07), builder.one_of(&[0., 0.01]));
@@ -105,7 +105,7 @@ pub(super) fn furniture(builder: &SceneBuilder, transform: Affine3A) {
     let size = builder.log_vector([(0.3, 2.), (0.3, 2.), (0.3, 1.)]);
     match builder.within(0..10) {
         0..4 => boards(builder, transform),
-        4..6 => builder.add_mesh(plain(builder, size), &builder.thing(), transform),
+        4..6 => builder.add_mesh(plain(builder, size), &builder.object_material(), transform),
         6 => leaves(builder, transform, builder.within(0.4..1.5), builder.within(12..60)),
         _ => heap(builder, size, transform, 2..9),
     }
@@ -133,7 +133,7 @@ pub(super) fn tree(builder: &SceneBuilder, transform: Affine3A, height: f32) {
     let bend = builder.vector([(-0.15, 0.15), (1., 1.001), (-0.15, 0.15)]) * height;
     let stem = move |t: f32| bend * vec3(t * t, t, t * t);
     let thick = builder.within(0.02..0.045) * height;
-    builder.add_mesh(tube(stem, move |t| thick * (1.1 - t), [8, 8]), &builder.thing(), transform);
+    builder.add_mesh(tube(stem, move |t| thick * (1.1 - t), [8, 8]), &builder.object_material(), transform);
     let (crown, noise, has_leaves) =
         (builder.material(Purpose::Foliage), builder.noise(), builder.chance(0.4));
     for _ in 0..builder.within(5..12) {
@@ -164,7 +164,7 @@ pub(super) fn picture(builder: &SceneBuilder, transform: Affine3A, is_window: bo
     let outer = size + 2. * builder.within(0.01..0.1);
     builder.add_mesh(
         cuboid(outer.extend(0.03), 0.),
-        &builder.thing(),
+        &builder.object_material(),
         transform * at(0., -0.5 * outer.y, 0.015),
     );
     let mut poster = builder.picture(size);
@@ -191,7 +191,11 @@ pub(super) fn orbit_target(builder: &SceneBuilder, spot: Vec3) -> OrbitTarget {
         // The block reaches below the ground, which may be uneven.
         let (foot, broad) = (0.5, builder.within(0.6..1.6));
         let block = cuboid(vec3(broad * size.x, below + foot, broad * size.z), builder.within(0. ..0.05));
-        builder.add_mesh(block, &builder.thing(), Affine3A::from_translation(spot - foot * Vec3::Y));
+        builder.add_mesh(
+            block,
+            &builder.object_material(),
+            Affine3A::from_translation(spot - foot * Vec3::Y),
+        );
     }
     let transform = standing(spot + below * Vec3::Y, builder.angle());
     exhibit(builder, size, transform);
@@ -210,7 +214,7 @@ pub(super) fn hung(builder: &SceneBuilder, spot: Vec3, front: Vec3) -> OrbitTarg
 /// Adds an object that merits its own video, about `size` metres large, standing at the origin of `transform`.
 fn exhibit(builder: &SceneBuilder, size: Vec3, transform: Affine3A) {
     match builder.within(0..6) {
-        0 => builder.add_mesh(plain(builder, size), &builder.thing(), transform),
+        0 => builder.add_mesh(plain(builder, size), &builder.object_material(), transform),
         1 => lump(builder, transform, size.max_element(), Purpose::Ground),
         2 => leaves(builder, transform, size.y, builder.within(12..60)),
         _ => heap(builder, size, transform, 3..12),

@@ -34,16 +34,16 @@ pub(super) fn room(builder: &SceneBuilder, sky: &mut Sky) -> CameraSpace {
         let (length, towards) = (along.length(), along.normalize());
         let rotation = Mat3::from_cols(towards, Vec3::Y, towards.cross(Vec3::Y));
         let transform = Affine3A::from_mat3_translation(rotation, corner);
-        let mut reached = builder.within(0.3..1.2);
-        while reached < length - 0.6 {
+        let mut distance = builder.within(0.3..1.2);
+        while distance < length - 0.6 {
             if builder.chance(0.6) {
-                objects::furniture(builder, transform * at(reached, 0., 0.5));
+                objects::furniture(builder, transform * at(distance, 0., 0.5));
             }
             if builder.chance(0.5) {
-                let spot = at(reached, builder.within(1.2..1.9), 0.);
-                objects::picture(builder, transform * spot, builder.chance(0.2));
+                let center = at(distance, builder.within(1.2..1.9), 0.);
+                objects::picture(builder, transform * center, builder.chance(0.2));
             }
-            reached += builder.within(0.8..2.4);
+            distance += builder.within(0.8..2.4);
         }
     }
     let inside = |share: (f32, f32)| size * builder.vector([share, (0., 1.), share]);
@@ -65,13 +65,13 @@ pub(super) fn room(builder: &SceneBuilder, sky: &mut Sky) -> CameraSpace {
             let mesh = objects::plain(builder, builder.log_vector([(0.15, 2.); 3]));
             let turn = Quat::from_axis_angle(builder.direction(), builder.angle());
             let place = Affine3A::from_rotation_translation(turn, inside((0., 1.)));
-            builder.add_mesh(mesh, &builder.thing(), place);
+            builder.add_mesh(mesh, &builder.object_material(), place);
         }
     }
     objects::clutter(builder, 0.9 * vec2(size.x, size.z), 0.4, at(0.5 * size.x, 0., 0.5 * size.z), 8);
-    let behind = 0.25;
-    let (min, max) = (vec3(behind, 0.5, behind), size - behind);
-    CameraSpace { min, max, eye_heights: (1., 1.75), clearance: 0.3, walls: Some(behind) }
+    let to_wall = 0.25;
+    let (min, max) = (vec3(to_wall, 0.5, to_wall), size - to_wall);
+    CameraSpace { min, max, eye_heights: (1., 1.75), clearance: 0.3, walls: Some(to_wall) }
 }
 
 /// Adds lamps of one color tone, on the ceiling or hanging, and sets the ambient light.
@@ -144,24 +144,25 @@ pub(super) fn landscape(builder: &SceneBuilder, sky: &Sky) -> CameraSpace {
         });
         builder.add_mesh(way, &builder.material(Purpose::Ground), Affine3A::IDENTITY);
     }
-    let spot = |least: f32, most: f32| {
+    // Returns a random place on the ground, between two distances from the middle.
+    let place_on_ground = |least: f32, most: f32| {
         let (far, turn) = (builder.log_uniform(least, most), builder.angle());
         let (x, z) = (far * turn.cos(), far * turn.sin());
         standing(vec3(x, height(x, z) - 0.02, z), builder.angle())
     };
     for _ in 0..builder.within(0..14) {
         let size = builder.vector([(3., 10.), (1., 7.), (0.3, 9.)]);
-        builder.add_mesh(cuboid(size, 0.), &builder.material(Purpose::Facade), spot(8., 60.));
+        builder.add_mesh(cuboid(size, 0.), &builder.material(Purpose::Facade), place_on_ground(8., 60.));
     }
     for _ in 0..builder.within(0..22) {
-        objects::tree(builder, spot(3., 50.), builder.within(2. ..9.));
+        objects::tree(builder, place_on_ground(3., 50.), builder.within(2. ..9.));
     }
     for _ in 0..builder.within(0..24) {
         let purpose = builder.one_of(&[Purpose::Foliage, Purpose::Ground]);
-        objects::lump(builder, spot(1.5, 25.), builder.log_uniform(0.3, 3.), purpose);
+        objects::lump(builder, place_on_ground(1.5, 25.), builder.log_uniform(0.3, 3.), purpose);
     }
     for _ in 0..builder.within(2..12) {
-        let transform = spot(1., 0.6 * wide);
+        let transform = place_on_ground(1., 0.6 * wide);
         match builder.chance(0.4) {
             true => objects::furniture(builder, transform),
             false => objects::heap(builder, builder.log_vector([(0.3, 4.); 3]), transform, 1..8),

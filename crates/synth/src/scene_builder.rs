@@ -87,7 +87,7 @@ impl SceneBuilder {
     }
 
     /// Returns a random material for furniture and other objects.
-    pub fn thing(&self) -> Material {
+    pub fn object_material(&self) -> Material {
         self.material(Purpose::Thing)
     }
 

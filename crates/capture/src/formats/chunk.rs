@@ -101,6 +101,9 @@ impl Chunk {
         if let Some(scene) = self.scenes.iter().find(is_chosen) {
             return self.capture_of(scene, purpose);
         }
+        if self.scenes.is_empty() {
+            return Err(Error::input(&self.file, "the list of scenes", "empty", "one scene at least"));
+        }
         let (keys, count) = (self.keys().take(SHOWN).collect::<Vec<_>>().join(", "), self.scenes.len());
         let choice = format!("one of its {count}: {keys}{}", if count > SHOWN { ", …" } else { "" });
         Err(match key {
@@ -191,7 +194,7 @@ fn list_scenes(chunk: &TorchFile, max_views: usize) -> Result<Vec<Scene>, String
         let (cameras, shape) = (array("cameras", get("cameras")?)?, [images.len(), CAMERA_NUMBERS]);
         if !cameras.is_float() || cameras.shape != shape {
             let found = format!("{} {:?}", cameras.dtype, cameras.shape);
-            return Err(refusal("cameras", found, &format!("F32 {shape:?} for as many images")));
+            return Err(refusal("cameras", found, &format!("floats {shape:?} for as many images")));
         }
         let key = match get("key")? {
             Value::Str(key) => key.to_string(),
