@@ -196,10 +196,11 @@ fn convert_preserves_the_views_of_a_capture() {
 fn convert_repairs_invalid_gaussians() {
     let sandbox = Sandbox::new();
     let (path, field, property) = files_with_invalid_values(sandbox.folder()).swap_remove(0);
+    let name = path.file_name().unwrap().to_str().unwrap();
     for command in
         ["render --orbit --out @orbit.png", "refine --scene @room --out @refined.ply", "eval --scene @room"]
     {
-        let error = sandbox.refuse(&format!("{command} --splat {}", path.display()));
+        let error = sandbox.refuse(&format!("{command} --splat @{name}"));
         assert_says(&error, &[field, "`globalsplat convert` leaves out"]);
     }
     let [without_rotation, _] = files_without_a_rotation(sandbox.folder());
