@@ -31,6 +31,10 @@ c10::impl::VirtualGuardImpl driver() { return c10::impl::VirtualGuardImpl(c10::k
 
 c10::Device by_number(int32_t gpu) { return {c10::kCUDA, static_cast<c10::DeviceIndex>(gpu)}; }
 
+// Value of MKL_CBWR. Without it, the order of MKL's sums with AVX2 depends on where its matrices lie in memory, and so on the number of
+// threads.
+constexpr char kStrictAvx2[] = "AVX2,STRICT";
+
 // Sets the variables that the libraries read when they first choose a kernel. Variables that the user has set are kept.
 SimdLimit limit_libraries() {
   struct Level {
@@ -45,8 +49,13 @@ SimdLimit limit_libraries() {
     setenv("ATEN_CPU_CAPABILITY", level.libtorch, 0);
     setenv("ONEDNN_MAX_CPU_ISA", level.one_dnn, 0);
     setenv("MKL_ENABLE_INSTRUCTIONS", level.mkl, 0);
+    if (level.limit == SimdLimit::Avx2) setenv("MKL_CBWR", kStrictAvx2, 0);
     return level.limit;
   }
+#if defined(__x86_64__)
+  __builtin_cpu_init();
+  if (__builtin_cpu_supports("avx2") && !__builtin_cpu_supports("avx512f")) setenv("MKL_CBWR", kStrictAvx2, 0);
+#endif
   return SimdLimit::None;
 }
 
