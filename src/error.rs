@@ -94,12 +94,6 @@ impl Error {
         move |source| globalsplat_files::Error::write(path)(source).into()
     }
 
-    /// Returns `true` if a write failed because the disk, the quota or the file-size limit (`ulimit -f`) is exhausted; the limit may be
-    /// raised while the program waits.
-    pub fn is_out_of_space(&self) -> bool {
-        matches!(self, Error::Files(error) if error.is_out_of_space())
-    }
-
     /// Returns `true` if a file could not be written.
     pub fn is_failed_write(&self) -> bool {
         matches!(self, Error::Files(globalsplat_files::Error::Write { .. }))

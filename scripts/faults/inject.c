@@ -6,8 +6,7 @@
 //                first of them the N-th, from 1; if STICKY is 1, all later ones, too. KIND is ENOSPC, EIO or EINTR, the error; short:
 //                half is written, and the call returns that count; torn: the same, and the next call fails with ENOSPC
 //
-// A rename is logged under the new name. Opening read-only is not a write. These are the functions by which the program writes
-// (nm -D), except for renames of single files: the crate tempfile calls the kernel itself.
+// A rename is logged under the new name. Opening read-only is not a write. These are the functions by which the program writes (nm -D).
 
 #define _GNU_SOURCE
 #include <dlfcn.h>

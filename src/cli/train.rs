@@ -6,9 +6,7 @@ use crate::eval::{HeldOut, HeldOutScores, write_curves};
 use crate::io::{InputFiles, check_writable_dir};
 use crate::loss::{Term, psnr_of_mse};
 use crate::metrics::{CaptureScores, Scores};
-use crate::train::{
-    CONFIG_FILE, Event, METRICS_FILE, Outcome, Resume, Trainer, Validator, retry_on_disk_full, run,
-};
+use crate::train::{CONFIG_FILE, Event, METRICS_FILE, Outcome, Resume, Trainer, Validator, run};
 use anyhow::Result;
 use clap::Args;
 use serde_json::json;
@@ -208,14 +206,7 @@ impl Train {
         };
         let (ours, nearest) = (mean(|v| &v.ours), mean(|v| &v.nearest));
         let curves = self.out.join(CURVES_FILE);
-        let mut on_event = |event: Event| {
-            if let Event::Notice(text) = event {
-                eprintln!("{text}");
-            }
-            !signals::is_stop_requested()
-        };
-        let nearest_psnr = nearest.map(|nearest| nearest.psnr);
-        retry_on_disk_full(&mut on_event, || write_curves(&curves, &self.out, nearest_psnr))?;
+        write_curves(&curves, &self.out, nearest.map(|nearest| nearest.psnr))?;
         let checkpoint = outcome.checkpoint.to_string_lossy();
         let mut json = json!({
             "checkpoint": checkpoint,

@@ -32,9 +32,7 @@ pub use weights::{
     write_weights,
 };
 
-pub(crate) use globalsplat_files::{
-    AppendFile, expand_path, read_text, recover_dirs, remove_dir, replace_dir, write_json,
-};
+pub(crate) use globalsplat_files::{AppendFile, expand_path, read_text, replace_link, sync_dir, write_json};
 
 pub(crate) use event_file::{EventFile, event_files};
 pub(crate) use globalsplat_capture::{PHOTO_EXTENSIONS, read_image_size};

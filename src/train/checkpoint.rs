@@ -1,22 +1,22 @@
-//! Checkpoints: one folder per step, which is either complete or missing.
+//! Checkpoints: one folder per step.
 //!
 //! `RUN/checkpoints/step-00001000/` has `model.safetensors` (weights and configuration), `optimizer.safetensors`, and `state.json` with the
-//! step, the position in the data, and the checksums of the other files. `RUN/best/` is the checkpoint with the best validation score, and
-//! has this score. Random number generators need no state: the random numbers of a sample depend only on the seed, which is part of the
-//! configuration, and on the sample's position in the data.
+//! step, the position in the data, and the checksums of the other files. The state is written last and removed first: a folder without it is
+//! no checkpoint. `RUN/best` is a link to the checkpoint with the best validation score, whose state has this score. Random number
+//! generators need no state: the random numbers of a sample depend only on the seed, which is part of the configuration, and on the
+//! sample's position in the data.
 
 use super::trainer::Trainer;
 use crate::error::{Error, Result};
 use crate::io::{
-    self, InputFiles, WeightsFile, read_weights, recover_dirs, remove_dir, replace_dir, write_atomically,
-    write_weights,
+    InputFiles, WeightsFile, checksum, read_weights, replace_link, sync_dir, write_json, write_weights,
 };
 use crate::model::Precision;
 use crate::reconstruct::save_model;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fs::{self, File, OpenOptions, TryLockError};
-use std::io::{Read, Write};
+use std::io::{self, ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 
 const FOLDER: &str = "checkpoints";
@@ -27,7 +27,7 @@ pub const MODEL_FILE: &str = "model.safetensors";
 const OPTIMIZER_FILE: &str = "optimizer.safetensors";
 const STATE_FILE: &str = "state.json";
 const LOCK_FILE: &str = ".lock";
-/// Our files in a checkpoint's folder. The state comes first, because without it there is no checkpoint.
+/// Files of a checkpoint. The state comes first, because without it there is no checkpoint.
 const FILES: [&str; 3] = [STATE_FILE, MODEL_FILE, OPTIMIZER_FILE];
 /// Files whose checksums are in the state, in the order of their names.
 const CHECKED_FILES: [&str; 2] = [MODEL_FILE, OPTIMIZER_FILE];
@@ -40,12 +40,12 @@ pub(super) struct State {
     samples: u64,
     /// Size in bytes and CRC-32 of each of the other files, by name.
     files: BTreeMap<String, (u64, u32)>,
-    /// Validation score of the best checkpoint; `None` for other checkpoints.
+    /// Validation score, if it was the best one so far.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     validation: Option<Validation>,
 }
 
-/// Validation score of a best checkpoint.
+/// Validation score of a checkpoint.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Validation {
     /// PSNR in dB.
@@ -65,6 +65,13 @@ fn folder_name(step: u64) -> String {
 /// # Errors
 /// Returns an error if a folder can't be read.
 pub fn list_checkpoints(run: &Path) -> Result<Vec<PathBuf>> {
+    let mut folders = list_folders(run)?;
+    folders.retain(|folder| folder.join(STATE_FILE).exists());
+    Ok(folders)
+}
+
+/// Lists the folders of the run's checkpoints, including incomplete ones, in order of their steps.
+fn list_folders(run: &Path) -> Result<Vec<PathBuf>> {
     let folder = run.join(FOLDER);
     if !folder.is_dir() {
         return Ok(vec![]);
@@ -116,10 +123,10 @@ pub(super) fn add_checkpoints(run: &Path, inputs: &mut InputFiles) {
     [FOLDER, BEST].iter().for_each(|folder| inputs.add_folder(&run.join(folder)));
 }
 
-/// Cleans up what a run left if it was killed during a save.
-pub(super) fn recover(run: &Path) -> Result<()> {
-    recover_dirs(run, &FILES)?;
-    Ok(recover_dirs(&run.join(FOLDER), &FILES)?)
+/// Removes what a run left that was killed during a save.
+pub(super) fn remove_incomplete(run: &Path) -> Result<()> {
+    let is_incomplete = |folder: &PathBuf| !folder.join(STATE_FILE).exists();
+    list_folders(run)?.into_iter().filter(is_incomplete).try_for_each(|folder| remove(&folder))
 }
 
 /// Returns the validation PSNR of the run's best checkpoint in dB, or `None` if there is no best checkpoint.
@@ -140,22 +147,15 @@ pub(super) fn best_score(run: &Path, settings: &str) -> Result<Option<f64>> {
     }
 }
 
-/// Makes `checkpoint` the run's best checkpoint, with the score `validation`. Files are hard links where the file system supports it.
+/// Makes `checkpoint` the run's best checkpoint, with the score `validation`.
 ///
 /// # Errors
-/// Returns an error if files can't be written. The previous best checkpoint then stays complete.
+/// Returns an error if files can't be written. The previous best checkpoint then stays the best one.
 pub(super) fn keep_best(run: &Path, checkpoint: &Path, validation: Validation) -> Result<()> {
     let state = State { validation: Some(validation), ..read_state(checkpoint)? };
-    replace_dir(&run.join(BEST), &FILES, |folder| {
-        for name in state.files.keys() {
-            let (from, to) = (checkpoint.join(name), folder.join(name));
-            if fs::hard_link(&from, &to).is_err() {
-                fs::copy(&from, &to).map_err(Error::write(&to))?;
-                File::open(&to).and_then(|file| file.sync_all()).map_err(Error::write(&to))?;
-            }
-        }
-        write_state(folder, &state)
-    })
+    write_json(&checkpoint.join(STATE_FILE), &state)?;
+    let target = checkpoint.strip_prefix(run).expect("a checkpoint of the run");
+    Ok(replace_link(&run.join(BEST), target)?)
 }
 
 impl Trainer {
@@ -170,16 +170,25 @@ impl Trainer {
     /// Returns an error if files can't be written. Older checkpoints then stay complete.
     pub(super) fn save(&self, run: &Path) -> Result<PathBuf> {
         let path = self.checkpoint(run);
-        replace_dir(&path, &FILES, |folder| {
-            save_model(&folder.join(MODEL_FILE), &self.vs, &self.config, self.stage(), Precision::F32)?;
-            write_weights(&folder.join(OPTIMIZER_FILE), &self.optimizer.state(), Default::default())?;
-            let files = CHECKED_FILES.map(|name| Ok((name.into(), checksum(&folder.join(name))?)));
-            let files = files.into_iter().collect::<Result<_>>()?;
-            let (step, samples) = (self.step, self.samples);
-            write_state(folder, &State { step, samples, files, validation: None })
-        })?;
+        remove(&path)?;
+        if let Err(e) = self.write_checkpoint(&path) {
+            let _ = remove(&path);
+            return Err(e);
+        }
         prune_checkpoints(run, &path, self.config.train.keep_checkpoints)?;
         Ok(path)
+    }
+
+    fn write_checkpoint(&self, folder: &Path) -> Result<()> {
+        fs::create_dir_all(folder).map_err(Error::write(folder))?;
+        save_model(&folder.join(MODEL_FILE), &self.vs, &self.config, self.stage(), Precision::F32)?;
+        write_weights(&folder.join(OPTIMIZER_FILE), &self.optimizer.state(), Default::default())?;
+        let files = CHECKED_FILES.map(|name| Ok((name.into(), size_and_checksum(&folder.join(name))?)));
+        let files = files.into_iter().collect::<Result<_>>()?;
+        let state = State { step: self.step, samples: self.samples, files, validation: None };
+        write_json(&folder.join(STATE_FILE), &state)?;
+        folder.parent().map(sync_dir);
+        Ok(())
     }
 
     /// Loads a checkpoint, for which [`check`] returned `state`. After an error, the weights and the optimizer's state may be those of the
@@ -197,18 +206,28 @@ impl Trainer {
     }
 }
 
-/// Removes the oldest checkpoints beyond the `kept` newest ones, but never `latest`. Damaged checkpoints don't count, and are removed if
-/// they are older than `latest`.
+/// Removes the oldest checkpoints beyond the `kept` newest ones, but never `latest` or the best one.
 pub(super) fn prune_checkpoints(run: &Path, latest: &Path, kept: usize) -> Result<()> {
+    let best = fs::read_link(run.join(BEST)).map(|target| run.join(target)).ok();
     let mut others = list_checkpoints(run)?;
-    others.retain(|other| other != latest);
-    let (whole, broken): (Vec<_>, Vec<_>) = others.into_iter().partition(|other| has_expected_sizes(other));
-    let surplus = (whole.len() + 1).saturating_sub(kept);
-    let useless = broken.iter().filter(|broken| broken.as_path() < latest);
-    for old in whole.iter().take(surplus).chain(useless) {
-        remove_dir(old, &FILES)?;
+    others.retain(|other| other != latest && best.as_ref() != Some(other));
+    let surplus = (others.len() + 1).saturating_sub(kept);
+    others[..surplus].iter().try_for_each(|old| remove(old))
+}
+
+/// Removes a checkpoint's files, and its folder unless it has other files. If that fails, what is left is no checkpoint.
+fn remove(folder: &Path) -> Result<()> {
+    let unless = |expected: &[ErrorKind], removed: io::Result<()>| match removed {
+        Err(e) if !expected.contains(&e.kind()) => Err(Error::write(folder)(e)),
+        _ => Ok(()),
+    };
+    for name in FILES {
+        // A process that was killed while it wrote the file left the partial one.
+        for file in [name, &format!(".{name}.globalsplat-partial")] {
+            unless(&[ErrorKind::NotFound], fs::remove_file(folder.join(file)))?;
+        }
     }
-    Ok(())
+    unless(&[ErrorKind::NotFound, ErrorKind::DirectoryNotEmpty], fs::remove_dir(folder))
 }
 
 /// Checks that a checkpoint is complete and its files have not changed since they were written. Returns its state.
@@ -216,21 +235,13 @@ pub(super) fn check(checkpoint: &Path) -> Result<State> {
     let state = read_state(checkpoint)?;
     for (name, (bytes, crc)) in &state.files {
         let file = checkpoint.join(name);
-        let found = checksum(&file)?;
+        let found = size_and_checksum(&file)?;
         if found != (*bytes, *crc) {
             let found = format!("damaged ({} bytes, checksum {:08x})", found.0, found.1);
             return Err(Error::input(&file, "the file", found, format!("{bytes} bytes, checksum {crc:08x}")));
         }
     }
     Ok(state)
-}
-
-/// Returns `true` if a checkpoint's files exist and have their original sizes. [`check`] reads the files, too.
-fn has_expected_sizes(checkpoint: &Path) -> bool {
-    let is_long = |(name, (bytes, _)): (&String, &(u64, u32))| {
-        fs::metadata(checkpoint.join(name)).is_ok_and(|file| file.len() == *bytes)
-    };
-    read_state(checkpoint).is_ok_and(|state| state.files.iter().all(is_long))
 }
 
 fn read_state(checkpoint: &Path) -> Result<State> {
@@ -249,15 +260,10 @@ fn read_state(checkpoint: &Path) -> Result<State> {
     }
 }
 
-fn write_state(checkpoint: &Path, state: &State) -> Result<()> {
-    let (file, json) = (checkpoint.join(STATE_FILE), serde_json::to_vec(state).expect("numbers and names"));
-    write_atomically(&file, |writer| writer.write_all(&json).map_err(Error::write(&file)))
-}
-
 /// Returns the size and CRC-32 of a file.
-fn checksum(path: &Path) -> Result<(u64, u32)> {
+fn size_and_checksum(path: &Path) -> Result<(u64, u32)> {
     let size = fs::metadata(path).map_err(Error::read(path))?.len();
-    Ok((size, io::checksum([path])?))
+    Ok((size, checksum([path])?))
 }
 
 /// Lock that limits a run's folder to one training process; two would overwrite each other's checkpoints. It is released when it is dropped, or when the process ends for any reason.

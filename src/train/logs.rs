@@ -1,7 +1,6 @@
 //! Logs of a run: `metrics.jsonl`, with one line for every step and for every validation, and `RUN/tensorboard`, with one event file for
 //! every time that the run was started or resumed.
 
-use super::event::{Event, retry_on_disk_full};
 use super::step::{Score, StepReport};
 use super::{METRICS_FILE, is_due};
 use crate::error::{Error, Result};
@@ -21,28 +20,17 @@ pub(super) struct RunLog {
 
 impl RunLog {
     /// Opens the logs in the folder `run` of a run that continues after `step` steps. Also returns the last step before the latest
-    /// validation in the metrics. This and all writes wait for space on a full disk ([`retry_on_disk_full`]).
-    pub fn open(
-        run: &Path,
-        step: u64,
-        every: u64,
-        on_event: &mut impl FnMut(Event) -> bool,
-    ) -> Result<(Self, Option<u64>)> {
-        let path = run.join(METRICS_FILE);
-        let (metrics, validated) = retry_on_disk_full(on_event, || open_metrics(&path, step))?;
-        let mut events = retry_on_disk_full(on_event, || EventFile::create_for(run))?;
+    /// validation in the metrics.
+    pub fn open(run: &Path, step: u64, every: u64) -> Result<(Self, Option<u64>)> {
+        let (metrics, validated) = open_metrics(&run.join(METRICS_FILE), step)?;
+        let mut events = EventFile::create_for(run)?;
         // Earlier events of this step and of later ones become void.
-        retry_on_disk_full(on_event, || events.start(step))?;
+        events.start(step)?;
         Ok((RunLog { metrics, events, every }, validated))
     }
 
     /// Logs a step.
-    pub fn log_step(
-        &mut self,
-        report: &StepReport,
-        samples_per_second: f64,
-        on_event: &mut impl FnMut(Event) -> bool,
-    ) -> Result<()> {
+    pub fn log_step(&mut self, report: &StepReport, samples_per_second: f64) -> Result<()> {
         let values = [
             ("loss", report.losses.total),
             ("psnr", report.psnr()),
@@ -61,37 +49,31 @@ impl RunLog {
         if report.skipped {
             line["scenes"] = report.scenes.clone().into();
         }
-        self.append(&line, on_event)?;
+        self.append(&line)?;
         if is_due(self.every, report.step) {
             let tagged = |group: &'static str| move |(name, value)| (format!("{group}/{name}"), value);
             let scalars = values.into_iter().map(tagged("train")).chain(terms.map(tagged("loss")));
             let scalars: Vec<_> = scalars.collect();
-            retry_on_disk_full(on_event, || self.events.write_scalars(report.step, &scalars))?;
+            self.events.write_scalars(report.step, &scalars)?;
         }
         let Some(picture) = &report.picture else { return Ok(()) };
-        retry_on_disk_full(on_event, || self.events.write_image(report.step, "train/views", picture))
+        self.events.write_image(report.step, "train/views", picture)
     }
 
     /// Logs the validation after step `step`. Its line in the metrics comes last, so that a run that was killed before repeats it.
-    pub fn log_validation(
-        &mut self,
-        step: u64,
-        score: &Score,
-        on_event: &mut impl FnMut(Event) -> bool,
-    ) -> Result<()> {
+    pub fn log_validation(&mut self, step: u64, score: &Score) -> Result<()> {
         let Score { psnr, ssim, scenes, stage, .. } = score;
         let scalars = [("psnr", *psnr), ("ssim", *ssim), ("stage", f64::from(stage.index))];
         let scalars = scalars.map(|(name, value)| (format!("validation/{name}"), value));
-        retry_on_disk_full(on_event, || self.events.write_scalars(step, &scalars))?;
+        self.events.write_scalars(step, &scalars)?;
         let validation = json!({
             "psnr": psnr, "ssim": ssim, "scenes": scenes, "stage": stage.index, "mix": stage.mix,
         });
-        self.append(&json!({ "step": step, "validation": validation }), on_event)
+        self.append(&json!({ "step": step, "validation": validation }))
     }
 
-    fn append(&mut self, line: &Value, on_event: &mut impl FnMut(Event) -> bool) -> Result<()> {
-        let line = format!("{line}\n");
-        retry_on_disk_full(on_event, || Ok(self.metrics.append(line.as_bytes())?))
+    fn append(&mut self, line: &Value) -> Result<()> {
+        Ok(self.metrics.append(format!("{line}\n").as_bytes())?)
     }
 }
 

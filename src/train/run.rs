@@ -2,9 +2,9 @@
 
 use super::checkpoint::{
     RunLock, Validation, add_checkpoints, best_score, check, keep_best, latest_checkpoint, list_checkpoints,
-    prune_checkpoints, recover,
+    prune_checkpoints, remove_incomplete,
 };
-use super::event::{Event, retry_on_disk_full};
+use super::event::Event;
 use super::is_due;
 use super::logs::RunLog;
 use super::step::{Score, StepReport};
@@ -62,7 +62,7 @@ pub trait Validator {
 ///
 /// # Errors
 /// Returns an error if another process uses the run, a checkpoint doesn't fit, too many steps in a row were skipped, another rank is gone,
-/// or a step or a save fails. If the disk is full, the run waits for free space. If a validation fails, it is left out.
+/// or a step or a save fails. If a validation fails, it is left out.
 pub fn run(
     trainer: &mut Trainer,
     out: &Path,
@@ -132,7 +132,7 @@ impl RunLogger {
     ) -> Result<(Self, Option<u64>, Option<PathBuf>)> {
         check_output_folder(out)?;
         let lock = RunLock::take(out)?;
-        recover(out)?;
+        remove_incomplete(out)?;
         let saved = begin(trainer, out, resume, on_event)?;
         let config = out.join(CONFIG_FILE);
         let toml = trainer.config.to_toml();
@@ -144,12 +144,8 @@ impl RunLogger {
             let changes = changes.join(", ");
             on_event(Event::Notice(format!("resuming with a changed configuration: {changes}")));
         }
-        retry_on_disk_full(on_event, || {
-            write_atomically(&config, |writer| {
-                writer.write_all(toml.as_bytes()).map_err(Error::write(&config))
-            })
-        })?;
-        let (log, validated) = RunLog::open(out, trainer.step, trainer.config.train.log_every, on_event)?;
+        write_atomically(&config, |writer| writer.write_all(toml.as_bytes()).map_err(Error::write(&config)))?;
+        let (log, validated) = RunLog::open(out, trainer.step, trainer.config.train.log_every)?;
         let settings = trainer.config.data.validation_settings();
         let best = best_score(out, &settings).unwrap_or_else(|e| {
             on_event(Event::Notice(format!("{e}; the best checkpoint is determined again")));
@@ -208,7 +204,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             let samples_per_second = batch / start.elapsed().as_secs_f64();
             saved = None;
             if let Some(logger) = &mut self.logger {
-                logger.log.log_step(&report, samples_per_second, &mut self.on_event)?;
+                logger.log.log_step(&report, samples_per_second)?;
             }
             should_continue =
                 self.emit(Event::Step { report: &report, samples_per_second }) && report.should_continue;
@@ -259,7 +255,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
     /// Saves a checkpoint on the first rank. Returns the checkpoint's folder on all ranks, even if it isn't written yet.
     fn save(&mut self) -> Result<PathBuf> {
         match &self.logger {
-            Some(_) => retry_on_disk_full(&mut self.on_event, || self.trainer.save(self.out)),
+            Some(_) => self.trainer.save(self.out),
             None => Ok(self.trainer.checkpoint(self.out)),
         }
     }
@@ -278,12 +274,14 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
         let step = self.trainer.step.saturating_sub(1);
         if let Some(logger) = &mut self.logger {
             if score.psnr > logger.best.unwrap_or(f64::NEG_INFINITY) {
-                let found = || Validation { psnr: score.psnr, settings: logger.settings.clone() };
-                retry_on_disk_full(on_event, || keep_best(self.out, checkpoint, found()))?;
+                let found = Validation { psnr: score.psnr, settings: logger.settings.clone() };
+                keep_best(self.out, checkpoint, found)?;
+                // The best one until now was kept in addition.
+                prune_checkpoints(self.out, checkpoint, self.trainer.config.train.keep_checkpoints)?;
                 logger.best = Some(score.psnr);
             }
             if self.validated != Some(step) {
-                logger.log.log_validation(step, &score, on_event)?;
+                logger.log.log_validation(step, &score)?;
             }
         }
         self.validated = Some(step);

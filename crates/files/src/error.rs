@@ -125,13 +125,6 @@ impl Error {
         move |source| Error::Write { path, source }
     }
 
-    /// Returns `true` if a write failed because the disk, the quota or the file-size limit (`ulimit -f`) is exhausted; the limit may be
-    /// raised while the program waits.
-    pub fn is_out_of_space(&self) -> bool {
-        use std::io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
-        matches!(self, Error::Write { source, .. } if matches!(source.kind(), StorageFull | QuotaExceeded | FileTooLarge))
-    }
-
     /// Returns `true` if the request was invalid (exit code 2), `false` if the work failed (exit code 1).
     pub fn is_invalid_request(&self) -> bool {
         match self {

@@ -10,10 +10,11 @@ mod motion;
 use crate::progress::{Progress, Reporter, Step};
 use ffmpeg::Video;
 use frame_selection::{positions, select_frames};
-use globalsplat_files::{Error, Result, replace_dir};
+use globalsplat_files::{Error, Result};
 use motion::{MotionTracker, sharpness_of};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
+use std::{fs, io};
 
 /// Maximum number of frames: the filter of the second pass, which lists them, has to fit into a command line.
 const MAX_REQUESTED_FRAMES: usize = 2000;
@@ -31,8 +32,8 @@ pub struct VideoFrames {
 
 /// Writes frames of `video` as JPEGs `frame_00001.jpg`, `frame_00002.jpg`, … to `folder`. The video is divided into segments in which the
 /// picture moves equally far, and the sharpest frame of each is chosen; a camera at rest adds no frames. A cut starts a new segment.
-/// Frames are upright, progressive and with square pixels; HDR becomes SDR. Replaces the frames of an earlier call in `folder`; its
-/// other files stay. The folder changes only when all frames are written.
+/// Frames are upright, progressive and with square pixels; HDR becomes SDR. When all are written, they replace the frames of an earlier call
+/// in `folder`; its other files stay.
 ///
 /// The number of frames is `count`, 1 to 2,000. `None` stands for one frame per 6 % of the longer side that the picture moves, but 30 to 300
 /// frames.
@@ -79,9 +80,15 @@ pub(crate) fn write_sharpest_frames(
     if let Some(declared) = source.declared_frames.filter(|declared| total * 20 < declared * 19) {
         warnings.push(format!("{total} of {declared} frames can be decoded"));
     }
-    let own_names = own_frames(folder);
-    let own_names: Vec<&str> = own_names.iter().map(String::as_str).collect();
-    replace_dir(folder, &own_names, |place| write_frames(&source, &indices, place, reporter))?;
+    let name = folder.file_name().unwrap_or_default().display();
+    let partial = folder.with_file_name(format!(".{name}.globalsplat-partial"));
+    // A call that was killed may have left frames.
+    let _ = fs::remove_dir_all(&partial);
+    fs::create_dir_all(&partial).map_err(Error::write(folder))?;
+    let written = write_frames(&source, &indices, &partial, reporter);
+    let written = written.and_then(|()| replace_frames(&partial, folder).map_err(Error::write(folder)));
+    let _ = fs::remove_dir_all(&partial);
+    written?;
     let summary = format!("{chosen} of {total} frames, the sharpest of each segment of equal motion");
     Ok(VideoFrames { indices, summary, warnings })
 }
@@ -114,9 +121,16 @@ fn write_frames(video: &Video, chosen: &[usize], folder: &Path, reporter: &mut R
     }
 }
 
+/// Moves the frames in the folder `from` to the folder `to`, whose own frames are removed.
+fn replace_frames(from: &Path, to: &Path) -> io::Result<()> {
+    fs::create_dir_all(to)?;
+    own_frames(to).iter().try_for_each(|old| fs::remove_file(to.join(old)))?;
+    own_frames(from).iter().try_for_each(|new| fs::rename(from.join(new), to.join(new)))
+}
+
 /// Returns the names of the frames in `folder`, which this call or an earlier one wrote.
 fn own_frames(folder: &Path) -> Vec<String> {
-    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
     let names = entries.map(|entry| entry.file_name().to_string_lossy().into_owned());
     let is_own = |name: &String| {
         let number = name.strip_prefix("frame_").and_then(|rest| rest.strip_suffix(".jpg"));
