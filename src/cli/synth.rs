@@ -21,7 +21,7 @@ const CHUNK_BYTES: usize = 20_000_000;
 ///
 /// The scenes are rooms and outdoor scenes full of objects of all shapes and materials, filmed along a path past them or around
 /// one, ray traced, in the chunk format of RealEstate10K, with an index.json and an evaluation_index.json. The same seed gives
-/// the same bytes, and the same command resumes an interrupted run.
+/// the same bytes.
 /// Training generates them on the fly if data.captures contains "synth:seed=1,scenes=10000".
 #[derive(Args)]
 #[command(after_help = "Examples:\n  \
@@ -73,37 +73,13 @@ impl Synth {
         }
         let bar = progress::bar(self.scenes, "videos");
         let (mut index, mut rows) = (BTreeMap::new(), vec![]);
-        let mut note = |capture: &Capture| -> Result<(), Error> {
-            index.insert(capture.name.clone(), SceneFrames::alternating(capture.len()));
-            if self.contact_sheet.is_some() && rows.len() < SHEET.0 {
-                rows.push(sheet_row(capture)?);
-            }
-            bar.inc(1);
-            Ok(())
-        };
-        let depth_file = |capture: &Capture| depths.join(&capture.name).with_extension("npy");
-        let made_before = writer.resume(
-            &videos.keys(),
-            || Ok(videos.capture(0)?),
-            |number, capture| {
-                let file = depth_file(capture);
-                if self.depth && !file.exists() {
-                    self.write_depths(&file, &videos.capture(number)?)?;
-                }
-                // The images of the chunk are JPEGs: the sheet shows what they were made of.
-                match self.contact_sheet.is_some() && number < SHEET.0 {
-                    true => note(&videos.capture(number)?),
-                    false => note(capture),
-                }
-            },
-        )?;
-        let numbers: Vec<usize> = (made_before..self.scenes as usize).collect();
         // Scenes are generated in parallel, because most of the work on one scene runs on a single thread.
+        let numbers: Vec<usize> = (0..self.scenes as usize).collect();
         let made = numbers.chunks(2 * rayon::current_num_threads()).map(|numbers| {
             let make = |&number| {
                 let capture = videos.capture(number)?;
                 if self.depth {
-                    self.write_depths(&depth_file(&capture), &capture)?;
+                    self.write_depths(&depths.join(&capture.name).with_extension("npy"), &capture)?;
                 }
                 Ok(capture)
             };
@@ -112,7 +88,11 @@ impl Synth {
         for captures in made {
             for capture in captures? {
                 writer.add(&capture)?;
-                note(&capture)?;
+                index.insert(capture.name.clone(), SceneFrames::alternating(capture.len()));
+                if self.contact_sheet.is_some() && rows.len() < SHEET.0 {
+                    rows.push(sheet_row(&capture)?);
+                }
+                bar.inc(1);
             }
         }
         let index = EvaluationIndex { file: self.out.join("evaluation_index.json"), scenes: index };

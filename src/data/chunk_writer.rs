@@ -3,7 +3,7 @@
 use crate::error::{Error, Result};
 use crate::io::{write_atomically, write_json};
 use globalsplat_capture::{
-    CAMERA_NUMBERS, CHUNK_EXTENSION, CHUNK_INDEX_FILE, Capture, Chunk, Holdout, camera_numbers,
+    CAMERA_NUMBERS, CHUNK_EXTENSION, CHUNK_INDEX_FILE, Capture, Holdout, camera_numbers,
 };
 use globalsplat_torch_file::{Dtype, Item, TensorView, serialize};
 use rayon::prelude::*;
@@ -59,44 +59,6 @@ impl ChunkWriter {
             chunks: 0,
             index: BTreeMap::new(),
         })
-    }
-
-    /// Takes over the chunks that an interrupted run of the same work left: those of its first scenes. `keys` are the names of all
-    /// scenes in order. `make` creates the first scene again, for comparison. `each` is called with every existing scene. Returns
-    /// their number.
-    ///
-    /// # Errors
-    /// Fails if the chunks belong to other work, or if `make` or `each` fails.
-    pub fn resume(
-        &mut self,
-        keys: &[String],
-        make: impl FnOnce() -> Result<Capture>,
-        mut each: impl FnMut(usize, &Capture) -> Result<()>,
-    ) -> Result<usize> {
-        let mut make = Some(make);
-        loop {
-            let file = self.folder.join(self.chunk_name());
-            if !file.exists() {
-                return Ok(self.index.len());
-            }
-            let other = || Error::input(&file, "the output", "an existing chunk", "a folder without chunks");
-            let chunk = Chunk::read(&file)?;
-            for key in chunk.keys() {
-                let capture = chunk.capture(key)?;
-                let number = self.index.len();
-                if keys.get(number).is_none_or(|wanted| wanted != key) {
-                    return Err(other());
-                }
-                if let Some(make) = make.take()
-                    && !is_same(&capture, &make()?)?
-                {
-                    return Err(other());
-                }
-                each(number, &capture)?;
-                self.index.insert(key.to_owned(), self.chunk_name());
-            }
-            self.chunks += 1;
-        }
     }
 
     /// Adds a capture under its name. JPEG and PNG files are copied bit for bit unless their lens distorts, they need rotating, or
@@ -176,9 +138,4 @@ fn chunk_bytes(scenes: &[WaitingScene]) -> Result<Vec<u8>> {
         ])
     });
     Ok(serialize(&Item::List(scenes.collect()))?)
-}
-
-/// Returns `true` if both captures have equally many photos and the same first photo.
-fn is_same(a: &Capture, b: &Capture) -> Result<bool> {
-    Ok(a.len() == b.len() && a.encoded(0)? == b.encoded(0)?)
 }

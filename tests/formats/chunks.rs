@@ -72,48 +72,6 @@ fn packed_captures_round_trip() {
 }
 
 #[test]
-fn chunks_that_interrupted_work_left_are_taken_over() {
-    let folder = tempfile::tempdir().unwrap();
-    let chunks = packed(folder.path());
-    let files = ["index.json", "000000.torch", "000001.torch"].map(|name| chunks.join(name));
-    let read = || files.each_ref().map(|file| std::fs::read(file).unwrap());
-    let before = read();
-    let capture = |name: &str| open_capture(&folder.path().join(name));
-    let bytes = files[1].metadata().unwrap().len() as usize;
-    for lost in [&files[..1], &[files[0].clone(), files[2].clone()]] {
-        lost.iter().for_each(|file| std::fs::remove_file(file).unwrap());
-        let mut writer = ChunkWriter::new(&chunks, bytes).unwrap();
-        let mut seen = vec![];
-        let count = writer
-            .resume(
-                &SCENES.map(String::from),
-                || Ok(capture(SCENES[0])?),
-                |number, capture| {
-                    seen.push((number, capture.name.clone()));
-                    Ok(())
-                },
-            )
-            .unwrap();
-        assert_eq!(count, if lost.len() == 1 { 3 } else { 2 });
-        let expected: Vec<_> = SCENES[..count].iter().map(|name| name.to_string()).enumerate().collect();
-        assert_eq!(seen, expected);
-        for name in &SCENES[count..] {
-            writer.add(&capture(name).unwrap()).unwrap();
-        }
-        assert_eq!(writer.finish().unwrap(), 2);
-        assert_eq!(read(), before);
-    }
-    // Chunks of other captures, recognized by their names or their photos.
-    std::fs::remove_file(&files[0]).unwrap();
-    let others = ["room_1", "room_0", "room_2"].map(String::from);
-    for (keys, first) in [(others, SCENES[0]), (SCENES.map(String::from), SCENES[1])] {
-        let mut writer = ChunkWriter::new(&chunks, bytes).unwrap();
-        let error = writer.resume(&keys, || Ok(capture(first)?), |_, _| Ok(())).unwrap_err().to_string();
-        assert!(error.contains("000000.torch: the output is an existing chunk"), "{error}");
-    }
-}
-
-#[test]
 fn split_folders_contain_only_their_own_captures() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path().join("set");

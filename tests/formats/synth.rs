@@ -1,6 +1,6 @@
 //! Videos of synthetic scenes are reproducible, consistent with their cameras, and usable like any other data.
 
-use crate::common::program::{arg, command, refuse, run_process, succeed, tiny_config};
+use crate::common::program::{Sandbox, arg, assert_says, command, run_process, succeed, tiny_config};
 use glam::{DMat3, DVec3};
 use globalsplat::data::{Dataset, Split, SyntheticDataset, load_all_views};
 use globalsplat::scene::{Camera, ImageSize};
@@ -29,36 +29,26 @@ fn a_seed_makes_the_same_bytes() {
 }
 
 #[test]
-fn interrupted_synth_resumes() {
-    let folder = tempfile::tempdir().unwrap();
-    let out = folder.path().join("worlds");
-    let (chunk, indices) =
-        (out.join("000000.torch"), ["index.json", "evaluation_index.json"].map(|n| out.join(n)));
-    let synth = |[scenes, frames, size, seed]: [&'static str; 4]| {
-        let settings = ["--scenes", scenes, "--frames", frames, "--size", size, "--seed", seed, "--depth"];
-        [&["synth", "--out", arg(&out)][..], &settings].concat()
+fn interrupted_synth_is_repeated_and_other_chunks_stay() {
+    let sandbox = Sandbox::empty();
+    let synth = |seed: u64| {
+        format!(
+            "synth --scenes 2 --frames 3 --size 24 --depth --contact-sheet @sheet.png --out @worlds --seed {seed}"
+        )
     };
-    let sheet = folder.path().join("sheet.png");
-    let arguments = [&synth(["2", "3", "24", "0"])[..], &["--contact-sheet", arg(&sheet)]].concat();
-    succeed(&arguments);
-    let files = [&indices[0], &indices[1], &out.join("depth/0_000001.npy"), &sheet, &chunk];
-    let read = || files.map(|file| std::fs::read(file).unwrap());
-    let (before, written) = (read(), || chunk.metadata().unwrap().modified().unwrap());
-    let when = written();
-
-    // Simulates a process that was stopped before it wrote the index, and a lost file.
-    files[..4].iter().for_each(|lost| std::fs::remove_file(lost).unwrap());
-    succeed(&arguments);
-    assert!(read() == before);
-    assert_eq!(written(), when, "made anew");
-    // The existing files are of other scenes, or of other photos of them.
-    std::fs::remove_file(&indices[0]).unwrap();
-    for other in [["1", "3", "24", "0"], ["2", "4", "24", "0"], ["2", "3", "25", "0"], ["2", "3", "24", "1"]]
+    sandbox.run(&synth(0));
+    let before = sandbox.contents();
+    // Simulates a process that was stopped before it wrote the index.
+    for lost in
+        ["worlds/index.json", "worlds/evaluation_index.json", "worlds/depth/0_000001.npy", "sheet.png"]
     {
-        let error = refuse(&synth(other));
-        assert!(error.contains("000000.torch: the output is an existing chunk"), "{other:?}: {error}");
+        std::fs::remove_file(sandbox.path(lost)).unwrap();
     }
-    assert!(std::fs::read(&chunk).unwrap() == before[4], "lost");
+    sandbox.run(&synth(0));
+    assert!(sandbox.contents() == before);
+    std::fs::remove_file(sandbox.path("worlds/index.json")).unwrap();
+    assert_says(&sandbox.refuse(&synth(1)), &["000000.torch: the output is an existing chunk"]);
+    assert!(sandbox.read("worlds/000000.torch") == before[&sandbox.path("worlds/000000.torch")], "lost");
 }
 
 /// Projects a pixel of `from` at `depth` metres into `to`; returns its position in pixels, and its depth there.
