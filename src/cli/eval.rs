@@ -260,8 +260,6 @@ impl Eval {
         }
         let dataset = Dataset::open(data, Split::Test)?;
         warn_of_many(dataset.warnings.iter());
-        let dataset_name = |index| DatasetEvaluation::dataset_name(self.dataset.as_deref(), data, index);
-        let dataset_names = indices.iter().map(dataset_name).collect::<Result<Vec<_>, _>>()?;
         check_writable_dir(out)?;
         self.check_outputs(&dataset, out, indices.iter().zip(&folders))?;
         let (loaded, path) = (self.load_model(device)?, self.path());
@@ -280,14 +278,14 @@ impl Eval {
         signals::handle_stop_requests()?;
 
         let mut evaluations = vec![];
-        for ((index, folder), dataset_name) in indices.iter().zip(folders).zip(dataset_names) {
+        for (index, folder) in indices.iter().zip(folders) {
             let evaluation = DatasetEvaluation {
                 method: self.method(model),
                 name: self.name.clone().unwrap_or(format!("{stem}{precision}")),
                 fingerprint: format!("{fingerprint}{precision}"),
                 dataset: &dataset,
                 root: data,
-                dataset_name,
+                dataset_name: DatasetEvaluation::dataset_name(self.dataset.as_deref(), data, index),
                 index,
                 target_size,
                 device,

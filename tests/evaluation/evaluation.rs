@@ -227,7 +227,7 @@ fn several_indices_make_one_report() {
     let error = sandbox.refuse(&format!("{eval} --index @other/acid_2v.json"));
     assert_says(&error, &["two of them would go to"]);
 
-    // --dataset decides if the index has the names of two.
+    // --dataset decides over the name of the index.
     sandbox.write("acid_from_re10k_2v.json", &index);
     let eval = SPLATS.replace("re10k_3v", "acid_from_re10k_2v").replace("@out", "@named");
     sandbox.succeed(&format!("{eval} @chunks --dataset ACID"));
