@@ -107,7 +107,7 @@ impl Capture {
 
     /// Points of a COLMAP reconstruction and their colors in [0, 1], two arrays [P, 3]; empty if the capture has none.
     fn points<'py>(&self, py: Python<'py>) -> PyResult<Points<'py>> {
-        let points = run(py, || Ok(read_points(&self.0)?))?;
+        let points = run(py, || read_points(&self.0))?;
         let positions: Vec<f64> = points.iter().flat_map(|point| point.position.to_array()).collect();
         let colors: Vec<f32> = points.iter().flat_map(|point| point.color).collect();
         let shape = [points.len(), 3];

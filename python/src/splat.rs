@@ -15,7 +15,7 @@ use std::path::PathBuf;
 /// Reads a splat file of any format. Returns the parameters that 3DGS optimizes, and the warnings of the reader.
 #[pyfunction]
 pub fn read_splat(py: Python<'_>, path: PathBuf) -> PyResult<(Bound<'_, PyDict>, Vec<String>)> {
-    let splat = run(py, || Ok(globalsplat::io::read_splat(&path)?))?;
+    let splat = run(py, || globalsplat::io::read_splat(&path))?;
     let warnings = splat.warnings.clone();
     Ok((to_dict(py, splat)?, warnings))
 }
@@ -34,7 +34,7 @@ pub fn write_splat(
     run(py, || {
         check_writable_splat(&path)?;
         let fitted = fit_splat(&path, &splat, &ShLimits::up_to(splat.sh_degree), &cameras)?;
-        Ok(globalsplat::io::write_splat(&path, &fitted)?)
+        globalsplat::io::write_splat(&path, &fitted)
     })
 }
 

@@ -25,7 +25,7 @@ pub fn parse(name: &str) -> Result<Device> {
 
 /// Loads libtorch's CUDA library if there is one, or returns why it can't be loaded. The program isn't linked to it: loading it
 /// takes longer than a small job on the CPU, and machines without a GPU may not have it.
-pub fn load_cuda() -> std::result::Result<(), String> {
+pub fn load_cuda() -> Result<(), String> {
     // SAFETY: the name is a terminated string, and the library's initializers only register themselves with libtorch.
     let loaded = unsafe { libc::dlopen(c"libtorch_cuda.so".as_ptr(), libc::RTLD_NOW | libc::RTLD_GLOBAL) };
     if !loaded.is_null() {

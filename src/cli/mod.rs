@@ -30,6 +30,7 @@ mod weights;
 
 use crate::Error;
 use crate::data::{Capture, Holdout};
+use crate::distributed::is_communication_error;
 use crate::error::panic_message;
 use crate::scene::ImageSize;
 use clap::{Parser, Subcommand};
@@ -187,11 +188,9 @@ impl Command {
             }
         };
         let message = error.to_string();
-        // An error of the lower crates is one of the library's.
-        let error = error.downcast::<globalsplat_files::Error>().map(Error::from);
-        let error = error.or_else(|other| other.downcast::<Error>());
-        let code = if error.as_ref().is_ok_and(Error::is_invalid_request) { WRONG_REQUEST } else { FAILED };
-        Err((code, user_message(&message, error.is_ok_and(|error| error.is_distributed()))))
+        let error = error.downcast_ref::<Error>();
+        let code = if error.is_some_and(Error::is_invalid_request) { WRONG_REQUEST } else { FAILED };
+        Err((code, user_message(&message, error.is_some_and(is_communication_error))))
     }
 }
 

@@ -41,5 +41,5 @@ pub fn write(path: &Path, splat: &Splat, local_origin: Option<DVec3>, options: &
     {
         eprintln!("{}: {loss}; --local-origin keeps them exact", path.display());
     }
-    Ok(write_local_splat(path, &splat.with_origin(local_origin.unwrap_or(DVec3::ZERO)), options)?)
+    write_local_splat(path, &splat.with_origin(local_origin.unwrap_or(DVec3::ZERO)), options)
 }

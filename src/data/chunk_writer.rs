@@ -74,7 +74,7 @@ impl ChunkWriter {
         }
         let (views, _) = capture.split(Holdout::None);
         let image = |&view| capture.encoded(view).map(|bytes| (bytes.len(), bytes));
-        let images = views.par_iter().map(image).collect::<std::result::Result<Vec<_>, _>>()?;
+        let images = views.par_iter().map(image).collect::<Result<Vec<_>, _>>()?;
         let bytes: usize = images.iter().map(|(length, _)| length).sum();
         if !self.waiting.is_empty() && self.waiting_bytes + bytes > self.chunk_bytes {
             self.write_chunk()?;
@@ -137,5 +137,5 @@ fn chunk_bytes(scenes: &[WaitingScene]) -> Result<Vec<u8>> {
             ("key", Item::Str(&scene.key)),
         ])
     });
-    Ok(serialize(&Item::List(scenes.collect()))?)
+    serialize(&Item::List(scenes.collect()))
 }

@@ -123,7 +123,7 @@ impl DataConfig {
     /// # Errors
     /// Fails if a variable is not set and has no default.
     pub fn capture_paths(&self) -> Result<Vec<PathBuf>> {
-        self.captures.iter().map(|path| Ok(expand_path(path)?)).collect()
+        self.captures.iter().map(|path| expand_path(path)).collect()
     }
 
     /// Returns all settings that the validation scores depend on, as a string.
@@ -143,7 +143,7 @@ impl DataConfig {
     /// # Errors
     /// Fails like [`DataConfig::capture_paths`].
     pub fn validation_paths(&self) -> Result<Vec<PathBuf>> {
-        self.validation.iter().map(|path| Ok(expand_path(path)?)).collect()
+        self.validation.iter().map(|path| expand_path(path)).collect()
     }
 
     /// Checks that the values are consistent.

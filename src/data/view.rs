@@ -109,7 +109,7 @@ impl FromStr for PhotoSize {
     type Err = String;
 
     /// Parses the longer side, as in `1600`, or width and height, as in `640x480`.
-    fn from_str(text: &str) -> std::result::Result<Self, String> {
+    fn from_str(text: &str) -> Result<Self, String> {
         let side = |text: &str| text.parse().ok().filter(|side| (MIN_SIDE..=MAX_SIDE).contains(side));
         let size = match text.split_once('x') {
             Some((width, height)) => side(width)
@@ -126,7 +126,7 @@ impl FromStr for PhotoSize {
 impl TryFrom<String> for PhotoSize {
     type Error = String;
 
-    fn try_from(text: String) -> std::result::Result<Self, String> {
+    fn try_from(text: String) -> Result<Self, String> {
         text.parse()
     }
 }

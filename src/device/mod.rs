@@ -8,7 +8,7 @@ pub(crate) use memory::{
 };
 pub use memory::{peak_memory_bytes, total_memory_bytes};
 
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::ffi::take_tensor;
 use cxx::UniquePtr;
 use globalsplat_csrc::runtime as ffi;
@@ -36,7 +36,7 @@ impl DeviceEvent {
     /// Records an event now, without waiting for the GPU.
     pub fn now(device: Device) -> Result<Self> {
         Ok(match gpu(device) {
-            Some(gpu) => DeviceEvent::Gpu(ffi::record_event(gpu)?),
+            Some(gpu) => DeviceEvent::Gpu(ffi::record_event(gpu).map_err(Error::external)?),
             None => DeviceEvent::Host(Instant::now()),
         })
     }
@@ -50,9 +50,9 @@ impl DeviceEvent {
     /// Panics if the events are of different devices.
     pub fn since(&self, earlier: &DeviceEvent) -> Result<Duration> {
         Ok(match (self, earlier) {
-            (DeviceEvent::Gpu(event), DeviceEvent::Gpu(earlier)) => {
-                Duration::from_secs_f64(1e-3 * event.milliseconds_since(earlier)?.max(0.))
-            }
+            (DeviceEvent::Gpu(event), DeviceEvent::Gpu(earlier)) => Duration::from_secs_f64(
+                1e-3 * event.milliseconds_since(earlier).map_err(Error::external)?.max(0.),
+            ),
             (DeviceEvent::Host(instant), DeviceEvent::Host(earlier)) => *instant - *earlier,
             _ => panic!("events of two devices"),
         })
@@ -77,7 +77,7 @@ impl Upload {
     /// # Errors
     /// Returns an error if the GPU is missing or fails.
     pub fn new(device: Device) -> Result<Self> {
-        let stream = gpu(device).map(ffi::copy_stream).transpose()?;
+        let stream = gpu(device).map(ffi::copy_stream).transpose().map_err(Error::external)?;
         Ok(Upload { device, stream })
     }
 
@@ -93,7 +93,7 @@ impl Upload {
             return Ok(Tensor::empty(shape, (Kind::Uint8, Device::Cpu)));
         }
         // SAFETY: the C++ side returns the address of a new tensor.
-        Ok(unsafe { take_tensor(ffi::empty_pinned_bytes(shape)?) })
+        Ok(unsafe { take_tensor(ffi::empty_pinned_bytes(shape).map_err(Error::external)?) })
     }
 
     /// Starts copying `tensors` from the host; the caller may drop them immediately.
@@ -102,7 +102,7 @@ impl Upload {
             Some(stream) => {
                 let addresses: Vec<usize> = tensors.iter().map(|t| t.as_ptr() as usize).collect();
                 // SAFETY: the tensors outlive the call.
-                PendingCopy::Gpu(unsafe { stream.copy(&addresses) }?)
+                PendingCopy::Gpu(unsafe { stream.copy(&addresses) }.map_err(Error::external)?)
             }
             None => PendingCopy::Done(tensors.iter().map(|t| t.to_device(self.device)).collect()),
         })
@@ -129,7 +129,8 @@ impl PendingCopy {
             PendingCopy::Gpu(copies) => {
                 // SAFETY: the C++ side returns the addresses of new tensors.
                 Ok(copies
-                    .take_tensors()?
+                    .take_tensors()
+                    .map_err(Error::external)?
                     .into_iter()
                     .map(|address| unsafe { take_tensor(address) })
                     .collect())

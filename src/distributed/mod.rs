@@ -6,7 +6,7 @@ mod process_group;
 
 pub use env::{DistributedEnv, Rendezvous};
 pub use globalsplat_csrc::distributed::{has_gloo, has_nccl};
-pub use process_group::ProcessGroup;
+pub use process_group::{ProcessGroup, is_communication_error};
 
 #[cfg(test)]
 pub(crate) mod tests {

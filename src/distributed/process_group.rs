@@ -29,9 +29,18 @@ impl fmt::Debug for ProcessGroup {
     }
 }
 
-/// Returns the error for a failed collective. The cause is almost always that another rank is gone.
+/// Failed communication with the other processes, almost always because one of them has ended.
+#[derive(Debug, thiserror::Error)]
+#[error("distributed communication failed ({0}); restart the processes to resume from the last checkpoint")]
+struct CommunicationError(String);
+
 fn distributed_error(why: cxx::Exception) -> Error {
-    Error::Distributed { message: why.what().lines().next().unwrap_or_default().to_string() }
+    Error::external(CommunicationError(why.what().lines().next().unwrap_or_default().to_string()))
+}
+
+/// Returns `true` if `error` is that of a failed communication with the other processes.
+pub fn is_communication_error(error: &Error) -> bool {
+    matches!(error, Error::Failed { source: Some(source), .. } if source.is::<CommunicationError>())
 }
 
 impl ProcessGroup {
@@ -95,10 +104,7 @@ impl ProcessGroup {
     }
 
     /// Calls a function of the C++ implementation, if there are several ranks.
-    fn call(
-        &self,
-        function: impl FnOnce(&ffi::ProcessGroup) -> std::result::Result<(), cxx::Exception>,
-    ) -> Result<()> {
+    fn call(&self, function: impl FnOnce(&ffi::ProcessGroup) -> Result<(), cxx::Exception>) -> Result<()> {
         self.inner.as_ref().map_or(Ok(()), |inner| function(inner).map_err(distributed_error))
     }
 

@@ -231,7 +231,7 @@ impl DatasetEvaluation<'_> {
             }
             return Ok(());
         }
-        Ok(write_json(&file, &identity)?)
+        write_json(&file, &identity)
     }
 
     /// Returns the stored scores of scene `key`, which is in the group that `open` opens. Returns `None`, so that the scene is scored

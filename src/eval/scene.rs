@@ -33,7 +33,7 @@ impl SceneFrames {
     /// # Errors
     /// Fails if a photo can't be read.
     pub(super) fn checksum(&self, capture: &Capture) -> Result<u32> {
-        Ok(capture.checksum(self.context.iter().chain(&self.target).copied())?)
+        capture.checksum(self.context.iter().chain(&self.target).copied())
     }
 
     /// Returns the file names of the target images without their extensions: six-digit frame numbers, as chunks name frames.
@@ -80,7 +80,7 @@ impl EvaluationIndex {
     /// # Errors
     /// Fails if the file can't be written.
     pub fn write(&self) -> Result<()> {
-        Ok(write_json(&self.file, &self.scenes)?)
+        write_json(&self.file, &self.scenes)
     }
 
     /// Returns the name of the index file.

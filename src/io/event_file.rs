@@ -67,7 +67,7 @@ impl EventFile {
     pub fn start(&mut self, step: u64) -> Result<()> {
         let version = record(&event(0, &bytes(3, VERSION.as_bytes())));
         let session = record(&event(step, &bytes(7, &varint(1, START))));
-        Ok(self.file.append(&[version, session].concat())?)
+        self.file.append(&[version, session].concat())
     }
 
     /// Writes the scalars of one step, by tag.
@@ -88,7 +88,7 @@ impl EventFile {
     }
 
     fn write_summary(&mut self, step: u64, summary: &[u8]) -> Result<()> {
-        Ok(self.file.append(&record(&event(step, &bytes(5, summary))))?)
+        self.file.append(&record(&event(step, &bytes(5, summary))))
     }
 }
 

@@ -19,14 +19,14 @@ pub fn tensor_from_rgb(image: &RgbImage) -> Tensor {
 /// Returns libtorch's error, for example for another shape.
 pub fn rgb_from_tensor(image: &Tensor) -> Result<RgbImage> {
     let planes = if image.dim() == 2 {
-        image.unsqueeze(0).f_expand([3, -1, -1], false)?
+        image.unsqueeze(0).f_expand([3, -1, -1], false).map_err(Error::external)?
     } else {
         image.shallow_clone()
     };
     let (height, width) = (planes.size()[1], planes.size()[2]);
     let bytes =
         (planes.detach().clamp(0., 1.) * 255.).round().to_kind(Kind::Uint8).permute([1, 2, 0]).contiguous();
-    let bytes = Vec::<u8>::try_from(bytes.flatten(0, -1))?;
+    let bytes = Vec::<u8>::try_from(bytes.flatten(0, -1)).map_err(Error::external)?;
     RgbImage::from_raw(width as u32, height as u32, bytes)
         .ok_or_else(|| Error::failed("the number of pixels doesn't match the image size"))
 }
@@ -44,7 +44,7 @@ pub fn check_writable_png(path: &Path) -> Result<()> {
     if !is_png_name(path) {
         return Err(Error::input(path, "the image's file extension", "another", ".png"));
     }
-    Ok(check_writable_file(path)?)
+    check_writable_file(path)
 }
 
 /// Writes a tensor [3, H, W] or [H, W] (gray) with values in [0, 1] as a PNG.

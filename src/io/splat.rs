@@ -1,6 +1,6 @@
 //! Splats fitted to the format of a file, and the precision of their positions in it.
 
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::render::{compensate_mean_color, fit_harmonics, shrink_harmonics};
 use crate::scene::{Camera, Gaussians, RawGaussians, splat_frame};
 use glam::DVec3;
@@ -32,8 +32,12 @@ pub fn fit_splat(path: &Path, splat: &Splat, limits: &ShLimits, cameras: &[Camer
     let logits = logits.where_self(&fitted.opacities.not_equal_tensor(&gaussians.opacities), &kept);
     let with_sh = |fitted: &Gaussians| -> Result<Splat> {
         Ok(Splat {
-            opacity_logits: Vec::try_from(logits.flatten(0, -1))?,
-            sh: Vec::<f32>::try_from(fitted.sh.flatten(0, -1))?.as_chunks().0.to_vec(),
+            opacity_logits: Vec::try_from(logits.flatten(0, -1)).map_err(Error::external)?,
+            sh: Vec::<f32>::try_from(fitted.sh.flatten(0, -1))
+                .map_err(Error::external)?
+                .as_chunks()
+                .0
+                .to_vec(),
             sh_degree: fitted.sh.size()[2].isqrt() as usize - 1,
             warnings: vec![],
             ..splat.clone()

@@ -93,7 +93,7 @@ impl VideoWriter {
             Encoder::Gif(gif) => gif.finish(&path)?,
             Encoder::Mp4(mut mp4) => mp4.end(&path)?,
         }
-        Ok(partial.persist()?)
+        partial.persist()
     }
 }
 
@@ -154,7 +154,7 @@ fn not_encoded(path: &Path) -> impl FnOnce(gif::EncodingError) -> Error {
 ///
 /// # Errors
 /// Returns a message that says what is missing and how to install it.
-pub fn find_ffmpeg() -> std::result::Result<String, String> {
+pub fn find_ffmpeg() -> Result<String, String> {
     const GET: &str = "(Debian and Ubuntu: apt install ffmpeg; macOS: brew install ffmpeg)";
     let output = Command::new("ffmpeg").arg("-encoders").stdin(Stdio::null()).output();
     let output = output.map_err(|e| match is_program_missing(&e) {

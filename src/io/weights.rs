@@ -28,7 +28,9 @@ impl Weights {
     /// Returns an error if names or shapes don't match, before anything is copied: it names the first mismatch and counts the others.
     pub fn load_into(&self, vs: &nn::VarStore, file: &Path) -> Result<()> {
         let shapes = self.tensors.iter().map(|(name, t)| (name.as_str(), t.size())).collect();
-        fit(vs, &shapes, file, |name, variable| Ok(variable.f_copy_(&self.tensors[name])?))
+        fit(vs, &shapes, file, |name, variable| {
+            variable.f_copy_(&self.tensors[name]).map_err(Error::external)
+        })
     }
 }
 
@@ -70,7 +72,7 @@ const HEADER_LENGTH: usize = 8;
 /// Returns an error if a tensor's type can't be stored, or if the file can't be written.
 pub fn write_checkpoint(path: &Path, weights: &Weights) -> Result<()> {
     let contents = contents_of(&weights.tensors)?;
-    Ok(torch_file::write_checkpoint(path, views(&weights.tensors, &contents)?, &weights.metadata)?)
+    torch_file::write_checkpoint(path, views(&weights.tensors, &contents)?, &weights.metadata)
 }
 
 /// Returns the bytes of each tensor, in row-major order.
@@ -78,7 +80,7 @@ fn contents_of(tensors: &BTreeMap<String, Tensor>) -> Result<Vec<Vec<u8>>> {
     let bytes = |tensor: &Tensor| {
         let tensor = tensor.detach().to_device(Device::Cpu).contiguous();
         let mut bytes = vec![0; tensor.numel() * to_dtype(tensor.kind())?.bitsize() / 8];
-        tensor.f_copy_data_u8(&mut bytes, tensor.numel())?;
+        tensor.f_copy_data_u8(&mut bytes, tensor.numel()).map_err(Error::external)?;
         Ok(bytes)
     };
     tensors.values().map(bytes).collect()
@@ -254,21 +256,21 @@ impl WeightsFile {
             return Err(Error::input(&self.path, field, array.dtype, "F32, BF16 or F16"));
         }
         let shapes = self.arrays.iter().map(|(name, a)| (name.as_str(), dimensions(&a.shape))).collect();
-        fit(
-            vs,
-            &shapes,
-            &self.path,
-            |name, variable| Ok(variable.f_copy_(&self.tensor(&self.arrays[name])?)?),
-        )
+        fit(vs, &shapes, &self.path, |name, variable| {
+            variable.f_copy_(&self.tensor(&self.arrays[name])?).map_err(Error::external)
+        })
     }
 
     fn tensor(&self, array: &Array) -> Result<Tensor> {
         let bytes = &self.bytes.get()[array.bytes.clone()];
         let count = bytes.len() / (array.dtype.bitsize() / 8);
-        let numbers = Tensor::f_from_data_size(bytes, &[count as i64], to_kind(array.dtype))?;
-        Ok(numbers
-            .f_as_strided(dimensions(&array.shape), dimensions(&array.strides), None)?
-            .f_contiguous()?)
+        let numbers = Tensor::f_from_data_size(bytes, &[count as i64], to_kind(array.dtype))
+            .map_err(Error::external)?;
+        numbers
+            .f_as_strided(dimensions(&array.shape), dimensions(&array.strides), None)
+            .map_err(Error::external)?
+            .f_contiguous()
+            .map_err(Error::external)
     }
 }
 

@@ -85,7 +85,7 @@ impl PerceptualNetwork {
     /// Returns an error if a variable isn't set and has no default.
     pub fn weights_file(config: &LossConfig) -> Result<PathBuf> {
         if !config.perceptual_weights.is_empty() {
-            return Ok(expand_path(&config.perceptual_weights)?);
+            return expand_path(&config.perceptual_weights);
         }
         let name = config.perceptual.backbone().unwrap_or(PerceptualBackbone::Vgg19).file_name();
         Ok(find_pretrained(&name).unwrap_or_else(|| pretrained_folders()[0].join(name)))

@@ -180,7 +180,7 @@ impl Optimizer {
     pub fn gradient_norm(&self) -> Result<Tensor> {
         let gradients: Vec<Tensor> = self.gradients().map(|(_, gradient)| gradient).collect();
         // SAFETY: the tensors outlive the call, which returns the address of a new one.
-        Ok(unsafe { take_tensor(norm(&addresses(&gradients))?) })
+        Ok(unsafe { take_tensor(norm(&addresses(&gradients)).map_err(Error::external)?) })
     }
 
     /// Scales the gradients, whose total norm is `norm`, so that the norm is at most `largest`.
@@ -191,7 +191,7 @@ impl Optimizer {
         if norm > largest {
             let gradients: Vec<Tensor> = self.gradients().map(|(_, gradient)| gradient).collect();
             // SAFETY: the tensors outlive the call, and nothing else works on them meanwhile.
-            unsafe { scale(&addresses(&gradients), largest / (norm + CLIP_EPS)) }?;
+            unsafe { scale(&addresses(&gradients), largest / (norm + CLIP_EPS)) }.map_err(Error::external)?;
         }
         Ok(())
     }
@@ -264,7 +264,8 @@ impl Optimizer {
             epsilon: self.epsilon,
         };
         // SAFETY: the tensors outlive the call, and nothing else works on them meanwhile.
-        Ok(unsafe { fused_adamw(&values, &addresses(&gradients), &first, &second, &numbers) }?)
+        unsafe { fused_adamw(&values, &addresses(&gradients), &first, &second, &numbers) }
+            .map_err(Error::external)
     }
 
     /// Updates a group of matrices by Muon.

@@ -80,7 +80,7 @@ impl RefineLog {
         std::fs::create_dir_all(run).map_err(Error::write(run))?;
         let file = run.join(METRICS_FILE);
         if steps == 0 {
-            write_atomically(&file, |_| Ok::<_, Error>(()))?;
+            write_atomically(&file, |_| Ok(()))?;
         }
         let (metrics, mut events) = (AppendFile::open(&file)?, EventFile::create_for(run)?);
         events.start(steps)?;

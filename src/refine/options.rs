@@ -90,7 +90,7 @@ macro_rules! options_struct {
 
         impl $name {
             /// Sets the field that `--set` calls `key`.
-            fn set_field(&mut self, key: &str, value: toml::Value) -> std::result::Result<(), toml::de::Error> {
+            fn set_field(&mut self, key: &str, value: toml::Value) -> Result<(), toml::de::Error> {
                 match key {
                     $(stringify!($both) => self.$both = value.try_into()?,)*
                     $(stringify!($setting) => self.$setting = value.try_into()?,)*
@@ -268,7 +268,7 @@ impl MaskBackground {
 
 /// Parses a number of Gaussians; `None` stands for `auto`.
 #[cfg(feature = "cli")]
-fn parse_gaussians(text: &str) -> std::result::Result<Option<usize>, String> {
+fn parse_gaussians(text: &str) -> Result<Option<usize>, String> {
     const MAX: usize = 10_000_000;
     match text.parse() {
         _ if text == "auto" => Ok(None),
@@ -320,7 +320,7 @@ impl RefineOptions {
     }
 
     /// Checks that every setting is in the range that the method supports. Returns the expected range of the first that isn't.
-    fn check_settings(&self) -> std::result::Result<(), &'static str> {
+    fn check_settings(&self) -> Result<(), &'static str> {
         let rates = [
             self.lr_means,
             self.lr_scales,

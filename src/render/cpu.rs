@@ -1,7 +1,7 @@
 //! CPU-only functions: measurements of the CPU rasterizer and its instruction set.
 
 use super::{Cameras, splat_arguments};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::scene::Gaussians;
 use globalsplat_csrc::{render as ffi, runtime};
 
@@ -13,7 +13,7 @@ pub use globalsplat_csrc::runtime::libtorch_simd_level;
 /// # Errors
 /// Fails if `GLOBALSPLAT_SIMD` names an instruction set that this machine doesn't have.
 pub fn simd_level() -> Result<String> {
-    Ok(ffi::simd_level()?)
+    ffi::simd_level().map_err(Error::external)
 }
 
 /// Counts the tile entries and (pixel, splat) pairs that [`render()`](super::render()) blends for float32 Gaussians on the CPU.
@@ -22,7 +22,7 @@ pub fn simd_level() -> Result<String> {
 /// Fails like [`render()`](super::render()), and if the Gaussians aren't float32 or not on the CPU.
 pub fn count_pairs(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<PairCounts> {
     // SAFETY: the tensors outlive the call.
-    Ok(unsafe { ffi::count_pairs(&splat_arguments(gaussians, cameras, eps2d)) }?)
+    unsafe { ffi::count_pairs(&splat_arguments(gaussians, cameras, eps2d)) }.map_err(Error::external)
 }
 
 /// Guard that limits libtorch to one thread while it lives. The kernels of this program use as many threads as libtorch did before. This is

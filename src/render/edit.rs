@@ -215,7 +215,7 @@ pub fn contributions(gaussians: &Gaussians, cameras: &[Camera]) -> Result<Vec<f3
     for camera in cameras {
         total += image_contributions(gaussians, &Cameras::single(camera))?;
     }
-    Ok(Vec::try_from(total.view([-1]))?)
+    Vec::try_from(total.view([-1])).map_err(Error::external)
 }
 
 /// Returns the indices of the `count` Gaussians, or of all if there are fewer, with the largest `contributions`, the largest first.
@@ -228,7 +228,7 @@ pub(crate) fn largest_contributions(contributions: &[f32], count: usize) -> Vec<
 
 /// Returns the contribution of each Gaussian to the images of `cameras` together, [B, N], as [`contributions`] does.
 pub(crate) fn image_contributions(gaussians: &Gaussians, cameras: &Cameras) -> Result<Tensor> {
-    let (b, n) = gaussians.opacities.size2()?;
+    let (b, n) = gaussians.opacities.size2().map_err(Error::external)?;
     let colors = Tensor::zeros([b, n, 1, 3], (gaussians.means.kind(), gaussians.means.device()));
     let colors = colors.set_requires_grad(true);
     let gray = Gaussians { sh: colors.shallow_clone(), ..gaussians.map(Tensor::detach) };

@@ -13,7 +13,7 @@ pub use globalsplat_csrc::runtime::libtorch_version;
 pub use harmonics::{compensate_mean_color, fit_harmonics, shrink_harmonics};
 pub use views::{RenderedView, SplatRenderer, orbit_around_gaussians, orbit_around_splat, render_views};
 
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::ffi::take_tensors;
 use crate::scene::{Camera, Gaussians, pose_to_rows};
 use globalsplat_csrc::render::{SplatArguments, splat};
@@ -92,7 +92,8 @@ pub struct RenderOutput {
 /// compiled for the GPU.
 pub fn render(gaussians: &Gaussians, cameras: &Cameras, eps2d: f64) -> Result<RenderOutput> {
     // SAFETY: the tensors outlive the call, which returns the addresses of new ones.
-    let [rgb, alpha, depth] = unsafe { take_tensors(splat(&splat_arguments(gaussians, cameras, eps2d))?) };
+    let [rgb, alpha, depth] =
+        unsafe { take_tensors(splat(&splat_arguments(gaussians, cameras, eps2d)).map_err(Error::external)?) };
     Ok(RenderOutput { rgb, alpha, depth })
 }
 

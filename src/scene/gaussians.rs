@@ -209,7 +209,7 @@ impl Gaussians {
 
 /// Returns the numbers of a tensor in rows of N.
 fn rows<const N: usize>(tensor: &Tensor) -> Result<Vec<[f32; N]>> {
-    Ok(Vec::<f32>::try_from(tensor.flatten(0, -1))?.as_chunks().0.to_vec())
+    Ok(Vec::<f32>::try_from(tensor.flatten(0, -1)).map_err(Error::external)?.as_chunks().0.to_vec())
 }
 
 /// Returns the local frame in which a splat is rendered (spec 2.5).

@@ -155,7 +155,7 @@ pub(super) fn keep_best(run: &Path, checkpoint: &Path, validation: Validation) -
     let state = State { validation: Some(validation), ..read_state(checkpoint)? };
     write_json(&checkpoint.join(STATE_FILE), &state)?;
     let target = checkpoint.strip_prefix(run).expect("a checkpoint of the run");
-    Ok(replace_link(&run.join(BEST), target)?)
+    replace_link(&run.join(BEST), target)
 }
 
 impl Trainer {

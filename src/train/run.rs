@@ -11,6 +11,7 @@ use super::step::{Score, StepReport};
 use super::trainer::Trainer;
 use super::{CONFIG_FILE, METRICS_FILE};
 use crate::config::{TrainConfig, changed_keys};
+use crate::distributed::is_communication_error;
 use crate::error::{Error, Result};
 use crate::io::{InputFiles, event_files, write_atomically};
 use std::path::{Path, PathBuf};
@@ -185,7 +186,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
                 let checkpoint = saved.take().map_or_else(|| self.save(), Ok)?;
                 should_continue = match self.validate(&checkpoint) {
                     // A failed write or a lost rank isn't a problem of the held-out data.
-                    Err(e) if e.is_failed_write() || e.is_distributed() => return Err(e),
+                    Err(e) if e.is_failed_write() || is_communication_error(&e) => return Err(e),
                     Err(e) => self.emit(Event::Notice(format!("a validation is left out: {e}"))),
                     should_continue => should_continue?,
                 };
@@ -234,7 +235,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
         }
         if complete && self.validator.is_some() {
             match self.validate(&checkpoint) {
-                Err(e) if e.is_failed_write() || e.is_distributed() => return Err(e),
+                Err(e) if e.is_failed_write() || is_communication_error(&e) => return Err(e),
                 Err(e) => {
                     self.emit(Event::Notice(format!("the last validation is left out: {e}")));
                 }

@@ -20,21 +20,15 @@ const NAME_BYTES: usize = 48;
 ///
 /// # Errors
 /// Returns the error of `fill`, or an error if something other than a regular file is at `path` or the file can't be written.
-pub fn write_atomically<E: From<Error>>(
-    path: &Path,
-    fill: impl FnOnce(&mut dyn Write) -> Result<(), E>,
-) -> Result<(), E> {
-    Ok(write_temporary(path, fill)?.persist()?)
+pub fn write_atomically(path: &Path, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<()> {
+    write_temporary(path, fill)?.persist()
 }
 
 /// Writes a file like [`write_atomically`], but leaves it under its temporary name until [`PartialFile::persist`] is called.
 ///
 /// # Errors
 /// Returns the errors of [`write_atomically`].
-pub fn write_temporary<E: From<Error>>(
-    path: &Path,
-    fill: impl FnOnce(&mut dyn Write) -> Result<(), E>,
-) -> Result<PartialFile, E> {
+pub fn write_temporary(path: &Path, fill: impl FnOnce(&mut dyn Write) -> Result<()>) -> Result<PartialFile> {
     let partial = PartialFile::create(path)?;
     let mut writer = BufWriter::new(partial.temporary.as_file());
     fill(&mut writer)?;

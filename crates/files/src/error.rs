@@ -103,6 +103,11 @@ impl Error {
         Error::Failed { message: message.into(), source: None }
     }
 
+    /// Returns an [`Error::Failed`] with the message of an error of another library.
+    pub fn external(source: impl StdError + Send + Sync + 'static) -> Self {
+        Error::Failed { message: source.to_string(), source: Some(Box::new(source)) }
+    }
+
     /// Returns a closure for `map_err` that wraps an error as [`Error::Failed`] with the message "`context`: error".
     pub fn failed_with_context<E: StdError + Send + Sync + 'static>(
         context: impl std::fmt::Display,
@@ -123,6 +128,11 @@ impl Error {
     pub fn write(path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.as_ref().to_owned();
         move |source| Error::Write { path, source }
+    }
+
+    /// Returns `true` if a file could not be written.
+    pub fn is_failed_write(&self) -> bool {
+        matches!(self, Error::Write { .. })
     }
 
     /// Returns `true` if the request was invalid (exit code 2), `false` if the work failed (exit code 1).

@@ -3,7 +3,7 @@
 use super::measure::{Measured, Section, TimingStats, Work};
 use crate::data::view_matrices;
 use crate::device::{Stopwatch, peak_memory_bytes_on, reset_peak_memory, resident_memory_bytes};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::render::cpu::{StageTimes, count_pairs, multiply_add_peak, simd_level, stage_times};
 use crate::render::cuda::{kernel_times, measure_kernels};
 use crate::render::{Cameras, RenderOutput, default_eps2d, render};
@@ -120,7 +120,7 @@ fn time_kernels(gaussians: &Gaussians, cameras: &Cameras, repeats: usize) -> Res
     for _ in 0..repeats {
         measure_kernels(true);
         render_with_gradients(gaussians, cameras)?;
-        let times = kernel_times()?.into_iter();
+        let times = kernel_times().map_err(Error::external)?.into_iter();
         measured.add_run(times.map(|time| (time.kernel, time.milliseconds / views, Work::default())));
     }
     measure_kernels(false);

@@ -243,7 +243,7 @@ fn whole_model(request: &Request) -> Result<Answer> {
 }
 
 fn scene_normalization(request: &Request) -> Result<Answer> {
-    let rows = Vec::<f64>::try_from(request.input("c2w")?.flatten(0, -1))?;
+    let rows = Vec::<f64>::try_from(request.input("c2w")?.flatten(0, -1)).map_err(Error::external)?;
     let poses: Vec<DMat4> =
         rows.chunks_exact(16).map(|rows| DMat4::from_cols_slice(rows).transpose()).collect();
     let normalization = scene::normalize(&poses)?;
@@ -260,7 +260,8 @@ fn depth_search(request: &Request, search: Search, score: &'static str) -> Resul
     let (grays, weights) =
         (grays.unbind(0), request.optional("other_weights").map(|weights| weights.unbind(0)));
     let compared = |(index, gray)| {
-        let matrix = Vec::<f64>::try_from(matrices.get(index as i64).to_kind(Kind::Double).view([-1]))?;
+        let matrix = Vec::<f64>::try_from(matrices.get(index as i64).to_kind(Kind::Double).view([-1]))
+            .map_err(Error::external)?;
         let column = |i: usize| DVec3::new(matrix[i], matrix[4 + i], matrix[8 + i]);
         let weight = weights.as_ref().map(|weights| &weights[index]);
         Ok(ComparedPhoto { gray, weight, to_pixels: std::array::from_fn(column) })
@@ -343,7 +344,7 @@ fn perceptual(request: &Request) -> Result<Answer> {
 fn resample(request: &Request) -> Result<Answer> {
     let image = request.input("image")?;
     let (height, width) = (image.size()[0] as u32, image.size()[1] as u32);
-    let bytes = Vec::<u8>::try_from(image.flatten(0, -1))?;
+    let bytes = Vec::<u8>::try_from(image.flatten(0, -1)).map_err(Error::external)?;
     let image = RgbImage::from_raw(width, height, bytes).expect("three bytes a pixel");
     let [left, top, region_width, region_height] = request.number("region")?;
     let region = data::Region { left, top, width: region_width, height: region_height };
@@ -356,7 +357,7 @@ fn resample(request: &Request) -> Result<Answer> {
 
 fn jitter(request: &Request) -> Result<Answer> {
     let image = request.input("image")?;
-    let mut planes = Vec::<f32>::try_from(image.flatten(0, -1))?;
+    let mut planes = Vec::<f32>::try_from(image.flatten(0, -1)).map_err(Error::external)?;
     data::Jitter { adjustments: request.number("adjustments")? }.apply(&mut planes);
     outputs([("image", Tensor::from_slice(&planes).view_as(&image))])
 }

@@ -97,9 +97,9 @@ fn answer(file: &Path, device: Device) -> Result<Tensors> {
 }
 
 fn read_request(file: &Path, device: Device) -> Result<Request> {
-    let mut arrays: Tensors = Tensor::read_safetensors(file)?.into_iter().collect();
+    let mut arrays: Tensors = Tensor::read_safetensors(file).map_err(Error::external)?.into_iter().collect();
     let case = arrays.remove("case").ok_or_else(|| unknown(file, "array", "case"))?;
-    let case = String::from_utf8_lossy(&Vec::<u8>::try_from(case)?).into_owned();
+    let case = String::from_utf8_lossy(&Vec::<u8>::try_from(case).map_err(Error::external)?).into_owned();
     let case: Value = serde_json::from_str(&case)
         .map_err(|e| Error::input(file, "case", format!("no JSON ({e})"), "{\"case\", \"config\"}"))?;
     let differentiate: Vec<&str> =

@@ -35,11 +35,11 @@ impl<'a> ImageOutput<'a> {
             )));
         }
         match kind {
-            Kind::Folder => return Ok(check_writable_dir(path)?),
+            Kind::Folder => return check_writable_dir(path),
             Kind::Row => {}
             Kind::Film => VideoWriter::check(path, frames_per_second.unwrap_or(1))?,
         }
-        Ok(check_writable_file(path)?)
+        check_writable_file(path)
     }
 
     /// Creates the output for images called `names`, unique with the `suffixes` of their parts, in frames of at most `size` with all parts

@@ -302,7 +302,7 @@ impl Shared {
         context_count: usize,
         random: &mut impl Rng,
         state: &mut WorkerState,
-    ) -> std::result::Result<LoadedScene, (Fault, String)> {
+    ) -> Result<LoadedScene, (Fault, String)> {
         let broken = |why: &Error| (Fault::Scene, why.to_string());
         let capture = match capture {
             Some(Ok(capture)) => capture,

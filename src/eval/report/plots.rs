@@ -20,7 +20,7 @@ const MAX_BINS: f64 = 28.;
 const MAX_POINTS: u64 = 60;
 
 type Chart<'a> = ChartContext<'a, SVGBackend<'a>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
-type Drawn = std::result::Result<(), DrawingAreaErrorKind<std::io::Error>>;
+type Drawn = Result<(), DrawingAreaErrorKind<std::io::Error>>;
 
 /// An axis: its title, its range, and the text of a tick.
 struct Axis<'a> {
