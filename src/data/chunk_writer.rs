@@ -1,7 +1,7 @@
 //! Writer of chunks.
 
 use crate::error::{Error, Result};
-use crate::io::{write_atomically, write_json};
+use crate::io::{write_file, write_json};
 use globalsplat_capture::{
     CAMERA_NUMBERS, CHUNK_EXTENSION, CHUNK_INDEX_FILE, Capture, Holdout, camera_numbers,
 };
@@ -115,7 +115,7 @@ impl ChunkWriter {
         if file.exists() && std::fs::read(&file).map_err(Error::read(&file))? != bytes {
             return Err(Error::input(&file, "the output", "an existing chunk", "a folder without chunks"));
         }
-        write_atomically(&file, |writer| writer.write_all(&bytes).map_err(Error::write(&file)))?;
+        write_file(&file, bytes)?;
         (self.chunks, self.waiting_bytes) = (self.chunks + 1, 0);
         Ok(())
     }

@@ -1,6 +1,6 @@
 //! Conversion of images between tensors and files, and images for display.
 
-use super::{check_writable_file, encode_photo, write_atomically};
+use super::{check_writable_file, encode_photo, write_file};
 use crate::error::{Error, Result};
 use crate::scene::ImageSize;
 use image::{Rgb, RgbImage};
@@ -63,7 +63,7 @@ pub(crate) fn write_jpeg(path: &Path, image: &Tensor) -> Result<()> {
 /// Writes an image as a JPEG, or as a PNG.
 fn write_image(path: &Path, image: &RgbImage, as_jpeg: bool) -> Result<()> {
     let bytes = encode_photo(image, as_jpeg)?;
-    write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
+    write_file(path, bytes)
 }
 
 /// Enlarges `image` [3, H, W] by an integer factor, repeating its pixels, until it is `height` high or a little less.

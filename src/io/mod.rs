@@ -13,7 +13,8 @@ pub const CONFIG_FILE: &str = "config.toml";
 pub const METRICS_FILE: &str = "metrics.jsonl";
 
 pub use globalsplat_files::{
-    InputFiles, check_regular, check_writable_dir, check_writable_file, checksum, parent_of, write_atomically,
+    InputFiles, check_regular, check_writable_dir, check_writable_file, checksum, parent_of,
+    write_atomically, write_file,
 };
 pub use globalsplat_splat_file::{
     ShLimits, Splat, WriteOptions, check_writable_splat, find_splat, is_splat_name, origin_file,

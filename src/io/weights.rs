@@ -1,7 +1,7 @@
 //! Weights of models: safetensors files, whose metadata hold the configuration that rebuilds their model, and checkpoints that torch.save
 //! wrote.
 
-use super::write_atomically;
+use super::write_file;
 use crate::error::{Error, Result};
 use globalsplat_torch_file::{self as torch_file, Array, Dtype, TorchFile, Value, is_torch_file, row_major};
 use memmap2::{Mmap, MmapOptions};
@@ -47,7 +47,7 @@ pub fn write_weights(
     let failed = |e| Error::failed(format!("{}: weights can't be serialized: {e}", path.display()));
     let mut bytes = safetensors::serialize(views(tensors, &contents)?, Some(metadata)).map_err(failed)?;
     sort_header(&mut bytes);
-    write_atomically(path, |writer| writer.write_all(&bytes).map_err(Error::write(path)))
+    write_file(path, bytes)
 }
 
 /// Sorts the metadata in the header. They come in the order of a hash map, which differs between processes; sorted, equal weights give

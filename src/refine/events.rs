@@ -1,7 +1,7 @@
 //! Progress events of a session, and their log for TensorBoard.
 
 use crate::error::{Error, Result};
-use crate::io::{AppendFile, CONFIG_FILE, EventFile, METRICS_FILE, write_atomically};
+use crate::io::{AppendFile, CONFIG_FILE, EventFile, METRICS_FILE, write_file};
 use crate::metrics::Scores;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
@@ -80,7 +80,7 @@ impl RefineLog {
         std::fs::create_dir_all(run).map_err(Error::write(run))?;
         let file = run.join(METRICS_FILE);
         if steps == 0 {
-            write_atomically(&file, |_| Ok(()))?;
+            write_file(&file, "")?;
         }
         let (metrics, mut events) = (AppendFile::open(&file)?, EventFile::create_for(run)?);
         events.start(steps)?;

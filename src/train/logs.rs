@@ -4,7 +4,7 @@
 use super::step::{Score, StepReport};
 use super::{METRICS_FILE, is_due};
 use crate::error::{Error, Result};
-use crate::io::{AppendFile, EventFile, write_atomically};
+use crate::io::{AppendFile, EventFile, write_file};
 use crate::loss::Term;
 use serde_json::{Value, json};
 use std::path::Path;
@@ -94,7 +94,7 @@ fn open_metrics(path: &Path, step: u64) -> Result<(AppendFile, Option<u64>)> {
             }
         }
         if kept != text {
-            write_atomically(path, |writer| writer.write_all(kept.as_bytes()).map_err(Error::write(path)))?;
+            write_file(path, kept)?;
         }
     }
     Ok((AppendFile::open(path)?, validated))

@@ -13,7 +13,7 @@ use super::{CONFIG_FILE, METRICS_FILE};
 use crate::config::{TrainConfig, changed_keys};
 use crate::distributed::is_communication_error;
 use crate::error::{Error, Result};
-use crate::io::{InputFiles, event_files, write_atomically};
+use crate::io::{InputFiles, event_files, write_file};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -145,7 +145,7 @@ impl RunLogger {
             let changes = changes.join(", ");
             on_event(Event::Notice(format!("resuming with a changed configuration: {changes}")));
         }
-        write_atomically(&config, |writer| writer.write_all(toml.as_bytes()).map_err(Error::write(&config)))?;
+        write_file(&config, &toml)?;
         let (log, validated) = RunLog::open(out, trainer.step, trainer.config.train.log_every)?;
         let settings = trainer.config.data.validation_settings();
         let best = best_score(out, &settings).unwrap_or_else(|e| {

@@ -5,7 +5,7 @@ use globalsplat_capture::{
     MASKS_FOLDER, decode_photo, encode_photo, exif_focal, find_masks, find_masks_in, gray_to_rgb,
     is_equirectangular, list_photos, read_image_size, read_mask,
 };
-use globalsplat_files::{Error, Result, checksum, parent_of, write_files};
+use globalsplat_files::{Error, Result, checksum, parent_of, write_file};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::collections::{HashMap, HashSet};
@@ -120,13 +120,13 @@ pub(crate) fn import_photos(
             }
             let target = images.join(&photo.name);
             if let Some(contents) = contents {
-                write_file(&target, &contents)?;
+                write_with_folder(&target, &contents)?;
             } else if !is_in_place {
                 link(&path, &target)?;
             }
             let target = images.with_file_name(MASKS_FOLDER).join(format!("{}.png", photo.name));
             if let Some(mask) = mask? {
-                write_file(&target, &mask)?;
+                write_with_folder(&target, &mask)?;
             } else if !is_in_place {
                 // A run with other masks may have left one.
                 let _ = fs::remove_file(target);
@@ -228,9 +228,9 @@ fn check_aspect(file: &Path, size: (u32, u32)) -> Result<()> {
 }
 
 /// Writes a file, and its folder.
-fn write_file(target: &Path, contents: &[u8]) -> Result<()> {
+fn write_with_folder(target: &Path, contents: &[u8]) -> Result<()> {
     fs::create_dir_all(parent_of(target)).map_err(Error::write(target))?;
-    write_files([(target, contents)])
+    write_file(target, contents)
 }
 
 /// Links `target` to the file `source`, copying it if it can't be linked.

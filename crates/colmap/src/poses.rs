@@ -5,7 +5,7 @@ use crate::photos::{Photo, SkippedPhoto, import_photos};
 use crate::progress::{Progress, Reporter, Step};
 use crate::record::{CaptureReport, Matching, Record, SHOWN_NAMES};
 use globalsplat_capture::{COLMAP_MODELS, MASKS_FOLDER, format_names, read_colmap_models};
-use globalsplat_files::{Error, Result, write_files};
+use globalsplat_files::{Error, Result, write_file};
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -179,7 +179,7 @@ impl Estimate<'_, '_> {
     /// Writes a list for COLMAP, and returns its path.
     fn write_list(&self, name: &str, lines: impl Iterator<Item = String>) -> Result<Value> {
         let (path, lines) = (self.out.join(name), lines.collect::<Vec<_>>().join("\n") + "\n");
-        write_files([(&path, lines.as_bytes())])?;
+        write_file(&path, lines)?;
         Ok(text(&path))
     }
 

@@ -36,6 +36,14 @@ pub fn write_temporary(path: &Path, fill: impl FnOnce(&mut dyn Write) -> Result<
     Ok(partial)
 }
 
+/// Writes a file with these `contents`, like [`write_atomically`].
+///
+/// # Errors
+/// Returns the errors of [`write_atomically`].
+pub fn write_file(path: &Path, contents: impl AsRef<[u8]>) -> Result<()> {
+    write_files([(path, contents.as_ref())])
+}
+
 /// Writes `files`, which are paths and contents, like [`write_atomically`]. No file is replaced before all of them are written.
 ///
 /// # Errors
@@ -55,8 +63,7 @@ pub fn write_files<'a>(files: impl IntoIterator<Item = (impl AsRef<Path>, &'a [u
 /// # Errors
 /// Returns an error if the file can't be written.
 pub fn write_json(path: &Path, value: &impl Serialize) -> Result<()> {
-    let json = serde_json::to_vec_pretty(value).expect("numbers and texts");
-    write_files([(path, &json[..])])
+    write_file(path, serde_json::to_vec_pretty(value).expect("numbers and texts"))
 }
 
 /// Makes `path` a symbolic link to `target`, atomically. A link or file that was there is replaced.
@@ -243,10 +250,6 @@ mod tests {
         names
     }
 
-    fn write(path: &Path, text: &str) -> Result<()> {
-        write_files([(path, text.as_bytes())])
-    }
-
     #[test]
     fn the_parent_of_a_name_alone_is_the_working_folder() {
         assert_eq!(parent_of(Path::new("cameras.json")), Path::new("."));
@@ -276,7 +279,7 @@ mod tests {
         for name in ["x".repeat(255), "é".repeat(127)] {
             let file = root.path().join(&name);
             check_writable_file(&file).unwrap();
-            write(&file, "text").unwrap();
+            write_file(&file, "text").unwrap();
             assert_eq!(names(root.path()), [name]);
             fs::remove_file(file).unwrap();
         }
@@ -300,7 +303,7 @@ mod tests {
         }
         for (link, target) in [("twice", "below/file"), ("dangling", "below/new")] {
             check_writable_file(&at(link)).unwrap();
-            write(&at(link), "new").unwrap();
+            write_file(&at(link), "new").unwrap();
             assert!(at(link).is_symlink(), "{link}");
             assert_eq!(fs::read(at(target)).unwrap(), b"new");
         }
@@ -319,7 +322,7 @@ mod tests {
             ("/proc/self/exe".into(), "an open file of a process"),
             (at("loop"), "can't be written"),
         ] {
-            for error in [check_writable_file(&path).unwrap_err(), write(&path, "new").unwrap_err()] {
+            for error in [check_writable_file(&path).unwrap_err(), write_file(&path, "new").unwrap_err()] {
                 assert!(error.to_string().contains(found), "{error}");
             }
             assert!(check_writable_file(&path).unwrap_err().is_invalid_request());
@@ -337,7 +340,7 @@ mod tests {
         for (before, after) in [(0o600, 0o600), (0o400, 0o600), (0o664, 0o664)] {
             fs::write(&file, "old").unwrap();
             fs::set_permissions(&file, fs::Permissions::from_mode(before)).unwrap();
-            write(&file, "new").unwrap();
+            write_file(&file, "new").unwrap();
             assert_eq!(fs::metadata(&file).unwrap().permissions().mode() & 0o777, after);
             fs::remove_file(&file).unwrap();
         }

@@ -12,7 +12,7 @@ pub use append::AppendFile;
 pub use archive::stored_zip;
 pub use atomic::{
     PartialFile, check_regular, check_writable_dir, check_writable_file, parent_of, replace_link, sync_dir,
-    write_atomically, write_files, write_json, write_temporary,
+    write_atomically, write_file, write_files, write_json, write_temporary,
 };
 pub use error::{Error, Result, is_program_missing, panic_message};
 pub use inputs::InputFiles;

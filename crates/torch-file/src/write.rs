@@ -3,7 +3,7 @@
 
 use crate::pickle::STORAGES;
 use crate::{Error, Result, row_major};
-use globalsplat_files::{stored_zip, write_files};
+use globalsplat_files::{stored_zip, write_file};
 use safetensors::tensor::TensorView;
 use std::collections::HashMap;
 use std::path::Path;
@@ -55,7 +55,7 @@ pub fn write_checkpoint(
     root.extend(strings.into_iter().map(|(key, text)| (key, Item::Str(text))));
     root.extend(COUNTERS.map(|key| (key, Item::Int(0))));
     let bytes = serialize(&Item::Dict(root))?;
-    write_files([(path, &bytes[..])])
+    write_file(path, bytes)
 }
 
 /// Returns the contents of a file that holds `root`.

@@ -4,7 +4,7 @@ use super::contents::contents;
 use crate::data::Capture;
 use crate::error::Error;
 use crate::io::{
-    ShLimits, Splat, WriteOptions, check_writable_file, fit_splat, write_atomically, write_local_splat,
+    ShLimits, Splat, WriteOptions, check_writable_file, fit_splat, write_file, write_local_splat,
 };
 use crate::scene::{Camera, Gaussians};
 use anyhow::Result;
@@ -59,7 +59,7 @@ pub fn write_page(
     let contents = contents(&local, capture, &frame)?;
     let cameras = frame.cameras_to_local(&capture.map(Capture::cameras).unwrap_or_default());
     let text = page(name, &contents, &spz(&local.to_splat(DVec3::ZERO)?, &cameras)?).into_string();
-    Ok(write_atomically(path, |writer| writer.write_all(text.as_bytes()).map_err(Error::write(path)))?)
+    Ok(write_file(path, text)?)
 }
 
 /// Encodes the splat compactly as SPZ, with colors within the range that viewers can show.

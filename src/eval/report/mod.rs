@@ -9,7 +9,7 @@ pub use plots::write_curves;
 
 use super::evaluation::Evaluation;
 use crate::error::{Error, Result};
-use crate::io::write_atomically;
+use crate::io::write_file;
 use entries::{Entry, absent, count, dataset_name, decimal, entries, finite, swatch, thousands};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use std::path::{Path, PathBuf};
@@ -31,8 +31,7 @@ pub fn write_report(path: &Path, evaluations: &[(PathBuf, Evaluation)]) -> Resul
     if evaluations.is_empty() {
         return Err(Error::request("a report shows one evaluation or more, found none"));
     }
-    let page = page(&entries(evaluations))?.into_string();
-    write_atomically(path, |writer| writer.write_all(page.as_bytes()).map_err(Error::write(path)))
+    write_file(path, page(&entries(evaluations))?.into_string())
 }
 
 fn page(entries: &[Entry]) -> Result<Markup> {

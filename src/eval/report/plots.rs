@@ -1,8 +1,8 @@
 //! Plots as SVG: quality by the number of context views and by size, the distribution over scenes, and the curves of a training run.
 
 use super::entries::{Entry, Row, count, dataset_name, decimal, finite, rows, short, swatch, view_counts};
-use crate::error::{Error, Result};
-use crate::io::write_atomically;
+use crate::error::Result;
+use crate::io::write_file;
 use crate::train::Curves;
 use maud::{Markup, PreEscaped, html};
 use plotters::coord::types::RangedCoordf64;
@@ -238,5 +238,5 @@ pub fn write_curves(path: &Path, run: &Path, nearest: Option<f64>) -> Result<()>
         let mut labels = chart.configure_series_labels();
         labels.position(SeriesLabelPosition::LowerRight).background_style(WHITE).border_style(BLACK).draw()
     });
-    write_atomically(path, |writer| writer.write_all(svg.as_bytes()).map_err(Error::write(path)))
+    write_file(path, svg)
 }

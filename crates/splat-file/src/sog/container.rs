@@ -2,7 +2,7 @@
 
 use super::IMAGES;
 use crate::{Error, Result};
-use globalsplat_files::{check_regular, parent_of, stored_zip, write_files};
+use globalsplat_files::{check_regular, parent_of, stored_zip, write_file, write_files};
 use image_webp::{ColorType, EncoderParams, WebPDecoder, WebPEncoder};
 use rayon::prelude::*;
 use std::io::{Cursor, Read};
@@ -121,7 +121,7 @@ pub fn write_zip(path: &Path, meta: &[u8], images: &[(&'static str, Vec<u8>)]) -
     // WebP can't be compressed further.
     let files = images.iter().map(|(name, file)| (*name, &file[..])).chain([("meta.json", meta)]);
     let archive = stored_zip(files, 1);
-    write_files([(path, &archive[..])])
+    write_file(path, archive)
 }
 
 /// Writes `meta.json` to `path` and the images beside it. No file is replaced before all of them are written.

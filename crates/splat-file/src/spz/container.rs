@@ -6,7 +6,7 @@ use crate::{Error, Result};
 use flate2::Compression;
 use flate2::bufread::GzDecoder;
 use flate2::write::GzEncoder;
-use globalsplat_files::{write_atomically, write_files};
+use globalsplat_files::{write_atomically, write_file};
 use std::fmt::Display;
 use std::io::{Read, Write};
 use std::ops::RangeInclusive;
@@ -221,5 +221,5 @@ pub fn write(path: &Path, header: &Header, streams: Streams) -> Result<()> {
         body.extend(compressed);
     }
     bytes.extend(body);
-    write_files([(path, &bytes[..])])
+    write_file(path, bytes)
 }
