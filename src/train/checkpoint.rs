@@ -14,7 +14,6 @@ use crate::io::{
 use crate::model::Precision;
 use crate::reconstruct::save_model;
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
@@ -29,8 +28,6 @@ const STATE_FILE: &str = "state.json";
 const LOCK_FILE: &str = ".lock";
 /// Files of a checkpoint. The state comes first, because without it there is no checkpoint.
 const FILES: [&str; 3] = [STATE_FILE, MODEL_FILE, OPTIMIZER_FILE];
-/// Files whose checksums are in the state, in the order of their names.
-const CHECKED_FILES: [&str; 2] = [MODEL_FILE, OPTIMIZER_FILE];
 
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct State {
@@ -38,11 +35,20 @@ pub(super) struct State {
     pub step: u64,
     /// Number of samples drawn, which is the position in the data.
     samples: u64,
-    /// Size in bytes and CRC-32 of each of the other files, by name.
-    files: BTreeMap<String, (u64, u32)>,
+    files: Files,
     /// Validation score, if it was the best one so far.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     validation: Option<Validation>,
+}
+
+/// Size in bytes and CRC-32 of each of a checkpoint's other files.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Files {
+    #[serde(rename = "model.safetensors")]
+    model: (u64, u32),
+    #[serde(rename = "optimizer.safetensors")]
+    optimizer: (u64, u32),
 }
 
 /// Validation score of a checkpoint.
@@ -183,8 +189,9 @@ impl Trainer {
         fs::create_dir_all(folder).map_err(Error::write(folder))?;
         save_model(&folder.join(MODEL_FILE), &self.vs, &self.config, self.stage(), Precision::F32)?;
         write_weights(&folder.join(OPTIMIZER_FILE), &self.optimizer.state(), Default::default())?;
-        let files = CHECKED_FILES.map(|name| Ok((name.into(), size_and_checksum(&folder.join(name))?)));
-        let files = files.into_iter().collect::<Result<_>>()?;
+        let [model, optimizer] =
+            [MODEL_FILE, OPTIMIZER_FILE].map(|name| size_and_checksum(&folder.join(name)));
+        let files = Files { model: model?, optimizer: optimizer? };
         let state = State { step: self.step, samples: self.samples, files, validation: None };
         write_json(&folder.join(STATE_FILE), &state)?;
         folder.parent().map(sync_dir);
@@ -233,10 +240,10 @@ fn remove(folder: &Path) -> Result<()> {
 /// Checks that a checkpoint is complete and its files have not changed since they were written. Returns its state.
 pub(super) fn check(checkpoint: &Path) -> Result<State> {
     let state = read_state(checkpoint)?;
-    for (name, (bytes, crc)) in &state.files {
+    for (name, (bytes, crc)) in [(MODEL_FILE, state.files.model), (OPTIMIZER_FILE, state.files.optimizer)] {
         let file = checkpoint.join(name);
         let found = size_and_checksum(&file)?;
-        if found != (*bytes, *crc) {
+        if found != (bytes, crc) {
             let found = format!("damaged ({} bytes, checksum {:08x})", found.0, found.1);
             return Err(Error::input(&file, "the file", found, format!("{bytes} bytes, checksum {crc:08x}")));
         }
@@ -248,16 +255,8 @@ fn read_state(checkpoint: &Path) -> Result<State> {
     let file = checkpoint.join(STATE_FILE);
     let state = fs::read(&file).map_err(Error::read(&file))?;
     let expected = "what globalsplat train writes";
-    let state: State = serde_json::from_slice(&state)
-        .map_err(|e| Error::input(&file, "the file", format!("broken ({e})"), expected))?;
-    let names: Vec<&str> = state.files.keys().map(String::as_str).collect();
-    match names == CHECKED_FILES {
-        true => Ok(state),
-        false => {
-            let expected = format!("{CHECKED_FILES:?}");
-            Err(Error::input(&file, "the names in files", format!("{names:?}"), expected))
-        }
-    }
+    serde_json::from_slice(&state)
+        .map_err(|e| Error::input(&file, "the file", format!("broken ({e})"), expected))
 }
 
 /// Returns the size and CRC-32 of a file.
