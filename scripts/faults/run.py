@@ -7,8 +7,8 @@ There is one operation for each way in which the program writes. It runs without
 records its calls. Then, for every call and every kind of fault, it runs again from the same state. Afterwards
   - it must have ended by itself, without a signal or a panic: with all files new, or one sentence that names the file;
   - every file, and every checkpoint as a whole, must be the old one or the new one;
-  - if it failed, the same command without faults must succeed, with the files of the first run and no others but those
-    that couldn't be removed.
+  - if it failed before all files were new, the same command without faults must succeed, with the files of the first run
+    and no others but those that couldn't be removed.
 Prints a Markdown table, and every failure with the options that reproduce it.
 """
 
@@ -80,7 +80,7 @@ def read_files(folder):
         elif name == "metrics.jsonl" or parent == "tensorboard":
             files[name] = read_log(path)
         elif path.is_symlink():
-            files[name] = os.readlink(path)
+            files[name] = str(path.readlink())
         elif path.is_file() and name not in (".lock", "stdout"):
             content = path.read_bytes()
             if path.name == "state.json":
@@ -205,10 +205,11 @@ class Operation:
             wrong += ["it prints a result, and fails"] * (output != "" and not first.endswith("/stdout"))
             wrong += ["it doesn't go on"] * goes_on
             wrong += self.mixtures()
-            code_again, errors_again, _ = self.bench.run(self.command)
-            wrong += [f"second run: {errors_again.strip()}"] * (code_again != 0)
             not_removed = [file for call, file in hit if call == "remove"]
-            wrong += [f"second run: {difference}" for difference in self.differences(not_removed)]
+            if self.differences(not_removed):
+                code_again, errors_again, _ = self.bench.run(self.command)
+                wrong += [f"second run: {errors_again.strip()}"] * (code_again != 0)
+                wrong += [f"second run: {difference}" for difference in self.differences(not_removed)]
         return wrong and [f"exit code {code}: {errors.strip() or 'no message'} ({first})", *wrong]
 
 
@@ -298,7 +299,9 @@ def main():
                 group, n, kind, sticky = arguments.fault
                 faults = [(group, int(n), kind, int(sticky))]
             elif arguments.short:
-                faults = random.Random(0).sample(faults, SHORT_OF_TRAINING if op.command[0] == "train" else SHORT_OF_OTHERS)
+                faults = random.Random(0).sample(
+                    faults, SHORT_OF_TRAINING if op.command[0] == "train" else SHORT_OF_OTHERS
+                )
             results = [(fault, wrong) for fault in faults if (wrong := op.check(fault)) is not None]
             for fault, wrong in results:
                 if wrong:
