@@ -1,3 +1,3 @@
-//! The library's error type, that of the crates that read and write files; every message is one sentence.
+//! The library's error type, which is that of [`globalsplat_files`]; every message is one sentence.
 
 pub use globalsplat_files::{Error, Result, panic_message};

@@ -47,7 +47,7 @@ TIMEOUT = 60
 
 
 def final_name(path):
-    """Replaces names of temporary files and folders with the names that errors use."""
+    """Replaces names of temporary files with the names that errors use."""
     path = re.sub(r"/\.([^/ ]+?)\.globalsplat-partial(-\d+)?(?=[/ :]|$)", r"/\1", str(path))
     return "standard output" if path.endswith("/out/stdout") else path.replace("/globalsplat-probe", "")
 
@@ -67,10 +67,11 @@ def read_log(path):
         return ["broken"]
 
 
-def read_files(folder):
+def read_files(folder, has_scores=True):
     """Returns what is below a folder by name, and the names of temporary files.
 
     The value of a file is its hash, that of a complete checkpoint the hashes of its files, and that of logs their records.
+    Without scores, the state of a checkpoint is that before it is known to be the best.
     """
     files, temporary = {}, []
     for path in sorted(folder.rglob("*")):
@@ -83,8 +84,7 @@ def read_files(folder):
             files[name] = str(path.readlink())
         elif path.is_file() and name not in (".lock", "stdout"):
             content = path.read_bytes()
-            if path.name == "state.json":
-                # The score is added when the checkpoint is known to be the best.
+            if path.name == "state.json" and not has_scores:
                 content = json.dumps(json.loads(content) | {"validation": None}).encode()
             digest = hashlib.sha1(content).hexdigest()
             if not parent.startswith("checkpoints/"):
@@ -141,12 +141,12 @@ class Operation:
         self.bench, self.name, self.command = bench, name, command
         shutil.rmtree(bench.old, ignore_errors=True)
         shutil.copytree(bench.out, bench.old, symlinks=True)
-        old, _ = read_files(bench.out)
+        old, _ = read_files(bench.out, has_scores=False)
         self.groups = Counter(group for _, group, _ in bench.succeed(command))
         self.new, temporary = read_files(bench.out)
         assert not temporary and self.new != old, name
         # What may be left: the old files, those between, and the new ones.
-        self.states = [old, *between, self.new]
+        self.states = [old, *between, read_files(bench.out, has_scores=False)[0]]
 
     def faults(self):
         """Returns (group, n, kind, sticky) for every kind of fault of every call."""
@@ -164,7 +164,7 @@ class Operation:
 
     def mixtures(self):
         """Returns which files in out/ are neither old nor new."""
-        (found, _), old = read_files(self.bench.out), self.states[0]
+        (found, _), old = read_files(self.bench.out, has_scores=False), self.states[0]
         wrong = []
         for name, value in found.items():
             is_log = isinstance(value, list)
@@ -272,7 +272,7 @@ def operations(bench, only):
             shutil.rmtree(out)
             out.mkdir()
             assert bench.run(command, ("rename", nth, "EIO", 0))[0] == 1
-            between.append(read_files(out)[0])
+            between.append(read_files(out, has_scores=False)[0])
         if name == "train":
             shutil.rmtree(out)
             out.mkdir()

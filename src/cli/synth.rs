@@ -1,8 +1,8 @@
 use super::{Output, progress};
 use crate::Error;
-use crate::data::{Capture, ChunkWriter, SyntheticDataset, load_views};
+use crate::data::{Capture, ChunkWriter, SyntheticDataset, load_views, write_unless_other};
 use crate::eval::{EvaluationIndex, SceneFrames};
-use crate::io::{Mosaic, check_writable_dir, check_writable_png, tile_horizontally, write_atomically};
+use crate::io::{Mosaic, check_writable_dir, check_writable_png, tile_horizontally};
 use crate::scene::ImageSize;
 use crate::synth::VideoSettings;
 use anyhow::Result;
@@ -116,18 +116,14 @@ impl Synth {
         ))
     }
 
+    /// Writes the depths of a video, unless an interrupted run has. Those of another video aren't replaced.
     fn write_depths(&self, file: &Path, capture: &Capture) -> Result<(), Error> {
-        let depths: Vec<f32> = (0..capture.len()).filter_map(|view| capture.depth(view)).flatten().collect();
-        write_atomically(file, |writer| {
-            let write = || {
-                let shape = [self.frames, self.size, self.size];
-                let mut npy =
-                    npyz::WriteOptions::new().default_dtype().shape(&shape).writer(writer).begin_nd()?;
-                npy.extend(&depths)?;
-                npy.finish()
-            };
-            write().map_err(Error::write(file))
-        })
+        let depths = (0..capture.len()).filter_map(|view| capture.depth(view)).flatten();
+        let shape = [self.frames, self.size, self.size];
+        let (mut bytes, options) = (vec![], npyz::WriteOptions::new().default_dtype().shape(&shape));
+        let mut npy = options.writer(&mut bytes).begin_nd().expect("memory");
+        npy.extend(depths).and_then(|()| npy.finish()).expect("memory");
+        write_unless_other(file, &bytes, "existing depths")
     }
 }
 

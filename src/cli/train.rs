@@ -168,7 +168,7 @@ impl Train {
                     }
                     return should_continue;
                 }
-                Event::Waiting => return should_continue,
+                Event::Busy => return should_continue,
             };
             if first {
                 bar.set_position(report.step);

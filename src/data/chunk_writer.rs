@@ -111,13 +111,21 @@ impl ChunkWriter {
     fn write_chunk(&mut self) -> Result<()> {
         let file = self.folder.join(self.chunk_name());
         let bytes = chunk_bytes(&std::mem::take(&mut self.waiting))?;
-        // An existing file with the same bytes was left by an interrupted run of the same work.
-        if file.exists() && std::fs::read(&file).map_err(Error::read(&file))? != bytes {
-            return Err(Error::input(&file, "the output", "an existing chunk", "a folder without chunks"));
-        }
-        write_file(&file, bytes)?;
+        write_unless_other(&file, &bytes, "an existing chunk")?;
         (self.chunks, self.waiting_bytes) = (self.chunks + 1, 0);
         Ok(())
+    }
+}
+
+/// Writes `bytes` to `file`. If it exists, it must have them already, from an interrupted run of the same work.
+///
+/// # Errors
+/// Fails if the file can't be written, or has other contents: it is then called `found`.
+pub(crate) fn write_unless_other(file: &Path, bytes: &[u8], found: &str) -> Result<()> {
+    match file.exists() {
+        false => write_file(file, bytes),
+        true if std::fs::read(file).map_err(Error::read(file))? == bytes => Ok(()),
+        true => Err(Error::input(file, "the output", found, "a folder without other scenes")),
     }
 }
 

@@ -12,6 +12,8 @@ mod view;
 pub use batch::{ViewBatch, view_batch};
 pub(crate) use batch::{cameras_at, select_views, view_matrices};
 pub use chunk_writer::ChunkWriter;
+#[cfg(feature = "cli")]
+pub(crate) use chunk_writer::write_unless_other;
 pub use config::{DataConfig, JitterConfig, Sampling};
 pub use dataset::{Dataset, OpenGroup, SceneGroup, Split};
 pub use globalsplat_capture::{

@@ -1,5 +1,4 @@
-//! File formats: splats, weights (safetensors), images, videos and TensorBoard event files. Writes never leave a partial
-//! file.
+//! File formats: splats, weights (safetensors), images, videos and TensorBoard event files. Files appear complete or not at all.
 
 mod event_file;
 mod images;
@@ -33,7 +32,9 @@ pub use weights::{
     write_weights,
 };
 
-pub(crate) use globalsplat_files::{AppendFile, expand_path, read_text, replace_link, sync_dir, write_json};
+pub(crate) use globalsplat_files::{
+    AppendFile, FolderLock, expand_path, read_text, replace_link, sync_dir, write_json,
+};
 
 pub(crate) use event_file::{EventFile, event_files};
 pub(crate) use globalsplat_capture::{PHOTO_EXTENSIONS, read_image_size};

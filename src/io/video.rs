@@ -1,4 +1,4 @@
-//! Videos, written frame by frame: GIF by our own code, MP4 by the ffmpeg on the PATH. No partial file stays behind.
+//! Videos, written frame by frame: GIF by our own code, MP4 by the ffmpeg on the PATH.
 
 use super::images::rgb_from_tensor;
 use crate::error::{Error, Result};

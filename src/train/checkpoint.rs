@@ -9,13 +9,14 @@
 use super::trainer::Trainer;
 use crate::error::{Error, Result};
 use crate::io::{
-    InputFiles, WeightsFile, checksum, read_weights, replace_link, sync_dir, write_json, write_weights,
+    FolderLock, InputFiles, WeightsFile, checksum, parent_of, read_weights, replace_link, sync_dir,
+    write_json, write_weights,
 };
 use crate::model::Precision;
 use crate::reconstruct::save_model;
 use serde::{Deserialize, Serialize};
-use std::fs::{self, File, OpenOptions, TryLockError};
-use std::io::{self, ErrorKind, Read, Write};
+use std::fs;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 const FOLDER: &str = "checkpoints";
@@ -25,7 +26,6 @@ const PREFIX: &str = "step-";
 pub const MODEL_FILE: &str = "model.safetensors";
 const OPTIMIZER_FILE: &str = "optimizer.safetensors";
 const STATE_FILE: &str = "state.json";
-const LOCK_FILE: &str = ".lock";
 /// Files of a checkpoint. The state comes first, because without it there is no checkpoint.
 const FILES: [&str; 3] = [STATE_FILE, MODEL_FILE, OPTIMIZER_FILE];
 
@@ -126,11 +126,19 @@ pub fn best_checkpoint(run: &Path) -> Result<PathBuf> {
 
 /// Adds the files of the run's checkpoints to `inputs`.
 pub(super) fn add_checkpoints(run: &Path, inputs: &mut InputFiles) {
-    [FOLDER, BEST].iter().for_each(|folder| inputs.add_folder(&run.join(folder)));
+    inputs.add_folder(&run.join(FOLDER));
 }
 
 /// Removes what a run left that was killed during a save.
+///
+/// # Errors
+/// Returns an error if a file can't be removed, or if something other than a link is where the best checkpoint's has to be.
 pub(super) fn remove_incomplete(run: &Path) -> Result<()> {
+    let best = run.join(BEST);
+    if best.exists() && !best.is_symlink() {
+        let expected = "a link that training makes: move it away";
+        return Err(Error::input(best, "the best checkpoint", "a file or folder", expected));
+    }
     let is_incomplete = |folder: &PathBuf| !folder.join(STATE_FILE).exists();
     list_folders(run)?.into_iter().filter(is_incomplete).try_for_each(|folder| remove(&folder))
 }
@@ -170,12 +178,16 @@ impl Trainer {
         run.join(FOLDER).join(folder_name(self.step))
     }
 
-    /// Saves a checkpoint under `run` and returns its folder. Removes the oldest checkpoints beyond those to keep.
+    /// Saves a checkpoint under `run`, unless the run has that of this step, and returns its folder. Removes the oldest checkpoints beyond
+    /// those to keep.
     ///
     /// # Errors
     /// Returns an error if files can't be written. Older checkpoints then stay complete.
     pub(super) fn save(&self, run: &Path) -> Result<PathBuf> {
         let path = self.checkpoint(run);
+        if check(&path).is_ok_and(|state| (state.step, state.samples) == (self.step, self.samples)) {
+            return Ok(path);
+        }
         remove(&path)?;
         if let Err(e) = self.write_checkpoint(&path) {
             let _ = remove(&path);
@@ -194,7 +206,7 @@ impl Trainer {
         let files = Files { model: model?, optimizer: optimizer? };
         let state = State { step: self.step, samples: self.samples, files, validation: None };
         write_json(&folder.join(STATE_FILE), &state)?;
-        folder.parent().map(sync_dir);
+        sync_dir(parent_of(folder));
         Ok(())
     }
 
@@ -213,28 +225,34 @@ impl Trainer {
     }
 }
 
-/// Removes the oldest checkpoints beyond the `kept` newest ones, but never `latest` or the best one.
+/// Removes the oldest checkpoints beyond the `kept` newest ones up to `latest`, but never the best one. Later ones are damaged, and replaced
+/// when the run has come so far.
 pub(super) fn prune_checkpoints(run: &Path, latest: &Path, kept: usize) -> Result<()> {
     let best = fs::read_link(run.join(BEST)).map(|target| run.join(target)).ok();
     let mut others = list_checkpoints(run)?;
-    others.retain(|other| other != latest && best.as_ref() != Some(other));
+    others.retain(|other| other.as_path() < latest && best.as_ref() != Some(other));
     let surplus = (others.len() + 1).saturating_sub(kept);
     others[..surplus].iter().try_for_each(|old| remove(old))
 }
 
-/// Removes a checkpoint's files, and its folder unless it has other files. If that fails, what is left is no checkpoint.
+/// Removes a checkpoint's files, also those that a killed process left under their temporary names, and its folder unless it has other files.
+/// The state goes first: after an error, the checkpoint is complete or none.
 fn remove(folder: &Path) -> Result<()> {
-    let unless = |expected: &[ErrorKind], removed: io::Result<()>| match removed {
-        Err(e) if !expected.contains(&e.kind()) => Err(Error::write(folder)(e)),
-        _ => Ok(()),
-    };
-    for name in FILES {
-        // A process that was killed while it wrote the file left the partial one.
-        for file in [name, &format!(".{name}.globalsplat-partial")] {
-            unless(&[ErrorKind::NotFound], fs::remove_file(folder.join(file)))?;
+    if !folder.is_dir() {
+        return Ok(());
+    }
+    let names = fs::read_dir(folder).map_err(Error::read(folder))?.flatten();
+    let names: Vec<String> = names.map(|entry| entry.file_name().to_string_lossy().into_owned()).collect();
+    for own in FILES {
+        let is_own = |name: &&String| *name == own || name.starts_with(&format!(".{own}."));
+        for name in names.iter().filter(is_own) {
+            fs::remove_file(folder.join(name)).map_err(Error::write(folder))?;
         }
     }
-    unless(&[ErrorKind::NotFound, ErrorKind::DirectoryNotEmpty], fs::remove_dir(folder))
+    match fs::remove_dir(folder) {
+        Err(e) if e.kind() != ErrorKind::DirectoryNotEmpty => Err(Error::write(folder)(e)),
+        _ => Ok(()),
+    }
 }
 
 /// Checks that a checkpoint is complete and its files have not changed since they were written. Returns its state.
@@ -265,43 +283,13 @@ fn size_and_checksum(path: &Path) -> Result<(u64, u32)> {
     Ok((size, checksum([path])?))
 }
 
-/// Lock that limits a run's folder to one training process; two would overwrite each other's checkpoints. It is released when it is dropped, or when the process ends for any reason.
-#[derive(Debug)]
-pub(super) struct RunLock {
-    _file: File,
-}
-
-impl RunLock {
-    /// Returns `true` if a run ever locked the folder `run`.
-    pub(super) fn was_ever_locked(run: &Path) -> bool {
-        run.join(LOCK_FILE).exists()
-    }
-
-    /// Locks the folder `run`, which must exist.
-    ///
-    /// # Errors
-    /// Returns an error that gives the ID of the other process if the folder is locked.
-    pub(super) fn take(run: &Path) -> Result<Self> {
-        let path = run.join(LOCK_FILE);
-        let options = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path);
-        let mut file = options.map_err(Error::write(&path))?;
-        match file.try_lock() {
-            Ok(()) => {}
-            Err(TryLockError::WouldBlock) => {
-                let mut holder = String::new();
-                let _ = file.read_to_string(&mut holder);
-                let found = format!("in use by process {}", holder.trim());
-                return Err(Error::input(
-                    run,
-                    "the run",
-                    found,
-                    "a run that no other process trains (choose another --out)",
-                ));
-            }
-            Err(TryLockError::Error(e)) => return Err(Error::write(&path)(e)),
-        }
-        let written = file.set_len(0).and_then(|()| write!(file, "{}", std::process::id()));
-        written.map_err(Error::write(&path))?;
-        Ok(RunLock { _file: file })
-    }
+/// Locks the folder of a run, which must exist: two training processes would overwrite each other's checkpoints.
+///
+/// # Errors
+/// Returns an error that gives the ID of the other process if the folder is locked.
+pub(super) fn lock(run: &Path) -> Result<FolderLock> {
+    FolderLock::try_take(run)?.map_err(|holder| {
+        let expected = "a run that no other process trains (choose another --out)";
+        Error::input(run, "the run", format!("in use by process {holder}"), expected)
+    })
 }

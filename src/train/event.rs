@@ -17,5 +17,5 @@ pub enum Event<'a> {
     /// Message for the user, in one sentence.
     Notice(String),
     /// No progress to report: the run is inside of a step or a validation.
-    Waiting,
+    Busy,
 }

@@ -1,7 +1,7 @@
 //! Training run, from its current state to the last step, with checkpoints on the way.
 
 use super::checkpoint::{
-    RunLock, Validation, add_checkpoints, best_score, check, keep_best, latest_checkpoint, list_checkpoints,
+    Validation, add_checkpoints, best_score, check, keep_best, latest_checkpoint, list_checkpoints, lock,
     prune_checkpoints, remove_incomplete,
 };
 use super::event::Event;
@@ -13,7 +13,7 @@ use super::{CONFIG_FILE, METRICS_FILE};
 use crate::config::{TrainConfig, changed_keys};
 use crate::distributed::is_communication_error;
 use crate::error::{Error, Result};
-use crate::io::{InputFiles, event_files, write_file};
+use crate::io::{FolderLock, InputFiles, event_files, write_file};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -63,7 +63,7 @@ pub trait Validator {
 ///
 /// # Errors
 /// Returns an error if another process uses the run, a checkpoint doesn't fit, too many steps in a row were skipped, another rank is gone,
-/// or a step or a save fails. If a validation fails, it is left out.
+/// or a step or a write fails. If a validation fails, it is left out.
 pub fn run(
     trainer: &mut Trainer,
     out: &Path,
@@ -95,7 +95,7 @@ pub fn add_run_inputs(run: &Path, inputs: &mut InputFiles) {
 
 /// Checks that a run may write into `out`: it has done so before, or the folder has no other files of the names that a run uses.
 fn check_output_folder(out: &Path) -> Result<()> {
-    if RunLock::was_ever_locked(out) || !list_checkpoints(out)?.is_empty() {
+    if FolderLock::was_ever_taken(out) || !list_checkpoints(out)?.is_empty() {
         return Ok(());
     }
     match [CONFIG_FILE, METRICS_FILE].into_iter().find(|name| out.join(name).exists()) {
@@ -114,7 +114,7 @@ fn check_output_folder(out: &Path) -> Result<()> {
 
 /// Files that a run writes beside its checkpoints.
 struct RunLogger {
-    _lock: RunLock,
+    _lock: FolderLock,
     log: RunLog,
     /// PSNR of the best checkpoint, in dB.
     best: Option<f64>,
@@ -132,7 +132,7 @@ impl RunLogger {
         on_event: &mut impl FnMut(Event) -> bool,
     ) -> Result<(Self, Option<u64>, Option<PathBuf>)> {
         check_output_folder(out)?;
-        let lock = RunLock::take(out)?;
+        let lock = lock(out)?;
         remove_incomplete(out)?;
         let saved = begin(trainer, out, resume, on_event)?;
         let config = out.join(CONFIG_FILE);
@@ -199,7 +199,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
             let start = Instant::now();
             let Run { trainer, on_event, asked_to_stop, .. } = &mut self;
             let report = trainer.step(&mut || {
-                *asked_to_stop |= !on_event(Event::Waiting);
+                *asked_to_stop |= !on_event(Event::Busy);
                 !*asked_to_stop
             })?;
             let samples_per_second = batch / start.elapsed().as_secs_f64();
@@ -266,7 +266,7 @@ impl<O: FnMut(Event) -> bool> Run<'_, '_, O> {
     fn validate(&mut self, checkpoint: &Path) -> Result<bool> {
         let Some(validator) = &mut self.validator else { return Ok(true) };
         let on_event = &mut self.on_event;
-        let Some(score) = validator.validate(self.trainer, &mut || on_event(Event::Waiting))? else {
+        let Some(score) = validator.validate(self.trainer, &mut || on_event(Event::Busy))? else {
             return Ok(false);
         };
         for why in &score.left_out {

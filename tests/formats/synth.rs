@@ -47,8 +47,14 @@ fn interrupted_synth_is_repeated_and_other_chunks_stay() {
     sandbox.run(&synth(0));
     assert!(sandbox.contents() == before);
     std::fs::remove_file(sandbox.path("worlds/index.json")).unwrap();
-    assert_says(&sandbox.refuse(&synth(1)), &["000000.torch: the output is an existing chunk"]);
-    assert!(sandbox.read("worlds/000000.torch") == before[&sandbox.path("worlds/000000.torch")], "lost");
+    for (other, found) in [
+        (synth(1), "000000.torch: the output is an existing chunk"),
+        (synth(0).replace("--size 24", "--size 25"), ".npy: the output is existing depths"),
+    ] {
+        assert_says(&sandbox.refuse(&other), &[found]);
+        let kept = |name: &str| sandbox.read(name) == before[&sandbox.path(name)];
+        assert!(kept("worlds/000000.torch") && kept("worlds/depth/0_000000.npy"), "lost");
+    }
 }
 
 /// Projects a pixel of `from` at `depth` metres into `to`; returns its position in pixels, and its depth there.

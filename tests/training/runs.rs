@@ -109,15 +109,22 @@ fn a_second_run_in_the_same_folder_is_refused() {
 }
 
 #[test]
-fn a_full_disk_ends_a_run_which_resumes_when_there_is_room() {
-    let sandbox = Sandbox::new();
-    sandbox.succeed(&train("whole", ""));
-    let output = limit_file_size(&sandbox.command(&train("run", ""))).output().unwrap();
+fn a_full_disk_ends_a_run_which_resumes_from_its_last_checkpoint() {
+    let (sandbox, settings) = (Sandbox::new(), "train.keep_checkpoints=3 data.holdout=none");
+    let [whole, run] = ["whole", "run"].map(|name| sandbox.path(name));
+    for name in ["whole", "run"] {
+        sandbox.succeed(&train(name, settings));
+    }
+    for step in [4, 6] {
+        std::fs::remove_dir_all(run.join(format!("checkpoints/step-{step:08}"))).unwrap();
+    }
+    let output = limit_file_size(&sandbox.command(&train("run", settings))).output().unwrap();
     assert_eq!(output.status.code(), Some(1));
-    assert_says(&String::from_utf8(output.stderr).unwrap(), &["step-00000002/", "can't be written"]);
-    assert!(sandbox.names("run/checkpoints").is_empty(), "no half checkpoint");
-    sandbox.succeed(&train("run", ""));
-    assert_same_bits(&sandbox.path("whole"), &sandbox.path("run"));
+    assert_says(&String::from_utf8(output.stderr).unwrap(), &["can't be written: File too large"]);
+    assert_eq!(checkpoints(&run), [2]);
+    sandbox.succeed(&train("run", settings));
+    assert_same_bits(&whole, &run);
+    assert_eq!(steps(&run).0, (0..6).collect::<Vec<_>>(), "every step once");
 }
 
 #[test]
@@ -206,7 +213,8 @@ fn a_changed_validation_discards_the_best_checkpoint() {
     assert!(is_beaten);
     sandbox.write(state, "{");
     let (err, is_beaten) = again("train.steps=7 data.holdout=every:4");
-    assert!(err.contains("state.json: the file is broken") && is_beaten, "{err}");
+    assert_says(&err, &["best/state.json: the file is broken", "determined again"]);
+    assert!(is_beaten);
 }
 
 #[test]
@@ -219,6 +227,11 @@ fn a_run_goes_on_from_a_checkpoint_that_is_named_unless_it_has_later_ones() {
     sandbox.succeed(&resume("branch"));
     assert_same_bits(&sandbox.path("run"), &sandbox.path("branch"));
     assert_eq!(steps(&sandbox.path("branch")).0, [4, 5]);
+    // A complete run keeps the checkpoint that it is resumed from, with its score.
+    let state = || sandbox.read("run/checkpoints/step-00000006/state.json");
+    let before = state();
+    sandbox.succeed(&format!("{} --resume @run/./checkpoints/step-00000006", train("run", "")));
+    assert!(state() == before && sandbox.read_json("run/best/state.json")["validation"].is_object());
 }
 
 /// Validator that is always interrupted before it has a score.

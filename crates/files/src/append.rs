@@ -28,13 +28,12 @@ impl AppendFile {
         Ok(AppendFile { path: path.to_owned(), file, length })
     }
 
-    /// Appends `record`. After an error, the call may be repeated.
+    /// Appends `record`.
     ///
     /// # Errors
     /// Returns an error if the file can't be written.
     pub fn append(&mut self, record: &[u8]) -> Result<()> {
-        // Truncate before writing too: removing what was left of an earlier record may have failed.
-        if let Err(e) = self.file.set_len(self.length).and_then(|()| self.file.write_all(record)) {
+        if let Err(e) = self.file.write_all(record) {
             let _ = self.file.set_len(self.length);
             return Err(Error::write(&self.path)(e));
         }

@@ -138,13 +138,18 @@ pub fn check_writable_dir(path: &Path) -> Result<()> {
 /// Creates a temporary file for `target` and removes it again.
 fn probe(target: &Path) -> io::Result<()> {
     let (_file, place) = create_temporary(target, |place| File::create_new(place))?;
-    fs::remove_file(place)
+    fs::remove_file(&place)?;
+    // It would be removed again on drop, although it may be another process's by then.
+    let _ = place.keep();
+    Ok(())
 }
 
-/// Converts a write error into a request error.
+/// Converts a write error into a request error, unless the disk is full.
 fn refused(e: Error) -> Error {
     match e {
-        Error::Write { .. } => Error::request(e.to_string()),
+        Error::Write { ref source, .. } if source.kind() != ErrorKind::StorageFull => {
+            Error::request(e.to_string())
+        }
         other => other,
     }
 }

@@ -5,6 +5,7 @@ mod archive;
 mod atomic;
 mod error;
 mod inputs;
+mod lock;
 mod paths;
 mod read;
 
@@ -16,5 +17,6 @@ pub use atomic::{
 };
 pub use error::{Error, Result, is_program_missing, panic_message};
 pub use inputs::InputFiles;
+pub use lock::FolderLock;
 pub use paths::{expand_path, split_keyed_path};
 pub use read::{checksum, read_text};
