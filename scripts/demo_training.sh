@@ -21,4 +21,4 @@ for weights in models/tiny.safetensors "$out/model.safetensors"; do
     "$globalsplat" eval --weights "$weights" --data "$captures" --index "$captures/evaluation_index.json" --name "$name" --out "$out/evaluation/$name"
 done
 "$globalsplat" report "$out/evaluation/tiny" "$out/evaluation/model" --out "$out/evaluation/report.html"
-echo "LOOK: $out/evaluation/report.html compares scores, views and depths, before and after; $out/training/curves.svg has the curves"
+echo "LOOK: $out/evaluation/report.html compares scores, views and depths, before and after; TensorBoard shows $out/training"

@@ -2,7 +2,7 @@ use super::{Output, distributed, keep_freed_memory, progress, signals, warn_of_m
 use crate::config::Config;
 use crate::data::{BadData, Capture, Dataset, SceneGroups, Split, TrainingScenes};
 use crate::error::Error;
-use crate::eval::{HeldOut, HeldOutScores, write_curves};
+use crate::eval::{HeldOut, HeldOutScores};
 use crate::io::{InputFiles, check_writable_dir};
 use crate::loss::{Term, psnr_of_mse};
 use crate::metrics::{CaptureScores, Scores};
@@ -19,7 +19,7 @@ use std::time::Instant;
 ///
 /// Ctrl-C or SIGTERM saves a checkpoint and stops; the same command resumes from it. Periodically, and at the end, held-out
 /// views and scenes are rendered and scored, compared with the baseline "nearest input photo"; RUN/best is the best checkpoint.
-/// RUN/curves.svg plots the run, and RUN/tensorboard is for TensorBoard.
+/// TensorBoard shows RUN/tensorboard.
 ///
 /// Started by torchrun, several processes train together, each on a GPU of its own (--device cuda) or on threads of the CPU:
 /// docs/distributed.md.
@@ -50,9 +50,6 @@ pub struct Train {
     #[arg(long, default_value = "cpu")]
     device: String,
 }
-
-/// Plot of the run.
-const CURVES_FILE: &str = "curves.svg";
 
 impl Train {
     pub fn run(self) -> Result<Output> {
@@ -137,7 +134,7 @@ impl Train {
         }
         self.from.iter().for_each(|path| inputs.add(path));
         inputs.check_folder(&self.out)?;
-        let files = [CONFIG_FILE, METRICS_FILE, CURVES_FILE].map(|name| self.out.join(name));
+        let files = [CONFIG_FILE, METRICS_FILE].map(|name| self.out.join(name));
         Ok(files.iter().try_for_each(|file| inputs.check_file(file))?)
     }
 
@@ -205,20 +202,14 @@ impl Train {
             (!validation.is_empty()).then(|| Scores::mean(validation.iter().map(|v| &scores(v).mean)))
         };
         let (ours, nearest) = (mean(|v| &v.ours), mean(|v| &v.nearest));
-        let curves = self.out.join(CURVES_FILE);
-        write_curves(&curves, &self.out, nearest.map(|nearest| nearest.psnr))?;
         let checkpoint = outcome.checkpoint.to_string_lossy();
         let mut json = json!({
             "checkpoint": checkpoint,
-            "curves": curves.to_string_lossy(),
             "seconds": seconds,
             "skipped_steps": outcome.skipped,
             "skipped_scenes": bad_data,
         });
-        let mut lines = vec![
-            format!("trained in {seconds:.0} s, checkpoint {checkpoint}"),
-            format!("{}: training curves", curves.display()),
-        ];
+        let mut lines = vec![format!("trained in {seconds:.0} s, checkpoint {checkpoint}")];
         if let Some((ours, nearest)) = ours.zip(nearest) {
             json["held_out"] = json!({
                 "psnr": ours.psnr,

@@ -14,6 +14,6 @@ pub use evaluation::{
     write_evaluation,
 };
 pub use method::Method;
-pub use report::{write_curves, write_report};
+pub use report::write_report;
 pub use scene::{EvalScene, EvaluationIndex, SceneFrames};
 pub use validation::{HeldOut, HeldOutScores};

@@ -15,7 +15,6 @@ mod trainer;
 pub use crate::io::{CONFIG_FILE, METRICS_FILE};
 pub use checkpoint::{MODEL_FILE, best_checkpoint, latest_checkpoint, list_checkpoints};
 pub use event::Event;
-pub use logs::Curves;
 pub use memory_estimate::MemoryEstimate;
 pub use run::{Outcome, Resume, Validator, add_run_inputs, run};
 pub use step::{Score, StepReport};

@@ -35,7 +35,7 @@ fn names_that_are_not_utf_8() {
     assert_eq!(run_json("pack @rooms --out chunks_too", &[])["out"], "chunks_too", "as it was given");
 
     sandbox.write("tiny.toml", TINY_CONFIG.replace("[data]", "[data]\ncaptures = [\"${ROOMS}/room_000\"]"));
-    run_json("train --config @tiny.toml --out @run", &["/checkpoint", "/curves"]);
+    run_json("train --config @tiny.toml --out @run", &["/checkpoint"]);
     run_json("export --run @run --out @tiny.safetensors", &["/weights"]);
     run_json("import --from @tiny.safetensors --out @imported.safetensors", &["/weights"]);
 

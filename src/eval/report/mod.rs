@@ -5,8 +5,6 @@ mod plots;
 mod scenes;
 mod tables;
 
-pub use plots::write_curves;
-
 use super::evaluation::Evaluation;
 use crate::error::{Error, Result};
 use crate::io::write_file;

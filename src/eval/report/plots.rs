@@ -1,23 +1,17 @@
-//! Plots as SVG: quality by the number of context views and by size, the distribution over scenes, and the curves of a training run.
+//! Plots as SVG: quality by the number of context views and by size, and the distribution over scenes.
 
 use super::entries::{Entry, Row, count, dataset_name, decimal, finite, rows, short, swatch, view_counts};
-use crate::error::Result;
-use crate::io::write_file;
-use crate::train::Curves;
 use maud::{Markup, PreEscaped, html};
 use plotters::coord::types::RangedCoordf64;
 use plotters::drawing::DrawingAreaErrorKind;
 use plotters::prelude::*;
 use std::ops::Range;
-use std::path::Path;
 
 /// Width and height of a plot in its own pixels, which the page scales.
 const SIZE: (u32, u32) = (560, 340);
 /// Possible widths of a histogram's bin in dB, and the maximum number of bins.
 const BIN_WIDTHS: [f64; 5] = [0.2, 0.5, 1., 2., 5.];
 const MAX_BINS: f64 = 28.;
-/// Maximum number of points of a training curve.
-const MAX_POINTS: u64 = 60;
 
 type Chart<'a> = ChartContext<'a, SVGBackend<'a>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 type Drawn = Result<(), DrawingAreaErrorKind<std::io::Error>>;
@@ -209,34 +203,4 @@ fn histogram(entry: &Entry, start: f64, bins: usize, width: f64) -> Markup {
     let title = format!("From scene to scene: {}, {views}", entry.name);
     let about = format!("Histogram of PSNR. {title}: mean {mean} dB over {scenes}.");
     figure(&title, &about, &svg, legend)
-}
-
-/// Draws PSNR over the steps of the training run in the folder `run` into `path`, a self-contained SVG: of training views and of held-out
-/// views. `nearest` is the score of showing the nearest photo, for comparison.
-///
-/// # Errors
-/// Fails if the metrics can't be read or the file can't be written.
-pub fn write_curves(path: &Path, run: &Path, nearest: Option<f64>) -> Result<()> {
-    let Curves { training, held_out } = Curves::read(run, MAX_POINTS)?;
-    let last = training.iter().chain(&held_out).map(|point| point.0).fold(1, u64::max);
-    let flat: Vec<(u64, f64)> = nearest.into_iter().flat_map(|psnr| [(0, psnr), (last, psnr)]).collect();
-    let lines =
-        [("in training", BLUE, training), ("held out", RED, held_out), ("nearest photo", BLACK, flat)];
-    let lines = lines.into_iter().filter_map(|(name, color, points)| {
-        let name = format!("{name} {}", decimal(points.last()?.1, 2));
-        Some((name, color, points.into_iter().map(|(step, psnr)| (step as f64, psnr)).collect::<Vec<_>>()))
-    });
-    let lines: Vec<_> = lines.collect();
-    let x = Axis { title: "Steps", range: 0. ..last as f64, tick: &|step| decimal(step, 0) };
-    let y = psnr_axis(lines.iter().flat_map(|(.., points)| points.iter().map(|point| point.1)));
-    let svg = plot(x, y, |chart| {
-        for (name, color, points) in &lines {
-            let style = color.filled();
-            let line = chart.draw_series(LineSeries::new(points.clone(), color.stroke_width(2)))?;
-            line.label(name).legend(move |(x, y)| Rectangle::new([(x, y - 2), (x + 16, y + 2)], style));
-        }
-        let mut labels = chart.configure_series_labels();
-        labels.position(SeriesLabelPosition::LowerRight).background_style(WHITE).border_style(BLACK).draw()
-    });
-    write_file(path, svg)
 }
