@@ -126,7 +126,8 @@ fn check_output(photos: &Path, out: &Path, is_video: bool, is_new: bool) -> Resu
         |entry: &DirEntry, start: &str| entry.file_name().as_encoded_bytes().starts_with(start.as_bytes());
     let are_photos = |folder: &Path| {
         is_same_folder(folder, photos)
-            && (!is_video || entries(folder).all(|frame| starts_with(&frame, "frame_")))
+            && (!is_video
+                || entries(folder).all(|file| ["frame_", "."].iter().any(|start| starts_with(&file, start))))
     };
     let other = entries(out).find(|entry| !starts_with(entry, ".") && !are_photos(&entry.path()));
     match other.filter(|_| is_new) {

@@ -80,8 +80,7 @@ pub(crate) fn write_sharpest_frames(
     if let Some(declared) = source.declared_frames.filter(|declared| total * 20 < declared * 19) {
         warnings.push(format!("{total} of {declared} frames can be decoded"));
     }
-    let name = folder.file_name().unwrap_or_default().display();
-    let partial = folder.with_file_name(format!(".{name}.globalsplat-partial"));
+    let partial = folder.join(".globalsplat-partial");
     // A call that was killed may have left frames.
     let _ = fs::remove_dir_all(&partial);
     fs::create_dir_all(&partial).map_err(Error::write(folder))?;
@@ -121,11 +120,12 @@ fn write_frames(video: &Video, chosen: &[usize], folder: &Path, reporter: &mut R
     }
 }
 
-/// Moves the frames in the folder `from` to the folder `to`, whose own frames are removed.
+/// Moves the frames in the folder `from` to the folder `to`, in place of its own frames.
 fn replace_frames(from: &Path, to: &Path) -> io::Result<()> {
-    fs::create_dir_all(to)?;
-    own_frames(to).iter().try_for_each(|old| fs::remove_file(to.join(old)))?;
-    own_frames(from).iter().try_for_each(|new| fs::rename(from.join(new), to.join(new)))
+    let (mut old, new) = (own_frames(to), own_frames(from));
+    new.iter().try_for_each(|name| fs::rename(from.join(name), to.join(name)))?;
+    old.retain(|name| !new.contains(name));
+    old.iter().try_for_each(|name| fs::remove_file(to.join(name)))
 }
 
 /// Returns the names of the frames in `folder`, which this call or an earlier one wrote.

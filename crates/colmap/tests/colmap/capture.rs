@@ -88,7 +88,7 @@ fn frames_of_a_video_are_chosen_once_and_their_poses_estimated() {
     assert!(run(5).0.contains("the video is 6 frames of walk.mp4"));
     // A call that was killed leaves the frames without the record.
     fs::remove_dir_all(&out).unwrap();
-    fs::create_dir_all(out.join("images")).unwrap();
+    fs::create_dir_all(out.join("images/.globalsplat-partial")).unwrap();
     fs::write(out.join("images/frame_00001.jpg"), "").unwrap();
     let (error, has_measured) = run(6);
     assert!(is_estimated(&error) && has_measured, "{error}");
