@@ -1,15 +1,19 @@
 //! Captures from photos or a video: which folders may be used, what an earlier call has made, and the steps in their order.
 
 use crate::colmap::Colmap;
-use crate::photos::{find_photos, is_same_folder};
+use crate::photos::{find_photo_masks, find_photos, is_same_path};
 use crate::poses::Estimate;
-use crate::progress::{Progress, Reporter};
+use crate::progress::{Progress, Reporter, Step};
 use crate::record::{CaptureReport, FILE, Matching, Record, VideoRecord};
-use crate::video::write_sharpest_frames;
+use crate::video::{remove_frames, write_sharpest_frames};
 use globalsplat_capture::COLMAP_MODELS;
-use globalsplat_files::{Error, Result};
+use globalsplat_files::{Error, FolderLock, Result};
 use std::fs::{self, DirEntry};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+/// Time between attempts to lock a capture.
+const PAUSE: Duration = Duration::from_millis(200);
 
 /// Options of [`make_capture`].
 #[derive(Debug, Clone, Default)]
@@ -64,10 +68,19 @@ fn make_or_continue(
     }
     let (images, is_video) = (out.join("images"), source.is_file());
     let photos = if is_video { &images } else { source };
-    let old = Record::read(out)?;
-    check_output(photos, out, is_video, old.is_none())?;
+    let read = || {
+        let old = Record::read(out)?;
+        check_output(photos, out, is_video, old.is_none()).map(|()| old)
+    };
+    // Nothing is created in a folder that is refused.
+    read()?;
+    fs::create_dir_all(out).map_err(Error::write(out))?;
+    let _lock = wait_for_lock(out, reporter)?;
+    let mut old = read()?;
     let write_frames = || frames_of_video(source, out, options, old.as_ref(), reporter);
     let video = is_video.then(write_frames).transpose()?;
+    // A call that was stopped before it had all frames.
+    old = old.filter(|old| old.video.as_ref().is_none_or(VideoRecord::is_finished));
     let (found, other_files) = find_photos(photos)?;
     if found.len() < 2 {
         return Err(Error::input(photos, "the number of photos", found.len(), "2 or more"));
@@ -80,7 +93,7 @@ fn make_or_continue(
             Matching::Auto if is_video => Matching::Sequential,
             matching => matching,
         },
-        masks: options.masks.clone(),
+        masks: find_photo_masks(photos, &found, options.masks.as_deref(), &images)?,
         found,
         ..Record::default()
     };
@@ -97,7 +110,6 @@ fn make_or_continue(
         Some(old) => old.update(new, options.keeps_finished),
         None => new,
     };
-    fs::create_dir_all(out).map_err(Error::write(out))?;
     record.write(out)?;
     let mut estimate = Estimate { photos, out, images: &images, colmap, record, reporter };
     let report = match estimate.record.report.clone() {
@@ -109,7 +121,7 @@ fn make_or_continue(
 
 /// Checks that a capture of the photos in the folder `photos` may be written to `out`: the photos may be the capture's own images, but no other
 /// folder of photos may contain the capture, which would then be found among the photos. If `is_new`, the folder `out` may only contain
-/// hidden files and these photos, or what a call left that was killed before it had recorded the frames of a video.
+/// hidden files and these photos.
 fn check_output(photos: &Path, out: &Path, is_video: bool, is_new: bool) -> Result<()> {
     // The frames of a video are written later.
     if !is_video {
@@ -121,21 +133,28 @@ fn check_output(photos: &Path, out: &Path, is_video: bool, is_new: bool) -> Resu
             return Err(Error::input(out, "the output", "inside the folder of photos", expected));
         }
     }
-    let entries = |folder: &Path| fs::read_dir(folder).into_iter().flatten().flatten();
-    let starts_with =
-        |entry: &DirEntry, start: &str| entry.file_name().as_encoded_bytes().starts_with(start.as_bytes());
-    let are_photos = |folder: &Path| {
-        is_same_folder(folder, photos)
-            && (!is_video
-                || entries(folder).all(|file| ["frame_", "."].iter().any(|start| starts_with(&file, start))))
+    let is_known = |entry: &DirEntry| {
+        entry.file_name().as_encoded_bytes().starts_with(b".")
+            || !is_video && is_same_path(&entry.path(), photos)
     };
-    let other = entries(out).find(|entry| !starts_with(entry, ".") && !are_photos(&entry.path()));
+    let other = fs::read_dir(out).into_iter().flatten().flatten().find(|entry| !is_known(entry));
     match other.filter(|_| is_new) {
         None => Ok(()),
         Some(other) => {
             let found = format!("a folder with {}", other.file_name().display());
             Err(Error::input(out, "the output", found, "a new folder, or one with such a capture"))
         }
+    }
+}
+
+/// Locks the folder `out`, once no other process uses it.
+fn wait_for_lock(out: &Path, reporter: &mut Reporter) -> Result<FolderLock> {
+    loop {
+        if let Ok(lock) = FolderLock::try_take(out)? {
+            return Ok(lock);
+        }
+        reporter.report(Progress { step: Step::Wait, done: 0, total: 1 })?;
+        std::thread::sleep(PAUSE);
     }
 }
 
@@ -147,17 +166,21 @@ fn frames_of_video(
     old: Option<&Record>,
     reporter: &mut Reporter,
 ) -> Result<VideoRecord> {
-    let mut record = VideoRecord::new(video, options.frames)?;
-    let Some(old) = old else {
-        record.chosen = write_sharpest_frames(video, &out.join("images"), options.frames, reporter)?;
-        return Ok(record);
-    };
-    match &old.video {
-        Some(old) if record.matches(old, options.keeps_finished) => Ok(old.clone()),
-        other => {
+    let (mut record, images) = (VideoRecord::new(video, options.frames)?, out.join("images"));
+    match old.map(|old| &old.video) {
+        None => {}
+        Some(Some(old)) if old.is_finished() && record.matches(old, options.keeps_finished) => {
+            return Ok(old.clone());
+        }
+        // The record names the folder's frames as ours.
+        Some(Some(old)) if !old.is_finished() && record.matches(old, true) => remove_frames(&images)?,
+        Some(other) => {
             let found = other.as_ref().map_or("none".to_string(), VideoRecord::to_string);
             let expected = format!("{record}, or a folder without a capture");
-            Err(Error::input(out.join(FILE), "the video", found, expected))
+            return Err(Error::input(out.join(FILE), "the video", found, expected));
         }
     }
+    Record { video: Some(record.clone()), ..Record::default() }.write(out)?;
+    record.chosen = write_sharpest_frames(video, &images, options.frames, reporter)?;
+    Ok(record)
 }

@@ -19,8 +19,11 @@ const GET: &str = "pip install pycolmap, or apt install colmap";
 const OLDEST_COLMAP: (u32, u32) = (3, 8);
 const OLDEST_PYCOLMAP: (u32, u32) = (4, 0);
 
-/// Prints pycolmap's version. Modules in the working directory are not imported.
-const PRINT_VERSION: &str = "import sys; sys.path = [p for p in sys.path if p]; import pycolmap; print('COLMAP', pycolmap.__version__)";
+/// Isolates Python (`-I`) from the working folder and from variables that name other modules. Packages of the user are added again.
+const ISOLATED: [&str; 2] = ["-I", "-c"];
+const ADD_USER_PACKAGES: &str = "import site, sys; sys.path.append(site.getusersitepackages())\n";
+/// Prints pycolmap's version.
+const PRINT_VERSION: &str = "import pycolmap; print('COLMAP', pycolmap.__version__)";
 /// Program that runs a command by pycolmap.
 const RUN_COMMAND: &str = include_str!("pycolmap_command.py");
 
@@ -35,8 +38,8 @@ pub struct Colmap {
 
 impl Colmap {
     /// Finds COLMAP: the program or the Python that `GLOBALSPLAT_COLMAP` names; else the newest of `colmap` on the PATH and the pycolmap of
-    /// the first Python that has it, and of equal versions pycolmap. Python is looked for in `.venv` of the working directory and of
-    /// the folders above this program, in the active virtual or Conda environment, and as `python3` on the PATH.
+    /// the first Python that has it, and of equal versions pycolmap. Python is looked for in `.venv` beside this program and up to three
+    /// folders above, in the active virtual or Conda environment, and as `python3` on the PATH.
     ///
     /// # Errors
     /// Returns an error that says how to install COLMAP if there is none, or what is wrong with the one that `GLOBALSPLAT_COLMAP` names.
@@ -83,7 +86,7 @@ impl Colmap {
     fn new(program: PathBuf, is_python: bool) -> Option<Self> {
         let mut command = Command::new(&program);
         match is_python {
-            true => command.args(["-c", PRINT_VERSION]),
+            true => command.args(ISOLATED).arg(format!("{ADD_USER_PACKAGES}{PRINT_VERSION}")),
             false => command.arg("help"),
         };
         let output = command.stdin(Stdio::null()).output().ok()?;
@@ -119,7 +122,8 @@ impl Colmap {
         reporter.report(start)?;
         let mut command = Command::new(&self.program);
         if self.is_python {
-            command.args(["-c", RUN_COMMAND, name, &options.to_string()]);
+            command.args(ISOLATED).arg(format!("{ADD_USER_PACKAGES}{RUN_COMMAND}"));
+            command.args([name, &options.to_string()]);
         } else {
             let mut help = Command::new(&self.program);
             let help = help.args([name, "-h"]).stdin(Stdio::null()).output().map_err(failed_start())?;
@@ -177,8 +181,7 @@ fn parse_version(version: &str) -> Option<(u32, u32)> {
 /// Returns the Pythons that may have pycolmap.
 fn python_programs() -> Vec<PathBuf> {
     let program = std::env::current_exe().unwrap_or_default();
-    let folders = [Path::new("")].into_iter().chain(program.ancestors().skip(1));
-    let local = folders.map(|folder| folder.join(".venv"));
+    let local = program.ancestors().skip(1).take(4).map(|folder| folder.join(".venv"));
     let active =
         ["VIRTUAL_ENV", "CONDA_PREFIX"].map(std::env::var_os).into_iter().flatten().map(PathBuf::from);
     let pythons = local.chain(active).map(|environment| environment.join("bin/python"));

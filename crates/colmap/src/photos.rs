@@ -1,14 +1,16 @@
 //! Photos of a folder, checked and brought into a capture's folder of images.
 
 use crate::progress::{Progress, Reporter, Step};
+use crate::record::Record;
 use globalsplat_capture::{
     MASKS_FOLDER, decode_photo, encode_photo, exif_focal, find_masks, find_masks_in, gray_to_rgb,
     is_equirectangular, list_photos, read_image_size, read_mask,
 };
 use globalsplat_files::{Error, Result, checksum, parent_of, write_file};
+use image::{Rgb, RgbImage};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -22,6 +24,14 @@ pub(crate) struct FoundPhoto {
     pub name: String,
     /// Size of the file.
     pub bytes: u64,
+    /// CRC-32 of its contents.
+    pub checksum: u32,
+}
+
+/// File of a photo's mask, as it was found.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct FoundMask {
+    pub file: PathBuf,
     /// CRC-32 of its contents.
     pub checksum: u32,
 }
@@ -65,55 +75,82 @@ pub(crate) fn find_photos(folder: &Path) -> Result<(Vec<FoundPhoto>, Option<Stri
     Ok((found, list.warning))
 }
 
-/// Brings the photos `found` in `source` into the folder `images`, by a hard link where the file system allows it. COLMAP
-/// reads pixels as they are stored: photos that EXIF says to rotate are written upright, and those that aren't JPEGs or PNGs are
-/// converted. Masks, which are files in `masks` or the opacity of a converted photo, are written to the folder [`MASKS_FOLDER`] beside `images`,
-/// each of the size of its photo. Returns the photos in the order in which they were found, and those that aren't used.
+/// Returns the masks of the photos `found` in `source`, by the names of the photos: those in the folder `masks`, or in a folder
+/// [`MASKS_FOLDER`] among the photos.
 ///
 /// # Errors
-/// Returns an error if a file can't be written, if a mask can't be read, if `masks` is given and has none for any photo, or if `source` is
-/// `images` and a photo in it would need another name or other contents.
-pub(crate) fn import_photos(
+/// Returns an error if `masks` is the folder of the photos or of the capture's `images`, or has no mask for any photo, or if a mask can't be
+/// read.
+pub(crate) fn find_photo_masks(
     source: &Path,
     found: &[FoundPhoto],
     masks: Option<&Path>,
     images: &Path,
+) -> Result<BTreeMap<String, FoundMask>> {
+    let names: Vec<&str> = found.iter().map(|photo| photo.name.as_str()).collect();
+    let files = match masks {
+        Some(folder) if is_same_path(folder, source) || is_same_path(folder, images) => {
+            let expected = "a folder of masks, named like the photos";
+            return Err(Error::input(folder, "the folder of masks", "that of the photos", expected));
+        }
+        Some(folder) => find_masks_in(folder, &names)?,
+        None => find_masks(&[source.join(MASKS_FOLDER)], &names),
+    };
+    let describe = |(name, file): (&str, Option<PathBuf>)| {
+        let file = file?;
+        Some(checksum([&file]).map(|checksum| (name.to_string(), FoundMask { file, checksum })))
+    };
+    names.into_iter().zip(files).filter_map(describe).collect()
+}
+
+/// Copies the photos of `record`, which are in `source`, into the folder `images` of the capture in `out`. On file systems that can share the
+/// contents of files, copies take no space. COLMAP reads pixels as they are stored: photos that EXIF says to rotate are written upright, and
+/// those that aren't JPEGs or PNGs are converted. Masks, which are files or the opacity of a converted photo, are written to the folder
+/// [`MASKS_FOLDER`] beside `images`, each of the size of its photo. If some photos have masks, all others get a white one, without which
+/// COLMAP would leave them out. Returns the photos in the order in which they were found, and those that aren't used.
+///
+/// # Errors
+/// Returns an error if a file can't be written, if a mask can't be read, if a mask would replace one that no call has written, or if `source` is
+/// `images` and a photo in it would need another name or other contents.
+pub(crate) fn import_photos(
+    source: &Path,
+    out: &Path,
+    images: &Path,
+    record: &mut Record,
     reporter: &mut Reporter,
 ) -> Result<(Vec<Photo>, Vec<SkippedPhoto>)> {
+    let found = record.found.clone();
     let all_names: Vec<&str> = found.iter().map(|photo| photo.name.as_str()).collect();
-    let mask_files = match masks {
-        Some(folder) => find_masks_in(folder, &all_names)?,
-        None => find_masks(&[source.join(MASKS_FOLDER)], &all_names),
-    };
     let (mut photos, mut skipped, mut distinct) = (vec![], vec![], vec![]);
     let mut first_of = HashMap::new();
-    for (photo, mask) in found.iter().zip(&mask_files) {
+    for photo in &found {
         let first = *first_of.entry((photo.bytes, photo.checksum)).or_insert(&photo.name);
         if *first == photo.name {
-            distinct.push((&photo.name, mask));
+            distinct.push((&photo.name, record.masks.get(&photo.name).map(|mask| mask.file.clone())));
         } else {
             let (name, reason) = (photo.name.clone(), format!("identical to {first}"));
             skipped.push(SkippedPhoto { name, reason });
         }
     }
-    let is_in_place = is_same_folder(source, images);
-    let mut names = HashSet::new();
+    let is_in_place = is_same_path(source, images);
+    let (mut names, mut unmasked) = (HashSet::new(), vec![]);
     let mut done = skipped.len();
     // Few photos at a time, for progress and memory.
     for few in distinct.chunks(2 * rayon::current_num_threads()) {
         let inspected: Vec<_> =
             few.par_iter().map(|(name, mask)| inspect(source, name, mask.as_deref(), &all_names)).collect();
-        for (&(name, _), inspected) in few.iter().zip(inspected) {
+        let mut masks = vec![];
+        for ((name, mask_file), inspected) in few.iter().zip(inspected) {
             let path = source.join(name);
             let Inspected { mut photo, contents, mask } = match inspected {
                 Ok(inspected) => inspected,
                 Err(reason) => {
-                    skipped.push(SkippedPhoto { name: name.clone(), reason });
+                    skipped.push(SkippedPhoto { name: name.to_string(), reason });
                     continue;
                 }
             };
             photo.name = list_name(photo.name, &mut names);
-            if is_in_place && (contents.is_some() || photo.name != *name) {
+            if is_in_place && (contents.is_some() || photo.name != **name) {
                 let found = "one that COLMAP can't read as it is, by its name, format or rotation";
                 let expected = "an output whose images aren't the photos themselves";
                 return Err(Error::input(path, "the photo", found, expected));
@@ -122,25 +159,69 @@ pub(crate) fn import_photos(
             if let Some(contents) = contents {
                 write_with_folder(&target, &contents)?;
             } else if !is_in_place {
-                link(&path, &target)?;
+                copy(&path, &target)?;
             }
-            let target = images.with_file_name(MASKS_FOLDER).join(format!("{}.png", photo.name));
-            if let Some(mask) = mask? {
-                write_with_folder(&target, &mask)?;
-            } else if !is_in_place {
-                // A run with other masks may have left one.
-                let _ = fs::remove_file(target);
+            match mask? {
+                Some(contents) => masks.push((photo.clone(), contents, mask_file.as_deref())),
+                None => unmasked.push(photo.clone()),
             }
             photos.push(photo);
         }
+        write_masks(out, record, masks)?;
         done += few.len();
         reporter.report(Progress { step: Step::Photos, done, total: found.len() })?;
+    }
+    let mask_file = |photo: &Photo| out.join(MASKS_FOLDER).join(mask_name(photo));
+    for photo in unmasked.iter().filter(|photo| record.own_masks.remove(&mask_name(photo))) {
+        // Another call has written it.
+        let file = mask_file(photo);
+        fs::remove_file(&file).map_err(Error::write(&file))?;
+    }
+    if photos.iter().any(|photo| mask_file(photo).exists()) {
+        unmasked.retain(|photo| !mask_file(photo).exists());
+        let white = |photo: Photo| {
+            let pixels = RgbImage::from_pixel(photo.width, photo.height, Rgb([u8::MAX; 3]));
+            Ok((photo, encode_photo(&pixels, false)?, None))
+        };
+        write_masks(out, record, unmasked.into_iter().map(white).collect::<Result<_>>()?)?;
     }
     Ok((photos, skipped))
 }
 
-/// Returns `true` if both paths lead to the same folder.
-pub(crate) fn is_same_folder(a: &Path, b: &Path) -> bool {
+/// Returns the name of a photo's mask, as COLMAP looks for it.
+fn mask_name(photo: &Photo) -> String {
+    format!("{}.png", photo.name)
+}
+
+/// Writes the masks of photos, given by their contents and by the files that they are made of, to the capture in `out`. The record names
+/// them first, so that calls know their own. A file that lies there already as the mask that it is made of stays.
+fn write_masks(out: &Path, record: &mut Record, masks: Vec<(Photo, Vec<u8>, Option<&Path>)>) -> Result<()> {
+    let mut new = vec![];
+    for (photo, contents, file) in masks {
+        let name = mask_name(&photo);
+        let target = out.join(MASKS_FOLDER).join(&name);
+        if file.is_some_and(|file| is_same_path(file, &target)) {
+            if read_image_size(&target)? != (photo.width, photo.height) {
+                let expected = "one of the size of its photo, or --masks with another folder";
+                return Err(Error::input(target, "the mask", "of another size", expected));
+            }
+        } else if target.exists() && !record.own_masks.contains(&name) {
+            let expected = "a capture without masks, or with those that it wrote";
+            return Err(Error::input(target, "the mask", "one that no capture wrote", expected));
+        } else {
+            new.push((name, target, contents));
+        }
+    }
+    let known = record.own_masks.len();
+    record.own_masks.extend(new.iter().map(|(name, ..)| name.clone()));
+    if record.own_masks.len() > known {
+        record.write(out)?;
+    }
+    new.iter().try_for_each(|(_, target, contents)| write_with_folder(target, contents))
+}
+
+/// Returns `true` if both paths lead to the same folder or file.
+pub(crate) fn is_same_path(a: &Path, b: &Path) -> bool {
     a.canonicalize().is_ok_and(|a| b.canonicalize().is_ok_and(|b| a == b))
 }
 
@@ -233,14 +314,10 @@ fn write_with_folder(target: &Path, contents: &[u8]) -> Result<()> {
     write_file(target, contents)
 }
 
-/// Links `target` to the file `source`, copying it if it can't be linked.
-fn link(source: &Path, target: &Path) -> Result<()> {
-    let source = source.canonicalize().map_err(Error::read(source))?;
+/// Copies the file `source` to `target`.
+fn copy(source: &Path, target: &Path) -> Result<()> {
     fs::create_dir_all(parent_of(target)).map_err(Error::write(target))?;
-    // A link that an earlier run left may be to another file.
+    // A file that an earlier call left may be a link, and copying would change what it links to.
     let _ = fs::remove_file(target);
-    if fs::hard_link(&source, target).is_err() {
-        fs::copy(&source, target).map_err(Error::write(target))?;
-    }
-    Ok(())
+    fs::copy(source, target).map(drop).map_err(Error::write(target))
 }

@@ -85,14 +85,17 @@ impl Estimate<'_, '_> {
 
     /// Brings the photos into the folder of images.
     fn import(&mut self) -> Result<()> {
-        let Record { photos: None, found, masks, .. } = &self.record else { return Ok(()) };
+        if self.record.photos.is_some() {
+            return Ok(());
+        }
         let (photos, skipped) =
-            import_photos(self.photos, found, masks.as_deref(), self.images, self.reporter)?;
+            import_photos(self.photos, self.out, self.images, &mut self.record, self.reporter)?;
         if photos.len() < 2 {
             let explain = |photo: &SkippedPhoto| format!("{} is {}", photo.name, photo.reason);
             let reasons: Vec<String> = skipped.iter().map(explain).collect();
             let reasons = format_names(&reasons, SHOWN_NAMES);
-            let unusable = format!("{}, of which {} can't be used ({reasons})", found.len(), skipped.len());
+            let (found, unused) = (self.record.found.len(), skipped.len());
+            let unusable = format!("{found}, of which {unused} can't be used ({reasons})");
             let expected = "2 or more different ones";
             return Err(Error::input(self.photos, "the number of photos", unusable, expected));
         }

@@ -7,11 +7,13 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Step {
+    /// Another process uses the capture.
+    Wait,
     /// Sharpness and motion of the frames of a video are measured.
     Measure,
     /// The chosen frames of a video are written.
     Frames,
-    /// Photos are checked and linked.
+    /// Photos are checked and copied.
     Photos,
     /// Features are detected in photos.
     Features,
@@ -25,6 +27,7 @@ impl Step {
     /// Returns what the step counts.
     pub fn unit(self) -> &'static str {
         match self {
+            Step::Wait => "waiting for another process that uses the capture",
             Step::Measure => "frames measured",
             Step::Frames => "frames written",
             Step::Photos => "photos checked",

@@ -6,8 +6,7 @@ import sys
 import threading
 from pathlib import Path
 
-sys.path = [path for path in sys.path if path]  # noqa: TID251
-import pycolmap  # noqa: E402
+import pycolmap
 
 
 def exit_with_parent():

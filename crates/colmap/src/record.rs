@@ -1,14 +1,14 @@
 //! The file that records how far a capture has come, so that the same call continues it, and the settings and results in it.
 
-use crate::photos::{FoundPhoto, Photo, SkippedPhoto};
+use crate::photos::{FoundMask, FoundPhoto, Photo, SkippedPhoto};
 use crate::progress::Step;
 use crate::video::VideoFrames;
 use globalsplat_capture::format_names;
 use globalsplat_files::{Error, Result, read_text, write_json};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::str::FromStr;
 use std::time::UNIX_EPOCH;
 
@@ -68,6 +68,11 @@ impl VideoRecord {
             frames,
             chosen: VideoFrames::default(),
         })
+    }
+
+    /// Returns `true` if the frames are chosen and written.
+    pub(crate) fn is_finished(&self) -> bool {
+        !self.chosen.indices.is_empty()
     }
 
     /// Returns `true` if the frames of `other` are those of this video, and as many as this one asks for or `any_number`.
@@ -150,8 +155,10 @@ pub(crate) struct Record {
     pub camera_model: Option<String>,
     /// Choice of pairs.
     pub matching: Matching,
-    /// Folder of masks that the user named.
-    pub masks: Option<PathBuf>,
+    /// Files of the masks, by the names of their photos.
+    pub masks: BTreeMap<String, FoundMask>,
+    /// Names of the masks that calls have written. Others in their folder are the user's.
+    pub own_masks: BTreeSet<String>,
     /// Photos in the folder of the user, or frames of the video.
     pub found: Vec<FoundPhoto>,
     /// Photos in the folder of images, once they are all there.
@@ -195,12 +202,14 @@ impl Record {
     /// Returns this record with the settings of `new`, without what depends on settings that have changed. If `keeps_finished`, a finished
     /// capture stays as it is.
     pub fn update(mut self, new: Record, keeps_finished: bool) -> Record {
-        if keeps_finished && self.report.is_some() {
+        let has_other_masks = self.masks != new.masks;
+        if keeps_finished && self.report.is_some() && (new.masks.is_empty() || !has_other_masks) {
             return self;
         }
         // The photos stay frames of their video if the user names their folder.
-        let new = Record { video: new.video.or_else(|| self.video.clone()), ..new };
-        if self.masks != new.masks {
+        let video = new.video.or_else(|| self.video.clone());
+        let new = Record { video, own_masks: self.own_masks.clone(), ..new };
+        if has_other_masks {
             return new;
         }
         if (&self.colmap, &self.camera_model) != (&new.colmap, &new.camera_model) {

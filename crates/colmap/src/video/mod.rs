@@ -32,8 +32,8 @@ pub struct VideoFrames {
 
 /// Writes frames of `video` as JPEGs `frame_00001.jpg`, `frame_00002.jpg`, … to `folder`. The video is divided into segments in which the
 /// picture moves equally far, and the sharpest frame of each is chosen; a camera at rest adds no frames. A cut starts a new segment.
-/// Frames are upright, progressive and with square pixels; HDR becomes SDR. When all are written, they replace the frames of an earlier call
-/// in `folder`; its other files stay.
+/// Frames are upright, progressive and with square pixels; HDR becomes SDR. They appear in the folder, which must be new or empty, when all are
+/// written.
 ///
 /// The number of frames is `count`, 1 to 2,000. `None` stands for one frame per 6 % of the longer side that the picture moves, but 30 to 300
 /// frames.
@@ -42,7 +42,7 @@ pub struct VideoFrames {
 /// folder stays as it was.
 ///
 /// # Errors
-/// Returns an error if ffmpeg or ffprobe is missing, if `video` isn't a video of two or more frames, if the number of frames is out of
+/// Returns an error if ffmpeg or ffprobe is missing, if `folder` has files, if `video` isn't a video of two or more frames, if the number of frames is out of
 /// range, or if a frame can't be written.
 pub fn extract_frames(
     video: &Path,
@@ -61,6 +61,11 @@ pub(crate) fn write_sharpest_frames(
 ) -> Result<VideoFrames> {
     if let Some(count) = count.filter(|count| !(1..=MAX_REQUESTED_FRAMES).contains(count)) {
         return Err(Error::setting("the number of frames", count, format!("1 to {MAX_REQUESTED_FRAMES}")));
+    }
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.file_name());
+    if let Some(name) = entries.into_iter().find(|name| !name.as_encoded_bytes().starts_with(b".")) {
+        let found = format!("one with {}", name.display());
+        return Err(Error::input(folder, "the folder of frames", found, "a new or empty folder"));
     }
     let source = Video::open(video)?;
     let (sharpness, motion) = measure(&source, reporter)?;
@@ -85,7 +90,7 @@ pub(crate) fn write_sharpest_frames(
     let _ = fs::remove_dir_all(&partial);
     fs::create_dir_all(&partial).map_err(Error::write(folder))?;
     let written = write_frames(&source, &indices, &partial, reporter);
-    let written = written.and_then(|()| replace_frames(&partial, folder).map_err(Error::write(folder)));
+    let written = written.and_then(|()| move_frames(&partial, folder).map_err(Error::write(folder)));
     let _ = fs::remove_dir_all(&partial);
     written?;
     let summary = format!("{chosen} of {total} frames, the sharpest of each segment of equal motion");
@@ -110,7 +115,7 @@ fn measure(video: &Video, reporter: &mut Reporter) -> Result<(Vec<f64>, Vec<f64>
 fn write_frames(video: &Video, chosen: &[usize], folder: &Path, reporter: &mut Reporter) -> Result<()> {
     let total = chosen.len();
     let mut report_written = || {
-        let done = own_frames(folder).len();
+        let done = frames_in(folder).len();
         reporter.report(Progress { step: Step::Frames, done, total }).map(|()| done)
     };
     video.write(chosen, folder, || report_written().map(drop))?;
@@ -120,21 +125,26 @@ fn write_frames(video: &Video, chosen: &[usize], folder: &Path, reporter: &mut R
     }
 }
 
-/// Moves the frames in the folder `from` to the folder `to`, in place of its own frames.
-fn replace_frames(from: &Path, to: &Path) -> io::Result<()> {
-    let (mut old, new) = (own_frames(to), own_frames(from));
-    new.iter().try_for_each(|name| fs::rename(from.join(name), to.join(name)))?;
-    old.retain(|name| !new.contains(name));
-    old.iter().try_for_each(|name| fs::remove_file(to.join(name)))
+/// Moves the frames in the folder `from` to the folder `to`.
+fn move_frames(from: &Path, to: &Path) -> io::Result<()> {
+    frames_in(from).iter().try_for_each(|name| fs::rename(from.join(name), to.join(name)))
 }
 
-/// Returns the names of the frames in `folder`, which this call or an earlier one wrote.
-fn own_frames(folder: &Path) -> Vec<String> {
+/// Removes the frames in `folder`, which are those of a call that was stopped.
+pub(crate) fn remove_frames(folder: &Path) -> Result<()> {
+    frames_in(folder)
+        .iter()
+        .try_for_each(|name| fs::remove_file(folder.join(name)))
+        .map_err(Error::write(folder))
+}
+
+/// Returns the names of the frames in `folder`.
+fn frames_in(folder: &Path) -> Vec<String> {
     let entries = fs::read_dir(folder).into_iter().flatten().flatten();
     let names = entries.map(|entry| entry.file_name().to_string_lossy().into_owned());
-    let is_own = |name: &String| {
+    let is_frame = |name: &String| {
         let number = name.strip_prefix("frame_").and_then(|rest| rest.strip_suffix(".jpg"));
         number.is_some_and(|number| number.len() >= 5 && number.bytes().all(|digit| digit.is_ascii_digit()))
     };
-    names.filter(is_own).collect()
+    names.filter(is_frame).collect()
 }

@@ -2,7 +2,11 @@
 
 use crate::{failing_colmap, has_ffmpeg, make, write_noise};
 use globalsplat_colmap::{CaptureOptions, Colmap, Step, make_capture};
+use globalsplat_files::FolderLock;
+use globalsplat_test_kit::rerun_test;
+use serde_json::{Value, json};
 use std::fs;
+use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::Command;
 
@@ -86,14 +90,66 @@ fn frames_of_a_video_are_chosen_once_and_their_poses_estimated() {
     let (error, has_measured) = run(6);
     assert!(is_estimated(&error) && !has_measured, "{error}");
     assert!(run(5).0.contains("the video is 6 frames of walk.mp4"));
-    // A call that was killed leaves the frames without the record.
-    fs::remove_dir_all(&out).unwrap();
-    fs::create_dir_all(out.join("images/.globalsplat-partial")).unwrap();
-    fs::write(out.join("images/frame_00001.jpg"), "").unwrap();
-    let (error, has_measured) = run(6);
+    // A call that was killed while it moved the frames: its record names none.
+    let record = out.join("capture.json");
+    let mut unfinished: Value = serde_json::from_slice(&fs::read(&record).unwrap()).unwrap();
+    (unfinished["video"]["indices"], unfinished["found"]) = (json!([]), json!([]));
+    fs::write(&record, unfinished.to_string()).unwrap();
+    fs::remove_file(out.join("images/frame_00006.jpg")).unwrap();
+    let (error, has_measured) = run(5);
     assert!(is_estimated(&error) && has_measured, "{error}");
-    // Photos that the user put there are no frames.
-    fs::remove_file(out.join("capture.json")).unwrap();
-    fs::write(out.join("images/mine.jpg"), "").unwrap();
-    assert!(run(6).0.contains("the output is a folder with "));
+    assert_eq!(fs::read_dir(out.join("images")).unwrap().count(), 5);
+    // Frames that another program wrote.
+    fs::remove_file(record).unwrap();
+    let frame = fs::read(out.join("images/frame_00001.jpg")).unwrap();
+    assert!(run(6).0.contains("the output is a folder with images"));
+    assert_eq!(fs::read(out.join("images/frame_00001.jpg")).unwrap(), frame);
+}
+
+#[test]
+fn a_capture_is_made_by_one_process_at_a_time() {
+    let folder = tempfile::tempdir().unwrap();
+    let [photos, out] = ["photos", "out"].map(|name| folder.path().join(name));
+    write_noise(&photos);
+    fs::create_dir(&out).unwrap();
+    let mut lock = Some(FolderLock::try_take(&out).unwrap().unwrap());
+    let mut steps = vec![];
+    let result =
+        make_capture(&photos, &out, &CaptureOptions::default(), &failing_colmap(), &mut |progress| {
+            // Released when the second one has said that it waits.
+            lock = None;
+            steps.push(progress.step);
+            true
+        });
+    assert!(result.unwrap_err().to_string().contains("COLMAP's feature_extractor failed"));
+    assert_eq!(steps[..2], [Step::Wait, Step::Photos]);
+}
+
+/// Modules and environments in the working folder may be anybody's.
+#[test]
+fn nothing_in_the_working_folder_is_run() {
+    const NAME: &str = "capture::nothing_in_the_working_folder_is_run";
+    const CHILD: &str = "GLOBALSPLAT_TEST_WORKING_FOLDER";
+    if let Some(folder) = std::env::var_os(CHILD) {
+        std::env::set_current_dir(folder).unwrap();
+        // Without COLMAP, only the search for it is tested.
+        if let Ok(colmap) = Colmap::find() {
+            let _ = make(Path::new("photos"), Path::new("out"), &CaptureOptions::default(), &colmap);
+        }
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    write_noise(&folder.path().join("photos"));
+    let trap = format!("open({:?}, 'w')", folder.path().join("was_run"));
+    for module in ["json.py", "site.py", "pycolmap.py", "lib/sitecustomize.py"] {
+        fs::create_dir_all(folder.path().join("lib")).unwrap();
+        fs::write(folder.path().join(module), &trap).unwrap();
+    }
+    let python = folder.path().join(".venv/bin/python");
+    fs::create_dir_all(python.parent().unwrap()).unwrap();
+    fs::write(&python, format!("#!/bin/sh\ntouch {}/was_run\n", folder.path().display())).unwrap();
+    fs::set_permissions(&python, fs::Permissions::from_mode(0o755)).unwrap();
+    let variables = [(CHILD, folder.path()), ("PYTHONPATH", &folder.path().join("lib"))];
+    assert!(rerun_test(NAME, &variables).0);
+    assert!(!folder.path().join("was_run").exists());
 }

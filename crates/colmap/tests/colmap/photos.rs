@@ -120,9 +120,15 @@ fn masks_of_another_folder_replace_those_of_an_earlier_run() {
     for (seed, name) in ["photos/a.png", "photos/b.png", "photos/masks/a.png"].into_iter().enumerate() {
         folders.write(name, seed as u8).unwrap();
     }
-    let have_masks = || ["a", "b"].map(|name| folders.at(format!("out/masks/{name}.png.png")).exists());
+    // Photos without a mask count whole.
+    let are_white = || {
+        ["a", "b"].map(|name| {
+            let mask = read_image(&folders.at(format!("out/masks/{name}.png.png"))).unwrap();
+            mask.pixels().all(|pixel| pixel.0 == [255; 3])
+        })
+    };
     folders.import("photos", None).unwrap();
-    assert_eq!(have_masks(), [true, false]);
+    assert_eq!(are_white(), [false, true]);
     let mask = folders.at("other/b.png.png");
     let small = RgbImage::new(8, 16);
     for (prepare, expected) in [
@@ -137,7 +143,54 @@ fn masks_of_another_folder_replace_those_of_an_earlier_run() {
     }
     fs::copy(folders.at("photos/b.png"), &mask).unwrap();
     folders.import("photos", Some("other")).unwrap();
-    assert_eq!(have_masks(), [false, true]);
+    assert_eq!(are_white(), [true, false]);
+    // Other contents of a mask are noticed.
+    GrayImage::from_pixel(16, 8, Luma([255])).save(&mask).unwrap();
+    folders.import("photos", Some("other")).unwrap();
+    assert_eq!(are_white(), [true, true]);
+    let error = folders.import("photos", Some("photos")).unwrap_err();
+    assert!(error.contains("the folder of masks is that of the photos"), "{error}");
+}
+
+#[test]
+fn masks_that_no_capture_wrote_stay() {
+    let folders = Folders::new();
+    for (seed, name) in ["photos/a.png", "photos/b.png"].into_iter().enumerate() {
+        folders.write(name, seed as u8).unwrap();
+    }
+    folders.import("photos", None).unwrap();
+    // The user's, beside the photos of the capture.
+    let mask = folders.at("out/masks/a.png.png");
+    fs::create_dir_all(mask.parent().unwrap()).unwrap();
+    GrayImage::from_fn(16, 8, |x, _| Luma([if x < 8 { 0 } else { 255 }])).save(&mask).unwrap();
+    let before = fs::read(&mask).unwrap();
+    fs::create_dir(folders.at("other")).unwrap();
+    folders.write("other/a.png", 5).unwrap();
+    let error = folders.import("photos", Some("other")).unwrap_err();
+    assert!(error.contains("masks/a.png.png: the mask is one that no capture wrote"), "{error}");
+    // As an input, it is used as it is.
+    folders.import("photos", Some("out/masks")).unwrap();
+    assert!(folders.at("out/masks/b.png.png").exists() && fs::read(&mask).unwrap() == before);
+    folders.import("photos", None).unwrap();
+    assert_eq!(fs::read(&mask).unwrap(), before);
+    RgbImage::new(8, 4).save(&mask).unwrap();
+    let before = fs::read(&mask).unwrap();
+    let error = folders.import("photos", Some("out/masks")).unwrap_err();
+    assert!(error.contains("a.png.png: the mask is of another size"), "{error}");
+    assert_eq!(fs::read(&mask).unwrap(), before);
+}
+
+/// Photos of a capture may be edited: they are copies.
+#[test]
+fn photos_are_copies() {
+    let folders = Folders::new();
+    for (seed, name) in ["photos/a.png", "photos/b.png"].into_iter().enumerate() {
+        folders.write(name, seed as u8).unwrap();
+    }
+    let original = fs::read(folders.at("photos/a.png")).unwrap();
+    folders.import("photos", None).unwrap();
+    fs::write(folders.at("out/images/a.png"), "edited").unwrap();
+    assert_eq!(fs::read(folders.at("photos/a.png")).unwrap(), original);
 }
 
 #[test]

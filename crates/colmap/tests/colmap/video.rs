@@ -51,7 +51,9 @@ impl Fixture {
         xs.into_iter().map(|x| view(&self.picture, x)).collect()
     }
 
+    /// Chooses frames of a video; those of an earlier call are removed.
     fn extract(&self, name: &str, count: Option<usize>) -> Result<VideoFrames> {
+        let _ = fs::remove_dir_all(self.at("frames"));
         let frames = extract_frames(&self.at(name), &self.at("frames"), count, &mut |_| true);
         frames.map(|frames| frames.expect("nothing stops it"))
     }
@@ -143,12 +145,10 @@ fn frames_are_equally_far_apart_and_a_pause_adds_none() {
 
     // 1.3 widths would be 22 frames at the usual distance.
     assert_eq!(extract(&video, &folder, None).indices.len(), 30);
-    // The others of the larger number are removed.
-    extract(&video, &folder, Some(1));
-    assert_eq!(names(&folder).len(), 1);
     // ffmpeg takes more than 100 frames in a nested expression only.
-    extract(&video, &folder, Some(105));
-    assert_eq!(names(&folder).len(), 105);
+    let many = fixture.at("many");
+    extract(&video, &many, Some(105));
+    assert_eq!(names(&many).len(), 105);
 
     // A relative path, which leads elsewhere from the folder of the frames.
     let depth = std::env::current_dir().unwrap().components().skip(1).count();
@@ -296,18 +296,19 @@ fn a_stopped_call_changes_nothing() {
         assert!(extract_frames(&video, &folder, Some(20), &mut go_on).unwrap().is_none());
         assert!(!folder.exists() || names(&folder).is_empty());
     }
-    // What isn't a frame stays.
+    // A folder with files is refused, whatever their names are.
     fs::create_dir_all(&folder).unwrap();
-    fs::write(folder.join("notes.txt"), "mine").unwrap();
-    fs::write(folder.join("frame_00099.jpg"), "of an earlier call").unwrap();
+    fs::write(folder.join("frame_00099.jpg"), "of another program").unwrap();
+    let error = extract_frames(&video, &folder, Some(20), &mut |_| true).unwrap_err().to_string();
+    assert!(error.contains("the folder of frames is one with frame_00099.jpg"), "{error}");
+    fs::remove_file(folder.join("frame_00099.jpg")).unwrap();
     let mut seen: Vec<Progress> = vec![];
     let extracted = extract_frames(&video, &folder, Some(20), &mut |progress| {
         seen.push(progress);
         true
     });
     assert!(extracted.unwrap().is_some());
-    assert_eq!(names(&folder).len(), 21);
-    assert!(folder.join("notes.txt").is_file() && folder.join("frame_00020.jpg").is_file());
+    assert_eq!(names(&folder).len(), 20);
     for (step, total) in [(Step::Measure, 40), (Step::Frames, 20)] {
         let last = seen.iter().rfind(|progress| progress.step == step);
         assert_eq!(last, Some(&Progress { step, done: total, total }));
