@@ -46,7 +46,8 @@ def _save_for_backward(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, 
 
 
 def _splat_backward(ctx: Any, d_rgb: Tensor, d_alpha: Tensor, d_depth: Tensor, _: None) -> tuple[Tensor | None, ...]:
-    tensors, output = ctx.saved_tensors[:TENSORS], ctx.saved_tensors[TENSORS:]
+    saved = ctx.saved_tensors  # activation checkpointing computes them when they are read, which it allows once
+    tensors, output = saved[:TENSORS], saved[TENSORS:]
     has_viewmats_grad, has_means2d_grad = ctx.needs_input_grad[5], ctx.needs_input_grad[-1]
     *gradients, viewmats, means2d = torch.ops.globalsplat.splat_backward(
         *tensors, *ctx.settings, *output, d_rgb, d_alpha, d_depth, has_viewmats_grad, has_means2d_grad

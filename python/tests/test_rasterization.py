@@ -5,6 +5,7 @@ import itertools
 import globalsplat
 import pytest
 import torch
+import torch.utils.checkpoint
 from globalsplat.reference import splat as reference
 
 WIDTH, HEIGHT = 45, 37
@@ -191,6 +192,20 @@ def test_saved_tensors_may_be_moved_and_second_derivatives_are_refused():
         torch.testing.assert_close(ours, theirs, rtol=0, atol=0)
     with pytest.raises(RuntimeError, match="can't be differentiated twice"):
         gradients(create_graph=True)[0].sum().backward()
+
+
+@pytest.mark.parametrize("use_reentrant", [True, False])
+def test_checkpointed_calls_give_the_same_gradients(use_reentrant):
+    viewmats, Ks = cameras(1, torch.float32)
+    scene = leaves([*gaussians(torch.float32), torch.rand(60, 3)])
+
+    def image(*tensors):
+        return globalsplat.rasterization(*tensors, viewmats, Ks, WIDTH, HEIGHT)[0]
+
+    expected = torch.autograd.grad(image(*scene).square().sum(), scene)
+    torch.utils.checkpoint.checkpoint(image, *scene, use_reentrant=use_reentrant).square().sum().backward()
+    for tensor, theirs in zip(scene, expected, strict=True):
+        torch.testing.assert_close(tensor.grad, theirs, rtol=0, atol=0)
 
 
 def test_half_precision_renders_in_float32():
