@@ -6,6 +6,9 @@
 #include <ATen/ops/where.h>
 #include <torch/library.h>
 
+#include <cmath>
+#include <limits>
+
 #include "backend.h"
 
 namespace globalsplat {
@@ -13,24 +16,30 @@ namespace {
 
 using torch::jit::Stack;
 
-// Holds a forward pass's state, and the memory of the int64 tensor [1] that represents it.
+// State of a forward pass: its backend's, and which images are NaN, [B, C], undefined if none is.
+struct State {
+  std::unique_ptr<const SavedState> of_backend;
+  Tensor is_nan;
+};
+
+// Holds a state, and the memory of the int64 tensor [1] that represents it.
 struct StateOwner {
   int64_t value;
-  std::unique_ptr<const SavedState> state;
+  State state;
 };
 
 void delete_state(void* owner) { delete static_cast<StateOwner*>(owner); }
 
-Tensor to_tensor(std::unique_ptr<const SavedState> state) {
+Tensor to_tensor(State state) {
   auto* const owner = new StateOwner{0, std::move(state)};
   c10::DataPtr memory(&owner->value, owner, delete_state, at::kCPU);
   return at::empty({0}, at::kLong).set_(c10::Storage(c10::Storage::use_byte_size_t(), sizeof(owner->value), std::move(memory)), 0, {1}, {1});
 }
 
 // Returns the state that a tensor represents, or null if the tensor is a copy, as when saved tensors were moved to another device.
-const SavedState* state_of(const Tensor& tensor) {
+const State* state_of(const Tensor& tensor) {
   const c10::DataPtr& memory = tensor.storage().data_ptr();
-  return memory.get_deleter() == delete_state ? static_cast<const StateOwner*>(memory.get_context())->state.get() : nullptr;
+  return memory.get_deleter() == delete_state ? &static_cast<const StateOwner*>(memory.get_context())->state : nullptr;
 }
 
 // Arguments of every op. Shapes: means [B, N, 3], quats [B, N, 4], scales [B, N, 3], opacities [B, N], colors [B, N, K, 3], viewmats
@@ -56,10 +65,38 @@ void finish(Stack* stack, size_t arguments, const Results&... results) {
   torch::jit::push(*stack, results.to(device)...);
 }
 
+// Returns which images depend on a camera or a Gaussian with a number that isn't finite, [B, C], or an undefined tensor if none does.
+// Colors aren't checked: their NaN reaches the pixels that show them.
+Tensor find_nan_images(const Inputs& in) {
+  const auto& [means, scales, quaternions, opacities, sh] = in.gaussians;
+  // Sums take a tenth of the time of isfinite(). They may overflow.
+  const Tensor sum = means.sum() + scales.sum() + quaternions.sum() + opacities.sum() + in.w2c.sum() + in.intrinsics.sum();
+  if (std::isfinite(sum.item<double>())) return {};
+  const auto are_finite = [](const Tensor& t, int64_t dims) { return t.flatten(dims).isfinite().all(dims); };
+  Tensor are_valid = are_finite(in.w2c, 2).logical_and(are_finite(in.intrinsics, 2));
+  for (const Tensor& t : {means, scales, quaternions, opacities}) are_valid = are_valid.logical_and(are_finite(t, 1).unsqueeze(1));
+  return are_valid.logical_not();
+}
+
+// Sets results of a call, [B, ...] or [B, C, ...], to NaN where `is_nan`, [B] or [B, C], is true.
+void fill_nan(Tensor is_nan, const Tensor& results) {
+  while (is_nan.dim() < results.dim()) is_nan = is_nan.unsqueeze(-1);
+  results.masked_fill_(is_nan, std::numeric_limits<double>::quiet_NaN());
+}
+
+// Renders. Backends leave out Gaussians with numbers that aren't finite, and training that has diverged would look well: the images are NaN.
+RenderOutput render_or_nan(const Inputs& in, State& state) {
+  const RenderOutput out = render(in, state.of_backend);
+  state.is_nan = find_nan_images(in);
+  if (state.is_nan.defined())
+    for (const Tensor& t : {out.rgb, out.alpha, out.depth}) fill_nan(state.is_nan, t);
+  return out;
+}
+
 void splat_op(const c10::OperatorHandle&, Stack* stack) {
   const Inputs in = inputs_of(torch::jit::last(*stack, kArguments + 1).slice(0, kArguments));
-  std::unique_ptr<const SavedState> state;
-  const RenderOutput out = render(in, state);
+  State state;
+  const RenderOutput out = render_or_nan(in, state);
   finish(stack, kArguments + 1, out.rgb, out.alpha, out.depth);
   torch::jit::push(*stack, to_tensor(std::move(state)));
 }
@@ -71,15 +108,20 @@ void splat_backward_op(const c10::OperatorHandle&, Stack* stack) {
   const at::TensorOptions options = in.gaussians.means.options();
   const auto tensor = [&](size_t index) { return all[kArguments + index].toTensor().to(options).contiguous(); };
   RenderOutput outputs{tensor(0), tensor(1), tensor(2)};
-  const SavedState* state = state_of(all[kArguments + 3].toTensor());
-  std::unique_ptr<const SavedState> repeated;
+  const State* state = state_of(all[kArguments + 3].toTensor());
+  State repeated;
   if (state == nullptr) {
-    outputs = render(in, repeated);
-    state = repeated.get();
+    outputs = render_or_nan(in, repeated);
+    state = &repeated;
   }
   const GradientRequest request{all[kArguments + 7].toBool(), all[kArguments + 8].toBool()};
-  const Gradients d = render_backward(in, outputs, {tensor(4), tensor(5), tensor(6)}, *state, request);
+  const Gradients d = render_backward(in, outputs, {tensor(4), tensor(5), tensor(6)}, *state->of_backend, request);
   const Gaussians& g = d.gaussians;
+  if (state->is_nan.defined()) {
+    for (const Tensor& t : {g.means, g.scales, g.quaternions, g.opacities, g.sh}) fill_nan(state->is_nan.any(1), t);
+    for (const Tensor& t : {d.w2c, d.means2d})
+      if (t.defined()) fill_nan(state->is_nan, t);
+  }
   const auto defined = [&](const Tensor& t) { return t.defined() ? t : at::empty({0}, options); };
   finish(stack, kAll, g.means, g.quaternions, g.scales, g.opacities, g.sh, defined(d.w2c), defined(d.means2d));
 }

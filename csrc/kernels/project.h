@@ -196,7 +196,7 @@ GS_INLINE void make_splats(const ProjectionParams<T>& params, const Projection<T
                            Vector<T> out[16]) {
   using V = Vector<T>;
   const V zero{}, a = p.factor_a, b = p.factor_b, c = p.factor_c;
-  const auto clamped = [&](V color) { return params.direct_colors ? color : larger(color, zero); };
+  const auto clamped = [&](V color) { return params.direct_colors ? color : larger(zero, color); };  // NaN stays NaN
   // α ≥ 1/255 ⟺ s ≤ log₂(255·opacity). The margin covers the rounding of s, whose terms may exceed s itself: at the rim of a splat by 1 +
   // |b|/c.
   const V exact = p.log2_opacity + T(kLog2Of255), skew = magnitude(b) / c;

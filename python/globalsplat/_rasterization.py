@@ -61,6 +61,9 @@ def rasterization(
     :attr:`means`, :attr:`quats`, :attr:`scales`, :attr:`opacities`, :attr:`colors`, :attr:`backgrounds` and :attr:`viewmats`, and
     bit-identical for any number of threads. float64 tensors are rendered in float64, on the CPU; all others in float32.
 
+    A number that isn't finite makes the images NaN that depend on it: all images of its scene, or that of its camera, and in
+    :attr:`colors` the pixels that show it. The gradients of such images are NaN, too.
+
     .. note::
         More than three channels take a pass for every three. Colors of each camera, :math:`(*, C, N, \ldots)`, take a projection for
         each camera.

@@ -1,6 +1,7 @@
 """The splat op against the reference rasterizer, which the parity checks compare the program with, and as an op of PyTorch."""
 
 import itertools
+import math
 
 import globalsplat
 import pytest
@@ -206,6 +207,40 @@ def test_checkpointed_calls_give_the_same_gradients(use_reentrant):
     torch.utils.checkpoint.checkpoint(image, *scene, use_reentrant=use_reentrant).square().sum().backward()
     for tensor, theirs in zip(scene, expected, strict=True):
         torch.testing.assert_close(tensor.grad, theirs, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "viewmats", "Ks"])
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_numbers_that_are_not_finite_make_results_nan(name, number):
+    viewmats, Ks = cameras(2, torch.float32)
+    means, quats, scales, opacities = gaussians(torch.float32)
+    scene = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": torch.rand(60, 3)}
+    batch = {key: torch.stack([value, value]) for key, value in {**scene, "viewmats": viewmats, "Ks": Ks}.items()}
+    batch[name][1, 1].view(-1)[0] = number
+    tensors = {key: value.requires_grad_(key != "Ks") for key, value in batch.items()}
+    image, alpha, meta = globalsplat.rasterization(**tensors, width=WIDTH, height=HEIGHT, render_mode="RGB+ED")
+    of_camera = name in ("viewmats", "Ks")
+    is_nan = torch.tensor([[False, False], [not of_camera, True]])  # of each scene's cameras
+    meta["means2d"].retain_grad()
+    (image.sum() + alpha.sum()).backward()
+    results = [image, alpha, batch["viewmats"].grad, meta["means2d"].grad]
+    for result in results:
+        assert result[is_nan].isnan().all() and result[~is_nan].isfinite().all()
+    for key in scene:
+        assert batch[key].grad[0].isfinite().all() and batch[key].grad[1].isnan().all(), key
+
+
+@pytest.mark.parametrize("sh_degree", [None, 0])
+def test_colors_that_are_nan_are_seen_and_large_numbers_are_not_nan(sh_degree):
+    viewmats, Ks = cameras(1, torch.float32)
+    means, quats, scales, opacities = gaussians(torch.float32)
+    means[:9] = 3e38  # their sum is infinite
+    colors = torch.full((60, 3) if sh_degree is None else (60, 1, 3), math.nan)
+    image, alpha, _ = globalsplat.rasterization(
+        means, quats, scales, opacities, colors, viewmats, Ks, WIDTH, HEIGHT, sh_degree=sh_degree
+    )
+    assert alpha.isfinite().all() and alpha.any()
+    assert (image.isnan() | (alpha == 0)).all()
 
 
 def test_half_precision_renders_in_float32():
