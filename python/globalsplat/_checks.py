@@ -1,7 +1,7 @@
 """Checks of arguments, which raise a ValueError with one sentence."""
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 
 class HasShape(Protocol):
@@ -16,6 +16,25 @@ def expect(name: str, value: object, is_valid: bool, expected: str) -> None:
         raise ValueError(f"{name} is {value}, expected {expected}")
 
 
-def expect_shape(name: str, value: HasShape, *shape: int) -> None:
-    if tuple(value.shape) != shape:
-        raise ValueError(f"{name} has shape {list(value.shape)}, expected {list(shape)}")
+def expect_integer(name: str, value: Any, least: int) -> None:
+    is_integer = isinstance(value, int) or hasattr(value, "__index__")
+    expect(name, repr(value), is_integer and value >= least, f"an integer, {least} or more")
+
+
+def expect_shape(name: str, value: HasShape, *shape: int | str) -> None:
+    """Raises an error if the value doesn't have the shape, in which names stand for any size."""
+    sizes = tuple(value.shape)
+    if len(sizes) != len(shape) or any(
+        not isinstance(expected, str) and size != expected for size, expected in zip(sizes, shape, strict=True)
+    ):
+        raise ValueError(f"{name} has shape {list(sizes)}, expected [{', '.join(map(str, shape))}]")
+
+
+def select_harmonics(colors: Any, degree: int) -> Any:
+    """Returns the spherical harmonics up to a degree from [..., K, 3]."""
+    expect_integer("sh_degree", degree, 0)
+    bases = (degree + 1) ** 2
+    if bases > colors.shape[-2]:
+        found = f"colors has {colors.shape[-2]} spherical harmonics"
+        raise ValueError(f"{found}, expected {bases} or more for degree {degree}")
+    return colors[..., :bases, :]

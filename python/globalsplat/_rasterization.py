@@ -6,7 +6,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from ._checks import expect, expect_shape
+from ._checks import expect, expect_integer, expect_shape, select_harmonics
 from ._ops import result_dtype
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
@@ -83,7 +83,7 @@ def rasterization(
         far_plane (float): Gaussians whose depth isn't below it are left out.
         eps2d (float): added to the diagonal of projected covariances, in pixels². Splats of GlobalSplat are made for 0.05.
         sh_degree (int, optional): degree of the spherical harmonics to use, 0 to 3. If ``None``, :attr:`colors` are used as they are.
-        backgrounds (Tensor, optional): colors of the backgrounds. :math:`(*, C, D)`
+        backgrounds (Tensor, optional): colors of the backgrounds, without effect on depths. :math:`(*, C, D)`
         render_mode (str): what to render: ``"RGB"`` the colors, ``"D"`` accumulated depths :math:`\sum_i w_i z_i`, ``"ED"`` expected
             depths :math:`\sum_i w_i z_i / \sum_i w_i`, or colors and depths, ``"RGB+D"`` and ``"RGB+ED"``.
         rasterize_mode (str): ``"antialiased"`` reduces opacities by what :attr:`eps2d` adds to the areas of the projected Gaussians.
@@ -135,30 +135,17 @@ def rasterization(
     )
     if sh_degree is not None and sh_degree > 3:
         raise NotImplementedError(f"sh_degree is {sh_degree}, and spherical harmonics are implemented up to degree 3")
-    expect("sh_degree", sh_degree, sh_degree is None or sh_degree >= 0, "0 to 3, or None")
-    expect("width", width, width >= 1, "1 or more")
-    expect("height", height, height >= 1, "1 or more")
-    expect("eps2d", eps2d, eps2d >= 0.0, "0 or more")
+    for name, value in (("width", width), ("height", height), ("tile_size", tile_size)):
+        expect_integer(name, value, 1)
+    expect("eps2d", eps2d, 0.0 <= eps2d < math.inf, "0 or more")
     expect("near_plane", near_plane, near_plane >= 0.0, "0 or more")
     expect("far_plane", far_plane, far_plane > near_plane, "more than near_plane")
     has_colors, has_depth = render_mode in ("RGB", "RGB+D", "RGB+ED"), render_mode != "RGB"
     expect("render_mode", render_mode, has_colors or render_mode in ("D", "ED"), "RGB, D, ED, RGB+D or RGB+ED")
     expect("rasterize_mode", rasterize_mode, rasterize_mode in ("classic", "antialiased"), "classic or antialiased")
 
-    batch, count, cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
-    tail = 1 if sh_degree is None else 2
-    has_camera_colors = colors.dim() == len(batch) + 2 + tail
-    channels = colors.shape[-1]
-    expect_shape("means", means, *batch, count, 3)
-    expect_shape("quats", quats, *batch, count, 4)
-    expect_shape("scales", scales, *batch, count, 3)
-    expect_shape("opacities", opacities, *batch, count)
-    expect_shape("viewmats", viewmats, *batch, cameras, 4, 4)
-    expect_shape("Ks", Ks, *batch, cameras, 3, 3)
-    per_gaussian = (channels,) if sh_degree is None else (colors.shape[-2], 3)
-    expect_shape("colors", colors, *batch, *((cameras,) if has_camera_colors else ()), count, *per_gaussian)
-    expect("the number of channels of colors", channels, channels >= 1, "1 or more")
-    others = {
+    tensors = {
+        "means": means,
         "quats": quats,
         "scales": scales,
         "opacities": opacities,
@@ -166,8 +153,26 @@ def rasterization(
         "viewmats": viewmats,
         "Ks": Ks,
     }
-    for name, tensor in others.items():
+    if not has_colors:
+        backgrounds = None
+    if backgrounds is not None:
+        tensors["backgrounds"] = backgrounds
+    for name, tensor in tensors.items():
+        expect(f"the type of {name}", type(tensor).__name__, isinstance(tensor, Tensor), "Tensor")
         expect(f"the device of {name}", tensor.device, tensor.device == means.device, f"{means.device}, that of means")
+    batch = means.shape[:-2]
+    tail = ("D",) if sh_degree is None else ("K", 3)
+    expect_shape("means", means, *batch, "N", 3)
+    expect_shape("viewmats", viewmats, *batch, "C", 4, 4)
+    count, cameras = means.shape[-2], viewmats.shape[-3]
+    has_camera_colors = colors.dim() == len(batch) + 2 + len(tail)
+    expect_shape("quats", quats, *batch, count, 4)
+    expect_shape("scales", scales, *batch, count, 3)
+    expect_shape("opacities", opacities, *batch, count)
+    expect_shape("Ks", Ks, *batch, cameras, 3, 3)
+    expect_shape("colors", colors, *batch, *((cameras,) if has_camera_colors else ()), count, *tail)
+    channels = colors.shape[-1]
+    expect("the number of channels of colors", channels, channels >= 1, "1 or more")
     if backgrounds is not None:
         expect_shape("backgrounds", backgrounds, *batch, cameras, channels)
 
@@ -180,17 +185,13 @@ def rasterization(
 
     gaussians = [flat(means, 2), flat(quats, 2), flat(scales, 2), flat(opacities, 1)]
     viewmats, Ks = flat(viewmats, 3), flat(Ks, 3).detach()
-    colors = flat(colors, 1 + tail + has_camera_colors)
+    colors = flat(colors, 1 + len(tail) + has_camera_colors)
     if has_camera_colors:
         # Every camera sees Gaussians of its own.
         gaussians = [tensor.repeat_interleave(cameras, 0) for tensor in gaussians]
         viewmats, Ks, colors = viewmats.flatten(0, 1)[:, None], Ks.flatten(0, 1)[:, None], colors.flatten(0, 1)
     if sh_degree is not None:
-        bases = (sh_degree + 1) ** 2
-        if bases > colors.shape[-2]:
-            found = f"colors has {colors.shape[-2]} spherical harmonics"
-            raise ValueError(f"{found}, expected {bases} or more for degree {sh_degree}")
-        passes = [colors[..., :bases, :]]
+        passes = [select_harmonics(colors, sh_degree)]
     elif has_colors:
         padded = torch.nn.functional.pad(colors, (0, -channels % CHANNELS))
         passes = list(padded.unsqueeze(-2).split(CHANNELS, -1))

@@ -128,7 +128,8 @@ def test_features_depths_and_backgrounds_equal_the_reference(channels, render_mo
     compare(inputs, Ks, render_mode=render_mode, **options)
     del options["backgrounds"]
     for mode in ("D", "ED"):
-        ours, _, _ = globalsplat.rasterization(*inputs, Ks, WIDTH, HEIGHT, render_mode=mode, **options)
+        one_channel = {"backgrounds": normals(5, 2, 1), "render_mode": mode}
+        ours, _, _ = globalsplat.rasterization(*inputs, Ks, WIDTH, HEIGHT, **one_channel, **options)
         assert_close("depth", ours, reference_rasterization(*inputs, Ks, render_mode=mode, **options)[0])
 
 
@@ -272,6 +273,16 @@ def test_invalid_arguments_are_named():
         (NotImplementedError, "degree 3", {"sh_degree": 4}),
         (ValueError, r"scales has shape \[59, 3\], expected \[60, 3\]", {"scales": scales[1:]}),
         (ValueError, r"Ks has shape \[3, 3\], expected \[1, 3, 3\]", {"Ks": Ks[0]}),
+        (ValueError, r"viewmats has shape \[4, 4\], expected \[C, 4, 4\]", {"viewmats": viewmats[0], "Ks": Ks[0]}),
+        (ValueError, r"means has shape \[3\], expected \[N, 3\]", {"means": means[0]}),
+        (ValueError, r"colors has shape \[60, 3\], expected \[60, K, 3\]", {"colors": torch.rand(60, 3)}),
+        (ValueError, r"backgrounds has shape \[1, 1\], expected \[1, 3\]", {"backgrounds": torch.rand(1, 1)}),
+        (ValueError, "the type of means is ndarray, expected Tensor", {"means": means.numpy()}),
+        (ValueError, "the type of backgrounds is float, expected Tensor", {"backgrounds": 1.0}),
+        (ValueError, "width is 640.0, expected an integer, 1 or more", {"width": 640.0}),
+        (ValueError, "tile_size is 0, expected an integer, 1 or more", {"tile_size": 0}),
+        (ValueError, "sh_degree is 1.0, expected an integer, 0 or more", {"sh_degree": 1.0}),
+        (ValueError, "eps2d is inf, expected", {"eps2d": math.inf}),
         (ValueError, "render_mode is .*, expected", {"render_mode": "rgb"}),
         (ValueError, "width is .*, expected", {"width": 0}),
         (ValueError, "far_plane is .*, expected", {"far_plane": float("nan")}),
