@@ -54,6 +54,8 @@ def rasterization(
     ftheta_coeffs: Any = None,
     rolling_shutter: Any = None,
     viewmats_rs: Tensor | None = None,
+    *,
+    origin: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     r"""Renders 3D Gaussians from cameras, on the CPU or a CUDA device.
 
@@ -90,6 +92,8 @@ def rasterization(
         packed, tile_size, channel_chunk, segmented: accepted and without effect.
         radius_clip, sparse_grad, absgrad, distributed, camera_model, covars, with_ut, with_eval3d, radial_coeffs, tangential_coeffs,
             thin_prism_coeffs, ftheta_coeffs, rolling_shutter, viewmats_rs: only their default values are implemented.
+        origin (Tensor, optional): where :attr:`means` have their origin in the world of :attr:`viewmats`, which are best float64 if it
+            is far away. Not an argument of gsplat. :math:`(3,)`
 
     Returns:
         A tuple of
@@ -175,6 +179,11 @@ def rasterization(
     expect("the number of channels of colors", channels, channels >= 1, "1 or more")
     if backgrounds is not None:
         expect_shape("backgrounds", backgrounds, *batch, cameras, channels)
+    if origin is not None:
+        expect_shape("origin", origin, 3)
+        to_world = torch.eye(4, dtype=torch.float64, device=means.device)
+        to_world[:3, 3] = torch.as_tensor(origin)
+        viewmats = viewmats.double() @ to_world
 
     dtype = result_dtype(means)
     scenes = math.prod(batch)

@@ -144,6 +144,10 @@ def _to_capture(capture: Capture | Path | Tensor, viewmats: Tensor | None = None
             raise ValueError("images need viewmats and Ks")
         images = capture.detach().cpu()
         if images.is_floating_point():
+            # Resampling oversteps the range by less than half of it.
+            invalid = images[~((images > -0.5) & (images < 1.5))]
+            if len(invalid) > 0:
+                raise ValueError(f"images have {invalid[0]:g}, expected floats from 0 to 1, or uint8")
             images = (images.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
         if images.dtype != torch.uint8 or images.dim() != 4 or images.shape[3] != 3:
             found = f"{images.dtype} of shape {list(images.shape)}"

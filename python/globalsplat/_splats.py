@@ -10,14 +10,25 @@ import numpy.typing as npt
 import torch
 
 from . import _native
-from ._checks import expect, expect_shape
+from ._checks import expect, expect_shape, select_harmonics
 
 Array = Any
 """A NumPy array or a tensor."""
 
 
-class Splat(TypedDict):
-    """Gaussians, as arguments of :func:`rasterization` of the same names."""
+#: Natural logarithm of the largest scale that splat files may have.
+MAX_LOG_SCALE = 88.0
+
+
+class _Origin(TypedDict, total=False):
+    origin: Array
+
+
+class Splat(_Origin):
+    """Gaussians, as arguments of :func:`rasterization` of the same names.
+
+    With an :attr:`origin`, :math:`(3,)` in float64, :attr:`means` are relative to it: float32 would round world coordinates far away.
+    """
 
     means: Array
     quats: Array
@@ -29,11 +40,11 @@ class Splat(TypedDict):
     rasterize_mode: Literal["classic", "antialiased"]
 
 
-class Parameters(TypedDict):
+class Parameters(_Origin):
     """Gaussians before activation, as 3DGS and gsplat optimize and store them.
 
     :attr:`scales` are logarithms and :attr:`opacities` logits. :attr:`sh0` has the first spherical harmonic, :math:`(N, 1, 3)`, and
-    :attr:`shN` the others, :math:`(N, K - 1, 3)`.
+    :attr:`shN` the others, :math:`(N, K - 1, 3)`. The :attr:`origin` is that of :class:`Splat`.
     """
 
     means: Array
@@ -58,7 +69,8 @@ def load_splat(path: str | os.PathLike[str], activated: bool = True) -> Splat | 
             if ``False``.
 
     Returns:
-        A dictionary of NumPy arrays in float32. Warnings of the reader are given as :class:`UserWarning`.
+        A dictionary of NumPy arrays in float32, and with ``origin`` in float64 if the file has coordinates relative to one. Warnings of
+        the reader are given as :class:`UserWarning`.
 
     Raises:
         ValueError: if the file isn't a valid splat.
@@ -82,6 +94,7 @@ def load_splat(path: str | os.PathLike[str], activated: bool = True) -> Splat | 
             "sh0": sh[:, :1],
             "shN": sh[:, 1:],
             "rasterize_mode": _mode(raw),
+            **_origin(raw),
         }
     return to_splat(raw)
 
@@ -98,8 +111,9 @@ def save_splat(
     Args:
         path (str or PathLike): the file.
         splat (dict or nn.ParameterDict): arrays or tensors of N Gaussians with the keys of :class:`Splat`, of which
-            ``sh_degree``, ``eps2d`` and ``rasterize_mode`` may be absent, or those of :class:`Parameters` if
-            :attr:`activated` is ``False``. Spherical harmonics :math:`(N, K, 3)` are needed, not colors.
+            ``sh_degree``, ``eps2d``, ``rasterize_mode`` and ``origin`` may be absent, or those of :class:`Parameters` if
+            :attr:`activated` is ``False``. Spherical harmonics :math:`(N, K, 3)` are needed, not colors; those above ``sh_degree``
+            aren't written. An ``origin`` is written to a file beside the splat, ``room.ply.origin.json`` for ``room.ply``.
         activated (bool): as in :func:`load_splat`.
         capture (Capture, optional): the photos' cameras. A format with fewer spherical harmonics than the splat, such as .splat, gets
             the colors that these cameras see.
@@ -128,7 +142,12 @@ def to_splat(raw: Mapping[str, Any]) -> Splat:
         "sh_degree": round(sh.shape[1] ** 0.5) - 1,
         "eps2d": raw["eps2d"],
         "rasterize_mode": _mode(raw),
+        **_origin(raw),
     }
+
+
+def _origin(raw: Mapping[str, Any]) -> _Origin:
+    return {"origin": raw["origin"]} if raw["origin"].any() else {}
 
 
 def _mode(raw: Mapping[str, Any]) -> Literal["classic", "antialiased"]:
@@ -152,12 +171,13 @@ def from_splat(splat: Mapping[str, Any] | torch.nn.ParameterDict, activated: boo
     expect_shape("opacities", opacities, count)
     mode = splat.get("rasterize_mode", "classic")
     expect("rasterize_mode", repr(mode), mode in ("classic", "antialiased"), "classic or antialiased")
+    largest = (np.exp(MAX_LOG_SCALE), 1.0) if activated else (MAX_LOG_SCALE, np.inf)
+    for name, array, most in zip(("scales", "opacities"), (scales, opacities), largest, strict=True):
+        least = 0.0 if activated else -np.inf
+        invalid = array[(array < least) | (array > most)]
+        if len(invalid) > 0:
+            raise ValueError(f"{name} has {invalid[0]:g}, expected {least:g} to {most:g}")
     if activated:
-        ranges = (("scales", scales, np.inf, "0 or more"), ("opacities", opacities, 1.0, "0 to 1"))
-        for name, array, most, expected in ranges:
-            invalid = array[(array < 0.0) | (array > most)]
-            if len(invalid) > 0:
-                raise ValueError(f"{name} has {invalid[0]:g}, expected {expected}")
         sh = values["colors"]
         with np.errstate(divide="ignore"):
             scales = np.log(scales)
@@ -166,6 +186,11 @@ def from_splat(splat: Mapping[str, Any] | torch.nn.ParameterDict, activated: boo
         sh = np.concatenate([values["sh0"], values["shN"]], 1)
     if sh.ndim != 3 or (len(sh), sh.shape[2]) != (count, 3):
         raise ValueError(f"colors has shape {list(sh.shape)}, expected spherical harmonics [{count}, K, 3]")
+    degree = splat.get("sh_degree")
+    if degree is not None:
+        sh = select_harmonics(sh, degree)
+    origin = _to_array("origin", splat.get("origin", np.zeros(3)))
+    expect_shape("origin", origin, 3)
 
     def contiguous(array: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
         return np.ascontiguousarray(array, np.float32)
@@ -177,16 +202,18 @@ def from_splat(splat: Mapping[str, Any] | torch.nn.ParameterDict, activated: boo
         "opacity_logits": contiguous(opacities),
         "sh": contiguous(sh),
         "antialiased": mode == "antialiased",
+        "origin": origin,
     }
 
 
 def _to_array(name: str, value: Array) -> npt.NDArray[np.float64]:
-    """Returns a float64 array of an array or tensor. Only logarithms and logits may be infinite."""
+    """Returns a float64 array of an array or tensor, whose numbers float32 can hold. Only logarithms and logits may be infinite."""
     if isinstance(value, torch.Tensor):
         value = value.detach().cpu().double().numpy()
     array = np.asarray(value, np.float64)
-    if np.isnan(array).any() or (name not in ("scales", "opacities") and np.isinf(array).any()):
-        raise ValueError(f"{name} has values that aren't finite")
+    most = np.inf if name in ("scales", "opacities") else np.finfo(np.float32).max
+    if not (np.abs(array) <= most).all():
+        raise ValueError(f"{name} has values that aren't finite in float32")
     return array
 
 

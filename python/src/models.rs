@@ -1,7 +1,7 @@
 //! Models: their weights, and reconstruction with them.
 
 use crate::capture::Capture;
-use crate::splat::to_dict;
+use crate::splat::{in_world, to_dict};
 use crate::work::run;
 use globalsplat::Result;
 use globalsplat::data::Holdout;
@@ -29,7 +29,7 @@ pub fn reconstruct<'py>(
         let count = views.unwrap_or(data.context_views);
         let photos = load_context(&capture.0, Holdout::None, Some(count), data.image_size)?;
         let reconstruction = globalsplat::reconstruct::reconstruct(&model, &photos, &[])?;
-        Ok((reconstruction.to_splat()?, model.assumed))
+        Ok((in_world(reconstruction.to_splat()?), model.assumed))
     })?;
     let warnings: Vec<String> = splat
         .warnings

@@ -3,7 +3,7 @@
 use crate::capture::Capture;
 use crate::error::to_python;
 use crate::models::device;
-use crate::splat::{Parameters, to_dict};
+use crate::splat::{Parameters, in_world, to_dict};
 use crate::work::run;
 use globalsplat::Error;
 use globalsplat::refine::{RefineEvent, RefineOptions, RefineSession, SceneInit};
@@ -46,7 +46,7 @@ pub fn refine<'py>(
         let init = initial.as_ref().map_or(SceneInit::Photos, SceneInit::Splat);
         let mut session = RefineSession::load(&capture.0, &options, init, on_event)?;
         session.start()?;
-        Ok(session.run()?.splat)
+        Ok(in_world(session.run()?.splat))
     });
     // An interrupted session may end with an error of its own.
     if let Some(raised) = raised {

@@ -3,7 +3,10 @@
 use crate::capture::Capture;
 use crate::error::to_python;
 use crate::work::run;
-use globalsplat::io::{ShLimits, Splat, check_writable_splat, fit_splat};
+use glam::DVec3;
+use globalsplat::io::{
+    ShLimits, Splat, WriteOptions, check_writable_splat, fit_splat, rounding_warning, write_local_splat,
+};
 use globalsplat::render::{ANTIALIASED_EPS2D, DEFAULT_EPS2D};
 use numpy::ndarray::Dimension;
 use numpy::{PyArray, PyArrayMethods, PyReadonlyArray, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
@@ -34,24 +37,30 @@ pub fn write_splat(
     run(py, || {
         check_writable_splat(&path)?;
         let fitted = fit_splat(&path, &splat, &ShLimits::up_to(splat.sh_degree), &cameras)?;
-        globalsplat::io::write_splat(&path, &fitted)
+        write_local_splat(&path, &fitted, &WriteOptions::default())
     })
 }
 
-/// Returns the parameters of `splat`, with means in world coordinates.
+/// Returns `splat` in world coordinates, unless float32 would visibly round them.
+pub fn in_world(splat: Splat) -> Splat {
+    if rounding_warning(&splat).is_some() {
+        return splat;
+    }
+    Splat { warnings: splat.warnings.clone(), ..splat.with_origin(DVec3::ZERO) }
+}
+
+/// Returns the parameters of `splat`, and the origin of its means in the world.
 pub fn to_dict(py: Python<'_>, splat: Splat) -> PyResult<Bound<'_, PyDict>> {
     let (count, bases) = (splat.len(), splat.bases());
-    let origin = splat.origin;
-    let world = |mean: [f32; 3]| (origin + glam::Vec3::from(mean).as_dvec3()).as_vec3().to_array();
-    let means: Vec<[f32; 3]> = splat.means.iter().copied().map(world).collect();
     let array = |values: Vec<f32>, shape: &[usize]| PyArray::from_vec(py, values).reshape(shape.to_vec());
     let dict = PyDict::new(py);
-    dict.set_item("means", array(means.into_flattened(), &[count, 3])?)?;
+    dict.set_item("means", array(splat.means.into_flattened(), &[count, 3])?)?;
     dict.set_item("quats", array(splat.quaternions.into_flattened(), &[count, 4])?)?;
     dict.set_item("log_scales", array(splat.log_scales.into_flattened(), &[count, 3])?)?;
     dict.set_item("opacity_logits", array(splat.opacity_logits, &[count])?)?;
     dict.set_item("sh", array(splat.sh.into_flattened(), &[count, bases, 3])?)?;
     dict.set_item("antialiased", splat.antialiased)?;
+    dict.set_item("origin", PyArray::from_slice(py, &splat.origin.to_array()))?;
     dict.set_item("eps2d", if splat.antialiased { ANTIALIASED_EPS2D } else { DEFAULT_EPS2D })?;
     Ok(dict)
 }
@@ -66,10 +75,11 @@ pub struct Parameters<'py> {
     opacity_logits: PyReadonlyArray1<'py, f32>,
     sh: PyReadonlyArray3<'py, f32>,
     antialiased: bool,
+    origin: [f64; 3],
 }
 
 impl Parameters<'_> {
-    /// Returns a splat with the origin of its coordinates at zero.
+    /// Returns the splat.
     pub fn into_splat(self) -> PyResult<Splat> {
         let bases = self.sh.as_array().shape()[1];
         let degree = bases.isqrt().wrapping_sub(1);
@@ -87,7 +97,7 @@ impl Parameters<'_> {
             rows(&self.sh),
         )
         .map_err(to_python)?;
-        Ok(Splat { antialiased: self.antialiased, ..splat })
+        Ok(Splat { antialiased: self.antialiased, origin: self.origin.into(), ..splat })
     }
 }
 
