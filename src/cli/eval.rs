@@ -2,7 +2,7 @@ use super::{
     Output, check_views, device, distributed, model, open_masked_capture, parse_holdout, progress,
     report_downscaling, signals, warn, warn_of_many,
 };
-use crate::data::{Capture, Dataset, PhotoSize, Split};
+use crate::data::{Capture, Dataset, Holdout, PhotoSize, Split};
 use crate::error::Error;
 use crate::eval::{
     DatasetEvaluation, EvalScene, Evaluation, EvaluationIndex, Method, REPORT, evaluation_files,
@@ -73,6 +73,12 @@ pub struct Eval {
     /// splats and images all
     #[arg(long, value_name = "WHICH", conflicts_with = "data")]
     holdout: Option<String>,
+    /// Score only pixels that at least two of the photos that aren't held out show, by the depths on which these agree
+    #[arg(long, conflicts_with = "data")]
+    covered: bool,
+    /// Also score depths by exact ones, as synth --depth writes them for the capture
+    #[arg(long, value_name = "FILE.npy", conflicts_with_all = ["data", "renders"])]
+    depth: Option<PathBuf>,
     /// Number of input photos, spread along the camera path; by default all that are not held out
     #[arg(long, value_name = "N", conflicts_with_all = ["splat", "renders", "data"])]
     views: Option<usize>,
@@ -123,7 +129,14 @@ impl Eval {
         }
         let loaded = self.load_model(device)?;
         let model = loaded.as_ref().map(Model::from);
-        let scene = self.one_scene(&capture, model)?;
+        let mut scene = self.one_scene(&capture, model)?;
+        if self.covered {
+            let holdout = self.holdout.as_deref().map_or(Ok(Holdout::None), parse_holdout)?;
+            scene = scene.covered(holdout)?;
+        }
+        if let Some(depth) = &self.depth {
+            scene = scene.with_depths(depth)?;
+        }
         if self.render_height.is_some() && scene.enlarged {
             eprintln!("{}: {}", scene.name, model::ENLARGED);
         }
@@ -153,9 +166,9 @@ impl Eval {
                 ("nearest_photo", "the nearest photo shown", scene.score_nearest_photo()?),
                 ("mean_photo", "the mean photo shown", scene.score_mean_photo()?),
             ] {
-                let Scores { psnr, ssim, .. } = scores.mean;
+                let Scores { psnr, cc_psnr, ssim, .. } = scores.mean;
                 json["baselines"][key] = json!({ "psnr": psnr, "ssim": ssim });
-                lines.push(format!("{name:<24} {psnr:>8.2} {ssim:>8.4}"));
+                lines.push(format!("{name:<24} {psnr:>8.2} {cc_psnr:>8.2} {ssim:>8.4}"));
             }
         }
         Ok(Output::new(json, lines.join("\n")))
@@ -386,22 +399,29 @@ fn table(scores: &CaptureScores) -> Vec<String> {
     let gaussians = scores.gaussians.map_or(String::new(), |n| format!(", {n} Gaussians"));
     let mut lines = vec![format!("{}: {} views{gaussians}", scores.scene, scores.views.len())];
     type Value = fn(&Scores) -> Option<f64>;
-    let lpips: [(_, Value); 2] =
-        [("LPIPS-VGG", |scores| scores.lpips_vgg), ("LPIPS-Alex", |scores| scores.lpips_alex)];
+    let others: [(_, Value); 3] = [
+        ("LPIPS-VGG", |scores| scores.lpips_vgg),
+        ("LPIPS-Alex", |scores| scores.lpips_alex),
+        ("depth", |scores| scores.depth_error),
+    ];
     // Columns without any value are left out.
     let has_values = |value: Value| scores.views.iter().any(|view| value(&view.scores).is_some());
-    let lpips: Vec<_> = lpips.into_iter().filter(|(_, value)| has_values(*value)).collect();
-    let names: String = lpips.iter().map(|(name, _)| format!(" {name:>10}")).collect();
-    lines.push(format!("{:<24} {:>8} {:>8}{names}", "view", "PSNR", "SSIM"));
+    let others: Vec<_> = others.into_iter().filter(|(_, value)| has_values(*value)).collect();
+    let names: String = others.iter().map(|(name, _)| format!(" {name:>10}")).collect();
+    lines.push(format!("{:<24} {:>8} {:>8} {:>8}{names}", "view", "PSNR", "cc-PSNR", "SSIM"));
     let row = |name: &str, scores: &Scores| {
         let shown = |value: Option<f64>| value.map_or(String::new(), |value| format!("{value:.4}"));
-        let lpips = lpips.iter().map(|(_, value)| format!(" {:>10}", shown(value(scores))));
-        format!("{name:<24} {:>8.2} {:>8.4}{}", scores.psnr, scores.ssim, lpips.collect::<String>())
+        let others = others.iter().map(|(_, value)| format!(" {:>10}", shown(value(scores))));
+        let Scores { psnr, cc_psnr, ssim, .. } = scores;
+        format!("{name:<24} {psnr:>8.2} {cc_psnr:>8.2} {ssim:>8.4}{}", others.collect::<String>())
     };
     lines.extend(scores.views.iter().map(|view| row(&view.image, &view.scores)));
     lines.push(row("mean", &scores.mean));
     if let Some(fraction) = scores.mean.pixel_fraction {
-        lines.push(format!("scored over {:.1} % of the pixels: the others are masked out", 100. * fraction));
+        lines.push(format!(
+            "scored over {:.1} % of the pixels: the others are masked out or not covered",
+            100. * fraction
+        ));
     }
     lines
 }

@@ -209,7 +209,7 @@ impl Refine {
         let (of_photos, of_held_out) =
             if session.held_out().is_empty() { (distances, [None; 2]) } else { ([None; 2], distances) };
         let out = self.out.to_string_lossy();
-        let of = |scores: &Scores, lpips: Option<f64>| json!({ "psnr": scores.psnr, "ssim": scores.ssim, "lpips_vgg": lpips });
+        let of = |scores: &Scores, lpips: Option<f64>| json!({ "psnr": scores.psnr, "cc_psnr": scores.cc_psnr, "ssim": scores.ssim, "lpips_vgg": lpips });
         let mut json = json!({
             "splat": out, "gaussians": count, "photos": photos, "near_duplicates": session.near_duplicates,
             "steps": steps, "seconds": ended, "begin_seconds": begun, "corrections": corrections,

@@ -1,6 +1,8 @@
 use super::{Output, progress};
 use crate::Error;
-use crate::data::{Capture, ChunkWriter, SyntheticDataset, load_views, write_unless_other};
+use crate::data::{
+    Capture, ChunkWriter, SyntheticDataset, load_views, write_nerf_capture, write_unless_other,
+};
 use crate::eval::{EvaluationIndex, SceneFrames};
 use crate::io::{Mosaic, check_writable_dir, check_writable_png, tile_horizontally};
 use crate::scene::ImageSize;
@@ -28,7 +30,7 @@ const CHUNK_BYTES: usize = 20_000_000;
     globalsplat synth --out scenes/train --scenes 2000\n  \
     globalsplat synth --out scenes/test --scenes 50 --first 2000 --contact-sheet scenes.png")]
 pub struct Synth {
-    /// Folder for index.json, 000000.torch, …
+    /// Folder for index.json, 000000.torch, … or, with --off-path, for a folder per video
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// Number of videos
@@ -46,6 +48,10 @@ pub struct Synth {
     /// Side of a photo in pixels
     #[arg(long, value_name = "PIXELS", default_value_t = 128, value_parser = clap::value_parser!(u64).range(SyntheticDataset::SIZE))]
     size: u64,
+    /// Write each video as a folder in the layout of NeRF's synthetic scenes, instead of chunks, with N test views off the camera's path:
+    /// 30° to its sides and above it
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=1000))]
+    off_path: u64,
     /// Also write depth/SCENE.npy: exact depths [photos, rows, columns] in metres, infinite in the sky
     #[arg(long)]
     depth: bool,
@@ -64,7 +70,7 @@ impl Synth {
         }
         check_writable_dir(&self.out)?;
         let size = ImageSize { height: self.size as u32, width: self.size as u32 };
-        let settings = VideoSettings { frames: self.frames as usize, size };
+        let settings = VideoSettings { frames: self.frames as usize, off_path: self.off_path as usize, size };
         let videos = SyntheticDataset::new(self.seed, self.first, self.scenes, settings);
         let mut writer = ChunkWriter::new(&self.out, CHUNK_BYTES)?;
         let depths = self.out.join("depth");
@@ -87,8 +93,12 @@ impl Synth {
         });
         for captures in made {
             for capture in captures? {
-                writer.add(&capture)?;
-                index.insert(capture.name.clone(), SceneFrames::alternating(capture.len()));
+                if self.off_path > 0 {
+                    write_nerf_capture(&self.out.join(&capture.name), &capture, self.frames as usize)?;
+                } else {
+                    writer.add(&capture)?;
+                    index.insert(capture.name.clone(), SceneFrames::alternating(capture.len()));
+                }
                 if self.contact_sheet.is_some() && rows.len() < SHEET.0 {
                     rows.push(sheet_row(&capture)?);
                 }
@@ -96,30 +106,33 @@ impl Synth {
             }
         }
         let index = EvaluationIndex { file: self.out.join("evaluation_index.json"), scenes: index };
-        index.write()?;
+        if self.off_path == 0 {
+            index.write()?;
+        }
         if let Some(sheet) = &self.contact_sheet {
             let mut mosaic = Mosaic::column(rows.len());
             rows.iter().try_for_each(|row| mosaic.add(std::slice::from_ref(row)))?;
             mosaic.write(sheet)?;
         }
         // This must be last: a folder with the index of its chunks is finished, and nothing more is written there.
-        let chunks = writer.finish()?;
+        let chunks = (self.off_path == 0).then(|| writer.finish()).transpose()?;
         bar.finish_and_clear();
         let (out, scenes) = (self.out.to_string_lossy(), self.scenes);
+        let files = chunks.map_or("folders".into(), |chunks| format!("{chunks} chunks"));
         Ok(Output::new(
             json!({
-                "out": out, "scenes": scenes, "chunks": chunks, "index": index.file.to_string_lossy(),
+                "out": out, "scenes": scenes, "chunks": chunks, "index": chunks.map(|_| index.file.to_string_lossy()),
                 "depth": self.depth.then_some(depths.to_string_lossy()),
                 "contact_sheet": self.contact_sheet.as_deref().map(Path::to_string_lossy),
             }),
-            format!("{out}: {scenes} videos of {} photos in {chunks} chunks", self.frames),
+            format!("{out}: {scenes} videos of {} photos in {files}", self.frames + self.off_path),
         ))
     }
 
     /// Writes the depths of a video, unless an interrupted run has. Those of another video aren't replaced.
     fn write_depths(&self, file: &Path, capture: &Capture) -> Result<(), Error> {
         let depths = (0..capture.len()).filter_map(|view| capture.depth(view)).flatten();
-        let shape = [self.frames, self.size, self.size];
+        let shape = [self.frames + self.off_path, self.size, self.size];
         let (mut bytes, options) = (vec![], npyz::WriteOptions::new().default_dtype().shape(&shape));
         let mut npy = options.writer(&mut bytes).begin_nd().expect("memory");
         npy.extend(depths).and_then(|()| npy.finish()).expect("memory");

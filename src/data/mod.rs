@@ -7,6 +7,8 @@ mod chunk_writer;
 mod config;
 mod dataset;
 mod loading;
+#[cfg(feature = "cli")]
+mod nerf_writer;
 mod view;
 
 pub use batch::{ViewBatch, view_batch};
@@ -23,6 +25,8 @@ pub use globalsplat_capture::{
 };
 pub use globalsplat_synth::SyntheticDataset;
 pub use loading::{BadData, Batch, BatchShard, DataLoader, LoadedScene, SceneGroups, TrainingScenes};
+#[cfg(feature = "cli")]
+pub(crate) use nerf_writer::write_nerf_capture;
 pub(crate) use view::MIN_SHORTER_SIDE;
 pub use view::{MIN_SIDE, PhotoSize, Pixels, View, load_all_views, load_views, tensor_from_planes};
 

@@ -94,7 +94,9 @@ impl Method<'_> {
                 warnings.push(format!("{scene}: {view} is masked out as a whole, and not scored"));
                 return Ok(());
             }
-            let score = score_view(&image, view, perceptual)?;
+            let mut score = score_view(&image, view, perceptual)?;
+            score.scores.depth_error =
+                rendered.as_ref().and_then(|rendered| scene.depth_error(i, view, &rendered.depth));
             on_image(view, &image, rendered.as_ref(), &score)?;
             views.push(score);
             Ok(())

@@ -1,6 +1,7 @@
 //! Evaluation of rendered images: the methods and scenes under evaluation, validation, the paper's protocol over a dataset, and its report.
 
 mod dataset;
+mod depths;
 mod evaluation;
 mod method;
 mod published;

@@ -1,12 +1,14 @@
 //! Scenes for evaluation: context photos, which a method may see, and target photos, which it has to match, as an index or a holdout
 //! splits them.
 
-use crate::data::{Capture, Holdout, PhotoSize, View, load_views};
+use super::depths::{ExactDepths, depth_error};
+use crate::data::{Capture, Holdout, PhotoSize, Pixels, View, load_views, read_points};
 use crate::error::{Error, Result};
 use crate::io::{read_text, write_json};
 use crate::metrics::{CaptureScores, score_view};
 use crate::reconstruct::{context_views, load_context};
 use crate::scene::{Camera, ImageSize};
+use crate::stereo::{DepthMap, SWEEP_SIDE, SmallPhoto, covered, sweep};
 use glam::DMat4;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -130,6 +132,10 @@ pub struct EvalScene {
     target_size: PhotoSize,
     /// Names of the target photos.
     target_names: Vec<String>,
+    /// Depths of photos that at least two of must cover a pixel that is scored; empty to score all pixels.
+    coverage: Vec<DepthMap>,
+    /// Exact depths of all photos of the capture.
+    depths: Option<ExactDepths>,
 }
 
 impl EvalScene {
@@ -152,7 +158,42 @@ impl EvalScene {
             context,
             frames,
             target_size,
+            coverage: vec![],
+            depths: None,
         }
+    }
+
+    /// Restricts the scores to the pixels that the depths of at least two of the photos that `holdout` leaves cover: nothing can be known of
+    /// the others.
+    ///
+    /// # Errors
+    /// Fails if a photo can't be read, or if the photos agree on no depth.
+    pub fn covered(self, holdout: Holdout) -> Result<Self> {
+        let photo = |photo: usize| {
+            let small = PhotoSize::Within(SWEEP_SIDE as u32).resized(&self.capture.camera(photo));
+            let view = load_views(&self.capture, &[photo], small)?.remove(0);
+            let mask = view.mask.as_ref().map(Pixels::to_float);
+            Ok(SmallPhoto::new(&view.name, &view.image.to_float(), mask.as_ref(), view.camera, SWEEP_SIDE))
+        };
+        let photos = self.capture.split(holdout).0.into_iter().map(photo).collect::<Result<_>>()?;
+        let depth_maps = sweep(photos, &read_points(&self.capture)?, |_| true).depth_maps;
+        Ok(EvalScene { coverage: depth_maps.into_iter().map(|(_, map)| map).collect(), ..self })
+    }
+
+    /// Adds the scores of depths by the exact ones in `file`, an array [photos, rows, columns] as `globalsplat synth --depth` writes it.
+    ///
+    /// # Errors
+    /// Fails if the file can't be read, or if its shape isn't that of the capture's photos.
+    pub fn with_depths(self, file: &Path) -> Result<Self> {
+        let depths = ExactDepths::read(file, &self.capture)?;
+        Ok(EvalScene { depths: Some(depths), ..self })
+    }
+
+    /// Returns the error of the rendered `depth` [H, W] of target view `i` ([`Scores::depth_error`](crate::metrics::Scores)), if exact
+    /// depths are known at its size.
+    pub(super) fn depth_error(&self, i: usize, view: &View, depth: &Tensor) -> Option<f64> {
+        let exact = self.depths.as_ref()?.of_photo(self.frames.target[i]);
+        (exact.size() == depth.size()).then(|| depth_error(depth, &exact, view.mask.as_ref()))
     }
 
     /// Creates a scene for splats and images, whose targets have the given size. They are the views that `holdout` holds out; without it,
@@ -220,7 +261,12 @@ impl EvalScene {
             let views = load_views(&self.capture, photos, self.scored_size(photos[0]))?;
             // In this order, the end of `views` takes no number.
             for (view, i) in views.into_iter().zip(&mut numbers) {
-                visit(i, &View { name: self.target_names[i].clone(), ..view })?;
+                let mut view = View { name: self.target_names[i].clone(), ..view };
+                if !self.coverage.is_empty() {
+                    view.mask =
+                        Some((view.mask_or_ones().to_float() * covered(&self.coverage, &view.camera)).into());
+                }
+                visit(i, &view)?;
             }
         }
         Ok(())

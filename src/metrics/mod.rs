@@ -6,7 +6,7 @@ mod psnr_ssim;
 
 pub use contact_sheet::{ContactSheet, comparison_image};
 pub use lpips::{PeakMemory, Perceptual};
-pub use psnr_ssim::{masked_psnr, masked_ssim, psnr};
+pub use psnr_ssim::{color_corrected_psnr, masked_psnr, masked_ssim, psnr};
 
 use crate::data::{Pixels, View};
 use crate::error::{Error, Result};
@@ -23,6 +23,8 @@ use tch::Tensor;
 pub struct Scores {
     /// PSNR in dB.
     pub psnr: f64,
+    /// PSNR in dB after the affine color map of each image that brings it closest to its photo, as `cc_psnr` of gsplat and nerfstudio.
+    pub cc_psnr: f64,
     /// Structural similarity, computed as in scikit-image.
     pub ssim: f64,
     /// LPIPS with VGG-16; `None` if the network's weights are missing or an image is too small.
@@ -34,6 +36,9 @@ pub struct Scores {
     /// Fraction of the pixels that were scored, by the weights of the photo's mask; `None` if all were.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub pixel_fraction: Option<f64>,
+    /// Mean over the pixels that count of |z − z*| / (z + z*), where z is the rendered depth and z* the exact one; `None` if none is known.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub depth_error: Option<f64>,
 }
 
 impl Scores {
@@ -47,10 +52,12 @@ impl Scores {
         let has_masks = scores.iter().any(|scores| scores.pixel_fraction.is_some());
         Scores {
             psnr: mean(|s| Some(s.psnr)).unwrap_or(f64::NAN),
+            cc_psnr: mean(|s| Some(s.cc_psnr)).unwrap_or(f64::NAN),
             ssim: mean(|s| Some(s.ssim)).unwrap_or(f64::NAN),
             lpips_vgg: mean(|s| s.lpips_vgg),
             lpips_alex: mean(|s| s.lpips_alex),
             pixel_fraction: mean(|s| Some(s.pixel_fraction.unwrap_or(1.))).filter(|_| has_masks),
+            depth_error: mean(|s| s.depth_error),
         }
     }
 }
@@ -115,7 +122,9 @@ pub fn score_view(image: &Tensor, view: &View, perceptual: Option<&Perceptual>) 
     let photo = view.image.to_float();
     let psnr = masked_psnr(image, &photo, mask.as_ref());
     let ssim = masked_ssim(image, &photo, mask.as_ref());
-    let mut scores = Scores { psnr, ssim, lpips_vgg: None, lpips_alex: None, pixel_fraction };
+    let cc_psnr = color_corrected_psnr(image, &photo, mask.as_ref());
+    let mut scores =
+        Scores { psnr, cc_psnr, ssim, lpips_vgg: None, lpips_alex: None, pixel_fraction, depth_error: None };
     if let Some(perceptual) = perceptual {
         perceptual.add_to(&mut scores, image, view)?;
     }

@@ -8,6 +8,8 @@ use tch::{Kind, Tensor};
 const BAND_PIXELS: i64 = 1 << 20;
 /// Side of the SSIM windows, in pixels.
 pub(super) const SSIM_WINDOW: i64 = 11;
+/// Weight of the squared numbers of a color map per pixel.
+const RIDGE: f64 = 1e-9;
 /// Number of rows that a band shares with the next one, so that every window lies inside a band.
 const SSIM_OVERLAP: i64 = SSIM_WINDOW - 1;
 
@@ -47,6 +49,28 @@ pub fn psnr(image: &Tensor, ground_truth: &Tensor) -> f64 {
 pub fn masked_psnr(image: &Tensor, ground_truth: &Tensor, mask: Option<&Tensor>) -> f64 {
     let mean = squared_error(image, ground_truth, mask) / image.numel() as f64;
     psnr_of_mse(mean / mask.map_or(1., mean_weight))
+}
+
+/// Returns [`masked_psnr`] after the affine map of the image's colors that brings them closest to the photo's: the 3×4 matrix with the least
+/// squared error over the pixels that count. It disregards differences of exposure and white balance (spec 9.4).
+pub fn color_corrected_psnr(image: &Tensor, ground_truth: &Tensor, mask: Option<&Tensor>) -> f64 {
+    let size = image.size();
+    let products = |(first, count)| {
+        let band = |t: &Tensor| band(t, first, count).flatten(1, 2);
+        let image = band(image);
+        let colors = Tensor::cat(&[&image, &image.narrow(0, 0, 1).ones_like()], 0);
+        let weighted = mask.map_or_else(|| colors.shallow_clone(), |mask| &colors * band(mask));
+        weighted.matmul(&Tensor::cat(&[&colors, &band(ground_truth)], 0).tr())
+    };
+    let sums = bands(size[1], size[2]).map(products).reduce(|a, b| a + b).expect("an image has rows");
+    // The map of an image of few colors isn't unique.
+    let ridge =
+        Tensor::eye(4, (Kind::Double, tch::Device::Cpu)) * (RIDGE * sums.double_value(&[3, 3]).max(1.));
+    let map = Tensor::linalg_solve(&(sums.narrow(1, 0, 4) + ridge), &sums.narrow(1, 4, 3), true);
+    let map = map.tr().to_kind(Kind::Float);
+    let colors = image.detach().to_device(tch::Device::Cpu).clamp(0., 1.).flatten(1, 2);
+    let corrected = map.narrow(1, 0, 3).matmul(&colors) + map.narrow(1, 3, 1);
+    masked_psnr(&corrected.view(size.as_slice()), ground_truth, mask)
 }
 
 /// Returns the structural similarity of two images `[3, H, W]` over the pixels that count by `mask` `[1, H, W]` (spec 7.9): 1 − (1 − SSIM) /
@@ -114,6 +138,27 @@ mod tests {
         let [all, plain] = [Some(&mask.ones_like()), None].map(|mask| masked_ssim(&image, &truth, mask));
         assert!((all - plain).abs() < 1e-12);
         assert!(masked_psnr(&image, &truth, Some(&mask.zeros_like())).is_nan());
+    }
+
+    /// A photo of another exposure, white balance and saturation is that photo after a color map; noise stays, and so does what is masked out.
+    #[test]
+    fn color_maps_are_corrected_where_pixels_count() {
+        tch::manual_seed(1);
+        let options = (Kind::Float, Device::Cpu);
+        let (truth, mask) =
+            (Tensor::rand([3, 32, 24], options) * 0.5 + 0.2, Tensor::ones([1, 32, 24], options));
+        let mix = Tensor::from_slice(&[0.7f32, 0.1, 0., 0.05, 0.8, 0.1, 0., 0.1, 0.6]).view([3, 3]);
+        let image = mix.matmul(&truth.flatten(1, 2)).view([3, 32, 24]) + 0.05;
+        assert!(psnr(&image, &truth) < 25.);
+        assert!(color_corrected_psnr(&image, &truth, None) > 90.);
+        let _ = image.narrow(1, 0, 16).fill_(1.);
+        let _ = mask.narrow(1, 0, 16).zero_();
+        assert!(color_corrected_psnr(&image, &truth, None) < 20.);
+        assert!(color_corrected_psnr(&image, &truth, Some(&mask)) > 90.);
+        // Every map of one color gives its channels' means.
+        let gray = Tensor::full([3, 32, 24], 0.3, options);
+        let mean = truth.mean_dim([1i64, 2].as_slice(), true, Kind::Float).expand_as(&truth);
+        assert!((color_corrected_psnr(&gray, &truth, None) - psnr(&mean, &truth)).abs() < 1e-3);
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! Depths of photos by a plane sweep, which needs no weights: for every pixel, the depth at which photos taken from other positions look
 //! most alike.
 
+mod coverage;
 pub(crate) mod depth_search;
 mod pixel_depths;
 mod sweep;
@@ -9,6 +10,7 @@ mod view_selection;
 pub use sweep::DepthMap;
 
 // Used by the refinement, which starts from depths, and by the photos of a model that reads depths.
+pub(crate) use coverage::covered;
 pub(crate) use depth_search::{SmallPhoto, pool_masked};
 pub(crate) use pixel_depths::pixel_depths;
 pub(crate) use sweep::{PlaneSweepOutput, SWEEP_SIDE, numbers, sweep, truths};

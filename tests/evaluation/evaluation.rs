@@ -211,7 +211,7 @@ fn external_renders_are_scored_by_an_index() {
     let report = sandbox.json(
         "eval --renders @renders --name 'the photos' --render-height 64 --data @chunks --index @re10k_3v.json --out @out",
     );
-    assert_eq!(report["evaluations"][0]["summary"], json!({"psnr": 100., "ssim": 1.}));
+    assert_eq!(report["evaluations"][0]["summary"], json!({"psnr": 100., "cc_psnr": 100., "ssim": 1.}));
     assert_eq!(read(&sandbox, "out").method, "the photos");
 }
 

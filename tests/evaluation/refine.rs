@@ -67,6 +67,25 @@ fn a_reconstruction_becomes_a_splat_of_the_requested_size() {
     assert_eq!(done["gaussians"], 4000);
 }
 
+/// Of views off the path, the pixels are scored that the photos cover, and depths by the exact ones.
+#[test]
+fn views_off_the_path_are_scored_where_photos_cover_them() {
+    let sandbox = Sandbox::empty();
+    sandbox.run("synth --scenes 1 --frames 8 --off-path 3 --size 64 --depth --out @off");
+    sandbox.run("refine --scene @off/0_000000 --gaussians 400 --steps 40 --out @a.ply");
+    let eval = "eval --splat @a.ply --scene @off/0_000000 --holdout none --depth @off/depth/0_000000.npy";
+    let [all, covered] = [eval.into(), format!("{eval} --covered")].map(|line: String| sandbox.json(&line));
+    assert_eq!((all["views"].as_array().unwrap().len(), all.get("pixel_fraction")), (3, None));
+    let fraction = number(&covered, "/pixel_fraction");
+    assert!(0.05 < fraction && fraction < 0.95, "{fraction}");
+    assert!(number(&covered, "/depth_error") < number(&all, "/depth_error"), "{covered} {all}");
+    assert!(number(&all, "/cc_psnr") > number(&all, "/psnr"));
+    sandbox.run("synth --scenes 1 --frames 8 --size 64 --depth --out @path");
+    let other = eval.replace("@off/depth", "@path/depth");
+    let expected = "the shape is [8, 64, 64], expected [11, 64, 64], that of the photos";
+    assert_says(&sandbox.refuse(&other), &[expected]);
+}
+
 /// Commands leave out what the masks in a folder cover.
 #[test]
 fn masks_in_a_folder_are_left_out() {
@@ -88,7 +107,10 @@ fn masks_in_a_folder_are_left_out() {
     assert!(number(&masked, "/psnr") > number(&unmasked, "/psnr") + 10., "{masked}");
     assert_eq!((number(&masked, "/pixel_fraction"), unmasked.get("pixel_fraction")), (0.5, None));
     let table = sandbox.succeed(&format!("{eval} --masks @masks"));
-    assert!(table.ends_with("scored over 50.0 % of the pixels: the others are masked out\n"), "{table}");
+    assert!(
+        table.ends_with("scored over 50.0 % of the pixels: the others are masked out or not covered\n"),
+        "{table}"
+    );
 
     let bytes = |line: &str| {
         sandbox.run(&format!("{line} --scene @room --out @out.ply"));

@@ -22,7 +22,15 @@ fn scene(name: &str, psnr: f64, lpips: bool) -> SceneScores {
         let psnr = psnr + f64::from(i - 1);
         ViewScore {
             image: format!("{i:06}.png"),
-            scores: Scores { psnr, ssim, lpips_vgg, lpips_alex, pixel_fraction: None },
+            scores: Scores {
+                psnr,
+                cc_psnr: psnr,
+                ssim,
+                lpips_vgg,
+                lpips_alex,
+                pixel_fraction: None,
+                depth_error: None,
+            },
         }
     };
     let views = (0..3).map(view).collect();

@@ -1,8 +1,8 @@
 //! Videos of synthetic scenes are reproducible, consistent with their cameras, and usable like any other data.
 
 use crate::common::program::{Sandbox, arg, assert_says, command, run_process, succeed, tiny_config};
-use glam::{DMat3, DVec3};
-use globalsplat::data::{Dataset, Split, SyntheticDataset, load_all_views};
+use glam::{DMat3, DMat4, DVec3};
+use globalsplat::data::{Dataset, Holdout, Split, SyntheticDataset, load_all_views, open_capture};
 use globalsplat::scene::{Camera, ImageSize};
 use globalsplat::synth::{Video, VideoSettings};
 use npyz::NpyFile;
@@ -10,7 +10,7 @@ use std::fs::File;
 use std::path::Path;
 
 fn settings(frames: usize, side: u32) -> VideoSettings {
-    VideoSettings { frames, size: ImageSize { height: side, width: side } }
+    VideoSettings { frames, off_path: 0, size: ImageSize { height: side, width: side } }
 }
 
 /// A seed determines the bytes, whatever the number of threads; another seed gives others.
@@ -213,5 +213,36 @@ fn names_of_synthetic_videos_are_checked() {
     ] {
         let error = named(name).unwrap_err().to_string();
         assert!(error.contains(found), "{name}: {error}");
+    }
+}
+
+/// Views off the path look at what a view of the path looks at, from 30° aside or above and with nothing in between.
+#[test]
+fn views_off_the_path_are_the_test_part_of_a_capture() {
+    let sandbox = Sandbox::empty();
+    sandbox.run("synth --scenes 2 --frames 4 --off-path 6 --size 24 --depth --out @off");
+    let capture = open_capture(&sandbox.path("off/0_000001")).unwrap();
+    assert_eq!(capture.split(Holdout::None), ((0..4).collect(), (4..10).collect()));
+    let video = Video::new(0, 1, &VideoSettings { off_path: 6, ..settings(4, 24) });
+    let depths = sandbox.read("off/depth/0_000001.npy");
+    let depths = NpyFile::new(&depths[..]).unwrap();
+    assert_eq!(depths.shape(), [10, 24, 24]);
+    let cameras = capture.cameras();
+    for (index, camera) in cameras[4..].iter().enumerate() {
+        assert!((camera.c2w - video.cameras()[4 + index].c2w).abs_diff_eq(DMat4::ZERO, 1e-9));
+        let base = &cameras[index * 4 / 6];
+        let [a, b] = [base, camera].map(|camera| camera.c2w.z_axis.truncate());
+        assert!((a.angle_between(b).to_degrees() - 30.).abs() < 1e-3);
+        // Both axes meet in a point that is visible in both images.
+        let [near, far] = [base, camera].map(|camera| camera.c2w.w_axis.truncate());
+        let meet = |from: DVec3, axis: DVec3, other: DVec3, with: DVec3| {
+            let normal = with.cross(axis.cross(with));
+            (other - from).dot(normal) / axis.dot(normal)
+        };
+        let target = far + b * meet(far, b, near, a);
+        let distance = (target - near).reject_from_normalized(a).length() / near.distance(target);
+        assert!(distance < 1e-4, "{distance}");
+        let at = |frame: usize| f64::from(video.depth(frame)[12 * 24 + 12]);
+        assert!(at(4 + index) > 0.7 * far.distance(target), "view {index}");
     }
 }

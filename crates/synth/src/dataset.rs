@@ -83,7 +83,7 @@ impl SyntheticDataset {
             }
         }
         let size = ImageSize { height: size as u32, width: size as u32 };
-        let settings = VideoSettings { frames: frames as usize, size };
+        let settings = VideoSettings { frames: frames as usize, off_path: 0, size };
         let name = path.to_string_lossy().into_owned();
         Ok(Some(SyntheticDataset { name, seed, first, scenes, settings }))
     }

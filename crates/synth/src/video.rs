@@ -4,7 +4,7 @@ use super::light::Sky;
 use super::scene_builder::SceneBuilder;
 use super::sensor::{PixelRng, Sensor};
 use super::tracer::{SampleChoice, Tracer};
-use super::walk::{CameraSpace, OrbitTarget, walk};
+use super::walk::{CameraSpace, OrbitTarget, pose, walk};
 use super::{objects, places};
 use glam::{DMat3, DMat4, DVec2, DVec3, Vec2, Vec3, vec2};
 use globalsplat_capture::{Camera, ImageSize, Intrinsics, Lens};
@@ -27,6 +27,8 @@ const WORLDS: u64 = 20;
 pub struct VideoSettings {
     /// Number of images per video.
     pub frames: usize,
+    /// Number of further images from poses off the camera path: 30° to its sides and above it, about the point in the middle of an image.
+    pub off_path: usize,
     /// Size of an image.
     pub size: ImageSize,
 }
@@ -36,6 +38,7 @@ pub struct Video {
     tracer: Tracer,
     sensor: Sensor,
     cameras: Vec<Camera>,
+    frames: usize,
     seed: u32,
 }
 
@@ -60,14 +63,16 @@ impl Video {
         let (place, orbit_target, sky) = world(&builder);
         let tracer = Tracer::new(builder.contents.take(), sky);
         let poses = walk(&builder, &tracer, place, orbit_target, settings.frames)?;
-        let cameras = cameras(&builder, poses, settings.size);
+        let mut cameras = cameras(&builder, poses, settings.size);
         let seen = mean_light(&tracer, &cameras);
         let sensor = Sensor::draw(&builder, seen);
         let seed = builder.seed();
-        Some(Video { tracer, sensor, cameras, seed })
+        let others = off_path(&tracer, &cameras, settings.off_path);
+        cameras.extend(others);
+        Some(Video { tracer, sensor, cameras, frames: settings.frames, seed })
     }
 
-    /// Returns the cameras of the images.
+    /// Returns the cameras of the images: those of the path, then those off it.
     pub fn cameras(&self) -> &[Camera] {
         &self.cameras
     }
@@ -101,7 +106,7 @@ impl Video {
         spread: f32,
         towards: impl Fn(Vec2) -> Option<Vec3>,
     ) -> RgbImage {
-        let exposure = self.sensor.exposure(index as f32 / self.cameras.len() as f32);
+        let exposure = self.sensor.exposure((index % self.frames) as f32 / self.frames as f32);
         let half = 0.5 * vec2(size.width as f32, size.height as f32);
         let eye = self.cameras[index].c2w.w_axis.truncate().as_vec3();
         RgbImage::from_fn(size.width, size.height, |x, y| {
@@ -185,6 +190,33 @@ fn cameras(builder: &SceneBuilder, poses: Vec<DMat4>, size: ImageSize) -> Vec<Ca
     poses.into_iter().map(camera).collect()
 }
 
+/// Angle between a view off the path and that of the path, in radians.
+const OFF_PATH: f32 = std::f32::consts::FRAC_PI_6;
+/// Maximum distance of the point about which cameras leave the path, in metres.
+const FARTHEST_TARGET: f32 = 20.;
+
+/// Returns `count` cameras off the path of `cameras`, spread over it: by turns to the left of one of its cameras, above it, and to its right,
+/// by [`OFF_PATH`] about the point that it looks at. Where something is in the way they take another of these sides, or are nearer to that point.
+fn off_path(tracer: &Tracer, cameras: &[Camera], count: usize) -> Vec<Camera> {
+    let camera = |i: usize| {
+        let camera = cameras[i * cameras.len() / count];
+        let [right, _, forward, eye] = [0, 1, 2, 3].map(|i| camera.c2w.col(i).truncate().as_vec3());
+        let depth = tracer.free_distance(eye, forward, FARTHEST_TARGET);
+        let target = eye + 0.98 * depth * forward;
+        let (sin, cos) = OFF_PATH.sin_cos();
+        let side = |side: usize| {
+            let aside =
+                [-right, Vec3::Y, right][side % 3].reject_from_normalized(forward).normalize_or(right);
+            let away = sin * aside - cos * forward;
+            (tracer.free_distance(target, away, depth), away)
+        };
+        let is_free = |&(free, _): &(f32, Vec3)| free > 0.7 * depth;
+        let (free, away) = (i..i + 3).map(side).find(is_free).unwrap_or_else(|| side(i));
+        Camera { c2w: pose((target + 0.9 * free * away, -away, 0.)), ..camera }
+    };
+    (0..count).map(camera).collect()
+}
+
 /// Returns the unit direction from the camera through `at`, in pixels.
 fn towards(camera: &Camera, at: Vec2) -> Vec3 {
     let Intrinsics { fx, fy, cx, cy } = camera.intrinsics;
@@ -220,7 +252,7 @@ mod tests {
 
     #[test]
     fn a_pinhole_lens_shows_the_photo_and_no_light_comes_from_outside_a_lens() {
-        let settings = VideoSettings { frames: 2, size: [24, 32].into() };
+        let settings = VideoSettings { frames: 2, off_path: 0, size: [24, 32].into() };
         let video = Video::new(1, 3, &settings);
         let Intrinsics { fx, fy, cx, cy } = video.cameras[1].intrinsics;
         let lens = |model, parameters: &[f64]| Lens::from_colmap(model, parameters, settings.size).unwrap();

@@ -257,7 +257,8 @@ fn is_free(path: &Path, tracer: &Tracer, place: CameraSpace, patience: f32) -> b
     })
 }
 
-fn pose((position, towards, roll): (Vec3, Vec3, f32)) -> DMat4 {
+/// Returns the pose of a camera at a position with a viewing direction and a roll angle.
+pub(super) fn pose((position, towards, roll): (Vec3, Vec3, f32)) -> DMat4 {
     let forward = towards.as_dvec3().normalize();
     let level = forward.cross(DVec3::Y).normalize();
     let below = forward.cross(level);
