@@ -18,7 +18,8 @@ def expect(name: str, value: object, is_valid: bool, expected: str) -> None:
 
 def expect_integer(name: str, value: Any, least: int) -> None:
     is_integer = isinstance(value, int) or hasattr(value, "__index__")
-    expect(name, repr(value), is_integer and value >= least, f"an integer, {least} or more")
+    if not is_integer or value < least:
+        raise ValueError(f"{name} is {value!r}, expected an integer, {least} or more")
 
 
 def expect_shape(name: str, value: HasShape, *shape: int | str) -> None:
