@@ -225,9 +225,13 @@ pub(crate) fn is_same_path(a: &Path, b: &Path) -> bool {
     a.canonicalize().is_ok_and(|a| b.canonicalize().is_ok_and(|b| a == b))
 }
 
-/// Returns a name that COLMAP's lists can hold, and that differs from `taken`, to which it is added.
+/// Returns a name that COLMAP's lists can hold, and that differs from `taken`, to which it is added. White space ends a name, a `#` at its
+/// start a comment, and a `\` becomes a `/`.
 fn list_name(name: String, taken: &mut HashSet<String>) -> String {
-    let mut safe = name.replace(|c: char| c.is_whitespace() || c.is_control(), "_");
+    let mut safe = name.replace(|c: char| c.is_whitespace() || c.is_control() || c == '\\', "_");
+    if safe.starts_with('#') {
+        safe.replace_range(..1, "_");
+    }
     while !taken.insert(safe.clone()) {
         safe.insert(safe.rfind('/').map_or(0, |slash| slash + 1), '_');
     }

@@ -51,8 +51,9 @@ fn names(record: &Value) -> Vec<&str> {
 fn useless_photos_are_skipped_and_named() {
     let folders = Folders::new();
     let at = |name: &str| folders.at("photos").join(name);
-    fs::create_dir(at("b")).unwrap();
-    for (seed, name) in ["a 1.png", "a_1.png", "b/2.png", "é.png"].into_iter().enumerate() {
+    ["#b", "b"].iter().for_each(|folder| fs::create_dir(at(folder)).unwrap());
+    let photos = ["#.png", "#b/#.png", "a 1.png", "a\\1.png", "a_1.png", "b/2.png", "é.png"];
+    for (seed, name) in photos.into_iter().enumerate() {
         folders.write(at(name), seed as u8).unwrap();
     }
     fs::copy(at("b/2.png"), at("b/3.png")).unwrap();
@@ -62,8 +63,10 @@ fn useless_photos_are_skipped_and_named() {
     // Some file systems refuse this name.
     let is_foreign = folders.write(Path::new("photos").join(OsStr::from_bytes(b"z\xe9.png")), 9).is_ok();
     let record = folders.import("photos", None).unwrap();
-    assert_eq!(names(&record), ["a_1.png", "_a_1.png", "b/2.png", "é.png"]);
-    assert_eq!(fs::read(folders.at("out/images/_a_1.png")).unwrap(), fs::read(at("a_1.png")).unwrap());
+    // COLMAP's lists have comments after a `#`, names between spaces, and `/` in the place of `\`.
+    let expected = ["_.png", "_b/#.png", "a_1.png", "_a_1.png", "__a_1.png", "b/2.png", "é.png"];
+    assert_eq!(names(&record), expected);
+    assert_eq!(fs::read(folders.at("out/images/__a_1.png")).unwrap(), fs::read(at("a_1.png")).unwrap());
     let skipped = record["skipped"].as_array().unwrap();
     let reasons = [
         ("b/3.png", "identical to b/2.png"),
