@@ -2,6 +2,7 @@
 
 use super::heif::{HEADER_BYTES, decode_heif, heif_size};
 use super::jpeg::{decode_jpeg, jpeg_size};
+use super::metadata::exif_chunk;
 use globalsplat_files::{Error, Result, panic_message};
 use image::codecs::jpeg::JpegEncoder;
 use image::metadata::Orientation;
@@ -78,7 +79,8 @@ pub fn decode_photo(encoded: &[u8], file: &Path, size: (u32, u32)) -> Result<Dec
     }
     decoder.set_limits(limits).map_err(undecodable(file))?;
     // Unreadable EXIF data isn't an error, because the pixels may still be usable.
-    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    let orientation = exif_chunk(&mut decoder).and_then(|exif| Orientation::from_exif_chunk(&exif));
+    let orientation = orientation.or(decoder.orientation().ok()).unwrap_or(Orientation::NoTransforms);
     let (is_jpeg, is_png) = (format == Some(ImageFormat::Jpeg), format == Some(ImageFormat::Png));
     // The decoders of some rare formats panic.
     let image = panic::catch_unwind(AssertUnwindSafe(|| match is_jpeg {

@@ -1,7 +1,7 @@
 //! What a photo's metadata say about its camera.
 
 use super::codec::encoded_image_size;
-use exif::{In, Reader, Tag, Value};
+use exif::{Exif, In, Reader, Tag, Value};
 use image::{ImageDecoder, ImageReader};
 use std::io::Cursor;
 
@@ -17,10 +17,11 @@ const FILM_DIAGONAL: f64 = 43.266_615;
 pub fn exif_focal(encoded: &[u8]) -> Option<f64> {
     let (width, height) = encoded_image_size(encoded)?;
     let (width, height) = (f64::from(width), f64::from(height));
-    let exif = Reader::new().read_from_container(&mut Cursor::new(encoded)).ok()?;
+    let exif = read_exif(encoded)?;
     let number = |tag| {
         let number = match &exif.get_field(tag, In::PRIMARY)?.value {
             Value::Rational(numbers) => numbers.first()?.to_f64(),
+            Value::SRational(numbers) => numbers.first()?.to_f64(),
             value => f64::from(value.get_uint(0)?),
         };
         // 0 stands for an unknown number.
@@ -40,14 +41,30 @@ pub fn exif_focal(encoded: &[u8]) -> Option<f64> {
     Some(number(Tag::FocalLength)? * number(Tag::FocalPlaneXResolution)? / millimetres * reduction)
 }
 
+/// Returns the EXIF data in `encoded`, the contents of a photo's file, as far as they aren't damaged.
+fn read_exif(encoded: &[u8]) -> Option<Exif> {
+    let mut reader = Reader::new();
+    reader.continue_on_error(true);
+    let undamaged =
+        |exif: Result<Exif, exif::Error>| exif.or_else(|why| why.distill_partial_result(|_| ())).ok();
+    let of_chunk = || undamaged(reader.read_raw(exif_chunk(&mut open_decoder(encoded)?)?));
+    undamaged(reader.read_from_container(&mut Cursor::new(encoded))).or_else(of_chunk)
+}
+
+fn open_decoder(encoded: &[u8]) -> Option<impl ImageDecoder> {
+    ImageReader::new(Cursor::new(encoded)).with_guessed_format().ok()?.into_decoder().ok()
+}
+
+/// Returns the EXIF data of a JPEG, PNG or WebP. Old versions of Pillow write the prefix that they have in JPEGs into other files, too.
+pub(super) fn exif_chunk(decoder: &mut impl ImageDecoder) -> Option<Vec<u8>> {
+    let chunk = decoder.exif_metadata().ok()??;
+    Some(chunk.strip_prefix(b"Exif\0\0").map(<[u8]>::to_vec).unwrap_or(chunk))
+}
+
 /// Returns `true` if the XMP data in `encoded`, the contents of a photo's file, declare a panorama of 360°: `GPano:ProjectionType` is
 /// `equirectangular`.
 pub fn is_equirectangular(encoded: &[u8]) -> bool {
-    let xmp = || {
-        let reader = ImageReader::new(Cursor::new(encoded)).with_guessed_format().ok()?;
-        reader.into_decoder().ok()?.xmp_metadata().ok()?
-    };
-    let xmp = xmp().unwrap_or_default();
+    let xmp = open_decoder(encoded).and_then(|mut decoder| decoder.xmp_metadata().ok()?).unwrap_or_default();
     // Either an attribute, `GPano:ProjectionType="equirectangular"`, or an element of this name.
     let text = String::from_utf8_lossy(&xmp);
     text.split("GPano:ProjectionType").skip(1).any(|value| {

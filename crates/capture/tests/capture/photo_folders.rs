@@ -93,6 +93,76 @@ fn exif_data_tell_the_focal_length() {
     assert_eq!(exif_focal(b"text"), None);
 }
 
+/// Entry of a directory in EXIF data: its tag, type, number of values, and value or offset.
+type Entry = (u16, u16, u32, u32);
+
+/// Returns EXIF data whose directory at `start` points to another one, of `entries`. Each names the offset of a `next` one. The rational
+/// numbers 13/2 and 2/0 are at the offsets 8 and 12.
+fn lay_out_exif(is_big: bool, start: u32, entries: &[Entry], next: [u32; 2]) -> Vec<u8> {
+    let short = |value: u16| if is_big { value.to_be_bytes() } else { value.to_le_bytes() };
+    let long = |value: u32| if is_big { value.to_be_bytes() } else { value.to_le_bytes() };
+    let directory = |entries: &[Entry], next: u32| {
+        let entry = |&(tag, kind, count, value): &Entry| {
+            let value = if kind == 3 { [short(value as u16), [0; 2]].concat() } else { long(value).to_vec() };
+            [&short(tag)[..], &short(kind), &long(count), &value].concat()
+        };
+        [&short(entries.len() as u16)[..], &entries.iter().flat_map(entry).collect::<Vec<_>>(), &long(next)]
+            .concat()
+    };
+    let order = if is_big { b"MM" } else { b"II" };
+    let mut bytes = [&order[..], &short(42), &long(start), &long(13), &long(2)].concat();
+    bytes.resize(start as usize, 0);
+    let pointer = (0x8769, 4, 1, start + 18);
+    [bytes, directory(&[pointer], next[0]), directory(entries, next[1])].concat()
+}
+
+/// COLMAP and Pillow read what careless writers leave, too.
+#[test]
+fn damaged_exif_data_tell_what_is_left_of_them() {
+    const BEYOND: u32 = u32::MAX;
+    let equivalent = |kind: u16, count: u32, value: u32| (0xa405, kind, count, value);
+    let (length, resolution, millimetres) = ((0x920a, 5, 1, 8), (0xa20e, 5, 1, 8), (0xa210, 3, 1, 4));
+    let (by_26, by_6_5, by_pixels) = (300.462_606, 300.462_606 / 4., 6.5 * 6.5);
+    let short = equivalent(3, 1, 26);
+    let cases: [(&[Entry], [u32; 2], f64); 12] = [
+        (&[short], [0, 0], by_26),
+        // FLIR's cameras, piexif, and directories of thumbnails that are none.
+        (&[short], [0, BEYOND], by_26),
+        (&[short], [0, 8], by_26),
+        (&[short], [BEYOND, 0], by_26),
+        (&[short], [9, 0], by_26),
+        // Other values are beyond the end, of an unknown type, or missing.
+        (&[(0x927c, 7, 900, 9000), short], [0, 0], by_26),
+        (&[(0x927c, 99, 900, 9000), (0x829a, 5, 0, 0), short], [0, 0], by_26),
+        (&[equivalent(4, 1, 26)], [0, 0], by_26),
+        (&[equivalent(5, 1, 8)], [0, 0], by_6_5),
+        (&[equivalent(10, 1, 8)], [0, 0], by_6_5),
+        // A denominator of 0 stands for an unknown number.
+        (&[equivalent(5, 1, 12), length, resolution, millimetres], [0, 0], by_pixels),
+        (&[equivalent(3, 0, 26), length, resolution, millimetres], [BEYOND, BEYOND], by_pixels),
+    ];
+    for (is_big, start) in [(true, 20), (false, 20), (true, 21), (false, 33)] {
+        let lay_out = |(entries, next, expected): &(&[Entry], _, _)| {
+            (lay_out_exif(is_big, start, entries, *next), *expected)
+        };
+        let mut files: Vec<_> = cases.iter().map(lay_out).collect();
+        let plain = files[0].0.clone();
+        files.extend([
+            (plain[..plain.len() - 4].to_vec(), by_26),
+            ([&plain, &b"garbage"[..]].concat(), by_26),
+            // Older versions of Pillow keep the prefix that EXIF data have in a JPEG.
+            ([b"Exif\0\0", &plain[..]].concat(), by_26),
+        ]);
+        for (number, (exif, expected)) in files.iter().enumerate() {
+            for (extension, bytes) in encode_with_exif(&RgbImage::new(400, 300).into(), exif) {
+                let found = exif_focal(&bytes).unwrap_or(0.);
+                let name = format!("{number} in {extension}, {is_big}, {start}");
+                assert!((found / expected - 1.).abs() < 1e-6, "{name}: {found} {expected}");
+            }
+        }
+    }
+}
+
 #[test]
 fn panoramas_are_known_by_their_xmp_data() {
     let is_panorama = |xmp: &str| {
