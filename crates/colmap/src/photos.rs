@@ -3,8 +3,8 @@
 use crate::progress::{Progress, Reporter, Step};
 use crate::record::Record;
 use globalsplat_capture::{
-    MASKS_FOLDER, decode_photo, encode_photo, exif_focal, find_masks, find_masks_in, gray_to_rgb,
-    is_equirectangular, list_photos, read_image_size, read_mask,
+    MASKS_FOLDER, decode_upright, encode_photo, exif_focal, find_masks, find_masks_in, fit_mask, gray_to_rgb,
+    is_equirectangular, list_photos, read_image_size,
 };
 use globalsplat_files::{Error, Result, checksum, parent_of, write_file};
 use image::{Rgb, RgbImage};
@@ -260,9 +260,7 @@ fn inspect(source: &Path, name: &str, mask: Option<&Path>, all_names: &[&str]) -
         true => "named in another encoding than UTF-8".to_string(),
         false => format!("unreadable ({why})"),
     })?;
-    let (width, height) = read_image_size(path).map_err(refuse)?;
-    // Declaring the sides in the other order has the photo rotated if its EXIF says so.
-    let decoded = decode_photo(&encoded, path, (height, width)).map_err(refuse)?;
+    let decoded = decode_upright(&encoded, path).map_err(refuse)?;
     let pixels = decoded.pixels;
     let (darkest, brightest) =
         pixels.iter().fold((u8::MAX, u8::MIN), |(low, high), &value| (low.min(value), high.max(value)));
@@ -273,13 +271,11 @@ fn inspect(source: &Path, name: &str, mask: Option<&Path>, all_names: &[&str]) -
     let extension = path.extension().unwrap_or_default().to_ascii_lowercase();
     let is_png = decoded.is_png && extension == "png";
     let is_jpeg = decoded.is_jpeg && (extension == "jpg" || extension == "jpeg");
-    let is_readable = (is_png || is_jpeg) && pixels.dimensions() == (width, height);
+    let is_readable = (is_png || is_jpeg) && !decoded.is_turned;
     let contents = (!is_readable).then(|| encode_photo(&pixels, !is_png)).transpose().map_err(refuse)?;
     let levels = match (mask, decoded.alpha) {
         // COLMAP compares a mask with its photo pixel by pixel.
-        (Some(file), _) => check_aspect(file, pixels.dimensions())
-            .and_then(|()| read_mask(file, pixels.dimensions()))
-            .map(Some),
+        (Some(file), _) => read_upright_mask(file, pixels.dimensions()).map(Some),
         (None, Some(alpha)) if !is_readable => Ok(Some(gray_to_rgb(&alpha))),
         (None, _) => Ok(None),
     };
@@ -300,13 +296,14 @@ fn inspect(source: &Path, name: &str, mask: Option<&Path>, all_names: &[&str]) -
     Ok(Inspected { photo, contents, mask })
 }
 
-/// Checks that the mask `file` has `size` = (width, height), the size of its photo, or both sides by one factor.
-fn check_aspect(file: &Path, size: (u32, u32)) -> Result<()> {
-    let found = read_image_size(file)?;
+/// Reads the mask `file` at `size` = (width, height), that of its upright photo. The mask has this size, or both sides by one factor.
+fn read_upright_mask(file: &Path, size: (u32, u32)) -> Result<RgbImage> {
+    let mask = decode_upright(&fs::read(file).map_err(Error::read(file))?, file)?.pixels;
+    let found = mask.dimensions();
     let [(w, h), (width, height)] = [found, size].map(|(w, h)| (f64::from(w), f64::from(h)));
     // Each side of the mask may be rounded.
     if (w * height - h * width).abs() <= (width + height) / 2. {
-        return Ok(());
+        return Ok(fit_mask(mask, size));
     }
     let expected = format!("{}×{} pixels as its upright photo, or both by one factor", size.0, size.1);
     Err(Error::input(file, "the mask", format!("{}×{} pixels", found.0, found.1), expected))

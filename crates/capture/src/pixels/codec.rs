@@ -28,8 +28,7 @@ pub(crate) const SUPPORTED_IMAGES: &str = "a JPEG, PNG, WebP, TIFF, BMP, HEIC or
 /// # Errors
 /// Returns an error if the file is missing, can't be decoded, or is truncated.
 pub fn read_image(path: &Path) -> Result<RgbImage> {
-    // The size 0×0 matches no photo, so the EXIF orientation isn't applied.
-    Ok(decode_photo(&std::fs::read(path).map_err(Error::read(path))?, path, (0, 0))?.pixels)
+    Ok(decode(&std::fs::read(path).map_err(Error::read(path))?, path, |_, _| false)?.pixels)
 }
 
 /// Pixels of a decoded photo.
@@ -41,6 +40,8 @@ pub struct DecodedPhoto {
     pub alpha: Option<GrayImage>,
     /// `true` if the file holds exactly these pixels in 8-bit RGB: no palette, gray, CMYK or opacity, not rotated and not converted.
     pub is_verbatim: bool,
+    /// `true` if the orientation in the file's EXIF data was applied to the pixels as they are stored.
+    pub is_turned: bool,
     /// `true` if the file is a JPEG.
     pub is_jpeg: bool,
     /// `true` if the file is a PNG.
@@ -58,9 +59,27 @@ pub struct DecodedPhoto {
 /// # Errors
 /// Returns the errors of [`read_image`].
 pub fn decode_photo(encoded: &[u8], file: &Path, size: (u32, u32)) -> Result<DecodedPhoto> {
+    decode(encoded, file, |stored, turned| stored != size && turned == size)
+}
+
+/// Decodes the photo `encoded`, the contents of `file`, like [`read_image`], but upright: the EXIF orientation is applied.
+///
+/// # Errors
+/// Returns the errors of [`read_image`].
+pub fn decode_upright(encoded: &[u8], file: &Path) -> Result<DecodedPhoto> {
+    decode(encoded, file, |_, _| true)
+}
+
+/// Decodes a photo. `should_turn` returns `true` if the EXIF orientation is to be applied, given the photo's size as stored and its upright
+/// size.
+fn decode(
+    encoded: &[u8],
+    file: &Path,
+    should_turn: impl FnOnce((u32, u32), (u32, u32)) -> bool,
+) -> Result<DecodedPhoto> {
     if heif_size(encoded).is_some() {
-        let pixels = decode_heif(encoded, file)?;
-        return Ok(DecodedPhoto { pixels, alpha: None, is_verbatim: false, is_jpeg: false, is_png: false });
+        let (pixels, [is_verbatim, is_turned, is_jpeg, is_png]) = (decode_heif(encoded, file)?, [false; 4]);
+        return Ok(DecodedPhoto { pixels, alpha: None, is_verbatim, is_turned, is_jpeg, is_png });
     }
     let reader = ImageReader::new(Cursor::new(encoded)).with_guessed_format().map_err(Error::read(file))?;
     let format = reader.format();
@@ -101,13 +120,13 @@ pub fn decode_photo(encoded: &[u8], file: &Path, size: (u32, u32)) -> Result<Dec
         | Orientation::Rotate270FlipH => (stored.1, stored.0),
         _ => stored,
     };
-    let turn = stored != size && turned == size;
-    if turn {
+    let is_turned = orientation != Orientation::NoTransforms && should_turn(stored, turned);
+    if is_turned {
         image.apply_orientation(orientation);
     }
-    let is_verbatim = !turn && has_rgb && matches!(image, DynamicImage::ImageRgb8(_));
+    let is_verbatim = !is_turned && has_rgb && matches!(image, DynamicImage::ImageRgb8(_));
     let (pixels, alpha) = split_alpha(image);
-    Ok(DecodedPhoto { pixels, alpha, is_verbatim, is_jpeg, is_png })
+    Ok(DecodedPhoto { pixels, alpha, is_verbatim, is_turned, is_jpeg, is_png })
 }
 
 /// Encodes a photo as a JPEG of high quality, or as a PNG.

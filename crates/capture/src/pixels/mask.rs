@@ -9,23 +9,28 @@ use globalsplat_files::{Error, Result};
 use image::{GrayImage, Rgb, RgbImage};
 use std::path::Path;
 
-/// Reads the mask `file` at `size` = (width, height), resized if it has another size. The level of its gray is the weight; a color
-/// counts by its luminance, and what is transparent is black. A mask without a level above 1 has levels 0 and 1.
+/// Reads the mask `file` at `size` = (width, height), like [`fit_mask`].
 ///
 /// # Errors
 /// Fails if the file can't be read or decoded.
-pub fn read_mask(file: &Path, size: (u32, u32)) -> Result<RgbImage> {
+pub(crate) fn read_mask(file: &Path, size: (u32, u32)) -> Result<RgbImage> {
     let encoded = std::fs::read(file).map_err(Error::read(file))?;
-    let mut mask = image::DynamicImage::from(decode_photo(&encoded, file, size)?.pixels).into_luma8();
+    Ok(fit_mask(decode_photo(&encoded, file, size)?.pixels, size))
+}
+
+/// Returns a decoded mask at `size` = (width, height), resized if it has another size. The level of its gray is the weight; a color counts
+/// by its luminance, and what is transparent is black. A mask without a level above 1 has levels 0 and 1.
+pub fn fit_mask(pixels: RgbImage, size: (u32, u32)) -> RgbImage {
+    let mut mask = image::DynamicImage::from(pixels).into_luma8();
     if mask.pixels().all(|level| level[0] <= 1) {
         mask.pixels_mut().for_each(|level| level[0] *= u8::MAX);
     }
     let mask = gray_to_rgb(&mask);
     if mask.dimensions() == size {
-        return Ok(mask);
+        return mask;
     }
     let size = ImageSize { height: size.1, width: size.0 };
-    Ok(resample_planes(&mask, Region::whole(&mask), size).to_rgb())
+    resample_planes(&mask, Region::whole(&mask), size).to_rgb()
 }
 
 /// Returns the image whose channels all are `image`.

@@ -12,7 +12,9 @@ mod undistort;
 
 #[cfg(feature = "chunks")]
 pub(crate) use codec::encoded_image_size;
-pub use codec::{DecodedPhoto, PHOTO_EXTENSIONS, decode_photo, encode_photo, read_image, read_image_size};
+pub use codec::{
+    DecodedPhoto, PHOTO_EXTENSIONS, decode_photo, decode_upright, encode_photo, read_image, read_image_size,
+};
 pub(crate) use codec::{SUPPORTED_IMAGES, has_alpha_channel};
 pub use metadata::{exif_focal, is_equirectangular};
 pub use planes::{CHANNELS, Planes};
@@ -20,6 +22,6 @@ pub use resample::{Region, Resampler};
 pub use resize_and_crop::resize_and_crop;
 pub(crate) use resize_and_crop::source_window;
 
-pub(crate) use mask::multiply;
-pub use mask::{gray_to_rgb, read_mask};
+pub use mask::{fit_mask, gray_to_rgb};
+pub(crate) use mask::{multiply, read_mask};
 pub(crate) use undistort::undistort;

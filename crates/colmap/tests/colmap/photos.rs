@@ -3,10 +3,13 @@
 use crate::{failing_colmap, make};
 use globalsplat_capture::read_image;
 use globalsplat_colmap::CaptureOptions;
-use image::{GrayImage, ImageFormat, ImageResult, Luma, Rgb, RgbImage, Rgba, RgbaImage};
+use image::codecs::png::PngEncoder;
+use image::{
+    DynamicImage, GrayImage, ImageEncoder, ImageFormat, ImageResult, Luma, Rgb, RgbImage, Rgba, RgbaImage,
+};
 use serde_json::{Value, from_slice, json};
 use std::ffi::OsStr;
-use std::fs;
+use std::fs::{self, File};
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
@@ -114,6 +117,53 @@ fn photos_that_colmap_may_not_read_are_converted_with_their_opacity_and_orientat
     let (upright, photo) = (read("images/c.jpg"), &record["photos"][3]);
     assert_eq!((upright.dimensions(), &photo["width"], &photo["height"]), ((8, 16), &json!(8), &json!(16)));
     assert!(upright.get_pixel(4, 2).0[0] < 50 && upright.get_pixel(4, 13).0[0] > 200);
+}
+
+/// Orientations 1 to 8 of EXIF, of photos whose upright size differs from the stored one or doesn't. Masks are upright, or turned as well.
+#[test]
+fn photos_and_masks_of_every_orientation_become_upright() {
+    let folders = Folders::new();
+    let write = |name: &str, image: &RgbImage, orientation: u8| {
+        let mut encoder = PngEncoder::new(File::create(folders.at("photos").join(name)).unwrap());
+        let exif = b"MM\0\x2a\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0";
+        encoder.set_exif_metadata([exif, &[orientation][..], &[0; 6]].concat()).unwrap();
+        image.write_with_encoder(encoder).unwrap();
+    };
+    let upright = |orientation: u8, width: u32| {
+        RgbImage::from_fn(width, 8, |x, y| Rgb([x as u8 * 15 + y as u8, y as u8 * 30, orientation]))
+    };
+    let cases = || (1..=8).flat_map(|orientation| [8, 16].map(|width| (orientation, width)));
+    for (orientation, width) in cases() {
+        let (image, (right, bottom)) = (upright(orientation, width), (width - 1, 7));
+        let (w, h) = if orientation < 5 { (width, 8) } else { (8, width) };
+        // Where the stored column and row are in the upright image (EXIF 2.32, 4.6.4).
+        let stored = RgbImage::from_fn(w, h, |column, row| {
+            let (x, y) = match orientation {
+                1 => (column, row),
+                2 => (right - column, row),
+                3 => (right - column, bottom - row),
+                4 => (column, bottom - row),
+                5 => (row, column),
+                6 => (right - row, column),
+                7 => (right - row, bottom - column),
+                _ => (row, bottom - column),
+            };
+            *image.get_pixel(x, y)
+        });
+        let name = format!("{orientation}_{width}.png");
+        write(&name, &stored, orientation);
+        let (mask, turn) = if width == 8 { (image, 1) } else { (stored, orientation) };
+        write(&format!("masks/{name}"), &mask, turn);
+    }
+    let record = folders.import("photos", None).unwrap();
+    assert_eq!(record["skipped"], json!([]));
+    for (orientation, width) in cases() {
+        let (name, image) = (format!("{orientation}_{width}.png"), upright(orientation, width));
+        assert!(read_image(&folders.at("out/images").join(&name)).unwrap() == image, "{name}");
+        let mask = read_image(&folders.at(format!("out/masks/{name}.png"))).unwrap();
+        let luma = DynamicImage::from(image).into_luma8();
+        assert!(DynamicImage::from(mask).into_luma8() == luma, "the mask of {name}");
+    }
 }
 
 #[test]
