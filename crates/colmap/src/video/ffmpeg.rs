@@ -78,6 +78,13 @@ impl<'a> Video<'a> {
             let has_sound = streams.iter().any(|stream| stream["codec_type"] == "audio");
             return no_video(if has_sound { "sound without pictures" } else { "without pictures" });
         };
+        let size = |stream: &Value| (stream["width"].clone(), stream["height"].clone());
+        let count = streams.iter().filter(has_pictures).filter(|other| size(other) == size(stream)).count();
+        if count > 1 {
+            let found = format!("{count} of {}×{} pixels", stream["width"], stream["height"]);
+            let expected = "1: of a camera for 360 degrees, the stitched video, or one lens by ffmpeg -i VIDEO -map 0:v:0 -c copy LENS.mkv";
+            return Err(Error::input(path, "the number of picture streams", found, expected));
+        }
         let is_one_of = |field: &str, names: &[&str]| names.contains(&text(&stream[field]).as_str());
         let declared_frames = Some(number(&stream["nb_frames"]) as usize).filter(|count| *count > 0);
         let rate = text(&stream["avg_frame_rate"]);

@@ -332,6 +332,8 @@ fn what_is_no_video_is_refused() {
     // The index is at the end.
     let whole = fs::read(at("whole.mov")).unwrap();
     fs::write(at("broken.mov"), &whole[..whole.len() / 2]).unwrap();
+    let lenses = ["-i", "video.mkv", "-map", "0", "-map", "0", "-c", "copy", "lenses.mkv"];
+    assert!(fixture.ffmpeg(&lenses));
     fs::write(at("notes.txt"), "notes of a walk\n".repeat(200)).unwrap();
     fs::write(at("noise.mp4"), (0..20_000u32).map(|i| (i * i / 8) as u8).collect::<Vec<u8>>()).unwrap();
     fs::write(at("empty.mp4"), "").unwrap();
@@ -343,6 +345,11 @@ fn what_is_no_video_is_refused() {
         ("photo.jpg", "the content is a photo, expected a video"),
         ("sound.wav", "the content is sound without pictures, expected a video"),
         ("cover.flac", "the content is sound without pictures, expected a video"),
+        (
+            "lenses.mkv",
+            "the number of picture streams is 2 of 320×180 pixels, expected 1: of a camera for 360 degrees, the stitched video, or one lens \
+             by ffmpeg -i VIDEO -map 0:v:0 -c copy LENS.mkv",
+        ),
         ("broken.mov", "(moov atom not found), expected a video"),
         ("noise.mp4", "), expected a video"),
         ("empty.mp4", "), expected a video"),
