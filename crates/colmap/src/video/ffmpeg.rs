@@ -10,8 +10,8 @@ use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
-/// BT.2020 in PQ or HLG to BT.709, by linear light in which 1 is 100 cd/m².
-const TONEMAP: &str = "zscale=t=linear:npl=100,format=gbrpf32le,zscale=p=bt709,tonemap=hable:desat=0,\
+/// PQ or HLG to BT.709, by linear light in which 1 is 100 cd/m². The declared colors of the input precede them.
+const TONEMAP: &str = "t=linear:npl=100,format=gbrpf32le,zscale=p=bt709,tonemap=hable:desat=0,\
                        zscale=t=bt709:m=bt709:r=tv,format=yuv420p,";
 
 /// A video, and how ffmpeg has to read it.
@@ -98,25 +98,29 @@ impl<'a> Video<'a> {
             command.arg("-hide_banner").args(question);
             run(path, command).map(|output| String::from_utf8_lossy(&output.stdout).into_owned())
         };
-        let (mut warnings, mut tonemap) = (vec![], "");
+        let picture = format!("0:{}", stream["index"]);
+        let is_declared = |field| !is_one_of(field, &["", "unknown"]);
+        let (mut warnings, mut tonemap) = (vec![], String::new());
         if is_one_of("color_transfer", &["smpte2084", "arib-std-b67"]) {
-            let filters = ask(&["-filters"])?;
-            if ["zscale", "tonemap"].iter().all(|name| filters.split_whitespace().any(|word| word == *name)) {
-                tonemap = TONEMAP;
-            } else {
-                let lacks =
-                    "the video is HDR, and the ffmpeg on the PATH lacks the filters zscale and tonemap";
-                warnings.push(format!("{lacks}: colors are pale"));
+            let primaries = if is_declared("color_primaries") { "" } else { "pin=2020:p=2020:" };
+            let matrix = if is_declared("color_space") { "" } else { "min=2020_ncl:" };
+            tonemap = format!("zscale={primaries}{matrix}{TONEMAP}");
+            let mut trial = command("ffmpeg");
+            trial.args(["-v", "error", "-i"]).arg(absolute(path)?).args(["-map", &picture, "-vf"]);
+            trial.args([tonemap.trim_end_matches(','), "-frames:v", "1", "-f", "null", "-"]);
+            if !run(path, trial)?.status.success() {
+                tonemap.clear();
+                let lacks = "the ffmpeg on the PATH lacks the filters zscale and tonemap, or can't convert its colors";
+                warnings.push(format!("the video is HDR, and {lacks}: colors are pale"));
             }
         }
         // Players take HD for BT.709 if the matrix of the colors isn't declared. JPEG has that of BT.601, and the full range.
-        let is_declared = !is_one_of("color_space", &["", "unknown"]);
-        let is_bt709 = !is_declared && area(stream) >= 1280 * 720 && tonemap.is_empty();
+        let is_bt709 = !is_declared("color_space") && area(stream) >= 1280 * 720 && tonemap.is_empty();
         let from = if is_bt709 { ":in_color_matrix=bt709" } else { "" };
         let scale = format!("scale=w=round(iw*sar):h=ih{from}:out_color_matrix=bt601:out_range=pc");
         Ok(Video {
             path,
-            stream: format!("0:{}", stream["index"]),
+            stream: picture,
             // ffmpeg has one option before 5.1, and the other since 8.
             every_frame: if ask(&["-h", "long"])?.contains("-fps_mode") { "-fps_mode" } else { "-vsync" },
             deinterlace: match is_one_of("field_order", &["tt", "bb", "tb", "bt"]) {

@@ -276,14 +276,27 @@ fn hdr_is_converted() {
     let Some(fixture) = Fixture::new() else { return };
     // White of 100 cd/m², the diffuse white of SDR, is 51 % in PQ, a medium gray if it is taken for SDR.
     let input = ["-f", "lavfi", "-i", "color=c=0x828282:s=320x180:d=0.2:r=25", "-pix_fmt", "yuv420p10le"];
-    let colors = ["-vf", "setparams=color_primaries=bt2020:color_trc=smpte2084:colorspace=bt2020nc"];
-    assert!(fixture.ffmpeg(&[&input[..], &colors, &["-c:v", "ffv1", "video.mkv"]].concat()));
-    let frames = fixture.extract("video.mkv", Some(1)).unwrap();
-    if let [warning] = &frames.warnings[..] {
-        return skip("ffmpeg with zscale", warning);
+    for (transfer, range) in [("smpte2084", 145..=175), ("arib-std-b67", 115..=140)] {
+        // BT.2020 is meant if nothing else is declared.
+        for (primaries, matrix) in
+            [("bt2020", "bt2020nc"), ("bt2020", "unknown"), ("unknown", "bt2020nc"), ("unknown", "unknown")]
+        {
+            let colors =
+                format!("setparams=color_primaries={primaries}:color_trc={transfer}:colorspace={matrix}");
+            assert!(fixture.ffmpeg(&[&input[..], &["-vf", &colors, "-c:v", "ffv1", "video.mkv"]].concat()));
+            let frames = fixture.extract("video.mkv", Some(1)).unwrap();
+            if let [warning] = &frames.warnings[..] {
+                return skip("ffmpeg with zscale", warning);
+            }
+            let gray = fixture.frame(0).into_luma8()[(160, 90)].0[0];
+            assert!(range.contains(&gray), "{colors}: {gray}");
+        }
     }
-    let gray = fixture.frame(0).into_luma8()[(160, 90)].0[0];
-    assert!((145..=175).contains(&gray), "{gray}");
+    // A matrix that the filters don't know.
+    let colors = "setparams=color_primaries=bt2020:color_trc=smpte2084:colorspace=bt2020c";
+    assert!(fixture.ffmpeg(&[&input[..], &["-vf", colors, "-c:v", "ffv1", "video.mkv"]].concat()));
+    let warnings = fixture.extract("video.mkv", Some(1)).unwrap().warnings;
+    assert!(matches!(&warnings[..], [line] if line.ends_with("colors are pale")), "{warnings:?}");
 }
 
 #[test]
