@@ -1,4 +1,4 @@
-//! `transforms.json` of nerfstudio and instant-ngp: {"frames": [{"file_path", "transform_matrix" 4×4, camera-to-world with OpenGL
+//! `transforms.json` of nerfstudio and instant-ngp: {"frames": [{"file_path", "transform_matrix" 4×4 or 3×4, camera-to-world with OpenGL
 //! axes}]}, and lens parameters for all frames or for each: `w`, `h`, `fl_x`, `fl_y`, `cx`, `cy` in pixels, `camera_angle_x` and
 //! `camera_angle_y` in radians, the `camera_model`, and the distortion `k1` to `k6`, `p1`, `p2` (spec 10.3). NeRF's synthetic scenes
 //! have a file of this kind for each split.
@@ -409,12 +409,17 @@ impl<'a> Fields<'a> {
     fn c2w(&self) -> Result<(DMat4, f64)> {
         let name = self.name("transform_matrix");
         let value = self.frame.get("transform_matrix");
-        let four = |value: &'a Value| value.as_array().filter(|list| list.len() == 4);
-        let rows: Option<Vec<_>> = value.and_then(four).and_then(|rows| rows.iter().map(four).collect());
-        let Some(rows) = rows else {
-            return Err(Error::input(self.file, name, describe_value(value), "a 4×4 matrix"));
+        let list = |value: &'a Value, lengths: &[usize]| {
+            value.as_array().filter(|list| lengths.contains(&list.len()))
         };
-        let mut entries = [0.; 16];
+        let rows = value.and_then(|rows| list(rows, &[3, 4]));
+        let Some(rows) =
+            rows.and_then(|rows| rows.iter().map(|row| list(row, &[4])).collect::<Option<Vec<_>>>())
+        else {
+            let expected = "a 4×4 matrix, or its first three rows";
+            return Err(Error::input(self.file, name, describe_value(value), expected));
+        };
+        let mut entries = DMat4::IDENTITY.to_cols_array();
         for (i, value) in rows.into_iter().flatten().enumerate() {
             entries[i] = match value {
                 Value::Null => f64::NAN,

@@ -234,6 +234,8 @@ fn transforms_specify_intrinsics_in_several_ways() {
         t["ply_file_path"] = json!("sparse_pc.ply");
         (t["camera_model"], t["is_fisheye"]) = (json!("OpenCV"), json!(false));
         (t["frames"][0]["colmap_im_id"], t["frames"][0]["sharpness"]) = (json!(1), json!(30.5));
+        // instant-ngp reads three rows alone.
+        t["frames"][1]["transform_matrix"].as_array_mut().unwrap().pop();
     };
     let (equal, wide) = (with_focal(21.5, 21.5), with_focal(30., 30.));
     for (change, expected) in [
