@@ -106,7 +106,7 @@ fn run_make_capture(source: &Path, out: &Path, options: &CaptureOptions) -> Resu
 #[derive(Args)]
 #[group(required = true, multiple = false)]
 pub struct SceneSource {
-    /// Capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
+    /// Capture: a folder with a cameras.json, a transforms.json, a COLMAP model or Polycam's keyframes, or CHUNK.torch#KEY
     #[arg(long, value_name = "PATH")]
     scene: Option<PathBuf>,
     /// Folder of photos, or a video, without camera poses: COLMAP finds them first, as in `globalsplat capture`, and the capture

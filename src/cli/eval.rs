@@ -46,7 +46,7 @@ pub struct Eval {
     /// Folder of images named like the photos; with --data a folder of such folders
     #[arg(long, value_name = "DIR", group = "subject")]
     renders: Option<PathBuf>,
-    /// Capture: a folder with a cameras.json, a transforms.json or a COLMAP model, or CHUNK.torch#KEY
+    /// Capture: a folder with a cameras.json, a transforms.json, a COLMAP model or Polycam's keyframes, or CHUNK.torch#KEY
     #[arg(long, value_name = "PATH", group = "photos")]
     scene: Option<PathBuf>,
     /// Folder of masks named like the photos, as in photo.jpg.png or photo.png: black pixels are not scored, nor seen by a model; by

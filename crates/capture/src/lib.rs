@@ -18,6 +18,7 @@ pub use formats::cameras_json::write_cameras_json;
 pub use formats::chunk::{CAMERA_NUMBERS, CHUNK_EXTENSION, CHUNK_INDEX_FILE, Chunk, camera_numbers};
 pub use formats::colmap::{ColmapModel, Point, read_colmap_models, read_points};
 pub use formats::folder_name;
+pub use formats::polycam::is_polycam;
 pub use formats::transforms_json::write_transforms_json;
 pub use geometry::{
     Camera, ImageSize, Intrinsics, LocalFrame, Normalization, Similarity, check_pose, normalize,

@@ -3,9 +3,11 @@
 use crate::capture::{Capture, Purpose};
 #[cfg(feature = "chunks")]
 use crate::formats::chunk;
-use crate::formats::{CaptureOpener, cameras_json, colmap, transforms_json};
+use crate::formats::{CaptureOpener, cameras_json, colmap, polycam, transforms_json};
 use crate::photos::natural_order;
 use globalsplat_files::{Error, Result};
+use std::fs::File;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// Function that looks for a capture of one format at a path: a folder, or the file that describes the capture.
@@ -18,12 +20,27 @@ const FORMATS: &[Format] = &[
     cameras_json::find,
     transforms_json::find,
     colmap::find,
+    polycam::find,
 ];
 
 /// Description of the supported formats for error messages.
 const SUPPORTED_FORMATS: &str = "a cameras.json, a transforms.json or a transforms_train.json in it, a COLMAP model (cameras and images, both \
-                     .bin or both .txt) in it or in its sparse, sparse/0, colmap/sparse/0, dense/sparse or dense/0/sparse, or a \
-                     CHUNK.torch#KEY";
+                     .bin or both .txt) in it or in its sparse, sparse/0, colmap/sparse/0, dense/sparse or dense/0/sparse, \
+                     Polycam's keyframes/cameras, or a CHUNK.torch#KEY";
+
+/// Number of bytes in which the text of [`OTHER_POSES`] is looked for.
+const OTHER_POSES_BYTES: u64 = 4096;
+
+/// Files of poses that aren't read, though the programs that write them may export the poses for COLMAP: extension, text near the beginning,
+/// program, and its export.
+const OTHER_POSES: [(&str, &str, &str, &str); 6] = [
+    ("xml", "<chunk", "Metashape", "its COLMAP export (File > Export > Export Cameras, Colmap)"),
+    ("csv", "name,x,y,alt", "RealityCapture", "its COLMAP export (Alignment > Export > Registration)"),
+    ("xmp", "xcr:", "RealityCapture", "its COLMAP export (Alignment > Export > Registration)"),
+    ("json", "\"projection_type\"", "OpenSfM", "its COLMAP export (opensfm export_colmap)"),
+    ("out", "# Bundle file", "Bundler", "the COLMAP export of the program that wrote it"),
+    ("nvm", "NVM_V3", "VisualSFM", "the COLMAP export of the program that wrote it"),
+];
 
 /// Returns `true` if a capture is at `path`, judging by file names alone.
 pub fn is_capture(path: &Path) -> bool {
@@ -39,7 +56,8 @@ pub fn is_capture(path: &Path) -> bool {
 ///    out;
 /// 4. a folder with a COLMAP model, binary or text, in `sparse/0`, `sparse`, `colmap/sparse/0`, `dense/0/sparse`, `dense/sparse` or
 ///    the folder itself, and the photos in `images` next to it, or in the folder itself. If there are several models, the one with
-///    the most photos.
+///    the most photos;
+/// 5. a folder with Polycam's raw data, `keyframes`, or this folder.
 ///
 /// If several formats match, the first that can be read is used. Missing photos are left out, and cameras are scaled to photos
 /// whose size differs from the declared one. [`Capture::warnings`] lists everything that is left out or changed.
@@ -81,13 +99,37 @@ pub(crate) fn open_for(path: &Path, purpose: Purpose) -> Result<Capture> {
     }
     match refusals.len() {
         0 if !path.exists() => Err(Error::request(format!("{}: no such capture", path.display()))),
-        0 => Err(Error::input(path, "the capture", "of no known format", SUPPORTED_FORMATS)),
+        0 => Err(unknown_format(path)),
         1 => Err(refusals.remove(0)),
         _ => {
             let reasons = refusals.iter().map(Error::to_string).collect::<Vec<_>>().join("; ");
             Err(Error::request(format!("{}: none of its formats can be read: {reasons}", path.display())))
         }
     }
+}
+
+/// Returns the error that no capture of a known format is at `path`. It names the poses of another program that are there, or one level below.
+fn unknown_format(path: &Path) -> Error {
+    let entries = |folder: &PathBuf| {
+        std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path())
+    };
+    let path = path.to_owned();
+    let top: Vec<PathBuf> = entries(&path).chain([path.clone()]).collect();
+    let mut files: Vec<PathBuf> = top.iter().flat_map(entries).chain(top.clone()).collect();
+    files.retain(|file| file.is_file());
+    files.sort_by(natural_order);
+    let poses = files.into_iter().find_map(|file| {
+        let extension = file.extension()?.to_ascii_lowercase();
+        let (_, text, program, export) = OTHER_POSES.into_iter().find(|(known, ..)| extension == *known)?;
+        let mut start = vec![];
+        File::open(&file).ok()?.take(OTHER_POSES_BYTES).read_to_end(&mut start).ok()?;
+        String::from_utf8_lossy(&start).contains(text).then_some((file, program, export))
+    });
+    let Some((file, program, export)) = poses else {
+        return Error::input(path, "the capture", "of no known format", SUPPORTED_FORMATS);
+    };
+    let found = format!("of no known format, and {} has poses of {program}", file.display());
+    Error::input(path, "the capture", found, format!("{export}, or photos alone for `globalsplat capture`"))
 }
 
 /// Maximum depth of folders that are searched for captures.

@@ -6,7 +6,7 @@ use crate::poses::Estimate;
 use crate::progress::{Progress, Reporter, Step};
 use crate::record::{CaptureReport, FILE, Matching, Record, VideoRecord};
 use crate::video::{remove_frames, write_sharpest_frames};
-use globalsplat_capture::COLMAP_MODELS;
+use globalsplat_capture::{COLMAP_MODELS, is_polycam};
 use globalsplat_files::{Error, FolderLock, Result};
 use std::fs::{self, DirEntry};
 use std::path::{Path, PathBuf};
@@ -125,6 +125,15 @@ fn make_or_continue(
 fn check_output(photos: &Path, out: &Path, is_video: bool, is_new: bool) -> Result<()> {
     // The frames of a video are written later.
     if !is_video {
+        if is_polycam(photos) {
+            let expected = "--scene with this folder, or a folder of photos alone";
+            return Err(Error::input(
+                photos,
+                "the folder of photos",
+                "raw data of Polycam, which have poses",
+                expected,
+            ));
+        }
         let photos_folder = photos.canonicalize().map_err(Error::read(photos))?;
         let absolute = std::path::absolute(out).map_err(Error::write(out))?;
         let existing = absolute.ancestors().find_map(|folder| folder.canonicalize().ok());

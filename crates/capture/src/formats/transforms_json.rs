@@ -409,13 +409,10 @@ impl<'a> Fields<'a> {
     fn c2w(&self) -> Result<(DMat4, f64)> {
         let name = self.name("transform_matrix");
         let value = self.frame.get("transform_matrix");
-        let list = |value: &'a Value, lengths: &[usize]| {
-            value.as_array().filter(|list| lengths.contains(&list.len()))
-        };
-        let rows = value.and_then(|rows| list(rows, &[3, 4]));
-        let Some(rows) =
-            rows.and_then(|rows| rows.iter().map(|row| list(row, &[4])).collect::<Option<Vec<_>>>())
-        else {
+        let four = |row: &'a Value| row.as_array().filter(|row| row.len() == 4);
+        let rows = value.and_then(Value::as_array).filter(|rows| matches!(rows.len(), 3 | 4));
+        let rows: Option<Vec<_>> = rows.and_then(|rows| rows.iter().map(four).collect());
+        let Some(rows) = rows else {
             let expected = "a 4×4 matrix, or its first three rows";
             return Err(Error::input(self.file, name, describe_value(value), expected));
         };

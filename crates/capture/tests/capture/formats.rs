@@ -2,7 +2,9 @@
 
 use crate::{assert_refused, assert_warns, open_transforms, photos_alone, write_photos};
 use glam::DMat3;
-use globalsplat_capture::{Camera, Holdout, Intrinsics, find_captures, open_capture, write_cameras_json};
+use globalsplat_capture::{
+    Camera, Holdout, Intrinsics, find_captures, open_capture, read_camera_path, write_cameras_json,
+};
 use globalsplat_test_kit::formats::{
     Format, assert_same_cameras, cameras, in_images, names, pinhole, rewrite, transforms,
     write_colmap_binary, write_colmap_text,
@@ -72,6 +74,99 @@ fn the_first_of_several_formats_is_chosen() {
     let known =
         ["of no known format", "cameras.json", "transforms_train.json", "sparse/0", "CHUNK.torch#KEY"];
     assert_refused(open_capture(path), &known);
+}
+
+#[test]
+fn poses_of_programs_that_export_them_for_colmap_are_named() {
+    for (name, contents, expected) in [
+        (
+            "a.xml",
+            "<?xml version=\"1.0\"?>\n<document version=\"2.0.0\">\n  <chunk label=\"1\">",
+            "Metashape, expected its COLMAP export",
+        ),
+        (
+            "p.csv",
+            "#cameras 5\n#name,x,y,alt,heading,pitch,roll,f\n",
+            "RealityCapture, expected its COLMAP export",
+        ),
+        (
+            "images/0.xmp",
+            "<x:xmpmeta><rdf:Description xcr:Version=\"3\"",
+            "RealityCapture, expected its COLMAP",
+        ),
+        (
+            "opensfm/reconstruction.json",
+            "[{\"cameras\": {\"v2\": {\"projection_type\": \"",
+            "OpenSfM, expected its COLMAP export",
+        ),
+        (
+            "bundle.out",
+            "# Bundle file v0.3\n5 0\n",
+            "Bundler, expected the COLMAP export of the program that wrote it",
+        ),
+        ("scene.nvm", "NVM_V3 \n\n5\n", "VisualSFM, expected the COLMAP export of the program that wrote it"),
+    ] {
+        let folder = photos_alone();
+        let file = folder.path().join(name);
+        std::fs::create_dir_all(file.parent().unwrap()).unwrap();
+        std::fs::write(&file, contents).unwrap();
+        let parts = [
+            "of no known format, and ",
+            &format!("{name} has poses of {expected}"),
+            "or photos alone for `globalsplat capture`",
+        ];
+        assert_refused(open_capture(folder.path()), &parts);
+        assert_refused(open_capture(&file), &[expected]);
+        std::fs::write(&file, "something else").unwrap();
+        assert_refused(open_capture(folder.path()), &["of no known format, expected a cameras.json"]);
+    }
+}
+
+/// Raw data of Polycam are read by the poses and images that it has corrected, if there are some.
+#[test]
+fn polycams_keyframes_are_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let keyframes = folder.path().join("keyframes");
+    let write = |kind: &str, change: &dyn Fn(&mut Value)| {
+        for (name, camera) in names().iter().zip(cameras()) {
+            let Intrinsics { fx, fy, cx, cy } = camera.intrinsics;
+            let mut entry = json!({ "fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": 24, "height": 16, "blur_score": 90. });
+            let c2w = transforms(&names(), &[camera])["frames"][0]["transform_matrix"].take();
+            (0..12).for_each(|i| entry[format!("t_{}{}", i / 4, i % 4)] = c2w[i / 4][i % 4].clone());
+            change(&mut entry);
+            let file = keyframes.join(format!("{kind}cameras")).join(name).with_extension("json");
+            std::fs::create_dir_all(file.parent().unwrap()).unwrap();
+            std::fs::write(file, entry.to_string()).unwrap();
+        }
+    };
+    write("", &|_| ());
+    ["images", "depth", "confidence"]
+        .iter()
+        .for_each(|photos| write_photos(&keyframes.join(photos), &names()));
+    for path in [folder.path(), &keyframes] {
+        let capture = open_capture(path).unwrap();
+        assert_same_cameras(&capture, &cameras());
+        assert!(capture.warnings().is_empty() && capture.load_all(None).unwrap()[4].name == "004.png");
+    }
+    write("", &|entry| entry["t_03"] = json!(9.));
+    write("corrected_", &|_| ());
+    write_photos(&keyframes.join("corrected_images"), &names()[1..]);
+    let capture = open_capture(folder.path()).unwrap();
+    assert_same_cameras(&capture, &cameras()[1..]);
+    assert_warns(&capture, &["corrected_cameras: 1 of 5 photos are missing and left out: 000"]);
+    for (key, value, expected) in [
+        ("t_12", json!(null), "t_12 is null or NaN, expected a number"),
+        ("t_11", json!(7.), "c2w of view 0 is a matrix that isn't rigid"),
+        ("fx", json!(-1.), "focal length fx of view 0 is -1"),
+        ("width", json!(0.5), "width is 0.5, expected a number of pixels"),
+    ] {
+        write("corrected_", &|entry| entry[key] = value.clone());
+        assert_refused(open_capture(folder.path()), &["corrected_cameras/001.json: ", expected]);
+    }
+    // Cameras don't need photos.
+    write("corrected_", &|_| ());
+    std::fs::remove_dir_all(keyframes.join("corrected_images")).unwrap();
+    assert_eq!(read_camera_path(folder.path(), None).unwrap().cameras.len(), 5);
 }
 
 #[test]

@@ -18,6 +18,8 @@ fn bad_requests_are_refused_in_one_sentence() {
     fs::write(at("full/thesis.tex"), "").unwrap();
     write_noise(&at("photos"));
     write_noise(&at("same"));
+    write_noise(&at("scan/keyframes/images"));
+    fs::create_dir(at("scan/keyframes/cameras")).unwrap();
     for index in 1..4 {
         fs::copy(at("same/0.png"), at(&format!("same/{index}.png"))).unwrap();
     }
@@ -46,6 +48,13 @@ fn bad_requests_are_refused_in_one_sentence() {
             "photos/out",
             None,
             "photos/out: the output is inside the folder of photos, expected a folder outside of photos",
+        ),
+        (
+            "scan",
+            "out",
+            None,
+            "scan: the folder of photos is raw data of Polycam, which have poses, expected --scene with this folder, or a folder of photos \
+             alone",
         ),
         ("photos", "out", Some("FISH"), "the camera model is FISH, expected one of SIMPLE_PINHOLE, "),
     ] {
