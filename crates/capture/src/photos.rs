@@ -125,6 +125,10 @@ fn file_at(path: PathBuf) -> Option<PathBuf> {
 /// Names of files that systems leave in folders, beside hidden ones.
 const SYSTEM_FILES: [&str; 2] = ["Thumbs.db", "desktop.ini"];
 
+/// File extensions of videos, in lower case.
+const VIDEO_EXTENSIONS: [&str; 10] =
+    ["mp4", "mov", "m4v", "mkv", "webm", "avi", "mts", "m2ts", "360", "insv"];
+
 /// The photos in a folder and its subfolders.
 #[derive(Debug)]
 pub struct PhotoList {
@@ -151,7 +155,14 @@ pub fn list_photos(folder: &Path) -> Result<PhotoList> {
     let (photos, others): (Vec<_>, Vec<_>) = files.into_par_iter().partition(|file| is_photo(file));
     if photos.is_empty() {
         let found = format!("without photos, of {} files", others.len());
-        return Err(Error::input(folder, "the folder", found, format!("photos, each {SUPPORTED_IMAGES}")));
+        let video = others.iter().find(|file| has_extension(file, &VIDEO_EXTENSIONS));
+        let video = video.map_or(String::new(), |file| format!(", or one video itself: {}", file.display()));
+        return Err(Error::input(
+            folder,
+            "the folder",
+            found,
+            format!("photos, each {SUPPORTED_IMAGES}{video}"),
+        ));
     }
     let name = |file: &PathBuf| file.strip_prefix(folder).unwrap_or(file).display().to_string();
     let others: Vec<String> = others.iter().map(name).collect();
@@ -179,11 +190,16 @@ fn collect_files(folder: &Path, files: &mut Vec<PathBuf>) -> Result<()> {
 }
 
 fn is_photo(file: &Path) -> bool {
-    let is_known =
-        |extension: &str| PHOTO_EXTENSIONS.iter().any(|known| known.eq_ignore_ascii_case(extension));
-    let extension = file.extension().map(|extension| extension.to_string_lossy());
     // Opening anything but a file, such as a pipe, may block.
-    extension.is_none_or(|extension| is_known(&extension)) && file.is_file() && read_image_size(file).is_ok()
+    (file.extension().is_none() || has_extension(file, &PHOTO_EXTENSIONS))
+        && file.is_file()
+        && read_image_size(file).is_ok()
+}
+
+/// Returns `true` if the extension of `file` is one of `known` in any case.
+fn has_extension(file: &Path, known: &[&str]) -> bool {
+    let extension = file.extension().unwrap_or_default();
+    known.iter().any(|known| extension.eq_ignore_ascii_case(known))
 }
 
 /// Compares names or paths folder by folder. Within a folder's name, runs of digits are compared by their numeric value, however
