@@ -36,8 +36,8 @@ pub struct Capture {
     /// nearby by GPS, and every pair among 64; or auto, which is sequential for videos and more than 200 photos
     #[arg(long, value_name = "PAIRS", default_value = "auto", value_parser = str::parse::<Matching>)]
     matching: Matching,
-    /// Folder of masks named like the photos, as in photo.jpg.png or photo.png: nothing is matched in black pixels; by default the
-    /// folder `masks` among the photos
+    /// Folder of masks named like the photos, as in photo.jpg.png, photo.png or photo_mask.png: nothing is matched in black pixels; by
+    /// default the folder `masks` among the photos
     #[arg(long, value_name = "DIR")]
     masks: Option<PathBuf>,
 }

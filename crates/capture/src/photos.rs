@@ -50,7 +50,8 @@ pub(crate) fn find_photos(bases: &[PathBuf], names: &[impl AsRef<str>]) -> Vec<O
 }
 
 /// Looks for the masks of the photos `names` in `folders`: files with the name of the photo, with the extension of an image added or
-/// in place of its own. Photos of the same name but for the extension share a mask. Returns one path, or `None`, for each photo.
+/// in place of its own, or in place of its own after `_mask`. Photos of the same name but for the extension share a mask. Returns one path,
+/// or `None`, for each photo.
 pub fn find_masks(folders: &[PathBuf], names: &[impl AsRef<str>]) -> Vec<Option<PathBuf>> {
     if !folders.iter().any(|folder| folder.is_dir()) {
         return vec![None; names.len()];
@@ -58,8 +59,9 @@ pub fn find_masks(folders: &[PathBuf], names: &[impl AsRef<str>]) -> Vec<Option<
     let names: Vec<String> = names.iter().map(|name| portable(name.as_ref())).collect();
     let stem = |name: &String| Path::new(name).with_extension("").to_string_lossy().into_owned();
     let stems: Vec<String> = names.iter().map(stem).collect();
-    let by_stem = find_photos(folders, &stems);
-    find_photos(folders, &names).into_iter().zip(by_stem).map(|(mask, by_stem)| mask.or(by_stem)).collect()
+    let with_word = stems.iter().map(|stem| format!("{stem}_mask")).collect();
+    let found = [names, stems, with_word].map(|names: Vec<String>| find_photos(folders, &names));
+    (0..found[0].len()).map(|photo| found.iter().find_map(|masks| masks[photo].clone())).collect()
 }
 
 /// Looks for masks like [`find_masks`] in a folder that has to have some.

@@ -36,11 +36,11 @@ fn masks_are_found_where_tools_put_them() {
     let nerfstudio = folder_of_photos(&names());
     save(levels(), &nerfstudio.path().join("masks/some.png"));
     let named = open_transforms(nerfstudio.path(), |t| t["frames"][1]["mask_path"] = json!("masks/some.png"));
-    // COLMAP adds an extension to the name of the photo, or the name has the same one.
+    // COLMAP adds an extension to the name of the photo, others replace its own, or add a word, too.
     let names = ["left/0.jpg", "left/1.png", "right/0.jpg", "right/1.png", "2.png"].map(String::from);
     let colmap = folder_of_photos(&names);
     write_colmap_text(&colmap.path().join("sparse/0"), &names, &cameras(), &pinhole(&cameras()[0]));
-    for mask in ["left/0.jpg.png", "left/1.png.png", "right/0.png", "right/1.png"] {
+    for mask in ["left/0.jpg.png", "left/1.png.png", "right/0.png", "right/1_mask.png"] {
         save(levels(), &colmap.path().join("masks").join(mask));
     }
     for (capture, expected) in [(named, [1].as_slice()), (open_capture(colmap.path()), &[1, 2, 3, 4])] {
