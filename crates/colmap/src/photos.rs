@@ -7,15 +7,20 @@ use globalsplat_capture::{
     is_equirectangular, list_photos, read_image_size,
 };
 use globalsplat_files::{Error, Result, checksum, parent_of, write_file};
+use image::imageops::thumbnail;
 use image::{Rgb, RgbImage};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::Mutex;
 
 /// Maximum difference between values of a photo that shows nothing, such as one taken with the lens cap on.
 const BLANK: u8 = 8;
+
+/// Number of pixels above which photos are reduced. COLMAP decodes a photo on each core, and reduces it further.
+pub(crate) const MAX_PIXELS: u64 = 128_000_000;
 
 /// A photo of the given folder, as it was found.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -49,6 +54,9 @@ pub(crate) struct Photo {
     pub focal: Option<f64>,
     /// `true` if the file's XMP data declare a panorama of 360°.
     pub is_equirectangular: bool,
+    /// `true` if the photo in the folder has more than [`MAX_PIXELS`].
+    #[serde(default)]
+    pub is_reduced: bool,
 }
 
 /// A photo that isn't used.
@@ -104,8 +112,8 @@ pub(crate) fn find_photo_masks(
 }
 
 /// Copies the photos of `record`, which are in `source`, into the folder `images` of the capture in `out`. On file systems that can share the
-/// contents of files, copies take no space. COLMAP reads pixels as they are stored: photos that EXIF says to rotate are written upright, and
-/// those that aren't JPEGs or PNGs are converted. Masks, which are files or the opacity of a converted photo, are written to the folder
+/// contents of files, copies take no space. COLMAP reads pixels as they are stored: photos that EXIF says to rotate are written upright,
+/// those that aren't JPEGs or PNGs are converted, and those of more than [`MAX_PIXELS`] are reduced. Masks, which are files or the opacity of a converted photo, are written to the folder
 /// [`MASKS_FOLDER`] beside `images`, each of the size of its photo. If some photos have masks, all others get a white one, without which
 /// COLMAP would leave them out. Returns the photos in the order in which they were found, and those that aren't used.
 ///
@@ -134,11 +142,13 @@ pub(crate) fn import_photos(
     }
     let is_in_place = is_same_path(source, images);
     let (mut names, mut unmasked) = (HashSet::new(), vec![]);
-    let mut done = skipped.len();
+    let (mut done, large) = (skipped.len(), Mutex::new(()));
     // Few photos at a time, for progress and memory.
     for few in distinct.chunks(2 * rayon::current_num_threads()) {
-        let inspected: Vec<_> =
-            few.par_iter().map(|(name, mask)| inspect(source, name, mask.as_deref(), &all_names)).collect();
+        let inspect = |(name, mask): &(&String, Option<PathBuf>)| {
+            inspect(source, name, mask.as_deref(), &all_names, MAX_PIXELS, &large)
+        };
+        let inspected: Vec<_> = few.par_iter().map(inspect).collect();
         let mut masks = vec![];
         for ((name, mask_file), inspected) in few.iter().zip(inspected) {
             let path = source.join(name);
@@ -151,7 +161,7 @@ pub(crate) fn import_photos(
             };
             photo.name = list_name(photo.name, &mut names);
             if is_in_place && (contents.is_some() || photo.name != **name) {
-                let found = "one that COLMAP can't read as it is, by its name, format or rotation";
+                let found = "one that COLMAP can't read as it is, by its name, format, rotation or size";
                 let expected = "an output whose images aren't the photos themselves";
                 return Err(Error::input(path, "the photo", found, expected));
             }
@@ -249,8 +259,16 @@ struct Inspected {
 }
 
 /// Decodes the photo `name` in `source` and its mask in the file `mask`; returns why it can't be used if it is damaged or shows nothing. Its
-/// name is changed to none of `all_names`.
-fn inspect(source: &Path, name: &str, mask: Option<&Path>, all_names: &[&str]) -> Result<Inspected, String> {
+/// name is changed to none of `all_names`. Its sides are divided by a whole number if it has more than `max_pixels`; only one such photo is
+/// decoded at a time, while `large` is locked.
+fn inspect(
+    source: &Path,
+    name: &str,
+    mask: Option<&Path>,
+    all_names: &[&str],
+    max_pixels: u64,
+    large: &Mutex<()>,
+) -> Result<Inspected, String> {
     let path = &source.join(name);
     let refuse = |why: Error| match why {
         Error::Input { found, .. } => found,
@@ -260,7 +278,18 @@ fn inspect(source: &Path, name: &str, mask: Option<&Path>, all_names: &[&str]) -
         true => "named in another encoding than UTF-8".to_string(),
         false => format!("unreadable ({why})"),
     })?;
-    let decoded = decode_upright(&encoded, path).map_err(refuse)?;
+    let (width, height) = read_image_size(path).map_err(refuse)?;
+    let area = f64::from(width) * f64::from(height);
+    let divisor = (area / max_pixels as f64).sqrt().ceil().max(1.) as u32;
+    let is_reduced = divisor > 1;
+    let _alone = is_reduced.then(|| large.lock());
+    let mut decoded = decode_upright(&encoded, path).map_err(refuse)?;
+    let upright = decoded.pixels.dimensions();
+    if is_reduced {
+        let (width, height) = (upright.0.div_ceil(divisor), upright.1.div_ceil(divisor));
+        decoded.pixels = thumbnail(&decoded.pixels, width, height);
+        decoded.alpha = decoded.alpha.map(|alpha| thumbnail(&alpha, width, height));
+    }
     let pixels = decoded.pixels;
     let (darkest, brightest) =
         pixels.iter().fold((u8::MAX, u8::MIN), |(low, high), &value| (low.min(value), high.max(value)));
@@ -271,11 +300,11 @@ fn inspect(source: &Path, name: &str, mask: Option<&Path>, all_names: &[&str]) -
     let extension = path.extension().unwrap_or_default().to_ascii_lowercase();
     let is_png = decoded.is_png && extension == "png";
     let is_jpeg = decoded.is_jpeg && (extension == "jpg" || extension == "jpeg");
-    let is_readable = (is_png || is_jpeg) && !decoded.is_turned;
+    let is_readable = (is_png || is_jpeg) && !decoded.is_turned && !is_reduced;
     let contents = (!is_readable).then(|| encode_photo(&pixels, !is_png)).transpose().map_err(refuse)?;
     let levels = match (mask, decoded.alpha) {
         // COLMAP compares a mask with its photo pixel by pixel.
-        (Some(file), _) => read_upright_mask(file, pixels.dimensions()).map(Some),
+        (Some(file), _) => read_upright_mask(file, upright, pixels.dimensions()).map(Some),
         (None, Some(alpha)) if !is_readable => Ok(Some(gray_to_rgb(&alpha))),
         (None, _) => Ok(None),
     };
@@ -290,22 +319,23 @@ fn inspect(source: &Path, name: &str, mask: Option<&Path>, all_names: &[&str]) -
         name,
         width: pixels.width(),
         height: pixels.height(),
-        focal: exif_focal(&encoded),
+        focal: exif_focal(&encoded).map(|focal| focal / f64::from(divisor)),
         is_equirectangular: is_equirectangular(&encoded),
+        is_reduced,
     };
     Ok(Inspected { photo, contents, mask })
 }
 
-/// Reads the mask `file` at `size` = (width, height), that of its upright photo. The mask has this size, or both sides by one factor.
-fn read_upright_mask(file: &Path, size: (u32, u32)) -> Result<RgbImage> {
+/// Reads the mask `file` at `size` = (width, height). The mask has the size of its `upright` photo, or both sides by one factor.
+fn read_upright_mask(file: &Path, upright: (u32, u32), size: (u32, u32)) -> Result<RgbImage> {
     let mask = decode_upright(&fs::read(file).map_err(Error::read(file))?, file)?.pixels;
     let found = mask.dimensions();
-    let [(w, h), (width, height)] = [found, size].map(|(w, h)| (f64::from(w), f64::from(h)));
+    let [(w, h), (width, height)] = [found, upright].map(|(w, h)| (f64::from(w), f64::from(h)));
     // Each side of the mask may be rounded.
     if (w * height - h * width).abs() <= (width + height) / 2. {
         return Ok(fit_mask(mask, size));
     }
-    let expected = format!("{}×{} pixels as its upright photo, or both by one factor", size.0, size.1);
+    let expected = format!("{}×{} pixels as its upright photo, or both by one factor", upright.0, upright.1);
     Err(Error::input(file, "the mask", format!("{}×{} pixels", found.0, found.1), expected))
 }
 
@@ -321,4 +351,27 @@ fn copy(source: &Path, target: &Path) -> Result<()> {
     // A file that an earlier call left may be a link, and copying would change what it links to.
     let _ = fs::remove_file(target);
     fs::copy(source, target).map(drop).map_err(Error::write(target))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn large_photos_are_reduced_with_their_masks() {
+        let folder = tempfile::tempdir().unwrap();
+        let [photo, mask] = ["a.png", "mask.png"].map(|name| folder.path().join(name));
+        RgbImage::from_fn(21, 12, |x, _| Rgb([if x < 9 { 0 } else { 200 }; 3])).save(&photo).unwrap();
+        RgbImage::from_pixel(42, 24, Rgb([255; 3])).save(&mask).unwrap();
+        for (max_pixels, size) in [(252, (21, 12)), (251, (11, 6)), (62, (7, 4))] {
+            let inspected = inspect(folder.path(), "a.png", Some(&mask), &[], max_pixels, &Mutex::new(()));
+            let Inspected { photo, contents, mask } = inspected.unwrap();
+            let is_reduced = size.0 < 21;
+            assert_eq!((photo.width, photo.height, photo.is_reduced), (size.0, size.1, is_reduced));
+            assert_eq!(contents.is_some(), is_reduced);
+            for encoded in contents.iter().chain(&mask.unwrap()) {
+                assert_eq!(image::load_from_memory(encoded).unwrap().into_rgb8().dimensions(), size);
+            }
+        }
+    }
 }

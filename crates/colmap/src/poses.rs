@@ -269,6 +269,7 @@ impl Estimate<'_, '_> {
         let largest = &models[0];
         let registered: BTreeSet<&String> = largest.photos.iter().collect();
         let unregistered = self.photos().iter().filter(|photo| !registered.contains(&photo.name));
+        let name = |photo: &Photo| photo.name.clone();
         let is_few = (largest.photos.len() as f64) < FEW_REGISTERED * self.photos().len() as f64;
         Ok(CaptureReport {
             video: None,
@@ -279,7 +280,8 @@ impl Estimate<'_, '_> {
             points: largest.points,
             other_files: None,
             skipped: self.record.skipped.clone(),
-            unregistered: unregistered.map(|photo| photo.name.clone()).collect(),
+            reduced: self.photos().iter().filter(|photo| photo.is_reduced).map(name).collect(),
+            unregistered: unregistered.map(name).collect(),
             advice: if is_few { vec![ADVICE.to_string()] } else { vec![] },
             models: models.iter().map(|model| model.photos.len()).collect(),
             seconds: self.record.seconds.clone(),
@@ -361,7 +363,7 @@ mod tests {
     fn fisheyes_start_without_distortion() {
         let photo = |focal| {
             let name = "a.jpg".to_string();
-            Photo { name, width: 400, height: 300, focal, is_equirectangular: false }
+            Photo { name, width: 400, height: 300, focal, is_equirectangular: false, is_reduced: false }
         };
         for (model, _) in COLMAP_MODELS {
             let parameters = fisheye_parameters(model, &photo(None));

@@ -1,6 +1,6 @@
 //! The file that records how far a capture has come, so that the same call continues it, and the settings and results in it.
 
-use crate::photos::{FoundMask, FoundPhoto, Photo, SkippedPhoto};
+use crate::photos::{FoundMask, FoundPhoto, MAX_PIXELS, Photo, SkippedPhoto};
 use crate::progress::Step;
 use crate::video::VideoFrames;
 use globalsplat_capture::format_names;
@@ -112,6 +112,9 @@ pub struct CaptureReport {
     pub other_files: Option<String>,
     /// Photos that are damaged, show nothing, or are identical to another.
     pub skipped: Vec<SkippedPhoto>,
+    /// Names of the photos whose size was reduced, as they have more than 128 megapixels.
+    #[serde(default)]
+    pub reduced: Vec<String>,
     /// Names of the other photos that aren't in the largest model.
     pub unregistered: Vec<String>,
     /// What to try if few photos were registered.
@@ -136,6 +139,14 @@ impl fmt::Display for CaptureReport {
             let skip = |photo: &SkippedPhoto| format!("{} ({})", photo.name, photo.reason);
             let skipped: Vec<String> = self.skipped.iter().map(skip).collect();
             write!(f, "\nnot used: {}", format_names(&skipped, SHOWN_NAMES))?;
+        }
+        if !self.reduced.is_empty() {
+            let most = MAX_PIXELS / 1_000_000;
+            write!(
+                f,
+                "\nreduced to {most} megapixels or less: {}",
+                format_names(&self.reduced, SHOWN_NAMES)
+            )?;
         }
         if !self.unregistered.is_empty() {
             write!(f, "\nnot registered: {}", format_names(&self.unregistered, SHOWN_NAMES))?;

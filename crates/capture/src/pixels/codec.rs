@@ -31,6 +31,11 @@ pub fn read_image(path: &Path) -> Result<RgbImage> {
     Ok(decode(&std::fs::read(path).map_err(Error::read(path))?, path, |_, _| false)?.pixels)
 }
 
+/// Largest number of pixels of a photo: more than the sensor of any phone or camera has.
+const MAX_PIXELS: u64 = 256_000_000;
+/// Bytes of a pixel: four colors of 16 bits.
+const MAX_PIXEL_BYTES: u64 = 8;
+
 /// Pixels of a decoded photo.
 #[derive(Debug)]
 pub struct DecodedPhoto {
@@ -85,12 +90,13 @@ fn decode(
     let format = reader.format();
     let mut decoder = reader.into_decoder().map_err(undecodable(file))?;
     // A file of a few bytes can claim any size.
-    let limits = Limits::default();
-    limits.check_dimensions(decoder.dimensions().0, decoder.dimensions().1).map_err(undecodable(file))?;
-    if decoder.total_bytes() > limits.max_alloc.unwrap_or(u64::MAX) {
-        let (width, height) = decoder.dimensions();
-        return Err(Error::input(file, "the image", format!("{width}×{height} pixels"), "a photo's size"));
+    let (width, height) = decoder.dimensions();
+    if u64::from(width) * u64::from(height) > MAX_PIXELS {
+        let found = format!("{width}×{height} pixels, more than {} megapixels", MAX_PIXELS / 1_000_000);
+        return Err(Error::input(file, "the image", found, "a smaller one"));
     }
+    let mut limits = Limits::no_limits();
+    limits.max_alloc = Some(MAX_PIXELS * MAX_PIXEL_BYTES);
     if matches!(decoder.color_type(), ColorType::Rgb32F | ColorType::Rgba32F) {
         // The range of floating-point pixels isn't standardized.
         let found = "with floating-point pixels";

@@ -1,7 +1,7 @@
 //! HEIC and AVIF: files of boxes (ISO/IEC 14496-12, 23008-12). The size is read from them; libheif's program decodes the pixels.
 
 use globalsplat_files::{Error, Result, is_program_missing};
-use image::{DynamicImage, RgbImage};
+use image::{DynamicImage, ImageReader, RgbImage};
 use std::path::Path;
 use std::process::{Command, Stdio};
 
@@ -54,7 +54,11 @@ pub(super) fn decode_heif(encoded: &[u8], file: &Path) -> Result<RgbImage> {
             false => format!("libheif can't be started: {e}"),
         })
     })?;
-    let image = image::open(&png).ok().filter(|_| output.status.success());
+    let decode = |mut reader: ImageReader<_>| {
+        reader.no_limits();
+        reader.decode().ok()
+    };
+    let image = ImageReader::open(&png).ok().filter(|_| output.status.success()).and_then(decode);
     image.map(DynamicImage::into_rgb8).ok_or_else(|| {
         let message = String::from_utf8_lossy(&output.stderr);
         let message = message.lines().map(str::trim).collect::<Vec<_>>().join("; ");

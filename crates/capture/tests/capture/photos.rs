@@ -241,6 +241,22 @@ fn floating_point_pixels_are_refused() {
     assert_refused(decode_photo(&tiff, "deep.tif".as_ref(), (9, 9)), &[found]);
 }
 
+#[test]
+fn photos_have_256_megapixels_at_most() {
+    let mut bmp = encode(&noise(9, 9).into(), ImageFormat::Bmp);
+    // 200 megapixels, as of phones, whose data are missing; and a number that no sensor has.
+    for (width, height, expected) in [
+        (16_320u32, 12_240u32, "undecodable ("),
+        (16_000, 16_001, "16000×16001 pixels, more than 256 megapixels, "),
+    ] {
+        bmp[18..26].copy_from_slice(&[width.to_le_bytes(), height.to_le_bytes()].concat());
+        assert_refused(
+            decode_photo(&bmp, "large.bmp".as_ref(), (width, height)),
+            &[&format!("large.bmp: the image is {expected}")],
+        );
+    }
+}
+
 #[track_caller]
 fn assert_red_and_blue(image: &RgbImage, red: (u32, u32), blue: (u32, u32)) {
     for ((x, y), expected) in [(red, [220, 30, 20]), (blue, [20, 40, 230])] {
