@@ -121,9 +121,10 @@ impl SceneSource {
         self.photos.is_some()
     }
 
-    /// Returns the path of the capture. If it has to be made, it is made beside the output `out`, with the masks in the folder `masks`.
-    pub fn path(&self, masks: Option<&Path>, out: &Path) -> Result<PathBuf> {
-        let Some(photos) = &self.photos else { return Ok(self.scene.clone().unwrap_or_default()) };
+    /// Returns the path of the capture, and the folder of masks to open it with. If it has to be made, it is made beside the output `out` with
+    /// the masks in the folder `masks`, which it then has itself.
+    pub fn path<'a>(&self, masks: Option<&'a Path>, out: &Path) -> Result<(PathBuf, Option<&'a Path>)> {
+        let Some(photos) = &self.photos else { return Ok((self.scene.clone().unwrap_or_default(), masks)) };
         let name = out.file_name().unwrap_or_default().to_string_lossy();
         let stem = name.rsplit_once('.').map_or(&*name, |(stem, _)| stem);
         let capture = out.with_file_name(format!("{}_capture", stem.trim_end_matches(".compressed")));
@@ -132,6 +133,6 @@ impl SceneSource {
         let options = CaptureOptions { keeps_finished: true, masks, ..CaptureOptions::default() };
         let report = run_make_capture(photos, &capture, &options)?;
         eprintln!("{}: {report}", capture.display());
-        Ok(capture)
+        Ok((capture, None))
     }
 }

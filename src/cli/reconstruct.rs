@@ -97,9 +97,9 @@ impl Reconstruct {
         signals::handle_stop_requests()?;
         signals::end_at_request(1);
         let path = || self.scene.path(self.masks.as_deref(), &self.out);
-        let scene = if self.scene.is_unposed() { stopwatch.time("poses", path)? } else { path()? };
+        let (scene, masks) = if self.scene.is_unposed() { stopwatch.time("poses", path)? } else { path()? };
         let loaded = stopwatch.time("weights", || model::load(self.weights.as_deref(), asked, device))?;
-        let capture = stopwatch.time("photos", || open_masked_capture(&scene, self.masks.as_deref()))?;
+        let capture = stopwatch.time("photos", || open_masked_capture(&scene, masks))?;
         let mut inputs = InputFiles::default();
         capture.add_input_files(&mut inputs);
         self.weights.iter().for_each(|path| inputs.add(path));

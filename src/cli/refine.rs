@@ -114,11 +114,11 @@ impl Refine {
         self.reports.log.iter().try_for_each(|log| check_writable_dir(log))?;
         signals::handle_stop_requests()?;
         signals::end_at_request(1);
-        let path = self.scene.path(self.masks.as_deref(), &self.out)?;
+        let (path, masks) = self.scene.path(self.masks.as_deref(), &self.out)?;
         // The time budget begins after the poses of photos are found.
         let clock = started.filter(|_| !self.scene.is_unposed()).unwrap_or_else(Instant::now);
         self.options.started = Some(clock);
-        let capture = open_masked_capture(&path, self.masks.as_deref())?;
+        let capture = open_masked_capture(&path, masks)?;
         self.check_outputs(&capture)?;
         let (mut splat, mut loaded, mut state) = (None, None, None);
         let init = match &self.splat {

@@ -1,9 +1,9 @@
 //! Refinement of splats on photos improves held-out views, is bit-identical with any number of threads, and reports impossible
 //! requests in one sentence.
 
-use crate::common::formats::{Format, rewrite, write_points};
-use crate::common::program::{Sandbox, WAIT_PASSIVELY, arg, assert_says, number};
-use crate::common::{captures, fox};
+use crate::common::formats::{Format, rewrite, write_colmap_binary, write_points};
+use crate::common::program::{Sandbox, WAIT_PASSIVELY, arg, assert_says, number, run_process};
+use crate::common::{captures, fox, write_script};
 use glam::{DVec3, DVec4};
 use globalsplat::data::{
     Capture, Holdout, PhotoSize, load_all_views, open_capture, read_points, write_cameras_json,
@@ -121,6 +121,46 @@ fn masks_in_a_folder_are_left_out() {
     let ignored = bytes(refine);
     for color in ["black", "white", "random"] {
         assert!(bytes(&format!("{refine} --mask-background {color}")) != ignored, "{color}");
+    }
+}
+
+/// Photos may have other names in the capture that is made of them, which has their masks.
+#[test]
+fn masks_of_photos_without_poses_are_those_of_their_capture() {
+    let sandbox = Sandbox::new();
+    let names = sandbox.names("room/images");
+    for folder in ["photos", "masks"] {
+        std::fs::create_dir(sandbox.path(folder)).unwrap();
+    }
+    for name in &names {
+        let [photo, mask] = ["photos", "masks"].map(|folder| sandbox.path(folder).join(format!("a {name}")));
+        std::fs::copy(sandbox.path("room/images").join(name), photo).unwrap();
+        image::GrayImage::from_fn(40, 40, |x, _| image::Luma([if x < 20 { 0 } else { 255 }]))
+            .save(mask)
+            .unwrap();
+    }
+    // A COLMAP that knows the poses.
+    let model = sandbox.path("model");
+    let renamed: Vec<String> = names.iter().map(|name| format!("a_{name}")).collect();
+    write_colmap_binary(&model, &renamed, &open_capture(&sandbox.path("room")).unwrap().cameras());
+    write_points(&model, Format::ColmapBinary, &[0., 0., 1.]);
+    let mapper = format!(
+        "for word; do [ \"$last\" = --output_path ] && cp -r '{}' \"$word/0\"; last=$word; done",
+        arg(&model)
+    );
+    let colmap = sandbox.path("colmap");
+    write_script(&colmap, &format!("case $1 in help) echo COLMAP 3.9;; mapper) {mapper};; esac; exit 0"));
+    for command in ["refine --steps 3 --gaussians 200", "reconstruct --views 2"] {
+        let splat = |source: &str| {
+            let mut command = sandbox.command(&format!("{command} {source} --out @a.ply"));
+            run_process(command.env("GLOBALSPLAT_COLMAP", &colmap));
+            sandbox.read("a.ply")
+        };
+        let masked = splat("--photos @photos --masks @masks");
+        assert!(masked == splat("--scene @a_capture --masks @a_capture/masks"), "{command}");
+        std::fs::rename(sandbox.path("a_capture/masks"), sandbox.path("hidden")).unwrap();
+        assert!(masked != splat("--scene @a_capture"), "{command}");
+        std::fs::rename(sandbox.path("hidden"), sandbox.path("a_capture/masks")).unwrap();
     }
 }
 

@@ -270,6 +270,7 @@ impl Estimate<'_, '_> {
         let registered: BTreeSet<&String> = largest.photos.iter().collect();
         let unregistered = self.photos().iter().filter(|photo| !registered.contains(&photo.name));
         let name = |photo: &Photo| photo.name.clone();
+        let (found, masks) = (self.record.found.iter().map(|photo| &photo.name), &self.record.masks);
         let is_few = (largest.photos.len() as f64) < FEW_REGISTERED * self.photos().len() as f64;
         Ok(CaptureReport {
             video: None,
@@ -281,6 +282,7 @@ impl Estimate<'_, '_> {
             other_files: None,
             skipped: self.record.skipped.clone(),
             reduced: self.photos().iter().filter(|photo| photo.is_reduced).map(name).collect(),
+            unmasked: found.filter(|name| !masks.is_empty() && !masks.contains_key(*name)).cloned().collect(),
             unregistered: unregistered.map(name).collect(),
             advice: if is_few { vec![ADVICE.to_string()] } else { vec![] },
             models: models.iter().map(|model| model.photos.len()).collect(),

@@ -115,6 +115,9 @@ pub struct CaptureReport {
     /// Names of the photos whose size was reduced, as they have more than 128 megapixels.
     #[serde(default)]
     pub reduced: Vec<String>,
+    /// Names of the photos without a mask, if others have one.
+    #[serde(default)]
+    pub unmasked: Vec<String>,
     /// Names of the other photos that aren't in the largest model.
     pub unregistered: Vec<String>,
     /// What to try if few photos were registered.
@@ -140,16 +143,15 @@ impl fmt::Display for CaptureReport {
             let skipped: Vec<String> = self.skipped.iter().map(skip).collect();
             write!(f, "\nnot used: {}", format_names(&skipped, SHOWN_NAMES))?;
         }
-        if !self.reduced.is_empty() {
-            let most = MAX_PIXELS / 1_000_000;
-            write!(
-                f,
-                "\nreduced to {most} megapixels or less: {}",
-                format_names(&self.reduced, SHOWN_NAMES)
-            )?;
-        }
-        if !self.unregistered.is_empty() {
-            write!(f, "\nnot registered: {}", format_names(&self.unregistered, SHOWN_NAMES))?;
+        let reduced = format!("reduced to {} megapixels or less", MAX_PIXELS / 1_000_000);
+        for (what, names) in [
+            (&*reduced, &self.reduced),
+            ("without a mask, so that they count whole", &self.unmasked),
+            ("not registered", &self.unregistered),
+        ] {
+            if !names.is_empty() {
+                write!(f, "\n{what}: {}", format_names(names, SHOWN_NAMES))?;
+            }
         }
         self.advice.iter().try_for_each(|sentence| write!(f, "\n{sentence}"))
     }
