@@ -181,8 +181,8 @@ fn frames_of_video(
         Some(Some(old)) if old.is_finished() && record.matches(old, options.keeps_finished) => {
             return Ok(old.clone());
         }
-        // The record names the folder's frames as ours.
-        Some(Some(old)) if !old.is_finished() && record.matches(old, true) => remove_frames(&images)?,
+        // The record names the folder's frames as ours. They may be those of a video that was refused.
+        Some(Some(old)) if !old.is_finished() => remove_frames(&images)?,
         Some(other) => {
             let found = other.as_ref().map_or("none".to_string(), VideoRecord::to_string);
             let expected = format!("{record}, or a folder without a capture");

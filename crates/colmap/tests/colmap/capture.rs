@@ -99,10 +99,11 @@ fn frames_of_a_video_are_chosen_once_and_their_poses_estimated() {
     let (error, has_measured) = run(6);
     assert!(is_estimated(&error) && !has_measured, "{error}");
     assert!(run(5).0.contains("the video is 6 frames of walk.mp4"));
-    // A call that was killed while it moved the frames: its record names none.
+    // A call for another video that was killed while it moved the frames: its record names none.
     let record = out.join("capture.json");
     let mut unfinished: Value = serde_json::from_slice(&fs::read(&record).unwrap()).unwrap();
     (unfinished["video"]["indices"], unfinished["found"]) = (json!([]), json!([]));
+    unfinished["video"]["name"] = json!("refused.mp4");
     fs::write(&record, unfinished.to_string()).unwrap();
     fs::remove_file(out.join("images/frame_00006.jpg")).unwrap();
     let (error, has_measured) = run(5);
