@@ -24,7 +24,7 @@ use tch::Device;
 pub type Reader = fn(&[u8]);
 
 /// Readers, by the names that `scripts/fuzz.sh` takes and of the folders of their seeds.
-pub const READERS: [(&str, Reader); 26] = [
+pub const READERS: [(&str, Reader); 27] = [
     ("antimatter", antimatter),
     // A camera path of nerfstudio's viewer.
     ("camera_path", |bytes| {
@@ -53,6 +53,10 @@ pub const READERS: [(&str, Reader); 26] = [
         let _ = decode_photo(bytes, Path::new("photo.jpg"), (8, 8));
     }),
     ("ply", |bytes| read_and_repair(&file("ply", "splat.ply", bytes))),
+    ("polycam", |bytes| {
+        file("polycam", "keyframes/cameras/000.json", bytes);
+        let _ = read_camera_path(&folder("polycam"), None);
+    }),
     ("sog", |bytes| read_and_repair(&file("sog", "splat.sog", bytes))),
     ("splat_origin", splat_origin),
     ("spz", |bytes| read_and_repair(&file("spz", "splat.spz", bytes))),
