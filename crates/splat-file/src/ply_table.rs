@@ -36,7 +36,15 @@ pub struct Element {
 
 impl Element {
     pub fn property(&self, name: &str) -> Option<&Property> {
-        self.properties.iter().find(|property| property.name == name)
+        self.index_of(name).map(|index| &self.properties[index])
+    }
+
+    /// Returns the index of the property `name`. If there is none, that of the property with the prefix of CloudCompare's PLYs, `scalar_`,
+    /// of 3dgsconverter's, `scal_`, or of both.
+    fn index_of(&self, name: &str) -> Option<usize> {
+        let names = || self.properties.iter().map(|property| &*property.name);
+        let own = |full: &str| full.trim_start_matches("scalar_").trim_start_matches("scal_") == name;
+        names().position(|full| full == name).or_else(|| names().position(own))
     }
 }
 
@@ -48,9 +56,6 @@ pub struct Header {
     /// `true` if a comment says that the splat is antialiased.
     pub antialiased: bool,
 }
-
-/// Comment of an antialiased splat, after the keyword, as Brush, gsplat and nerfstudio write it.
-const ANTIALIASED: [&str; 2] = ["SplatRenderMode:", "mip"];
 
 impl Header {
     /// Returns `true` if `bytes` begin like a PLY.
@@ -101,10 +106,14 @@ impl Header {
                     let kind = parse_kind(path, kind, name)?;
                     element.properties.push(Property { name: name.to_string(), kind });
                 }
-                // Postshot writes `antialiased 1`.
-                ["comment", comment @ ..] => {
-                    antialiased |= comment == ANTIALIASED || comment == ["antialiased", "1"];
-                }
+                // The first form is that of Brush, gsplat and nerfstudio, the second one Postshot's. The last comment counts.
+                ["comment", comment @ ..] => match comment.concat().to_ascii_lowercase().as_str() {
+                    "splatrendermode:mip" | "antialiased1" => antialiased = true,
+                    "splatrendermode:default" | "splatrendermode:2dgs" | "antialiased0" => {
+                        antialiased = false
+                    }
+                    _ => {}
+                },
                 _ => {}
             }
         }
@@ -113,8 +122,7 @@ impl Header {
 
     /// Returns the lines at the beginning of a written header, up to the first element.
     pub fn first_lines(antialiased: bool) -> String {
-        let comment =
-            if antialiased { format!("comment {}\n", ANTIALIASED.join(" ")) } else { String::new() };
+        let comment = if antialiased { "comment SplatRenderMode: mip\n" } else { "" };
         format!("ply\nformat binary_little_endian 1.0\n{comment}")
     }
 
@@ -123,7 +131,7 @@ impl Header {
     }
 
     /// Returns the numbers of the properties `names` of an element, row by row, each converted by `convert`. They must be of type `scalar`, if
-    /// it is given. Other elements and properties are skipped. `bytes` are the contents of the file at `path`.
+    /// it is given. Other elements and properties are skipped. `bytes` are the contents of the file at `path`, which end with the elements.
     pub fn columns<T>(
         &self,
         path: &Path,
@@ -134,19 +142,18 @@ impl Header {
         convert: impl Fn(f64) -> T,
     ) -> Result<Vec<T>> {
         let mut body = Body { path, rest: &bytes[self.length..], encoding: self.encoding };
-        for before in self.elements.iter().take_while(|before| before.name != element) {
-            body.read_rows(before, |_, _| ())?;
-        }
-        let Some(element) = self.element(element) else {
+        let Some(index) = self.elements.iter().position(|own| own.name == element) else {
             return Err(Error::input(path, format!("the element {element}"), "missing", "the Gaussians"));
         };
+        let element = &self.elements[index];
+        self.elements[..index].iter().try_for_each(|before| body.skip_rows(before))?;
         // Index in `names` of each property of the element.
         let mut places: Vec<Option<usize>> = vec![None; element.properties.len()];
         for (place, name) in names.iter().enumerate() {
             let refuse = |found: &str, expected: &str| {
                 Err(Error::input(path, format!("property {name}"), found, expected))
             };
-            let at = element.properties.iter().position(|property| property.name == *name);
+            let at = element.index_of(name);
             match at.map(|at| element.properties[at].kind) {
                 None => return refuse("missing", "one of a 3D Gaussian splat's properties"),
                 Some(Kind::List(..)) => return refuse("a list", "numbers"),
@@ -170,6 +177,12 @@ impl Header {
                 values.extend(row.iter().map(|&number| convert(number)));
             }
         })?;
+        self.elements[index + 1..].iter().try_for_each(|after| body.skip_rows(after))?;
+        if !body.rest.trim_ascii_start().is_empty() {
+            let size = bytes.len() - body.rest.len();
+            let expected = format!("{size}, where the header's elements end");
+            return Err(Error::input(path, "the size", format!("{} bytes", bytes.len()), expected));
+        }
         Ok(values)
     }
 }
@@ -231,6 +244,20 @@ impl Body<'_> {
                 }
                 visit(index, number);
             }
+        }
+        Ok(())
+    }
+
+    /// Skips the rows of an element: at once if their size is fixed and the bytes are there.
+    fn skip_rows(&mut self, element: &Element) -> Result<()> {
+        let size_of = |property: &Property| match property.kind {
+            Kind::Number(scalar) if self.encoding != Encoding::Ascii => Some(scalar.size()),
+            _ => None,
+        };
+        let width: Option<usize> = element.properties.iter().map(size_of).sum();
+        match width.and_then(|width| self.rest.get(width.checked_mul(element.count)?..)) {
+            Some(rest) => self.rest = rest,
+            None => self.read_rows(element, |_, _| ())?,
         }
         Ok(())
     }

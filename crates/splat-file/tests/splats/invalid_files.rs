@@ -46,6 +46,17 @@ fn bad_plys() {
     ];
     assert_headers_are_refused("ply", &cases);
     assert_bytes_refused("ply", b"hello", &["the file is no PLY"]);
+    for ending in ["ply", "compressed.ply"] {
+        let mut bytes = bytes_of(ending, &random_splat(300, 1, 9));
+        let size = bytes.len();
+        bytes.extend(b"\r\n");
+        assert_eq!(read_bytes(ending, &bytes).unwrap().len(), 300);
+        // As many rows again, or bytes of a row that the header leaves out.
+        bytes.extend_from_within(size - 600..size);
+        let message =
+            format!("the size is {} bytes, expected {size}, where the header's elements end", size + 602);
+        assert_bytes_refused(ending, &bytes, &[&message]);
+    }
     for (length, message) in [
         (-1., "i in row 0 of face is a list of the length -1, expected numbers"),
         (f64::NAN, "i in row 0 of face is a list of the length NaN"),
@@ -61,14 +72,17 @@ fn bad_plys() {
 
 #[test]
 fn bad_compressed_plys() {
+    // Other elements have the bytes of the rows that are missing.
+    let one_chunk = "element other 72\nproperty uchar a\nelement chunk 1";
+    let fewer_rows = "element other 9\nproperty uchar a\nelement sh 299";
     let cases = [
         ("element chunk", "element chunks", "the element chunk is missing"),
-        ("element chunk 2", "element chunk 1", "the number of chunks is 1, expected 2 for 300"),
+        ("element chunk 2", one_chunk, "the number of chunks is 1, expected 2 for 300"),
         ("vertex 300", "vertex 4000000000", "of vertex is cut short, expected numbers in 4000000000 rows"),
         ("float max_b", "float most_b", "property max_b is missing"),
         ("uint packed_scale", "int packed_scale", "property packed_scale is of another type, expected uint"),
         ("uchar f_rest_3", "char f_rest_3", "property f_rest_3 is of another type, expected uchar"),
-        ("element sh 300", "element sh 299", "rows of the element sh is 299, expected 300"),
+        ("element sh 300", fewer_rows, "rows of the element sh is 299, expected 300"),
         ("uchar f_rest_8", "uchar f_rest_x", "f_rest_* is 8 properties"),
     ];
     assert_headers_are_refused("compressed.ply", &cases);

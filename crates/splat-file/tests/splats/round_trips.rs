@@ -60,6 +60,10 @@ fn antialiased_splats_are_marked() {
         ("antialiased 1", true),
         ("SplatRenderMode: default", false),
         ("antialiased 0", false),
+        ("splatrendermode: Mip", true),
+        // The last one counts.
+        ("SplatRenderMode: mip\ncomment antialiased 0", false),
+        ("SplatRenderMode: default\ncomment Antialiased 1\ncomment antialiased by a filter", true),
     ] {
         let bytes = [first, format!("comment {comment}\n").as_bytes(), rest].concat();
         assert_eq!(read_bytes("ply", &bytes).unwrap().antialiased, antialiased, "{comment}");

@@ -54,6 +54,22 @@ fn a_ply_is_read_however_it_is_written() {
     }
 }
 
+/// CloudCompare saves properties with a prefix, and 3dgsconverter puts another one before it.
+#[test]
+fn properties_of_cloudcompare_are_read() {
+    let plain = bytes_of("ply", &random_splat(3, 1, 5));
+    let (header, body) = plain.split_at(body_of_ply(&plain));
+    let header = String::from_utf8_lossy(header);
+    for prefix in ["scalar_", "scal_", "scalar_scal_"] {
+        let mut header = header.to_string();
+        for name in ["f_dc_", "f_rest_", "opacity", "scale_", "rot_"] {
+            header = header.replace(&format!("float {name}"), &format!("float {prefix}{name}"));
+        }
+        let read = read_bytes("ply", &[header.as_bytes(), body].concat()).unwrap();
+        assert_eq!(read, read_bytes("ply", &plain).unwrap(), "{prefix}");
+    }
+}
+
 /// Opacities of exactly 1 and 0 have infinite logits, and scales of 0 an infinite logarithm, in files of programs that store bytes. They
 /// are kept in memory, and written as finite numbers.
 #[test]
