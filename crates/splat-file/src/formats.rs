@@ -41,9 +41,6 @@ pub struct SplatFormat {
     pub round_sh: Option<fn(&Splat) -> Splat>,
 }
 
-/// Name of the file that describes an unbundled SOG.
-const SOG_META: &str = "meta.json";
-
 /// mkkellogg's format, which is only read. The other formats state what differs from it.
 const KSPLAT: SplatFormat = SplatFormat {
     ending: ".ksplat",
@@ -51,7 +48,7 @@ const KSPLAT: SplatFormat = SplatFormat {
     marks_antialiased: false,
     read: ksplat::read,
     find_invalid: InvalidGaussians::find,
-    write: |path, _, _| Err(only_read(path)),
+    write: |path, _, _| Err(only_read(path, &KSPLAT)),
     limits: || ShLimits::up_to(3),
     round_sh: None,
 };
@@ -68,7 +65,7 @@ const SOG: SplatFormat = SplatFormat {
 };
 
 /// All formats. The first one whose suffix matches, or that recognizes a file, is used.
-static FORMATS: [SplatFormat; 9] = [
+static FORMATS: [SplatFormat; 10] = [
     SplatFormat {
         ending: ".compressed.ply",
         recognizes: compressed_ply::recognizes,
@@ -89,7 +86,7 @@ static FORMATS: [SplatFormat; 9] = [
     },
     SOG,
     SplatFormat {
-        ending: SOG_META,
+        ending: sog::META,
         recognizes: |_| false,
         read: sog::read_folder,
         write: sog::write_folder,
@@ -120,19 +117,22 @@ static FORMATS: [SplatFormat; 9] = [
     },
     SplatFormat { ending: ".gltf", read: gltf::read, write: gltf::write_gltf, ..KSPLAT },
     KSPLAT,
+    SplatFormat { ending: ".zip", ..SOG },
 ];
+/// Extensions of the formats that are only read.
+const ONLY_READ: [&str; 2] = [".ksplat", ".zip"];
 
 /// Extensions of the formats that are written, for messages.
 const WRITTEN_ENDINGS: &str = ".ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf or meta.json";
 /// Extensions of all formats, for messages.
-const ENDINGS: &str = ".ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf, .ksplat or meta.json";
+const ENDINGS: &str = ".ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf, .ksplat, meta.json or .zip";
 
 impl SplatFormat {
     /// Returns the paths of the other files that the splat at `path` is written to.
     fn other_files(&self, path: &Path) -> Vec<PathBuf> {
         match self.ending {
             ".gltf" => vec![gltf::buffer_file(path)],
-            SOG_META => sog::IMAGES.map(|name| path.with_file_name(name)).to_vec(),
+            sog::META => sog::IMAGES.map(|name| path.with_file_name(name)).to_vec(),
             _ => vec![],
         }
     }
@@ -155,13 +155,13 @@ fn format_of(path: &Path) -> Result<&'static SplatFormat> {
 /// Returns an error for an unknown extension, or a format that is only read.
 pub fn output_format(path: &Path) -> Result<&'static SplatFormat> {
     match format_of(path)? {
-        format if format.ending == KSPLAT.ending => Err(only_read(path)),
+        format if ONLY_READ.contains(&format.ending) => Err(only_read(path, format)),
         format => Ok(format),
     }
 }
 
-fn only_read(path: &Path) -> Error {
-    Error::input(path, "the format", format!("{}, which is only read", KSPLAT.ending), WRITTEN_ENDINGS)
+fn only_read(path: &Path, format: &SplatFormat) -> Error {
+    Error::input(path, "the format", format!("{}, which is only read", format.ending), WRITTEN_ENDINGS)
 }
 
 /// Returns `true` if `path` has the extension of a splat format.

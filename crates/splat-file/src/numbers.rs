@@ -1,12 +1,33 @@
-//! Little-endian numbers in the bytes of a file, and how many of them it may hold.
+//! Little-endian numbers in the bytes of a file, and how many Gaussians it may hold.
 
-/// Maximum ratio of the size in memory to that of the file, with `MAX_SMALL` bytes allowed in addition. Real splats reach a ratio of ten.
-pub(crate) const MAX_RATIO: usize = 256;
-const MAX_SMALL: usize = 1 << 20;
+use crate::{Error, Result};
+use std::path::Path;
 
-/// Returns `true` if a file of `file_length` bytes may hold what takes `size` bytes in memory. It is checked before memory is allocated.
-pub(crate) fn may_hold(file_length: usize, size: u128) -> bool {
-    size <= MAX_SMALL as u128 + MAX_RATIO as u128 * file_length as u128
+/// Maximum ratio of the Gaussians' size in memory to that of the file, with `MAX_SMALL` bytes allowed in addition. Real splats reach 20.
+const MAX_RATIO: u128 = 256;
+const MAX_SMALL: u128 = 1 << 24;
+
+/// Gaussians that a compressed file claims to hold.
+#[derive(Default)]
+pub(crate) struct ClaimedGaussians {
+    count: u128,
+    /// Size in memory in bytes.
+    memory: u128,
+}
+
+impl ClaimedGaussians {
+    /// Adds `count` Gaussians, and checks that files of `size` bytes may hold all of them. Call it before memory is allocated.
+    pub fn add(&mut self, path: &Path, count: usize, sh_degree: usize, size: usize) -> Result<()> {
+        let numbers = 3 + 3 + 4 + 1 + 3 * (sh_degree + 1).pow(2);
+        self.count += count as u128;
+        self.memory += count as u128 * (numbers * size_of::<f32>()) as u128;
+        if self.memory <= MAX_SMALL + MAX_RATIO * size as u128 {
+            return Ok(());
+        }
+        let found = format!("{}, which take {} bytes of memory", self.count, self.memory);
+        let expected = format!("{MAX_RATIO} times the file's {size} bytes at most");
+        Err(Error::input(path, "the number of Gaussians", found, expected))
+    }
 }
 
 /// Type of a number.

@@ -10,8 +10,8 @@ use percent_encoding::percent_decode_str;
 use serde::Deserialize;
 use serde_json::Value;
 use std::borrow::Cow;
-use std::collections::BTreeMap;
-use std::path::Path;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
 
 #[derive(Default, Deserialize)]
 #[serde(default, rename_all = "camelCase")]
@@ -123,7 +123,8 @@ impl<'a> Document<'a> {
             let expected = format!("{} or none", KNOWN.join(", "));
             return Err(Error::input(path, "a required extension", quoted(unknown), expected));
         }
-        let read = |(index, buffer)| read_buffer(path, index, buffer, bin.filter(|_| index == 0));
+        let mut files = BTreeSet::new();
+        let read = |(index, buffer)| read_buffer(path, index, buffer, bin.filter(|_| index == 0), &mut files);
         let buffers = gltf.buffers.iter().enumerate().map(read).collect::<Result<Vec<_>>>()?;
         let is_owned = |buffer: &&Cow<[u8]>| matches!(buffer, Cow::Owned(_));
         let size = bytes.len() + buffers.iter().filter(is_owned).map(|buffer| buffer.len()).sum::<usize>();
@@ -214,12 +215,14 @@ impl<'a> Document<'a> {
     }
 }
 
-/// Reads buffer `index` of the file at `path`, which is in the chunk `bin` if it has no URI.
+/// Reads buffer `index` of the file at `path`, which is in the chunk `bin` if it has no URI. Its file is added to `files`, none of which is
+/// read twice.
 fn read_buffer<'a>(
     path: &Path,
     index: usize,
     buffer: &Buffer,
     bin: Option<&'a [u8]>,
+    files: &mut BTreeSet<PathBuf>,
 ) -> Result<Cow<'a, [u8]>> {
     let Buffer { uri, byte_length } = buffer;
     let error = |path: &Path, field: &str, found: &str, expected: &str| {
@@ -244,6 +247,10 @@ fn read_buffer<'a>(
             let name = name.ok_or_else(|| error(path, "the uri of buffer", &quoted(uri), expected))?;
             file = parent_of(path).join(&*name);
             check_regular(&file)?;
+            if !files.insert(file.canonicalize().map_err(Error::read(&file))?) {
+                let expected = "a file that no other buffer has";
+                return Err(error(path, "the uri of buffer", &quoted(uri), expected));
+            }
             Cow::Owned(std::fs::read(&file).map_err(Error::read(&file))?)
         }
     };

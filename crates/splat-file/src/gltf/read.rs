@@ -3,7 +3,7 @@
 use super::document::{Document, Primitive, quoted};
 use super::{COLOR_SPACE, EXTENSION, KERNEL, POINTS, SPZ_EXTENSION, rotation_from_gltf, sh_attribute};
 use crate::axes::Axes;
-use crate::numbers::{MAX_RATIO, may_hold};
+use crate::numbers::ClaimedGaussians;
 use crate::splat::{color_to_sh0, logit_of_opacity};
 use crate::{Error, Result, Splat, spz};
 use glam::{DMat4, DQuat, DVec3};
@@ -14,7 +14,7 @@ use std::path::Path;
 /// Reads the Gaussians of all primitives in the default scene, at the places of their nodes.
 pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
     let document = Document::parse(path, bytes)?;
-    let (mut parts, mut others, mut memory) = (vec![], 0, 0);
+    let (mut parts, mut others, mut claimed) = (vec![], 0, ClaimedGaussians::default());
     let mut warnings = BTreeSet::new();
     for MeshNode { node, mesh, matrix } in mesh_nodes(&document)? {
         for (index, primitive) in
@@ -31,7 +31,7 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
             }
             let name = format!("primitive {index} of mesh {mesh}");
             let part =
-                PrimitiveReader { document: &document, primitive, name }.read(splatting, &mut memory)?;
+                PrimitiveReader { document: &document, primitive, name }.read(splatting, &mut claimed)?;
             parts.push(if matrix == DMat4::IDENTITY { part } else { moved(path, &part, &matrix, node)? });
         }
     }
@@ -72,10 +72,10 @@ struct PrimitiveReader<'a> {
 }
 
 impl PrimitiveReader<'_> {
-    /// Returns the Gaussians in glTF's axes, without the transform of the node. `splatting` is the primitive's extension; `memory` is the
-    /// size of all Gaussians read before, to which theirs is added.
-    fn read(&self, splatting: &Value, memory: &mut u128) -> Result<Splat> {
-        let path = self.document.path;
+    /// Returns the Gaussians in glTF's axes, without the transform of the node. `splatting` is the primitive's extension; they are
+    /// added to `claimed`, since nodes can share meshes.
+    fn read(&self, splatting: &Value, claimed: &mut ClaimedGaussians) -> Result<Splat> {
+        let &Document { path, size, .. } = self.document;
         if let Some(mode) = self.primitive.mode.filter(|&mode| mode != POINTS) {
             let field = format!("the mode of {}", self.name);
             return Err(Error::input(path, field, mode, format!("{POINTS} (POINTS)")));
@@ -84,7 +84,7 @@ impl PrimitiveReader<'_> {
             let mut splat = spz::read(path, self.document.view(view as usize)?.0)?;
             // The numbers of an SPZ inside of glTF are in glTF's axes.
             Axes::RUB.convert(&mut splat);
-            self.add_size(memory, splat.len(), splat.bases())?;
+            claimed.add(path, splat.len(), splat.sh_degree, size)?;
             return Ok(splat);
         }
         let count = self.document.accessor(self.index_of("POSITION")?, "POSITION")?.count;
@@ -92,7 +92,7 @@ impl PrimitiveReader<'_> {
         let has_degree = |&degree: &usize| (0..2 * degree + 1).any(|k| is_present(sh_attribute(degree, k)));
         let sh_degree = (1..=3).rev().find(has_degree).unwrap_or(0);
         let means = self.numbers("POSITION", count)?;
-        self.add_size(memory, count, (sh_degree + 1).pow(2))?;
+        claimed.add(path, count, sh_degree, size)?;
         let own = |name: &str| format!("{EXTENSION}:{name}");
         let rotations = self.numbers(&own("ROTATION"), count)?;
         let opacities = self.numbers_or_colors(&own("OPACITY"), count, |[.., opacity]| [opacity])?;
@@ -140,20 +140,6 @@ impl PrimitiveReader<'_> {
             let field = format!("the attribute {name} of {}", self.name);
             Error::input(self.document.path, field, "missing", "one of every Gaussian splat")
         })
-    }
-
-    /// Adds the size of Gaussians in memory to `memory`, before it is allocated, and checks that the file may hold the sum: nodes can share
-    /// meshes.
-    fn add_size(&self, memory: &mut u128, count: usize, bases: usize) -> Result<()> {
-        let numbers = 3 + 3 + 3 + 4 + 1 + 3 * bases;
-        *memory += count as u128 * (numbers * size_of::<f32>()) as u128;
-        let size = self.document.size;
-        if !may_hold(size, *memory) {
-            let found = format!("more than fit: {memory} bytes of them in files of {size}");
-            let expected = format!("{MAX_RATIO} times the files' bytes at most");
-            return Err(Error::input(self.document.path, "the number of Gaussians", found, expected));
-        }
-        Ok(())
     }
 }
 

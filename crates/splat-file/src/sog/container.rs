@@ -1,12 +1,12 @@
 //! Files of a SOG: in a ZIP archive or in a folder, and their images.
 
-use super::IMAGES;
+use super::{IMAGES, META};
 use crate::{Error, Result};
 use globalsplat_files::{check_regular, parent_of, stored_zip, write_file, write_files};
 use image_webp::{ColorType, EncoderParams, WebPDecoder, WebPEncoder};
 use rayon::prelude::*;
 use std::io::{Cursor, Read};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use zip::ZipArchive;
 
 /// Maximum ratio of decompressed to compressed size of the archive, with `MAX_SMALL` bytes allowed in addition.
@@ -22,16 +22,36 @@ pub struct Image {
 /// Reader of a SOG's files.
 pub struct Reader<'a> {
     path: &'a Path,
-    /// Archive and maximum size of a file in it, or `None` for files in a folder.
-    archive: Option<(ZipArchive<Cursor<&'a [u8]>>, u64)>,
+    /// Archive, or `None` for files in a folder.
+    archive: Option<Archive<'a>>,
+}
+
+struct Archive<'a> {
+    zip: ZipArchive<Cursor<&'a [u8]>>,
+    /// Folder of the SOG's files, which ends in a separator if there is one.
+    folder: String,
+    /// Size of the archive in bytes.
+    size: usize,
 }
 
 impl<'a> Reader<'a> {
     /// Opens the archive at `path`, whose contents are `bytes`.
     pub fn open_zip(path: &'a Path, bytes: &'a [u8]) -> Result<Self> {
-        let archive = ZipArchive::new(Cursor::new(bytes))
+        let zip = ZipArchive::new(Cursor::new(bytes))
             .map_err(|why| Error::input(path, "the file", format!("damaged: {why}"), "a ZIP archive"))?;
-        Ok(Reader { path, archive: Some((archive, MAX_SMALL + MAX_RATIO * bytes.len() as u64)) })
+        // macOS adds a folder for its own.
+        let names = zip.file_names().filter(|name| !name.starts_with("__MACOSX"));
+        let is_folder = |name: &&str| name.is_empty() || name.ends_with(['/', '\\']);
+        let folders: Vec<_> = names.filter_map(|name| name.strip_suffix(META)).filter(is_folder).collect();
+        let folder = match &folders[..] {
+            folders if folders.contains(&"") => String::new(),
+            [folder] => folder.to_string(),
+            _ => {
+                let found = format!("in {} folders of the archive", folders.len());
+                return Err(Error::input(path, META, found, "one, that of a SOG"));
+            }
+        };
+        Ok(Reader { path, archive: Some(Archive { zip, folder, size: bytes.len() }) })
     }
 
     /// Opens the folder of the `meta.json` at `path`.
@@ -39,30 +59,46 @@ impl<'a> Reader<'a> {
         Reader { path, archive: None }
     }
 
+    /// Returns the path of the file `name` beside the `meta.json` of a folder.
+    fn beside(&self, name: &str) -> Result<PathBuf> {
+        if name.is_empty() || name.contains(['/', '\\']) || name == ".." {
+            let found = format!("{name:?}");
+            return Err(Error::input(self.path, "a file name", found, "a name without a folder"));
+        }
+        Ok(parent_of(self.path).join(name))
+    }
+
+    /// Returns the size in bytes of the archive, or of the files `names` in the folder.
+    pub fn size<'n>(&self, mut names: impl Iterator<Item = &'n String>) -> Result<usize> {
+        if let Some(archive) = &self.archive {
+            return Ok(archive.size);
+        }
+        names.try_fold(0, |size, name| {
+            let file = self.beside(name)?;
+            Ok(size + std::fs::metadata(&file).map_err(Error::read(&file))?.len() as usize)
+        })
+    }
+
     /// Returns the contents of the file `name`, which must be in the archive or folder.
     pub fn file(&mut self, name: &str) -> Result<Vec<u8>> {
-        let Some((archive, max)) = &mut self.archive else {
-            if name.is_empty() || name.contains(['/', '\\']) || name == ".." {
-                let found = format!("{name:?}");
-                return Err(Error::input(self.path, "a file name", found, "a name without a folder"));
-            }
-            let file = parent_of(self.path).join(name);
+        let Some(Archive { zip, folder, size }) = &mut self.archive else {
+            let file = self.beside(name)?;
             check_regular(&file)?;
             return std::fs::read(&file).map_err(Error::read(&file));
         };
         let refuse = |found: String| Error::input(self.path, name, found, "a file in the archive");
-        let file = archive.by_name(name).map_err(|why| refuse(format!("missing or damaged ({why})")))?;
-        let mut contents = vec![];
-        file.take(*max + 1).read_to_end(&mut contents).map_err(|why| refuse(format!("damaged: {why}")))?;
-        match contents.len() as u64 > *max {
+        let file = zip.by_name(&format!("{folder}{name}"));
+        let file = file.map_err(|why| refuse(format!("missing or damaged ({why})")))?;
+        let (mut contents, max) = (vec![], MAX_SMALL + MAX_RATIO * *size as u64);
+        file.take(max + 1).read_to_end(&mut contents).map_err(|why| refuse(format!("damaged: {why}")))?;
+        match contents.len() as u64 > max {
             true => Err(refuse(format!("more than {max} bytes"))),
             false => Ok(contents),
         }
     }
 
-    /// Returns the image `name` if `is_allowed` returns `true` for its numbers of pixels and of bytes in the file, which are known before
-    /// memory is allocated.
-    pub fn image(&mut self, name: &str, is_allowed: impl FnOnce(usize, usize) -> bool) -> Result<Image> {
+    /// Returns the image `name`, which may have `max_pixels`. Their number is known before memory is allocated.
+    pub fn image(&mut self, name: &str, max_pixels: usize) -> Result<Image> {
         let file = self.file(name)?;
         let damaged = |why: image_webp::DecodingError| {
             Error::input(self.path, name, format!("damaged: {why}"), "a WebP image")
@@ -70,10 +106,9 @@ impl<'a> Reader<'a> {
         let mut decoder = WebPDecoder::new(Cursor::new(&file)).map_err(damaged)?;
         let (width, height) = decoder.dimensions();
         let count = width as usize * height as usize;
-        if !is_allowed(count, file.len()) {
+        if count > max_pixels {
             let found = format!("of {width}×{height} pixels");
-            let expected = "about as many pixels as Gaussians, and at most 256 times the bytes of the file";
-            return Err(Error::input(self.path, name, found, expected));
+            return Err(Error::input(self.path, name, found, format!("{max_pixels} at most")));
         }
         let has_alpha = decoder.has_alpha();
         let mut bytes = vec![0; count * if has_alpha { 4 } else { 3 }];
@@ -119,7 +154,7 @@ fn encode_webp(image: &Image) -> std::result::Result<Vec<u8>, image_webp::Encodi
 /// Writes `meta.json` and the images to a ZIP archive.
 pub fn write_zip(path: &Path, meta: &[u8], images: &[(&'static str, Vec<u8>)]) -> Result<()> {
     // WebP can't be compressed further.
-    let files = images.iter().map(|(name, file)| (*name, &file[..])).chain([("meta.json", meta)]);
+    let files = images.iter().map(|(name, file)| (*name, &file[..])).chain([(META, meta)]);
     let archive = stored_zip(files, 1);
     write_file(path, archive)
 }

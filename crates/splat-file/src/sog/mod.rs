@@ -1,19 +1,19 @@
-//! PlayCanvas' SOG, version 2 (spec 10.19): the properties of all Gaussians as lossless WebP images and a `meta.json`, together in a ZIP
-//! archive (`.sog`) or as files in a folder (`meta.json`). The pixel at x, y of each image belongs to Gaussian x + width · y. The axes are
-//! a PLY's.
+//! PlayCanvas' SOG (spec 10.19): the properties of all Gaussians as lossless WebP images and a `meta.json`, together in a ZIP archive
+//! (`.sog`) or as files in a folder (`meta.json`). The pixel at x, y of each image belongs to Gaussian x + width · y. The axes are a PLY's.
+//! Versions 1 and 2 are read, version 2 is written.
 
 mod container;
 mod palette;
 
 use crate::morton::morton_order;
-use crate::numbers::may_hold;
+use crate::numbers::ClaimedGaussians;
 use crate::rotations::{from_smallest_three, smallest_three};
 use crate::splat::{bounds, logit_of_opacity};
 use crate::{Error, Result, Splat, WriteOptions};
 use container::{Image, Reader, encode_all, write_zip};
 use palette::{Codebook, Palette};
 use serde::{Deserialize, Serialize};
-use serde_json::json;
+use serde_json::{Value, json};
 use std::path::Path;
 
 /// Names of the images that are written; those of coefficients are absent from a splat of degree 0.
@@ -27,10 +27,15 @@ pub(crate) const IMAGES: [&str; 7] = [
     "shN_labels.webp",
 ];
 
-/// Version that is read and written.
+/// Name of the file that describes the others.
+pub(crate) const META: &str = "meta.json";
+/// Version that is written. Files of version 1 have none.
 const VERSION: u64 = 2;
-/// Number of centroids in a row of their image.
+/// Value of `model` of antialiased splats.
+const ANTIALIASED: &str = "antialiased";
+/// Number of centroids in a row of their image, and maximum number of a centroid's pixels.
 const CENTROIDS_PER_ROW: usize = 64;
+const MAX_COEFFICIENTS: usize = 15;
 /// Alpha of a rotation whose largest component is w. For x, y and z it is one, two and three more.
 const FIRST_MODE: u8 = 252;
 /// Maximum number of centroids, whose indices have 16 bits, and the number up to which every Gaussian may have its own.
@@ -47,12 +52,17 @@ const MAX_PIXELS: (usize, usize) = (4, 1 << 16);
 /// Contents of `meta.json`.
 #[derive(Serialize, Deserialize)]
 struct Meta {
+    #[serde(default)]
     version: u64,
     #[serde(default)]
-    asset: serde_json::Value,
-    count: usize,
+    asset: Value,
+    /// Number of Gaussians, which version 1 has in the shape of the means.
+    count: Option<usize>,
     #[serde(default)]
     antialias: bool,
+    /// Kind of the splat, which splat-transform reads in place of `antialias`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    model: Option<String>,
     means: Means,
     scales: Indexed,
     quats: Files,
@@ -64,6 +74,8 @@ struct Meta {
 /// Positions, whose range is that of sign(x) · ln(|x| + 1).
 #[derive(Serialize, Deserialize)]
 struct Means {
+    #[serde(default, skip_serializing)]
+    shape: Vec<usize>,
     mins: [f64; 3],
     maxs: [f64; 3],
     files: [String; 2],
@@ -74,20 +86,69 @@ struct Files {
     files: [String; 1],
 }
 
-/// Images of indices into a codebook.
+/// Image of bytes that stand for values.
 #[derive(Serialize, Deserialize)]
 struct Indexed {
-    codebook: Vec<f32>,
+    #[serde(flatten)]
+    values: Values,
     files: [String; 1],
 }
 
-/// SH coefficients above degree 0: the image of the centroids, and that of each Gaussian's centroid.
+/// SH coefficients above degree 0: the image of the centroids, and that of each Gaussian's centroid. Version 1 has neither count nor bands.
 #[derive(Serialize, Deserialize)]
 struct Rest {
-    count: usize,
-    bands: usize,
-    codebook: Vec<f32>,
+    count: Option<usize>,
+    bands: Option<usize>,
+    #[serde(flatten)]
+    values: Values,
     files: [String; 2],
+}
+
+/// Values of bytes.
+#[derive(Default, Serialize, Deserialize)]
+struct Values {
+    #[serde(default)]
+    codebook: Vec<Option<f32>>,
+    /// In version 1, values of the bytes 0 and 255: a list with one for each channel, or a number for all.
+    #[serde(default, skip_serializing)]
+    mins: Value,
+    #[serde(default, skip_serializing)]
+    maxs: Value,
+}
+
+impl Values {
+    /// Returns the values of the bytes of `channels` in version 1, or those of red, green and blue since version 2. `name` is that of the
+    /// entry in `meta.json`.
+    fn tables(&self, path: &Path, name: &str, channels: usize) -> Result<Vec<Vec<f32>>> {
+        if self.codebook.is_empty() {
+            let expected = "one, or in version 1 mins and maxs";
+            let missing = || Error::input(path, format!("{name}.codebook"), "missing", expected);
+            let bound = |bounds: &Value, channel: usize| {
+                bounds.get(channel).unwrap_or(bounds).as_f64().ok_or_else(missing)
+            };
+            let table = |channel: usize| {
+                let (min, max) = (bound(&self.mins, channel)?, bound(&self.maxs, channel)?);
+                Ok((0..=255).map(|byte| (min + (max - min) * f64::from(byte) / 255.) as f32).collect())
+            };
+            return (0..channels).map(table).collect();
+        }
+        let mut codebook = self.codebook.clone();
+        // As PlayCanvas' engine reads files of an early program.
+        if let [first @ None, Some(second), .., Some(last)] = &mut codebook[..] {
+            *first = Some(*second + (*second - *last) / 255.);
+        }
+        let null = |index: usize| {
+            Error::input(path, format!("entry {index} of {name}.codebook"), "null", "a number")
+        };
+        let entries = codebook.iter().enumerate().map(|(index, entry)| entry.ok_or_else(|| null(index)));
+        Ok(vec![entries.collect::<Result<_>>()?; 3])
+    }
+}
+
+impl From<Codebook> for Values {
+    fn from(codebook: Codebook) -> Self {
+        Values { codebook: codebook.values.into_iter().map(Some).collect(), ..Values::default() }
+    }
 }
 
 /// Returns `true` if `bytes` are a ZIP archive, which no other format is.
@@ -98,7 +159,7 @@ pub(crate) fn recognizes(bytes: &[u8]) -> bool {
 /// Reads a `.sog`.
 pub(crate) fn read_bundle(path: &Path, bytes: &[u8]) -> Result<Splat> {
     let mut reader = Reader::open_zip(path, bytes)?;
-    let meta = reader.file("meta.json")?;
+    let meta = reader.file(META)?;
     read(path, reader, &meta)
 }
 
@@ -109,97 +170,106 @@ pub(crate) fn read_folder(path: &Path, bytes: &[u8]) -> Result<Splat> {
 
 fn read(path: &Path, mut reader: Reader, meta: &[u8]) -> Result<Splat> {
     let refuse = |field: &str, found: String, expected: &str| Err(Error::input(path, field, found, expected));
-    let bad_json = |what: &str, why, expected: &str| {
-        Error::input(path, "meta.json", format!("{what} ({why})"), expected)
-    };
-    let value: serde_json::Value =
+    let bad_json =
+        |what: &str, why, expected: &str| Error::input(path, META, format!("{what} ({why})"), expected);
+    let value: Value =
         serde_json::from_slice(meta).map_err(|why| bad_json("no JSON", why, "the JSON of a SOG"))?;
-    let version = value.get("version").map_or("missing".into(), ToString::to_string);
-    if version != VERSION.to_string() {
-        return refuse("the version in meta.json", version, "2, the version of SOG");
+    if let Some(version) = value.get("version").filter(|&version| *version != 1 && *version != VERSION) {
+        return refuse("the version in meta.json", version.to_string(), "1 or 2");
     }
-    let meta: Meta = serde_json::from_value(value)
-        .map_err(|why| bad_json("incomplete", why, "the entries of a SOG of version 2"))?;
-    let [lower_name, upper_name] = &meta.means.files;
+    let meta: Meta =
+        serde_json::from_value(value).map_err(|why| bad_json("incomplete", why, "the entries of a SOG"))?;
+    let Some(count) = meta.count.or(meta.means.shape.first().copied()) else {
+        return refuse("the number of Gaussians", "missing".into(), "count, or in version 1 means.shape");
+    };
+    let singles = [&meta.scales.files[0], &meta.quats.files[0], &meta.sh0.files[0]];
+    let of_rest = meta.sh_rest.iter().flat_map(|rest| &rest.files);
+    let size = reader.size(meta.means.files.iter().chain(singles).chain(of_rest))?;
+    ClaimedGaussians::default().add(path, count, if meta.sh_rest.is_some() { 3 } else { 0 }, size)?;
     let mut image = |name: &str| -> Result<Image> {
-        let image = reader.image(name, |pixels, bytes| {
-            // The lower bytes of positions hardly compress, and all other images have as many pixels.
-            let is_small = name != lower_name || may_hold(bytes, 4 * pixels as u128);
-            is_small && pixels / MAX_PIXELS.0 <= meta.count.saturating_add(MAX_PIXELS.1)
-        })?;
-        if image.pixels.len() < meta.count {
-            let expected = format!("{} or more, one for each Gaussian", meta.count);
+        let image = reader.image(name, MAX_PIXELS.0 * (count + MAX_PIXELS.1))?;
+        if image.pixels.len() < count {
+            let expected = format!("{count} or more, one for each Gaussian");
             let field = format!("the number of pixels of {name}");
             return Err(Error::input(path, field, image.pixels.len(), expected));
         }
         Ok(image)
     };
-    let [lower, upper] = [image(lower_name)?, image(upper_name)?];
-    let [scales, rotations, colors] =
-        [image(&meta.scales.files[0])?, image(&meta.quats.files[0])?, image(&meta.sh0.files[0])?];
+    let [lower, upper] = [image(&meta.means.files[0])?, image(&meta.means.files[1])?];
+    let [scale_name, rotation_name, color_name] = singles;
+    let [scales, rotations, colors] = [image(scale_name)?, image(rotation_name)?, image(color_name)?];
     let labels = meta.sh_rest.as_ref().map(|rest| image(&rest.files[1])).transpose()?;
-    let mut splat = Splat { antialiased: meta.antialias, ..Splat::default() };
-    // Values of the three indices in a pixel of the image `name`.
-    let look_up = |codebook: &[f32], name: &str, pixel: [u8; 4]| -> Result<[f32; 3]> {
+    let antialiased = meta.antialias || meta.model.as_deref() == Some(ANTIALIASED);
+    let mut splat = Splat { antialiased, ..Splat::default() };
+    // Values of the first three bytes of a pixel of the image `name`.
+    let look_up = |tables: &[Vec<f32>], name: &str, pixel: [u8; 4]| -> Result<[f32; 3]> {
         let mut values = [0.; 3];
-        for (value, index) in values.iter_mut().zip(pixel) {
-            *value = *codebook.get(usize::from(index)).ok_or_else(|| {
-                let expected = format!("less than {}, the length of the codebook", codebook.len());
+        for ((value, index), table) in values.iter_mut().zip(pixel).zip(tables) {
+            *value = *table.get(usize::from(index)).ok_or_else(|| {
+                let expected = format!("less than {}, the length of the codebook", table.len());
                 Error::input(path, format!("an index in {name}"), index, expected)
             })?;
         }
         Ok(values)
     };
+    let scale_tables = meta.scales.values.tables(path, "scales", 3)?;
+    let color_tables = meta.sh0.values.tables(path, "sh0", 4)?;
     let coordinate = |axis: usize, lower: u8, upper: u8| {
         let (min, max) = (meta.means.mins[axis], meta.means.maxs[axis]);
         let value = min + (max - min) * f64::from(u16::from_le_bytes([lower, upper])) / f64::from(u16::MAX);
         (value.signum() * value.abs().exp_m1()) as f32
     };
-    for index in 0..meta.count {
+    for index in 0..count {
         let (lower, upper) = (lower.pixels[index], upper.pixels[index]);
         splat.means.push([0, 1, 2].map(|axis| coordinate(axis, lower[axis], upper[axis])));
-        splat.log_scales.push(look_up(&meta.scales.codebook, &meta.scales.files[0], scales.pixels[index])?);
+        splat.log_scales.push(look_up(&scale_tables, scale_name, scales.pixels[index])?);
         let [a, b, c, mode] = rotations.pixels[index];
         let fractions = [a, b, c].map(|byte| f64::from(byte) / 255.);
         splat.quaternions.push(match mode.checked_sub(FIRST_MODE) {
             Some(largest) => from_smallest_three(largest.into(), fractions),
             None => [f32::NAN; 4],
         });
-        splat.sh.push(look_up(&meta.sh0.codebook, &meta.sh0.files[0], colors.pixels[index])?);
-        splat.opacity_logits.push(logit_of_opacity(f64::from(colors.pixels[index][3]) / 255.));
+        splat.sh.push(look_up(&color_tables, color_name, colors.pixels[index])?);
+        let opacity = colors.pixels[index][3];
+        splat.opacity_logits.push(match color_tables.get(3) {
+            Some(logits) => logits[usize::from(opacity)],
+            None => logit_of_opacity(f64::from(opacity) / 255.),
+        });
     }
     if let (Some(rest), Some(labels)) = (&meta.sh_rest, labels) {
-        if !(1..=3).contains(&rest.bands) {
-            return refuse("shN.bands", rest.bands.to_string(), "1 to 3");
-        }
-        if !(1..=MAX_CENTROIDS).contains(&rest.count) {
-            return refuse("shN.count", rest.count.to_string(), "1 to 65536");
-        }
-        let coefficients = (rest.bands + 1).pow(2) - 1;
         let name = &rest.files[0];
-        let centroids =
-            reader.image(name, |pixels, _| pixels <= (MAX_CENTROIDS + CENTROIDS_PER_ROW) * coefficients)?;
-        if centroids.width != CENTROIDS_PER_ROW * coefficients {
-            let expected = format!("{} for degree {}", CENTROIDS_PER_ROW * coefficients, rest.bands);
-            return refuse(&format!("the width of {name}"), centroids.width.to_string(), &expected);
+        let centroids = reader.image(name, (MAX_CENTROIDS + CENTROIDS_PER_ROW) * MAX_COEFFICIENTS)?;
+        let width = centroids.width;
+        let coefficients_of = |bands: usize| (bands + 1).pow(2) - 1;
+        let Some(bands) = (1..=3).find(|&bands| width == CENTROIDS_PER_ROW * coefficients_of(bands)) else {
+            let expected = "192, 512 or 960 (SH degree 1 to 3)";
+            return refuse(&format!("the width of {name}"), width.to_string(), expected);
+        };
+        if let Some(found) = rest.bands.filter(|&found| found != bands) {
+            let expected = format!("{bands} for the width of {name}, {width}");
+            return refuse("shN.bands", found.to_string(), &expected);
         }
-        if centroids.pixels.len() < rest.count * coefficients {
-            let found = format!("{} pixels", centroids.pixels.len());
-            return refuse(name, found, &format!("{coefficients} for each of {} centroids", rest.count));
+        let coefficients = coefficients_of(bands);
+        let stored = centroids.pixels.len() / coefficients;
+        let centroid_count = rest.count.unwrap_or(stored);
+        if centroid_count > stored {
+            let expected = format!("{stored} at most, as in {name}");
+            return refuse("shN.count", centroid_count.to_string(), &expected);
         }
-        let mut sh = Vec::with_capacity(meta.count * (coefficients + 1));
+        let tables = rest.values.tables(path, "shN", 3)?;
+        let mut sh = Vec::with_capacity(count * (coefficients + 1));
         for (color, label) in splat.sh.iter().zip(&labels.pixels) {
             let label = usize::from(u16::from_le_bytes([label[0], label[1]]));
-            if label >= rest.count {
-                let expected = format!("less than {}, the number of centroids", rest.count);
+            if label >= centroid_count {
+                let expected = format!("less than {centroid_count}, the number of centroids");
                 return refuse(&format!("an index in {}", rest.files[1]), label.to_string(), &expected);
             }
             sh.push(*color);
             for &pixel in &centroids.pixels[label * coefficients..][..coefficients] {
-                sh.push(look_up(&rest.codebook, name, pixel)?);
+                sh.push(look_up(&tables, name, pixel)?);
             }
         }
-        (splat.sh, splat.sh_degree) = (sh, rest.bands);
+        (splat.sh, splat.sh_degree) = (sh, bands);
     }
     Ok(splat)
 }
@@ -307,18 +377,19 @@ fn encode(splat: &Splat) -> (Vec<u8>, Vec<(&'static str, Image)>) {
         images.push(("shN_centroids.webp", Image { width, pixels: centroids }));
         images.push(("shN_labels.webp", image(&label)));
         let files = ["shN_centroids.webp", "shN_labels.webp"].map(String::from);
-        Rest { count, bands: splat.sh_degree, codebook: codebook.values, files }
+        Rest { count: Some(count), bands: Some(splat.sh_degree), values: codebook.into(), files }
     });
     let name = |name: &str| [name.to_owned()];
     let meta = Meta {
         version: VERSION,
         asset: json!({"generator": concat!("globalsplat ", env!("CARGO_PKG_VERSION"))}),
-        count: splat.len(),
+        count: Some(splat.len()),
         antialias: splat.antialiased,
-        means: Means { mins, maxs, files: ["means_l.webp", "means_u.webp"].map(String::from) },
-        scales: Indexed { codebook: scales.values, files: name("scales.webp") },
+        model: splat.antialiased.then(|| ANTIALIASED.into()),
+        means: Means { shape: vec![], mins, maxs, files: ["means_l.webp", "means_u.webp"].map(String::from) },
+        scales: Indexed { values: scales.into(), files: name("scales.webp") },
         quats: Files { files: name("quats.webp") },
-        sh0: Indexed { codebook: colors.values, files: name("sh0.webp") },
+        sh0: Indexed { values: colors.into(), files: name("sh0.webp") },
         sh_rest,
     };
     (serde_json::to_vec(&meta).expect("numbers and strings"), images)

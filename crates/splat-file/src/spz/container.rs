@@ -1,7 +1,7 @@
 //! Container of SPZ: a header and six streams, together in gzip up to version 3, each in Zstandard since version 4.
 
 use crate::axes::Axes;
-use crate::numbers::{MAX_RATIO, may_hold, u32_at};
+use crate::numbers::{ClaimedGaussians, u32_at};
 use crate::{Error, Result};
 use flate2::Compression;
 use flate2::bufread::GzDecoder;
@@ -49,7 +49,7 @@ pub struct Header {
 
 impl Header {
     /// Parses the header of `length` bytes at the beginning of `bytes`, in a file of `file_length` bytes. The version must be one of
-    /// `versions`. Checks that the file may decompress to the size that it claims, before memory is allocated for it.
+    /// `versions`.
     fn parse(
         path: &Path,
         bytes: &[u8],
@@ -85,12 +85,7 @@ impl Header {
             antialiased: flags & ANTIALIASED != 0,
             has_extensions: flags & HAS_EXTENSIONS != 0,
         };
-        let size = header.widths().iter().sum::<usize>() as u128 * count as u128;
-        if !may_hold(file_length, size) {
-            let found = format!("{count}, {size} bytes of them in a file of {file_length}");
-            let expected = format!("{MAX_RATIO} times the file's bytes at most");
-            return refuse("the number of Gaussians", &found, &expected);
-        }
+        ClaimedGaussians::default().add(path, count, header.sh_degree, file_length)?;
         Ok(header)
     }
 

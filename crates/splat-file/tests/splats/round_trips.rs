@@ -53,6 +53,18 @@ fn antialiased_splats_are_marked() {
             assert_eq!(copy.select(&[3]).antialiased, copy.antialiased);
         }
     }
+    // splat-transform and PlayCanvas' engine read different marks of a SOG.
+    let folder = tempfile::tempdir().unwrap();
+    let splat = Splat { antialiased: true, ..random_splat(20, 0, 5) };
+    let meta = written(folder.path(), "meta.json", &splat);
+    let text = std::fs::read_to_string(&meta).unwrap();
+    let marks = ["\"antialias\":true,", "\"model\":\"antialiased\","];
+    for (removed, antialiased) in [(&marks[..1], true), (&marks[1..], true), (&marks, false)] {
+        assert!(removed.iter().all(|mark| text.contains(mark)), "{text}");
+        std::fs::write(&meta, removed.iter().fold(text.clone(), |text, mark| text.replace(mark, "")))
+            .unwrap();
+        assert_eq!(read_splat(&meta).unwrap().antialiased, antialiased, "without {removed:?}");
+    }
     let plain = bytes_of("ply", &random_splat(1, 0, 5));
     let (first, rest) = plain.split_at("ply\nformat binary_little_endian 1.0\n".len());
     for (comment, antialiased) in [
@@ -184,11 +196,12 @@ fn names_without_a_format_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let splat = random_splat(3, 0, 1);
     let written = "expected .ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf";
-    let read = format!("{written}, .ksplat or meta.json");
+    let read = format!("{written}, .ksplat, meta.json or .zip");
     for (name, message, formats) in [
         ("a.obj", "the ending is .obj", &*read),
         ("a", "the ending is missing", &read),
         ("a.ksplat", "the format is .ksplat, which is only read", written),
+        ("a.zip", "the format is .zip, which is only read", written),
     ] {
         let path = folder.path().join(name);
         for error in [
