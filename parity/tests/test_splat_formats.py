@@ -242,6 +242,20 @@ def test_niantics_library_reads_and_writes_as_we_do(tmp_path, degree):
         assert_same(splat, read_ply(tmp_path / "c.ply"), of_two if version == "2" else STEPS["their spz"])
 
 
+def test_niantics_library_and_we_read_the_same_axes(tmp_path):
+    write_ply(tmp_path / "a.ply", made(3))
+    ours(tmp_path / "a.ply", tmp_path / "a.spz")
+    plain = (tmp_path / "a.spz").read_bytes()
+    for code in range(1, 17):
+        # The flags and the place of the table of contents in the header tell of the extension.
+        extension = np.array([0xADBE0003, 4, code], "<u4").tobytes()
+        header = plain[:14] + bytes([2, plain[15], 32 + len(extension)]) + plain[17:32]
+        (tmp_path / "b.spz").write_bytes(header + extension + plain[32:])
+        ours(tmp_path / "b.spz", tmp_path / "b.ply")
+        expected = read_by("adobe", tmp_path / "b.spz", tmp_path)
+        assert_same(expected, read_ply(tmp_path / "b.ply"), STEPS["same file"])
+
+
 def test_niantics_library_and_we_mark_antialiased_splats_alike(tmp_path):
     write_ply(tmp_path / "plain.ply", made(1))
     plain = (tmp_path / "plain.ply").read_bytes()

@@ -23,6 +23,9 @@ const PLAIN_HEADER: usize = 32;
 const ANTIALIASED: u8 = 1;
 /// Flag that there are extensions: after the streams up to version 3, before them since version 4.
 const HAS_EXTENSIONS: u8 = 2;
+/// Flag of Spark's levels of detail: a tree of Gaussians, each with the number of its children and the index of the first one, in 16 and 32
+/// bits. Opacities are stored as halves.
+const HAS_LEVELS: u8 = 0x80;
 /// Type of the extension that names the axes.
 const COORDINATE_SYSTEM: u32 = 0xADBE_0003;
 /// Maximum size of the extensions in bytes.
@@ -31,8 +34,9 @@ const MAX_EXTENSIONS: usize = 1 << 16;
 const ZSTD_LEVEL: i32 = 12;
 
 /// Streams in the file's order, each with the values of all Gaussians: positions (three coordinates, float16 in version 1, 24 bits each since
-/// version 2), opacities, colors, scales, rotations (three bytes up to version 2, four since version 3), spherical harmonics.
-pub type Streams = [Vec<u8>; 6];
+/// version 2), opacities, colors, scales, rotations (three bytes up to version 2, four since version 3), spherical harmonics, and with
+/// levels of detail the numbers of children, followed by the indices of the first ones.
+pub type Streams = [Vec<u8>; 7];
 
 /// Header of a file.
 #[derive(Debug, Clone, Copy)]
@@ -45,6 +49,8 @@ pub struct Header {
     pub antialiased: bool,
     /// `true` if there are extensions. None are written.
     pub has_extensions: bool,
+    /// `true` if there are levels of detail. None are written.
+    pub has_levels: bool,
 }
 
 impl Header {
@@ -77,6 +83,10 @@ impl Header {
         if fractional_bits > 30 {
             return refuse("the number of fractional bits", &fractional_bits, "0 to 30");
         }
+        let has_levels = flags & HAS_LEVELS != 0;
+        if has_levels && version > 3 {
+            return refuse("the flags", &format!("{flags}, Spark's levels of detail"), "none in version 4");
+        }
         let header = Header {
             version,
             count,
@@ -84,16 +94,18 @@ impl Header {
             fractional_bits: fractional_bits.into(),
             antialiased: flags & ANTIALIASED != 0,
             has_extensions: flags & HAS_EXTENSIONS != 0,
+            has_levels,
         };
         ClaimedGaussians::default().add(path, count, header.sh_degree, file_length)?;
         Ok(header)
     }
 
     /// Returns the number of bytes per Gaussian in each stream.
-    fn widths(&self) -> [usize; 6] {
+    fn widths(&self) -> [usize; 7] {
         let position = if self.version == 1 { 6 } else { 9 };
         let rotation = if self.version >= 3 { 4 } else { 3 };
-        [position, 1, 3, 3, rotation, 3 * ((self.sh_degree + 1).pow(2) - 1)]
+        let children = if self.has_levels { 2 + 4 } else { 0 };
+        [position, 1, 3, 3, rotation, 3 * ((self.sh_degree + 1).pow(2) - 1), children]
     }
 
     /// Returns the axes that one of the `extensions` names, if there are any. Each extension is a type, a length and that many bytes.
@@ -107,7 +119,7 @@ impl Header {
             };
             if let (COORDINATE_SYSTEM, Some(number)) = (kind, contents.first_chunk()) {
                 let number = u32::from_le_bytes(*number);
-                let unknown = || Error::input(path, "the coordinate system", number, "1 to 8 (LDB to RUF)");
+                let unknown = || Error::input(path, "the coordinate system", number, "1 to 16 (LDB to RBU)");
                 axes = Axes::from_code(number).ok_or_else(unknown)?;
             }
             extensions = after;

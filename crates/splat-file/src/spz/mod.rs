@@ -35,8 +35,9 @@ const SH_BITS: [u32; 2] = [8, 7];
 /// Reads an SPZ.
 pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
     let (header, axes, streams) = container::read(path, bytes)?;
-    let Header { version, sh_degree, fractional_bits, antialiased, .. } = header;
-    let [positions, opacities, colors, scales, rotations, harmonics] = streams;
+    let Header { version, sh_degree, fractional_bits, antialiased, has_levels, .. } = header;
+    let [positions, opacities, colors, scales, rotations, harmonics, children] = streams;
+    let opacity = |byte: u8| (f64::from(byte) / if has_levels { 127.5 } else { 255. }).min(1.);
     let fixed = |bytes: [u8; 3]| {
         let shifted = i32::from_le_bytes([0, bytes[0], bytes[1], bytes[2]]); // moves the sign to the highest bit
         (f64::from(shifted >> 8) / f64::from(1u32 << fractional_bits)) as f32
@@ -62,13 +63,21 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
             1 | 2 => rotations.as_chunks().0.iter().map(|&bytes| unpack_first_three(bytes)).collect(),
             _ => rotations.as_chunks().0.iter().map(|&bytes| unpack_smallest_three(bytes)).collect(),
         },
-        opacity_logits: opacities.iter().map(|&byte| logit_of_opacity(f64::from(byte) / 255.)).collect(),
+        opacity_logits: opacities.iter().map(|&byte| logit_of_opacity(opacity(byte))).collect(),
         sh,
         sh_degree,
         antialiased,
         ..Splat::default()
     };
     axes.convert(&mut splat);
+    if has_levels {
+        let child_counts = children.as_chunks::<2>().0;
+        let finest: Vec<usize> = (0..splat.len()).filter(|&index| child_counts[index] == [0; 2]).collect();
+        let left_out = format!("{} of {} Gaussians are left out", splat.len() - finest.len(), splat.len());
+        splat = splat.select(&finest);
+        let which = "which are Spark's coarser levels of detail";
+        splat.warnings.push(format!("{}: {left_out}, {which}", path.display()));
+    }
     Ok(splat)
 }
 
@@ -159,10 +168,13 @@ pub(crate) fn write(path: &Path, splat: &Splat, options: &WriteOptions) -> Resul
             _ => rotations.flat_map(pack_smallest_three).collect(),
         },
         harmonics.collect(),
+        vec![],
     ];
     let Splat { sh_degree, antialiased, .. } = *splat;
     let count = splat.len();
-    let header = Header { version, count, sh_degree, fractional_bits, antialiased, has_extensions: false };
+    let (has_extensions, has_levels) = (false, false);
+    let header =
+        Header { version, count, sh_degree, fractional_bits, antialiased, has_extensions, has_levels };
     container::write(path, &header, streams)
 }
 

@@ -4,7 +4,9 @@ use super::common::{
     assert_bytes_refused, assert_changes_refused, assert_says, assert_within, largest_error, random_splat,
     read_bytes, round_trip,
 };
+use glam::DMat4;
 use globalsplat_splat_file::{Splat, WriteOptions, write_local_splat, write_splat};
+use std::f64::consts::FRAC_PI_2;
 use std::io::{Read, Write};
 
 /// Returns the bytes of an SPZ of a version.
@@ -74,6 +76,12 @@ fn gzip(bytes: &[u8]) -> Vec<u8> {
     encoder.finish().unwrap()
 }
 
+fn unfolded(gzipped: &[u8]) -> Vec<u8> {
+    let mut bytes = vec![];
+    flate2::bufread::GzDecoder::new(gzipped).read_to_end(&mut bytes).unwrap();
+    bytes
+}
+
 /// The axes that an extension of an SPZ names are applied: here those of PLYs, for which no sign changes.
 #[test]
 fn the_axes_of_an_spz_are_applied() {
@@ -91,14 +99,52 @@ fn the_axes_of_an_spz_are_applied() {
     // The order of degree 1 is y, z, x.
     let signed = [(0, 1f32), (1, -1.), (2, -1.), (3, 1.)];
     assert_eq!(rdf.sh, signed.map(|(basis, sign)| rub.sh[basis].map(|channel| sign * channel)));
-    assert_bytes_refused("spz", &with_axes(9), &["the coordinate system is 9", "1 to 8"]);
+    // The others are a quarter turn away: 12 is RFU, right, forward and up.
+    let [x, y, z] = rdf.means[0];
+    assert_eq!(read_bytes("spz", &with_axes(12)).unwrap().means[0], [x, -z, y]);
+    for number in 1..=8 {
+        let [plain, turned] = [0, 8].map(|more| read_bytes("spz", &with_axes(number + more)).unwrap());
+        let quarter_turn = DMat4::from_rotation_x(-FRAC_PI_2);
+        assert_within("axes", &plain.transformed(&quarter_turn).unwrap(), &turned, [1e-6; 7]);
+    }
+    assert_bytes_refused("spz", &with_axes(17), &["the coordinate system is 17", "1 to 16"]);
+}
+
+/// Of Spark's levels of detail, only the finest is read: Gaussians without children, whose opacities are stored as halves.
+#[test]
+fn the_finest_level_of_detail_is_read() {
+    let mut bytes = unfolded(&bytes_of_version(3, &random_splat(3, 1, 9)));
+    let plain = read_bytes("spz", &gzip(&bytes)).unwrap();
+    bytes[14] |= 0x80;
+    let message = ["the body is cut short: 87 bytes, expected 105 bytes for 3 Gaussians"];
+    assert_bytes_refused("spz", &gzip(&bytes), &message);
+    // Numbers of children, and indices of the first ones.
+    bytes.extend([0u16, 2, 0].map(u16::to_le_bytes).concat());
+    bytes.extend([0u32, 2, 0].map(u32::to_le_bytes).concat());
+    let read = read_bytes("spz", &gzip(&bytes)).unwrap();
+    let leaves = plain.select(&[0, 2]);
+    for index in 0..2 {
+        assert!((read.opacity(index) - (2. * leaves.opacity(index)).min(1.)).abs() < 1e-6);
+    }
+    assert_says(
+        &read.warnings[0],
+        &["a.spz: 1 of 3 Gaussians are left out, which are Spark's coarser levels of detail"],
+    );
+    let same = Splat { opacity_logits: leaves.opacity_logits.clone(), warnings: vec![], ..read };
+    assert_eq!(same, leaves);
+    let mut four = bytes_of_version(4, &random_splat(3, 1, 9));
+    four[14] |= 0x80;
+    assert_bytes_refused(
+        "spz",
+        &four,
+        &["the flags is 128, Spark's levels of detail, expected none in version 4"],
+    );
 }
 
 #[test]
 fn bad_spzs() {
     let gzipped = bytes_of_version(3, &random_splat(300, 1, 9));
-    let mut unfolded = vec![];
-    flate2::bufread::GzDecoder::new(&gzipped[..]).read_to_end(&mut unfolded).unwrap();
+    let unfolded = unfolded(&gzipped);
     for (at, byte, message) in [
         (0, b'n', "the first bytes is"),
         (4, 4, "the version is 4, expected 1 to 3 in gzip"),
