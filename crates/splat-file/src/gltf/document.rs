@@ -131,6 +131,15 @@ impl<'a> Document<'a> {
         Ok(Document { path, gltf, buffers, size })
     }
 
+    /// Returns `true` if the program that wrote the file wrote logarithms of scales: splat-transform before version 2.7.
+    pub fn has_log_scales(&self) -> bool {
+        let generator = self.gltf.asset["generator"].as_str().unwrap_or_default();
+        let Some(version) = generator.strip_prefix("splat-transform ") else { return false };
+        let mut numbers =
+            version.trim_start_matches('v').split('.').map_while(|number| number.parse::<u32>().ok());
+        numbers.next().zip(numbers.next()).is_some_and(|version| version < (2, 7))
+    }
+
     /// Returns the bytes of a buffer view, and its stride if it has one.
     pub fn view(&self, index: usize) -> Result<(&[u8], Option<usize>)> {
         let view = self.get(&self.gltf.buffer_views, "buffer view", index)?;

@@ -44,6 +44,9 @@ pub(crate) fn read(path: &Path, bytes: &[u8]) -> Result<Splat> {
         warnings
             .insert(format!("{others} of {all} mesh primitives are left out, which aren't Gaussian splats"));
     }
+    if document.has_log_scales() {
+        warnings.insert("scales are read as logarithms, as splat-transform wrote them before 2.7".into());
+    }
     let mut splat = Splat::concat(&parts.iter().collect::<Vec<_>>());
     splat.antialiased = parts.iter().all(|part| part.antialiased);
     Axes::LUF.convert_without_rotations(&mut splat);
@@ -100,7 +103,17 @@ impl PrimitiveReader<'_> {
         splat.quaternions = rotations.into_iter().map(|[x, y, z, w]| [w, x, y, z]).collect();
         splat.opacity_logits =
             opacities.into_iter().map(|[opacity]| logit_of_opacity(f32::into(opacity))).collect();
-        self.numbers(&own("SCALE"), count)?.into_iter().for_each(|scale| splat.push_linear_scale(scale));
+        let scales: Vec<[f32; 3]> = self.numbers(&own("SCALE"), count)?;
+        if self.document.has_log_scales() {
+            (splat.log_scales, splat.linear_scales) = (scales, None);
+        } else if let Some(negative) = scales.as_flattened().iter().find(|&&scale| scale < 0.) {
+            let field = format!("the attribute {} of {}", own("SCALE"), self.name);
+            let expected =
+                "lengths of 0 or more; only those of splat-transform before 2.7 are read as logarithms";
+            return Err(Error::input(path, field, format!("negative: {negative}"), expected));
+        } else {
+            scales.into_iter().for_each(|scale| splat.push_linear_scale(scale));
+        }
         let to_sh0 = |color: f32| color_to_sh0(color.into());
         let sh0 = self.numbers_or_colors(&sh_attribute(0, 0), count, |[r, g, b, _]| [r, g, b].map(to_sh0));
         let mut harmonics: Vec<Vec<[f32; 3]>> = vec![sh0?];

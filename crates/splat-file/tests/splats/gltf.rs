@@ -231,6 +231,36 @@ fn quantized_and_interleaved_attributes_are_read() {
     glb.assert_refused_with(&format!("{view}/byteStride"), json!(4), &stride);
 }
 
+/// splat-transform wrote the logarithms of scales before version 2.7. Negative scales of other programs are refused, since the other scales
+/// may be logarithms, too.
+#[test]
+fn logarithms_of_scales_are_read() {
+    let splat = random_splat(20, 1, 3);
+    let mut glb = Glb::new(&splat);
+    let logs = splat.log_scales.as_flattened().iter().flat_map(|log| log.to_le_bytes());
+    glb.numbers(SCALE).copy_from_slice(&logs.collect::<Vec<_>>());
+    for generator in ["splat-transform v2.6.0", "splat-transform 1.9.2"] {
+        glb.json["asset"]["generator"] = json!(generator);
+        let read = glb.read();
+        assert_same(generator, &splat, &read);
+        assert_eq!((&read.log_scales, &read.linear_scales), (&splat.log_scales, &None));
+        assert_says(
+            &read.warnings[0],
+            &["scales are read as logarithms, as splat-transform wrote them before 2.7"],
+        );
+    }
+    let message =
+        [&format!("{SCALE} of primitive 0 of mesh 0 is negative: -"), "expected lengths of 0 or more"];
+    for generator in [
+        json!("splat-transform v2.7.0"),
+        json!("splat-transform v3.0.0"),
+        json!("splat-transform"),
+        json!(null),
+    ] {
+        glb.assert_refused_with("/asset/generator", generator, &message);
+    }
+}
+
 /// Colors and opacities come from COLOR_0 if the attributes of the extension are absent, as in files of its drafts.
 #[test]
 fn colors_are_a_fallback() {
