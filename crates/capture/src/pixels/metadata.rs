@@ -1,7 +1,7 @@
 //! What a photo's metadata say about its camera.
 
 use super::codec::encoded_image_size;
-use exif::{Exif, In, Reader, Tag, Value};
+use exif::{Context, Exif, In, Reader, Tag, Value};
 use image::{ImageDecoder, ImageReader};
 use std::io::Cursor;
 
@@ -19,9 +19,16 @@ pub fn exif_focal(encoded: &[u8]) -> Option<f64> {
     let (width, height) = (f64::from(width), f64::from(height));
     let exif = read_exif(encoded)?;
     let number = |tag| {
-        let number = match &exif.get_field(tag, In::PRIMARY)?.value {
+        // Some files have all tags in one directory.
+        let field = exif.get_field(tag, In::PRIMARY);
+        let field = field.or_else(|| exif.get_field(Tag(Context::Tiff, tag.number()), In::PRIMARY))?;
+        let number = match &field.value {
             Value::Rational(numbers) => numbers.first()?.to_f64(),
             Value::SRational(numbers) => numbers.first()?.to_f64(),
+            Value::SShort(numbers) => f64::from(*numbers.first()?),
+            Value::SLong(numbers) => f64::from(*numbers.first()?),
+            Value::Float(numbers) => f64::from(*numbers.first()?),
+            Value::Double(numbers) => *numbers.first()?,
             value => f64::from(value.get_uint(0)?),
         };
         // 0 stands for an unknown number.
@@ -47,8 +54,19 @@ fn read_exif(encoded: &[u8]) -> Option<Exif> {
     reader.continue_on_error(true);
     let undamaged =
         |exif: Result<Exif, exif::Error>| exif.or_else(|why| why.distill_partial_result(|_| ())).ok();
-    let of_chunk = || undamaged(reader.read_raw(exif_chunk(&mut open_decoder(encoded)?)?));
-    undamaged(reader.read_from_container(&mut Cursor::new(encoded))).or_else(of_chunk)
+    let mut tiff = match undamaged(reader.read_from_container(&mut Cursor::new(encoded))) {
+        Some(exif) => exif.buf().to_vec(),
+        None => exif_chunk(&mut open_decoder(encoded)?)?,
+    };
+    // libtiff declares the pointer to the Exif directory as an IFD (13). The reader only follows a LONG (4).
+    for (pointer, long) in
+        [([0x69, 0x87, 13, 0], [0x69, 0x87, 4, 0]), ([0x87, 0x69, 0, 13], [0x87, 0x69, 0, 4])]
+    {
+        if let Some(at) = tiff.windows(4).position(|bytes| bytes == pointer) {
+            tiff[at..at + 4].copy_from_slice(&long);
+        }
+    }
+    undamaged(reader.read_raw(tiff))
 }
 
 fn open_decoder(encoded: &[u8]) -> Option<impl ImageDecoder> {

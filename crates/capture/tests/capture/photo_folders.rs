@@ -129,7 +129,7 @@ fn damaged_exif_data_tell_what_is_left_of_them() {
     let (length, resolution, millimetres) = ((0x920a, 5, 1, 8), (0xa20e, 5, 1, 8), (0xa210, 3, 1, 4));
     let (by_26, by_6_5, by_pixels) = (300.462_606, 300.462_606 / 4., 6.5 * 6.5);
     let short = equivalent(3, 1, 26);
-    let cases: [(&[Entry], [u32; 2], f64); 12] = [
+    let cases: [(&[Entry], [u32; 2], f64); 14] = [
         (&[short], [0, 0], by_26),
         // FLIR's cameras, piexif, and directories of thumbnails that are none.
         (&[short], [0, BEYOND], by_26),
@@ -142,6 +142,8 @@ fn damaged_exif_data_tell_what_is_left_of_them() {
         (&[equivalent(4, 1, 26)], [0, 0], by_26),
         (&[equivalent(5, 1, 8)], [0, 0], by_6_5),
         (&[equivalent(10, 1, 8)], [0, 0], by_6_5),
+        (&[equivalent(9, 1, 26)], [0, 0], by_26),
+        (&[equivalent(11, 1, 26f32.to_bits())], [0, 0], by_26),
         // A denominator of 0 stands for an unknown number.
         (&[equivalent(5, 1, 12), length, resolution, millimetres], [0, 0], by_pixels),
         (&[equivalent(3, 0, 26), length, resolution, millimetres], [BEYOND, BEYOND], by_pixels),
@@ -152,7 +154,14 @@ fn damaged_exif_data_tell_what_is_left_of_them() {
         };
         let mut files: Vec<_> = cases.iter().map(lay_out).collect();
         let plain = files[0].0.clone();
+        let (mut of_libtiff, mut at_top) = (plain.clone(), plain.clone());
+        // The pointer is an IFD (13) instead of a LONG (4); its low byte comes first or second.
+        of_libtiff[start as usize + 4 + usize::from(is_big)] = 13;
+        let entries = start + 18;
+        at_top[4..8].copy_from_slice(&if is_big { entries.to_be_bytes() } else { entries.to_le_bytes() });
         files.extend([
+            (of_libtiff, by_26),
+            (at_top, by_26),
             (plain[..plain.len() - 4].to_vec(), by_26),
             ([&plain, &b"garbage"[..]].concat(), by_26),
             // Older versions of Pillow keep the prefix that EXIF data have in a JPEG.
