@@ -1,6 +1,5 @@
 use super::edits::Edits;
 use super::{Output, open_capture, splat_out, warn};
-use crate::Error;
 use crate::data::write_transforms_json;
 use crate::io::{
     InputFiles, ShLimits, Splat, WriteOptions, check_writable_file, check_writable_splat, fit_splat,
@@ -83,15 +82,7 @@ impl Convert {
         let (options, edits): (Vec<_>, Vec<_>) = self.edits.read(&mut inputs, warn)?.into_iter().unzip();
         splat_files(&self.to).iter().try_for_each(|file| inputs.check_file(file))?;
         if let Some(file) = &self.cameras_out {
-            [&self.from, &self.to]
-                .iter()
-                .flat_map(|path| splat_files(path))
-                .for_each(|file| inputs.add(&file));
-            if file == &self.to {
-                let why =
-                    format!("{}: the cameras would replace the splat, expected another name", file.display());
-                return Err(Error::request(why).into());
-            }
+            [&self.from, &self.to].into_iter().for_each(|path| inputs.add_all(splat_files(path)));
             inputs.check_file(file)?;
             check_writable_file(file)?;
         }

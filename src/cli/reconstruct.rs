@@ -3,7 +3,7 @@ use super::refine::{Refine, Reports};
 use super::{Output, check_views, device, model, open_masked_capture, parse_holdout, signals, splat_out};
 use crate::data::Capture;
 use crate::device::{Stopwatch, peak_memory_bytes, process_age};
-use crate::io::{InputFiles, check_writable_splat};
+use crate::io::{InputFiles, check_writable_splat, splat_files};
 use crate::reconstruct::{load_context, reconstruct};
 use crate::refine::RefineOptions;
 use crate::scene::{ImageSize, LocalFrame};
@@ -103,7 +103,7 @@ impl Reconstruct {
         let mut inputs = InputFiles::default();
         capture.add_input_files(&mut inputs);
         self.weights.iter().for_each(|path| inputs.add(path));
-        inputs.check_file(&self.out)?;
+        splat_files(&self.out).iter().try_for_each(|file| inputs.check_file(file))?;
         let data = &loaded.config.data;
         let count = self.views.unwrap_or(data.context_views);
         let photos =

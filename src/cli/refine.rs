@@ -24,7 +24,7 @@ use crate::scene::{Camera, LocalFrame};
 use anyhow::Result;
 use clap::Args;
 use serde_json::json;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 /// Maximum number of cameras for which a splat's colors are fitted to the range of its file format.
@@ -119,7 +119,7 @@ impl Refine {
         let clock = started.filter(|_| !self.scene.is_unposed()).unwrap_or_else(Instant::now);
         self.options.started = Some(clock);
         let capture = open_masked_capture(&path, masks)?;
-        self.check_outputs(&capture)?;
+        self.check_outputs(&capture, &state_file)?;
         let (mut splat, mut loaded, mut state) = (None, None, None);
         let init = match &self.splat {
             _ if self.resume && state_file.exists() => {
@@ -246,13 +246,14 @@ impl Refine {
     }
 
     /// Returns an error if an output would replace an input, except the initial splat.
-    fn check_outputs(&self, capture: &Capture) -> Result<()> {
+    fn check_outputs(&self, capture: &Capture, state: &Path) -> Result<()> {
         let mut inputs = InputFiles::default();
         capture.add_input_files(&mut inputs);
         self.weights.iter().for_each(|weights| inputs.add(weights));
-        inputs.check_file(&self.out)?;
+        let outputs = [splat_files(&self.out), vec![state.to_owned()]].concat();
+        outputs.iter().try_for_each(|file| inputs.check_file(file))?;
         self.splat.iter().for_each(|splat| inputs.add_all(splat_files(splat)));
-        inputs.add_all(splat_files(&self.out));
+        inputs.add_all(outputs);
         Ok(self.reports.contact_sheet.iter().try_for_each(|sheet| inputs.check_file(sheet))?)
     }
 }

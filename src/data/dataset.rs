@@ -1,7 +1,7 @@
 //! Datasets: many captures under one name (spec 10.8).
 
 use crate::error::{Error, Result};
-use crate::io::{InputFiles, read_text};
+use crate::io::{InputFiles, read_text, real_path};
 use globalsplat_capture::{
     CHUNK_INDEX_FILE, Capture, Chunk, FoundCaptures, find_captures, folder_name, is_capture, open_capture,
 };
@@ -134,14 +134,13 @@ impl SceneGroup {
     /// Adds to `inputs` the files of the group that writing below the folder `output` could overwrite. Adds none of a capture that
     /// can't be opened; opening it elsewhere reports the error.
     pub fn add_input_files(&self, output: &Path, inputs: &mut InputFiles) {
-        let resolved = |path: &Path| path.canonicalize().unwrap_or(path.to_owned());
         match &self.source {
             Source::Chunk => {
                 inputs.add(&self.path);
                 inputs.add(&self.path.with_file_name(CHUNK_INDEX_FILE));
             }
             Source::Folder => {
-                let (folder, output) = (resolved(&self.path), resolved(output));
+                let (folder, output) = (real_path(&self.path), real_path(output));
                 if (folder.starts_with(&output) || output.starts_with(&folder))
                     && let Ok(capture) = open_capture(&self.path)
                 {

@@ -6,6 +6,7 @@ use crate::data::{
     Capture, DataConfig, Dataset, Holdout, PhotoSize, SceneGroup, Split, TrainingScenes, load_views,
 };
 use crate::error::{Error, Result};
+use crate::io::real_path;
 use crate::metrics::{CaptureScores, score_view};
 use crate::reconstruct::spread_over_path;
 use crate::train::{Score, Trainer, Validator};
@@ -215,7 +216,7 @@ impl Validator for HeldOut {
 type SceneId = (PathBuf, Option<String>);
 
 fn scene_id(file: &Path, key: Option<&String>) -> SceneId {
-    (file.canonicalize().unwrap_or(file.to_owned()), key.cloned())
+    (real_path(file), key.cloned())
 }
 
 /// Returns the identities of all scenes of `training`.

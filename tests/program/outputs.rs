@@ -71,6 +71,7 @@ fn splats_and_weights_replace_nothing_that_is_read() {
     ] {
         symlink(sandbox.path(file), sandbox.path(link)).unwrap();
     }
+    symlink("room", sandbox.path("rooms")).unwrap();
     sandbox.run("train --config @tiny.toml --out @run --set train.steps=2");
     refuse_all(
         &sandbox,
@@ -80,6 +81,8 @@ fn splats_and_weights_replace_nothing_that_is_read() {
             "reconstruct --weights @tiny.safetensors --scene @room --refine 1s --out @weights.ply",
             "refine --scene @room --steps 1 --out @cameras.ply",
             "convert @splat.ply @cameras.ply --scene @room",
+            "convert @splat.ply @new.ply --scene @room --cameras-out @rooms/../new.ply",
+            "convert @splat.ply @new.ply --scene @room --cameras-out @new.ply.origin.json",
             "export --config @tiny.toml --out @tiny.toml",
             "export --run @run --out @run/checkpoints/step-00000002/model.safetensors",
             "export --run @run --out @run/config.toml",

@@ -1,13 +1,13 @@
 //! Captures from photos or a video: which folders may be used, what an earlier call has made, and the steps in their order.
 
 use crate::colmap::Colmap;
-use crate::photos::{find_photo_masks, find_photos, is_same_path};
+use crate::photos::{find_photo_masks, find_photos};
 use crate::poses::Estimate;
 use crate::progress::{Progress, Reporter, Step};
 use crate::record::{CaptureReport, FILE, Matching, Record, VideoRecord};
 use crate::video::{remove_frames, write_sharpest_frames};
 use globalsplat_capture::{COLMAP_MODELS, is_polycam};
-use globalsplat_files::{Error, FolderLock, Result};
+use globalsplat_files::{Error, FolderLock, Result, is_same_file, real_path};
 use std::fs::{self, DirEntry};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -134,17 +134,15 @@ fn check_output(photos: &Path, out: &Path, is_video: bool, is_new: bool) -> Resu
                 expected,
             ));
         }
-        let photos_folder = photos.canonicalize().map_err(Error::read(photos))?;
-        let absolute = std::path::absolute(out).map_err(Error::write(out))?;
-        let existing = absolute.ancestors().find_map(|folder| folder.canonicalize().ok());
-        if existing.is_some_and(|out| out.starts_with(photos_folder)) {
+        fs::metadata(photos).map_err(Error::read(photos))?;
+        if real_path(out).starts_with(real_path(photos)) {
             let expected = format!("a folder outside of {}", photos.display());
             return Err(Error::input(out, "the output", "inside the folder of photos", expected));
         }
     }
     let is_known = |entry: &DirEntry| {
         entry.file_name().as_encoded_bytes().starts_with(b".")
-            || !is_video && is_same_path(&entry.path(), photos)
+            || !is_video && is_same_file(&entry.path(), photos)
     };
     let other = fs::read_dir(out).into_iter().flatten().flatten().find(|entry| !is_known(entry));
     match other.filter(|_| is_new) {

@@ -6,7 +6,7 @@ use globalsplat_capture::{
     MASKS_FOLDER, decode_upright, encode_photo, exif_focal, find_masks, find_masks_in, fit_mask, gray_to_rgb,
     is_equirectangular, list_photos, read_image_size,
 };
-use globalsplat_files::{Error, Result, checksum, parent_of, write_file};
+use globalsplat_files::{Error, Result, checksum, is_same_file, parent_of, write_file};
 use image::imageops::thumbnail;
 use image::{Rgb, RgbImage};
 use rayon::prelude::*;
@@ -97,7 +97,7 @@ pub(crate) fn find_photo_masks(
 ) -> Result<BTreeMap<String, FoundMask>> {
     let names: Vec<&str> = found.iter().map(|photo| photo.name.as_str()).collect();
     let files = match masks {
-        Some(folder) if is_same_path(folder, source) || is_same_path(folder, images) => {
+        Some(folder) if is_same_file(folder, source) || is_same_file(folder, images) => {
             let expected = "a folder of masks, named like the photos";
             return Err(Error::input(folder, "the folder of masks", "that of the photos", expected));
         }
@@ -140,7 +140,7 @@ pub(crate) fn import_photos(
             skipped.push(SkippedPhoto { name, reason });
         }
     }
-    let is_in_place = is_same_path(source, images);
+    let is_in_place = is_same_file(source, images);
     let (mut names, mut unmasked) = (HashSet::new(), vec![]);
     let (mut done, large) = (skipped.len(), Mutex::new(()));
     // Few photos at a time, for progress and memory.
@@ -210,7 +210,7 @@ fn write_masks(out: &Path, record: &mut Record, masks: Vec<(Photo, Vec<u8>, Opti
     for (photo, contents, file) in masks {
         let name = mask_name(&photo);
         let target = out.join(MASKS_FOLDER).join(&name);
-        if file.is_some_and(|file| is_same_path(file, &target)) {
+        if file.is_some_and(|file| is_same_file(file, &target)) {
             if read_image_size(&target)? != (photo.width, photo.height) {
                 let expected = "one of the size of its photo, or --masks with another folder";
                 return Err(Error::input(target, "the mask", "of another size", expected));
@@ -228,11 +228,6 @@ fn write_masks(out: &Path, record: &mut Record, masks: Vec<(Photo, Vec<u8>, Opti
         record.write(out)?;
     }
     new.iter().try_for_each(|(_, target, contents)| write_with_folder(target, contents))
-}
-
-/// Returns `true` if both paths lead to the same folder or file.
-pub(crate) fn is_same_path(a: &Path, b: &Path) -> bool {
-    a.canonicalize().is_ok_and(|a| b.canonicalize().is_ok_and(|b| a == b))
 }
 
 /// Returns a name that COLMAP's lists can hold, and that differs from `taken`, to which it is added. White space ends a name, a `#` at its

@@ -1,13 +1,13 @@
-//! Files that a command reads, which its outputs must not replace.
+//! Files that a command reads, which its outputs must not replace, and what it takes for one file.
 
 use crate::atomic::parent_of;
 use crate::{Error, Result};
 use std::collections::BTreeSet;
 use std::fs;
-use std::path::Path;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
 
-/// Files that a command reads. Files are compared by identity (device and inode), so other paths and
-/// links to an input are recognized.
+/// Files that a command reads, and those of its other outputs. They are compared as [`is_same_file`] does.
 #[derive(Debug, Clone, Default)]
 pub struct InputFiles {
     photos: BTreeSet<FileId>,
@@ -16,16 +16,13 @@ pub struct InputFiles {
     others: BTreeSet<FileId>,
 }
 
-/// Device and inode of a file or folder.
-type FileId = (u64, u64);
-
 impl InputFiles {
-    /// Adds `file`, if it exists.
+    /// Adds `file`, which need not exist yet.
     pub fn add(&mut self, file: &Path) {
-        self.others.extend(file_id(file));
+        self.others.insert(FileId::of(file));
     }
 
-    /// Adds those of `files` that exist.
+    /// Adds all of `files`.
     pub fn add_all(&mut self, files: impl IntoIterator<Item = impl AsRef<Path>>) {
         files.into_iter().for_each(|file| self.add(file.as_ref()));
     }
@@ -34,7 +31,7 @@ impl InputFiles {
     pub fn add_folder(&mut self, folder: &Path) {
         let (mut pending, mut visited) = (vec![folder.to_owned()], BTreeSet::new());
         while let Some(folder) = pending.pop() {
-            if !file_id(&folder).is_some_and(|id| visited.insert(id)) {
+            if !visited.insert(FileId::of(&folder)) {
                 continue;
             }
             for entry in fs::read_dir(&folder).into_iter().flatten().flatten() {
@@ -47,10 +44,10 @@ impl InputFiles {
         }
     }
 
-    /// Adds the photo `file`, if it exists, and its folder as a folder of photos.
+    /// Adds the photo `file`, and its folder as a folder of photos.
     pub fn add_photo(&mut self, file: &Path) {
-        self.photos.extend(file_id(file));
-        self.photo_folders.extend(file_id(parent_of(file)));
+        self.photos.insert(FileId::of(file));
+        self.photo_folders.insert(FileId::of(parent_of(file)));
     }
 
     /// Adds all files and folders of `others`.
@@ -65,10 +62,10 @@ impl InputFiles {
     /// # Errors
     /// Returns [`Error::Input`] if `path` is one of the inputs.
     pub fn check_file(&self, path: &Path) -> Result<()> {
-        let Some(id) = file_id(path) else { return Ok(()) };
+        let id = FileId::of(path);
         let (found, expected) = match (self.photos.contains(&id), self.others.contains(&id)) {
             (true, _) => ("a photo of the capture", "a path that isn't an input photo"),
-            (false, true) => ("a file that this command reads", "another name"),
+            (false, true) => ("a file that this command reads or writes", "another name"),
             (false, false) => return Ok(()),
         };
         Err(Error::input(path, "the output", found, expected))
@@ -79,7 +76,7 @@ impl InputFiles {
     /// # Errors
     /// Returns [`Error::Input`] if `path` is a folder of photos.
     pub fn check_folder(&self, path: &Path) -> Result<()> {
-        if file_id(path).is_some_and(|id| self.photo_folders.contains(&id)) {
+        if self.photo_folders.contains(&FileId::of(path)) {
             let (found, expected) = ("a folder with the capture's photos", "a folder without them");
             return Err(Error::input(path, "the output", found, expected));
         }
@@ -87,9 +84,41 @@ impl InputFiles {
     }
 }
 
-fn file_id(path: &Path) -> Option<FileId> {
-    use std::os::unix::fs::MetadataExt;
-    fs::metadata(path).ok().map(|file| (file.dev(), file.ino()))
+/// Returns `true` if both paths lead to one file or folder: by other names of its folders, or by symbolic or hard links. A file that doesn't
+/// exist yet is the one that a write would create.
+pub fn is_same_file(a: &Path, b: &Path) -> bool {
+    FileId::of(a) == FileId::of(b)
+}
+
+/// Returns the absolute path that `path` leads to, without links. What doesn't exist yet keeps its name.
+pub fn real_path(path: &Path) -> PathBuf {
+    match (path.canonicalize(), fs::read_link(path), path.file_name()) {
+        (Ok(real), ..) => real,
+        (Err(e), Ok(link), _) if e.kind() == ErrorKind::NotFound => real_path(&parent_of(path).join(link)),
+        (_, _, Some(name)) => real_path(parent_of(path)).join(name),
+        _ => path.to_owned(),
+    }
+}
+
+/// What a path leads to.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+enum FileId {
+    /// Device and inode of a file or folder.
+    #[cfg(unix)]
+    Inode(u64, u64),
+    /// Path of [`real_path`].
+    Path(PathBuf),
+}
+
+impl FileId {
+    fn of(path: &Path) -> Self {
+        #[cfg(unix)]
+        if let Ok(file) = fs::metadata(path) {
+            use std::os::unix::fs::MetadataExt;
+            return FileId::Inode(file.dev(), file.ino());
+        }
+        FileId::Path(real_path(path))
+    }
 }
 
 #[cfg(test)]
@@ -108,13 +137,17 @@ mod tests {
         }
         fs::hard_link(at("a.ply"), at("link.ply")).expect("a link");
         // Links to a folder, back to a folder above, and to nothing.
-        for (target, link) in
-            [("elsewhere", "run/link"), ("run", "elsewhere/loop"), ("missing", "run/dangling")]
-        {
+        for (target, link) in [
+            ("elsewhere", "run/link"),
+            ("run", "elsewhere/loop"),
+            ("missing", "run/dangling"),
+            ("run/missing.ply", "new.ply"),
+            ("circle", "circle"),
+        ] {
             symlink(at(target), at(link)).expect("a link");
         }
         let mut inputs = InputFiles::default();
-        inputs.add_all([at("a.ply"), at("missing.ply")]);
+        inputs.add_all([at("a.ply"), at("run/missing.ply")]);
         inputs.add_folder(&at("run"));
         inputs.add_photo(Path::new("photo.png"));
         for (name, is_input) in [
@@ -124,8 +157,14 @@ mod tests {
             ("run/below/b", true),
             ("elsewhere/c", true),
             ("other.ply", false),
+            ("run/missing.ply", true),
+            ("elsewhere/loop/../run/missing.ply", true),
+            ("new.ply", true),
+            ("run/missing", false),
+            ("missing", true),
             ("missing.ply", false),
-            ("missing", false),
+            ("circle", false),
+            ("no/folder", false),
         ] {
             assert_eq!(inputs.check_file(&at(name)).is_err(), is_input, "{name}");
         }

@@ -16,7 +16,7 @@ pub use atomic::{
     write_atomically, write_file, write_files, write_json, write_temporary,
 };
 pub use error::{Error, Result, is_program_missing, panic_message};
-pub use inputs::InputFiles;
+pub use inputs::{InputFiles, is_same_file, real_path};
 pub use lock::FolderLock;
 pub use paths::{expand_path, split_keyed_path};
 pub use read::{checksum, read_text};
