@@ -1,5 +1,6 @@
 use super::edits::Edits;
-use super::{Output, open_capture, splat_out, warn};
+use super::splat_out::{self, LocalOrigin};
+use super::{Output, open_capture, warn};
 use crate::data::write_transforms_json;
 use crate::io::{
     InputFiles, ShLimits, Splat, WriteOptions, check_writable_file, check_writable_splat, fit_splat,
@@ -61,10 +62,8 @@ pub struct Convert {
     /// example for `render --path`
     #[arg(long, value_name = "FILE", requires = "scene")]
     cameras_out: Option<PathBuf>,
-    /// Write coordinates relative to the center of the scene, which is stored in a file beside the splat: far from the world's
-    /// origin, as in UTM coordinates, float32 and the formats' own number types lose detail
-    #[arg(long)]
-    local_origin: bool,
+    #[command(flatten)]
+    local_origin: LocalOrigin,
     /// Version of SPZ, 2 to 4; by default 4, or with --clamp-sh 3, because some viewers don't read 4
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..=4))]
     spz_version: Option<u32>,
@@ -75,7 +74,7 @@ pub struct Convert {
 impl Convert {
     pub fn run(self) -> Result<Output> {
         check_writable_splat(&self.to)?;
-        splat_out::check_origin(&self.to, self.local_origin)?;
+        self.local_origin.check(&self.to, Some(&self.from))?;
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
         let mut inputs = InputFiles::default();
         capture.iter().for_each(|capture| capture.add_input_files(&mut inputs));
@@ -101,6 +100,9 @@ impl Convert {
                 );
             }
         }
+        let is_far =
+            |edit: &SplatEdit| matches!(edit, SplatEdit::Merge(other) if other.origin != DVec3::ZERO);
+        let has_origin = source.origin != DVec3::ZERO || edits.iter().any(is_far);
         let edited = edit_splat(&source, &edits, &cameras)?;
         let moved = match edited.from_original == DMat4::IDENTITY {
             true => source,
@@ -117,10 +119,11 @@ impl Convert {
         // Without a capture the writer clamps by itself.
         let is_fitted = capture.is_some() || self.clamp_sh;
         let written = if is_fitted { &fitted } else { &original }.with_sh_degree(degree);
-        let origin = self.local_origin.then(|| match &capture {
+        // Edits give an origin to a splat that has none.
+        let kept = if has_origin { original.origin } else { DVec3::ZERO };
+        let origin = self.local_origin.choose(kept, || match &capture {
             Some(_) => LocalFrame::from_cameras(&cameras).origin,
-            // A splat that already has an origin keeps it.
-            None if original.origin != DVec3::ZERO => original.origin,
+            None if has_origin => kept,
             None => splat_frame(&original).origin,
         });
         let begin = Instant::now();

@@ -1,6 +1,7 @@
 use super::capture::SceneSource;
 use super::refine::{Refine, Reports};
-use super::{Output, check_views, device, model, open_masked_capture, parse_holdout, signals, splat_out};
+use super::splat_out::{self, LocalOrigin};
+use super::{Output, check_views, device, model, open_masked_capture, parse_holdout, signals};
 use crate::data::Capture;
 use crate::device::{Stopwatch, peak_memory_bytes, process_age};
 use crate::io::{InputFiles, check_writable_splat, splat_files};
@@ -9,6 +10,7 @@ use crate::refine::RefineOptions;
 use crate::scene::{ImageSize, LocalFrame};
 use anyhow::Result;
 use clap::Args;
+use glam::DVec3;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -44,10 +46,8 @@ pub struct Reconstruct {
     /// Also refine the splat on all input photos for this time, as `refine --init model` does; as in 60s or 2m
     #[arg(long, value_name = "TIME", value_parser = parse_seconds, conflicts_with = "precision")]
     refine: Option<f64>,
-    /// Write coordinates relative to the center of the cameras, which is stored in a file beside the splat: far from the
-    /// world's origin, as in UTM coordinates, float32 loses detail
-    #[arg(long)]
-    local_origin: bool,
+    #[command(flatten)]
+    local_origin: LocalOrigin,
     /// Precision: f32, bf16 for matrix products, or auto: bf16 for wide models if the device has instructions for it
     #[arg(long, default_value = "auto")]
     precision: String,
@@ -90,7 +90,7 @@ impl Reconstruct {
         let device = device::parse(&self.device)?;
         let holdout = parse_holdout(&self.holdout)?;
         check_writable_splat(&self.out)?;
-        splat_out::check_origin(&self.out, self.local_origin)?;
+        self.local_origin.check(&self.out, None)?;
         let asked = model::parse_precision(&self.precision)?;
         let started = process_age();
         let mut stopwatch = Stopwatch::default();
@@ -114,8 +114,8 @@ impl Reconstruct {
         let reconstruction = stopwatch.time("network", || reconstruct(&loaded, &photos, &[]))?;
         stopwatch.time("splat", || {
             let (splat, cameras) = (reconstruction.to_splat()?, capture.cameras());
-            let origin = self.local_origin.then(|| LocalFrame::from_cameras(&cameras).origin);
-            splat_out::write_for(&self.out, &splat, &cameras, origin)
+            let center = || LocalFrame::from_cameras(&cameras).origin;
+            splat_out::write_for(&self.out, &splat, &cameras, self.local_origin.choose(DVec3::ZERO, center))
         })?;
         let parts: Map<String, Value> = started
             .map(|age| ("start", age))

@@ -2,9 +2,10 @@
 
 use super::capture::SceneSource;
 use super::progress::{self, Progress};
+use super::splat_out::{self, LocalOrigin};
 use super::{
     Output, check_views, device, keep_freed_memory, model, open_masked_capture, report_downscaling, signals,
-    splat_out, warn,
+    warn,
 };
 use crate::data::{Capture, PhotoSize};
 use crate::device::process_age;
@@ -23,6 +24,7 @@ use crate::refine::{
 use crate::scene::{Camera, LocalFrame};
 use anyhow::Result;
 use clap::Args;
+use glam::DVec3;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -67,10 +69,8 @@ pub struct Refine {
     /// --seconds and --steps include those of the earlier runs
     #[arg(long)]
     pub resume: bool,
-    /// Write coordinates relative to the center of the cameras, which is stored in a file beside the splat: far from the
-    /// world's origin, as in UTM coordinates, float32 loses detail
-    #[arg(long)]
-    pub local_origin: bool,
+    #[command(flatten)]
+    pub local_origin: LocalOrigin,
     #[command(flatten)]
     pub options: RefineOptions,
     #[command(flatten)]
@@ -105,7 +105,7 @@ impl Refine {
         }
         let started = Instant::now().checked_sub(process_age().unwrap_or_default());
         check_writable_splat(&self.out)?;
-        splat_out::check_origin(&self.out, self.local_origin)?;
+        self.local_origin.check(&self.out, self.splat.as_deref())?;
         self.reports.contact_sheet.iter().try_for_each(|sheet| check_writable_png(sheet))?;
         let state_file = RefineState::path_for(&self.out);
         if self.resume {
@@ -120,18 +120,16 @@ impl Refine {
         self.options.started = Some(clock);
         let capture = open_masked_capture(&path, masks)?;
         self.check_outputs(&capture, &state_file)?;
-        let (mut splat, mut loaded, mut state) = (None, None, None);
-        let init = match &self.splat {
+        let splat = self.splat.as_deref().map(read_splat).transpose()?;
+        warn(splat.as_ref().map_or(&[], |splat| &splat.warnings));
+        let (mut loaded, mut state) = (None, None);
+        let init = match &splat {
             _ if self.resume && state_file.exists() => {
                 let state = state.insert(RefineState::read(&state_file)?);
                 eprintln!("{}: continues after {} steps", state_file.display(), state.steps());
                 SceneInit::State(state)
             }
-            Some(path) => {
-                let splat = splat.insert(read_splat(path)?);
-                warn(&splat.warnings);
-                SceneInit::Splat(splat)
-            }
+            Some(splat) => SceneInit::Splat(splat),
             None if self.weights.is_some() || self.init.as_deref() == Some("model") => {
                 let load = model::load(self.weights.as_deref(), Some(Precision::F32), self.options.device);
                 SceneInit::Model(loaded.insert(load?))
@@ -176,7 +174,8 @@ impl Refine {
         let cameras = capture.cameras();
         let spread = spread_over_path(&cameras, &(0..cameras.len()).collect::<Vec<_>>(), FITTED_CAMERAS);
         let spread: Vec<Camera> = spread.into_iter().map(|index| cameras[index]).collect();
-        let origin = self.local_origin.then(|| LocalFrame::from_cameras(&cameras).origin);
+        let read_origin = splat.as_ref().map_or(DVec3::ZERO, |splat| splat.origin);
+        let origin = self.local_origin.choose(read_origin, || LocalFrame::from_cameras(&cameras).origin);
         splat_out::write_for(&self.out, &result.splat, &spread, origin)?;
         if let (true, Some(state)) = (self.resume, &result.state) {
             state.write(&state_file)?;

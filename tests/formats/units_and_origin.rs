@@ -159,7 +159,8 @@ fn a_local_origin_keeps_the_detail() {
     write_local_splat(&local, &moved_splat(&read("room/truth.ply"), &to), &WriteOptions::default()).unwrap();
     let psnr = |splat: &str| number(&sandbox.json(&format!("eval --splat @{splat} --scene @scene")), "/psnr");
 
-    let (_, said) = sandbox.succeed_with_messages("convert @local.ply @world.ply --scene @scene --json");
+    let (_, said) = sandbox
+        .succeed_with_messages("convert @local.ply @world.ply --scene @scene --local-origin=off --json");
     assert_eq!(said.lines().count(), 1, "{said}");
     assert_says(&said, &["world.ply", "5.412e6 units", "every 0.5 units", "--local-origin"]);
     assert!(!has_origin("world.ply"));
@@ -177,15 +178,33 @@ fn a_local_origin_keeps_the_detail() {
         let inspected = sandbox.json(&format!("inspect @{copy}"));
         assert_eq!(inspected["local_origin"], json!(center.to_array()));
         assert!((number(&inspected, "/x/1") - offset.x).abs() < 5., "{inspected}");
-        sandbox.succeed(&convert);
+        sandbox.succeed(&format!("{convert} --local-origin=off"));
         assert!(!has_origin(copy), "{copy}");
     }
 
-    // Without a capture, a splat keeps its origin, and one without an origin gets its own center.
-    sandbox.succeed("convert @local.ply @kept.ply --local-origin");
-    assert_eq!(read("kept.ply").origin, offset);
-    sandbox.succeed("convert @world.ply @kept.ply --local-origin");
-    assert!(read("kept.ply").origin.distance(offset) < 10.);
+    // Without a capture, a splat without an origin gets its own center.
+    sandbox.succeed("convert @world.ply @centered.ply --local-origin");
+    assert!(read("centered.ply").origin.distance(offset) < 10.);
+    // A splat keeps the origin that it has, as does what is merged, and edits alone give none.
+    let means = read("local.ply").means;
+    for (line, out, origin, count) in [
+        ("convert @local.ply @kept.ply", "kept.ply", offset, means.len()),
+        ("convert @local.ply @kept.ply --local-origin", "kept.ply", offset, means.len()),
+        ("convert @kept.ply @kept.ply", "kept.ply", offset, means.len()),
+        ("convert @room/truth.ply @both.ply --merge @local.ply", "both.ply", offset, 2 * means.len()),
+        ("convert @room/truth.ply @moved.ply --translate 9,0,0", "moved.ply", DVec3::ZERO, means.len()),
+        (
+            "refine --splat @local.ply --scene @scene --steps 2 --out @refined.ply",
+            "refined.ply",
+            offset,
+            means.len(),
+        ),
+    ] {
+        sandbox.succeed(line);
+        let written = read(out);
+        assert_eq!((written.origin, written.len()), (origin, count), "{line}");
+        assert!(out != "kept.ply" || written.means == means, "{line}");
+    }
 
     // A file name that is too long for the origin's file is refused before the work.
     let said = sandbox.refuse(&format!("convert @local.ply @{}.ply --local-origin", "x".repeat(240)));
