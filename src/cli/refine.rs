@@ -26,6 +26,7 @@ use anyhow::Result;
 use clap::Args;
 use glam::DVec3;
 use serde_json::json;
+use std::cell::RefCell;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -111,7 +112,10 @@ impl Refine {
         if self.resume {
             check_writable_file(&state_file)?;
         }
-        self.reports.log.iter().try_for_each(|log| check_writable_dir(log))?;
+        self.reports
+            .log
+            .iter()
+            .try_for_each(|log| check_writable_dir(log).and_then(|()| RefineLog::check(log)))?;
         signals::handle_stop_requests()?;
         signals::end_at_request(1);
         let (path, masks) = self.scene.path(self.masks.as_deref(), &self.out)?;
@@ -138,12 +142,13 @@ impl Refine {
         };
         let bar = Bar::new(self.options.budget(), clock);
         let steps = if let SceneInit::State(state) = init { state.steps() } else { 0 };
-        let mut log = self.reports.log.as_ref().map(|folder| RefineLog::create(folder, steps)).transpose()?;
+        let log = RefCell::new(None::<RefineLog>);
         let on_event = |event: RefineEvent| {
             bar.update(event);
+            let mut log = log.borrow_mut();
             if let Some(Err(error)) = log.as_mut().map(|log| log.write(&event)) {
                 eprintln!("{error}; the log ends here");
-                log = None;
+                *log = None;
             }
             !signals::is_stop_requested()
         };
@@ -158,6 +163,8 @@ impl Refine {
         signals::end_at_request(if matches!(init, SceneInit::Model(_)) { 1 } else { 2 });
         let gaussians = session.start()?;
         signals::end_at_request(2);
+        *log.borrow_mut() =
+            self.reports.log.as_ref().map(|folder| RefineLog::open(folder, steps)).transpose()?;
         if self.resume {
             let count = gaussians.count().max(session.gaussians as i64);
             session.reserve(STATE_TIME_PER_GAUSSIAN * count as u32);

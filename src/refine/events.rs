@@ -1,7 +1,7 @@
 //! Progress events of a session, and their log for TensorBoard.
 
 use crate::error::{Error, Result};
-use crate::io::{AppendFile, CONFIG_FILE, EventFile, METRICS_FILE, write_file};
+use crate::io::{AppendFile, CONFIG_FILE, EventFile, METRICS_FILE, read_text};
 use crate::metrics::Scores;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
@@ -68,21 +68,39 @@ pub struct RefineLog {
 }
 
 impl RefineLog {
-    /// Creates the log of a refinement that continues after `steps` steps in the folder `run`. The log of an earlier refinement is replaced if
-    /// `steps` is 0, and continued otherwise.
+    /// Checks that the folder `run` has no other metrics than those of refinements. Changes nothing.
     ///
     /// # Errors
-    /// Returns an error if the folder has the log of a training, or if a file can't be written.
-    pub fn create(run: &Path, steps: u64) -> Result<Self> {
+    /// Returns an error if the folder has the log of a training, or a `metrics.jsonl` that no refinement wrote.
+    pub fn check(run: &Path) -> Result<()> {
         if run.join(CONFIG_FILE).exists() {
             return Err(Error::input(run, "the log", "a folder of a training run", "another folder"));
         }
-        std::fs::create_dir_all(run).map_err(Error::write(run))?;
         let file = run.join(METRICS_FILE);
-        if steps == 0 {
-            write_file(&file, "")?;
+        let text = if file.exists() { read_text(&file)? } else { String::new() };
+        let is_own = |line: &str| {
+            let value: Value = serde_json::from_str(line).unwrap_or_default();
+            let has_values = value["gaussians"].is_number() || value["validation"].is_object();
+            line.ends_with('\n') && value["step"].is_u64() && has_values
+        };
+        match text.split_inclusive('\n').position(|line| !is_own(line)) {
+            Some(index) => {
+                let found = "no line of a refinement's log";
+                Err(Error::input(&file, format!("line {}", index + 1), found, "another folder for the log"))
+            }
+            None => Ok(()),
         }
-        let (metrics, mut events) = (AppendFile::open(&file)?, EventFile::create_for(run)?);
+    }
+
+    /// Opens the log of a refinement that continues after `steps` steps in the folder `run`. It is appended to those of earlier refinements.
+    ///
+    /// # Errors
+    /// Returns the errors of [`RefineLog::check`], or an error if a file can't be written.
+    pub fn open(run: &Path, steps: u64) -> Result<Self> {
+        Self::check(run)?;
+        std::fs::create_dir_all(run).map_err(Error::write(run))?;
+        let metrics = AppendFile::open(&run.join(METRICS_FILE))?;
+        let mut events = EventFile::create_for(run)?;
         events.start(steps)?;
         Ok(RefineLog { metrics, events })
     }

@@ -372,8 +372,16 @@ fn a_refinement_is_continued_and_logged() {
     assert_says(&message, &["a.state.safetensors: continues after 120 steps"]);
     assert_eq!(steps_with("loss"), [49, 99, 149, 199]);
     assert!(!steps_with("validation").is_empty());
+    // Another refinement is appended; one without its photos touches no file.
+    sandbox.run("refine --scene @room --out @b.ply --gaussians 200 --size 48 --steps 60 --log @log");
+    assert_eq!(steps_with("loss"), [49, 99, 149, 199, 49]);
+    let before = sandbox.contents();
     let message = sandbox.refuse(&format!("{refine} --steps 200"));
     assert_says(&message, &["the refinement is one of 200 steps already"]);
+    sandbox.write("room/images/003.png", "no image");
+    sandbox.refuse("refine --scene @room --out @b.ply --steps 60 --log @log");
+    sandbox.write("room/images/003.png", &before[&sandbox.path("room/images/003.png")]);
+    assert!(sandbox.contents() == before);
 }
 
 /// A splat that is optimized for antialiased rendering is marked, and keeps the mark when it is continued or refined.

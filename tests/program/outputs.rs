@@ -292,6 +292,12 @@ fn foreign_files_are_not_overwritten() {
     sandbox.run("pack @room --out @chunks");
     assert!(sandbox.read("chunks/000000.torch") == before);
 
+    // A refinement continues no log but its own.
+    sandbox.write("log/metrics.jsonl", NOTES);
+    let error = sandbox.refuse("refine --scene @room --steps 2 --out @a.ply --log @log");
+    assert_says(&error, &["metrics.jsonl: line 1 is no line of a refinement's log"]);
+    assert_eq!((sandbox.text("log/metrics.jsonl").as_str(), sandbox.names("log").len()), (NOTES, 1));
+
     // A run takes no configuration for its own.
     sandbox.copy("tiny.toml", "run/config.toml");
     for _ in 0..2 {
