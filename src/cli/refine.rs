@@ -11,7 +11,7 @@ use crate::data::{Capture, PhotoSize};
 use crate::device::process_age;
 use crate::error::Error;
 use crate::io::{
-    InputFiles, check_writable_dir, check_writable_file, check_writable_png, check_writable_splat,
+    InputFiles, check_writable_dir, check_writable_file, check_writable_png, check_writable_splat, checksum,
     read_splat, splat_files,
 };
 use crate::metrics::{CaptureScores, Scores};
@@ -126,15 +126,17 @@ impl Refine {
         self.check_outputs(&capture, &state_file)?;
         let splat = self.splat.as_deref().map(read_splat).transpose()?;
         warn(splat.as_ref().map_or(&[], |splat| &splat.warnings));
+        let source = self.source()?;
         let (mut loaded, mut state) = (None, None);
         let init = match &splat {
             _ if self.resume && state_file.exists() => {
                 let state = state.insert(RefineState::read(&state_file)?);
+                state.check_source(&source)?;
                 eprintln!("{}: continues after {} steps", state_file.display(), state.steps());
                 SceneInit::State(state)
             }
             Some(splat) => SceneInit::Splat(splat),
-            None if self.weights.is_some() || self.init.as_deref() == Some("model") => {
+            None if self.is_from_model() => {
                 let load = model::load(self.weights.as_deref(), Some(Precision::F32), self.options.device);
                 SceneInit::Model(loaded.insert(load?))
             }
@@ -173,7 +175,7 @@ impl Refine {
             session.reserve_for_contact_sheet(&gaussians)?;
         }
         keep_freed_memory();
-        let result = session.run()?;
+        let mut result = session.run()?;
         bar.bar.finish_and_clear();
         if result.is_initial && result.steps > 0 {
             eprintln!("the initial splat reproduces the photos better: it is kept");
@@ -184,7 +186,12 @@ impl Refine {
         let read_origin = splat.as_ref().map_or(DVec3::ZERO, |splat| splat.origin);
         let origin = self.local_origin.choose(read_origin, || LocalFrame::from_cameras(&cameras).origin);
         splat_out::write_for(&self.out, &result.splat, &spread, origin)?;
-        if let (true, Some(state)) = (self.resume, &result.state) {
+        if let (true, Some(state)) = (self.resume, &mut result.state) {
+            state.sources = vec![source];
+            // A splat that is refined in place is its own source the next time.
+            if self.splat.is_some() {
+                state.sources.push(splat_source(&self.out)?);
+            }
             state.write(&state_file)?;
         }
         let held_out = session.score_held_out(&result)?;
@@ -199,6 +206,21 @@ impl Refine {
         Ok(self.describe_result(&session, &result, held_out.as_ref(), lpips.as_ref()))
     }
 
+    /// Returns `true` if the initial Gaussians are a model's.
+    fn is_from_model(&self) -> bool {
+        self.weights.is_some() || self.init.as_deref() == Some("model")
+    }
+
+    /// Describes what the initial Gaussians come from, with the checksum of its files.
+    fn source(&self) -> Result<String> {
+        Ok(match (&self.splat, &self.weights) {
+            (Some(splat), _) => splat_source(splat)?,
+            (_, Some(weights)) => format!("the model with the checksum {:08x}", checksum([weights])?),
+            _ if self.is_from_model() => "the bundled model".into(),
+            _ => "the photos".into(),
+        })
+    }
+
     /// Describes the result. Scores are those before and after the optimization.
     fn describe_result(
         &self,
@@ -207,7 +229,7 @@ impl Refine {
         held_out: Option<&[CaptureScores; 2]>,
         lpips: Option<&[CaptureScores; 2]>,
     ) -> Output {
-        let RefineResult { steps, seconds: [begun, ended], shown: [before, after], corrections, .. } = result;
+        let RefineResult { steps, seconds: [begun, ended], train: [before, after], corrections, .. } = result;
         let (count, photos) = (result.gaussians.count(), session.photos().len());
         // Scores are of the held-out views if there are any, else of the photos.
         let distances =
@@ -219,12 +241,12 @@ impl Refine {
         let mut json = json!({
             "splat": out, "gaussians": count, "photos": photos, "near_duplicates": session.near_duplicates,
             "steps": steps, "seconds": ended, "begin_seconds": begun, "corrections": corrections,
-            "shown": { "before": of(before, of_photos[0]), "after": of(after, of_photos[1]) },
+            "train": { "before": of(before, of_photos[0]), "after": of(after, of_photos[1]) },
         });
         let row = |name: String, [before, after]: [f64; 2], ssim: f64| {
             format!("{name:<24} {before:>14.2} {after:>8.2} {ssim:>8.4}")
         };
-        let sampled = result.shown_photos;
+        let sampled = result.train_photos;
         let of_all_photos = if sampled < photos { format!("{sampled} of ") } else { String::new() };
         let mut lines = vec![
             format!("{out}: {count} Gaussians, {steps} steps, {ended:.0} s"),
@@ -262,6 +284,12 @@ impl Refine {
         inputs.add_all(outputs);
         Ok(self.reports.contact_sheet.iter().try_for_each(|sheet| inputs.check_file(sheet))?)
     }
+}
+
+/// Describes the splat at `path` as the source of a refinement.
+fn splat_source(path: &Path) -> Result<String> {
+    let files = splat_files(path).into_iter().filter(|file| file.is_file());
+    Ok(format!("the splat with the checksum {:08x}", checksum(files)?))
 }
 
 /// Progress bar of a session.

@@ -3,8 +3,8 @@
 use super::gaussian_params::{GaussianParams, NAMES, leaf};
 use super::options::{MIN_GAUSSIANS, RefineOptions};
 use super::relocate::relocate;
-use super::state::{GAUSSIANS, Growth, Record, RefineState};
-use crate::error::{Error, Result};
+use super::state::{Growth, Record, RefineState};
+use crate::error::Result;
 use crate::optim::{Optimizer, ParameterGroup, UpdateRule};
 use crate::scene::{Gaussians, RawGaussians};
 use rand_chacha::ChaCha8Rng;
@@ -68,29 +68,15 @@ impl GaussianOptimizer {
     /// Creates the optimizer that `state` was made of. The Gaussians grow to at least `count`.
     ///
     /// # Errors
-    /// Returns an error if a tensor is missing or has another shape than the others.
+    /// Returns an error if a moment is missing.
     pub(super) fn from_state(state: &RefineState, options: &RefineOptions, count: i64) -> Result<Self> {
         let Record { depth, growth, .. } = state.record;
-        let read = |kind: &str, expected: Option<&GaussianParams>| {
-            let tensor = |(index, name): (usize, &str)| {
-                let key = format!("{kind}.{name}");
-                let found = state.gaussians.get(&key);
-                let has_size = |t: &&Tensor| expected.is_none_or(|params| t.size() == params.0[index].size());
-                let refused = || {
-                    let found = found.map_or("missing".into(), |t| format!("of shape {:?}", t.size()));
-                    let field = format!("tensor {GAUSSIANS}{key}");
-                    Error::input(&state.file, field, found, "that of a refinement's state")
-                };
-                found.filter(has_size).map(|t| leaf(&t.to_device(options.device))).ok_or_else(refused)
-            };
-            let tensors = NAMES.into_iter().enumerate().map(tensor).collect::<Result<Vec<_>>>()?;
-            Ok::<_, Error>(GaussianParams(tensors.try_into().expect("a tensor for each name")))
+        let read = |kind: &str| {
+            let tensor = |name: &str| &state.gaussians[&format!("{kind}.{name}")];
+            GaussianParams(NAMES.map(|name| leaf(&tensor(name).to_device(options.device))))
         };
-        let params = read("value", None)?;
-        let average =
-            (growth.averaged_steps > 0).then(|| Ok::<_, Error>(read("average", Some(&params))?.copy()));
-        let average = average.transpose()?;
-        let mut all = GaussianOptimizer::from_params(params, depth, options, growth, count);
+        let average = (growth.averaged_steps > 0).then(|| read("average").copy());
+        let mut all = GaussianOptimizer::from_params(read("value"), depth, options, growth, count);
         all.optimizer.load_state(&state.file, &state.gaussians)?;
         Ok(GaussianOptimizer { average, ..all })
     }

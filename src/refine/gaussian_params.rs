@@ -10,6 +10,13 @@ const DEAD_LOGIT: f64 = -30.;
 /// spherical harmonics of degree 0 and of higher degrees, which have a smaller learning rate.
 pub(super) const NAMES: [&str; 6] = ["means", "log_scales", "quaternions", "opacity_logits", "sh0", "shN"];
 
+/// Returns the shapes of the parameters of `count` Gaussians with spherical harmonics up to `degree`, in the order of [`NAMES`].
+pub(super) fn shapes(count: i64, degree: i64) -> [Vec<i64>; 6] {
+    let rest = (degree + 1).pow(2) - 1;
+    [vec![3], vec![3], vec![4], vec![], vec![1, 3], vec![rest, 3]]
+        .map(|of_one| [vec![1, count], of_one].concat())
+}
+
 /// Gaussians of one scene before activation, [1, N, …] each, in the order of [`NAMES`].
 #[derive(Debug)]
 pub(super) struct GaussianParams(pub(super) [Tensor; 6]);

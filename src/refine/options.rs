@@ -7,6 +7,8 @@ use crate::reconstruct::spread_over_path;
 use crate::scene::{Camera, ImageSize};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 use tch::Device;
 
@@ -226,7 +228,7 @@ options_struct! {
 }
 
 /// Condition for the correction of exposures.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[cfg_attr(feature = "cli", derive(clap::ValueEnum))]
 pub enum ExposureCorrection {
@@ -242,7 +244,7 @@ pub enum ExposureCorrection {
 }
 
 /// Background that a splat is seen over where photos are masked out, so that nothing is left there.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[cfg_attr(feature = "cli", derive(clap::ValueEnum))]
 pub enum MaskBackground {
@@ -319,6 +321,19 @@ impl RefineOptions {
         Ok(options)
     }
 
+    /// Returns the options that a refinement shares with the one that it continues, by name: all that change the result, except for the
+    /// budget, the number of Gaussians and the size of the photos, which may grow, and `antialiased`, which stays.
+    pub(super) fn fixed_settings(&self) -> BTreeMap<String, Value> {
+        let mut settings = json!(self);
+        let RefineOptions { seed, correct_poses, correct_exposures, mask_background, .. } = self;
+        settings["seed"] = json!(seed);
+        settings["correct_poses"] = json!(correct_poses);
+        settings["correct_exposures"] = json!(correct_exposures);
+        settings["mask_background"] = json!(mask_background);
+        let settings = settings.as_object().expect("a struct").clone();
+        settings.into_iter().filter(|(name, _)| name != "antialiased").collect()
+    }
+
     /// Checks that every setting is in the range that the method supports. Returns the expected range of the first that isn't.
     fn check_settings(&self) -> Result<(), &'static str> {
         let rates = [
@@ -361,12 +376,12 @@ impl RefineOptions {
         let Budget::Time(time) = self.budget() else { return MIN_GAUSSIANS };
         let cores = std::thread::available_parallelism().map_or(1., |cores| cores.get() as f64);
         let by_time = GAUSSIANS_PER_CORE_SECOND * cores * time.as_secs_f64().min(MAX_SECONDS_OF_GROWTH);
-        let (cameras, (shown, _)) = (capture.cameras(), capture.split(self.holdout));
+        let (cameras, (train, _)) = (capture.cameras(), capture.split(self.holdout));
         let pixels = |&index: &usize| {
             let ImageSize { height, width } = PhotoSize::Within(LARGEST_SIDE).of(&cameras[index]);
             u64::from(height) * u64::from(width)
         };
-        let by_pixels = shown.iter().map(pixels).sum::<u64>() / PIXELS_PER_GAUSSIAN;
+        let by_pixels = train.iter().map(pixels).sum::<u64>() / PIXELS_PER_GAUSSIAN;
         (by_time.min(by_pixels as f64) as usize).clamp(MIN_GAUSSIANS, MAX_GAUSSIANS)
     }
 
@@ -426,29 +441,29 @@ impl RefineOptions {
         size: PhotoSize,
     ) -> ([Vec<usize>; 2], Option<String>) {
         let cameras = capture.cameras();
-        let (all_shown, all_held_out) = capture.split(self.holdout);
+        let (all_train, all_held_out) = capture.split(self.holdout);
         let bytes = |camera: &Camera| {
             let ImageSize { height, width } = size.of(camera);
             BYTES_PER_PIXEL * u64::from(height) * u64::from(width)
         };
         let largest = cameras.iter().map(bytes).max().unwrap_or(1);
         let fitting = |bytes: u64| (bytes / largest).max(2) as usize;
-        let shown =
-            spread_over_path(&cameras, &all_shown, self.max_views.unwrap_or(fitting(MAX_PHOTO_BYTES)));
+        let train =
+            spread_over_path(&cameras, &all_train, self.max_views.unwrap_or(fitting(MAX_PHOTO_BYTES)));
         let held_out = spread_over_path(&cameras, &all_held_out, fitting(MAX_HELD_OUT_BYTES));
-        let is_limited = (self.max_views.is_none() && shown.len() < all_shown.len())
+        let is_limited = (self.max_views.is_none() && train.len() < all_train.len())
             || held_out.len() < all_held_out.len();
         let warning = is_limited.then(|| {
             format!(
                 "{}: {} of {} photos are matched and {} of {} scored, spread along the camera path, as more need more than about 2 GB of memory",
                 capture.name,
-                shown.len(),
-                all_shown.len(),
+                train.len(),
+                all_train.len(),
                 held_out.len(),
                 all_held_out.len()
             )
         });
-        ([shown, held_out], warning)
+        ([train, held_out], warning)
     }
 }
 

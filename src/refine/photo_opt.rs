@@ -99,22 +99,16 @@ impl PhotoOpt {
         self.pose_opt.iter_mut().chain(&mut self.exposure_opt)
     }
 
-    /// Continues with the parameters in `state`, and with the moments if it has corrections of all kinds that are learned.
+    /// Continues with the parameters and the moments in `state`.
     ///
     /// # Errors
-    /// Returns an error if a moment is missing or has another shape.
+    /// Returns an error if the state has no corrections of a kind that is learned.
     pub(super) fn load_state(&mut self, state: &RefineState) -> Result<()> {
-        let mut are_all_known = true;
-        for params in self.params_mut() {
-            let known = state.corrections.get(&format!("value.{}", params.name));
-            match known.filter(|known| known.size() == params.rows.size()) {
-                Some(known) => tch::no_grad(|| params.rows.copy_(known)),
-                None => are_all_known = false,
-            }
-        }
-        // A state has one number of steps for all kinds.
-        let mut all = self.params_mut().filter(|_| are_all_known);
-        all.try_for_each(|params| params.optimizer.load_state(&state.file, &state.corrections))
+        self.params_mut().try_for_each(|params| {
+            let rows = state.correction(params.name, &params.rows.size())?;
+            tch::no_grad(|| params.rows.copy_(rows));
+            params.optimizer.load_state(&state.file, &state.corrections)
+        })
     }
 
     /// Returns the parameters and moments with their names in a state.

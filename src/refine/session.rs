@@ -5,7 +5,7 @@ use super::events::{EvalPoint, RefineEvent};
 use super::exposures::LogGains;
 use super::gaussian_optimizer::GaussianOptimizer;
 use super::init::{PhotoInit, SceneInit, gaussians_from_photos, most_visible};
-use super::options::{Budget, ExposureCorrection, RefineOptions};
+use super::options::{ExposureCorrection, RefineOptions};
 use super::photo_opt::{Correction, PhotoOpt};
 use super::photos::{Photos, distinct, load_photos};
 use super::state::{Record, RefineState};
@@ -20,6 +20,8 @@ use crate::reconstruct::{LoadedModel, Model, reconstruct, spread_over_path};
 use crate::scene::{Camera, Gaussians, LocalFrame, RawGaussians};
 use crate::stereo::DepthMap;
 use globalsplat_capture::format_names;
+use rayon::prelude::*;
+use std::collections::HashMap;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 use tch::Tensor;
@@ -58,10 +60,10 @@ pub struct RefineResult {
     pub seconds: [f64; 2],
     /// State from which [`SceneInit::State`] continues; `None` if the final Gaussians are the initial ones.
     pub state: Option<RefineState>,
-    /// Scores of a sample of the photos before and after the optimization.
-    pub shown: [Scores; 2],
+    /// Scores of a sample of the photos, on which the Gaussians were optimized, before and after.
+    pub train: [Scores; 2],
     /// Number of photos in this sample.
-    pub shown_photos: usize,
+    pub train_photos: usize,
     /// Scores of a sample of the held-out views during the optimization.
     pub curve: Vec<EvalPoint>,
 }
@@ -125,6 +127,8 @@ pub struct RefineSession<'a> {
     start: Option<Start>,
     /// Number of photos that were left out as near duplicates.
     pub near_duplicates: usize,
+    /// Name and checksum of each of the others.
+    fingerprints: Vec<(String, u32)>,
     /// Depths of some photos, if Gaussians were created from them.
     depth_maps: Vec<DepthMap>,
     /// Initial exposures of the photos, if they are corrected.
@@ -148,14 +152,17 @@ impl<'a> RefineSession<'a> {
     ) -> Result<Self> {
         let clock = options.started.unwrap_or_else(Instant::now);
         let options = options.resolve(init.is_splat())?;
+        if let SceneInit::State(state) = init {
+            state.check_options(&options)?;
+        }
         let (gaussians, size) = init.sizes(capture, &options);
-        let ([shown, held_out], warning) = options.select_views(capture, size);
+        let ([train, held_out], warning) = options.select_views(capture, size);
         if let Some(line) = warning {
             on_event(RefineEvent::Warning(&line));
         }
-        let count = shown.len() + held_out.len();
+        let count = train.len() + held_out.len();
         let mut should_continue = |done: usize| on_event(RefineEvent::Loading { done, count });
-        let mut photos = load_photos(capture, &shown, size, &mut should_continue)?;
+        let mut photos = load_photos(capture, &train, size, &mut should_continue)?;
         let mut held_out =
             load_photos(capture, &held_out, size, |done| should_continue(photos.len() + done))?;
         let masked_out: Vec<String> = [&mut photos, &mut held_out]
@@ -191,6 +198,7 @@ impl<'a> RefineSession<'a> {
             scored_every: 1,
             start: None,
             near_duplicates: 0,
+            fingerprints: vec![],
             depth_maps: vec![],
             log_exposures: None,
             steps: 0,
@@ -282,8 +290,9 @@ impl<'a> RefineSession<'a> {
             _ => scene_depth(&gaussians, &self.photos)?,
         };
         self.leave_out_near_duplicates(depth);
+        self.fingerprints = self.fingerprint_photos()?;
         if let SceneInit::State(state) = self.init {
-            self.check_state(state)?;
+            self.check_photos(state)?;
         }
         let new = |raw: RawGaussians| GaussianOptimizer::new(&raw, depth, &self.options, final_count);
         let optimizer = optimizer.or_else(|| raw.map(new));
@@ -327,8 +336,8 @@ impl<'a> RefineSession<'a> {
         let before = self.score_photos(&initial, &self.photo_opt(depth)?)?;
         let time = begun_scoring.elapsed();
         self.reserve(time);
-        let shown_photos = self.photos.len().div_ceil(sample_interval(&self.photos, u64::MAX));
-        let each = time / shown_photos as u32;
+        let train_photos = self.photos.len().div_ceil(sample_interval(&self.photos, u64::MAX));
+        let each = time / train_photos as u32;
         self.scored_every = self.time.reserve_for_held_out(each, self.held_out.len());
         self.time.last_scoring = each * self.held_out_sample().len() as u32;
         if let Some(line) = self.time.late_start_warning() {
@@ -363,8 +372,8 @@ impl<'a> RefineSession<'a> {
             steps: self.steps,
             seconds: [begun, ended],
             state,
-            shown: [before, after],
-            shown_photos,
+            train: [before, after],
+            train_photos,
             curve: std::mem::take(&mut self.curve),
         })
     }
@@ -458,8 +467,15 @@ impl<'a> RefineSession<'a> {
         let _ = (self.on_event)(RefineEvent::Warning(line));
     }
 
-    fn photo_names(&self) -> Vec<String> {
-        self.photos.iter().map(|photo| photo.name.clone()).collect()
+    /// Returns the name of each photo, and the checksum of its file with its camera and mask.
+    fn fingerprint_photos(&self) -> Result<Vec<(String, u32)>> {
+        let indices: HashMap<&str, usize> = self.capture.names().zip(0..).collect();
+        let names: Vec<&String> = self.photos.iter().map(|photo| &photo.name).collect();
+        let capture = self.capture;
+        names
+            .par_iter()
+            .map(|&name| Ok((name.clone(), capture.checksum([indices[name.as_str()]])?)))
+            .collect()
     }
 
     /// Returns the origin and the scale of the frame.
@@ -586,7 +602,7 @@ impl<'a> RefineSession<'a> {
             return Err(error);
         }
         let record = Record {
-            photos: self.photo_names(),
+            photos: self.fingerprints.clone(),
             frame: self.frame_numbers(),
             progress,
             total: earlier_total + self.time.elapsed(),
@@ -594,32 +610,32 @@ impl<'a> RefineSession<'a> {
             has_depths: !self.depth_maps.is_empty(),
             antialiased: self.options.antialiased,
             from_splat: self.init.is_splat(),
+            settings: self.options.fixed_settings(),
             growth: optimizer.growth,
         };
         let (gaussians, corrections) = (optimizer.state(), photo_opt.state());
-        let state = RefineState { record, gaussians, corrections, file: PathBuf::new() };
+        let state = RefineState { record, gaussians, corrections, file: PathBuf::new(), sources: vec![] };
         Ok((optimizer.averaged_gaussians(), photo_opt, state))
     }
 
-    /// Returns an error if `state` is that of other photos or cameras, or if the budget has been used up already.
-    fn check_state(&self, state: &RefineState) -> Result<()> {
-        let Record { photos, frame, progress, total, .. } = &state.record;
-        if *frame != self.frame_numbers() || *photos != self.photo_names() {
+    /// Returns an error if `state` is that of other photos or cameras.
+    fn check_photos(&self, state: &RefineState) -> Result<()> {
+        let Record { photos, frame, .. } = &state.record;
+        let names =
+            |photos: &[(String, u32)]| photos.iter().map(|(name, _)| name.clone()).collect::<Vec<_>>();
+        if *frame != self.frame_numbers() || names(photos) != names(&self.fingerprints) {
             let found = format!("that of another refinement, {} photos", photos.len());
             let expected =
                 format!("that of the {} photos of this one, with the same poses", self.photos.len());
             return Err(Error::input(&state.file, "the list of photos", found, expected));
         }
-        let (used, expected) = match self.options.budget() {
-            Budget::Steps(steps) if steps <= progress.steps => {
-                (format!("{} steps", progress.steps), "more steps in all")
+        match photos.iter().zip(&self.fingerprints).find(|(known, photo)| known != photo) {
+            Some(((name, known), (_, checksum))) => {
+                let field = format!("the checksum of {name} with its camera and mask");
+                Err(Error::input(&state.file, field, format!("{known:08x}"), format!("{checksum:08x}")))
             }
-            Budget::Time(time) if time <= *total => {
-                (format!("{:.0} s", total.as_secs_f64()), "more time in all")
-            }
-            _ => return Ok(()),
-        };
-        Err(Error::input(&state.file, "the refinement", format!("one of {used} already"), expected))
+            None => Ok(()),
+        }
     }
 
     /// Returns the Gaussians of a model that the photos show best, and new ones at the depths on which the photos agree. As few as from photos

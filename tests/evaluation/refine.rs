@@ -8,14 +8,15 @@ use glam::{DVec3, DVec4};
 use globalsplat::data::{
     Capture, Holdout, PhotoSize, load_all_views, open_capture, read_points, write_cameras_json,
 };
-use globalsplat::io::{read_splat, write_splat};
+use globalsplat::io::{read_splat, read_weights, write_splat, write_weights};
 use globalsplat::refine::{
     ExposureCorrection, RefineEvent, RefineOptions, RefineResult, RefineSession, RefineState, SceneInit,
     gaussians_from_photos,
 };
 use globalsplat::scene::{Camera, Gaussians};
 use serde_json::{Value, json};
-use tch::Kind;
+use std::collections::{BTreeMap, HashMap};
+use tch::{Kind, Tensor};
 
 /// Returns a folder with a video of a synthetic scene, `@world/000000.torch#7_000000`.
 fn world(size: u32) -> Sandbox {
@@ -384,6 +385,123 @@ fn a_refinement_is_continued_and_logged() {
     assert!(sandbox.contents() == before);
 }
 
+/// A state names what it came from, and continues nothing else.
+#[test]
+fn a_state_continues_only_its_own_refinement() {
+    let sandbox = Sandbox::new();
+    sandbox.copy("room/truth.ply", "splat.ply");
+    let from_photos = "refine --scene @room --out @a.ply --gaussians 60 --size 24 --resume --steps";
+    let from_splat = "refine --scene @room --out @b.ply --splat @splat.ply --resume --steps";
+    let in_place = "refine --scene @room --out @room/truth.ply --splat @room/truth.ply --resume --steps";
+    // The splats are dim, so that they are improved.
+    (0..9).for_each(|index| dim(&sandbox, &format!("images/{index:03}.png"), 0.7));
+    for line in [from_photos, from_splat, in_place] {
+        sandbox.run(&format!("{line} 9"));
+        sandbox.run(&format!("{line} 12"));
+    }
+    let refuse = |line: String, expected: &str| {
+        let before = sandbox.contents();
+        assert_says(&sandbox.refuse(&line), &[".state.safetensors: ", expected]);
+        assert!(sandbox.contents() == before, "{line}");
+    };
+    for (options, expected) in [
+        ("--antialiased", "antialiased is false, expected true, as requested"),
+        ("--seed 1", "seed is 0, expected 1, as requested"),
+        ("--correct-poses", "correct_poses is false, expected true, as requested"),
+        ("--correct-exposures", "correct_exposures is \"auto\", expected \"on\", as requested"),
+        ("--mask-background black", "mask_background is null, expected \"black\", as requested"),
+        ("--set sh_degree=2", "sh_degree is null, expected 2, as requested"),
+        ("--set lr_means=1e-3", "lr_means is 0.002, expected 0.001, as requested"),
+        ("--init model", "the source of the Gaussians is the photos, expected the bundled model"),
+        ("--holdout every:4", "the list of photos is that of another refinement, "),
+    ] {
+        refuse(format!("{from_photos} 15 {options}"), expected);
+    }
+    refuse(
+        format!("{from_photos} 15 --splat @splat.ply").replace("--gaussians 60", ""),
+        "the source of the Gaussians is the photos, expected the splat",
+    );
+    sandbox.run("convert @splat.ply @splat.ply --scale 1.01");
+    refuse(format!("{from_splat} 15"), "the source of the Gaussians is the splat with the checksum ");
+    dim(&sandbox, "images/004.png", 0.9);
+    refuse(format!("{from_photos} 15"), "the checksum of images/004.png with its camera and mask is ");
+}
+
+/// Every field of a damaged state is refused.
+#[test]
+fn damaged_states_are_refused() {
+    let sandbox = Sandbox::new();
+    let file = sandbox.path("a.state.safetensors");
+    let refine =
+        "refine --scene @room --out @a.ply --gaussians 60 --size 24 --steps 9 --set relocate_until=0.5";
+    sandbox.run(&format!("{refine} --resume --correct-poses"));
+    let good = read_weights(&file).unwrap();
+    let refuse = |tensors: &BTreeMap<String, Tensor>, metadata: HashMap<String, String>, expected: &str| {
+        write_weights(&file, tensors, metadata).unwrap();
+        let error = RefineState::read(&file).expect_err(expected);
+        assert!(error.is_invalid_request(), "{error}");
+        assert_says(&error.to_string(), &[&format!("a.state.safetensors: {expected}")]);
+    };
+    for (field, value, expected) in [
+        ("/depth", json!(0), "depth is 0.0, expected a finite number above 0"),
+        ("/depth", json!(-1.5), "depth is -1.5, expected"),
+        ("/frame", json!([0, 0, 0, 0]), "frame is [0.0, 0.0, 0.0, 0.0], expected"),
+        ("/growth/degrees", json!([0, 9]), "degrees is [0, 9], expected"),
+        ("/growth/degrees", json!([1, 0]), "degrees is [1, 0], expected"),
+        ("/growth/degree", json!(3), "degree is 3, expected"),
+        ("/growth/first_count", json!(0), "first_count is 0, expected 1 up to the number of Gaussians"),
+        ("/growth/first_count", json!(61), "first_count is 61, expected"),
+        ("/growth/averaged_steps", json!(10), "averaged_steps is 10, expected at most the number of steps"),
+        ("/progress/steps", json!(1u64 << 60), "steps is 1152921504606846976, expected"),
+        ("/progress/time/secs", json!(u64::MAX), "time is 18446744073709551615."),
+        ("/total/secs", json!(u64::MAX), "total is 18446744073709551615."),
+        ("/photos", json!([]), "photos is [], expected one or more"),
+        ("/photos/0", json!(7), "the metadata refinement is invalid (invalid type: integer `7`"),
+    ] {
+        let mut metadata = good.metadata.clone();
+        let mut record: Value = serde_json::from_str(&metadata["refinement"]).unwrap();
+        *record.pointer_mut(field).expect(field) = value;
+        metadata.insert("refinement".into(), record.to_string());
+        refuse(&good.tensors, metadata, expected);
+    }
+    type Damage = fn(&Tensor) -> Tensor;
+    let missing: Damage = |_| Tensor::new();
+    for (name, damage, expected) in [
+        (
+            "gaussians.value.means",
+            (|t| t.flatten(0, -1)) as Damage,
+            "Float of shape [180], expected Float of",
+        ),
+        ("gaussians.value.means", missing, "missing, expected Float of"),
+        ("gaussians.value.means", |t| t / 0., "not finite, expected finite numbers"),
+        (
+            "gaussians.value.log_scales",
+            |t| t.to_kind(Kind::Double),
+            "Double of shape [1, 60, 3], expected Float",
+        ),
+        ("gaussians.value.quaternions", |t| t.narrow(2, 0, 3), "Float of shape [1, 60, 3], expected"),
+        ("gaussians.value.shN", |t| t.narrow(2, 0, 2), "Float of shape [1, 60, 2, 3], expected"),
+        ("gaussians.average.sh0", |t| t.narrow(1, 0, 59), "Float of shape [1, 59, 1, 3], expected"),
+        ("gaussians.first.means", missing, "missing, expected Float of shape [1, 60, 3]"),
+        ("gaussians.second.opacity_logits", |t| t - 1., "below 0, expected 0 or more"),
+        ("gaussians.steps", |t| t + 1, "10, expected 9, the number of steps"),
+        ("corrections.value.poses", |t| t.narrow(1, 0, 5), "Float of shape [9, 5], expected"),
+        ("corrections.first.poses", missing, "missing, expected Float of shape [9, 6]"),
+    ] {
+        let damaged = damage(&good.tensors[name]);
+        let tensor = |(key, t): (&String, &Tensor)| {
+            (key.clone(), if key == name { &damaged } else { t }.shallow_clone())
+        };
+        let tensors = good.tensors.iter().map(tensor).filter(|(_, t)| t.defined());
+        refuse(&tensors.collect(), good.metadata.clone(), &format!("tensor {name} is {expected}"));
+    }
+    refuse(
+        &good.tensors,
+        HashMap::new(),
+        "the metadata refinement is missing, expected that of a refinement",
+    );
+}
+
 /// A splat that is optimized for antialiased rendering is marked, and keeps the mark when it is continued or refined.
 #[test]
 fn antialiased_splats_keep_their_mark() {
@@ -442,13 +560,13 @@ fn a_splat_becomes_better_or_stays() {
     splat.sh.as_flattened_mut().iter_mut().for_each(|coefficient| *coefficient *= 0.5);
     write_splat(&sandbox.path("dull.ply"), &splat).unwrap();
     let done = sandbox.json("refine --splat @dull.ply --scene @room --out @a.ply --steps 150");
-    assert_improved(&done["shown"], 5.);
+    assert_improved(&done["train"], 5.);
     assert_eq!(done["held_out"], Value::Null);
     assert_eq!(read_splat(&sandbox.path("a.ply")).unwrap().len(), splat.len());
     // Its photos are its own renders: no splat is better.
     let done = sandbox.json("refine --splat @room/truth.ply --scene @room --out @a.ply --steps 50");
-    assert_eq!(done["shown"]["before"], done["shown"]["after"]);
-    assert!(number(&done, "/shown/after/psnr") > 55.);
+    assert_eq!(done["train"]["before"], done["train"]["after"]);
+    assert!(number(&done, "/train/after/psnr") > 55.);
 }
 
 /// On real photos, held-out views score far above the baseline that uses the input photos. Photos of several sizes, with lens distortion, and
@@ -534,7 +652,7 @@ fn pose_and_exposure_errors_are_corrected() {
     };
     let (uncorrected, corrected) = (refined(""), refined("--correct-poses --correct-exposures"));
     assert_eq!(uncorrected["corrections"], json!([]));
-    let [before, after] = [&uncorrected, &corrected].map(|done| number(done, "/shown/after/psnr"));
+    let [before, after] = [&uncorrected, &corrected].map(|done| number(done, "/train/after/psnr"));
     assert!(after > before + 3., "{before} → {after}");
     let corrections = &corrected["corrections"];
     assert_eq!(corrections.as_array().unwrap().len(), 9);
