@@ -2,7 +2,7 @@
 #![cfg(unix)]
 
 use crate::common::browser::Browser;
-use crate::common::program::{Sandbox, arg, run_process, succeed};
+use crate::common::program::{Sandbox, arg, assert_says, run_process, succeed};
 use crate::common::{captures, has_viewer, write_script};
 use crate::{LEAST, assert_like, own_picture, picture_from_base64};
 use globalsplat::data::{load_views, open_capture};
@@ -303,4 +303,15 @@ fn pages_are_private_and_replaced_by_the_next() {
         before = Some(page);
     }
     assert!(temporary.join("page.html").exists());
+    // Without a folder for it, one sentence says so; a page with a place of its own needs none.
+    let nowhere = sandbox.path("nowhere");
+    let out = sandbox.command("view @room/truth.ply").env("TMPDIR", &nowhere).output().unwrap();
+    let err = String::from_utf8(out.stderr).unwrap();
+    assert_eq!((out.status.code(), err.lines().count()), (Some(2), 1), "{err}");
+    assert_says(&err, &["nowhere can't be written", "TMPDIR"]);
+    run_process(
+        sandbox
+            .command("render --splat @room/truth.ply --scene @room --html @page.html")
+            .env("TMPDIR", &nowhere),
+    );
 }

@@ -40,9 +40,14 @@ impl View {
         let splat = read_splat(&self.splat)?;
         warn(&splat.warnings);
         let name = name_of(&self.splat);
-        remove_pages(&std::env::temp_dir());
+        let folder = std::env::temp_dir();
+        remove_pages(&folder);
         // `tempfile` makes the page readable only by its owner. The page is kept, because the browser may read it after this program exits.
-        let page = tempfile::Builder::new().prefix("page-").suffix(PAGE_ENDING).tempfile()?;
+        let page = tempfile::Builder::new().prefix("page-").suffix(PAGE_ENDING).tempfile_in(&folder);
+        let page = page.map_err(|e| {
+            let e = Error::write(&folder)(e);
+            Error::request(format!("{e}; TMPDIR names another folder for the page, as does `render --html`"))
+        })?;
         write_page(page.path(), &name, &Gaussians::from_splat(&splat), splat.origin, capture.as_ref())?;
         let page = page.into_temp_path().keep().map_err(|e| Error::write(e.path.to_path_buf())(e.error))?;
         let opened = open::that_detached(&page);

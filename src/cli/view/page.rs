@@ -4,7 +4,7 @@ use super::contents::contents;
 use crate::data::Capture;
 use crate::error::Error;
 use crate::io::{
-    ShLimits, Splat, WriteOptions, check_writable_file, fit_splat, write_file, write_local_splat,
+    ShLimits, Splat, WriteOptions, check_writable_file, fit_splat, parent_of, write_file, write_local_splat,
 };
 use crate::scene::{Camera, Gaussians};
 use anyhow::Result;
@@ -58,14 +58,15 @@ pub fn write_page(
     let local = gaussians.to_local(&frame, origin);
     let contents = contents(&local, capture, &frame)?;
     let cameras = frame.cameras_to_local(&capture.map(Capture::cameras).unwrap_or_default());
-    let text = page(name, &contents, &spz(&local.to_splat(DVec3::ZERO)?, &cameras)?).into_string();
+    let spz = spz(parent_of(path), &local.to_splat(DVec3::ZERO)?, &cameras)?;
+    let text = page(name, &contents, &spz).into_string();
     Ok(write_file(path, text)?)
 }
 
-/// Encodes the splat compactly as SPZ, with colors within the range that viewers can show.
-fn spz(splat: &Splat, cameras: &[Camera]) -> Result<Vec<u8>> {
-    let folder = tempfile::tempdir()?;
-    let file = folder.path().join("scene.spz");
+/// Encodes the splat compactly as SPZ, with colors within the range that viewers can show, through a temporary file in `folder`.
+fn spz(folder: &Path, splat: &Splat, cameras: &[Camera]) -> Result<Vec<u8>> {
+    let temporary = tempfile::tempdir_in(folder).map_err(Error::write(folder))?;
+    let file = temporary.path().join("scene.spz");
     let fitted = fit_splat(&file, splat, &ShLimits::of_viewers(splat.sh_degree), cameras)?;
     // Spark doesn't read newer versions.
     write_local_splat(&file, &fitted, &WriteOptions { spz_version: 3 })?;
