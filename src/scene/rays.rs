@@ -79,7 +79,12 @@ impl RadialWarp {
             let distances = points.norm_scalaropt_dim(2, [-1i64], false).clamp_min(NEAREST);
             let logs = (&distances / DISTANCE).log() * &weights;
             let sums = histogram(&map_position(&points), &Tensor::stack(&[&logs, &weights], 1));
-            let total = |values: &Tensor| values.sum_dim_intlist(1i64, false, Kind::Float);
+            // View by view, since libtorch splits the sum of a single number among its threads, which changes the bits.
+            let total = |values: &Tensor| {
+                let by_view =
+                    values.unflatten(1, [depths.size()[1], -1]).sum_dim_intlist(2i64, false, Kind::Float);
+                by_view.sum_dim_intlist(1i64, false, Kind::Float)
+            };
             let mean = total(&logs) / (total(&weights) + PRIOR);
             RadialWarp {
                 log_factors: blurred_ratio(&sums),
@@ -202,6 +207,7 @@ fn blur(map: &Tensor, sigma: f64) -> Tensor {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::device::num_threads;
     use tch::Device;
 
     const OPTIONS: (Kind, Device) = (Kind::Float, Device::Cpu);
@@ -239,6 +245,28 @@ mod tests {
         assert!(warp.cameras(&c2w).equal(&c2w));
         let means = Tensor::randn([1, 9, 3], OPTIONS);
         assert!(warp.restore(&gaussians(&means)).means.equal(&means));
+    }
+
+    /// The warp has the same bits for any number of threads.
+    #[test]
+    fn threads_do_not_change_the_warp() {
+        let _guard = num_threads::lock_exclusive();
+        let before = tch::get_num_threads();
+        for count in 9..21 {
+            let irregular = Tensor::arange(count * 2 * 96 * 96, (Kind::Double, Device::Cpu)).square().sin();
+            let depths = (irregular.abs() + 0.01).to_kind(Kind::Float).view([1, count, 2, 96, 96]);
+            let [c2w, intrinsics, _] = views(1., 1.);
+            let [c2w, intrinsics] = [c2w, intrinsics].map(|t| t.narrow(1, 0, 1).repeat([1, count, 1, 1]));
+            let warps = [1, 2, 3].map(|threads| {
+                tch::set_num_threads(threads);
+                RadialWarp::new(&c2w, &intrinsics, &depths)
+            });
+            tch::set_num_threads(before);
+            for warp in &warps[1..] {
+                assert!(warp.camera_factors.equal(&warps[0].camera_factors), "{count} views");
+                assert!(warp.log_factors.equal(&warps[0].log_factors), "{count} views");
+            }
+        }
     }
 
     /// Gaussians at the warped place of a wall are moved back to the wall.
