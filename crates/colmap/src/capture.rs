@@ -66,6 +66,14 @@ fn make_or_continue(
     if let Some(model) = options.camera_model.as_ref().filter(|model| !models.contains(&model.as_str())) {
         return Err(Error::setting("the camera model", model, format!("one of {}", models.join(", "))));
     }
+    if out.to_str().is_none() {
+        return Err(Error::input(
+            out,
+            "the output",
+            "a path that isn't UTF-8",
+            "one that is, which COLMAP needs",
+        ));
+    }
     let (images, is_video) = (out.join("images"), source.is_file());
     let photos = if is_video { &images } else { source };
     let read = || {

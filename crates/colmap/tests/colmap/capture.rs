@@ -5,7 +5,9 @@ use globalsplat_colmap::{CaptureOptions, Colmap, Step, make_capture};
 use globalsplat_files::FolderLock;
 use globalsplat_test_kit::rerun_test;
 use serde_json::{Value, json};
+use std::ffi::OsStr;
 use std::fs;
+use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::Command;
@@ -64,6 +66,9 @@ fn bad_requests_are_refused_in_one_sentence() {
         let error = error.to_string().replace(&format!("{}/", folder.path().display()), "");
         assert!(error.starts_with(expected), "{error}");
     }
+    let latin_1 = folder.path().join(OsStr::from_bytes(b"caf\xe9"));
+    let error = make(&at("photos"), &latin_1, &CaptureOptions::default(), &failing_colmap()).unwrap_err();
+    assert!(error.is_invalid_request() && error.to_string().contains("a path that isn't UTF-8"), "{error}");
     let error = Colmap::at(Path::new("/no/such/python3")).unwrap_err();
     assert!(error.is_invalid_request());
     let expected = "/no/such/python3: the program is a Python without pycolmap, expected a colmap program or a Python with pycolmap \
