@@ -25,7 +25,8 @@ impl ClaimedGaussians {
             return Ok(());
         }
         let found = format!("{}, which take {} bytes of memory", self.count, self.memory);
-        let expected = format!("{MAX_RATIO} times the file's {size} bytes at most");
+        let expected =
+            format!("at most {} MiB plus {MAX_RATIO} times the file's {size} bytes", MAX_SMALL >> 20);
         Err(Error::input(path, "the number of Gaussians", found, expected))
     }
 }

@@ -5,11 +5,15 @@ use crate::{Error, Result};
 use globalsplat_files::{check_regular, parent_of, stored_zip, write_file, write_files};
 use image_webp::{ColorType, EncoderParams, WebPDecoder, WebPEncoder};
 use rayon::prelude::*;
+use std::collections::BTreeSet;
 use std::io::{Cursor, Read};
 use std::path::{Path, PathBuf};
 use zip::ZipArchive;
+use zip::read::ZipFile;
 
-/// Maximum ratio of decompressed to compressed size of the archive, with `MAX_SMALL` bytes allowed in addition.
+/// Expected place of a file, for messages.
+const IN_ARCHIVE: &str = "a file in the archive";
+/// Maximum ratio of decompressed to compressed size of a file in an archive, with `MAX_SMALL` bytes allowed in addition.
 const MAX_RATIO: u64 = 64;
 const MAX_SMALL: u64 = 1 << 20;
 
@@ -34,21 +38,31 @@ struct Archive<'a> {
     size: usize,
 }
 
+impl<'a> Archive<'a> {
+    /// Returns the entry of the SOG's file `name` in the archive at `path`.
+    fn entry(&mut self, path: &Path, name: &str) -> Result<ZipFile<'_>> {
+        let entry = self.zip.by_name(&format!("{}{name}", self.folder));
+        entry.map_err(|why| Error::input(path, name, format!("missing or damaged ({why})"), IN_ARCHIVE))
+    }
+}
+
 impl<'a> Reader<'a> {
     /// Opens the archive at `path`, whose contents are `bytes`.
     pub fn open_zip(path: &'a Path, bytes: &'a [u8]) -> Result<Self> {
         let zip = ZipArchive::new(Cursor::new(bytes))
             .map_err(|why| Error::input(path, "the file", format!("damaged: {why}"), "a ZIP archive"))?;
-        // macOS adds a folder for its own.
-        let names = zip.file_names().filter(|name| !name.starts_with("__MACOSX"));
+        // macOS adds folders of its own.
+        let names = zip.file_names().filter(|name| name.split(['/', '\\']).all(|part| part != "__MACOSX"));
         let is_folder = |name: &&str| name.is_empty() || name.ends_with(['/', '\\']);
         let folders: Vec<_> = names.filter_map(|name| name.strip_suffix(META)).filter(is_folder).collect();
         let folder = match &folders[..] {
             folders if folders.contains(&"") => String::new(),
             [folder] => folder.to_string(),
             _ => {
-                let found = format!("in {} folders of the archive", folders.len());
-                return Err(Error::input(path, META, found, "one, that of a SOG"));
+                let found = format!("with {} files {META}", folders.len());
+                let expected =
+                    "one, that of a SOG, with its images; other splats are read without an archive";
+                return Err(Error::input(path, "the archive", found, expected));
             }
         };
         Ok(Reader { path, archive: Some(Archive { zip, folder, size: bytes.len() }) })
@@ -68,12 +82,14 @@ impl<'a> Reader<'a> {
         Ok(parent_of(self.path).join(name))
     }
 
-    /// Returns the size in bytes of the archive, or of the files `names` in the folder.
-    pub fn size<'n>(&self, mut names: impl Iterator<Item = &'n String>) -> Result<usize> {
-        if let Some(archive) = &self.archive {
-            return Ok(archive.size);
-        }
-        names.try_fold(0, |size, name| {
+    /// Returns the size in bytes of the files `names`, compressed if they are in an archive. A file that is named twice counts once.
+    pub fn size<'n>(&mut self, names: impl Iterator<Item = &'n String>) -> Result<usize> {
+        let names: BTreeSet<_> = names.collect();
+        names.into_iter().try_fold(0, |size, name| {
+            if let Some(archive) = &mut self.archive {
+                let max = archive.size;
+                return Ok((size + archive.entry(self.path, name)?.compressed_size() as usize).min(max));
+            }
             let file = self.beside(name)?;
             Ok(size + std::fs::metadata(&file).map_err(Error::read(&file))?.len() as usize)
         })
@@ -81,15 +97,15 @@ impl<'a> Reader<'a> {
 
     /// Returns the contents of the file `name`, which must be in the archive or folder.
     pub fn file(&mut self, name: &str) -> Result<Vec<u8>> {
-        let Some(Archive { zip, folder, size }) = &mut self.archive else {
+        let Some(archive) = &mut self.archive else {
             let file = self.beside(name)?;
             check_regular(&file)?;
             return std::fs::read(&file).map_err(Error::read(&file));
         };
-        let refuse = |found: String| Error::input(self.path, name, found, "a file in the archive");
-        let file = zip.by_name(&format!("{folder}{name}"));
-        let file = file.map_err(|why| refuse(format!("missing or damaged ({why})")))?;
-        let (mut contents, max) = (vec![], MAX_SMALL + MAX_RATIO * *size as u64);
+        let refuse = |found: String| Error::input(self.path, name, found, IN_ARCHIVE);
+        let (mut contents, size) = (vec![], archive.size as u64);
+        let file = archive.entry(self.path, name)?;
+        let max = MAX_SMALL + MAX_RATIO * file.compressed_size().min(size);
         file.take(max + 1).read_to_end(&mut contents).map_err(|why| refuse(format!("damaged: {why}")))?;
         match contents.len() as u64 > max {
             true => Err(refuse(format!("more than {max} bytes"))),

@@ -52,14 +52,13 @@ const MAX_PIXELS: (usize, usize) = (4, 1 << 16);
 /// Contents of `meta.json`.
 #[derive(Serialize, Deserialize)]
 struct Meta {
-    #[serde(default)]
+    #[serde(skip_deserializing)]
     version: u64,
     #[serde(default)]
     asset: Value,
     /// Number of Gaussians, which version 1 has in the shape of the means.
     count: Option<usize>,
-    #[serde(default)]
-    antialias: bool,
+    antialias: Option<bool>,
     /// Kind of the splat, which splat-transform reads in place of `antialias`.
     #[serde(skip_serializing_if = "Option::is_none")]
     model: Option<String>,
@@ -174,7 +173,8 @@ fn read(path: &Path, mut reader: Reader, meta: &[u8]) -> Result<Splat> {
         |what: &str, why, expected: &str| Error::input(path, META, format!("{what} ({why})"), expected);
     let value: Value =
         serde_json::from_slice(meta).map_err(|why| bad_json("no JSON", why, "the JSON of a SOG"))?;
-    if let Some(version) = value.get("version").filter(|&version| *version != 1 && *version != VERSION) {
+    let is_known = |version: &&Value| version.as_f64().is_some_and(|number| number == 1. || number == 2.);
+    if let Some(version) = value.get("version").filter(|version| !is_known(version)) {
         return refuse("the version in meta.json", version.to_string(), "1 or 2");
     }
     let meta: Meta =
@@ -199,7 +199,7 @@ fn read(path: &Path, mut reader: Reader, meta: &[u8]) -> Result<Splat> {
     let [scale_name, rotation_name, color_name] = singles;
     let [scales, rotations, colors] = [image(scale_name)?, image(rotation_name)?, image(color_name)?];
     let labels = meta.sh_rest.as_ref().map(|rest| image(&rest.files[1])).transpose()?;
-    let antialiased = meta.antialias || meta.model.as_deref() == Some(ANTIALIASED);
+    let antialiased = meta.antialias == Some(true) || meta.model.as_deref() == Some(ANTIALIASED);
     let mut splat = Splat { antialiased, ..Splat::default() };
     // Values of the first three bytes of a pixel of the image `name`.
     let look_up = |tables: &[Vec<f32>], name: &str, pixel: [u8; 4]| -> Result<[f32; 3]> {
@@ -384,7 +384,7 @@ fn encode(splat: &Splat) -> (Vec<u8>, Vec<(&'static str, Image)>) {
         version: VERSION,
         asset: json!({"generator": concat!("globalsplat ", env!("CARGO_PKG_VERSION"))}),
         count: Some(splat.len()),
-        antialias: splat.antialiased,
+        antialias: Some(splat.antialiased),
         model: splat.antialiased.then(|| ANTIALIASED.into()),
         means: Means { shape: vec![], mins, maxs, files: ["means_l.webp", "means_u.webp"].map(String::from) },
         scales: Indexed { values: scales.into(), files: name("scales.webp") },

@@ -68,16 +68,15 @@ fn bundles_may_have_a_folder() {
     };
     let expected = read_splat(&path).unwrap();
     for (folder, other) in
-        [("room/", "__MACOSX/room/._meta.json"), ("a\\b\\", "__MACOSX/meta.json"), ("", "old/meta.json")]
+        [("room/", "__MACOSX/room/._meta.json"), ("a\\b\\", "x/__MACOSX/meta.json"), ("", "old/meta.json")]
     {
         write(&[folder], other);
         assert_eq!(read_splat(&bundle).unwrap(), expected, "{folder:?}");
     }
     for folders in [&["a/", "b/"][..], &[]] {
-        write(folders, "photo.jpg");
-        let message =
-            format!("a.ZIP: meta.json is in {} folders of the archive, expected one", folders.len());
-        assert_refused(&bundle, &[&message]);
+        write(folders, "room.ply");
+        let message = format!("a.ZIP: the archive is with {} files meta.json, expected one", folders.len());
+        assert_refused(&bundle, &[&message, "other splats are read without an archive"]);
     }
 }
 
@@ -99,6 +98,7 @@ fn bad_metas() {
         ("/count", json!(5), "pixels of means_l.webp is 4, expected 5"),
         ("/count", json!(u64::MAX), "the number of Gaussians is 18446744073709551615"),
         ("/count", json!(null), "the number of Gaussians is missing"),
+        ("/count", json!(0), "the number of Gaussians is 0, expected 1 or more"),
         ("/scales/codebook", json!([]), "scales.codebook is missing"),
         ("/scales/codebook", json!([null, null]), "entry 0 of scales.codebook is null"),
         ("/shN/codebook/255", json!(null), "entry 255 of shN.codebook is null"),
@@ -116,6 +116,16 @@ fn bad_metas() {
         change_meta(&path, |meta| *meta.pointer_mut(pointer).unwrap() = value);
         assert_refused(&path, &[message]);
     }
+}
+
+/// Programs write numbers and absent values in several ways.
+#[test]
+fn metas_may_have_decimals_and_null() {
+    let folder = tempfile::tempdir().unwrap();
+    let (_, path) = three(folder.path());
+    let expected = read_splat(&path).unwrap();
+    change_meta(&path, |meta| (meta["version"], meta["antialias"]) = (json!(2.0), json!(null)));
+    assert_eq!(read_splat(&path).unwrap(), expected);
 }
 
 /// An early program wrote null for the first entry of a codebook, which PlayCanvas' engine extrapolates.
@@ -195,8 +205,11 @@ fn bad_images_and_archives() {
         write_pixels(&small.path().join(name), 700, &vec![[0, 0, 0, 255]; 700 * 700]);
     }
     change_meta(&bomb, |meta| meta["count"] = json!(700 * 700));
-    assert_refused(&bomb, &["the number of Gaussians is 490000", "expected 256 times the file's "]);
-    // Zeros after an image, which an archive compresses, allow for no more.
+    assert_refused(
+        &bomb,
+        &["the number of Gaussians is 490000", "expected at most 16 MiB plus 256 times the file's "],
+    );
+    // Zeros after an image, which an archive compresses, and other files allow for no more.
     let mut archive = zip::ZipWriter::new(std::io::Cursor::new(vec![]));
     for file in splat_files(&bomb).iter().filter(|file| file.is_file()) {
         let name = file.file_name().unwrap().to_str().unwrap();
@@ -204,6 +217,9 @@ fn bad_images_and_archives() {
         let padding = vec![0; if name == "means_l.webp" { 1 << 19 } else { 0 }];
         archive.write_all(&[fs::read(file).unwrap(), padding].concat()).unwrap();
     }
+    let stored = zip::write::FileOptions::default().compression_method(zip::CompressionMethod::Stored);
+    archive.start_file("other", stored).unwrap();
+    archive.write_all(&[0; 1 << 20]).unwrap();
     let archive = archive.finish().unwrap().into_inner();
     assert_bytes_refused("sog", &archive, &["the number of Gaussians is 490000"]);
     let mut noise = vec![[0; 4]; 700 * 700];
