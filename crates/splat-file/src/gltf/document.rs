@@ -10,8 +10,9 @@ use percent_encoding::percent_decode_str;
 use serde::Deserialize;
 use serde_json::Value;
 use std::borrow::Cow;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::btree_map::{BTreeMap, Entry};
 use std::path::{Path, PathBuf};
+use std::rc::Rc;
 
 #[derive(Default, Deserialize)]
 #[serde(default, rename_all = "camelCase")]
@@ -104,7 +105,7 @@ const KNOWN: [&str; 4] = [EXTENSION, SPZ_EXTENSION, "KHR_mesh_quantization", "KH
 pub struct Document<'a> {
     pub path: &'a Path,
     pub gltf: Gltf,
-    buffers: Vec<Cow<'a, [u8]>>,
+    buffers: Vec<Rc<Cow<'a, [u8]>>>,
     /// Size in bytes of the file and of the buffers in other files.
     pub size: usize,
 }
@@ -123,11 +124,10 @@ impl<'a> Document<'a> {
             let expected = format!("{} or none", KNOWN.join(", "));
             return Err(Error::input(path, "a required extension", quoted(unknown), expected));
         }
-        let mut files = BTreeSet::new();
+        let mut files = BTreeMap::new();
         let read = |(index, buffer)| read_buffer(path, index, buffer, bin.filter(|_| index == 0), &mut files);
         let buffers = gltf.buffers.iter().enumerate().map(read).collect::<Result<Vec<_>>>()?;
-        let is_owned = |buffer: &&Cow<[u8]>| matches!(buffer, Cow::Owned(_));
-        let size = bytes.len() + buffers.iter().filter(is_owned).map(|buffer| buffer.len()).sum::<usize>();
+        let size = bytes.len() + files.values().map(|contents| contents.len()).sum::<usize>();
         Ok(Document { path, gltf, buffers, size })
     }
 
@@ -225,14 +225,14 @@ impl<'a> Document<'a> {
 }
 
 /// Reads buffer `index` of the file at `path`, which is in the chunk `bin` if it has no URI. Its file is added to `files`, none of which is
-/// read twice.
+/// read twice, though buffers may share it.
 fn read_buffer<'a>(
     path: &Path,
     index: usize,
     buffer: &Buffer,
     bin: Option<&'a [u8]>,
-    files: &mut BTreeSet<PathBuf>,
-) -> Result<Cow<'a, [u8]>> {
+    files: &mut BTreeMap<PathBuf, Rc<Cow<'a, [u8]>>>,
+) -> Result<Rc<Cow<'a, [u8]>>> {
     let Buffer { uri, byte_length } = buffer;
     let error = |path: &Path, field: &str, found: &str, expected: &str| {
         Error::input(path, format!("{field} {index}"), found, expected)
@@ -241,12 +241,12 @@ fn read_buffer<'a>(
     let contents = match uri.as_deref() {
         None => {
             let missing = || error(path, "buffer", "without a uri", "one, or the binary chunk of a .glb");
-            Cow::Borrowed(bin.ok_or_else(missing)?)
+            Rc::new(Cow::Borrowed(bin.ok_or_else(missing)?))
         }
         Some(uri) if uri.starts_with("data:") => {
             let bytes = uri.split_once(";base64,").and_then(|(_, text)| BASE64_STANDARD.decode(text).ok());
             let damaged = || error(path, "buffer", "another or a damaged data URI", "one in base64");
-            Cow::Owned(bytes.ok_or_else(damaged)?)
+            Rc::new(Cow::Owned(bytes.ok_or_else(damaged)?))
         }
         Some(uri) => {
             let is_relative =
@@ -256,11 +256,12 @@ fn read_buffer<'a>(
             let name = name.ok_or_else(|| error(path, "the uri of buffer", &quoted(uri), expected))?;
             file = parent_of(path).join(&*name);
             check_regular(&file)?;
-            if !files.insert(file.canonicalize().map_err(Error::read(&file))?) {
-                let expected = "a file that no other buffer has";
-                return Err(error(path, "the uri of buffer", &quoted(uri), expected));
+            match files.entry(file.canonicalize().map_err(Error::read(&file))?) {
+                Entry::Occupied(read) => read.get().clone(),
+                Entry::Vacant(new) => {
+                    new.insert(Rc::new(Cow::Owned(std::fs::read(&file).map_err(Error::read(&file))?))).clone()
+                }
             }
-            Cow::Owned(std::fs::read(&file).map_err(Error::read(&file))?)
         }
     };
     if contents.len() < *byte_length {

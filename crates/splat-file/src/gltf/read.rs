@@ -106,11 +106,11 @@ impl PrimitiveReader<'_> {
         let scales: Vec<[f32; 3]> = self.numbers(&own("SCALE"), count)?;
         if self.document.has_log_scales() {
             (splat.log_scales, splat.linear_scales) = (scales, None);
-        } else if let Some(negative) = scales.as_flattened().iter().find(|&&scale| scale < 0.) {
+        } else if 2 * scales.as_flattened().iter().filter(|&&scale| scale < 0.).count() > 3 * count {
             let field = format!("the attribute {} of {}", own("SCALE"), self.name);
             let expected =
                 "lengths of 0 or more; only those of splat-transform before 2.7 are read as logarithms";
-            return Err(Error::input(path, field, format!("negative: {negative}"), expected));
+            return Err(Error::input(path, field, "negative for the most part", expected));
         } else {
             scales.into_iter().for_each(|scale| splat.push_linear_scale(scale));
         }
