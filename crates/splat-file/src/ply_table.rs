@@ -107,13 +107,15 @@ impl Header {
                     element.properties.push(Property { name: name.to_string(), kind });
                 }
                 // The first form is that of Brush, gsplat and nerfstudio, the second one Postshot's. The last comment counts.
-                ["comment", comment @ ..] => match comment.concat().to_ascii_lowercase().as_str() {
-                    "splatrendermode:mip" | "antialiased1" => antialiased = true,
-                    "splatrendermode:default" | "splatrendermode:2dgs" | "antialiased0" => {
-                        antialiased = false
+                ["comment", comment @ ..] => {
+                    let comment = comment.concat().to_ascii_lowercase();
+                    match comment.strip_prefix("splatrendermode:") {
+                        Some(mode) => antialiased = mode == "mip",
+                        None if comment == "antialiased1" => antialiased = true,
+                        None if comment == "antialiased0" => antialiased = false,
+                        None => {}
                     }
-                    _ => {}
-                },
+                }
                 _ => {}
             }
         }
@@ -178,7 +180,7 @@ impl Header {
             }
         })?;
         self.elements[index + 1..].iter().try_for_each(|after| body.skip_rows(after))?;
-        if !body.rest.trim_ascii_start().is_empty() {
+        if !body.rest.iter().all(is_blank) {
             let size = bytes.len() - body.rest.len();
             let expected = format!("{size}, where the header's elements end");
             return Err(Error::input(path, "the size", format!("{} bytes", bytes.len()), expected));
@@ -210,6 +212,11 @@ fn parse_kind(path: &Path, words: &[&str], name: &str) -> Result<Kind> {
             Err(Error::input(path, field(), found, "a number type, or a list of one"))
         }
     }
+}
+
+/// Returns `true` for white space, and for NUL, with which programs pad files.
+fn is_blank(byte: &u8) -> bool {
+    byte.is_ascii_whitespace() || *byte == 0
 }
 
 /// The part of the file that is still to be read.
@@ -266,7 +273,7 @@ impl Body<'_> {
     fn number(&mut self, scalar: Scalar) -> Result<f64, String> {
         if self.encoding == Encoding::Ascii {
             let text = self.rest.trim_ascii_start();
-            let length = text.iter().position(u8::is_ascii_whitespace).unwrap_or(text.len());
+            let length = text.iter().position(is_blank).unwrap_or(text.len());
             let (word, rest) = text.split_at(length);
             if word.is_empty() {
                 return Err("cut short".into());

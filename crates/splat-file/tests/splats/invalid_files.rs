@@ -49,7 +49,7 @@ fn bad_plys() {
     for ending in ["ply", "compressed.ply"] {
         let mut bytes = bytes_of(ending, &random_splat(300, 1, 9));
         let size = bytes.len();
-        bytes.extend(b"\r\n");
+        bytes.extend(b"\0\n");
         assert_eq!(read_bytes(ending, &bytes).unwrap().len(), 300);
         // As many rows again, or bytes of a row that the header leaves out.
         bytes.extend_from_within(size - 600..size);
@@ -57,6 +57,12 @@ fn bad_plys() {
             format!("the size is {} bytes, expected {size}, where the header's elements end", size + 602);
         assert_bytes_refused(ending, &bytes, &[&message]);
     }
+    // NUL after the last number of a text.
+    let folder = tempfile::tempdir().unwrap();
+    let path = write_changed_ply(folder.path(), "text.ply", |_| ());
+    let text = std::fs::read(&path).unwrap();
+    std::fs::write(&path, [text.trim_ascii_end(), b"\0\0"].concat()).unwrap();
+    assert_eq!(read_splat(&path).unwrap().len(), 3);
     for (length, message) in [
         (-1., "i in row 0 of face is a list of the length -1, expected numbers"),
         (f64::NAN, "i in row 0 of face is a list of the length NaN"),

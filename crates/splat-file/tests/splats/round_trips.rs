@@ -75,6 +75,7 @@ fn antialiased_splats_are_marked() {
         ("splatrendermode: Mip", true),
         // The last one counts.
         ("SplatRenderMode: mip\ncomment antialiased 0", false),
+        ("SplatRenderMode: mip\ncomment SplatRenderMode: new", false),
         ("SplatRenderMode: default\ncomment Antialiased 1\ncomment antialiased by a filter", true),
     ] {
         let bytes = [first, format!("comment {comment}\n").as_bytes(), rest].concat();
