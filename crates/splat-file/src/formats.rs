@@ -33,7 +33,8 @@ pub struct SplatFormat {
     pub marks_antialiased: bool,
     read: fn(&Path, &[u8]) -> Result<Splat>,
     find_invalid: fn(&Splat) -> InvalidGaussians,
-    write: fn(&Path, &Splat, &WriteOptions) -> Result<()>,
+    /// Function that writes a splat, or `None` for a format that is only read.
+    write: Option<fn(&Path, &Splat, &WriteOptions) -> Result<()>>,
     /// Function that returns the limits of the spherical harmonics.
     pub limits: fn() -> ShLimits,
     /// Function that returns a splat with SH coefficients above degree 0 rounded as in a file, if the format has a palette of them, which
@@ -48,7 +49,7 @@ const KSPLAT: SplatFormat = SplatFormat {
     marks_antialiased: false,
     read: ksplat::read,
     find_invalid: InvalidGaussians::find,
-    write: |path, _, _| Err(only_read(path, &KSPLAT)),
+    write: None,
     limits: || ShLimits::up_to(3),
     round_sh: None,
 };
@@ -59,7 +60,7 @@ const SOG: SplatFormat = SplatFormat {
     recognizes: sog::recognizes,
     marks_antialiased: true,
     read: sog::read_bundle,
-    write: sog::write_bundle,
+    write: Some(sog::write_bundle),
     round_sh: Some(sog::round_sh),
     ..KSPLAT
 };
@@ -71,7 +72,7 @@ static FORMATS: [SplatFormat; 10] = [
         recognizes: compressed_ply::recognizes,
         marks_antialiased: true,
         read: compressed_ply::read,
-        write: compressed_ply::write,
+        write: Some(compressed_ply::write),
         limits: compressed_ply::limits,
         ..KSPLAT
     },
@@ -81,7 +82,7 @@ static FORMATS: [SplatFormat; 10] = [
         marks_antialiased: true,
         read: ply::read,
         find_invalid: ply::find_invalid,
-        write: ply::write,
+        write: Some(ply::write),
         ..KSPLAT
     },
     SOG,
@@ -89,7 +90,7 @@ static FORMATS: [SplatFormat; 10] = [
         ending: sog::META,
         recognizes: |_| false,
         read: sog::read_folder,
-        write: sog::write_folder,
+        write: Some(sog::write_folder),
         ..SOG
     },
     SplatFormat {
@@ -97,14 +98,14 @@ static FORMATS: [SplatFormat; 10] = [
         recognizes: spz::recognizes,
         marks_antialiased: true,
         read: spz::read,
-        write: spz::write,
+        write: Some(spz::write),
         limits: spz::limits,
         ..KSPLAT
     },
     SplatFormat {
         ending: ".splat",
         read: dot_splat::read,
-        write: dot_splat::write,
+        write: Some(dot_splat::write),
         limits: dot_splat::limits,
         ..KSPLAT
     },
@@ -112,22 +113,25 @@ static FORMATS: [SplatFormat; 10] = [
         ending: ".glb",
         recognizes: gltf::recognizes_glb,
         read: gltf::read,
-        write: gltf::write_glb,
+        write: Some(gltf::write_glb),
         ..KSPLAT
     },
-    SplatFormat { ending: ".gltf", read: gltf::read, write: gltf::write_gltf, ..KSPLAT },
+    SplatFormat { ending: ".gltf", read: gltf::read, write: Some(gltf::write_gltf), ..KSPLAT },
     KSPLAT,
-    SplatFormat { ending: ".zip", ..SOG },
+    SplatFormat { ending: ".zip", write: None, ..SOG },
 ];
-/// Extensions of the formats that are only read.
-const ONLY_READ: [&str; 2] = [".ksplat", ".zip"];
-
 /// Extensions of the formats that are written, for messages.
 const WRITTEN_ENDINGS: &str = ".ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf or meta.json";
 /// Extensions of all formats, for messages.
 const ENDINGS: &str = ".ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf, .ksplat, meta.json or .zip";
 
 impl SplatFormat {
+    /// Returns the function that writes a splat at `path`, or an error for a format that is only read.
+    fn writer(&self, path: &Path) -> Result<fn(&Path, &Splat, &WriteOptions) -> Result<()>> {
+        let found = || format!("{}, which is only read", self.ending);
+        self.write.ok_or_else(|| Error::input(path, "the format", found(), WRITTEN_ENDINGS))
+    }
+
     /// Returns the paths of the other files that the splat at `path` is written to.
     fn other_files(&self, path: &Path) -> Vec<PathBuf> {
         match self.ending {
@@ -154,14 +158,8 @@ fn format_of(path: &Path) -> Result<&'static SplatFormat> {
 /// # Errors
 /// Returns an error for an unknown extension, or a format that is only read.
 pub fn output_format(path: &Path) -> Result<&'static SplatFormat> {
-    match format_of(path)? {
-        format if ONLY_READ.contains(&format.ending) => Err(only_read(path, format)),
-        format => Ok(format),
-    }
-}
-
-fn only_read(path: &Path, format: &SplatFormat) -> Error {
-    Error::input(path, "the format", format!("{}, which is only read", format.ending), WRITTEN_ENDINGS)
+    let format = format_of(path)?;
+    format.writer(path).map(|_| format)
 }
 
 /// Returns `true` if `path` has the extension of a splat format.
@@ -245,9 +243,14 @@ fn read_contents(path: &Path) -> Result<(Splat, InvalidGaussians)> {
 /// Creates the splat from the valid Gaussians of a file that has `all` in total, without those that have no rotation.
 fn drawable(path: &Path, all: usize, valid: Splat) -> Result<Splat> {
     let splat = valid.without_missing_rotations(path.display());
-    if splat.is_empty() && all > 0 {
-        let found = format!("{all}, none of which can be drawn");
-        let expected = "finite numbers, and rotations whose length isn't 0";
+    if splat.is_empty() {
+        let (found, expected) = match all {
+            0 => ("0".into(), "1 or more"),
+            _ => (
+                format!("{all}, none of which can be drawn"),
+                "finite numbers, and rotations whose length isn't 0",
+            ),
+        };
         return Err(Error::input(path, "the number of Gaussians", found, expected));
     }
     Ok(Splat { origin: read_origin(path)?, ..splat })
@@ -269,7 +272,7 @@ pub fn write_splat(path: &Path, splat: &Splat) -> Result<()> {
 /// # Errors
 /// Returns the errors of [`write_splat`], or an error if the format doesn't allow the options.
 pub fn write_local_splat(path: &Path, splat: &Splat, options: &WriteOptions) -> Result<()> {
-    let format = output_format(path)?;
+    let write = format_of(path)?.writer(path)?;
     splat.check_lengths()?;
     let (rotated, _) = drop_missing_rotations(splat);
     write_with_origin(path, splat.origin, || {
@@ -279,6 +282,6 @@ pub fn write_local_splat(path: &Path, splat: &Splat, options: &WriteOptions) -> 
                 path.display()
             )));
         }
-        (format.write)(path, &rotated, options)
+        write(path, &rotated, options)
     })
 }

@@ -110,7 +110,7 @@ fn the_axes_of_an_spz_are_applied() {
     assert_bytes_refused("spz", &with_axes(17), &["the coordinate system is 17", "1 to 16"]);
 }
 
-/// Of Spark's levels of detail, only the finest is read: Gaussians without children, whose opacities are stored as halves.
+/// The reader keeps the finest of Spark's levels of detail: Gaussians without children, whose opacities are stored as halves.
 #[test]
 fn the_finest_level_of_detail_is_read() {
     let mut bytes = unfolded(&bytes_of_version(3, &random_splat(3, 1, 9)));
@@ -130,6 +130,10 @@ fn the_finest_level_of_detail_is_read() {
         &read.warnings[0],
         &["a.spz: 1 of 3 Gaussians are left out, which are Spark's coarser levels of detail"],
     );
+    let mut coarse = bytes.clone();
+    let children = coarse.len() - 3 * 6;
+    coarse[children..][..6].fill(1);
+    assert_bytes_refused("spz", &gzip(&coarse), &["the number of Gaussians is 0, expected 1 or more"]);
     let same = Splat { opacity_logits: leaves.opacity_logits.clone(), warnings: vec![], ..read };
     assert_eq!(same, leaves);
     let mut four = bytes_of_version(4, &random_splat(3, 1, 9));
