@@ -42,7 +42,7 @@ const MIN_CUT: f32 = 0.01;
     globalsplat convert room.ply shared.ply --clamp-sh --scene captures/room\n  \
     globalsplat convert room.ply table.sog --up z --crop-sphere 0,0,0,2 --filter-floaters --scale 10")]
 pub struct Convert {
-    /// Input splat: .ply, .compressed.ply, .sog, meta.json, .spz, .splat, .glb, .gltf or .ksplat
+    /// Input splat: .ply, .compressed.ply, .sog, meta.json, .spz, .splat, .glb, .gltf, .ksplat or .zip
     #[arg(value_name = "FROM")]
     from: PathBuf,
     /// Output file, whose extension selects the format

@@ -20,8 +20,8 @@ use std::path::{Path, PathBuf};
     after_help = "Examples:\n  globalsplat inspect room.ply\n  globalsplat inspect room.sog --preview room.png"
 )]
 pub struct Inspect {
-    /// Splat (.ply, .compressed.ply, .sog, meta.json, .spz, .splat, .glb, .gltf, .ksplat), weights (.safetensors, .ckpt), a .torch, a capture, or a folder with an
-    /// index.json
+    /// Splat (.ply, .compressed.ply, .sog, meta.json, .spz, .splat, .glb, .gltf, .ksplat or .zip), weights (.safetensors, .ckpt),
+    /// a .torch, a capture, or a folder with an index.json
     #[arg(value_name = "FILE|DIR")]
     path: PathBuf,
     /// Also render a splat to this PNG, 512×512 pixels, from in front of it

@@ -313,7 +313,7 @@ mod tests {
         assert!((50..85).contains(&left), "{left}");
     }
 
-    /// Of known Gaussians, those are kept that don't contradict the photos and contribute the most, up to the requested number.
+    /// The known Gaussians that don't contradict the photos and contribute the most are kept, up to the requested number.
     #[test]
     fn the_most_visible_gaussians_are_kept() {
         let options = (Kind::Float, Device::Cpu);

@@ -68,7 +68,7 @@ fn a_reconstruction_becomes_a_splat_of_the_requested_size() {
     assert_eq!(done["gaussians"], 4000);
 }
 
-/// Of views off the path, the pixels are scored that the photos cover, and depths by the exact ones.
+/// A view off the path is scored over the pixels that the photos cover, and its depth by the exact depth.
 #[test]
 fn views_off_the_path_are_scored_where_photos_cover_them() {
     let sandbox = Sandbox::empty();

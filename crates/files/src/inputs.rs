@@ -100,7 +100,7 @@ pub fn real_path(path: &Path) -> PathBuf {
     }
 }
 
-/// What a path leads to.
+/// Identity of the file or folder that a path leads to, by which two paths are compared.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 enum FileId {
     /// Device and inode of a file or folder.

@@ -65,7 +65,7 @@ impl Bench {
 #[command(after_help = "Examples:\n  globalsplat bench raster\n  \
     globalsplat bench raster --splat room.ply --scene captures/room --threads 1")]
 pub struct Raster {
-    /// Splat: .ply, .compressed.ply, .sog, meta.json, .spz, .splat, .glb, .gltf or .ksplat
+    /// Splat: .ply, .compressed.ply, .sog, meta.json, .spz, .splat, .glb, .gltf, .ksplat or .zip
     #[arg(long, value_name = "FILE", requires = "scene")]
     splat: Option<PathBuf>,
     /// Capture whose cameras render the splat, all in one call

@@ -39,7 +39,7 @@ const ALPHA: &str = "_alpha";
     globalsplat render --splat room.ply --scene captures/room --html room.html"
 )]
 pub struct Render {
-    /// Splat: .ply, .compressed.ply, .sog, meta.json, .spz, .splat, .glb, .gltf or .ksplat
+    /// Splat: .ply, .compressed.ply, .sog, meta.json, .spz, .splat, .glb, .gltf, .ksplat or .zip
     #[arg(long, value_name = "FILE", group = "source")]
     splat: Option<PathBuf>,
     /// Weights to reconstruct the capture with, as `reconstruct` does: a file that `export` or `import` wrote, or a checkpoint

@@ -25,7 +25,7 @@ use std::path::{Path, PathBuf};
 #[command(after_help = "Examples:\n  globalsplat view room.ply --scene captures/room\n  \
     globalsplat render --splat room.ply --scene captures/room --html room.html")]
 pub struct View {
-    /// Splat: .ply, .compressed.ply, .sog, meta.json, .spz, .splat, .glb, .gltf or .ksplat
+    /// Splat: .ply, .compressed.ply, .sog, meta.json, .spz, .splat, .glb, .gltf, .ksplat or .zip
     #[arg(value_name = "SPLAT")]
     splat: PathBuf,
     /// Capture that the splat was made from
