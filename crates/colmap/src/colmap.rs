@@ -19,8 +19,7 @@ const GET: &str = "pip install pycolmap, or apt install colmap";
 const OLDEST_COLMAP: (u32, u32) = (3, 8);
 const OLDEST_PYCOLMAP: (u32, u32) = (4, 0);
 
-/// Isolates Python (`-I`) from the working folder and from variables that name other modules. Packages of the user are added again.
-const ISOLATED: [&str; 2] = ["-I", "-c"];
+/// Adds the packages of the user, which `-I` leaves out.
 const ADD_USER_PACKAGES: &str = "import site, sys; sys.path.append(site.getusersitepackages())\n";
 /// Prints pycolmap's version.
 const PRINT_VERSION: &str = "import pycolmap; print('COLMAP', pycolmap.__version__)";
@@ -38,8 +37,8 @@ pub struct Colmap {
 
 impl Colmap {
     /// Finds COLMAP: the program or the Python that `GLOBALSPLAT_COLMAP` names; else the newest of `colmap` on the PATH and the pycolmap of
-    /// the first Python that has it, and of equal versions pycolmap. Python is looked for in `.venv` beside this program and up to three
-    /// folders above, in the active virtual or Conda environment, and as `python3` on the PATH.
+    /// the first Python that has it, and of equal versions pycolmap. Python is looked for in `.venv` beside this program, or of the
+    /// checkout in whose `target` it is, in the active virtual or Conda environment, and as `python3` on the PATH.
     ///
     /// # Errors
     /// Returns an error that says how to install COLMAP if there is none, or what is wrong with the one that `GLOBALSPLAT_COLMAP` names.
@@ -86,7 +85,7 @@ impl Colmap {
     fn new(program: PathBuf, is_python: bool) -> Option<Self> {
         let mut command = Command::new(&program);
         match is_python {
-            true => command.args(ISOLATED).arg(format!("{ADD_USER_PACKAGES}{PRINT_VERSION}")),
+            true => isolate(&mut command, PRINT_VERSION),
             false => command.arg("help"),
         };
         let output = command.stdin(Stdio::null()).output().ok()?;
@@ -122,8 +121,7 @@ impl Colmap {
         reporter.report(start)?;
         let mut command = Command::new(&self.program);
         if self.is_python {
-            command.args(ISOLATED).arg(format!("{ADD_USER_PACKAGES}{RUN_COMMAND}"));
-            command.args([name, &options.to_string()]);
+            isolate(&mut command, RUN_COMMAND).args([name, &options.to_string()]);
         } else {
             let mut help = Command::new(&self.program);
             let help = help.args([name, "-h"]).stdin(Stdio::null()).output().map_err(failed_start())?;
@@ -178,14 +176,22 @@ fn parse_version(version: &str) -> Option<(u32, u32)> {
     Some((numbers.next()?.parse().ok()?, numbers.next()?.parse().ok()?))
 }
 
+/// Makes `python` run `code` isolated (`-I`) from the working folder and from variables that name other modules, but with packages of the user.
+fn isolate<'a>(python: &'a mut Command, code: &str) -> &'a mut Command {
+    // `site` follows this variable even in isolation.
+    python.env_remove("PYTHONUSERBASE").args(["-I", "-c"]).arg(format!("{ADD_USER_PACKAGES}{code}"))
+}
+
 /// Returns the Pythons that may have pycolmap.
 fn python_programs() -> Vec<PathBuf> {
     let program = std::env::current_exe().unwrap_or_default();
-    let local = program.ancestors().skip(1).take(4).map(|folder| folder.join(".venv"));
+    let target = program.ancestors().take(5).find(|folder| folder.ends_with("target"));
+    let local = [Some(&*program), target].into_iter().flatten().map(|path| path.with_file_name(".venv"));
     let active =
         ["VIRTUAL_ENV", "CONDA_PREFIX"].map(std::env::var_os).into_iter().flatten().map(PathBuf::from);
     let pythons = local.chain(active).map(|environment| environment.join("bin/python"));
-    pythons.filter(|python| python.is_file()).chain(["python3".into()]).collect()
+    let is_usable = |python: &PathBuf| python.is_absolute() && python.is_file();
+    pythons.filter(is_usable).chain(["python3".into()]).collect()
 }
 
 /// Returns the arguments of COLMAP's program for `options`, in the version whose help for the command is `help`. Sections that are named
