@@ -2,10 +2,9 @@
 
 use super::{Output, progress, signals};
 use crate::Error;
-use crate::io::check_writable_dir;
 use anyhow::Result;
 use clap::Args;
-use globalsplat_colmap::{CaptureOptions, CaptureReport, Colmap, Matching, make_capture};
+use globalsplat_colmap::{CaptureOptions, CaptureReport, Colmap, Matching, Step, make_capture};
 use std::path::{Path, PathBuf};
 
 /// Make a capture from a folder of photos or a video: find the camera poses, by COLMAP.
@@ -70,13 +69,15 @@ impl Capture {
 fn run_make_capture(source: &Path, out: &Path, options: &CaptureOptions) -> Result<CaptureReport> {
     std::fs::metadata(source).map_err(Error::read(source))?;
     let colmap = Colmap::find()?;
-    check_writable_dir(out)?;
     eprintln!("{colmap}");
     let mut bar: Option<(&'static str, progress::Progress)> = None;
     signals::end_at_request(2);
     let report = make_capture(source, out, options, &colmap, &mut |at| {
         let unit = at.step.unit();
         if bar.as_ref().is_none_or(|(current, _)| *current != unit) {
+            if at.step == Step::Wait {
+                eprintln!("another process uses {}; waiting", out.display());
+            }
             let next = progress::bar(at.total as u64, unit);
             if let Some((_, finished)) = bar.replace((unit, next)) {
                 finished.finish_and_clear();

@@ -128,8 +128,10 @@ fn file_at(path: PathBuf) -> Option<PathBuf> {
 const SYSTEM_FILES: [&str; 2] = ["Thumbs.db", "desktop.ini"];
 
 /// File extensions of videos, in lower case.
-const VIDEO_EXTENSIONS: [&str; 10] =
-    ["mp4", "mov", "m4v", "mkv", "webm", "avi", "mts", "m2ts", "360", "insv"];
+const VIDEO_EXTENSIONS: [&str; 16] = [
+    "mp4", "mov", "m4v", "mkv", "webm", "avi", "mts", "m2ts", "360", "insv", "3gp", "wmv", "mpg", "mpeg",
+    "ts", "flv",
+];
 
 /// The photos in a folder and its subfolders.
 #[derive(Debug)]

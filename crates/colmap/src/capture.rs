@@ -5,9 +5,9 @@ use crate::photos::{find_photo_masks, find_photos};
 use crate::poses::Estimate;
 use crate::progress::{Progress, Reporter, Step};
 use crate::record::{CaptureReport, FILE, Matching, Record, VideoRecord};
-use crate::video::{remove_frames, write_sharpest_frames};
-use globalsplat_capture::{COLMAP_MODELS, is_polycam};
-use globalsplat_files::{Error, FolderLock, Result, is_same_file, real_path};
+use crate::video::{check_video, first_visible, remove_frames, write_sharpest_frames};
+use globalsplat_capture::{COLMAP_MODELS, is_polycam, list_photos};
+use globalsplat_files::{Error, FolderLock, Result, check_writable_dir, is_same_file, real_path};
 use std::fs::{self, DirEntry};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -80,9 +80,14 @@ fn make_or_continue(
         let old = Record::read(out)?;
         check_output(photos, out, is_video, old.is_none()).map(|()| old)
     };
-    // Nothing is created in a folder that is refused.
-    read()?;
-    fs::create_dir_all(out).map_err(Error::write(out))?;
+    // Nothing is created for what is refused.
+    let is_started = read()?.is_some();
+    match is_video {
+        true if is_started => {}
+        true => check_video(source, options.frames)?,
+        false => list_photos(photos).and_then(|list| check_count(photos, list.photos.len()))?,
+    }
+    check_writable_dir(out)?;
     let _lock = wait_for_lock(out, reporter)?;
     let mut old = read()?;
     let write_frames = || frames_of_video(source, out, options, old.as_ref(), reporter);
@@ -90,9 +95,7 @@ fn make_or_continue(
     // A call that was stopped before it had all frames.
     old = old.filter(|old| old.video.as_ref().is_none_or(VideoRecord::is_finished));
     let (found, other_files) = find_photos(photos)?;
-    if found.len() < 2 {
-        return Err(Error::input(photos, "the number of photos", found.len(), "2 or more"));
-    }
+    check_count(photos, found.len())?;
     let new = Record {
         video,
         colmap: colmap.name_and_version(),
@@ -127,9 +130,16 @@ fn make_or_continue(
     Ok(CaptureReport { video: estimate.record.video, other_files, ..report })
 }
 
+fn check_count(photos: &Path, count: usize) -> Result<()> {
+    match count {
+        0 | 1 => Err(Error::input(photos, "the number of photos", count, "2 or more")),
+        _ => Ok(()),
+    }
+}
+
 /// Checks that a capture of the photos in the folder `photos` may be written to `out`: the photos may be the capture's own images, but no other
 /// folder of photos may contain the capture, which would then be found among the photos. If `is_new`, the folder `out` may only contain
-/// hidden files and these photos.
+/// hidden files and these photos, or a folder of images without any.
 fn check_output(photos: &Path, out: &Path, is_video: bool, is_new: bool) -> Result<()> {
     // The frames of a video are written later.
     if !is_video {
@@ -150,7 +160,7 @@ fn check_output(photos: &Path, out: &Path, is_video: bool, is_new: bool) -> Resu
     }
     let is_known = |entry: &DirEntry| {
         entry.file_name().as_encoded_bytes().starts_with(b".")
-            || !is_video && is_same_file(&entry.path(), photos)
+            || is_same_file(&entry.path(), photos) && (!is_video || first_visible(photos).is_none())
     };
     let other = fs::read_dir(out).into_iter().flatten().flatten().find(|entry| !is_known(entry));
     match other.filter(|_| is_new) {
@@ -187,15 +197,18 @@ fn frames_of_video(
         Some(Some(old)) if old.is_finished() && record.matches(old, options.keeps_finished) => {
             return Ok(old.clone());
         }
-        // The record names the folder's frames as ours. They may be those of a video that was refused.
-        Some(Some(old)) if !old.is_finished() => remove_frames(&images)?,
+        Some(Some(old)) if !old.is_finished() => remove_frames(&images, old.moving.unwrap_or(0))?,
         Some(other) => {
             let found = other.as_ref().map_or("none".to_string(), VideoRecord::to_string);
             let expected = format!("{record}, or a folder without a capture");
             return Err(Error::input(out.join(FILE), "the video", found, expected));
         }
     }
-    Record { video: Some(record.clone()), ..Record::default() }.write(out)?;
-    record.chosen = write_sharpest_frames(video, &images, options.frames, reporter)?;
+    let before_moving = |count| {
+        record.moving = Some(count);
+        Record { video: Some(record.clone()), ..Record::default() }.write(out)
+    };
+    record.chosen = write_sharpest_frames(video, &images, options.frames, reporter, before_moving)?;
+    record.moving = None;
     Ok(record)
 }

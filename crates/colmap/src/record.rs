@@ -51,6 +51,9 @@ pub struct VideoRecord {
     modified: u64,
     /// Number of frames that was asked for.
     frames: Option<usize>,
+    /// Number of frames that a call was about to move to the folder of images, by whose end this is missing.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) moving: Option<usize>,
     /// The chosen frames.
     #[serde(flatten)]
     pub chosen: VideoFrames,
@@ -66,6 +69,7 @@ impl VideoRecord {
             bytes: metadata.len(),
             modified: modified.unwrap_or_default().as_secs(),
             frames,
+            moving: None,
             chosen: VideoFrames::default(),
         })
     }

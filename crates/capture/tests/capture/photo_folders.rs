@@ -51,9 +51,9 @@ fn photos_are_told_from_other_files_by_their_contents() {
     std::fs::create_dir(&empty).unwrap();
     let found = "none: the folder is without photos, of 0 files, expected photos, each a JPEG, PNG";
     assert_refused(list_photos(&empty), &[found]);
-    std::fs::write(empty.join("walk.MP4"), "").unwrap();
+    std::fs::write(empty.join("walk.3GP"), "").unwrap();
     let expected =
-        "photos, each a JPEG, PNG, WebP, TIFF, BMP, HEIC or AVIF, or one video itself: none/walk.MP4";
+        "photos, each a JPEG, PNG, WebP, TIFF, BMP, HEIC or AVIF, or one video itself: none/walk.3GP";
     let error = list_photos(&empty).unwrap_err().to_string().replace(&format!("{}/", root.display()), "");
     assert!(error.ends_with(expected), "{error}");
 }

@@ -13,6 +13,7 @@ use frame_selection::{positions, select_frames};
 use globalsplat_files::{Error, Result};
 use motion::{MotionTracker, sharpness_of};
 use serde::{Deserialize, Serialize};
+use std::ffi::OsString;
 use std::path::Path;
 use std::{fs, io};
 
@@ -42,32 +43,48 @@ pub struct VideoFrames {
 /// folder stays as it was.
 ///
 /// # Errors
-/// Returns an error if ffmpeg or ffprobe is missing, if `folder` has files, if `video` isn't a video of two or more frames, if the number of frames is out of
-/// range, or if a frame can't be written.
+/// Returns an error if ffmpeg or ffprobe is missing, if `folder` has files, if `video` isn't a video of two or more frames, if the number of
+/// frames is out of range, or if a frame can't be written.
 pub fn extract_frames(
     video: &Path,
     folder: &Path,
     count: Option<usize>,
     on_progress: &mut dyn FnMut(Progress) -> bool,
 ) -> Result<Option<VideoFrames>> {
-    Reporter::run(on_progress, |reporter| write_sharpest_frames(video, folder, count, reporter))
+    Reporter::run(on_progress, |reporter| write_sharpest_frames(video, folder, count, reporter, |_| Ok(())))
 }
 
+/// Checks that `video` can be opened, and that the number of frames is in range.
+pub(crate) fn check_video(video: &Path, count: Option<usize>) -> Result<()> {
+    open(video, count).map(drop)
+}
+
+fn open(video: &Path, count: Option<usize>) -> Result<Video<'_>> {
+    if let Some(count) = count.filter(|count| !(1..=MAX_REQUESTED_FRAMES).contains(count)) {
+        return Err(Error::setting("the number of frames", count, format!("1 to {MAX_REQUESTED_FRAMES}")));
+    }
+    Video::open(video)
+}
+
+/// Returns the name of a file in `folder` that isn't hidden, if there is one.
+pub(crate) fn first_visible(folder: &Path) -> Option<OsString> {
+    let mut names = fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.file_name());
+    names.find(|name| !name.as_encoded_bytes().starts_with(b"."))
+}
+
+/// Writes frames like [`extract_frames`]. Calls `before_moving` with their number before any appears in the folder, and ends if it fails.
 pub(crate) fn write_sharpest_frames(
     video: &Path,
     folder: &Path,
     count: Option<usize>,
     reporter: &mut Reporter,
+    before_moving: impl FnOnce(usize) -> Result<()>,
 ) -> Result<VideoFrames> {
-    if let Some(count) = count.filter(|count| !(1..=MAX_REQUESTED_FRAMES).contains(count)) {
-        return Err(Error::setting("the number of frames", count, format!("1 to {MAX_REQUESTED_FRAMES}")));
-    }
-    let entries = fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.file_name());
-    if let Some(name) = entries.into_iter().find(|name| !name.as_encoded_bytes().starts_with(b".")) {
+    if let Some(name) = first_visible(folder) {
         let found = format!("one with {}", name.display());
         return Err(Error::input(folder, "the folder of frames", found, "a new or empty folder"));
     }
-    let source = Video::open(video)?;
+    let source = open(video, count)?;
     let (sharpness, motion) = measure(&source, reporter)?;
     let total = sharpness.len();
     if total < 2 {
@@ -90,6 +107,7 @@ pub(crate) fn write_sharpest_frames(
     let _ = fs::remove_dir_all(&partial);
     fs::create_dir_all(&partial).map_err(Error::write(folder))?;
     let written = write_frames(&source, &indices, &partial, reporter);
+    let written = written.and_then(|()| before_moving(chosen));
     let written = written.and_then(|()| move_frames(&partial, folder).map_err(Error::write(folder)));
     let _ = fs::remove_dir_all(&partial);
     written?;
@@ -130,12 +148,10 @@ fn move_frames(from: &Path, to: &Path) -> io::Result<()> {
     frames_in(from).iter().try_for_each(|name| fs::rename(from.join(name), to.join(name)))
 }
 
-/// Removes the frames in `folder`, which are those of a call that was stopped.
-pub(crate) fn remove_frames(folder: &Path) -> Result<()> {
-    frames_in(folder)
-        .iter()
-        .try_for_each(|name| fs::remove_file(folder.join(name)))
-        .map_err(Error::write(folder))
+/// Removes the first `count` frames from `folder`, as far as a call that was stopped has moved them there.
+pub(crate) fn remove_frames(folder: &Path, count: usize) -> Result<()> {
+    let frames = (1..=count).map(|number| folder.join(format!("frame_{number:05}.jpg")));
+    frames.filter(|frame| frame.exists()).try_for_each(fs::remove_file).map_err(Error::write(folder))
 }
 
 /// Returns the names of the frames in `folder`.

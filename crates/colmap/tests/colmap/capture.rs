@@ -1,7 +1,7 @@
 //! Captures up to the first command of COLMAP: requests that are refused, and videos whose frames are chosen once.
 
 use crate::{failing_colmap, has_ffmpeg, make, write_noise};
-use globalsplat_colmap::{CaptureOptions, Colmap, Step, make_capture};
+use globalsplat_colmap::{CaptureOptions, Colmap, Progress, Step, make_capture};
 use globalsplat_files::FolderLock;
 use globalsplat_test_kit::rerun_test;
 use serde_json::{Value, json};
@@ -66,6 +66,7 @@ fn bad_requests_are_refused_in_one_sentence() {
         let error = error.to_string().replace(&format!("{}/", folder.path().display()), "");
         assert!(error.starts_with(expected), "{error}");
     }
+    assert!(!at("out").exists());
     let latin_1 = folder.path().join(OsStr::from_bytes(b"caf\xe9"));
     let error = make(&at("photos"), &latin_1, &CaptureOptions::default(), &failing_colmap()).unwrap_err();
     assert!(error.is_invalid_request() && error.to_string().contains("a path that isn't UTF-8"), "{error}");
@@ -104,16 +105,28 @@ fn frames_of_a_video_are_chosen_once_and_their_poses_estimated() {
     let (error, has_measured) = run(6);
     assert!(is_estimated(&error) && !has_measured, "{error}");
     assert!(run(5).0.contains("the video is 6 frames of walk.mp4"));
-    // A call for another video that was killed while it moved the frames: its record names none.
+    // A call for another video that was killed while it moved 5 frames. Another program wrote one more.
     let record = out.join("capture.json");
     let mut unfinished: Value = serde_json::from_slice(&fs::read(&record).unwrap()).unwrap();
     (unfinished["video"]["indices"], unfinished["found"]) = (json!([]), json!([]));
-    unfinished["video"]["name"] = json!("refused.mp4");
+    (unfinished["video"]["name"], unfinished["video"]["moving"]) = (json!("other.mp4"), json!(5));
     fs::write(&record, unfinished.to_string()).unwrap();
+    fs::remove_file(out.join("images/frame_00005.jpg")).unwrap();
+    assert!(run(5).0.contains("the folder of frames is one with frame_00006.jpg"));
     fs::remove_file(out.join("images/frame_00006.jpg")).unwrap();
     let (error, has_measured) = run(5);
     assert!(is_estimated(&error) && has_measured, "{error}");
     assert_eq!(fs::read_dir(out.join("images")).unwrap().count(), 5);
+    // Nothing is left of what is refused, and a call that is stopped can be repeated.
+    let (bad, other) = (folder.path().join("bad.mp4"), folder.path().join("other"));
+    fs::write(&bad, "no video").unwrap();
+    assert!(make(&bad, &other, &CaptureOptions::default(), &failing_colmap()).is_err() && !other.exists());
+    for step in [Step::Measure, Step::Frames] {
+        let mut go_on = |progress: Progress| progress.step != step;
+        let stopped = make_capture(&video, &other, &CaptureOptions::default(), &failing_colmap(), &mut go_on);
+        assert!(stopped.unwrap().is_none());
+    }
+    assert!(!other.join("capture.json").exists());
     // Frames that another program wrote.
     fs::remove_file(record).unwrap();
     let frame = fs::read(out.join("images/frame_00001.jpg")).unwrap();
@@ -156,15 +169,30 @@ fn nothing_in_the_working_folder_is_run() {
     let folder = tempfile::tempdir().unwrap();
     write_noise(&folder.path().join("photos"));
     let trap = format!("open({:?}, 'w')", folder.path().join("was_run"));
+    let write = |name: &str, contents: &str| {
+        let path = folder.path().join(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(&path, contents).unwrap();
+        path
+    };
     for module in ["json.py", "site.py", "pycolmap.py", "lib/sitecustomize.py"] {
-        fs::create_dir_all(folder.path().join("lib")).unwrap();
-        fs::write(folder.path().join(module), &trap).unwrap();
+        write(module, &trap);
     }
-    let python = folder.path().join(".venv/bin/python");
-    fs::create_dir_all(python.parent().unwrap()).unwrap();
-    fs::write(&python, format!("#!/bin/sh\ntouch {}/was_run\n", folder.path().display())).unwrap();
-    fs::set_permissions(&python, fs::Permissions::from_mode(0o755)).unwrap();
-    let variables = [(CHILD, folder.path()), ("PYTHONPATH", &folder.path().join("lib"))];
+    for version in 8..20 {
+        write(&format!("lib/python3.{version}/site-packages/pycolmap.py"), &trap);
+    }
+    for python in [".venv/bin/python", "bin/python"] {
+        let python = write(python, &format!("#!/bin/sh\ntouch {}/was_run\n", folder.path().display()));
+        fs::set_permissions(python, fs::Permissions::from_mode(0o755)).unwrap();
+    }
+    let (library, empty) = (folder.path().join("lib"), Path::new(""));
+    let variables = [
+        (CHILD, folder.path()),
+        ("PYTHONPATH", &library),
+        ("PYTHONUSERBASE", folder.path()),
+        ("VIRTUAL_ENV", empty),
+        ("CONDA_PREFIX", empty),
+    ];
     assert!(rerun_test(NAME, &variables).0);
     assert!(!folder.path().join("was_run").exists());
 }
