@@ -10,7 +10,7 @@ use crate::pixels::{
     read_image_size, read_mask, resize_and_crop, source_window, undistort,
 };
 use glam::{DMat3, DMat4};
-use globalsplat_files::{Error, InputFiles, Result, parent_of, split_keyed_path};
+use globalsplat_files::{Error, InputFiles, Result, is_same_file, parent_of, split_keyed_path};
 use image::RgbImage;
 use rayon::prelude::*;
 use std::borrow::Cow;
@@ -297,7 +297,7 @@ impl Capture {
     /// extension of an image added or in place of its own, as in `images/1.jpg.png` or `1.png` for `images/1.jpg`.
     ///
     /// # Errors
-    /// Fails if the folder can't be read or has no mask for any photo, or if a mask has another aspect ratio than its photo.
+    /// Fails if the folder can't be read or has no mask for any photo, or if a mask is a photo or has another aspect ratio than its photo.
     pub fn with_masks(mut self, folder: &Path) -> Result<Self> {
         let names: Vec<&str> = self.frames.iter().map(|frame| frame.name.as_str()).collect();
         let masks = find_masks_in(folder, &names)?;
@@ -307,6 +307,9 @@ impl Capture {
             format!("{count} of {} photos have no mask and count whole", names.len())
         });
         for (frame, mask) in self.frames.iter_mut().zip(masks) {
+            if let Some(mask) = mask.as_ref().filter(|mask| is_same_file(mask, frame.image.file())) {
+                return Err(Error::input(mask, "the mask", "the photo itself", "a mask of the photo"));
+            }
             frame.mask = mask;
         }
         self.warnings.extend(line);

@@ -32,6 +32,6 @@ pub use open::{FoundCaptures, find_captures, is_capture, open_capture};
 pub use photos::{MASKS_FOLDER, PhotoList, find_masks, find_masks_in, format_names, list_photos};
 pub use pixels::{
     CHANNELS, DecodedPhoto, PHOTO_EXTENSIONS, Planes, Region, Resampler, decode_photo, decode_upright,
-    encode_photo, exif_focal, fit_mask, gray_to_rgb, is_equirectangular, read_image, read_image_size,
-    resize_and_crop,
+    encode_photo, encode_upright, exif_focal, fit_mask, gray_to_rgb, is_equirectangular, read_image,
+    read_image_size, resize_and_crop,
 };

@@ -1,5 +1,6 @@
 //! Files of photos and masks: the search for those that a capture names, folders of photos without poses, and the order and forms of names.
 
+use crate::formats::polycam::is_polycam;
 use crate::pixels::{PHOTO_EXTENSIONS, SUPPORTED_IMAGES, read_image_size};
 use globalsplat_files::{Error, Result};
 use rayon::prelude::*;
@@ -50,7 +51,7 @@ pub(crate) fn find_photos(bases: &[PathBuf], names: &[impl AsRef<str>]) -> Vec<O
 }
 
 /// Looks for the masks of the photos `names` in `folders`: files with the name of the photo, with the extension of an image added or
-/// in place of its own, or in place of its own after `_mask`. Photos of the same name but for the extension share a mask. Returns one path,
+/// in place of its own, or either after `_mask`. Photos of the same name but for the extension share a mask. Returns one path,
 /// or `None`, for each photo.
 pub fn find_masks(folders: &[PathBuf], names: &[impl AsRef<str>]) -> Vec<Option<PathBuf>> {
     if !folders.iter().any(|folder| folder.is_dir()) {
@@ -59,8 +60,9 @@ pub fn find_masks(folders: &[PathBuf], names: &[impl AsRef<str>]) -> Vec<Option<
     let names: Vec<String> = names.iter().map(|name| portable(name.as_ref())).collect();
     let stem = |name: &String| Path::new(name).with_extension("").to_string_lossy().into_owned();
     let stems: Vec<String> = names.iter().map(stem).collect();
-    let with_word = stems.iter().map(|stem| format!("{stem}_mask")).collect();
-    let found = [names, stems, with_word].map(|names: Vec<String>| find_photos(folders, &names));
+    let [with_words, with_word] =
+        [&names, &stems].map(|names| names.iter().map(|name| format!("{name}_mask")).collect());
+    let found = [names, stems, with_words, with_word].map(|names: Vec<String>| find_photos(folders, &names));
     (0..found[0].len()).map(|photo| found.iter().find_map(|masks| masks[photo].clone())).collect()
 }
 
@@ -127,6 +129,9 @@ fn file_at(path: PathBuf) -> Option<PathBuf> {
 /// Names of files that systems leave in folders, beside hidden ones.
 const SYSTEM_FILES: [&str; 2] = ["Thumbs.db", "desktop.ini"];
 
+/// Names of files and folders in Polycam's raw data whose pictures aren't photos.
+const POLYCAM_PICTURES: [&str; 3] = ["thumbnail.jpg", "depth", "confidence"];
+
 /// File extensions of videos, in lower case.
 const VIDEO_EXTENSIONS: [&str; 16] = [
     "mp4", "mov", "m4v", "mkv", "webm", "avi", "mts", "m2ts", "360", "insv", "3gp", "wmv", "mpg", "mpeg",
@@ -148,7 +153,7 @@ pub struct PhotoList {
 ///
 /// A photo is a file whose contents begin as those of an image, whatever format its extension names, and whose extension is that of a
 /// photo in any case, or missing. So a text file named `.jpg` is none, and neither is a camera's raw file, whose contents begin as those
-/// of a TIFF. Hidden files and folders, files of the system, and folders named `masks` are ignored.
+/// of a TIFF. Hidden files and folders, files of the system, folders named `masks`, and Polycam's depths and thumbnails are ignored.
 ///
 /// # Errors
 /// Fails if a folder can't be read, or if there is no photo.
@@ -178,10 +183,12 @@ pub fn list_photos(folder: &Path) -> Result<PhotoList> {
 
 /// Adds the files below `folder`. Links to folders count as files, so that no folder is visited twice.
 fn collect_files(folder: &Path, files: &mut Vec<PathBuf>) -> Result<()> {
+    let others = if is_polycam(folder) { &POLYCAM_PICTURES[..] } else { &[] };
     for entry in std::fs::read_dir(folder).map_err(Error::read(folder))? {
         let entry = entry.map_err(Error::read(folder))?;
         let name = entry.file_name();
-        if name.as_encoded_bytes().starts_with(b".") || SYSTEM_FILES.iter().any(|system| name == *system) {
+        let is_known = SYSTEM_FILES.iter().chain(others).any(|known| name == *known);
+        if name.as_encoded_bytes().starts_with(b".") || is_known {
             continue;
         }
         match entry.file_type().map_err(Error::read(entry.path()))?.is_dir() {
@@ -237,7 +244,8 @@ fn tokens(mut rest: &[u8]) -> impl Iterator<Item = (u8, usize, &[u8])> {
     })
 }
 
-/// Returns a line about the photos `names` of `file`, of which `describe` tells something, given their number. Returns `None` without photos.
+/// Returns a line about the photos `names` of `file`, of which `describe` tells something, given their number. Returns `None` without
+/// photos.
 pub(crate) fn describe_photos(
     file: &Path,
     names: &[impl AsRef<str>],

@@ -18,11 +18,11 @@ const PAUSE: Duration = Duration::from_millis(200);
 /// Options of [`make_capture`].
 #[derive(Debug, Clone, Default)]
 pub struct CaptureOptions {
-    /// Number of frames to take from a video, 1 to 2,000. `None` stands for one frame per 6 % of the longer side that the picture moves, but 30
-    /// to 300 frames.
+    /// Number of frames to take from a video, 1 to 2,000. `None` stands for one frame per 6 % of the longer side that the picture moves,
+    /// but 30 to 300 frames.
     pub frames: Option<usize>,
-    /// A camera model of COLMAP. By default EQUIRECTANGULAR for panoramas of 360° whose XMP data say so, else OPENCV for 10 or more photos of
-    /// one size and focal length, and SIMPLE_RADIAL for fewer.
+    /// A camera model of COLMAP. By default EQUIRECTANGULAR for panoramas of 360° whose XMP data say so, else OPENCV for 10 or more photos
+    /// of one size and focal length, and SIMPLE_RADIAL for fewer.
     pub camera_model: Option<String>,
     /// Choice of pairs.
     pub matching: Matching,
@@ -34,11 +34,11 @@ pub struct CaptureOptions {
 }
 
 /// Makes a capture in the folder `out` of `source`, a folder of photos or a video: chooses the frames of a video like
-/// [`extract_frames`](crate::extract_frames), estimates poses by `colmap` on all cores, and writes the photos to `images` and COLMAP's models
-/// to `sparse/0`, `sparse/1`, …
+/// [`extract_frames`](crate::extract_frames), estimates poses by `colmap` on all cores, and writes the photos to `images` and COLMAP's
+/// models to `sparse/0`, `sparse/1`, …
 ///
-/// `on_progress` is called several times a second. If it returns `false`, the work is stopped and the result is `None`; the same call continues
-/// where it was stopped. `capture.json` records how far the capture is. A call with other settings repeats what depends on them.
+/// `on_progress` is called several times a second. If it returns `false`, the work is stopped and the result is `None`; the same call
+/// continues where it was stopped. `capture.json` records how far the capture is. A call with other settings repeats what depends on them.
 ///
 /// Photos that are damaged, of a single color or identical to another are left out and reported.
 ///
@@ -104,7 +104,7 @@ fn make_or_continue(
             Matching::Auto if is_video => Matching::Sequential,
             matching => matching,
         },
-        masks: find_photo_masks(photos, &found, options.masks.as_deref(), &images)?,
+        masks: find_photo_masks(photos, &found, options.masks.as_deref(), out, old.as_ref())?,
         found,
         ..Record::default()
     };
@@ -137,9 +137,9 @@ fn check_count(photos: &Path, count: usize) -> Result<()> {
     }
 }
 
-/// Checks that a capture of the photos in the folder `photos` may be written to `out`: the photos may be the capture's own images, but no other
-/// folder of photos may contain the capture, which would then be found among the photos. If `is_new`, the folder `out` may only contain
-/// hidden files and these photos, or a folder of images without any.
+/// Checks that a capture of the photos in the folder `photos` may be written to `out`: the photos may be the capture's own images, but no
+/// other folder of photos may contain the capture, which would then be found among the photos. If `is_new`, the folder `out` may only
+/// contain hidden files and these photos, or a folder of images without any.
 fn check_output(photos: &Path, out: &Path, is_video: bool, is_new: bool) -> Result<()> {
     // The frames of a video are written later.
     if !is_video {

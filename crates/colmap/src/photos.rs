@@ -3,16 +3,17 @@
 use crate::progress::{Progress, Reporter, Step};
 use crate::record::Record;
 use globalsplat_capture::{
-    MASKS_FOLDER, decode_upright, encode_photo, exif_focal, find_masks, find_masks_in, fit_mask, gray_to_rgb,
-    is_equirectangular, list_photos, read_image_size,
+    MASKS_FOLDER, decode_upright, encode_photo, encode_upright, exif_focal, find_masks, find_masks_in,
+    fit_mask, gray_to_rgb, is_equirectangular, list_photos, read_image_size,
 };
-use globalsplat_files::{Error, Result, checksum, is_same_file, parent_of, write_file};
+use globalsplat_files::{Error, Result, checksum, is_same_file, parent_of, real_path, write_file};
 use image::imageops::thumbnail;
 use image::{Rgb, RgbImage};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fs;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
@@ -57,6 +58,9 @@ pub(crate) struct Photo {
     /// `true` if the photo in the folder has more than [`MAX_PIXELS`].
     #[serde(default)]
     pub is_reduced: bool,
+    /// `true` if the photo that was found isn't opaque, which makes a mask.
+    #[serde(default)]
+    pub has_alpha: bool,
 }
 
 /// A photo that isn't used.
@@ -84,42 +88,58 @@ pub(crate) fn find_photos(folder: &Path) -> Result<(Vec<FoundPhoto>, Option<Stri
 }
 
 /// Returns the masks of the photos `found` in `source`, by the names of the photos: those in the folder `masks`, or in a folder
-/// [`MASKS_FOLDER`] among the photos.
+/// [`MASKS_FOLDER`] among the photos, without those that calls have written to the capture in `out`, by its record `old`.
 ///
 /// # Errors
-/// Returns an error if `masks` is the folder of the photos or of the capture's `images`, or has no mask for any photo, or if a mask can't be
+/// Returns an error if `masks` is the folder of the photos or of the capture's images, or has no mask for any photo, or if a mask can't be
 /// read.
 pub(crate) fn find_photo_masks(
     source: &Path,
     found: &[FoundPhoto],
     masks: Option<&Path>,
-    images: &Path,
+    out: &Path,
+    old: Option<&Record>,
 ) -> Result<BTreeMap<String, FoundMask>> {
     let names: Vec<&str> = found.iter().map(|photo| photo.name.as_str()).collect();
     let files = match masks {
-        Some(folder) if is_same_file(folder, source) || is_same_file(folder, images) => {
+        Some(folder) if is_same_file(folder, source) || is_same_file(folder, &out.join("images")) => {
             let expected = "a folder of masks, named like the photos";
             return Err(Error::input(folder, "the folder of masks", "that of the photos", expected));
         }
         Some(folder) => find_masks_in(folder, &names)?,
         None => find_masks(&[source.join(MASKS_FOLDER)], &names),
     };
+    let own_folder = real_path(&out.join(MASKS_FOLDER));
+    let is_own = |file: &PathBuf| {
+        let file = real_path(file);
+        let name = file.strip_prefix(&own_folder).ok().and_then(Path::to_str);
+        old.zip(name).is_some_and(|(old, name)| old.own_masks.contains(name))
+    };
     let describe = |(name, file): (&str, Option<PathBuf>)| {
-        let file = file?;
+        let file = file.filter(|file| !is_own(file))?;
         Some(checksum([&file]).map(|checksum| (name.to_string(), FoundMask { file, checksum })))
     };
-    names.into_iter().zip(files).filter_map(describe).collect()
+    let described: BTreeMap<_, _> =
+        names.into_iter().zip(files).filter_map(describe).collect::<Result<_>>()?;
+    match masks.filter(|_| described.is_empty()) {
+        Some(folder) => {
+            let expected = "the masks that they were made of";
+            Err(Error::input(folder, "the folder of masks", "one of masks that `capture` wrote", expected))
+        }
+        None => Ok(described),
+    }
 }
 
-/// Copies the photos of `record`, which are in `source`, into the folder `images` of the capture in `out`. On file systems that can share the
-/// contents of files, copies take no space. COLMAP reads pixels as they are stored: photos that EXIF says to rotate are written upright,
-/// those that aren't JPEGs or PNGs are converted, and those of more than [`MAX_PIXELS`] are reduced. Masks, which are files or the opacity of a converted photo, are written to the folder
-/// [`MASKS_FOLDER`] beside `images`, each of the size of its photo. If some photos have masks, all others get a white one, without which
-/// COLMAP would leave them out. Returns the photos in the order in which they were found, and those that aren't used.
+/// Copies the photos of `record`, which are in `source`, into the folder `images` of the capture in `out`. On file systems that can share
+/// the contents of files, copies take no space. COLMAP reads pixels as they are stored: photos that EXIF says to rotate are written
+/// upright, those that aren't JPEGs or PNGs are converted, and those of more than [`MAX_PIXELS`] are reduced. Masks, which are files or
+/// the opacity of a converted photo, are written to the folder [`MASKS_FOLDER`] beside `images`, each of the size of its photo. If some
+/// photos have masks, all others get a white one, without which COLMAP would leave them out. Returns the photos in the order in which they
+/// were found, and those that aren't used.
 ///
 /// # Errors
-/// Returns an error if a file can't be written, if a mask can't be read, if a mask would replace one that no call has written, or if `source` is
-/// `images` and a photo in it would need another name or other contents.
+/// Returns an error if a file can't be written, if a mask can't be read, if a mask would replace one that no call has written, or if
+/// `source` is `images` and a photo in it would need another name or other contents.
 pub(crate) fn import_photos(
     source: &Path,
     out: &Path,
@@ -185,7 +205,10 @@ pub(crate) fn import_photos(
     for photo in unmasked.iter().filter(|photo| record.own_masks.remove(&mask_name(photo))) {
         // Another call has written it.
         let file = mask_file(photo);
-        fs::remove_file(&file).map_err(Error::write(&file))?;
+        match fs::remove_file(&file) {
+            Err(why) if why.kind() != ErrorKind::NotFound => return Err(Error::write(&file)(why)),
+            _ => {}
+        }
     }
     if photos.iter().any(|photo| mask_file(photo).exists()) {
         unmasked.retain(|photo| !mask_file(photo).exists());
@@ -253,9 +276,9 @@ struct Inspected {
     mask: Result<Option<Vec<u8>>>,
 }
 
-/// Decodes the photo `name` in `source` and its mask in the file `mask`; returns why it can't be used if it is damaged or shows nothing. Its
-/// name is changed to none of `all_names`. Its sides are divided by a whole number if it has more than `max_pixels`; only one such photo is
-/// decoded at a time, while `large` is locked.
+/// Decodes the photo `name` in `source` and its mask in the file `mask`; returns why it can't be used if it is damaged or shows nothing.
+/// Its name is changed to none of `all_names`. Its sides are divided by a whole number if it has more than `max_pixels`; only one such
+/// photo is decoded at a time, while `large` is locked.
 fn inspect(
     source: &Path,
     name: &str,
@@ -296,7 +319,12 @@ fn inspect(
     let is_png = decoded.is_png && extension == "png";
     let is_jpeg = decoded.is_jpeg && (extension == "jpg" || extension == "jpeg");
     let is_readable = (is_png || is_jpeg) && !decoded.is_turned && !is_reduced;
-    let contents = (!is_readable).then(|| encode_photo(&pixels, !is_png)).transpose().map_err(refuse)?;
+    let encode = || match is_png {
+        true => encode_photo(&pixels, false),
+        false => encode_upright(&pixels, &encoded),
+    };
+    let contents = (!is_readable).then(encode).transpose().map_err(refuse)?;
+    let has_alpha = decoded.alpha.is_some();
     let levels = match (mask, decoded.alpha) {
         // COLMAP compares a mask with its photo pixel by pixel.
         (Some(file), _) => read_upright_mask(file, upright, pixels.dimensions()).map(Some),
@@ -317,6 +345,7 @@ fn inspect(
         focal: exif_focal(&encoded).map(|focal| focal / f64::from(divisor)),
         is_equirectangular: is_equirectangular(&encoded),
         is_reduced,
+        has_alpha,
     };
     Ok(Inspected { photo, contents, mask })
 }

@@ -248,8 +248,8 @@ impl Estimate<'_, '_> {
                 self.out.join("colmap.log").display()
             )));
         }
-        // The robust loss weighs wrong matches less than the squared errors by which COLMAP has registered the photos. COLMAP's program has no
-        // option for it.
+        // The robust loss weighs wrong matches less than the squared errors by which COLMAP has registered the photos. COLMAP's program has
+        // no option for it.
         for model in models.iter().filter(|_| self.colmap.is_python) {
             let options = json!({
                 "input_path": text(&model.folder),
@@ -270,7 +270,13 @@ impl Estimate<'_, '_> {
         let registered: BTreeSet<&String> = largest.photos.iter().collect();
         let unregistered = self.photos().iter().filter(|photo| !registered.contains(&photo.name));
         let name = |photo: &Photo| photo.name.clone();
-        let (found, masks) = (self.record.found.iter().map(|photo| &photo.name), &self.record.masks);
+        let Record { found, masks, skipped, .. } = &self.record;
+        let mut names: Vec<&String> = found.iter().map(|photo| &photo.name).collect();
+        names.retain(|name| skipped.iter().all(|photo| photo.name != **name));
+        let is_unmasked = |(name, photo): &(&String, &Photo)| {
+            !masks.is_empty() && !masks.contains_key(*name) && !photo.has_alpha
+        };
+        let unmasked = names.into_iter().zip(self.photos()).filter(is_unmasked);
         let is_few = (largest.photos.len() as f64) < FEW_REGISTERED * self.photos().len() as f64;
         Ok(CaptureReport {
             video: None,
@@ -282,7 +288,7 @@ impl Estimate<'_, '_> {
             other_files: None,
             skipped: self.record.skipped.clone(),
             reduced: self.photos().iter().filter(|photo| photo.is_reduced).map(name).collect(),
-            unmasked: found.filter(|name| !masks.is_empty() && !masks.contains_key(*name)).cloned().collect(),
+            unmasked: unmasked.map(|(name, _)| name.clone()).collect(),
             unregistered: unregistered.map(name).collect(),
             advice: if is_few { vec![ADVICE.to_string()] } else { vec![] },
             models: models.iter().map(|model| model.photos.len()).collect(),
@@ -365,7 +371,15 @@ mod tests {
     fn fisheyes_start_without_distortion() {
         let photo = |focal| {
             let name = "a.jpg".to_string();
-            Photo { name, width: 400, height: 300, focal, is_equirectangular: false, is_reduced: false }
+            Photo {
+                name,
+                width: 400,
+                height: 300,
+                focal,
+                is_equirectangular: false,
+                is_reduced: false,
+                has_alpha: false,
+            }
         };
         for (model, _) in COLMAP_MODELS {
             let parameters = fisheye_parameters(model, &photo(None));

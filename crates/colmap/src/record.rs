@@ -6,6 +6,7 @@ use crate::video::VideoFrames;
 use globalsplat_capture::format_names;
 use globalsplat_files::{Error, Result, read_text, write_json};
 use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::path::Path;
@@ -175,6 +176,7 @@ pub(crate) struct Record {
     /// Files of the masks, by the names of their photos.
     pub masks: BTreeMap<String, FoundMask>,
     /// Names of the masks that calls have written. Others in their folder are the user's.
+    #[serde(default)]
     pub own_masks: BTreeSet<String>,
     /// Photos in the folder of the user, or frames of the video.
     pub found: Vec<FoundPhoto>,
@@ -205,7 +207,12 @@ impl Record {
             return Ok(None);
         }
         let refuse = |why| Error::input(&file, "the contents", why, "what an earlier run wrote");
-        serde_json::from_str(&read_text(&file)?).map(Some).map_err(refuse)
+        let mut json: Value = serde_json::from_str(&read_text(&file)?).map_err(refuse)?;
+        // Earlier versions recorded a folder.
+        if let Some(masks) = json.get_mut("masks").filter(|masks| masks.is_null()) {
+            *masks = json!({});
+        }
+        serde_json::from_value(json).map(Some).map_err(refuse)
     }
 
     /// Writes the record to the folder `out`.

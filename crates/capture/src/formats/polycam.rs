@@ -1,5 +1,6 @@
-//! Raw data of Polycam (spec 10.4): `keyframes/cameras/NAME.json` has the pose and the intrinsics of `keyframes/images/NAME.jpg`. The first three
-//! rows of the camera-to-world matrix, with OpenGL axes, are `t_00` to `t_23`. `corrected_cameras` and `corrected_images` are preferred.
+//! Raw data of Polycam (spec 10.4): `keyframes/cameras/NAME.json` has the pose and the intrinsics of `keyframes/images/NAME.jpg`. The first
+//! three rows of the camera-to-world matrix, with OpenGL axes, are `t_00` to `t_23`. `corrected_cameras` are preferred, with
+//! `corrected_images` if there are such.
 
 use super::transforms_json::{describe_value, from_opengl};
 use super::{CaptureOpener, folder_name, read_json};
@@ -8,6 +9,7 @@ use crate::geometry::{Camera, Intrinsics};
 use crate::photos::{find_photos, natural_order};
 use globalsplat_files::{Error, Result, parent_of};
 use serde_json::Value;
+use std::io;
 use std::iter::once;
 use std::path::{Path, PathBuf};
 use std::slice;
@@ -18,11 +20,26 @@ const KEYFRAMES: &str = "keyframes";
 /// Recognizes a folder with [`KEYFRAMES`], or these.
 pub(crate) fn find(path: &Path) -> Option<CaptureOpener> {
     let keyframes = if path.ends_with(KEYFRAMES) { path.to_owned() } else { path.join(KEYFRAMES) };
-    let kinds = ["corrected_", ""].into_iter();
-    let mut folders =
-        kinds.map(|kind| ["cameras", "images"].map(|name| keyframes.join(format!("{kind}{name}"))));
-    let [cameras, images] = folders.find(|[cameras, _]| cameras.is_dir())?;
+    let [corrected, original] = ["corrected_cameras", "cameras"].map(|name| keyframes.join(name));
+    let (cameras, names) =
+        match original.is_dir() && cameras_in(&corrected).is_ok_and(|files| files.is_empty()) {
+            false if corrected.is_dir() => (corrected, ["corrected_images", "images"]),
+            _ if original.is_dir() => (original, ["images", "corrected_images"]),
+            _ => return None,
+        };
+    let [first, second] = names.map(|name| keyframes.join(name));
+    let images = if second.is_dir() && !first.is_dir() { second } else { first };
     Some(Box::new(move |purpose| read(&keyframes, &cameras, images, purpose)))
+}
+
+/// Returns the files in the folder `cameras`, ordered by name, with numbers in names compared by value.
+fn cameras_in(cameras: &Path) -> io::Result<Vec<PathBuf>> {
+    let mut files: Vec<PathBuf> = std::fs::read_dir(cameras)?.flatten().map(|entry| entry.path()).collect();
+    let is_hidden =
+        |file: &PathBuf| file.file_name().unwrap_or_default().as_encoded_bytes().starts_with(b".");
+    files.retain(|file| file.extension().is_some_and(|extension| extension == "json") && !is_hidden(file));
+    files.sort_by(natural_order);
+    Ok(files)
 }
 
 /// Returns `true` if raw data of Polycam are in the folder `path`.
@@ -30,12 +47,9 @@ pub fn is_polycam(path: &Path) -> bool {
     find(path).is_some()
 }
 
-/// Reads the files in the folder `cameras`, ordered by name, with numbers in names compared by value. Frames with a missing photo are left out.
+/// Reads the files in the folder `cameras` in their order. Frames with a missing photo are left out.
 fn read(keyframes: &Path, cameras: &Path, images: PathBuf, purpose: Purpose) -> Result<Capture> {
-    let entries = std::fs::read_dir(cameras).map_err(Error::read(cameras))?;
-    let mut files: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).collect();
-    files.retain(|file| file.extension().is_some_and(|extension| extension == "json"));
-    files.sort_by(natural_order);
+    let files = cameras_in(cameras).map_err(Error::read(cameras))?;
     let stem = |file: &PathBuf| file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let names: Vec<String> = files.iter().map(stem).collect();
     let photos = find_photos(slice::from_ref(&images), &names);

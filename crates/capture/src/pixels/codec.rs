@@ -2,12 +2,13 @@
 
 use super::heif::{HEADER_BYTES, decode_heif, heif_size};
 use super::jpeg::{decode_jpeg, jpeg_size};
-use super::metadata::exif_chunk;
+use super::metadata::{exif_chunk, upright_exif};
 use globalsplat_files::{Error, Result, panic_message};
 use image::codecs::jpeg::JpegEncoder;
 use image::metadata::Orientation;
 use image::{
-    ColorType, DynamicImage, GrayImage, ImageDecoder, ImageFormat, ImageReader, Limits, Luma, Rgb, RgbImage,
+    ColorType, DynamicImage, GrayImage, ImageDecoder, ImageEncoder, ImageFormat, ImageReader, Limits, Luma,
+    Rgb, RgbImage,
 };
 use std::any::Any;
 use std::fs::File;
@@ -22,8 +23,8 @@ pub const PHOTO_EXTENSIONS: [&str; 10] =
 /// Description of the supported formats for error messages.
 pub(crate) const SUPPORTED_IMAGES: &str = "a JPEG, PNG, WebP, TIFF, BMP, HEIC or AVIF";
 
-/// Reads any image as 8-bit RGB, with pixels as they are stored, but HEIC and AVIF upright: gray is repeated, transparent pixels are composited over black, 16 bits
-/// are rounded to 8. HEIC and AVIF are decoded by libheif's program on the PATH.
+/// Reads any image as 8-bit RGB, with pixels as they are stored, but HEIC and AVIF upright: gray is repeated, transparent pixels are
+/// composited over black, 16 bits are rounded to 8. HEIC and AVIF are decoded by libheif's program on the PATH.
 ///
 /// # Errors
 /// Returns an error if the file is missing, can't be decoded, or is truncated.
@@ -140,14 +141,37 @@ fn decode(
 /// # Errors
 /// Returns an error if the format doesn't support the size.
 pub fn encode_photo(pixels: &RgbImage, as_jpeg: bool) -> Result<Vec<u8>> {
-    const QUALITY: u8 = 95;
+    if as_jpeg {
+        return encode_jpeg(pixels, None);
+    }
     let mut bytes = Cursor::new(vec![]);
-    let encoded = match as_jpeg {
-        true => pixels.write_with_encoder(JpegEncoder::new_with_quality(&mut bytes, QUALITY)),
-        false => pixels.write_to(&mut bytes, ImageFormat::Png),
-    };
-    encoded.map_err(Error::failed_with_context("an image can't be encoded"))?;
+    pixels.write_to(&mut bytes, ImageFormat::Png).map_err(not_encoded())?;
     Ok(bytes.into_inner())
+}
+
+/// Encodes the upright photo `pixels` as a JPEG of high quality, with the EXIF data in `original`, the contents of the file that they are
+/// of, but for the orientation.
+///
+/// # Errors
+/// Returns an error if the format doesn't support the size.
+pub fn encode_upright(pixels: &RgbImage, original: &[u8]) -> Result<Vec<u8>> {
+    encode_jpeg(pixels, upright_exif(original))
+}
+
+fn encode_jpeg(pixels: &RgbImage, exif: Option<Vec<u8>>) -> Result<Vec<u8>> {
+    const QUALITY: u8 = 95;
+    let mut bytes = vec![];
+    let mut encoder = JpegEncoder::new_with_quality(&mut bytes, QUALITY);
+    // A segment of a JPEG has no more.
+    if let Some(exif) = exif.filter(|exif| exif.len() < 65_000) {
+        encoder.set_exif_metadata(exif).map_err(not_encoded())?;
+    }
+    pixels.write_with_encoder(encoder).map_err(not_encoded())?;
+    Ok(bytes)
+}
+
+fn not_encoded<E: std::error::Error + Send + Sync + 'static>() -> impl FnOnce(E) -> Error {
+    Error::failed_with_context("an image can't be encoded")
 }
 
 /// Returns (width, height) like [`read_image_size`], for an image in memory, or `None` if it isn't an image.
@@ -163,8 +187,8 @@ pub fn read_image_size(path: &Path) -> Result<(u32, u32)> {
     Ok(read_header(BufReader::new(File::open(path).map_err(Error::read(path))?), path)?.0)
 }
 
-/// Returns `true` if the image's header declares an alpha channel or a transparent color. HEIC and AVIF are decoded without their alpha channel,
-/// so they have none here.
+/// Returns `true` if the image's header declares an alpha channel or a transparent color. HEIC and AVIF are decoded without their alpha
+/// channel, so they have none here.
 ///
 /// # Errors
 /// Returns an error if the file is missing or is no image.

@@ -2,14 +2,15 @@
 
 use super::codec::encoded_image_size;
 use exif::{Context, Exif, In, Reader, Tag, Value};
+use image::metadata::Orientation;
 use image::{ImageDecoder, ImageReader};
 use std::io::Cursor;
 
 /// Diagonal of 35 mm film, 36 mm × 24 mm.
 const FILM_DIAGONAL: f64 = 43.266_615;
 
-/// Returns the focal length in pixels that the EXIF data in `encoded`, the contents of a photo's file, tell, at the size of the file, or `None` if
-/// they tell none.
+/// Returns the focal length in pixels that the EXIF data in `encoded`, the contents of a photo's file, tell, at the size of the file, or
+/// `None` if they tell none.
 ///
 /// The 35 mm equivalent f₃₅ comes first, since a photo may have been reduced after its EXIF data were written: f = f₃₅·√(W² + H²) /
 /// 43.27 mm (CIPA DCG-001). Otherwise f is the focal length times the sensor's pixels per millimetre (`FocalPlaneXResolution`), times
@@ -77,6 +78,16 @@ fn open_decoder(encoded: &[u8]) -> Option<impl ImageDecoder> {
 pub(super) fn exif_chunk(decoder: &mut impl ImageDecoder) -> Option<Vec<u8>> {
     let chunk = decoder.exif_metadata().ok()??;
     Some(chunk.strip_prefix(b"Exif\0\0").map(<[u8]>::to_vec).unwrap_or(chunk))
+}
+
+/// Returns the EXIF data in `encoded`, the contents of a photo's file, without an orientation.
+pub(super) fn upright_exif(encoded: &[u8]) -> Option<Vec<u8>> {
+    let mut chunk = match open_decoder(encoded) {
+        Some(mut decoder) => exif_chunk(&mut decoder)?,
+        None => read_exif(encoded)?.buf().to_vec(),
+    };
+    let _ = Orientation::remove_from_exif_chunk(&mut chunk);
+    Some(chunk)
 }
 
 /// Returns `true` if the XMP data in `encoded`, the contents of a photo's file, declare a panorama of 360°: `GPano:ProjectionType` is

@@ -13,7 +13,8 @@ mod undistort;
 #[cfg(feature = "chunks")]
 pub(crate) use codec::encoded_image_size;
 pub use codec::{
-    DecodedPhoto, PHOTO_EXTENSIONS, decode_photo, decode_upright, encode_photo, read_image, read_image_size,
+    DecodedPhoto, PHOTO_EXTENSIONS, decode_photo, decode_upright, encode_photo, encode_upright, read_image,
+    read_image_size,
 };
 pub(crate) use codec::{SUPPORTED_IMAGES, has_alpha_channel};
 pub use metadata::{exif_focal, is_equirectangular};

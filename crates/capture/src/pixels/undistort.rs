@@ -10,8 +10,8 @@ use std::ops::Range;
 /// the view, and black elsewhere; `None` if the photo shows all of it. Only the pixels in the `window` of columns and rows are computed.
 ///
 /// Pixel (i, j) has the ray x = (j + ½ − cx)/fx, y = (i + ½ − cy)/fy, and takes its color from the position in the photo to which the
-/// projection maps the ray, interpolated linearly between the four surrounding pixel centers. The border of a photo of a perspective lens is
-/// repeated beyond it.
+/// projection maps the ray, interpolated linearly between the four surrounding pixel centers. The border of a photo of a perspective lens
+/// is repeated beyond it.
 pub(crate) fn undistort(
     photo: &RgbImage,
     projection: &Projection,

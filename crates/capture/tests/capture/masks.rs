@@ -40,7 +40,7 @@ fn masks_are_found_where_tools_put_them() {
     let names = ["left/0.jpg", "left/1.png", "right/0.jpg", "right/1.png", "2.png"].map(String::from);
     let colmap = folder_of_photos(&names);
     write_colmap_text(&colmap.path().join("sparse/0"), &names, &cameras(), &pinhole(&cameras()[0]));
-    for mask in ["left/0.jpg.png", "left/1.png.png", "right/0.png", "right/1_mask.png"] {
+    for mask in ["left/0.jpg.png", "left/1.png_mask.png", "right/0.png", "right/1_mask.png"] {
         save(levels(), &colmap.path().join("masks").join(mask));
     }
     for (capture, expected) in [(named, [1].as_slice()), (open_capture(colmap.path()), &[1, 2, 3, 4])] {
@@ -63,6 +63,8 @@ fn a_folder_of_masks_replaces_those_of_the_capture() {
     std::fs::create_dir(&given).unwrap();
     let found = "given: the folder is without a mask for any photo, expected images/000.png.png";
     assert_refused(own.clone().with_masks(&given), &[found]);
+    let error = own.clone().with_masks(&folder.path().join("images"));
+    assert_refused(error, &["images/000.png: the mask is the photo itself"]);
     // With or without the folders of the photos' names.
     for names in [["images/001.png.png", "images/002.tif"], ["001.png", "002.png.bmp"]] {
         names.iter().for_each(|name| save(levels(), &given.join(name)));

@@ -117,6 +117,12 @@ fn photos_that_colmap_may_not_read_are_converted_with_their_opacity_and_orientat
     let (upright, photo) = (read("images/c.jpg"), &record["photos"][3]);
     assert_eq!((upright.dimensions(), &photo["width"], &photo["height"]), ((8, 16), &json!(8), &json!(16)));
     assert!(upright.get_pixel(4, 2).0[0] < 50 && upright.get_pixel(4, 13).0[0] > 200);
+    // Other EXIF data, such as the position, are kept.
+    let upright_exif = exif.map(|byte| if byte == 6 { 1 } else { byte });
+    let written = fs::read(out.join("images/c.jpg")).unwrap();
+    assert!(written.windows(exif.len()).any(|bytes| bytes == upright_exif));
+    let alpha: Vec<bool> = (0..4).map(|photo| record["photos"][photo]["has_alpha"] == true).collect();
+    assert_eq!(alpha, [false, true, false, false]);
 }
 
 /// Orientations 1 to 8 of EXIF, of photos whose upright size differs from the stored one or doesn't. Masks are upright, or turned as well.
@@ -201,8 +207,16 @@ fn masks_of_another_folder_replace_those_of_an_earlier_run() {
     GrayImage::from_pixel(16, 8, Luma([255])).save(&mask).unwrap();
     folders.import("photos", Some("other")).unwrap();
     assert_eq!(are_white(), [true, true]);
+    let error = folders.import("photos", Some("out/masks")).unwrap_err();
+    assert!(error.contains("the folder of masks is one of masks that `capture` wrote"), "{error}");
     let error = folders.import("photos", Some("photos")).unwrap_err();
     assert!(error.contains("the folder of masks is that of the photos"), "{error}");
+    // The masks of all folders may be removed, and earlier versions recorded none as null.
+    ["photos/masks", "out/masks"].iter().for_each(|name| fs::remove_dir_all(folders.at(name)).unwrap());
+    let mut record = folders.import("photos", None).unwrap();
+    assert_eq!(record["masks"].take(), json!({}));
+    fs::write(folders.at("out/capture.json"), record.to_string()).unwrap();
+    assert_eq!(folders.import("photos", None).unwrap()["masks"], json!({}));
 }
 
 #[test]
@@ -222,7 +236,8 @@ fn masks_that_no_capture_wrote_stay() {
     let error = folders.import("photos", Some("other")).unwrap_err();
     assert!(error.contains("masks/a.png.png: the mask is one that no capture wrote"), "{error}");
     // As an input, it is used as it is.
-    folders.import("photos", Some("out/masks")).unwrap();
+    let [first, second] = [(); 2].map(|()| folders.import("photos", Some("out/masks")).unwrap());
+    assert_eq!(first["masks"], second["masks"]);
     assert!(folders.at("out/masks/b.png.png").exists() && fs::read(&mask).unwrap() == before);
     folders.import("photos", None).unwrap();
     assert_eq!(fs::read(&mask).unwrap(), before);
