@@ -31,15 +31,16 @@ const SUPPORTED_FORMATS: &str = "a cameras.json, a transforms.json or a transfor
 /// Number of bytes in which the text of [`OTHER_POSES`] is looked for.
 const OTHER_POSES_BYTES: u64 = 4096;
 
-/// Files of poses that aren't read, though the programs that write them may export the poses for COLMAP: extension, text near the beginning,
-/// program, and its export.
-const OTHER_POSES: [(&str, &str, &str, &str); 6] = [
+/// Files of poses that aren't read, though the programs that write them may export the poses for COLMAP: extension, text near the beginning
+/// in lower case, without white space and with `,` for `;`, program, and its export.
+const OTHER_POSES: [(&str, &str, &str, &str); 7] = [
     ("xml", "<chunk", "Metashape", "its COLMAP export (File > Export > Export Cameras, Colmap)"),
+    ("xml", "<blocksexchange", "ContextCapture", "the COLMAP export of the program that wrote it"),
     ("csv", "name,x,y,alt", "RealityCapture", "its COLMAP export (Alignment > Export > Registration)"),
     ("xmp", "xcr:", "RealityCapture", "its COLMAP export (Alignment > Export > Registration)"),
-    ("json", "\"projection_type\"", "OpenSfM", "its COLMAP export (opensfm export_colmap)"),
-    ("out", "# Bundle file", "Bundler", "the COLMAP export of the program that wrote it"),
-    ("nvm", "NVM_V3", "VisualSFM", "the COLMAP export of the program that wrote it"),
+    ("json", "[{\"cameras\":{", "OpenSfM", "its COLMAP export (opensfm export_colmap)"),
+    ("out", "#bundlefile", "Bundler", "the COLMAP export of the program that wrote it"),
+    ("nvm", "nvm_v3", "VisualSFM", "the COLMAP export of the program that wrote it"),
 ];
 
 /// Returns `true` if a capture is at `path`, judging by file names alone.
@@ -97,19 +98,24 @@ pub(crate) fn open_for(path: &Path, purpose: Purpose) -> Result<Capture> {
             Err(why) => return Err(why),
         }
     }
-    match refusals.len() {
-        0 if !path.exists() => Err(Error::request(format!("{}: no such capture", path.display()))),
-        0 => Err(unknown_format(path)),
-        1 => Err(refusals.remove(0)),
+    let poses = other_poses(path);
+    let refusal = match (refusals.len(), &poses) {
+        (0, _) if !path.exists() => Error::request(format!("{}: no such capture", path.display())),
+        (0, None) => Error::input(path, "the capture", "of no known format", SUPPORTED_FORMATS),
+        (0, Some(_)) => Error::request(format!("{}: the capture is of no known format", path.display())),
+        (1, _) => refusals.remove(0),
         _ => {
             let reasons = refusals.iter().map(Error::to_string).collect::<Vec<_>>().join("; ");
-            Err(Error::request(format!("{}: none of its formats can be read: {reasons}", path.display())))
+            Error::request(format!("{}: none of its formats can be read: {reasons}", path.display()))
         }
-    }
+    };
+    let Some((file, program, export)) = poses else { return Err(refusal) };
+    let advice = format!("expected {export}, or photos alone for `globalsplat capture`");
+    Err(Error::request(format!("{refusal}, and {} has poses of {program}, {advice}", file.display())))
 }
 
-/// Returns the error that no capture of a known format is at `path`. It names the poses of another program that are there, or one level below.
-fn unknown_format(path: &Path) -> Error {
+/// Returns the file of another program's poses that is at `path`, in this folder, or one level below, with the program and its export.
+fn other_poses(path: &Path) -> Option<(PathBuf, &'static str, &'static str)> {
     let entries = |folder: &PathBuf| {
         std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path())
     };
@@ -118,18 +124,17 @@ fn unknown_format(path: &Path) -> Error {
     let mut files: Vec<PathBuf> = top.iter().flat_map(entries).chain(top.clone()).collect();
     files.retain(|file| file.is_file());
     files.sort_by(natural_order);
-    let poses = files.into_iter().find_map(|file| {
+    files.into_iter().find_map(|file| {
         let extension = file.extension()?.to_ascii_lowercase();
-        let (_, text, program, export) = OTHER_POSES.into_iter().find(|(known, ..)| extension == *known)?;
+        let mut known = OTHER_POSES.iter().filter(|(known, ..)| extension == *known).peekable();
+        known.peek()?;
         let mut start = vec![];
         File::open(&file).ok()?.take(OTHER_POSES_BYTES).read_to_end(&mut start).ok()?;
-        String::from_utf8_lossy(&start).contains(text).then_some((file, program, export))
-    });
-    let Some((file, program, export)) = poses else {
-        return Error::input(path, "the capture", "of no known format", SUPPORTED_FORMATS);
-    };
-    let found = format!("of no known format, and {} has poses of {program}", file.display());
-    Error::input(path, "the capture", found, format!("{export}, or photos alone for `globalsplat capture`"))
+        let start =
+            String::from_utf8_lossy(&start).to_lowercase().replace(char::is_whitespace, "").replace(';', ",");
+        let (.., program, export) = known.find(|(_, text, ..)| start.contains(text))?;
+        Some((file, *program, *export))
+    })
 }
 
 /// Maximum depth of folders that are searched for captures.

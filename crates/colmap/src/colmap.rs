@@ -104,8 +104,8 @@ impl Colmap {
         }
     }
 
-    /// Runs a command of COLMAP and appends what it prints to the file `log`. `options` have the names that COLMAP 4 gives them. Reports progress
-    /// regularly, from `start` by the number of photos in the log.
+    /// Runs a command of COLMAP and appends what it prints to the file `log`. `options` have the names that COLMAP 4 gives them. Reports
+    /// progress regularly, from `start` by the number of photos in the log.
     ///
     /// # Errors
     /// Returns an error that quotes COLMAP's if the command can't be started or fails, or the one of [`Reporter::stop`].
@@ -176,7 +176,8 @@ fn parse_version(version: &str) -> Option<(u32, u32)> {
     Some((numbers.next()?.parse().ok()?, numbers.next()?.parse().ok()?))
 }
 
-/// Makes `python` run `code` isolated (`-I`) from the working folder and from variables that name other modules, but with packages of the user.
+/// Makes `python` run `code` isolated (`-I`) from the working folder and from variables that name other modules, but with packages of the
+/// user.
 fn isolate<'a>(python: &'a mut Command, code: &str) -> &'a mut Command {
     // `site` follows this variable even in isolation.
     python.env_remove("PYTHONUSERBASE").args(["-I", "-c"]).arg(format!("{ADD_USER_PACKAGES}{code}"))

@@ -3,7 +3,8 @@
 use crate::{assert_refused, assert_warns, open_transforms, photos_alone, write_photos};
 use glam::DMat3;
 use globalsplat_capture::{
-    Camera, Holdout, Intrinsics, find_captures, open_capture, read_camera_path, write_cameras_json,
+    Camera, Holdout, Intrinsics, find_captures, list_photos, open_capture, read_camera_path,
+    write_cameras_json,
 };
 use globalsplat_test_kit::formats::{
     Format, assert_same_cameras, cameras, in_images, names, pinhole, rewrite, transforms,
@@ -85,8 +86,13 @@ fn poses_of_programs_that_export_them_for_colmap_are_named() {
             "Metashape, expected its COLMAP export",
         ),
         (
+            "blocks.xml",
+            "<?xml version=\"1.0\"?>\n<BlocksExchange version=\"2.1\">",
+            "ContextCapture, expected the COLMAP export",
+        ),
+        (
             "p.csv",
-            "#cameras 5\n#name,x,y,alt,heading,pitch,roll,f\n",
+            "#cameras 5\n# Name; X; Y; Alt; Heading; Pitch; Roll; f\n",
             "RealityCapture, expected its COLMAP export",
         ),
         (
@@ -140,6 +146,9 @@ fn polycams_keyframes_are_read() {
         }
     };
     write("", &|_| ());
+    // Left by macOS, and by a correction that failed.
+    std::fs::write(keyframes.join("cameras/._000.json"), "resources").unwrap();
+    std::fs::create_dir(keyframes.join("corrected_cameras")).unwrap();
     ["images", "depth", "confidence"]
         .iter()
         .for_each(|photos| write_photos(&keyframes.join(photos), &names()));
@@ -148,8 +157,13 @@ fn polycams_keyframes_are_read() {
         assert_same_cameras(&capture, &cameras());
         assert!(capture.warnings().is_empty() && capture.load_all(None).unwrap()[4].name == "004.png");
     }
+    write_photos(folder.path(), &["thumbnail.jpg".into()]);
+    for parent in [folder.path(), &keyframes] {
+        assert_eq!(list_photos(parent).unwrap().photos.len(), 5);
+    }
     write("", &|entry| entry["t_03"] = json!(9.));
     write("corrected_", &|_| ());
+    assert_same_cameras(&open_capture(folder.path()).unwrap(), &cameras());
     write_photos(&keyframes.join("corrected_images"), &names()[1..]);
     let capture = open_capture(folder.path()).unwrap();
     assert_same_cameras(&capture, &cameras()[1..]);
@@ -173,6 +187,13 @@ fn polycams_keyframes_are_read() {
 fn the_first_format_that_can_be_read_is_taken() {
     let folder = photos_alone();
     let path = folder.path();
+    // File that ODM writes beside its poses.
+    std::fs::create_dir(path.join("opensfm")).unwrap();
+    std::fs::write(path.join("opensfm/reconstruction.json"), "[{\"cameras\": {\"v2\": {").unwrap();
+    std::fs::write(path.join("cameras.json"), r#"{"v2": {"projection_type": "brown"}}"#).unwrap();
+    let hint = "opensfm/reconstruction.json has poses of OpenSfM, expected its COLMAP export";
+    assert_refused(open_capture(path), &["cameras.json: ", hint]);
+    std::fs::remove_dir_all(path.join("opensfm")).unwrap();
     // File that 3DGS writes beside its splats.
     let foreign = r#"[{"id": 0, "img_name": "000", "width": 24, "height": 16, "position": [0, 0, 0]}]"#;
     std::fs::write(path.join("cameras.json"), foreign).unwrap();

@@ -73,13 +73,20 @@ impl<'a> Video<'a> {
             |stream: &&Value| stream["codec_type"] == "video" && stream["disposition"]["attached_pic"] != 1;
         let area =
             |stream: &Value| stream["width"].as_u64().unwrap_or(0) * stream["height"].as_u64().unwrap_or(0);
+        // Some cameras add a thumbnail as a stream of one frame.
+        let moves = |stream: &Value| stream["nb_frames"] != "1";
+        let rank = |stream: &&Value| (moves(stream), area(stream));
         // The first of the largest ones.
-        let Some(stream) = streams.iter().filter(has_pictures).rev().max_by_key(|stream| area(stream)) else {
+        let Some(stream) = streams.iter().filter(has_pictures).rev().max_by_key(rank) else {
             let has_sound = streams.iter().any(|stream| stream["codec_type"] == "audio");
             return no_video(if has_sound { "sound without pictures" } else { "without pictures" });
         };
         let size = |stream: &Value| (stream["width"].clone(), stream["height"].clone());
-        let count = streams.iter().filter(has_pictures).filter(|other| size(other) == size(stream)).count();
+        let count = streams
+            .iter()
+            .filter(has_pictures)
+            .filter(|other| moves(other) && size(other) == size(stream))
+            .count();
         if count > 1 {
             let found = format!("{count} of {}×{} pixels", stream["width"], stream["height"]);
             let expected = "1: of a camera for 360 degrees, the stitched video, or one lens by ffmpeg -i VIDEO -map 0:v:0 -c copy LENS.mkv";

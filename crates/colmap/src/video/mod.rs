@@ -33,18 +33,18 @@ pub struct VideoFrames {
 
 /// Writes frames of `video` as JPEGs `frame_00001.jpg`, `frame_00002.jpg`, … to `folder`. The video is divided into segments in which the
 /// picture moves equally far, and the sharpest frame of each is chosen; a camera at rest adds no frames. A cut starts a new segment.
-/// Frames are upright, progressive and with square pixels; HDR becomes SDR. They appear in the folder, which must be new or empty, when all are
-/// written.
+/// Frames are upright, progressive and with square pixels; HDR becomes SDR. They appear in the folder, which must be new or empty, when all
+/// are written.
 ///
-/// The number of frames is `count`, 1 to 2,000. `None` stands for one frame per 6 % of the longer side that the picture moves, but 30 to 300
-/// frames.
+/// The number of frames is `count`, 1 to 2,000. `None` stands for one frame per 6 % of the longer side that the picture moves, but 30 to
+/// 300 frames.
 ///
-/// `on_progress` is called for every frame, and several times a second in the second pass. If it returns `false`, the result is `None` and the
-/// folder stays as it was.
+/// `on_progress` is called for every frame, and several times a second in the second pass. If it returns `false`, the result is `None` and
+/// the folder stays as it was.
 ///
 /// # Errors
-/// Returns an error if ffmpeg or ffprobe is missing, if `folder` has files, if `video` isn't a video of two or more frames, if the number of
-/// frames is out of range, or if a frame can't be written.
+/// Returns an error if ffmpeg or ffprobe is missing, if `folder` has files, if `video` isn't a video of two or more frames, if the number
+/// of frames is out of range, or if a frame can't be written.
 pub fn extract_frames(
     video: &Path,
     folder: &Path,

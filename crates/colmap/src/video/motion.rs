@@ -29,8 +29,8 @@ const NEXT_REFERENCE: f64 = 0.02;
 /// Motion of a cut, in units of the longer side.
 const CUT: f64 = 1.;
 
-/// Returns the sharpness of an image: the mean square of the Laplacian, relative to the variance of the pixels, which makes it independent of
-/// exposure. 0 for an image of less than 3 pixels a side.
+/// Returns the sharpness of an image: the mean square of the Laplacian, relative to the variance of the pixels, which makes it independent
+/// of exposure. 0 for an image of less than 3 pixels a side.
 pub(super) fn sharpness_of(image: &GrayImage) -> f64 {
     /// Variance that matters little in a photo, but makes the noise of a black frame count as blur.
     const LEAST_VARIANCE: f64 = 25.;

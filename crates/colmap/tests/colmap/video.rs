@@ -347,6 +347,9 @@ fn what_is_no_video_is_refused() {
     fs::write(at("broken.mov"), &whole[..whole.len() / 2]).unwrap();
     let lenses = ["-i", "video.mkv", "-map", "0", "-map", "0", "-c", "copy", "lenses.mkv"];
     assert!(fixture.ffmpeg(&lenses));
+    let thumbnail =
+        ["-i", "video.mkv", "-i", "photo.jpg", "-map", "1", "-map", "0", "-c", "copy", "thumbnail.mov"];
+    assert!(fixture.ffmpeg(&thumbnail));
     fs::write(at("notes.txt"), "notes of a walk\n".repeat(200)).unwrap();
     fs::write(at("noise.mp4"), (0..20_000u32).map(|i| (i * i / 8) as u8).collect::<Vec<u8>>()).unwrap();
     fs::write(at("empty.mp4"), "").unwrap();
@@ -382,6 +385,8 @@ fn what_is_no_video_is_refused() {
         assert_eq!(error.to_string(), format!("the number of frames is {count}, expected 1 to 2000"));
     }
     assert!(!at("frames").exists());
+    // The only picture of one stream is a thumbnail.
+    assert_eq!(fixture.extract("thumbnail.mov", Some(4)).unwrap().indices.len(), 4);
     // A video that ends early gives what it has.
     let video = fs::read(at("video.mkv")).unwrap();
     fs::write(at("short.mkv"), &video[..video.len() / 2]).unwrap();
