@@ -41,6 +41,9 @@ impl Frame {
     }
 }
 
+/// Name of the file in a capture's folder that records how it was made.
+pub const CAPTURE_RECORD: &str = "capture.json";
+
 /// A pinhole view of a photo.
 #[derive(Debug, Clone)]
 struct View {
@@ -427,6 +430,12 @@ impl Capture {
         // A COLMAP model consists of several files.
         let form = described.extension().filter(|form| *form == "bin" || *form == "txt");
         let siblings = form.and_then(|_| std::fs::read_dir(parent_of(&described)).ok());
+        // The model of a capture that `globalsplat capture` made is in its folder sparse/0.
+        let record = described.ancestors().nth(3).map(|folder| folder.join(CAPTURE_RECORD));
+        record
+            .iter()
+            .filter(|record| form.is_some() && record.is_file())
+            .for_each(|record| inputs.add(record));
         for sibling in siblings.into_iter().flatten().flatten() {
             if Path::new(&sibling.file_name()).extension() == form {
                 inputs.add(&sibling.path());

@@ -12,7 +12,7 @@ mod photos;
 mod pixels;
 
 pub use camera_path::{CameraPath, read_camera_path};
-pub use capture::{Capture, Photo};
+pub use capture::{CAPTURE_RECORD, Capture, Photo};
 pub use formats::cameras_json::write_cameras_json;
 #[cfg(feature = "chunks")]
 pub use formats::chunk::{CAMERA_NUMBERS, CHUNK_EXTENSION, CHUNK_INDEX_FILE, Chunk, camera_numbers};

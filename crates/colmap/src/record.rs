@@ -14,7 +14,7 @@ use std::str::FromStr;
 use std::time::UNIX_EPOCH;
 
 /// Name of the file, in the capture's folder.
-pub(crate) const FILE: &str = "capture.json";
+pub(crate) const FILE: &str = globalsplat_capture::CAPTURE_RECORD;
 
 /// Number of photos that messages name.
 pub(crate) const SHOWN_NAMES: usize = 5;

@@ -6,6 +6,7 @@ use globalsplat_capture::{
     Camera, Holdout, Intrinsics, find_captures, list_photos, open_capture, read_camera_path,
     write_cameras_json,
 };
+use globalsplat_files::InputFiles;
 use globalsplat_test_kit::formats::{
     Format, assert_same_cameras, cameras, in_images, names, pinhole, rewrite, transforms,
     write_colmap_binary, write_colmap_text,
@@ -228,6 +229,12 @@ fn colmap_models_are_found_where_tools_put_them() {
             let capture = open_capture(&folder.path().join(opened)).unwrap();
             assert_same_cameras(&capture, &cameras());
             assert!(capture.warnings().is_empty() && capture.load_all(None).unwrap()[4].name == "004.png");
+            // No output may replace the record of `globalsplat capture`.
+            let record = folder.path().join("capture.json");
+            std::fs::write(&record, "{}").unwrap();
+            let mut inputs = InputFiles::default();
+            capture.add_input_files(&mut inputs);
+            assert!(place != "sparse/0" || inputs.check_file(&record).is_err());
         }
     }
 }
