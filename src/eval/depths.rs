@@ -2,7 +2,7 @@
 
 use crate::data::{Capture, Pixels};
 use crate::error::{Error, Result};
-use npyz::NpyFile;
+use npyz::{NpyFile, Order};
 use std::fs::File;
 use std::path::Path;
 use tch::{Kind, Tensor};
@@ -12,10 +12,10 @@ use tch::{Kind, Tensor};
 pub(super) struct ExactDepths(Tensor);
 
 impl ExactDepths {
-    /// Reads the depths of `capture` from `file`, a NumPy array of float32.
+    /// Reads the depths of `capture` from `file`, a NumPy array of float32 or float64.
     ///
     /// # Errors
-    /// Fails if the file can't be read, or has another shape than the photos.
+    /// Fails if the file can't be read, has another shape than the photos or Fortran's order, or if a depth is below 0 or NaN.
     pub fn read(file: &Path, capture: &Capture) -> Result<Self> {
         let camera = capture.camera(0);
         let expected = [capture.len() as u64, u64::from(camera.height), u64::from(camera.width)];
@@ -25,7 +25,17 @@ impl ExactDepths {
             let expected = format!("{expected:?}, that of the photos");
             return Err(Error::input(file, "the shape", format!("{found:?}"), expected));
         }
-        let values = npy.into_vec::<f32>().map_err(Error::read(file))?;
+        if npy.header().order() == Order::Fortran {
+            return Err(Error::input(file, "the order", "Fortran's", "C's, the last index first"));
+        }
+        let values: Vec<f32> = match npy.dtype().descr().ends_with("f8'") {
+            true => npy.into_vec::<f64>().map(|values| values.into_iter().map(|z| z as f32).collect()),
+            false => npy.into_vec(),
+        }
+        .map_err(Error::read(file))?;
+        if let Some(bad) = values.iter().find(|z| z.is_nan() || **z < 0.) {
+            return Err(Error::input(file, "a depth", bad, "0 or more, or infinity where nothing is"));
+        }
         Ok(ExactDepths(Tensor::from_slice(&values).view(expected.map(|side| side as i64).as_slice())))
     }
 
