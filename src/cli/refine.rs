@@ -11,8 +11,8 @@ use crate::data::{Capture, PhotoSize};
 use crate::device::process_age;
 use crate::error::Error;
 use crate::io::{
-    InputFiles, check_writable_dir, check_writable_file, check_writable_png, check_writable_splat, checksum,
-    read_splat, splat_files,
+    InputFiles, ShLimits, Splat, WriteOptions, check_writable_dir, check_writable_file, check_writable_png,
+    check_writable_splat, checksum, fit_splat, parent_of, read_splat, splat_files, write_local_splat,
 };
 use crate::metrics::{CaptureScores, Scores};
 use crate::model::Precision;
@@ -115,7 +115,7 @@ impl Refine {
         self.reports
             .log
             .iter()
-            .try_for_each(|log| check_writable_dir(log).and_then(|()| RefineLog::check(log)))?;
+            .try_for_each(|log| check_writable_dir(log).and_then(|()| RefineLog::check(log).map(drop)))?;
         signals::handle_stop_requests()?;
         signals::end_at_request(1);
         let (path, masks) = self.scene.path(self.masks.as_deref(), &self.out)?;
@@ -185,14 +185,25 @@ impl Refine {
         let spread: Vec<Camera> = spread.into_iter().map(|index| cameras[index]).collect();
         let read_origin = splat.as_ref().map_or(DVec3::ZERO, |splat| splat.origin);
         let origin = self.local_origin.choose(read_origin, || LocalFrame::from_cameras(&cameras).origin);
-        splat_out::write_for(&self.out, &result.splat, &spread, origin)?;
-        if let (true, Some(state)) = (self.resume, &mut result.state) {
-            state.sources = vec![source];
-            // A splat that is refined in place is its own source the next time.
-            if self.splat.is_some() {
-                state.sources.push(splat_source(&self.out)?);
+        let limits = ShLimits::up_to(result.splat.sh_degree);
+        let fitted = fit_splat(&self.out, &result.splat, &limits, &spread)?;
+        let mut state = result.state.take().filter(|_| self.resume);
+        let mut save = |result: Option<&Splat>| -> Result<()> {
+            let Some(state) = &mut state else { return Ok(()) };
+            state.sources = vec![source.clone()];
+            if let Some(splat) = result {
+                state.sources.push(self.result_source(splat)?);
             }
-            state.write(&state_file)?;
+            Ok(state.write(&state_file)?)
+        };
+        // A splat that is refined in place is its own source the next time. The state is written before it replaces its source, so that
+        // a refinement that is killed in between can be continued.
+        let is_source = self.splat.is_some();
+        let saved = if is_source { save(Some(&fitted.with_origin(origin))) } else { Ok(()) };
+        splat_out::write(&self.out, &fitted, origin, &WriteOptions::default())?;
+        saved?;
+        if !is_source {
+            save(None)?;
         }
         let held_out = session.score_held_out(&result)?;
         if let Some(sheet) = &self.reports.contact_sheet {
@@ -221,6 +232,15 @@ impl Refine {
         })
     }
 
+    /// Describes the output of `splat` as the source of another refinement, before it is written.
+    fn result_source(&self, splat: &Splat) -> Result<String> {
+        let parent = parent_of(&self.out);
+        let folder = tempfile::tempdir_in(parent).map_err(Error::write(parent))?;
+        let copy = folder.path().join(self.out.file_name().unwrap_or_default());
+        write_local_splat(&copy, splat, &WriteOptions::default())?;
+        splat_source(&copy)
+    }
+
     /// Describes the result. Scores are those before and after the optimization.
     fn describe_result(
         &self,
@@ -237,7 +257,7 @@ impl Refine {
         let (of_photos, of_held_out) =
             if session.held_out().is_empty() { (distances, [None; 2]) } else { ([None; 2], distances) };
         let out = self.out.to_string_lossy();
-        let of = |scores: &Scores, lpips: Option<f64>| json!({ "psnr": scores.psnr, "cc_psnr": scores.cc_psnr, "ssim": scores.ssim, "lpips_vgg": lpips });
+        let of = |&Scores { psnr, cc_psnr, ssim, .. }: &Scores, lpips: Option<f64>| json!({ "psnr": psnr, "cc_psnr": cc_psnr, "ssim": ssim, "lpips_vgg": lpips });
         let mut json = json!({
             "splat": out, "gaussians": count, "photos": photos, "near_duplicates": session.near_duplicates,
             "steps": steps, "seconds": ended, "begin_seconds": begun, "corrections": corrections,
@@ -278,6 +298,7 @@ impl Refine {
         let mut inputs = InputFiles::default();
         capture.add_input_files(&mut inputs);
         self.weights.iter().for_each(|weights| inputs.add(weights));
+        self.reports.log.iter().try_for_each(|log| inputs.check_folder(log))?;
         let outputs = [splat_files(&self.out), vec![state.to_owned()]].concat();
         outputs.iter().try_for_each(|file| inputs.check_file(file))?;
         self.splat.iter().for_each(|splat| inputs.add_all(splat_files(splat)));

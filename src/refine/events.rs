@@ -68,27 +68,30 @@ pub struct RefineLog {
 }
 
 impl RefineLog {
-    /// Checks that the folder `run` has no other metrics than those of refinements. Changes nothing.
+    /// Checks that the folder `run` has no other metrics than those of refinements. A last line that is cut short, as by a kill, counts
+    /// as one of them. Returns the length of the whole lines in bytes. Changes nothing.
     ///
     /// # Errors
     /// Returns an error if the folder has the log of a training, or a `metrics.jsonl` that no refinement wrote.
-    pub fn check(run: &Path) -> Result<()> {
+    pub fn check(run: &Path) -> Result<u64> {
         if run.join(CONFIG_FILE).exists() {
             return Err(Error::input(run, "the log", "a folder of a training run", "another folder"));
         }
         let file = run.join(METRICS_FILE);
         let text = if file.exists() { read_text(&file)? } else { String::new() };
-        let is_own = |line: &str| {
-            let value: Value = serde_json::from_str(line).unwrap_or_default();
-            let has_values = value["gaussians"].is_number() || value["validation"].is_object();
-            line.ends_with('\n') && value["step"].is_u64() && has_values
+        let is_own = |line: &str| match serde_json::from_str::<Value>(line) {
+            Ok(value) => {
+                let has_values = value["gaussians"].is_number() || value["validation"].is_object();
+                value["step"].is_u64() && has_values
+            }
+            Err(e) => e.is_eof() && line.starts_with("{\"") && !line.ends_with('\n'),
         };
         match text.split_inclusive('\n').position(|line| !is_own(line)) {
             Some(index) => {
                 let found = "no line of a refinement's log";
                 Err(Error::input(&file, format!("line {}", index + 1), found, "another folder for the log"))
             }
-            None => Ok(()),
+            None => Ok(text.rfind('\n').map_or(0, |end| end as u64 + 1)),
         }
     }
 
@@ -97,9 +100,10 @@ impl RefineLog {
     /// # Errors
     /// Returns the errors of [`RefineLog::check`], or an error if a file can't be written.
     pub fn open(run: &Path, steps: u64) -> Result<Self> {
-        Self::check(run)?;
+        let whole = Self::check(run)?;
         std::fs::create_dir_all(run).map_err(Error::write(run))?;
-        let metrics = AppendFile::open(&run.join(METRICS_FILE))?;
+        let mut metrics = AppendFile::open(&run.join(METRICS_FILE))?;
+        metrics.truncate(whole)?;
         let mut events = EventFile::create_for(run)?;
         events.start(steps)?;
         Ok(RefineLog { metrics, events })

@@ -603,6 +603,7 @@ impl<'a> RefineSession<'a> {
         }
         let record = Record {
             photos: self.fingerprints.clone(),
+            side: self.longest_side(),
             frame: self.frame_numbers(),
             progress,
             total: earlier_total + self.time.elapsed(),
@@ -618,9 +619,24 @@ impl<'a> RefineSession<'a> {
         Ok((optimizer.averaged_gaussians(), photo_opt, state))
     }
 
-    /// Returns an error if `state` is that of other photos or cameras.
+    /// Returns the number of pixels along the longest side of the photos.
+    fn longest_side(&self) -> u32 {
+        let sides = self.photos.iter().map(|photo| photo.camera.width.max(photo.camera.height));
+        sides.max().unwrap_or(0)
+    }
+
+    /// Returns an error if `state` is that of other photos or cameras, or of larger photos.
     fn check_photos(&self, state: &RefineState) -> Result<()> {
-        let Record { photos, frame, .. } = &state.record;
+        let Record { photos, side, frame, .. } = &state.record;
+        if self.longest_side() < *side {
+            let expected = format!("at most {}, as in this refinement (--size)", self.longest_side());
+            return Err(Error::input(
+                &state.file,
+                "the size of the photos",
+                format!("{side} pixels"),
+                expected,
+            ));
+        }
         let names =
             |photos: &[(String, u32)]| photos.iter().map(|(name, _)| name.clone()).collect::<Vec<_>>();
         if *frame != self.frame_numbers() || names(photos) != names(&self.fingerprints) {

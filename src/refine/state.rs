@@ -41,6 +41,8 @@ pub(crate) struct TrainProgress {
 pub(super) struct Record {
     /// Names of the photos that were matched, and the checksum of each with its camera and mask.
     pub photos: Vec<(String, u32)>,
+    /// Number of pixels along the longest side of the photos.
+    pub side: u32,
     /// Origin and scale of the local frame that the Gaussians are in.
     pub frame: [f64; 4],
     /// Where the optimization has ended.

@@ -85,6 +85,26 @@ fn views_off_the_path_are_scored_where_photos_cover_them() {
     let other = eval.replace("@off/depth", "@path/depth");
     let expected = "the shape is [8, 64, 64], expected [11, 64, 64], that of the photos";
     assert_says(&sandbox.refuse(&other), &[expected]);
+    let whole = sandbox.read("off/depth/0_000000.npy");
+    let end = 10 + usize::from(whole[8]) + 256 * usize::from(whole[9]);
+    let (header, numbers) = whole.split_at(end);
+    let header = std::str::from_utf8(&header[10..]).unwrap();
+    let changed = |from: &str, to: &str, numbers: &[u8]| {
+        let header = header.replace(from, to);
+        assert_eq!(header.len() + 10, end);
+        sandbox.write("changed.npy", [&whole[..10], header.as_bytes(), numbers].concat());
+        eval.replace("@off/depth/0_000000.npy", "@changed.npy")
+    };
+    let negative = [&numbers[..numbers.len() - 4], &(-1f32).to_le_bytes()].concat();
+    for (from, to, numbers, expected) in [
+        ("False, ", "True,  ", numbers, "the order is Fortran's, expected C's"),
+        ("", "", &negative, "a depth is -1, expected 0 or more"),
+    ] {
+        assert_says(&sandbox.refuse(&changed(from, to, numbers)), &[expected]);
+    }
+    let doubles = numbers.as_chunks().0.iter().flat_map(|&z| f64::from(f32::from_le_bytes(z)).to_le_bytes());
+    let wide = sandbox.json(&changed("<f4", "<f8", &doubles.collect::<Vec<_>>()));
+    assert_eq!(number(&wide, "/depth_error"), number(&all, "/depth_error"));
 }
 
 /// Commands leave out what the masks in a folder cover.
@@ -373,7 +393,9 @@ fn a_refinement_is_continued_and_logged() {
     assert_says(&message, &["a.state.safetensors: continues after 120 steps"]);
     assert_eq!(steps_with("loss"), [49, 99, 149, 199]);
     assert!(!steps_with("validation").is_empty());
-    // Another refinement is appended; one without its photos touches no file.
+    // Another refinement is appended, after a line that a kill cut short; one without its photos touches no file.
+    let log = sandbox.text("log/metrics.jsonl");
+    sandbox.write("log/metrics.jsonl", format!("{log}{{\"gaussians\":20"));
     sandbox.run("refine --scene @room --out @b.ply --gaussians 200 --size 48 --steps 60 --log @log");
     assert_eq!(steps_with("loss"), [49, 99, 149, 199, 49]);
     let before = sandbox.contents();
@@ -390,7 +412,7 @@ fn a_refinement_is_continued_and_logged() {
 fn a_state_continues_only_its_own_refinement() {
     let sandbox = Sandbox::new();
     sandbox.copy("room/truth.ply", "splat.ply");
-    let from_photos = "refine --scene @room --out @a.ply --gaussians 60 --size 24 --resume --steps";
+    let from_photos = "refine --scene @room --out @a.ply --gaussians 60 --size 36 --resume --steps";
     let from_splat = "refine --scene @room --out @b.ply --splat @splat.ply --resume --steps";
     let in_place = "refine --scene @room --out @room/truth.ply --splat @room/truth.ply --resume --steps";
     // The splats are dim, so that they are improved.
@@ -399,6 +421,11 @@ fn a_state_continues_only_its_own_refinement() {
         sandbox.run(&format!("{line} 9"));
         sandbox.run(&format!("{line} 12"));
     }
+    // The splat of a refinement in place that was killed after it wrote its state.
+    let splat = sandbox.read("room/truth.ply");
+    sandbox.run(&format!("{in_place} 14"));
+    sandbox.write("room/truth.ply", splat);
+    sandbox.run(&format!("{in_place} 16"));
     let refuse = |line: String, expected: &str| {
         let before = sandbox.contents();
         assert_says(&sandbox.refuse(&line), &[".state.safetensors: ", expected]);
@@ -420,6 +447,10 @@ fn a_state_continues_only_its_own_refinement() {
     refuse(
         format!("{from_photos} 15 --splat @splat.ply").replace("--gaussians 60", ""),
         "the source of the Gaussians is the photos, expected the splat",
+    );
+    refuse(
+        format!("{from_photos} 15").replace("36", "32"),
+        "the size of the photos is 36 pixels, expected at most 32",
     );
     sandbox.run("convert @splat.ply @splat.ply --scale 1.01");
     refuse(format!("{from_splat} 15"), "the source of the Gaussians is the splat with the checksum ");

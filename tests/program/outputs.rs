@@ -297,6 +297,8 @@ fn foreign_files_are_not_overwritten() {
     let error = sandbox.refuse("refine --scene @room --steps 2 --out @a.ply --log @log");
     assert_says(&error, &["metrics.jsonl: line 1 is no line of a refinement's log"]);
     assert_eq!((sandbox.text("log/metrics.jsonl").as_str(), sandbox.names("log").len()), (NOTES, 1));
+    let error = sandbox.refuse("refine --scene @room --steps 2 --out @a.ply --log @room/images");
+    assert_says(&error, &["a folder with the capture's photos"]);
 
     // A run takes no configuration for its own.
     sandbox.copy("tiny.toml", "run/config.toml");

@@ -28,6 +28,15 @@ impl AppendFile {
         Ok(AppendFile { path: path.to_owned(), file, length })
     }
 
+    /// Removes what follows the first `length` bytes, the end of the last whole record.
+    ///
+    /// # Errors
+    /// Returns an error if the file can't be written.
+    pub fn truncate(&mut self, length: u64) -> Result<()> {
+        self.length = length;
+        self.file.set_len(length).map_err(Error::write(&self.path))
+    }
+
     /// Appends `record`.
     ///
     /// # Errors
