@@ -23,6 +23,9 @@ impl Default for WriteOptions {
     }
 }
 
+/// Function that writes a splat to a file.
+type Write = fn(&Path, &Splat, &WriteOptions) -> Result<()>;
+
 /// A splat file format: what it can represent, and the functions that read and write it.
 pub struct SplatFormat {
     /// Suffix of file names, in lower case, or a whole file name if it doesn't begin with a dot.
@@ -34,7 +37,7 @@ pub struct SplatFormat {
     read: fn(&Path, &[u8]) -> Result<Splat>,
     find_invalid: fn(&Splat) -> InvalidGaussians,
     /// Function that writes a splat, or `None` for a format that is only read.
-    write: Option<fn(&Path, &Splat, &WriteOptions) -> Result<()>>,
+    write: Option<Write>,
     /// Function that returns the limits of the spherical harmonics.
     pub limits: fn() -> ShLimits,
     /// Function that returns a splat with SH coefficients above degree 0 rounded as in a file, if the format has a palette of them, which
@@ -127,7 +130,7 @@ const ENDINGS: &str = ".ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf, .
 
 impl SplatFormat {
     /// Returns the function that writes a splat at `path`, or an error for a format that is only read.
-    fn writer(&self, path: &Path) -> Result<fn(&Path, &Splat, &WriteOptions) -> Result<()>> {
+    fn writer(&self, path: &Path) -> Result<Write> {
         let found = || format!("{}, which is only read", self.ending);
         self.write.ok_or_else(|| Error::input(path, "the format", found(), WRITTEN_ENDINGS))
     }
