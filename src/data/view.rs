@@ -3,6 +3,7 @@
 use crate::error::Result;
 use crate::io::rgb_from_tensor;
 use crate::scene::{Camera, ImageSize};
+use crate::stereo::SmallPhoto;
 use globalsplat_capture::{CHANNELS, Capture, Photo, Planes, resize_and_crop};
 use rayon::prelude::*;
 use serde::Deserialize;
@@ -197,6 +198,13 @@ impl View {
     /// Returns `true` if no pixel counts.
     pub fn is_masked_out(&self) -> bool {
         self.pixel_fraction() == Some(0.)
+    }
+
+    /// Returns the view with at most `longest_side` pixels along its longer side, on the CPU.
+    pub(crate) fn to_small_photo(&self, longest_side: f64) -> SmallPhoto {
+        let on_cpu = |pixels: &Pixels| pixels.to_float().to_device(Device::Cpu);
+        let (image, mask) = (on_cpu(&self.image), self.mask.as_ref().map(on_cpu));
+        SmallPhoto::new(&self.name, &image, mask.as_ref(), self.camera, longest_side)
     }
 
     /// Returns the view fitted to `size` as [`load_views`] does, without reading the photo again.

@@ -2,13 +2,13 @@
 //! splits them.
 
 use super::depths::{ExactDepths, depth_error};
-use crate::data::{Capture, Holdout, PhotoSize, Pixels, View, load_views, read_points};
+use crate::data::{Capture, Holdout, PhotoSize, View, load_views, read_points};
 use crate::error::{Error, Result};
 use crate::io::{read_text, write_json};
 use crate::metrics::{CaptureScores, score_view};
 use crate::reconstruct::{context_views, load_context};
 use crate::scene::{Camera, ImageSize};
-use crate::stereo::{DepthMap, SWEEP_SIDE, SmallPhoto, covered, sweep};
+use crate::stereo::{DepthMap, SWEEP_SIDE, covered, sweep};
 use glam::DMat4;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -171,9 +171,7 @@ impl EvalScene {
     pub fn covered(self, holdout: Holdout) -> Result<Self> {
         let photo = |photo: usize| {
             let small = PhotoSize::Within(SWEEP_SIDE as u32).resized(&self.capture.camera(photo));
-            let view = load_views(&self.capture, &[photo], small)?.remove(0);
-            let mask = view.mask.as_ref().map(Pixels::to_float);
-            Ok(SmallPhoto::new(&view.name, &view.image.to_float(), mask.as_ref(), view.camera, SWEEP_SIDE))
+            Ok(load_views(&self.capture, &[photo], small)?.remove(0).to_small_photo(SWEEP_SIDE))
         };
         let photos = self.capture.split(holdout).0.into_iter().map(photo).collect::<Result<_>>()?;
         let depth_maps = sweep(photos, &read_points(&self.capture)?, |_| true).depth_maps;

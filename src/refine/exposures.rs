@@ -186,7 +186,6 @@ fn median(values: &mut [f32]) -> f32 {
 mod tests {
     use super::*;
     use crate::data::View;
-    use crate::refine::init::small_photo;
     use crate::refine::{PhotoInit, gaussians_from_photos};
     use crate::scene::SH_C0;
     use tch::Kind;
@@ -205,7 +204,7 @@ mod tests {
     fn exposures_are_measured() {
         let gains = [[1., 1., 1.], [0.8, 0.9, 1.1], [1.3, 1.2, 1.4], [1., 1., 1.]];
         let views: Vec<View> = [-0.5, 0., 0.5, 90.].into_iter().zip(gains).map(|(x, g)| wall(x, g)).collect();
-        let photos: Vec<SmallPhoto> = views.iter().map(|view| small_photo(view, 128.)).collect();
+        let photos: Vec<SmallPhoto> = views.iter().map(|view| view.to_small_photo(128.)).collect();
         let map = |index: usize| {
             let map = DepthMap { camera: photos[index].camera, ..DepthMap::flat(64, 64, DEPTH) };
             (index, map)

@@ -3,13 +3,13 @@
 use super::exposures::{LogGains, correct_exposures};
 use super::options::{ExposureCorrection, RefineOptions};
 use super::state::RefineState;
-use crate::data::{Capture, PhotoSize, Pixels, Point, View};
+use crate::data::{Capture, PhotoSize, Point, View};
 use crate::error::Result;
 use crate::io::Splat;
 use crate::reconstruct::LoadedModel;
 use crate::render::{contributions, largest_contributions};
 use crate::scene::{Camera, RawGaussians, SH_C0};
-use crate::stereo::{DepthMap, PlaneSweepOutput, SWEEP_SIDE, SmallPhoto, pixel_and_depth, sweep};
+use crate::stereo::{DepthMap, PlaneSweepOutput, SWEEP_SIDE, pixel_and_depth, sweep};
 use glam::DVec3;
 use rand::seq::index::sample;
 use rand::{Rng, SeedableRng};
@@ -91,7 +91,7 @@ pub fn gaussians_from_photos(
     exposures: ExposureCorrection,
     should_continue: impl FnMut(usize) -> bool,
 ) -> Option<PhotoInit> {
-    let photos = views.iter().map(|view| small_photo(view, SWEEP_SIDE)).collect();
+    let photos = views.iter().map(|view| view.to_small_photo(SWEEP_SIDE)).collect();
     let PlaneSweepOutput { photos, mut depth_maps } = sweep(photos, points, should_continue);
     if depth_maps.is_empty() {
         return None;
@@ -106,13 +106,6 @@ pub fn gaussians_from_photos(
     let depth_maps: Vec<DepthMap> = depth_maps.into_iter().map(|(_, map)| map).collect();
     let gaussians = sample_gaussians(&depth_maps, points, count, seed);
     Some(PhotoInit { gaussians, depth_maps, log_exposures })
-}
-
-/// Downscales a view to at most `longest_side` pixels along its longer side, on the CPU.
-pub(super) fn small_photo(view: &View, longest_side: f64) -> SmallPhoto {
-    let on_cpu = |pixels: &Pixels| pixels.to_float().to_device(Device::Cpu);
-    let (image, mask) = (on_cpu(&view.image), view.mask.as_ref().map(on_cpu));
-    SmallPhoto::new(&view.name, &image, mask.as_ref(), view.camera, longest_side)
 }
 
 /// Returns at most `count` of the `known` Gaussians, on the CPU: of those that don't contradict the photos of `depth_maps`, the ones that

@@ -7,7 +7,7 @@ use super::gaussian_optimizer::GaussianOptimizer;
 use super::init::{PhotoInit, SceneInit, gaussians_from_photos, most_visible};
 use super::options::{ExposureCorrection, RefineOptions};
 use super::photo_opt::{Correction, PhotoOpt};
-use super::photos::{Photos, distinct, load_photos};
+use super::photos::{Photos, distinct, load_photos, longest_side};
 use super::state::{Record, RefineState};
 use super::time_budget::TimeBudget;
 use super::{OptimizeArgs, refine, scene_depth};
@@ -603,7 +603,7 @@ impl<'a> RefineSession<'a> {
         }
         let record = Record {
             photos: self.fingerprints.clone(),
-            side: self.longest_side(),
+            side: longest_side(&self.photos),
             frame: self.frame_numbers(),
             progress,
             total: earlier_total + self.time.elapsed(),
@@ -619,17 +619,12 @@ impl<'a> RefineSession<'a> {
         Ok((optimizer.averaged_gaussians(), photo_opt, state))
     }
 
-    /// Returns the number of pixels along the longest side of the photos.
-    fn longest_side(&self) -> u32 {
-        let sides = self.photos.iter().map(|photo| photo.camera.width.max(photo.camera.height));
-        sides.max().unwrap_or(0)
-    }
-
     /// Returns an error if `state` is that of other photos or cameras, or of larger photos.
     fn check_photos(&self, state: &RefineState) -> Result<()> {
         let Record { photos, side, frame, .. } = &state.record;
-        if self.longest_side() < *side {
-            let expected = format!("at most {}, as in this refinement (--size)", self.longest_side());
+        let own_side = longest_side(&self.photos);
+        if own_side < *side {
+            let expected = format!("at most {own_side}, as in this refinement (--size)");
             return Err(Error::input(
                 &state.file,
                 "the size of the photos",

@@ -123,6 +123,7 @@ static FORMATS: [SplatFormat; 10] = [
     KSPLAT,
     SplatFormat { ending: ".zip", write: None, ..SOG },
 ];
+
 /// Extensions of the formats that are written, for messages.
 const WRITTEN_ENDINGS: &str = ".ply, .compressed.ply, .sog, .spz, .splat, .glb, .gltf or meta.json";
 /// Extensions of all formats, for messages.

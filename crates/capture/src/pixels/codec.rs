@@ -84,8 +84,14 @@ fn decode(
     should_turn: impl FnOnce((u32, u32), (u32, u32)) -> bool,
 ) -> Result<DecodedPhoto> {
     if heif_size(encoded).is_some() {
-        let (pixels, [is_verbatim, is_turned, is_jpeg, is_png]) = (decode_heif(encoded, file)?, [false; 4]);
-        return Ok(DecodedPhoto { pixels, alpha: None, is_verbatim, is_turned, is_jpeg, is_png });
+        return Ok(DecodedPhoto {
+            pixels: decode_heif(encoded, file)?,
+            alpha: None,
+            is_verbatim: false,
+            is_turned: false,
+            is_jpeg: false,
+            is_png: false,
+        });
     }
     let reader = ImageReader::new(Cursor::new(encoded)).with_guessed_format().map_err(Error::read(file))?;
     let format = reader.format();
