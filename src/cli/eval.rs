@@ -131,8 +131,7 @@ impl Eval {
         let model = loaded.as_ref().map(Model::from);
         let mut scene = self.one_scene(&capture, model)?;
         if self.covered {
-            let holdout = self.holdout.as_deref().map_or(Ok(Holdout::None), parse_holdout)?;
-            scene = scene.covered(holdout)?;
+            scene = scene.covered(self.holdout(model)?.unwrap_or(Holdout::None))?;
         }
         if let Some(depth) = &self.depth {
             scene = scene.with_depths(depth)?;
@@ -177,8 +176,8 @@ impl Eval {
     /// Returns the scene to evaluate: a model's input and target views; for splats and images, all photos as targets.
     fn one_scene(&self, capture: &Capture, model: Option<Model>) -> Result<EvalScene> {
         let target_size = self.target_size(model)?;
-        let holdout = self.holdout.as_deref().map(parse_holdout).transpose()?;
-        let Some(Model { config, .. }) = model else {
+        let holdout = self.holdout(model)?;
+        let (Some(Model { config, .. }), Some(held_out)) = (model, holdout) else {
             let size = match &self.size {
                 Some(size) => size
                     .parse::<PhotoSize>()
@@ -187,8 +186,13 @@ impl Eval {
             };
             return Ok(EvalScene::without_context(capture, holdout, size)?);
         };
-        let (holdout, photo_size) = (holdout.unwrap_or(config.data.holdout), config.data.image_size);
-        Ok(EvalScene::held_out(capture, holdout, self.views, photo_size, target_size)?)
+        Ok(EvalScene::held_out(capture, held_out, self.views, config.data.image_size, target_size)?)
+    }
+
+    /// Returns the requested holdout, or else that of the model's training.
+    fn holdout(&self, model: Option<Model>) -> Result<Option<Holdout>> {
+        let requested = self.holdout.as_deref().map(parse_holdout).transpose()?;
+        Ok(requested.or(model.map(|model| model.config.data.holdout)))
     }
 
     /// Returns the size of the scored images.

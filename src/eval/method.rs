@@ -91,7 +91,8 @@ impl Method<'_> {
             }
             if view.is_masked_out() {
                 let (scene, view) = (&scene.name, &view.name);
-                warnings.push(format!("{scene}: {view} is masked out as a whole, and not scored"));
+                warnings
+                    .push(format!("{scene}: {view} is masked out or not covered as a whole, and not scored"));
                 return Ok(());
             }
             let mut score = score_view(&image, view, perceptual)?;
@@ -102,7 +103,7 @@ impl Method<'_> {
             Ok(())
         })?;
         if views.is_empty() {
-            let why = format!("{}: every view to score is masked out as a whole", scene.name);
+            let why = format!("{}: every view to score is masked out or not covered as a whole", scene.name);
             return Err(Error::request(why));
         }
         Ok(SceneScores {

@@ -132,8 +132,8 @@ pub struct EvalScene {
     target_size: PhotoSize,
     /// Names of the target photos.
     target_names: Vec<String>,
-    /// Depths of photos that at least two of must cover a pixel that is scored; empty to score all pixels.
-    coverage: Vec<DepthMap>,
+    /// Depths of photos, at least two of which must cover a pixel that is scored; `None` to score all pixels.
+    coverage: Option<Vec<DepthMap>>,
     /// Exact depths of all photos of the capture.
     depths: Option<ExactDepths>,
 }
@@ -158,7 +158,7 @@ impl EvalScene {
             context,
             frames,
             target_size,
-            coverage: vec![],
+            coverage: None,
             depths: None,
         }
     }
@@ -167,7 +167,7 @@ impl EvalScene {
     /// the others.
     ///
     /// # Errors
-    /// Fails if a photo can't be read, or if the photos agree on no depth.
+    /// Fails if a photo can't be read.
     pub fn covered(self, holdout: Holdout) -> Result<Self> {
         let photo = |photo: usize| {
             let small = PhotoSize::Within(SWEEP_SIDE as u32).resized(&self.capture.camera(photo));
@@ -175,7 +175,7 @@ impl EvalScene {
         };
         let photos = self.capture.split(holdout).0.into_iter().map(photo).collect::<Result<_>>()?;
         let depth_maps = sweep(photos, &read_points(&self.capture)?, |_| true).depth_maps;
-        Ok(EvalScene { coverage: depth_maps.into_iter().map(|(_, map)| map).collect(), ..self })
+        Ok(EvalScene { coverage: Some(depth_maps.into_iter().map(|(_, map)| map).collect()), ..self })
     }
 
     /// Adds the scores of depths by the exact ones in `file`, an array [photos, rows, columns] as `globalsplat synth --depth` writes it.
@@ -260,9 +260,9 @@ impl EvalScene {
             // In this order, the end of `views` takes no number.
             for (view, i) in views.into_iter().zip(&mut numbers) {
                 let mut view = View { name: self.target_names[i].clone(), ..view };
-                if !self.coverage.is_empty() {
-                    view.mask =
-                        Some((view.mask_or_ones().to_float() * covered(&self.coverage, &view.camera)).into());
+                if let Some(depth_maps) = &self.coverage {
+                    let mask = view.mask_or_ones().to_float() * covered(depth_maps, &view.camera);
+                    view.mask = Some(mask.into());
                 }
                 visit(i, &view)?;
             }

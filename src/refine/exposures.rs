@@ -138,13 +138,13 @@ impl<'a> ExposedPhoto<'a> {
 
     /// Returns points of the surfaces that the photo shows, and their colors. Requires a depth map.
     fn points(&self) -> Vec<(DVec3, [f32; 3])> {
-        let Camera { intrinsics: k, c2w, width, .. } = self.photo.camera;
+        let camera = self.photo.camera;
         let depths = self.depths.as_ref().expect("depths");
         let point = |(pixel, &depth): (usize, &f32)| {
             let color = self.color(pixel).filter(|_| depth.is_finite())?;
-            let [u, v] = [pixel as u32 % width, pixel as u32 / width].map(|side| f64::from(side) + 0.5);
-            let seen = DVec3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.) * f64::from(depth);
-            Some((c2w.transform_point3(seen), color))
+            let [u, v] =
+                [pixel as u32 % camera.width, pixel as u32 / camera.width].map(|side| f64::from(side) + 0.5);
+            Some((camera.unproject(u, v, depth.into()), color))
         };
         let points: Vec<_> = depths.iter().enumerate().filter_map(point).collect();
         let every = points.len().div_ceil(MAX_POINTS).max(1);

@@ -209,7 +209,7 @@ fn sample_pixels(
     gaussians: &mut Vec<IsotropicGaussian>,
 ) {
     let (width, height) = (of.camera.width as usize, of.camera.height as usize);
-    let (depth, image, k) = (of.depths(), of.colors(), of.camera.intrinsics);
+    let (depth, image) = (of.depths(), of.colors());
     let counted =
         of.counted_pixels().map(|counted| (0..counted.len()).filter(|&i| counted[i]).collect::<Vec<_>>());
     for _ in 0..count {
@@ -223,10 +223,9 @@ fn sample_pixels(
         };
         let pixel = v as usize * width + u as usize;
         let z = f64::from(depth[pixel]);
-        let seen = DVec3::new((u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z);
         gaussians.push(IsotropicGaussian {
-            mean: of.camera.c2w.transform_point3(seen),
-            scale: EXTENT * spacing * z / k.fx,
+            mean: of.camera.unproject(u, v, z),
+            scale: EXTENT * spacing * z / of.camera.intrinsics.fx,
             color: [0, 1, 2].map(|channel| image[channel * width * height + pixel]),
         });
     }

@@ -40,13 +40,12 @@ pub(crate) fn covered(depth_maps: &[DepthMap], camera: &Camera) -> Tensor {
 impl DepthMap {
     /// Returns the points of the pixels that count and on whose depth the photos agree.
     fn sure_points(&self) -> impl Iterator<Item = DVec3> {
-        let (width, k, c2w) = (self.camera.width as usize, self.camera.intrinsics, self.camera.c2w);
+        let (camera, width) = (self.camera, self.camera.width as usize);
         let (sure, counted) = (self.sure_pixels(), self.counted_pixels());
         self.depths().into_iter().enumerate().filter_map(move |(pixel, z)| {
             let is_known = sure[pixel] && counted.as_ref().is_none_or(|counted| counted[pixel]);
-            let (u, v, z) = ((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5, f64::from(z));
-            is_known
-                .then(|| c2w.transform_point3(DVec3::new((u - k.cx) / k.fx * z, (v - k.cy) / k.fy * z, z)))
+            let [u, v] = [pixel % width, pixel / width].map(|side| side as f64 + 0.5);
+            is_known.then(|| camera.unproject(u, v, z.into()))
         })
     }
 }

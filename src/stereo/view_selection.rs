@@ -168,11 +168,9 @@ fn spaced(others: &[Neighbour], cameras: &[Camera], min_distance: f64, min_overl
 
 /// Returns points at `depth` in front of a camera, spread over its image.
 fn grid(camera: &Camera, depth: f64) -> Vec<DVec3> {
-    let k = camera.intrinsics;
     let along = |side: u32| (0..GRID).map(move |i| (f64::from(i) + 0.5) / f64::from(GRID) * f64::from(side));
-    let point = |u: f64, v: f64| DVec3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.) * depth;
     along(camera.height)
-        .flat_map(|v| along(camera.width).map(move |u| camera.c2w.transform_point3(point(u, v))))
+        .flat_map(|v| along(camera.width).map(move |u| camera.unproject(u, v, depth)))
         .collect()
 }
 

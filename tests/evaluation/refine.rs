@@ -278,6 +278,8 @@ fn photos_from_one_place_are_shown_at_one_distance() {
     assert_says(&message, &["depth can't be estimated"]);
     let means = read_splat(&sandbox.path("a.ply")).unwrap().means;
     assert!(means.as_flattened().iter().all(|coordinate| coordinate.is_finite()));
+    let refused = sandbox.refuse("eval --splat @a.ply --scene @room --covered");
+    assert_says(&refused, &["every view to score is masked out or not covered as a whole"]);
 }
 
 /// Runs a session until an event for which `is_end` returns `true`.

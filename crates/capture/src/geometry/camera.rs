@@ -95,6 +95,12 @@ pub struct Camera {
 }
 
 impl Camera {
+    /// Returns the point in world coordinates that is seen at the pixel coordinates (`u`, `v`) at `depth` along the camera's axis.
+    pub fn unproject(&self, u: f64, v: f64, depth: f64) -> DVec3 {
+        let k = self.intrinsics;
+        self.c2w.transform_point3(DVec3::new((u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.) * depth)
+    }
+
     /// Returns the camera for an image of another size. The field of view stays the same along the side whose pixel count has the
     /// smaller ratio of new to old.
     pub fn with_size(&self, ImageSize { width, height }: ImageSize) -> Self {
