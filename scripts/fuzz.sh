@@ -17,6 +17,8 @@ readers=("$@")
 export RUSTC_BOOTSTRAP=1
 export LIBTORCH=${LIBTORCH:-$PWD/.venv/libtorch}
 export LD_LIBRARY_PATH="$LIBTORCH/lib${LD_LIBRARY_PATH:+:$LD_LIBRARY_PATH}"
+# GCC reports a constant array of zstd as used out of scope.
+export CFLAGS="-fno-sanitize-address-use-after-scope${CFLAGS:+ $CFLAGS}"
 # Each reader runs on one thread. Leak detection is off because libtorch keeps allocations until the process ends.
 export OMP_NUM_THREADS=1 ASAN_OPTIONS="detect_leaks=0:allocator_may_return_null=1${ASAN_OPTIONS:+:$ASAN_OPTIONS}"
 if command -v clang++ >/dev/null; then

@@ -20,8 +20,8 @@ pub use config::{DataConfig, JitterConfig, Sampling};
 pub use dataset::{Dataset, OpenGroup, SceneGroup, Split};
 pub use globalsplat_capture::{
     CHUNK_INDEX_FILE as INDEX_FILE, CameraPath, Capture, Chunk, FoundCaptures, Holdout, ImageSource, Planes,
-    Point, find_captures, open_capture, read_camera_path, read_points, resize_and_crop, write_cameras_json,
-    write_transforms_json,
+    Point, find_captures, open_capture, read_camera_path, read_npy, read_points, resize_and_crop,
+    write_cameras_json, write_transforms_json,
 };
 pub use globalsplat_synth::SyntheticDataset;
 pub use loading::{BadData, Batch, BatchShard, DataLoader, LoadedScene, SceneGroups, TrainingScenes};

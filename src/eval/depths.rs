@@ -1,9 +1,7 @@
 //! Exact depths of a synthetic capture, against which rendered ones are scored.
 
-use crate::data::{Capture, Pixels};
+use crate::data::{Capture, Pixels, read_npy};
 use crate::error::{Error, Result};
-use npyz::{NpyFile, Order};
-use std::fs::File;
 use std::path::Path;
 use tch::{Kind, Tensor};
 
@@ -18,25 +16,17 @@ impl ExactDepths {
     /// Fails if the file can't be read, has another shape than the photos or Fortran's order, or if a depth is below 0 or NaN.
     pub fn read(file: &Path, capture: &Capture) -> Result<Self> {
         let camera = capture.camera(0);
-        let expected = [capture.len() as u64, u64::from(camera.height), u64::from(camera.width)];
-        let npy = NpyFile::new(File::open(file).map_err(Error::read(file))?).map_err(Error::read(file))?;
-        let found = npy.shape().to_vec();
+        let expected = [capture.len(), camera.height as usize, camera.width as usize];
+        let (found, values) = read_npy(file)?;
         if found != expected {
             let expected = format!("{expected:?}, that of the photos");
             return Err(Error::input(file, "the shape", format!("{found:?}"), expected));
         }
-        if npy.header().order() == Order::Fortran {
-            return Err(Error::input(file, "the order", "Fortran's", "C's, the last index first"));
-        }
-        let values: Vec<f32> = match npy.dtype().descr().ends_with("f8'") {
-            true => npy.into_vec::<f64>().map(|values| values.into_iter().map(|z| z as f32).collect()),
-            false => npy.into_vec(),
-        }
-        .map_err(Error::read(file))?;
         if let Some(bad) = values.iter().find(|z| z.is_nan() || **z < 0.) {
             return Err(Error::input(file, "a depth", bad, "0 or more, or infinity where nothing is"));
         }
-        Ok(ExactDepths(Tensor::from_slice(&values).view(expected.map(|side| side as i64).as_slice())))
+        let depths = Tensor::from_slice(&values).to_kind(Kind::Float);
+        Ok(ExactDepths(depths.view(expected.map(|side| side as i64).as_slice())))
     }
 
     /// Returns the depths of a photo, [H, W].

@@ -24,7 +24,7 @@ use tch::Device;
 pub type Reader = fn(&[u8]);
 
 /// Readers, by the names that `scripts/fuzz.sh` takes and of the folders of their seeds.
-pub const READERS: [(&str, Reader); 27] = [
+pub const READERS: [(&str, Reader); 28] = [
     ("antimatter", antimatter),
     // A camera path of nerfstudio's viewer.
     ("camera_path", |bytes| {
@@ -49,6 +49,9 @@ pub const READERS: [(&str, Reader); 27] = [
     ("glb", |bytes| read_and_repair(&file("glb", "splat.glb", bytes))),
     ("gltf", |bytes| read_and_repair(&file("gltf", "splat.gltf", bytes))),
     ("ksplat", |bytes| read_and_repair(&file("ksplat", "splat.ksplat", bytes))),
+    ("llff", |bytes| {
+        let _ = open_capture(&file("llff", "poses_bounds.npy", bytes)).map(|capture| load(&capture));
+    }),
     ("photo", |bytes| {
         let _ = decode_photo(bytes, Path::new("photo.jpg"), (8, 8));
     }),

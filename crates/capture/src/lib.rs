@@ -7,6 +7,7 @@ mod geometry;
 mod holdout;
 mod image_source;
 mod lens;
+mod npy;
 mod open;
 mod photos;
 mod pixels;
@@ -28,6 +29,7 @@ pub use globalsplat_files::{Error, Result};
 pub use holdout::Holdout;
 pub use image_source::ImageSource;
 pub use lens::{COLMAP_MODELS, Lens};
+pub use npy::read_npy;
 pub use open::{FoundCaptures, find_captures, is_capture, open_capture};
 pub use photos::{MASKS_FOLDER, PhotoList, find_masks, find_masks_in, format_names, list_photos};
 pub use pixels::{

@@ -3,7 +3,7 @@
 use crate::capture::{Capture, Purpose};
 #[cfg(feature = "chunks")]
 use crate::formats::chunk;
-use crate::formats::{CaptureOpener, cameras_json, colmap, polycam, transforms_json};
+use crate::formats::{CaptureOpener, cameras_json, colmap, llff, polycam, transforms_json};
 use crate::photos::natural_order;
 use globalsplat_files::{Error, Result};
 use std::fs::File;
@@ -21,12 +21,13 @@ const FORMATS: &[Format] = &[
     transforms_json::find,
     colmap::find,
     polycam::find,
+    llff::find,
 ];
 
 /// Description of the supported formats for error messages.
 const SUPPORTED_FORMATS: &str = "a cameras.json, a transforms.json or a transforms_train.json in it, a COLMAP model (cameras and images, both \
                      .bin or both .txt) in it or in its sparse, sparse/0, colmap/sparse/0, dense/sparse or dense/0/sparse, \
-                     Polycam's keyframes/cameras, or a CHUNK.torch#KEY";
+                     Polycam's keyframes/cameras, LLFF's poses_bounds.npy, or a CHUNK.torch#KEY";
 
 /// Number of bytes in which the text of [`OTHER_POSES`] is looked for.
 const OTHER_POSES_BYTES: u64 = 4096;
@@ -58,7 +59,8 @@ pub fn is_capture(path: &Path) -> bool {
 /// 4. a folder with a COLMAP model, binary or text, in `sparse/0`, `sparse`, `colmap/sparse/0`, `dense/0/sparse`, `dense/sparse` or
 ///    the folder itself, and the photos in `images` next to it, or in the folder itself. If there are several models, the one with
 ///    the most photos;
-/// 5. a folder with Polycam's raw data, `keyframes`, or this folder.
+/// 5. a folder with Polycam's raw data, `keyframes`, or this folder;
+/// 6. a folder with LLFF's `poses_bounds.npy` and `images`, or `images_N` of reduced photos, or that file.
 ///
 /// If several formats match, the first that can be read is used. Missing photos are left out, and cameras are scaled to photos
 /// whose size differs from the declared one. [`Capture::warnings`] lists everything that is left out or changed.

@@ -4,6 +4,7 @@ pub mod cameras_json;
 #[cfg(feature = "chunks")]
 pub mod chunk;
 pub mod colmap;
+pub mod llff;
 pub mod polycam;
 pub mod transforms_json;
 

@@ -129,6 +129,78 @@ fn poses_of_programs_that_export_them_for_colmap_are_named() {
     }
 }
 
+/// LLFF's photos belong to the rows of its poses by their names, whatever folder has them; masks lie beside them or in a folder.
+#[test]
+fn poses_of_llff_are_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("poses_bounds.npy");
+    let intrinsics = Intrinsics { fx: 20., fy: 20., cx: 12., cy: 8. };
+    let expected: Vec<Camera> = cameras().iter().map(|camera| Camera { intrinsics, ..*camera }).collect();
+    let numbers = |change: &dyn Fn(&mut [f64; 17])| -> Vec<f64> {
+        let row = |camera: &Camera| {
+            let [right, down, forward, center] = [0, 1, 2, 3].map(|i| camera.c2w.col(i));
+            let rows = [0, 1, 2].map(|i| [down[i], right[i], -forward[i], center[i], [16., 24., 20.][i]]);
+            let mut row = [0.5; 17];
+            row[..15].copy_from_slice(rows.as_flattened());
+            change(&mut row);
+            row
+        };
+        expected.iter().flat_map(row).collect()
+    };
+    let write = |shape: &str, numbers: &[f64]| {
+        let header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}");
+        let header = format!("{header:<117}\n");
+        let bytes = numbers.iter().flat_map(|number| number.to_le_bytes());
+        let start = [b"\x93NUMPY\x01\x00".as_slice(), &118u16.to_le_bytes(), header.as_bytes()].concat();
+        std::fs::write(&file, start.into_iter().chain(bytes).collect::<Vec<_>>()).unwrap();
+    };
+    let right = numbers(&|_| ());
+    write("(5, 17)", &right);
+    assert_refused(
+        open_capture(folder.path()),
+        &["the folder is without photos, expected images, or images_4"],
+    );
+    // By their bytes, image10 comes before image9.
+    let names = ["image0.png", "image1.png", "image10.png", "image9.png", "image_mask.png"].map(String::from);
+    write_photos(&folder.path().join("images_8"), &names[1..]);
+    write_photos(&folder.path().join("images_2"), &names);
+    for path in [folder.path(), &file] {
+        let capture = open_capture(path).unwrap();
+        assert_same_cameras(&capture, &expected);
+        assert!(
+            capture.names().eq(names.iter()) && capture.warnings().is_empty() && capture.mask_count() == 0
+        );
+    }
+    write_photos(&folder.path().join("images_2"), &["image9_mask.png".into()]);
+    write_photos(&folder.path().join("masks"), &["image1_mask.png".into()]);
+    let capture = open_capture(folder.path()).unwrap();
+    assert_eq!((capture.len(), capture.mask_count()), (5, 2));
+    assert_eq!(read_camera_path(folder.path(), None).unwrap().cameras.len(), 5);
+    for (shape, numbers, expected) in [
+        ("(5, 15)", right.clone(), "the shape is [5, 15], expected [photos, 17]"),
+        (
+            "(4, 17)",
+            right[..68].to_vec(),
+            "the number of poses is 4, expected 5, as many as there are photos",
+        ),
+        (
+            "(99999999999, 17)",
+            right.clone(),
+            "the shape is [99999999999, 17], expected one whose numbers fit",
+        ),
+        ("(5, 17)", numbers(&|row| row[0] += 1.), "c2w of view 0 is"),
+        (
+            "(5, 17)",
+            numbers(&|row| row[9] = f64::NAN),
+            "the size of view 0 is [16.0, NaN], expected a height and width",
+        ),
+        ("(5, 17)", numbers(&|row| row[14] = -1.), "focal length fx of view 0 is -1"),
+    ] {
+        write(shape, &numbers);
+        assert_refused(open_capture(folder.path()), &["poses_bounds.npy: ", expected]);
+    }
+}
+
 /// Raw data of Polycam are read by the poses and images that it has corrected, if there are some.
 #[test]
 fn polycams_keyframes_are_read() {
