@@ -69,6 +69,9 @@ pub struct Eval {
     /// a whole word, else the name of its folder
     #[arg(long, value_name = "NAME", requires = "data", conflicts_with = "scene")]
     dataset: Option<String>,
+    /// Score all pixels over this color, black or white, instead of leaving out what is masked or transparent, as NeRF's benchmarks do
+    #[arg(long, value_name = "COLOR", value_parser = ["black", "white"], conflicts_with = "data")]
+    mask_background: Option<String>,
     /// Target views: every:N, every:N+K, or none for the capture's own test split; by default as in the model's training, and for
     /// splats and images all
     #[arg(long, value_name = "WHICH", conflicts_with = "data")]
@@ -130,6 +133,9 @@ impl Eval {
         let loaded = self.load_model(device)?;
         let model = loaded.as_ref().map(Model::from);
         let mut scene = self.one_scene(&capture, model)?;
+        if let Some(color) = &self.mask_background {
+            scene = scene.with_background(if color == "white" { 255 } else { 0 });
+        }
         if self.covered {
             scene = scene.covered(self.holdout(model)?.unwrap_or(Holdout::None))?;
         }

@@ -60,7 +60,7 @@ struct Cli {
 enum Command {
     Capture(capture::Capture),
     Train(train::Train),
-    Eval(eval::Eval),
+    Eval(Box<eval::Eval>),
     Report(report::Report),
     Reconstruct(reconstruct::Reconstruct),
     Refine(Box<refine::Refine>),

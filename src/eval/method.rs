@@ -84,7 +84,10 @@ impl Method<'_> {
         let mut warnings = splat.map(|splat| splat.warnings).unwrap_or_default();
         let mut views = vec![];
         scene.for_each_target(|i, view| {
-            let (image, rendered) = source.image(scene, i, view)?;
+            let (mut image, rendered) = source.image(scene, i, view)?;
+            if let (Some(level), Some(rendered)) = (scene.background, &rendered) {
+                image += (1. - rendered.alpha.to_device(image.device())) * level;
+            }
             if let Some(perceptual) = perceptual {
                 // The memory of a method includes the first image, but not the networks that score it.
                 perceptual.load()?;

@@ -133,6 +133,13 @@ fn masks_in_a_folder_are_left_out() {
         "{table}"
     );
 
+    // Over a background all pixels count: the splat is opaque where the photos show black or white.
+    let [black, white] = ["black", "white"]
+        .map(|color| sandbox.json(&format!("{eval} --masks @masks --mask-background {color}")));
+    assert!([&black, &white].iter().all(|scores| scores.get("pixel_fraction").is_none()));
+    assert!(number(&masked, "/psnr") > number(&black, "/psnr") + 3., "{black}");
+    assert!((number(&black, "/psnr") - number(&white, "/psnr")).abs() > 1., "{black} {white}");
+
     let bytes = |line: &str| {
         sandbox.run(&format!("{line} --scene @room --out @out.ply"));
         sandbox.read("out.ply")

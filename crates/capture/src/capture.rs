@@ -6,8 +6,8 @@ use crate::image_source::ImageSource;
 use crate::lens::{Lens, LensModel, PinholeView, Projection, split_into_views};
 use crate::photos::{describe_photos, find_masks_in, part_name, unique_stems};
 use crate::pixels::{
-    DecodedPhoto, Planes, decode_photo, encode_photo, gray_to_rgb, has_alpha_channel, multiply,
-    read_image_size, read_mask, resize_and_crop, source_window, undistort,
+    DecodedPhoto, Planes, add_background, decode_photo, encode_photo, gray_to_rgb, has_alpha_channel,
+    multiply, read_image_size, read_mask, resize_and_crop, source_window, undistort,
 };
 use glam::{DMat3, DMat4};
 use globalsplat_files::{Error, InputFiles, Result, is_same_file, parent_of, split_keyed_path};
@@ -109,6 +109,8 @@ pub struct Capture {
     /// Number of views in the training part, which come first in `views`.
     train: usize,
     is_complete: bool,
+    /// Gray level that replaces what is left out.
+    background: Option<u8>,
     warnings: Vec<String>,
 }
 
@@ -248,6 +250,7 @@ impl Capture {
             views: vec![],
             train: 0,
             is_complete: true,
+            background: None,
             warnings: vec![],
         };
         let capture = empty.with_test(&file, frames, changes, purpose)?;
@@ -318,6 +321,12 @@ impl Capture {
         self.warnings.extend(line);
         self.warnings.extend(check_masks(folder, &self.frames)?);
         Ok(self)
+    }
+
+    /// Replaces what masks and transparency leave out by the gray `level`, 0 for black to 255 for white, at the photos' own size. Then all
+    /// pixels count, as NeRF's benchmarks have it.
+    pub fn with_background(self, level: u8) -> Self {
+        Capture { background: Some(level), ..self }
     }
 
     /// Inserts `lines` before the other warnings.
@@ -557,15 +566,26 @@ impl Capture {
     }
 
     /// Returns the pixels of a photo as its lens took them, and their weights in equal channels: the mask's, multiplied by the photo's
-    /// opacity.
+    /// opacity. With a background, no pixel is left out.
     fn read_photo(&self, frame: &Frame) -> Result<(RgbImage, Option<RgbImage>)> {
         if let ImageLocation::Source { source, index } = &frame.image {
             return Ok((source.image(*index), None));
         }
-        let DecodedPhoto { pixels, alpha, .. } = self.decode(frame, &frame.image.read()?)?;
+        let DecodedPhoto { mut pixels, alpha, .. } = self.decode(frame, &frame.image.read()?)?;
         let alpha = alpha.map(|alpha| gray_to_rgb(&alpha));
-        let Some(file) = &frame.mask else { return Ok((pixels, alpha)) };
-        let mut mask = read_mask(file, pixels.dimensions())?;
+        let mask = frame.mask.as_ref().map(|file| read_mask(file, pixels.dimensions())).transpose()?;
+        if let Some(level) = self.background {
+            // Where a photo is transparent, it is composited over black already.
+            if let Some(alpha) = &alpha {
+                add_background(&mut pixels, alpha, level);
+            }
+            if let Some(mask) = &mask {
+                multiply(&mut pixels, mask);
+                add_background(&mut pixels, mask, level);
+            }
+            return Ok((pixels, None));
+        }
+        let Some(mut mask) = mask else { return Ok((pixels, alpha)) };
         if let Some(alpha) = alpha {
             multiply(&mut mask, &alpha);
         }

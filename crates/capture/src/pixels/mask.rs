@@ -38,6 +38,13 @@ pub fn gray_to_rgb(image: &GrayImage) -> RgbImage {
     RgbImage::from_fn(image.width(), image.height(), |x, y| Rgb([image.get_pixel(x, y)[0]; 3]))
 }
 
+/// Adds the gray `level` to an image over black where `mask`, an image of the same size, leaves its pixels out.
+pub(crate) fn add_background(image: &mut RgbImage, mask: &RgbImage, level: u8) {
+    for (value, mask) in image.iter_mut().zip(mask.iter()) {
+        *value = value.saturating_add(multiply_levels(u8::MAX - mask, level));
+    }
+}
+
 /// Multiplies the levels of `mask` by those of `other`, an image of the same size.
 pub(crate) fn multiply(mask: &mut RgbImage, other: &RgbImage) {
     for (level, other) in mask.iter_mut().zip(other.iter()) {

@@ -23,6 +23,6 @@ pub use resample::{Region, Resampler};
 pub use resize_and_crop::resize_and_crop;
 pub(crate) use resize_and_crop::source_window;
 
+pub(crate) use mask::{add_background, multiply, read_mask};
 pub use mask::{fit_mask, gray_to_rgb};
-pub(crate) use mask::{multiply, read_mask};
 pub(crate) use undistort::undistort;

@@ -119,6 +119,20 @@ fn opacity_is_a_mask_and_multiplies_another() {
         (f64::from(level[0]) * f64::from(x as u8 * 10) / 255.).round() as u8
     };
     assert_eq!(mask_of(&capture, 2).unwrap(), levels().enumerate_pixels().map(product).collect::<Vec<_>>());
+    // Over white, all pixels count. The second photo's red is 200, that of the last one 80.
+    let red = capture.clone().with_background(255).load_all(None).unwrap();
+    assert!(red.iter().all(|photo| photo.mask.is_none()));
+    let over_white = |(x, _, level): (u32, u32, &Luma<u8>)| {
+        let of_photo = 255. + (200. - 255.) * f64::from(x * 10) / 255.;
+        255. + (of_photo - 255.) * f64::from(level[0]) / 255.
+    };
+    let expected: Vec<f64> = levels().enumerate_pixels().map(over_white).collect();
+    let [_, _, photo, ..] = &red[..] else { panic!() };
+    let found = &photo.image.as_bytes()[..(WIDTH * HEIGHT) as usize];
+    assert!(
+        expected.iter().zip(found).all(|(a, b)| (a - f64::from(*b)).abs() < 2.),
+        "{expected:?} {found:?}"
+    );
     // If every pixel counts, there is no mask.
     assert!([1, 3, 4].iter().all(|&view| mask_of(&capture, view).is_none()));
     // Two alpha channels with and without effect, an alpha channel with a mask, and a mask.
