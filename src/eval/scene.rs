@@ -112,7 +112,7 @@ impl EvaluationIndex {
 }
 
 /// Number of target photos that are decoded together.
-const DECODED_TOGETHER: usize = 4;
+const DECODED_TOGETHER: usize = 2;
 
 /// A scene: photos that a method may see, and photos that it has to match. The latter are decoded a few at a time, so that large photos don't
 /// fill the memory all at once.

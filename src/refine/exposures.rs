@@ -188,6 +188,7 @@ mod tests {
     use crate::data::View;
     use crate::refine::{PhotoInit, gaussians_from_photos};
     use crate::scene::SH_C0;
+    use crate::stereo::SWEEP_SIDE;
     use tch::Kind;
 
     const DEPTH: f64 = 4.;
@@ -227,8 +228,9 @@ mod tests {
     fn initial_colors_have_the_average_exposure() {
         let gains = [0.8, 1.25, 1.];
         let views: Vec<View> = [-0.5, 0., 0.5].into_iter().zip(gains).map(|(x, g)| wall(x, [g; 3])).collect();
-        let initial =
-            |correction| gaussians_from_photos(&views, &[], 900, 0, correction, |_| true).expect("depths");
+        let initial = |correction| {
+            gaussians_from_photos(&views, &[], 900, SWEEP_SIDE, 0, correction, |_| true).expect("depths")
+        };
         // Brightness of the Gaussians of each photo, relative to all: a third of them come from each.
         let brightness = |scene: &PhotoInit| {
             let colors = &scene.gaussians.sh * SH_C0 + 0.5;

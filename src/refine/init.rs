@@ -9,7 +9,7 @@ use crate::io::Splat;
 use crate::reconstruct::LoadedModel;
 use crate::render::{contributions, largest_contributions};
 use crate::scene::{Camera, RawGaussians, SH_C0};
-use crate::stereo::{DepthMap, PlaneSweepOutput, SWEEP_SIDE, pixel_and_depth, sweep};
+use crate::stereo::{DepthMap, PlaneSweepOutput, pixel_and_depth, sweep};
 use glam::DVec3;
 use rand::seq::index::sample;
 use rand::{Rng, SeedableRng};
@@ -79,7 +79,8 @@ pub struct PhotoInit {
     pub log_exposures: Option<Vec<[f64; 3]>>,
 }
 
-/// Creates `count` Gaussians at the depths on which the photos agree, and at `points` of the scene, if some are known. The size of each
+/// Creates `count` Gaussians at the depths on which the photos agree, and at `points` of the scene, if some are known. The photos are compared
+/// at `side` pixels along their longer side. The size of each Gaussian
 /// matches the part of the images that it covers. At least two views are required. `should_continue` is called before each photo with the
 /// number of photos that are done. If it returns `false`, Gaussians are created from the photos that are done, or `None` is returned if there
 /// are none.
@@ -87,11 +88,12 @@ pub fn gaussians_from_photos(
     views: &[View],
     points: &[Point],
     count: usize,
+    side: f64,
     seed: u64,
     exposures: ExposureCorrection,
     should_continue: impl FnMut(usize) -> bool,
 ) -> Option<PhotoInit> {
-    let photos = views.iter().map(|view| view.to_small_photo(SWEEP_SIDE)).collect();
+    let photos = views.iter().map(|view| view.to_small_photo(side)).collect();
     let PlaneSweepOutput { photos, mut depth_maps } = sweep(photos, points, should_continue);
     if depth_maps.is_empty() {
         return None;

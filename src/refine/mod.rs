@@ -203,6 +203,7 @@ mod tests {
     use crate::metrics::score_views;
     use crate::render::DEFAULT_EPS2D;
     use crate::scene::{Intrinsics, RawGaussians};
+    use crate::stereo::SWEEP_SIDE;
     use glam::{DMat4, DVec3};
     use globalsplat_csrc::runtime::{RecordedOp, WAITING, computing, record_ops};
     use tch::Device;
@@ -242,7 +243,7 @@ mod tests {
     /// Returns `count` Gaussians at the depths on which the photos agree.
     pub(super) fn start(views: &[View], count: usize, seed: u64) -> RawGaussians {
         let off = ExposureCorrection::Off;
-        gaussians_from_photos(views, &[], count, seed, off, |_| true).expect("depths").gaussians
+        gaussians_from_photos(views, &[], count, SWEEP_SIDE, seed, off, |_| true).expect("depths").gaussians
     }
 
     fn args_of<'a>(photos: &'a Photos, options: &'a RefineOptions, steps: u64) -> OptimizeArgs<'a> {
@@ -323,7 +324,10 @@ mod tests {
     fn the_number_of_gaussians_grows() {
         let _guard = num_threads::lock_exclusive();
         let views = walls();
-        assert!(gaussians_from_photos(&views, &[], 40, 0, ExposureCorrection::Auto, |_| false).is_none());
+        assert!(
+            gaussians_from_photos(&views, &[], 40, SWEEP_SIDE, 0, ExposureCorrection::Auto, |_| false)
+                .is_none()
+        );
         let raw = start(&views, 40, 0);
         let depth = scene_depth(&raw.activate(), &views).unwrap();
         for relocate_every in [0, 3] {

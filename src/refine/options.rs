@@ -5,6 +5,7 @@ use crate::data::{Capture, Holdout, PhotoSize};
 use crate::error::{Error, Result};
 use crate::reconstruct::spread_over_path;
 use crate::scene::{Camera, ImageSize};
+use crate::stereo::SWEEP_SIDE;
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -45,6 +46,9 @@ const MAX_HELD_OUT_BYTES: u64 = 256 << 20;
 const BYTES_PER_PIXEL: u64 = 4;
 /// Minimum number of steps in which the number of Gaussians grows: with fewer, all are there from the start.
 const MIN_STEPS_TO_GROW: u64 = 500;
+/// Minimum number of steps, or time, for which photos are compared at twice [`SWEEP_SIDE`].
+const MIN_STEPS_OF_LARGE_SWEEP: u64 = 1000;
+const MIN_TIME_OF_LARGE_SWEEP: Duration = Duration::from_secs(30);
 /// Longer side of photos, in pixels, from which the learning rate of poses falls.
 const POSES_SIDE: f64 = 256.;
 /// Number of Gaussians above which spherical harmonics have degree 2 by default.
@@ -416,6 +420,16 @@ impl RefineOptions {
     /// Returns the learning rate of poses for photos of `longest_side` pixels.
     pub(super) fn lr_poses_for(&self, longest_side: u32) -> f64 {
         self.lr_poses * (POSES_SIDE / f64::from(longest_side)).min(1.)
+    }
+
+    /// Returns the longer side in pixels at which photos are compared to find their depths. Larger ones show thin things, but take time from
+    /// the steps.
+    pub(super) fn sweep_side(&self) -> f64 {
+        let is_short = match self.budget() {
+            Budget::Steps(steps) => steps < MIN_STEPS_OF_LARGE_SWEEP,
+            Budget::Time(time) => time < MIN_TIME_OF_LARGE_SWEEP,
+        };
+        if is_short { SWEEP_SIDE } else { 2. * SWEEP_SIDE }
     }
 
     /// Returns the weight of known depths, which falls to 0 in the first half: later the photos decide.

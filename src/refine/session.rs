@@ -518,7 +518,9 @@ impl<'a> RefineSession<'a> {
             !is_stopped && !self.time.is_late_for_depths(done)
         };
         let RefineOptions { seed, correct_exposures: correction, .. } = self.options;
-        let init = gaussians_from_photos(&self.photos, &points, count, seed, correction, should_continue);
+        let side = self.options.sweep_side();
+        let init =
+            gaussians_from_photos(&self.photos, &points, count, side, seed, correction, should_continue);
         self.is_stopped |= is_stopped;
         let Some(PhotoInit { gaussians, depth_maps, log_exposures }) = init else { return Ok(None) };
         let is_continued = matches!(self.init, SceneInit::State(_));

@@ -652,7 +652,7 @@ fn colmap_points_initialize_gaussians() {
         // Nine tenths of the Gaussians are at points, the others on pixels.
         let views = load_all_views(&capture, None).unwrap();
         let off = ExposureCorrection::Off;
-        let scene = gaussians_from_photos(&views, &points, 1000, 0, off, |_| true).expect("depths");
+        let scene = gaussians_from_photos(&views, &points, 1000, 128., 0, off, |_| true).expect("depths");
         let begun: Vec<f64> = Vec::try_from(scene.gaussians.means.to_kind(Kind::Double).view([-1])).unwrap();
         let at_points = begun
             .chunks(3)
