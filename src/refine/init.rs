@@ -80,10 +80,9 @@ pub struct PhotoInit {
 }
 
 /// Creates `count` Gaussians at the depths on which the photos agree, and at `points` of the scene, if some are known. The photos are compared
-/// at `side` pixels along their longer side. The size of each Gaussian
-/// matches the part of the images that it covers. At least two views are required. `should_continue` is called before each photo with the
-/// number of photos that are done. If it returns `false`, Gaussians are created from the photos that are done, or `None` is returned if there
-/// are none.
+/// at `side` pixels along their longer side. The size of each Gaussian matches the part of the images that it covers. At least two views are
+/// required. `should_continue` is called before each photo with the number of photos that are done. If it returns `false`, Gaussians are
+/// created from the photos that are done, or `None` is returned if there are none.
 pub fn gaussians_from_photos(
     views: &[View],
     points: &[Point],
