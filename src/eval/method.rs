@@ -84,10 +84,7 @@ impl Method<'_> {
         let mut warnings = splat.map(|splat| splat.warnings).unwrap_or_default();
         let mut views = vec![];
         scene.for_each_target(|i, view| {
-            let (mut image, rendered) = source.image(scene, i, view)?;
-            if let (Some(level), Some(rendered)) = (scene.background, &rendered) {
-                image += (1. - rendered.alpha.to_device(image.device())) * level;
-            }
+            let (image, rendered) = source.image(scene, i, view)?;
             if let Some(perceptual) = perceptual {
                 // The memory of a method includes the first image, but not the networks that score it.
                 perceptual.load()?;
@@ -168,7 +165,10 @@ impl ImageSource {
     fn image(&self, scene: &EvalScene, i: usize, view: &View) -> Result<(Tensor, Option<RenderedView>)> {
         match self {
             ImageSource::Splat(renderer, poses) => {
-                let rendered = renderer.render(&[Camera { c2w: poses[i], ..view.camera }])?.remove(0);
+                let mut rendered = renderer.render(&[Camera { c2w: poses[i], ..view.camera }])?.remove(0);
+                if let Some(level) = scene.background() {
+                    rendered.rgb += (1. - &rendered.alpha) * level;
+                }
                 Ok((rendered.rgb.shallow_clone(), Some(rendered)))
             }
             ImageSource::Folder(folder) => {

@@ -134,8 +134,6 @@ pub struct EvalScene {
     target_names: Vec<String>,
     /// Depths of photos, at least two of which must cover a pixel that is scored; `None` to score all pixels.
     coverage: Option<Vec<DepthMap>>,
-    /// Gray level, 0 to 1, that splats and photos lie over.
-    pub(super) background: Option<f64>,
     /// Exact depths of all photos of the capture.
     depths: Option<ExactDepths>,
 }
@@ -161,7 +159,6 @@ impl EvalScene {
             frames,
             target_size,
             coverage: None,
-            background: None,
             depths: None,
         }
     }
@@ -183,8 +180,12 @@ impl EvalScene {
 
     /// Scores all pixels, with the splat and the photos over the gray `level`, 0 for black to 255 for white.
     pub fn with_background(self, level: u8) -> Self {
-        let capture = self.capture.with_background(level);
-        EvalScene { capture, background: Some(f64::from(level) / 255.), ..self }
+        EvalScene { capture: self.capture.with_background(level), ..self }
+    }
+
+    /// Returns the gray level, 0 to 1, that splats and photos lie over.
+    pub(super) fn background(&self) -> Option<f64> {
+        self.capture.background().map(|level| f64::from(level) / 255.)
     }
 
     /// Adds the scores of depths by the exact ones in `file`, an array [photos, rows, columns] as `globalsplat synth --depth` writes it.

@@ -329,6 +329,11 @@ impl Capture {
         Capture { background: Some(level), ..self }
     }
 
+    /// Returns the gray level of [`Capture::with_background`].
+    pub fn background(&self) -> Option<u8> {
+        self.background
+    }
+
     /// Inserts `lines` before the other warnings.
     pub(crate) fn with_warnings(mut self, mut lines: Vec<String>) -> Self {
         lines.append(&mut self.warnings);

@@ -70,21 +70,19 @@ fn photos_and_masks(folder: &Path) -> Result<(Vec<PathBuf>, Vec<Option<PathBuf>>
     let Some((_, images)) = folders.min() else {
         return Err(Error::input(folder, "the folder", "without photos", "images, or images_4 and the like"));
     };
-    let (mut photos, mut masks) = (list_photos(&images)?.photos, vec![]);
+    let mut photos = list_photos(&images)?.photos;
     photos.sort_by_key(name);
     let stem = |path: &PathBuf| path.file_stem().and_then(OsStr::to_str).unwrap_or_default().to_owned();
     let stems: Vec<String> = photos.iter().map(stem).collect();
-    photos.retain(|photo| {
-        let masked =
-            stem(photo).strip_suffix("_mask").and_then(|masked| stems.iter().position(|s| s == masked));
-        masks.extend(masked.map(|masked| (stems[masked].clone(), photo.clone())));
-        masked.is_none()
-    });
+    let is_mask = |photo: &PathBuf| {
+        stem(photo).strip_suffix("_mask").is_some_and(|masked| stems.iter().any(|stem| stem == masked))
+    };
+    let (masks, photos): (Vec<_>, Vec<_>) = photos.into_iter().partition(is_mask);
     let names: Vec<_> = photos.iter().map(|photo| name(photo).to_string_lossy().into_owned()).collect();
     let own = find_masks(&[folder.join(MASKS_FOLDER)], &names);
     let beside = |photo: &PathBuf| {
-        let mut masks = masks.iter();
-        masks.find(|(masked, _)| *masked == stem(photo)).map(|(_, mask)| mask.clone())
+        let wanted = format!("{}_mask", stem(photo));
+        masks.iter().find(|mask| stem(mask) == wanted).cloned()
     };
     let masks = photos.iter().zip(own).map(|(photo, own)| own.or_else(|| beside(photo))).collect();
     Ok((photos, masks))
