@@ -105,7 +105,7 @@ def refine(
         seed (int): seed of the random numbers.
         antialiased (bool): optimizes for antialiased rendering.
         correct_poses (bool): also optimizes the poses of the cameras.
-        settings (dict, optional): settings of the method, which docs/refine.md lists.
+        settings (dict, optional): settings of the method, which docs/configuration.md lists.
         device (str or torch.device): device of the optimization.
         progress (callable, optional): is called with the number of steps done and the PSNR of held-out views, or ``None``. An exception
             that it raises ends the optimization.

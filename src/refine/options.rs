@@ -155,7 +155,7 @@ options_struct! {
         /// Background of masked pixels instead of ignoring them, so that the splat stays empty there
         #[arg(long, value_enum, value_name = "COLOR")]
         pub mask_background: Option<MaskBackground> = None,
-        /// Override a setting of the method, as in views=4; docs/refine.md lists them
+        /// Override a setting of the method, as in views=4; docs/configuration.md lists them
         #[arg(long, value_name = "KEY=VALUE")]
         pub set: Vec<String> = vec![],
         /// Start of the time budget; if it is `None`, the start of the session.
