@@ -97,6 +97,8 @@ run_small() {
     run small splat:: model:: refine:: examples::
 }
 
+# Tests run the examples, which `--tests` doesn't build.
+"${CARGO:-cargo}" build --release --locked --workspace --examples
 case "${1:-all}" in
 ordinary | small) "run_$1" "${@:2}" ;;
 all)
