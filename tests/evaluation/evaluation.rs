@@ -203,9 +203,11 @@ fn photos_are_scored_one_at_a_time() {
     let follower = std::thread::spawn(move || follow_peak(id));
     let output = process.wait_with_output().unwrap();
     let peak = follower.join().unwrap();
+    let err = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(0), "{err}");
     let scores: Value = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!(scores["views"].as_array().unwrap().len() as u64, PHOTOS);
-    assert_says(&String::from_utf8(output.stderr).unwrap(), &["sheet.png: pictures are shrunk to 1/2"]);
+    assert_says(&err, &["sheet.png: pictures are shrunk to 1/2"]);
     assert!(peak < 1_300_000_000, "{peak} bytes");
     // 40 rows of three images of 816×612, and the gaps.
     let size = read_image(&sandbox.path("sheet.png")).unwrap().dimensions();
