@@ -32,7 +32,7 @@ use self::photos::TrainBatch;
 use crate::data::{View, ViewBatch};
 use crate::device::Stopwatch;
 use crate::error::{Error, Result};
-use crate::loss::{depth_smoothness, fill_masked, photometric};
+use crate::loss::{depth_smoothness, photometric};
 use crate::render::cpu::KernelThreads;
 use crate::render::{Cameras, RenderOutput, default_eps2d, render, render_views};
 use crate::scene::{Camera, Gaussians};
@@ -132,7 +132,8 @@ pub(crate) fn refine(
 }
 
 /// Returns the loss: the difference between rendered images and photos, plus the regularization of the Gaussians. Masked pixels of the
-/// photos are left out, or have the color `background`, over which the splat is seen. `depth` is the depth of the scene.
+/// photos, which are over black then, are left out, or have the color `background`, over which the splat is seen. `depth` is the depth of
+/// the scene.
 fn loss(
     gaussians: &Gaussians,
     rendered: &RenderOutput,
@@ -146,7 +147,7 @@ fn loss(
         Some(color) => {
             let color = Tensor::from_slice(&color).view([3, 1, 1]).to_device(photos.images.device());
             let rgb = &rendered.rgb + (1. - rendered.alpha.unsqueeze(2)) * &color;
-            let filled = photos.masks.as_ref().map(|masks| fill_masked(&photos.images, &color, masks));
+            let filled = photos.masks.as_ref().map(|masks| &photos.images + (1. - masks) * &color);
             photometric(&rgb, filled.as_ref().unwrap_or(&photos.images), None, l1_weight, ssim_weight)
         }
         None => photometric(&rendered.rgb, &photos.images, photos.masks.as_ref(), l1_weight, ssim_weight),
@@ -303,10 +304,13 @@ mod tests {
     #[test]
     fn a_random_mask_background_leaves_emptiness() {
         let whole = walls();
-        let views = masked(&whole, |index, mask| {
+        let mut views = masked(&whole, |index, mask| {
             let end = SIDE / 2 - (index - 3) * 4;
             mask.narrow(2, end, SIDE - end)
         });
+        for view in &mut views {
+            view.image = (view.image.to_float() * view.mask_or_ones().to_float()).into();
+        }
         let middle = [views[3].camera];
         let [ignored, random] = [None, Some(MaskBackground::Random)].map(|background| {
             let alpha =
@@ -349,28 +353,33 @@ mod tests {
         }
     }
 
-    /// The splat is compared over the background: one that is empty matches a photo that is masked out.
+    /// The splat is compared over the background: one that is empty matches a photo that is masked out, and one that is as transparent as
+    /// the photo matches it.
     #[test]
     fn masked_pixels_have_the_background_s_color() {
         let view = wall(0.);
         let gaussians = start(&walls(), 40, 0).activate();
         let options = RefineOptions { opacity_reg: 0., ..RefineOptions::default() };
-        let loss_of = |alpha: f64, masked: bool, background: [f32; 3]| {
+        // A splat of black, or of the photo's color.
+        let loss_of = |alpha: f64, level: f64, weight: f64, background: [f32; 3]| {
             let views = view_batch(std::slice::from_ref(&view), &[view.camera.c2w], Device::Cpu);
-            let (images, full) = (views.images.ones_like() * 0.3, views.images.select(2, 0).ones_like());
-            let masks = masked.then(|| full.zeros_like().unsqueeze(2));
-            let (rgb, depth) = (images.zeros_like(), full.zeros_like());
+            let (ones, full) = (views.images.ones_like(), views.images.select(2, 0).ones_like());
+            let images = &ones * (0.3 * weight);
+            let masks = (weight < 1.).then(|| full.unsqueeze(2) * weight);
+            let (rgb, depth) = (ones * (level * alpha), full.zeros_like());
             let rendered = RenderOutput { rgb, alpha: full * alpha, depth };
             let views = ViewBatch { images, masks, ..views };
             loss(&gaussians, &rendered, &views, Some(background), &options, 1.).double_value(&[])
         };
         for color in [[0.; 3], [1.; 3], [0.2, 0.9, 0.4]] {
-            let found = loss_of(0., true, color);
-            assert!(found.abs() < 1e-4, "{color:?}: {found}");
+            for weight in [0., 0.5, 1.] {
+                let found = loss_of(weight, 0.3, weight, color);
+                assert!(found.abs() < 1e-4, "{weight} {color:?}: {found}");
+            }
         }
-        assert!(loss_of(1., true, [1.; 3]) > 0.5 && loss_of(1., true, [0.; 3]).abs() < 1e-4);
+        assert!(loss_of(1., 0., 0., [1.; 3]) > 0.5 && loss_of(1., 0., 0., [0.; 3]).abs() < 1e-4);
         // Photos without a mask are compared over the background, too.
-        assert!(loss_of(0., false, [0.3; 3]).abs() < 1e-4 && loss_of(1., false, [0.3; 3]) > 0.1);
+        assert!(loss_of(0., 0., 1., [0.3; 3]).abs() < 1e-4 && loss_of(1., 0., 1., [0.3; 3]) > 0.1);
     }
 
     /// A step copies nothing between devices beyond what is counted here: photos, Gaussians and corrections are on the device. It waits for

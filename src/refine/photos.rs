@@ -145,7 +145,8 @@ impl Group {
 }
 
 /// Returns views of one size at half their width and height, or as they are if they would become too small. Pixels are rounded to 8 bits.
-fn halved(views: &[View], device: Device) -> Vec<View> {
+/// Photos that are multiplied by their masks stay so if they are `over_black`.
+fn halved(views: &[View], over_black: bool, device: Device) -> Vec<View> {
     let Camera { width, height, .. } = views[0].camera;
     if width.min(height) < 2 * MIN_SHORTER_SIDE {
         return views.iter().map(View::shallow_clone).collect();
@@ -158,7 +159,11 @@ fn halved(views: &[View], device: Device) -> Vec<View> {
     let mut masks = views[0].mask.is_some().then(|| allocate(1)).into_iter().flatten();
     let halve = |(view, mut small): (&View, Pixels)| {
         let mask = view.mask.as_ref().map(Pixels::to_float);
-        let (image, mask) = pool_masked(&view.image.to_float(), mask.as_ref(), half);
+        let image = view.image.to_float();
+        let (image, mask) = match over_black {
+            true => (half(&image), mask.as_ref().map(half)),
+            false => pool_masked(&image, mask.as_ref(), half),
+        };
         small.copy_from_floats(&image);
         let mask = masks.next().zip(mask).map(|(mut small, mask)| {
             small.copy_from_floats(&mask);
@@ -174,7 +179,8 @@ fn halved(views: &[View], device: Device) -> Vec<View> {
 
 impl Photos {
     /// Creates photos from `views`, at least one, at the sizes of `options`' schedule, each half as wide and high as the next, on its device.
-    /// Depths of some of them are known from `depth_maps`.
+    /// With a background for masked pixels, `views` are over black ([`Capture::over_black`]). Depths of some of them are known from
+    /// `depth_maps`.
     pub(crate) fn new(views: &[View], depth_maps: &[DepthMap], options: &RefineOptions) -> Self {
         let device = options.device;
         let map_of = |view: &View| depth_maps.iter().find(|map| map.photo == view.name);
@@ -195,8 +201,11 @@ impl Photos {
         };
         let mut sizes: Vec<Vec<Group>> = vec![groups.into_values().map(whole).collect()];
         for _ in &schedule {
-            let half =
-                |group: &Group| Group::new(&group.indices, halved(&group.views, device), &depth_maps, device);
+            let over_black = options.mask_background.is_some();
+            let half = |group: &Group| {
+                let views = halved(&group.views, over_black, device);
+                Group::new(&group.indices, views, &depth_maps, device)
+            };
             sizes.push(sizes[sizes.len() - 1].iter().map(half).collect());
         }
         sizes.reverse();
@@ -224,9 +233,11 @@ impl Photos {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::refine::MaskBackground;
     use glam::DMat4;
 
-    /// Smaller copies are means of four pixels, or of those that count, rounded to 8 bits; photos stay as they were read.
+    /// Smaller copies are means of four pixels, or of those that count unless the others are black, rounded to 8 bits; photos stay as they
+    /// were read.
     #[test]
     fn photos_are_halved_and_kept_as_bytes() {
         let options = (Kind::Float, Device::Cpu);
@@ -237,18 +248,24 @@ mod tests {
         let (k, size) = (f64::from(MIN_SHORTER_SIDE), (width as u32, height as u32));
         let intrinsics = Intrinsics { fx: k, fy: k, cx: k, cy: k };
         let camera = Camera { intrinsics, c2w: DMat4::IDENTITY, width: size.0, height: size.1 };
-        for mask in [None, Some(mask)] {
+        let black = Some(MaskBackground::Black);
+        for (mask, mask_background) in [(None, None), (Some(&mask), None), (Some(&mask), black)] {
             let view = View {
                 name: String::new(),
                 image: levels.shallow_clone().into(),
-                mask: mask.as_ref().map(|mask| mask.shallow_clone().into()),
+                mask: mask.map(|mask| mask.shallow_clone().into()),
                 camera,
             };
-            let photos = Photos::new(&[view], &[], &RefineOptions::default());
+            let photos =
+                Photos::new(&[view], &[], &RefineOptions { mask_background, ..RefineOptions::default() });
             let [half, whole] = [1, 2].map(|size| photos.sizes[size][0].select(&[0]));
             assert!(whole.images.equal(&(&levels / 255.).view([1, 1, 3, height, width])));
             let halves = |t: &Tensor| t.unsqueeze(0).avg_pool2d(2, 2, 0, false, true, None).squeeze_dim(0);
-            let expected = pool_masked(&(&levels / 255.), mask.as_ref(), halves);
+            let pixels = &levels / 255.;
+            let expected = match mask_background {
+                Some(_) => (halves(&pixels), mask.map(halves)),
+                None => pool_masked(&pixels, mask, halves),
+            };
             let off = |found: &Tensor, expected: &Tensor| {
                 (found.get(0).get(0) - expected).abs().max().double_value(&[]) * 255.
             };

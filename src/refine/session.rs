@@ -162,7 +162,9 @@ impl<'a> RefineSession<'a> {
         }
         let count = train.len() + held_out.len();
         let mut should_continue = |done: usize| on_event(RefineEvent::Loading { done, count });
-        let mut photos = load_photos(capture, &train, size, &mut should_continue)?;
+        let over_black = options.mask_background.map(|_| capture.clone().over_black());
+        let mut photos =
+            load_photos(over_black.as_ref().unwrap_or(capture), &train, size, &mut should_continue)?;
         let mut held_out =
             load_photos(capture, &held_out, size, |done| should_continue(photos.len() + done))?;
         let masked_out: Vec<String> = [&mut photos, &mut held_out]

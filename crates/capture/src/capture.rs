@@ -111,6 +111,8 @@ pub struct Capture {
     is_complete: bool,
     /// Gray level that replaces what is left out.
     background: Option<u8>,
+    /// `true` if what masks leave out is black.
+    is_over_black: bool,
     warnings: Vec<String>,
 }
 
@@ -251,6 +253,7 @@ impl Capture {
             train: 0,
             is_complete: true,
             background: None,
+            is_over_black: false,
             warnings: vec![],
         };
         let capture = empty.with_test(&file, frames, changes, purpose)?;
@@ -327,6 +330,13 @@ impl Capture {
     /// pixels count, as NeRF's benchmarks have it.
     pub fn with_background(self, level: u8) -> Self {
         Capture { background: Some(level), ..self }
+    }
+
+    /// Multiplies the photos by their masks, so that what a mask leaves out is black, as what is transparent always is. The weights stay: a
+    /// photo of any size with weights w lies over a color c as photo + (1 − w)·c.
+    #[must_use]
+    pub fn over_black(self) -> Self {
+        Capture { is_over_black: true, ..self }
     }
 
     /// Returns the gray level of [`Capture::with_background`].
@@ -591,6 +601,9 @@ impl Capture {
             return Ok((pixels, None));
         }
         let Some(mut mask) = mask else { return Ok((pixels, alpha)) };
+        if self.is_over_black {
+            multiply(&mut pixels, &mask);
+        }
         if let Some(alpha) = alpha {
             multiply(&mut mask, &alpha);
         }

@@ -133,6 +133,15 @@ fn opacity_is_a_mask_and_multiplies_another() {
         expected.iter().zip(found).all(|(a, b)| (a - f64::from(*b)).abs() < 2.),
         "{expected:?} {found:?}"
     );
+    // Over black, with the same weights.
+    let black = capture.clone().over_black().load(&[2, 3], None).unwrap();
+    let products = black[0].mask.clone().unwrap();
+    assert_eq!(Some(&products), mask_of(&capture, 2).as_ref());
+    for (found, product) in black[0].image.as_bytes().iter().zip(products) {
+        let expected = 200. * f64::from(product) / 255.;
+        assert!((f64::from(*found) - expected).abs() < 1.5, "{found} {expected}");
+    }
+    assert!(black[1].image == capture.load(&[3], None).unwrap()[0].image);
     // If every pixel counts, there is no mask.
     assert!([1, 3, 4].iter().all(|&view| mask_of(&capture, view).is_none()));
     // Two alpha channels with and without effect, an alpha channel with a mask, and a mask.
