@@ -14,6 +14,7 @@ use rayon::prelude::*;
 use serde_json::json;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use tch::Tensor;
 
 /// Approximate bytes of photos per chunk.
@@ -52,6 +53,10 @@ pub struct Synth {
     /// 30° to its sides and above it
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=1000))]
     off_path: u64,
+    /// Show a single object in each video, without surroundings, on transparent images from all sides above it; the test views are
+    /// between the others
+    #[arg(long, requires = "off_path")]
+    objects: bool,
     /// Also write depth/SCENE.npy: exact depths [photos, rows, columns] in metres, infinite in the sky
     #[arg(long)]
     depth: bool,
@@ -70,7 +75,8 @@ impl Synth {
         }
         check_writable_dir(&self.out)?;
         let size = ImageSize { height: self.size as u32, width: self.size as u32 };
-        let settings = VideoSettings { frames: self.frames as usize, off_path: self.off_path as usize, size };
+        let (frames, off_path) = (self.frames as usize, self.off_path as usize);
+        let settings = VideoSettings { frames, off_path, is_object: self.objects, size };
         let videos = SyntheticDataset::new(self.seed, self.first, self.scenes, settings);
         let mut writer = ChunkWriter::new(&self.out, CHUNK_BYTES)?;
         let depths = self.out.join("depth");
@@ -83,18 +89,23 @@ impl Synth {
         let numbers: Vec<usize> = (0..self.scenes as usize).collect();
         let made = numbers.chunks(2 * rayon::current_num_threads()).map(|numbers| {
             let make = |&number| {
-                let capture = videos.capture(number)?;
+                let video = Arc::new(videos.video(number));
+                let capture = videos.capture_of(number, video.clone())?;
                 if self.depth {
                     self.write_depths(&depths.join(&capture.name).with_extension("npy"), &capture)?;
                 }
-                Ok(capture)
+                Ok((capture, video))
             };
             numbers.par_iter().map(make).collect::<Result<Vec<_>, Error>>()
         });
         for captures in made {
-            for capture in captures? {
+            for (capture, video) in captures? {
                 if self.off_path > 0 {
-                    write_nerf_capture(&self.out.join(&capture.name), &capture, self.frames as usize)?;
+                    let image_of = |view| match self.objects {
+                        true => video.cutout(view).into(),
+                        false => video.photo(view).into(),
+                    };
+                    write_nerf_capture(&self.out.join(&capture.name), &capture.cameras(), frames, image_of)?;
                 } else {
                     writer.add(&capture)?;
                     index.insert(capture.name.clone(), SceneFrames::alternating(capture.len()));

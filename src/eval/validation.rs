@@ -277,7 +277,7 @@ mod tests {
 
     #[test]
     fn the_model_sees_as_many_views_as_in_training() {
-        let settings = VideoSettings { frames: 12, off_path: 0, size: [16, 16].into() };
+        let settings = VideoSettings { frames: 12, off_path: 0, is_object: false, size: [16, 16].into() };
         let capture = SyntheticDataset::new(0, 0, 1, settings).capture(0).unwrap();
         let config = DataConfig {
             image_size: [16, 16].into(),

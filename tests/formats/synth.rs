@@ -10,7 +10,7 @@ use std::fs::File;
 use std::path::Path;
 
 fn settings(frames: usize, side: u32) -> VideoSettings {
-    VideoSettings { frames, off_path: 0, size: ImageSize { height: side, width: side } }
+    VideoSettings { frames, off_path: 0, is_object: false, size: ImageSize { height: side, width: side } }
 }
 
 /// A seed determines the bytes, whatever the number of threads; another seed gives others.
@@ -244,5 +244,21 @@ fn views_off_the_path_are_the_test_part_of_a_capture() {
         assert!(distance < 1e-4, "{distance}");
         let at = |frame: usize| f64::from(video.depth(frame)[12 * 24 + 12]);
         assert!(at(4 + index) > 0.7 * far.distance(target), "view {index}");
+    }
+    let photo = capture.load(&[5], None).unwrap().remove(0);
+    assert!(photo.image.to_rgb() == video.photo(5), "without loss");
+}
+
+/// Objects are opaque in the middle of their images and transparent around it.
+#[test]
+fn objects_are_captures_with_transparent_images() {
+    let sandbox = Sandbox::empty();
+    sandbox.run("synth --objects --scenes 1 --frames 6 --off-path 2 --size 24 --out @objects");
+    let capture = open_capture(&sandbox.path("objects/0_000000")).unwrap();
+    assert_eq!(capture.split(Holdout::None), ((0..6).collect(), (6..8).collect()));
+    let photos = capture.load_all(None).unwrap();
+    for photo in &photos {
+        let mask = photo.mask.as_ref().expect("transparent pixels");
+        assert!(mask[12 * 24 + 12] == 255 && mask[0] == 0, "{}", photo.name);
     }
 }

@@ -83,7 +83,7 @@ impl SyntheticDataset {
             }
         }
         let size = ImageSize { height: size as u32, width: size as u32 };
-        let settings = VideoSettings { frames: frames as usize, off_path: 0, size };
+        let settings = VideoSettings { frames: frames as usize, off_path: 0, is_object: false, size };
         let name = path.to_string_lossy().into_owned();
         Ok(Some(SyntheticDataset { name, seed, first, scenes, settings }))
     }
@@ -103,10 +103,22 @@ impl SyntheticDataset {
     /// # Errors
     /// Fails only if the capture violates the checks that apply to every capture.
     pub fn capture(&self, index: usize) -> Result<Capture> {
-        let number = self.first + index as u64;
-        let video = Arc::new(Video::new(self.seed, number, &self.settings));
+        self.capture_of(index, Arc::new(self.video(index)))
+    }
+
+    /// Generates the scene of video number `index`.
+    pub fn video(&self, index: usize) -> Video {
+        Video::new(self.seed, self.first + index as u64, &self.settings)
+    }
+
+    /// Returns the capture of `video`, number `index`.
+    ///
+    /// # Errors
+    /// Fails like [`SyntheticDataset::capture`].
+    pub fn capture_of(&self, index: usize, video: Arc<Video>) -> Result<Capture> {
+        let name = self.key(self.first + index as u64);
         let cameras = video.cameras().to_vec();
-        Capture::from_source(self.key(number), PathBuf::from(&self.name), &cameras, video)
+        Capture::from_source(name, PathBuf::from(&self.name), &cameras, video)
     }
 }
 

@@ -202,6 +202,17 @@ pub(super) fn orbit_target(builder: &SceneBuilder, spot: Vec3) -> OrbitTarget {
     OrbitTarget { middle: spot + (below + 0.4 * size.y) * Vec3::Y, radius: 0.5 * size.length(), front: None }
 }
 
+/// Adds a single object at the origin, and returns the middle and the radius of a ball that encloses it.
+pub(super) fn floating(builder: &SceneBuilder) -> (Vec3, f32) {
+    let size = builder.log_vector([(0.5, 1.5); 3]);
+    exhibit(builder, size, standing(Vec3::ZERO, builder.angle()));
+    let contents = builder.contents.borrow();
+    let positions = || contents.meshes.iter().flat_map(|(mesh, _)| mesh.positions.iter().copied());
+    let (min, max) = (positions().reduce(Vec3::min), positions().reduce(Vec3::max));
+    let middle = 0.5 * (min.unwrap_or_default() + max.unwrap_or_default());
+    (middle, positions().map(|position| position.distance(middle)).fold(0., f32::max))
+}
+
 /// Adds an object on a wall at `spot`, to be viewed from the direction `front`.
 pub(super) fn hung(builder: &SceneBuilder, spot: Vec3, front: Vec3) -> OrbitTarget {
     let size = builder.log_vector([(0.3, 1.2), (0.2, 1.), (0.3, 1.2)]);

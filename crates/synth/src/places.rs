@@ -175,7 +175,7 @@ pub(super) fn landscape(builder: &SceneBuilder, sky: &Sky) -> CameraSpace {
 }
 
 /// Adds the sun, unless clouds cover it.
-fn add_sun(builder: &SceneBuilder, sky: &Sky) {
+pub(super) fn add_sun(builder: &SceneBuilder, sky: &Sky) {
     let cover = sky.clouds.max(1. - 2. * (sky.zenith.z - sky.zenith.x).max(0.));
     if builder.chance(0.25) && cover > 0.6 {
         return;

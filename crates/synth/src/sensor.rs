@@ -47,6 +47,11 @@ impl Sensor {
         }
     }
 
+    /// Returns the sensor with the same response in every pixel of every image.
+    pub fn without_variation(self) -> Sensor {
+        Sensor { vignette: 0., noise: (0., 0.), exposure_range: 0., ..self }
+    }
+
     /// Returns the exposure factor of an image at `time`, which goes from 0 to 1 over the video.
     pub fn exposure(&self, time: f32) -> f32 {
         (self.exposure_range * self.exposure_noise.sample(vec3(4. * time, 0.5, 0.5))).exp2()

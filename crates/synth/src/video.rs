@@ -8,9 +8,10 @@ use super::walk::{CameraSpace, OrbitTarget, pose, walk};
 use super::{objects, places};
 use glam::{DMat3, DMat4, DVec2, DVec3, Vec2, Vec3, vec2};
 use globalsplat_capture::{Camera, ImageSize, Intrinsics, Lens};
-use image::RgbImage;
+use image::{ImageBuffer, Pixel, Rgb, RgbImage, Rgba, RgbaImage};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
+use std::f32::consts::TAU;
 use std::fmt;
 
 /// Rays per pixel along each side.
@@ -28,7 +29,10 @@ pub struct VideoSettings {
     /// Number of images per video.
     pub frames: usize,
     /// Number of further images from poses off the camera path: 30° to its sides and above it, about the point in the middle of an image.
+    /// Those of an object are seen from between the others.
     pub off_path: usize,
+    /// `true` for a single object without surroundings, seen from all sides above the ground, by a camera without noise and vignetting.
+    pub is_object: bool,
     /// Size of an image.
     pub size: ImageSize,
 }
@@ -60,6 +64,9 @@ impl Video {
 
     fn attempt(random: ChaCha8Rng, settings: &VideoSettings) -> Option<Video> {
         let builder = SceneBuilder::new(random);
+        if settings.is_object {
+            return Some(Video::of_object(&builder, settings));
+        }
         let (place, orbit_target, sky) = world(&builder);
         let tracer = Tracer::new(builder.contents.take(), sky);
         let poses = walk(&builder, &tracer, place, orbit_target, settings.frames)?;
@@ -72,6 +79,17 @@ impl Video {
         Some(Video { tracer, sensor, cameras, frames: settings.frames, seed })
     }
 
+    fn of_object(builder: &SceneBuilder, settings: &VideoSettings) -> Video {
+        let sky = places::sky(builder);
+        places::add_sun(builder, &sky);
+        let ball = objects::floating(builder);
+        let tracer = Tracer::new(builder.contents.take(), sky);
+        let mut cameras = cameras_around(ball, settings.size, 0., settings.frames);
+        cameras.extend(cameras_around(ball, settings.size, 1., settings.off_path));
+        let sensor = Sensor::draw(builder, mean_light(&tracer, &cameras)).without_variation();
+        Video { tracer, sensor, cameras, frames: settings.frames, seed: builder.seed() }
+    }
+
     /// Returns the cameras of the images: those of the path, then those off it.
     pub fn cameras(&self) -> &[Camera] {
         &self.cameras
@@ -80,9 +98,26 @@ impl Video {
     /// Renders image `index`.
     pub fn photo(&self, index: usize) -> RgbImage {
         let camera = &self.cameras[index];
-        let size = ImageSize { height: camera.height, width: camera.width };
-        let spread = 1. / (camera.intrinsics.fx as f32 * RAYS as f32);
-        self.render(index, size, spread, |at| Some(towards(camera, at)))
+        self.render(
+            index,
+            size(camera),
+            spread(camera),
+            |at| Some(towards(camera, at)),
+            |color, _| Rgb(color),
+        )
+    }
+
+    /// Renders image `index` with a transparent sky. Colors aren't multiplied by the opacity.
+    pub fn cutout(&self, index: usize) -> RgbaImage {
+        let camera = &self.cameras[index];
+        let eye = camera.c2w.w_axis.truncate().as_vec3();
+        let towards_surface = |at| {
+            let ray = towards(camera, at);
+            self.tracer.free_distance(eye, ray, f32::INFINITY).is_finite().then_some(ray)
+        };
+        self.render(index, size(camera), spread(camera), towards_surface, |[r, g, b], rays| {
+            Rgba([r, g, b, (255 * rays / Self::RAYS_PER_PIXEL) as u8])
+        })
     }
 
     /// Renders what `lens` shows from the pose of image `index`. Pixels without a ray are black.
@@ -92,27 +127,28 @@ impl Video {
         let middle = 0.5 * DVec2::new(size.width.into(), size.height.into());
         let [left, right] = [middle, middle + DVec2::X].map(|at| lens.unproject(at).unwrap_or(DVec3::Z));
         let spread = left.angle_between(right) as f32 / RAYS as f32;
-        self.render(index, size, spread, |at| {
-            lens.unproject(at.as_dvec2()).map(|ray| (rotation * ray).as_vec3())
-        })
+        let towards = |at: Vec2| lens.unproject(at.as_dvec2()).map(|ray| (rotation * ray).as_vec3());
+        self.render(index, size, spread, towards, |color, _| Rgb(color))
     }
 
     /// Renders an image of `size` from the position of image `index`. `towards` returns the unit direction through a position in pixels,
-    /// or `None` for black; `spread` is the angle between neighbouring rays in radians.
-    fn render(
+    /// or `None` for no ray; `spread` is the angle between neighbouring rays in radians. `to_pixel` takes the color of a pixel's rays, black
+    /// without any, and their number.
+    fn render<P: Pixel<Subpixel = u8>>(
         &self,
         index: usize,
         size: ImageSize,
         spread: f32,
         towards: impl Fn(Vec2) -> Option<Vec3>,
-    ) -> RgbImage {
+        to_pixel: impl Fn([u8; 3], u32) -> P,
+    ) -> ImageBuffer<P, Vec<u8>> {
         let exposure = self.sensor.exposure((index % self.frames) as f32 / self.frames as f32);
         let half = 0.5 * vec2(size.width as f32, size.height as f32);
         let eye = self.cameras[index].c2w.w_axis.truncate().as_vec3();
-        RgbImage::from_fn(size.width, size.height, |x, y| {
+        ImageBuffer::from_fn(size.width, size.height, |x, y| {
             let pixel = y * size.width + x;
             let mut random = PixelRng::new(self.seed, index as u32, pixel);
-            let mut light = Vec3::ZERO;
+            let (mut light, mut rays) = (Vec3::ZERO, 0);
             for sample in 0..Self::RAYS_PER_PIXEL {
                 let cell = vec2((sample % RAYS) as f32, (sample / RAYS) as f32);
                 let jitter = vec2(random.uniform(), random.uniform());
@@ -123,10 +159,11 @@ impl Video {
                 let radiance = self.tracer.trace(eye, ray, spread, choice);
                 // Clamp the radiance, so that a ray that hits a lamp doesn't dominate its pixel.
                 light += radiance.min(Vec3::splat(8.));
+                rays += 1;
             }
             let place = (vec2(x as f32, y as f32) - half) / half;
-            let mean = light / Self::RAYS_PER_PIXEL as f32;
-            image::Rgb(self.sensor.bytes(mean, exposure, place, index as u32, pixel))
+            let mean = light / rays.max(1) as f32;
+            to_pixel(self.sensor.bytes(mean, exposure, place, index as u32, pixel), rays)
         })
     }
 
@@ -217,6 +254,35 @@ fn off_path(tracer: &Tracer, cameras: &[Camera], count: usize) -> Vec<Camera> {
     (0..count).map(camera).collect()
 }
 
+/// Returns `count` cameras around a ball (middle, radius), which fills most of their images. They are spread evenly over the
+/// directions above it, the first of them `turn` radians about the vertical axis.
+fn cameras_around((middle, radius): (Vec3, f32), size: ImageSize, turn: f32, count: usize) -> Vec<Camera> {
+    const HALF_ANGLE: f32 = 20. * TAU / 360.;
+    const GOLDEN_ANGLE: f32 = 2.399_963;
+    let (width, height) = (f64::from(size.width), f64::from(size.height));
+    let focal = 0.5 * width.min(height) / f64::from(HALF_ANGLE.tan());
+    let intrinsics = Intrinsics { fx: focal, fy: focal, cx: width / 2., cy: height / 2. };
+    let distance = 1.05 * radius / HALF_ANGLE.sin();
+    let camera = |i: usize| {
+        let height = (i as f32 + 0.5) / count as f32;
+        let (sin, cos) = (turn + GOLDEN_ANGLE * i as f32).sin_cos();
+        let ring = (1. - height * height).sqrt();
+        let away = Vec3::new(ring * cos, height, ring * sin);
+        let c2w = pose((middle + distance * away, -away, 0.));
+        Camera { intrinsics, c2w, width: size.width, height: size.height }
+    };
+    (0..count).map(camera).collect()
+}
+
+fn size(camera: &Camera) -> ImageSize {
+    ImageSize { height: camera.height, width: camera.width }
+}
+
+/// Returns the angle between the rays of a pixel, in radians.
+fn spread(camera: &Camera) -> f32 {
+    1. / (camera.intrinsics.fx as f32 * RAYS as f32)
+}
+
 /// Returns the unit direction from the camera through `at`, in pixels.
 fn towards(camera: &Camera, at: Vec2) -> Vec3 {
     let Intrinsics { fx, fy, cx, cy } = camera.intrinsics;
@@ -252,7 +318,7 @@ mod tests {
 
     #[test]
     fn a_pinhole_lens_shows_the_photo_and_no_light_comes_from_outside_a_lens() {
-        let settings = VideoSettings { frames: 2, off_path: 0, size: [24, 32].into() };
+        let settings = VideoSettings { frames: 2, off_path: 0, is_object: false, size: [24, 32].into() };
         let video = Video::new(1, 3, &settings);
         let Intrinsics { fx, fy, cx, cy } = video.cameras[1].intrinsics;
         let lens = |model, parameters: &[f64]| Lens::from_colmap(model, parameters, settings.size).unwrap();
@@ -268,5 +334,33 @@ mod tests {
         let circle = video.photo_through(1, &lens("SIMPLE_FISHEYE", &[5., 16., 12.]));
         assert!(circle.get_pixel(0, 0).0.iter().all(|value| *value < 8), "{:?}", circle.get_pixel(0, 0));
         assert!(circle.get_pixel(16, 12).0.iter().any(|value| *value > 8));
+    }
+
+    /// An object is opaque in the middle of every image, and touches no border; the rest is transparent.
+    #[test]
+    fn objects_are_cut_out_and_seen_from_all_sides() {
+        for number in 0..6 {
+            let settings = VideoSettings { frames: 5, off_path: 2, is_object: true, size: [48, 48].into() };
+            let video = Video::new(3, number, &settings);
+            assert_eq!(video.cameras.len(), 7);
+            for index in 0..7 {
+                let image = video.cutout(index);
+                let share = |part: &dyn Fn(u32, u32) -> bool| {
+                    let counted = image.enumerate_pixels().filter(|(x, y, _)| part(*x, *y));
+                    let opacities: Vec<f32> = counted.map(|(.., pixel)| f32::from(pixel[3]) / 255.).collect();
+                    opacities.iter().sum::<f32>() / opacities.len() as f32
+                };
+                let border = share(&|x, y| x.min(y) == 0 || x.max(y) == 47);
+                let whole = share(&|_, _| true);
+                assert!(border == 0. && whole > 0.02 && whole < 0.8, "{number} {index}: {border} {whole}");
+                // A ray through the middle of a pixel may pass where the others of this pixel don't.
+                let depth = video.depth(index);
+                let differ = |(pixel, depth): &(&Rgba<u8>, f32)| {
+                    pixel[3] == 0 && depth.is_finite() || pixel[3] == 255 && depth.is_infinite()
+                };
+                let differing = image.pixels().zip(depth).filter(differ).count();
+                assert!(differing < 48 * 48 / 100, "{number} {index}: {differing}");
+            }
+        }
     }
 }

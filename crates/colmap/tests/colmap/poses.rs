@@ -33,7 +33,9 @@ impl Fixture {
     /// Writes photos of a synthetic scene, through `lens` or without distortion, and returns the poses of their cameras.
     fn write_photos(&self, count: usize, lens: Option<&Lens>) -> Vec<DMat4> {
         // A scene with enough texture.
-        let video = Video::new(1, 11, &VideoSettings { frames: count, off_path: 0, size: [360, 480].into() });
+        let settings =
+            VideoSettings { frames: count, off_path: 0, is_object: false, size: [360, 480].into() };
+        let video = Video::new(1, 11, &settings);
         for index in 0..count {
             let photo = match lens {
                 Some(lens) => video.photo_through(index, lens),
