@@ -306,6 +306,16 @@ GS_INLINE void transpose4(const void* from, int64_t stride, void* to, int64_t to
   for (int i = 0; i < 4; ++i) __builtin_memcpy(row + i, rows + 4 * i * stride, 16);
   _MM_TRANSPOSE4_PS(row[0], row[1], row[2], row[3]);
   for (int i = 0; i < 4; ++i) __builtin_memcpy(columns + 4 * i * to_stride, row + i, 16);
+#elif defined(__aarch64__)
+  uint32x4_t row[4];
+  for (int i = 0; i < 4; ++i) __builtin_memcpy(row + i, rows + 4 * i * stride, 16);
+  for (int i = 0; i < 2; ++i) {
+    // Columns i and i + 2 of the upper and of the lower two rows.
+    const uint64x2_t upper = (uint64x2_t)(i ? vtrn2q_u32(row[0], row[1]) : vtrn1q_u32(row[0], row[1]));
+    const uint64x2_t lower = (uint64x2_t)(i ? vtrn2q_u32(row[2], row[3]) : vtrn1q_u32(row[2], row[3]));
+    const uint64x2_t column[2] = {vtrn1q_u64(upper, lower), vtrn2q_u64(upper, lower)};
+    for (int k = 0; k < 2; ++k) __builtin_memcpy(columns + 4 * (i + 2 * k) * to_stride, column + k, 16);
+  }
 #else
   for (int i = 0; i < 4; ++i)
     for (int j = 0; j < 4; ++j) __builtin_memcpy(columns + 4 * (j * to_stride + i), rows + 4 * (i * stride + j), 4);
@@ -344,6 +354,11 @@ GS_INLINE Bits eighth(Bits i) {
   const __m128i wanted = (__m128i)(i % 8);
   const uint64_t low = uint64_t(_mm_cvtsi128_si64(wanted)), high = uint64_t(_mm_cvtsi128_si64(_mm_unpackhi_epi64(wanted, wanted)));
   return Bits{kExp2Eighths[uint32_t(low)], kExp2Eighths[low >> 32], kExp2Eighths[uint32_t(high)], kExp2Eighths[high >> 32]};
+}
+#elif defined(__aarch64__)
+GS_INLINE Bits eighth(Bits i) {
+  const uint8x16_t bytes = (uint8x16_t)(i % 8 * 0x04040404 + 0x03020100);  // the positions of an element's four bytes
+  return (Bits)vqtbl2q_u8(vld1q_u8_x2((const uint8_t*)kExp2Eighths), bytes);
 }
 #else
 GS_INLINE Bits eighth(Bits i) {
