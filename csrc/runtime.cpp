@@ -71,7 +71,8 @@ Bf16Support detect_bf16_support() {
   };
   // The operating system may refuse tile instructions that the processor has.
   if (has("amx_bf16") && at::cpu::init_amx()) return Bf16Support::Tiles;
-  return has("avx512_bf16") ? Bf16Support::Vectors : Bf16Support::None;
+  // The latter is that of ARM64.
+  return has("avx512_bf16") || has("bf16") ? Bf16Support::Vectors : Bf16Support::None;
 }
 
 std::atomic<int> own_threads{0};

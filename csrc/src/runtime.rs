@@ -12,7 +12,7 @@ mod ffi {
     enum Bf16Support {
         /// No instructions: bf16 products are slower than float32 products.
         None,
-        /// Vector instructions (avx512_bf16): bf16 products are about twice as fast as float32 products.
+        /// Vector instructions (avx512_bf16, or FEAT_BF16 of ARM64): bf16 products are about twice as fast as float32 products.
         Vectors,
         /// Tile instructions (AMX): bf16 products are many times as fast as float32 products.
         Tiles,
