@@ -7,9 +7,10 @@ use serde_json::Value;
 use std::fmt;
 use std::fs::OpenOptions;
 use std::io::Write;
+#[cfg(unix)]
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::{Command, ExitStatus, Stdio};
 
 /// Environment variable that names the COLMAP to use: the path of a `colmap` program, or of a Python that has pycolmap.
 const VARIABLE: &str = "GLOBALSPLAT_COLMAP";
@@ -148,14 +149,22 @@ impl Colmap {
         if status.success() {
             return Ok(());
         }
-        // Ctrl-C (SIGINT), SIGTERM and SIGHUP reach COLMAP, too, possibly before this process knows of them.
-        if matches!(status.signal(), Some(1 | 2 | 15)) {
+        if is_interrupted(status) {
             return reporter.stop();
         }
         reporter.report(current)?;
         let log = log.display();
         Err(Error::failed(format!("COLMAP's {name} failed: {last_words} ({status}); see {log}")))
     }
+}
+
+/// Returns `true` if Ctrl-C (SIGINT), SIGTERM or SIGHUP ended a process. They reach COLMAP, too, possibly before this process knows of them.
+fn is_interrupted(status: ExitStatus) -> bool {
+    #[cfg(unix)]
+    return matches!(status.signal(), Some(1 | 2 | 15));
+    // STATUS_CONTROL_C_EXIT.
+    #[cfg(windows)]
+    return status.code() == Some(0xc000_013a_u32 as i32);
 }
 
 /// Formats the version and the program, as `pycolmap 4.2.1 (.venv/bin/python)`.

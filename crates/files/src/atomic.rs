@@ -5,7 +5,10 @@ use crate::{Error, Result};
 use serde::Serialize;
 use std::fs::{self, File, FileType, Metadata};
 use std::io::{self, BufWriter, ErrorKind, Write};
+#[cfg(unix)]
 use std::os::unix::fs::{FileTypeExt, PermissionsExt, symlink};
+#[cfg(windows)]
+use std::os::windows::fs::symlink_file as symlink;
 use std::path::{Path, PathBuf};
 use tempfile::{NamedTempFile, TempPath};
 
@@ -187,8 +190,11 @@ fn target_of(path: &Path, is_expected: fn(&Metadata) -> bool, expected: &str) ->
 
 fn kind_name(kind: FileType) -> &'static str {
     match kind {
+        #[cfg(unix)]
         _ if kind.is_fifo() => "a FIFO",
+        #[cfg(unix)]
         _ if kind.is_socket() => "a socket",
+        #[cfg(unix)]
         _ if kind.is_block_device() || kind.is_char_device() => "a device",
         _ if kind.is_dir() => "a folder",
         _ => "a file",
@@ -196,7 +202,10 @@ fn kind_name(kind: FileType) -> &'static str {
 }
 
 fn writable_by_owner(mut permissions: fs::Permissions) -> fs::Permissions {
+    #[cfg(unix)]
     permissions.set_mode(permissions.mode() & 0o777 | 0o200);
+    #[cfg(windows)]
+    permissions.set_readonly(false);
     permissions
 }
 
@@ -291,6 +300,7 @@ mod tests {
         assert!(check_writable_file(&root.path().join("x".repeat(256))).unwrap_err().is_invalid_request());
     }
 
+    #[cfg(unix)]
     #[test]
     fn links_are_followed_and_anything_else_is_refused() {
         let root = tempfile::tempdir().unwrap();
@@ -338,6 +348,7 @@ mod tests {
         assert_eq!(names(root.path()), ["below", "dangling", "fifo", "loop", "socket", "to_fifo", "twice"]);
     }
 
+    #[cfg(unix)]
     #[test]
     fn permissions_are_preserved() {
         let root = tempfile::tempdir().unwrap();

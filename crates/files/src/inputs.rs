@@ -127,7 +127,10 @@ mod tests {
 
     #[test]
     fn files_are_recognized_by_any_path_and_links() {
+        #[cfg(unix)]
         use std::os::unix::fs::symlink;
+        #[cfg(windows)]
+        use std::os::windows::fs::symlink_dir as symlink;
         let folder = tempfile::tempdir().expect("a temporary folder");
         let at = |name: &str| folder.path().join(name);
         fs::create_dir_all(at("run/below")).expect("folders");

@@ -2,7 +2,6 @@
 
 use crate::{Error, Result};
 use std::ffi::{OsStr, OsString};
-use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 
 /// Returns `text` with `${NAME}` and `${NAME:-default}` replaced by environment variables. An empty variable counts as unset. A default
@@ -41,10 +40,11 @@ fn expand(text: &str, lookup: impl Fn(&str) -> Option<OsString>) -> Result<OsStr
 /// Returns the possible splits of `path` into a file and a key, one for each `#` in it from the first on: keys and folders may contain the
 /// sign too. Keys are text; bytes that aren't UTF-8 are replaced.
 pub fn split_keyed_path(path: &Path) -> impl DoubleEndedIterator<Item = (PathBuf, String)> {
-    let bytes = path.as_os_str().as_bytes();
+    let bytes = path.as_os_str().as_encoded_bytes();
     let signs = (0..bytes.len()).filter(move |&at| bytes[at] == b'#');
     signs.map(move |at| {
-        let file = PathBuf::from(OsStr::from_bytes(&bytes[..at]));
+        // SAFETY: encoded bytes may be split beside a character of ASCII.
+        let file = PathBuf::from(unsafe { OsStr::from_encoded_bytes_unchecked(&bytes[..at]) });
         (file, String::from_utf8_lossy(&bytes[at + 1..]).into_owned())
     })
 }

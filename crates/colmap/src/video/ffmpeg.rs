@@ -6,6 +6,7 @@ use image::GrayImage;
 use serde_json::Value;
 use std::fs;
 use std::io::{self, BufRead, ErrorKind};
+#[cfg(unix)]
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -199,8 +200,10 @@ impl<'a> Video<'a> {
 /// Returns the command that runs a program of ffmpeg without input.
 fn command(program: &str) -> Command {
     let mut command = Command::new(program);
+    command.stdin(Stdio::null());
     // Ctrl-C must reach only this program, which then ends ffmpeg.
-    command.stdin(Stdio::null()).process_group(0);
+    #[cfg(unix)]
+    command.process_group(0);
     command
 }
 
