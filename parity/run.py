@@ -46,6 +46,13 @@ def arguments(argv):
     option("--seed", metavar="N", type=int, default=0, help="seed of the random numbers (default: 0)")
     option("--repeat", metavar="N", type=int, default=1, help="number of seeds (default: 1)")
     option("--device", default="cpu", help="device of the program: cpu, cuda or cuda:N (default: cpu)")
+    option(
+        "--program",
+        metavar="FILE",
+        type=Path,
+        default=PROGRAM,
+        help="program to compare (default: target/release/globalsplat)",
+    )
     emulated = "run float32 with the CUDA kernels, emulated on the CPU; N seeds the order of blocks and threads"
     option("--cuda-on-cpu", metavar="N", type=int, help=emulated)
     perturb = "perturb correct results and check detection, of all cases, or of those whose index modulo N is K"
@@ -59,8 +66,8 @@ def main(argv=None):
     if not names:
         print(f"--only {options.only}: no such case, there are {', '.join(CASES)}", file=sys.stderr)
         return WRONG_REQUEST
-    if not PROGRAM.is_file():
-        print(f"{PROGRAM} doesn't exist: run make build", file=sys.stderr)
+    if not options.program.is_file():
+        print(f"{options.program} doesn't exist: run make build", file=sys.stderr)
         return WRONG_REQUEST
 
     if options.cuda_on_cpu is not None:
@@ -70,7 +77,7 @@ def main(argv=None):
     started, results = time.perf_counter(), []
     try:
         for seed in range(options.seed, options.seed + options.repeat):
-            results += run_cases(names, seed, PROGRAM, options.device, self_tested)
+            results += run_cases(names, seed, options.program, options.device, self_tested)
     except ProgramError as error:
         print(error, file=sys.stderr)
         return 1

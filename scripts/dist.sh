@@ -40,12 +40,17 @@ fi
 mapfile -t loaded < <(LD_LIBRARY_PATH="$libtorch/lib" ldd "${files[@]}" | awk '$2 == "=>" { print $3 }' \
     | xargs realpath "${files[@]:1}" | sort -u | grep "^$(dirname "$libtorch")/")
 for file in "${loaded[@]}"; do
-    # NVIDIA permits no changes of its libraries. They have no debug information.
-    if [[ $file == */nvidia/* ]]; then cp "$file" "$out/lib/"; else strip --strip-unneeded -o "$out/lib/$(basename "$file")" "$file"; fi
+    copy="$out/lib/$(basename "$file")"
+    if [[ $file == */nvidia/* ]]; then
+        # NVIDIA permits no changes of its libraries. They have no debug information.
+        cp "$file" "$copy"
+    else
+        strip --strip-unneeded -o "$copy" "$file"
+        # The wheel's libraries would also search folders outside of ours, which anyone may be able to write to.
+        "$patchelf" --set-rpath "\$ORIGIN" "$copy"
+    fi
 done
-# The wheel's libraries would also search folders outside of ours, which anyone may be able to write to.
 "$patchelf" --set-rpath "\$ORIGIN/../lib" "$out/bin/globalsplat"
-for file in "$out"/lib/lib{torch,c10,gomp}*; do "$patchelf" --set-rpath "\$ORIGIN" "$file"; done
 
 cp -r models configs "$out/share/globalsplat/"
 cp README.md CHANGELOG.md LICENSE-MIT LICENSE-APACHE "$out/share/doc/globalsplat/"
