@@ -87,33 +87,35 @@ step "kernels, layers, losses and optimizers against PyTorch"
 step "splat files, byte for byte"
 work="$(mktemp -d)"
 trap 'rm -rf "$work"' EXIT
+# Runs a command, and prints what it said if it fails.
+quietly() { "$@" >"$work/log" 2>&1 || { cat "$work/log" >&2; fail "failed: $*"; }; }
 captures="$work/captures"
-"$native" synth --out "$captures" --seed 3 --scenes 1 --frames 6 --off-path 2 --size 64 >"$work/log" 2>&1
+mkdir "$work"/{native,arm64}
+quietly "$native" synth --out "$captures" --seed 3 --scenes 1 --frames 6 --off-path 2 --size 64
 capture="$(echo "$captures"/3_*)"
-refine=(refine --scene "$capture" --steps 20 --gaussians 2000 --seed 1 --json)
-"$native" "${refine[@]}" --out "$work/native.ply" >"$work/native.json" 2>>"$work/log"
+refine=(refine --scene "$capture" --steps 20 --gaussians 2000 --seed 1)
+quietly "$native" "${refine[@]}" --out "$work/native.ply"
 for file in a.compressed.ply a.sog a.spz a.splat a.glb; do
-    mkdir -p "$work"/{native,arm64}
-    "$native" convert "$work/native.ply" "$work/native/$file" 2>>"$work/log" >&2
-    "$program" convert "$work/native.ply" "$work/arm64/$file" 2>>"$work/log" >&2
+    quietly "$native" convert "$work/native.ply" "$work/native/$file"
+    quietly "$program" convert "$work/native.ply" "$work/arm64/$file"
     same "$work/native/$file" "$work/arm64/$file"
-    "$program" convert "$work/native/$file" "$work/arm64/back.ply" 2>>"$work/log" >&2
-    "$native" convert "$work/native/$file" "$work/native/back.ply" 2>>"$work/log" >&2
+    quietly "$native" convert "$work/native/$file" "$work/native/back.ply"
+    quietly "$program" convert "$work/native/$file" "$work/arm64/back.ply"
     same "$work/native/back.ply" "$work/arm64/back.ply"
     rm "$work"/*/back.ply
 done
 
 step "refine and reconstruct"
 for run in 1 2; do
-    "$program" "${refine[@]}" --out "$work/arm64$run.ply" >"$work/arm64.json" 2>>"$work/log"
+    quietly "$program" "${refine[@]}" --out "$work/arm64$run.ply"
 done
 same "$work/arm641.ply" "$work/arm642.ply"
 reconstruct=(reconstruct --scene "$capture" --views 4)
-"$native" "${reconstruct[@]}" --out "$work/native_model.ply" 2>>"$work/log" >&2
-"$program" "${reconstruct[@]}" --out "$work/arm64_model.ply" 2>>"$work/log" >&2
+quietly "$native" "${reconstruct[@]}" --out "$work/native_model.ply"
+quietly "$program" "${reconstruct[@]}" --out "$work/arm64_model.ply"
 for pair in native.ply:arm641.ply native_model.ply:arm64_model.ply; do
     for splat in ${pair/:/ }; do
-        GLOBALSPLAT_WEIGHTS=/nonexistent "$native" eval --scene "$capture" --splat "$work/$splat" --json 2>>"$work/log" |
+        GLOBALSPLAT_WEIGHTS=/nonexistent "$native" eval --scene "$capture" --splat "$work/$splat" --json 2>/dev/null |
             "$python" -c 'import json, sys; print(json.load(sys.stdin)["psnr"])'
     done | "$python" -c "
 import sys
@@ -121,6 +123,7 @@ native, arm64 = map(float, sys.stdin)
 print(f'${pair}: {native:.3f} and {arm64:.3f} dB')
 sys.exit(abs(native - arm64) > 0.05)" || fail "the splats of $pair differ in PSNR"
 done
+
 step "the splat op in Python"
 package="$out/python/globalsplat"
 rm -rf "$package"
