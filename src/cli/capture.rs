@@ -53,7 +53,7 @@ impl Capture {
         if self.frames.is_some() && self.source.is_dir() {
             return Err(Error::request("--frames is for videos, and the source is a folder of photos").into());
         }
-        signals::handle_stop_requests()?;
+        signals::handle_stop_requests();
         signals::end_at_request(1);
         let report = run_make_capture(&self.source, &self.out, &options)?;
         let mut json = serde_json::to_value(&report)?;

@@ -298,7 +298,7 @@ impl Eval {
             Some(weights) => weights_fingerprint(weights)?,
             None => path.canonicalize()?.display().to_string(),
         };
-        signals::handle_stop_requests()?;
+        signals::handle_stop_requests();
 
         let mut evaluations = vec![];
         for (index, folder) in indices.iter().zip(folders) {

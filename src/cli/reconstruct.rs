@@ -94,7 +94,7 @@ impl Reconstruct {
         let asked = model::parse_precision(&self.precision)?;
         let started = process_age();
         let mut stopwatch = Stopwatch::default();
-        signals::handle_stop_requests()?;
+        signals::handle_stop_requests();
         signals::end_at_request(1);
         let path = || self.scene.path(self.masks.as_deref(), &self.out);
         let (scene, masks) = if self.scene.is_unposed() { stopwatch.time("poses", path)? } else { path()? };

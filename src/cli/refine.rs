@@ -116,7 +116,7 @@ impl Refine {
             .log
             .iter()
             .try_for_each(|log| check_writable_dir(log).and_then(|()| RefineLog::check(log).map(drop)))?;
-        signals::handle_stop_requests()?;
+        signals::handle_stop_requests();
         signals::end_at_request(1);
         let (path, masks) = self.scene.path(self.masks.as_deref(), &self.out)?;
         // The time budget begins after the poses of photos are found.

@@ -99,7 +99,7 @@ impl Train {
         }
 
         let start = Instant::now();
-        signals::handle_stop_requests()?;
+        signals::handle_stop_requests();
         let outcome = self.train(&config, &mut trainer, &mut held_out, &resume)?;
         let seconds = start.elapsed().as_secs_f64();
         let bad_data = trainer.bad_data();

@@ -113,7 +113,7 @@ impl Render {
         let shots = Shots::new(self, capture.as_ref(), (&gaussians, origin), &renderer)?;
         let scale = if self.depth { Some(DepthScale::estimate(&renderer, &shots.cameras)?) } else { None };
 
-        signals::handle_stop_requests()?;
+        signals::handle_stop_requests();
         let mut inputs = self.inputs(capture.as_ref());
         inputs.extend(shots.inputs.clone());
         let film = (self.size_of_all(&shots.cameras), shots.frames_per_second);
