@@ -73,8 +73,9 @@ pub fn color_corrected_psnr(image: &Tensor, ground_truth: &Tensor, mask: Option<
     masked_psnr(&corrected.view(size.as_slice()), ground_truth, mask)
 }
 
-/// Returns the structural similarity of two images `[3, H, W]` over the pixels that count by `mask` `[1, H, W]` (spec 7.9): 1 − (1 − SSIM) /
-/// mean weight, where the images are equal where they are masked out. H and W are at least 11. NaN if no pixel counts.
+/// Returns the structural similarity of two images `[3, H, W]` over the pixels that count by `mask` `[1, H, W]`, in [−1, 1] (spec 7.9): the
+/// images are equal where they are masked out, and windows without a pixel that counts are left out of the mean. H and W are at least 11.
+/// NaN if no pixel counts.
 pub fn masked_ssim(image: &Tensor, ground_truth: &Tensor, mask: Option<&Tensor>) -> f64 {
     let size = image.size();
     // Number of rows of windows that lie inside the image.
@@ -89,7 +90,15 @@ pub fn masked_ssim(image: &Tensor, ground_truth: &Tensor, mask: Option<&Tensor>)
         loss::ssim(&image, &ground_truth).double_value(&[]) * count as f64
     };
     let whole = bands(rows, size[2]).map(weighted).sum::<f64>() / rows as f64;
-    mask.map_or(whole, |mask| 1. - (1. - whole) / mean_weight(mask))
+    mask.map_or(whole, |mask| 1. - (1. - whole) / mean_weight_of_windows(mask))
+}
+
+/// Returns the mean over SSIM's windows of the largest weight of a mask `[1, H, W]` in each.
+fn mean_weight_of_windows(mask: &Tensor) -> f64 {
+    let largest = [[SSIM_WINDOW, 1], [1, SSIM_WINDOW]]
+        .into_iter()
+        .fold(mask.clamp(0., 1.), |mask, window| mask.max_pool2d(window, [1, 1], [0, 0], [1, 1], false));
+    largest.mean(Kind::Double).double_value(&[])
 }
 
 /// Returns the mean weight of a mask `[1, H, W]`, with values clamped to [0, 1].
@@ -130,8 +139,15 @@ mod tests {
         assert!((masked_psnr(&image, &truth, Some(&mask)) - expected).abs() < 1e-5);
         let ssim_of = |image: &Tensor| masked_ssim(image, &truth, Some(&mask));
         let (before, filled) = (ssim_of(&image), fill_masked(&image, &truth, &mask));
-        let expected = 1. - (1. - masked_ssim(&filled, &truth, None)) / (2. / 3. / 2.);
+        // Of 22 rows of windows, the first 6 lie in the masked half, 8 reach the weights of ⅓, and 8 those of 1.
+        let expected = 1. - (1. - masked_ssim(&filled, &truth, None)) / ((8. / 3. + 8.) / 22.);
         assert!((before - expected).abs() < 1e-6, "{before}, expected {expected}");
+        // A single pixel counts, and 121 windows see it.
+        let [dark, light] = [0., 1.].map(|value| Tensor::full([3, 32, 24], value, options));
+        let pixel = mask.zeros_like();
+        let _ = pixel.narrow(1, 15, 1).narrow(2, 12, 1).fill_(1.);
+        let similarity = masked_ssim(&dark, &light, Some(&pixel));
+        assert!((-1. ..1.).contains(&similarity), "{similarity}");
         let _ = image.narrow(1, 0, 16).zero_();
         assert_eq!(ssim_of(&image), before);
         assert!((ssim_of(&truth) - 1.).abs() < 1e-9);
