@@ -1,21 +1,31 @@
 #!/usr/bin/env bash
-# Builds the wheel of the Python package in python/, for every Linux with glibc 2.28, into target/wheels.
+# Builds the wheel of the Python package in python/ into target/wheels: for every Linux with glibc 2.28, or for macOS 11.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 target="${CARGO_TARGET_DIR:-target}"
 
 .venv/bin/python -m pip install --quiet --disable-pip-version-check -r requirements-dist.txt
-# The build of the wheel takes the program from here, and links the native module by the same `cc`.
-scripts/build_for_glibc.sh
-rm -f "$target"/release/lib_native.so "$target"/release/deps/lib_native.so
-built="$(mktemp -d)"
-trap 'rm -rf "$built"' EXIT
-PATH="$(realpath "$target")/linker:$PATH" .venv/bin/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir "$built" ./python
-# Refuses a tag that the symbols of the files contradict. libtorch comes from the wheel of PyTorch.
 rm -rf "$target/wheels"
-if ! said="$(PATH="$PWD/.venv/bin:$PATH" .venv/bin/python -m auditwheel repair --plat "manylinux_2_28_$(uname -m)" \
-    --exclude 'libtorch*.so' --exclude libc10.so --wheel-dir "$target/wheels" "$built"/*.whl 2>&1)"; then
-    echo "wheel: $(tail -n 1 <<<"$said")" >&2
-    exit 1
+# build_wheel FOLDER
+build_wheel() { .venv/bin/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir "$1" ./python; }
+# quietly COMMAND…: prints what the command said only if it fails.
+quietly() {
+    local said
+    said="$("$@" 2>&1)" || { echo "wheel: $(tail -n 1 <<<"$said")" >&2; exit 1; }
+}
+if [ "$(uname)" = Darwin ]; then
+    MACOSX_DEPLOYMENT_TARGET=11.0 build_wheel "$target/wheels"
+else
+    # The build of the wheel takes the program from here, and links the native module by the same `cc`.
+    scripts/build_for_glibc.sh
+    rm -f "$target"/release/lib_native.so "$target"/release/deps/lib_native.so
+    built="$(mktemp -d)"
+    trap 'rm -rf "$built"' EXIT
+    PATH="$(realpath "$target")/linker:$PATH" build_wheel "$built"
+    # Refuses a tag that the symbols of the files contradict. libtorch comes from the wheel of PyTorch.
+    PATH="$PWD/.venv/bin:$PATH" quietly .venv/bin/python -m auditwheel repair --plat "manylinux_2_28_$(uname -m)" \
+        --exclude 'libtorch*.so' --exclude libc10.so --wheel-dir "$target/wheels" "$built"/*.whl
 fi
-du -h --apparent-size "$target"/wheels/*.whl
+# The README and the classifiers, as package indexes take them.
+quietly .venv/bin/python -m twine check --strict "$target"/wheels/*.whl
+du -h "$target"/wheels/*.whl

@@ -4,7 +4,7 @@ import os
 import sys
 from pathlib import Path
 
-from ._torch import torch_folder
+from ._requirements import torch_folder
 
 
 def main() -> None:
@@ -16,7 +16,8 @@ def main() -> None:
     package = Path(__file__).resolve().parent
     # The program finds a PyTorch beside this package by itself. In an environment on top of another one, PyTorch may lie elsewhere.
     if libraries.resolve() != package.parent / "torch" / "lib":
-        others = os.environ.get("LD_LIBRARY_PATH")
-        os.environ["LD_LIBRARY_PATH"] = f"{libraries}:{others}" if others else str(libraries)
+        variable = "DYLD_LIBRARY_PATH" if sys.platform == "darwin" else "LD_LIBRARY_PATH"
+        others = os.environ.get(variable)
+        os.environ[variable] = f"{libraries}:{others}" if others else str(libraries)
     program = package / "bin" / "globalsplat"
     os.execv(program, [sys.argv[0], *sys.argv[1:]])

@@ -5,6 +5,7 @@ import math
 import os
 import subprocess
 import sys
+import sysconfig
 import tomllib
 from pathlib import Path
 
@@ -12,9 +13,10 @@ import globalsplat
 import numpy as np
 import pytest
 import torch
-from globalsplat import _torch
+from globalsplat import _requirements
 from globalsplat.reference.normalize import normalize_scene
 from globalsplat.reference.splat import sh_color
+from PIL import Image
 
 # Formats, and the PSNR in dB that a render may lose in each. A .splat has one color of each Gaussian, and is compared with the mean colors.
 FORMATS = {"ply": 0.01, "compressed.ply": 0.3, "sog": 0.3, "spz": 0.3, "splat": 0.3, "glb": 0.01}
@@ -89,17 +91,56 @@ def test_another_torch_is_refused_before_anything_is_loaded(tmp_path):
     )
     expected = "globalsplat was compiled for PyTorch 2.11, and 2.10.0 is installed: pip install 'torch==2.11.*'"
     environment = {**os.environ, "PYTHONPATH": str(packages)}
-    imported = run(sys.executable, "-c", "import globalsplat", env=environment)
+    assert_refused(expected, environment)
+
+
+def test_another_platform_is_refused_before_anything_is_loaded(tmp_path):
+    installed = Path(globalsplat.__file__).parent
+    (tmp_path / "globalsplat").symlink_to(installed)
+    for made_for in ("manylinux_2_28_riscv64", "macosx_11_0_arm64"):
+        metadata = tmp_path / f"globalsplat-{globalsplat.__version__}.dist-info"
+        metadata.mkdir(exist_ok=True)
+        (metadata / "METADATA").write_text(f"Name: globalsplat\nVersion: {globalsplat.__version__}\n")
+        (metadata / "WHEEL").write_text(f"Wheel-Version: 1.0\nTag: cp310-abi3-{made_for}\n")
+        expected = (
+            f"globalsplat was compiled for {made_for}, and this Python is for {sysconfig.get_platform()}: "
+            "pip install --force-reinstall globalsplat"
+        )
+        assert_refused(expected, {**os.environ, "PYTHONPATH": str(tmp_path)})
+
+
+def assert_refused(expected, environment):
+    """Asserts that the package and its program end with this sentence."""
+    imported = run(sys.executable, "-c", "from globalsplat import rasterization", env=environment)
     assert imported.returncode == 1 and imported.stderr.splitlines()[-1] == f"ImportError: {expected}"
-    program = run(sys.executable, f"{sys.prefix}/bin/globalsplat", "doctor", env=environment)
-    assert program.returncode == 1 and expected in program.stderr
+    program = run(sys.executable, "-m", "globalsplat", "doctor", env=environment)
+    assert program.returncode == 1 and program.stderr == f"globalsplat: {expected}\n"
 
 
 def test_the_version_of_torch_is_the_required_one():
     requires = importlib.metadata.requires("globalsplat")
-    assert requires is not None and f"torch=={_torch.REQUIRED}.*" in requires
+    assert requires is not None and f"torch=={_requirements.REQUIRED}.*" in requires
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
     assert project["version"] == globalsplat.__version__ == importlib.metadata.version("globalsplat")
+
+
+def test_photos_without_poses_are_refined_with_the_extra_for_poses(capture, tmp_path):
+    requires = importlib.metadata.requires("globalsplat")
+    assert requires is not None and any("pycolmap" in each and 'extra == "poses"' in each for each in requires)
+    if importlib.util.find_spec("pycolmap") is None:
+        assert not os.environ.get("GLOBALSPLAT_NO_SKIPS"), "pycolmap isn't installed (make poses)"
+        pytest.skip("pycolmap isn't installed (make poses)")
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for index, name in enumerate(capture.names):
+        Image.fromarray(capture.image(index)).save(photos / f"{Path(name).stem}.png")
+    # The Python of the environment has pycolmap, also while no environment is active.
+    environment = {"PATH": "/usr/bin:/bin", "TMPDIR": str(tmp_path)}
+    program = f"{sys.prefix}/bin/globalsplat"
+    out = tmp_path / "room.ply"
+    refined = run(program, "refine", "--photos", str(photos), "--seconds", "5", "--out", str(out), env=environment)
+    assert refined.returncode == 0, refined.stderr
+    assert len(globalsplat.load_splat(out)["means"]) > 1000
 
 
 def test_the_package_imports_torch_only_when_needed():

@@ -39,7 +39,8 @@ pub struct Colmap {
 impl Colmap {
     /// Finds COLMAP: the program or the Python that `GLOBALSPLAT_COLMAP` names; else the newest of `colmap` on the PATH and the pycolmap of
     /// the first Python that has it, and of equal versions pycolmap. Python is looked for in `.venv` beside this program, or of the
-    /// checkout in whose `target` it is, in the active virtual or Conda environment, and as `python3` on the PATH.
+    /// checkout in whose `target` it is, in the environment among whose packages it is, in the active virtual or Conda environment, and as
+    /// `python3` on the PATH.
     ///
     /// # Errors
     /// Returns an error that says how to install COLMAP if there is none, or what is wrong with the one that `GLOBALSPLAT_COLMAP` names.
@@ -197,9 +198,12 @@ fn python_programs() -> Vec<PathBuf> {
     let program = std::env::current_exe().unwrap_or_default();
     let target = program.ancestors().take(5).find(|folder| folder.ends_with("target"));
     let local = [Some(&*program), target].into_iter().flatten().map(|path| path.with_file_name(".venv"));
+    // ENVIRONMENT/lib/python3.N/site-packages/globalsplat/bin/globalsplat.
+    let packages = program.ancestors().find(|folder| folder.ends_with("site-packages"));
+    let own = packages.and_then(|folder| folder.ancestors().nth(3)).map(PathBuf::from);
     let active =
         ["VIRTUAL_ENV", "CONDA_PREFIX"].map(std::env::var_os).into_iter().flatten().map(PathBuf::from);
-    let pythons = local.chain(active).map(|environment| environment.join("bin/python"));
+    let pythons = local.chain(own).chain(active).map(|environment| environment.join("bin/python"));
     let is_usable = |python: &PathBuf| python.is_absolute() && python.is_file();
     pythons.filter(is_usable).chain(["python3".into()]).collect()
 }
