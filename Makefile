@@ -97,8 +97,8 @@ check-op: build
 	scripts/check_op.sh
 
 # Everything: `make test`, and what takes longer than it finds. CONTRIBUTING.md says which change needs which part.
-SLOW_CHECKS := check-ignored check-docs check-features check-packages check-licenses check-robustness check-machines check-arm64 check-windows \
-    check-demos dist check-wheel
+SLOW_CHECKS := check-ignored check-docs check-features check-packages check-licenses check-robustness check-machines check-arm64 check-macos \
+    check-windows check-demos dist check-wheel
 .PHONY: test-all slow-checks $(SLOW_CHECKS)
 test-all: build
 	@scripts/count_skips.sh $(MAKE) --no-print-directory --keep-going SELF_TEST=0/1 checks slow-checks
@@ -137,10 +137,12 @@ check-machines: build
 # The program and the splat op for Linux on ARM64, cross-compiled, under emulation.
 check-arm64: build
 	scripts/arm64.sh
-# The crates of CRATES compile for Windows. Needs a C compiler for it (Debian: gcc-mingw-w64-x86-64).
+# The program and the Python module link for macOS.
+check-macos: build
+	scripts/macos.sh
+# The tests of the CRATES, compiled for Windows and run under Wine.
 check-windows:
-	rustup target add x86_64-pc-windows-gnu
-	env -u LIBTORCH $(CARGO) check --locked --target x86_64-pc-windows-gnu $(CRATES:%=-p globalsplat-%)
+	scripts/windows.sh $(CRATES:%=globalsplat-%)
 # The demos on synthetic scenes, and the script for a GPU at a reduced size on the CPU.
 check-demos: build
 	CAPTURES=none OUT=target/demo scripts/demo.sh --dry-run

@@ -2,7 +2,7 @@
 
 use crate::formats::polycam::is_polycam;
 use crate::pixels::{PHOTO_EXTENSIONS, SUPPORTED_IMAGES, read_image_size};
-use globalsplat_files::{Error, Result};
+use globalsplat_files::{Error, Result, relative_name};
 use rayon::prelude::*;
 use std::cmp::Ordering;
 use std::collections::BTreeSet;
@@ -173,8 +173,7 @@ pub fn list_photos(folder: &Path) -> Result<PhotoList> {
             format!("photos, each {SUPPORTED_IMAGES}{video}"),
         ));
     }
-    let name = |file: &PathBuf| file.strip_prefix(folder).unwrap_or(file).display().to_string();
-    let others: Vec<String> = others.iter().map(name).collect();
+    let others: Vec<String> = others.iter().map(|file| relative_name(file, folder)).collect();
     let warning = describe_photos(folder, &others, |count| {
         format!("{count} of {} files are no photos and left out", count + photos.len())
     });
@@ -305,6 +304,7 @@ pub(crate) fn unique_stems(names: &[&str], suffixes: &[&str]) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use globalsplat_files::is_same_file;
 
     #[test]
     fn photos_are_found_however_their_paths_are_written() {
@@ -334,9 +334,15 @@ mod tests {
                 std::fs::write(path, b"").unwrap();
             }
             let found = find_photos(&[folder.path().to_owned()], names);
-            let expected: Vec<_> =
-                expected.iter().map(|index| index.map(|index| paths[index].clone())).collect();
-            assert_eq!(found, expected, "{names:?}");
+            assert_eq!(found.len(), expected.len());
+            for (found, index) in found.into_iter().zip(expected) {
+                // The same file, in the case of the name where the file system ignores it.
+                let is_expected = match (&found, index) {
+                    (Some(photo), Some(index)) => is_same_file(photo, &paths[*index]),
+                    (found, index) => found.is_none() && index.is_none(),
+                };
+                assert!(is_expected, "{names:?}: {found:?}");
+            }
         }
     }
 

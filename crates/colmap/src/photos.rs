@@ -6,7 +6,9 @@ use globalsplat_capture::{
     MASKS_FOLDER, decode_upright, encode_photo, encode_upright, exif_focal, find_masks, find_masks_in,
     fit_mask, gray_to_rgb, is_equirectangular, list_photos, read_image_size,
 };
-use globalsplat_files::{Error, Result, checksum, is_same_file, parent_of, real_path, write_file};
+use globalsplat_files::{
+    Error, Result, checksum, is_same_file, parent_of, real_path, relative_name, write_file,
+};
 use image::imageops::thumbnail;
 use image::{Rgb, RgbImage};
 use rayon::prelude::*;
@@ -80,8 +82,7 @@ pub(crate) fn find_photos(folder: &Path) -> Result<(Vec<FoundPhoto>, Option<Stri
     let list = list_photos(folder)?;
     let describe = |path: &PathBuf| {
         let bytes = fs::metadata(path).map_err(Error::read(path))?.len();
-        let name = path.strip_prefix(folder).unwrap_or(path).to_string_lossy();
-        Ok(FoundPhoto { name: name.into_owned(), bytes, checksum: checksum([path])? })
+        Ok(FoundPhoto { name: relative_name(path, folder), bytes, checksum: checksum([path])? })
     };
     let found = list.photos.par_iter().map(describe).collect::<Result<_>>()?;
     Ok((found, list.warning))
@@ -112,8 +113,8 @@ pub(crate) fn find_photo_masks(
     let own_folder = real_path(&out.join(MASKS_FOLDER));
     let is_own = |file: &PathBuf| {
         let file = real_path(file);
-        let name = file.strip_prefix(&own_folder).ok().and_then(Path::to_str);
-        old.zip(name).is_some_and(|(old, name)| old.own_masks.contains(name))
+        let is_inside = file.starts_with(&own_folder);
+        is_inside && old.is_some_and(|old| old.own_masks.contains(&relative_name(&file, &own_folder)))
     };
     let describe = |(name, file): (&str, Option<PathBuf>)| {
         let file = file.filter(|file| !is_own(file))?;
@@ -161,6 +162,7 @@ pub(crate) fn import_photos(
         }
     }
     let is_in_place = is_same_file(source, images);
+    let ignores_case = is_same_file(images, &images.with_file_name("IMAGES"));
     let (mut names, mut unmasked) = (HashSet::new(), vec![]);
     let (mut done, large) = (skipped.len(), Mutex::new(()));
     // Few photos at a time, for progress and memory.
@@ -179,7 +181,7 @@ pub(crate) fn import_photos(
                     continue;
                 }
             };
-            photo.name = list_name(photo.name, &mut names);
+            photo.name = list_name(photo.name, &mut names, ignores_case);
             if is_in_place && (contents.is_some() || photo.name != **name) {
                 let found = "one that COLMAP can't read as it is, by its name, format, rotation or size";
                 let expected = "an output whose images aren't the photos themselves";
@@ -253,14 +255,14 @@ fn write_masks(out: &Path, record: &mut Record, masks: Vec<(Photo, Vec<u8>, Opti
     new.iter().try_for_each(|(_, target, contents)| write_with_folder(target, contents))
 }
 
-/// Returns a name that COLMAP's lists can hold, and that differs from `taken`, to which it is added. White space ends a name, a `#` at its
-/// start a comment, and a `\` becomes a `/`.
-fn list_name(name: String, taken: &mut HashSet<String>) -> String {
+/// Returns a name that COLMAP's lists can hold, and that differs from `taken`, to which it is added; `ignores_case` if the file system takes
+/// `A.jpg` and `a.jpg` for one. White space ends a name, a `#` at its start a comment, and a `\` becomes a `/`.
+fn list_name(name: String, taken: &mut HashSet<String>, ignores_case: bool) -> String {
     let mut safe = name.replace(|c: char| c.is_whitespace() || c.is_control() || c == '\\', "_");
     if safe.starts_with('#') {
         safe.replace_range(..1, "_");
     }
-    while !taken.insert(safe.clone()) {
+    while !taken.insert(if ignores_case { safe.to_lowercase() } else { safe.clone() }) {
         safe.insert(safe.rfind('/').map_or(0, |slash| slash + 1), '_');
     }
     safe

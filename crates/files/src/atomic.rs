@@ -194,10 +194,9 @@ fn kind_name(kind: FileType) -> &'static str {
         _ if kind.is_fifo() => "a FIFO",
         #[cfg(unix)]
         _ if kind.is_socket() => "a socket",
-        #[cfg(unix)]
-        _ if kind.is_block_device() || kind.is_char_device() => "a device",
         _ if kind.is_dir() => "a folder",
-        _ => "a file",
+        _ if kind.is_file() => "a file",
+        _ => "a device",
     }
 }
 
@@ -297,6 +296,7 @@ mod tests {
             assert_eq!(names(root.path()), [name]);
             fs::remove_file(file).unwrap();
         }
+        #[cfg(unix)]
         assert!(check_writable_file(&root.path().join("x".repeat(256))).unwrap_err().is_invalid_request());
     }
 
@@ -346,6 +346,25 @@ mod tests {
             assert!(check_writable_dir(&at(file)).unwrap_err().to_string().contains("the name of a folder"));
         }
         assert_eq!(names(root.path()), ["below", "dangling", "fifo", "loop", "socket", "to_fifo", "twice"]);
+    }
+
+    /// Windows replaces no file that another program has open for itself.
+    #[cfg(windows)]
+    #[test]
+    fn a_file_in_use_stays_as_it_is() {
+        use std::os::windows::fs::OpenOptionsExt;
+        let root = tempfile::tempdir().unwrap();
+        let file = root.path().join("room.ply");
+        fs::write(&file, "old").unwrap();
+        let in_use = fs::OpenOptions::new().read(true).share_mode(0).open(&file).unwrap();
+        let error = write_file(&file, "new").unwrap_err().to_string();
+        assert!(error.contains("room.ply") && error.contains("can't be written"), "{error}");
+        drop(in_use);
+        assert_eq!((names(root.path()), fs::read(&file).unwrap()), (vec!["room.ply".into()], b"old".into()));
+        // Names of devices, with which no file can be made.
+        for name in ["NUL", "con"] {
+            assert!(check_writable_file(&root.path().join(name)).unwrap_err().is_invalid_request(), "{name}");
+        }
     }
 
     #[cfg(unix)]

@@ -18,5 +18,5 @@ pub use atomic::{
 pub use error::{Error, Result, is_program_missing, panic_message};
 pub use inputs::{InputFiles, is_same_file, real_path};
 pub use lock::FolderLock;
-pub use paths::{expand_path, split_keyed_path};
+pub use paths::{expand_path, relative_name, split_keyed_path};
 pub use read::{checksum, read_text};

@@ -1,8 +1,9 @@
-//! Paths as users write them: environment variables in a path of a configuration, and `FILE#KEY`, an entry of a file.
+//! Paths as users write them: environment variables in a path of a configuration, `FILE#KEY`, an entry of a file, and names of files in a
+//! folder.
 
 use crate::{Error, Result};
 use std::ffi::{OsStr, OsString};
-use std::path::{Path, PathBuf};
+use std::path::{MAIN_SEPARATOR_STR, Path, PathBuf};
 
 /// Returns `text` with `${NAME}` and `${NAME:-default}` replaced by environment variables. An empty variable counts as unset. A default
 /// can't contain `}` or another variable; an unclosed `${` stays as it is.
@@ -47,6 +48,14 @@ pub fn split_keyed_path(path: &Path) -> impl DoubleEndedIterator<Item = (PathBuf
         let file = PathBuf::from(unsafe { OsStr::from_encoded_bytes_unchecked(&bytes[..at]) });
         (file, String::from_utf8_lossy(&bytes[at + 1..]).into_owned())
     })
+}
+
+/// Returns the path of `file` relative to `folder`, in which it lies, with `/` as the separator on every system, as captures name their
+/// photos. Bytes that aren't UTF-8 are replaced.
+pub fn relative_name(file: &Path, folder: &Path) -> String {
+    let name = file.strip_prefix(folder).unwrap_or(file).to_string_lossy();
+    // On Unix, a name may contain a `\`.
+    name.replace(MAIN_SEPARATOR_STR, "/")
 }
 
 #[cfg(test)]

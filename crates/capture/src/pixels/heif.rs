@@ -1,5 +1,7 @@
-//! HEIC and AVIF: files of boxes (ISO/IEC 14496-12, 23008-12). The size is read from them; libheif's program decodes the pixels.
+//! HEIC and AVIF: files of boxes (ISO/IEC 14496-12, 23008-12). The size is read from them; libheif's program, or sips on macOS, decodes the
+//! pixels.
 
+use super::codec::decode_upright;
 use globalsplat_files::{Error, Result, is_program_missing};
 use image::{DynamicImage, ImageReader, RgbImage};
 use std::path::Path;
@@ -11,6 +13,8 @@ const BRANDS: [&[u8]; 10] =
 
 /// Names of libheif's program: since version 1.18, and before.
 const PROGRAMS: [&str; 2] = ["heif-dec", "heif-convert"];
+/// Program of macOS, which needs no installation.
+const SIPS: &str = "sips";
 
 /// Number of bytes at the start of a file that hold its headers.
 pub(super) const HEADER_BYTES: u64 = 1 << 16;
@@ -33,27 +37,41 @@ pub(super) fn heif_size(start: &[u8]) -> Option<(u32, u32)> {
     Some(if matches!(quarter_turns, 0 | 2) { (width, height) } else { (height, width) })
 }
 
-/// Decodes the upright image of `encoded`, the contents of `file`, by libheif's program on the PATH.
+/// Decodes the upright image of `encoded`, the contents of `file`, by libheif's program on the PATH, or else on macOS by sips.
 ///
 /// # Errors
 /// Returns an error if the file is truncated or damaged, or if the program isn't installed.
 pub(super) fn decode_heif(encoded: &[u8], file: &Path) -> Result<RgbImage> {
     let undecodable = |why: String| {
-        let expected = "a JPEG or PNG, to which sips converts it, or libheif on the PATH (Debian and Ubuntu: apt install libheif-examples; \
-                        macOS: brew install libheif)";
+        let expected = "a JPEG or PNG, or libheif on the PATH (Debian and Ubuntu: apt install libheif-examples; macOS: brew install libheif)";
         Error::input(file, "the image", format!("undecodable ({why})"), expected)
     };
     let not_given = |e: std::io::Error| undecodable(format!("it can't be given to libheif: {e}"));
     let folder = tempfile::tempdir().map_err(not_given)?;
-    let [heif, png] = ["photo.heif", "photo.png"].map(|name| folder.path().join(name));
+    let [heif, png, jpeg] = ["photo.heif", "photo.png", "photo.jpg"].map(|name| folder.path().join(name));
     std::fs::write(&heif, encoded).map_err(not_given)?;
-    let run = |program| Command::new(program).args([&heif, &png]).stdin(Stdio::null()).output();
-    let output = run(PROGRAMS[0]).or_else(|_| run(PROGRAMS[1])).map_err(|e| {
+    let run = |program| {
+        let mut command = Command::new(program);
+        match program == SIPS {
+            true => {
+                let format = ["-s", "format", "jpeg", "-s", "formatOptions", "best"];
+                command.args(format).arg(&heif).arg("--out").arg(&jpeg)
+            }
+            false => command.args([&heif, &png]),
+        };
+        command.stdin(Stdio::null()).output()
+    };
+    let of_system = |why| if cfg!(target_os = "macos") { run(SIPS) } else { Err(why) };
+    let output = run(PROGRAMS[0]).or_else(|_| run(PROGRAMS[1])).or_else(of_system).map_err(|e| {
         undecodable(match is_program_missing(&e) {
             true => "libheif isn't on the PATH".to_string(),
             false => format!("libheif can't be started: {e}"),
         })
     })?;
+    // sips writes the orientation into a JPEG's EXIF data; libheif turns the pixels.
+    if let Ok(encoded) = std::fs::read(&jpeg) {
+        return Ok(decode_upright(&encoded, file)?.pixels);
+    }
     let decode = |mut reader: ImageReader<_>| {
         reader.no_limits();
         reader.decode().ok()

@@ -10,7 +10,7 @@ use globalsplat_capture::{Capture, Result, open_capture};
 use globalsplat_test_kit::formats::{HEIGHT, WIDTH, cameras, in_images, names, transforms};
 use image::{Rgb, RgbImage};
 use serde_json::Value;
-use std::path::Path;
+use std::path::{MAIN_SEPARATOR_STR, Path};
 use tempfile::TempDir;
 
 /// Writes photos called `names`, whose pixels differ from photo to photo.
@@ -42,7 +42,7 @@ fn open_transforms(folder: &Path, change: impl FnOnce(&mut Value)) -> Result<Cap
 /// Asserts that `result` is an error whose message contains all of `parts`.
 #[track_caller]
 fn assert_refused<T>(result: Result<T>, parts: &[&str]) {
-    let error = result.err().expect("an error").to_string();
+    let error = result.err().expect("an error").to_string().replace(MAIN_SEPARATOR_STR, "/");
     parts.iter().for_each(|part| assert!(error.contains(part), "{part:?} is not in: {error}"));
 }
 
@@ -50,6 +50,7 @@ fn assert_refused<T>(result: Result<T>, parts: &[&str]) {
 #[track_caller]
 fn assert_warns(capture: &Capture, parts: &[&str]) {
     let [line] = capture.warnings() else { panic!("{:?}", capture.warnings()) };
+    let line = line.replace(MAIN_SEPARATOR_STR, "/");
     parts.iter().for_each(|part| assert!(line.contains(part), "{part:?} is not in: {line}"));
     assert!(!line.contains('\n'), "{line}");
 }

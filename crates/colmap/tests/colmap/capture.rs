@@ -3,12 +3,10 @@
 use crate::{failing_colmap, has_ffmpeg, make, write_noise};
 use globalsplat_colmap::{CaptureOptions, Colmap, Progress, Step, make_capture};
 use globalsplat_files::FolderLock;
+#[cfg(unix)]
 use globalsplat_test_kit::rerun_test;
 use serde_json::{Value, json};
-use std::ffi::OsStr;
 use std::fs;
-use std::os::unix::ffi::OsStrExt;
-use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::process::Command;
 
@@ -63,13 +61,21 @@ fn bad_requests_are_refused_in_one_sentence() {
         let options = CaptureOptions { camera_model: camera_model.map(String::from), ..Default::default() };
         let error = make(&at(source), &at(out), &options, &failing_colmap()).unwrap_err();
         assert!(error.is_invalid_request(), "{error}");
-        let error = error.to_string().replace(&format!("{}/", folder.path().display()), "");
+        let error = error.to_string().replace('\\', "/");
+        let error = error.replace(&format!("{}/", folder.path().display()).replace('\\', "/"), "");
         assert!(error.starts_with(expected), "{error}");
     }
     assert!(!at("out").exists());
-    let latin_1 = folder.path().join(OsStr::from_bytes(b"caf\xe9"));
-    let error = make(&at("photos"), &latin_1, &CaptureOptions::default(), &failing_colmap()).unwrap_err();
-    assert!(error.is_invalid_request() && error.to_string().contains("a path that isn't UTF-8"), "{error}");
+    #[cfg(unix)]
+    {
+        use std::os::unix::ffi::OsStrExt;
+        let latin_1 = folder.path().join(std::ffi::OsStr::from_bytes(b"caf\xe9"));
+        let error = make(&at("photos"), &latin_1, &CaptureOptions::default(), &failing_colmap()).unwrap_err();
+        assert!(
+            error.is_invalid_request() && error.to_string().contains("a path that isn't UTF-8"),
+            "{error}"
+        );
+    }
     let error = Colmap::at(Path::new("/no/such/python3")).unwrap_err();
     assert!(error.is_invalid_request());
     let expected = "/no/such/python3: the program is a Python without pycolmap, expected a colmap program or a Python with pycolmap \
@@ -154,6 +160,7 @@ fn a_capture_is_made_by_one_process_at_a_time() {
 }
 
 /// Modules and environments in the working folder may be anybody's.
+#[cfg(unix)]
 #[test]
 fn nothing_in_the_working_folder_is_run() {
     const NAME: &str = "capture::nothing_in_the_working_folder_is_run";
@@ -183,7 +190,7 @@ fn nothing_in_the_working_folder_is_run() {
     }
     for python in [".venv/bin/python", "bin/python"] {
         let python = write(python, &format!("#!/bin/sh\ntouch {}/was_run\n", folder.path().display()));
-        fs::set_permissions(python, fs::Permissions::from_mode(0o755)).unwrap();
+        fs::set_permissions(python, std::os::unix::fs::PermissionsExt::from_mode(0o755)).unwrap();
     }
     let (library, empty) = (folder.path().join("lib"), Path::new(""));
     let variables = [

@@ -32,7 +32,8 @@ fn make(source: &Path, out: &Path, options: &CaptureOptions, colmap: &Colmap) ->
 
 /// Returns a COLMAP whose commands all fail.
 fn failing_colmap() -> Colmap {
-    Colmap::at(&Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/colmap")).unwrap()
+    let name = if cfg!(windows) { "colmap.bat" } else { "colmap" };
+    Colmap::at(&Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)).unwrap()
 }
 
 /// Returns `true` if there is an ffmpeg with ffprobe; otherwise, skips the test.
