@@ -1,5 +1,5 @@
-//! Sets the rpath with which the binary, tests and examples find libtorch, and embeds the viewer of the HTML pages in the
-//! binary.
+//! Sets the rpath with which the binary, tests and examples find libtorch, which `GLOBALSPLAT_RPATH` overrides for a program that is moved,
+//! and embeds the viewer of the HTML pages in the binary.
 
 use std::env;
 use std::fs;
@@ -7,7 +7,9 @@ use std::path::Path;
 
 fn main() {
     let lib = env::var("DEP_GLOBALSPLAT_LIBTORCH_LIB").expect("globalsplat-csrc tells where libtorch is");
+    let lib = env::var("GLOBALSPLAT_RPATH").unwrap_or(lib);
     println!("cargo::rustc-link-arg=-Wl,-rpath,{lib}");
+    println!("cargo::rerun-if-env-changed=GLOBALSPLAT_RPATH");
     println!("cargo::rerun-if-changed=build.rs");
 
     // Bundle that scripts/setup.sh builds if npm is available.

@@ -76,6 +76,10 @@ fn main() {
     for folder in nvidia(&libtorch) {
         torch.flag("-isystem").flag(folder);
     }
+    if env::var("CARGO_CFG_TARGET_OS").is_ok_and(|system| system == "macos") {
+        // libtorch's symbols are those of Clang 17 or older, and newer ones name some templates in another way.
+        torch.flag_if_supported("-fclang-abi-compat=17");
+    }
     torch
         .std("c++17")
         // libtorch is compiled with NDEBUG: without it some of its classes have more fields here than there.

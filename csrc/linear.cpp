@@ -16,7 +16,11 @@
 #include "runtime.h"
 
 // Of MKL, which libtorch has on Intel's and compatible processors, and null elsewhere. Returns the number that this thread had before.
+#if defined(__x86_64__)
 extern "C" __attribute__((weak)) int MKL_Set_Num_Threads_Local(int count);
+#else
+constexpr int (*MKL_Set_Num_Threads_Local)(int) = nullptr;
+#endif
 
 namespace globalsplat {
 namespace {

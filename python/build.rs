@@ -1,9 +1,11 @@
-//! Lets the linker of macOS leave the symbols of Python open, which the interpreter defines when it loads the module.
+//! Lets the linker of macOS leave the symbols of Python open, which the interpreter defines when it loads the module, and sets where the module
+//! looks for libtorch there: in the torch beside this package.
 
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");
     if std::env::var("CARGO_CFG_TARGET_OS").is_ok_and(|system| system == "macos") {
         println!("cargo::rustc-cdylib-link-arg=-undefined");
         println!("cargo::rustc-cdylib-link-arg=dynamic_lookup");
+        println!("cargo::rustc-cdylib-link-arg=-Wl,-rpath,@loader_path/../torch/lib");
     }
 }

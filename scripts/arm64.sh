@@ -124,16 +124,22 @@ print(f'${pair}: {native:.3f} and {arm64:.3f} dB')
 sys.exit(abs(native - arm64) > 0.05)" || fail "the splats of $pair differ in PSNR"
 done
 
-step "the splat op in Python"
-package="$out/python/globalsplat"
-rm -rf "$package"
-mkdir -p "$package"
-ln -s "$PWD"/python/globalsplat/* "$PWD/parity/reference" "$package/"
-ln -s "$out/build/$target/release/lib_native.so" "$package/_native.abi3.so"
-aarch64-linux-gnu-gcc -o "$out/python/python" -x c - -x none "$libpython" <<'C'
+step "the wheel, installed for the Python of ARM64"
+# CMake packs what is built already.
+"$python" -m pip install --quiet --disable-pip-version-check -r requirements-dist.txt
+installed="$out/installed"
+rm -rf "$out/wheels" "$installed"
+CARGO="$(command -v true)" CARGO_TARGET_DIR="$out/build/$target" LIBTORCH="$site/torch" _PYTHON_HOST_PLATFORM=linux-aarch64 \
+    quietly "$python" -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir "$out/wheels" \
+    --config-settings=cmake.define.STRIP="$(command -v aarch64-linux-gnu-strip)" --config-settings=build-dir="$out/wheel" ./python
+"$python" -m pip install --quiet --disable-pip-version-check --no-deps --no-index --target "$installed" --only-binary=:all: \
+    --platform linux_aarch64 "$out"/wheels/*.whl
+refused="$(PYTHONPATH="$installed" "$python" -P -m globalsplat doctor 2>&1)" && fail "the program of ARM64 runs here"
+[[ $refused == "globalsplat: globalsplat was compiled for linux_aarch64, and this Python is for "* ]] || fail "another processor is refused with: $refused"
+aarch64-linux-gnu-gcc -o "$out/python3" -x c - -x none "$libpython" <<'C'
 int Py_BytesMain(int, char **);
 int main(int count, char **arguments) { return Py_BytesMain(count, arguments); }
 C
-PYTHONHOME=/usr PYTHONPATH="$out/python:$site" GLOBALSPLAT_PACKAGE="$out/python" qemu-aarch64 "$out/python/python" -P -m pytest -q \
+PYTHONHOME=/usr PYTHONPATH="$installed:$site" GLOBALSPLAT_PACKAGE="$installed" qemu-aarch64 "$out/python3" -P -m pytest -q \
     -p no:cacheprovider python/tests/test_rasterization.py
 step "done"

@@ -3,10 +3,22 @@
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
+    #[cfg(target_os = "macos")]
+    limit_spinning();
     globalsplat::main()
 }
 
-/// Lets OpenMP's threads sleep after a tenth of a millisecond of waiting instead of several, unless the user has set how they wait: while they
+/// Lets the threads of LLVM's OpenMP, which libtorch has on macOS, sleep after a millisecond of waiting instead of 200, unless the user has set
+/// how they wait. It reads its environment when it is first used.
+#[cfg(target_os = "macos")]
+fn limit_spinning() {
+    if ["KMP_BLOCKTIME", "OMP_WAIT_POLICY"].iter().all(|name| std::env::var_os(name).is_none()) {
+        // SAFETY: no other thread runs yet.
+        unsafe { std::env::set_var("KMP_BLOCKTIME", "1") };
+    }
+}
+
+/// Lets the threads of GNU's OpenMP sleep after a tenth of a millisecond of waiting instead of several, unless the user has set how they wait: while they
 /// spin, our own kernels and other processes lack their cores (docs/robustness.md).
 ///
 /// OpenMP reads its environment when it is loaded. Functions in `.preinit_array` run before that, but can't change the environment, so the

@@ -1,3 +1,9 @@
+// macOS declares the functions of <ucontext.h> to programs of the X/Open standard alone.
+#if defined(__APPLE__)
+#define _XOPEN_SOURCE 700
+#define _DARWIN_C_SOURCE
+#endif
+
 #include "emulator.h"
 
 #include <ucontext.h>

@@ -8,6 +8,7 @@ use crate::render::cpu::simd_level;
 use serde::{Deserialize, Serialize};
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 use tch::Device;
 
 /// Scores of one method (a model, given splats or given images) on the scenes of one index. [`DatasetEvaluation`](super::DatasetEvaluation)
@@ -258,15 +259,24 @@ pub fn read_evaluation(folder: &Path) -> Result<Evaluation> {
 /// # Errors
 /// Fails if `GLOBALSPLAT_SIMD` names a SIMD level that this machine doesn't have.
 pub(super) fn machine(device: Device) -> Result<String> {
-    let cpu_info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let model_name = cpu_info.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
-    let processor = model_name.map_or(std::env::consts::ARCH, |(_, name)| name.trim());
+    let processor = processor().unwrap_or(std::env::consts::ARCH.into());
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let gpu = match device {
         Device::Cpu => String::new(),
         other => format!(", {other:?}"),
     };
     Ok(format!("{processor}, {cores} cores, {}{gpu}", simd_level()?))
+}
+
+/// Returns the name of the processor, or `None` if the system doesn't tell it.
+fn processor() -> Option<String> {
+    if cfg!(target_os = "macos") {
+        let told = Command::new("/usr/sbin/sysctl").args(["-n", "machdep.cpu.brand_string"]).output().ok()?;
+        return Some(String::from_utf8(told.stdout).ok()?.trim().to_string()).filter(|name| !name.is_empty());
+    }
+    let cpu_info = std::fs::read_to_string("/proc/cpuinfo").ok()?;
+    let (_, name) = cpu_info.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'))?;
+    Some(name.trim().to_string())
 }
 
 #[cfg(test)]

@@ -98,6 +98,7 @@ fn kernels_are_compiled_once() {
     run("kept");
 }
 
+#[cfg(target_os = "linux")]
 #[test]
 fn doctor_reports_missing_libraries() {
     let driver = fake_driver();

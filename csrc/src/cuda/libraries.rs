@@ -2,8 +2,7 @@
 
 use super::Result;
 use libloading::os::unix::{Library, RTLD_GLOBAL, RTLD_LAZY};
-use std::ffi::{CStr, c_char, c_int, c_uint, c_void};
-use std::os::unix::ffi::OsStrExt;
+use std::ffi::{c_char, c_int, c_uint, c_void};
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
@@ -130,8 +129,16 @@ fn folders() -> Vec<PathBuf> {
     folders
 }
 
-/// Returns the folder of the libtorch that is loaded into this process.
+/// Returns the folder of the libtorch that is loaded into this process, or `None` on a system whose libtorch has no part for NVIDIA's GPUs.
+#[cfg(not(target_os = "linux"))]
 fn libtorch_folder() -> Option<PathBuf> {
+    None
+}
+
+#[cfg(target_os = "linux")]
+fn libtorch_folder() -> Option<PathBuf> {
+    use std::ffi::{CStr, OsStr};
+    use std::os::unix::ffi::OsStrExt;
     let mut origin = [0; libc::PATH_MAX as usize];
     // SAFETY: the library is only looked up, not loaded, and the path fits into the buffer.
     let found = unsafe {
@@ -141,9 +148,7 @@ fn libtorch_folder() -> Option<PathBuf> {
     };
     // SAFETY: dlinfo has terminated the string with a 0.
     let origin = || unsafe { CStr::from_ptr(origin.as_ptr()) };
-    found
-        .then(|| PathBuf::from(std::ffi::OsStr::from_bytes(origin().to_bytes())).canonicalize().ok())
-        .flatten()
+    found.then(|| PathBuf::from(OsStr::from_bytes(origin().to_bytes())).canonicalize().ok()).flatten()
 }
 
 /// Loads NVRTC from a folder, preceded by its builtins library, which it opens by name only. The file is called libnvrtc.so.13 in wheels
