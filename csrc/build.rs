@@ -129,7 +129,7 @@ fn main() {
     }
     for entry in fs::read_dir(".").expect("this folder is there") {
         let path = entry.expect("it can be listed").path();
-        if path.extension().is_none_or(|ending| ending != "md") {
+        if path.extension().is_none_or(|ending| ending != "md" && ending != "o") {
             println!("cargo::rerun-if-changed={}", path.display());
         }
     }

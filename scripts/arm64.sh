@@ -13,13 +13,8 @@ out="$PWD/target/arm64"
 python=.venv/bin/python
 mkdir -p "$out"
 
-# Something is missing: among other tests that may be skipped, this is counted, otherwise it is an error.
-refuse() {
-    echo "arm64: $*" >&2
-    [ -n "${GLOBALSPLAT_SKIPPED:-}" ] && [ -z "${GLOBALSPLAT_NO_SKIPS:-}" ] || exit 2
-    echo "cross-compilation for ARM64" >>"$GLOBALSPLAT_SKIPPED"
-    exit 0
-}
+. scripts/skip.sh
+refuse() { skip arm64 "cross-compilation for ARM64" "$*"; }
 for tool in aarch64-linux-gnu-g++ qemu-aarch64; do
     command -v "$tool" >/dev/null || refuse "$tool is missing: apt install g++-aarch64-linux-gnu qemu-user"
 done
@@ -129,13 +124,15 @@ step "the wheel, installed for the Python of ARM64"
 "$python" -m pip install --quiet --disable-pip-version-check -r requirements-dist.txt
 installed="$out/installed"
 rm -rf "$out/wheels" "$installed"
-CARGO="$(command -v true)" CARGO_TARGET_DIR="$out/build/$target" LIBTORCH="$site/torch" _PYTHON_HOST_PLATFORM=linux-aarch64 \
+CARGO="$(command -v true)" CARGO_TARGET_DIR="$out/build/$target" LIBTORCH="$site/torch" \
     quietly "$python" -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir "$out/wheels" \
-    --config-settings=cmake.define.STRIP="$(command -v aarch64-linux-gnu-strip)" --config-settings=build-dir="$out/wheel" ./python
+    --config-settings=wheel.tags=cp310-abi3-linux_aarch64 --config-settings=build-dir="$out/wheel" \
+    --config-settings=cmake.define.STRIP="$(command -v aarch64-linux-gnu-strip)" ./python
 "$python" -m pip install --quiet --disable-pip-version-check --no-deps --no-index --target "$installed" --only-binary=:all: \
     --platform linux_aarch64 "$out"/wheels/*.whl
-refused="$(PYTHONPATH="$installed" "$python" -P -m globalsplat doctor 2>&1)" && fail "the program of ARM64 runs here"
-[[ $refused == "globalsplat: globalsplat was compiled for linux_aarch64, and this Python is for "* ]] || fail "another processor is refused with: $refused"
+message="$(PYTHONPATH="$installed" "$python" -P -m globalsplat doctor 2>&1)" && fail "the program of ARM64 runs here"
+[[ $message == "globalsplat: globalsplat was compiled for linux_aarch64, and this is linux on "* ]] ||
+    fail "another processor is refused with: $message"
 aarch64-linux-gnu-gcc -o "$out/python3" -x c - -x none "$libpython" <<'C'
 int Py_BytesMain(int, char **);
 int main(int count, char **arguments) { return Py_BytesMain(count, arguments); }

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Builds the wheel of the Python package in python/ into target/wheels: for every Linux with glibc 2.28, or for macOS 11.
+# Builds the wheel of the Python package in python/ into target/wheels, for every Linux with glibc 2.28. The branch for
+# macOS 11 is untested.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 target="${CARGO_TARGET_DIR:-target}"
@@ -10,11 +11,12 @@ rm -rf "$target/wheels"
 build_wheel() { .venv/bin/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir "$1" ./python; }
 # quietly COMMAND…: prints what the command said only if it fails.
 quietly() {
-    local said
-    said="$("$@" 2>&1)" || { echo "wheel: $(tail -n 1 <<<"$said")" >&2; exit 1; }
+    local output
+    output="$("$@" 2>&1)" || { echo "wheel: $(tail -n 1 <<<"$output")" >&2; exit 1; }
 }
 if [ "$(uname)" = Darwin ]; then
-    MACOSX_DEPLOYMENT_TARGET=11.0 build_wheel "$target/wheels"
+    # Apart from the program of `make build`, which looks for libtorch elsewhere.
+    CARGO_TARGET_DIR="$(realpath "$target")/wheel-macos" MACOSX_DEPLOYMENT_TARGET=11.0 build_wheel "$target/wheels"
 else
     # The build of the wheel takes the program from here, and links the native module by the same `cc`.
     scripts/build_for_glibc.sh

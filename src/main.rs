@@ -8,8 +8,8 @@ fn main() -> ExitCode {
     globalsplat::main()
 }
 
-/// Lets the threads of LLVM's OpenMP, which libtorch has on macOS, sleep after a millisecond of waiting instead of 200, unless the user has set
-/// how they wait. It reads its environment when it is first used.
+/// Lets the threads of LLVM's OpenMP, which libtorch has on macOS, sleep after a millisecond of waiting instead of 200, unless the user
+/// has set how they wait. It reads its environment when it is first used.
 #[cfg(target_os = "macos")]
 fn limit_spinning() {
     if ["KMP_BLOCKTIME", "OMP_WAIT_POLICY"].iter().all(|name| std::env::var_os(name).is_none()) {

@@ -10,7 +10,7 @@ The parts are imported when they are first used, so that the command line progra
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from ._requirements import torch_folder as _torch_folder
+from ._requirements import check_requirements as _check_requirements
 
 if TYPE_CHECKING:
     from ._models import Model as Model
@@ -49,7 +49,7 @@ __all__ = sorted(_MODULES)
 def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    _torch_folder()  # raises an error before anything is loaded that was compiled for another PyTorch
+    _check_requirements()  # before anything is loaded that was compiled for them
     value = getattr(importlib.import_module(f".{_MODULES[name]}", __name__), name)
     globals()[name] = value
     return value

@@ -4,12 +4,13 @@ import os
 import sys
 from pathlib import Path
 
-from ._requirements import torch_folder
+from ._requirements import check_requirements, torch_folder
 
 
 def main() -> None:
     """Replaces this process with the program `globalsplat`, with the same arguments."""
     try:
+        check_requirements()
         libraries = torch_folder() / "lib"
     except ImportError as error:
         sys.exit(f"globalsplat: {error}")

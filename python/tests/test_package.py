@@ -3,9 +3,9 @@
 import importlib.metadata
 import math
 import os
+import platform
 import subprocess
 import sys
-import sysconfig
 import tomllib
 from pathlib import Path
 
@@ -97,15 +97,13 @@ def test_another_torch_is_refused_before_anything_is_loaded(tmp_path):
 def test_another_platform_is_refused_before_anything_is_loaded(tmp_path):
     installed = Path(globalsplat.__file__).parent
     (tmp_path / "globalsplat").symlink_to(installed)
-    for made_for in ("manylinux_2_28_riscv64", "macosx_11_0_arm64"):
+    system = "macosx" if sys.platform == "darwin" else sys.platform
+    for tag in ("manylinux_2_28_riscv64", f"win_{platform.machine()}"):
         metadata = tmp_path / f"globalsplat-{globalsplat.__version__}.dist-info"
         metadata.mkdir(exist_ok=True)
         (metadata / "METADATA").write_text(f"Name: globalsplat\nVersion: {globalsplat.__version__}\n")
-        (metadata / "WHEEL").write_text(f"Wheel-Version: 1.0\nTag: cp310-abi3-{made_for}\n")
-        expected = (
-            f"globalsplat was compiled for {made_for}, and this Python is for {sysconfig.get_platform()}: "
-            "pip install --force-reinstall globalsplat"
-        )
+        (metadata / "WHEEL").write_text(f"Wheel-Version: 1.0\nTag: cp310-abi3-{tag}\n")
+        expected = f"globalsplat was compiled for {tag}, and this is {system} on {platform.machine()}: install the wheel for it"
         assert_refused(expected, {**os.environ, "PYTHONPATH": str(tmp_path)})
 
 

@@ -259,7 +259,7 @@ pub fn read_evaluation(folder: &Path) -> Result<Evaluation> {
 /// # Errors
 /// Fails if `GLOBALSPLAT_SIMD` names a SIMD level that this machine doesn't have.
 pub(super) fn machine(device: Device) -> Result<String> {
-    let processor = processor().unwrap_or(std::env::consts::ARCH.into());
+    let processor = read_processor_name().unwrap_or(std::env::consts::ARCH.into());
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let gpu = match device {
         Device::Cpu => String::new(),
@@ -269,10 +269,12 @@ pub(super) fn machine(device: Device) -> Result<String> {
 }
 
 /// Returns the name of the processor, or `None` if the system doesn't tell it.
-fn processor() -> Option<String> {
+fn read_processor_name() -> Option<String> {
     if cfg!(target_os = "macos") {
-        let told = Command::new("/usr/sbin/sysctl").args(["-n", "machdep.cpu.brand_string"]).output().ok()?;
-        return Some(String::from_utf8(told.stdout).ok()?.trim().to_string()).filter(|name| !name.is_empty());
+        let output =
+            Command::new("/usr/sbin/sysctl").args(["-n", "machdep.cpu.brand_string"]).output().ok()?;
+        return Some(String::from_utf8(output.stdout).ok()?.trim().to_string())
+            .filter(|name| !name.is_empty());
     }
     let cpu_info = std::fs::read_to_string("/proc/cpuinfo").ok()?;
     let (_, name) = cpu_info.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'))?;

@@ -90,15 +90,16 @@ pub fn masked_ssim(image: &Tensor, ground_truth: &Tensor, mask: Option<&Tensor>)
         loss::ssim(&image, &ground_truth).double_value(&[]) * count as f64
     };
     let whole = bands(rows, size[2]).map(weighted).sum::<f64>() / rows as f64;
-    mask.map_or(whole, |mask| 1. - (1. - whole) / mean_weight_of_windows(mask))
+    mask.map_or(whole, |mask| 1. - (1. - whole) / fraction_of_windows(mask))
 }
 
-/// Returns the mean over SSIM's windows of the largest weight of a mask `[1, H, W]` in each.
-fn mean_weight_of_windows(mask: &Tensor) -> f64 {
-    let largest = [[SSIM_WINDOW, 1], [1, SSIM_WINDOW]]
+/// Returns the fraction of SSIM's windows that have a pixel that counts by `mask` `[1, H, W]`.
+fn fraction_of_windows(mask: &Tensor) -> f64 {
+    let counts = mask.gt(0.).to_kind(Kind::Float);
+    let windows = [[SSIM_WINDOW, 1], [1, SSIM_WINDOW]]
         .into_iter()
-        .fold(mask.clamp(0., 1.), |mask, window| mask.max_pool2d(window, [1, 1], [0, 0], [1, 1], false));
-    largest.mean(Kind::Double).double_value(&[])
+        .fold(counts, |counts, window| counts.max_pool2d(window, [1, 1], [0, 0], [1, 1], false));
+    windows.mean(Kind::Double).double_value(&[])
 }
 
 /// Returns the mean weight of a mask `[1, H, W]`, with values clamped to [0, 1].
@@ -139,15 +140,17 @@ mod tests {
         assert!((masked_psnr(&image, &truth, Some(&mask)) - expected).abs() < 1e-5);
         let ssim_of = |image: &Tensor| masked_ssim(image, &truth, Some(&mask));
         let (before, filled) = (ssim_of(&image), fill_masked(&image, &truth, &mask));
-        // Of 22 rows of windows, the first 6 lie in the masked half, 8 reach the weights of ⅓, and 8 those of 1.
-        let expected = 1. - (1. - masked_ssim(&filled, &truth, None)) / ((8. / 3. + 8.) / 22.);
+        // Of 22 rows of windows, the first 6 lie in the masked half.
+        let expected = 1. - (1. - masked_ssim(&filled, &truth, None)) / (16. / 22.);
         assert!((before - expected).abs() < 1e-6, "{before}, expected {expected}");
         // A single pixel counts, and 121 windows see it.
         let [dark, light] = [0., 1.].map(|value| Tensor::full([3, 32, 24], value, options));
         let pixel = mask.zeros_like();
         let _ = pixel.narrow(1, 15, 1).narrow(2, 12, 1).fill_(1.);
-        let similarity = masked_ssim(&dark, &light, Some(&pixel));
-        assert!((-1. ..1.).contains(&similarity), "{similarity}");
+        for mask in [pixel, mask.ones_like() * 0.1] {
+            let similarity = masked_ssim(&dark, &light, Some(&mask));
+            assert!((-1. ..1.).contains(&similarity), "{similarity}");
+        }
         let _ = image.narrow(1, 0, 16).zero_();
         assert_eq!(ssim_of(&image), before);
         assert!((ssim_of(&truth) - 1.).abs() < 1e-9);

@@ -1,6 +1,5 @@
 //! GPU kernels, as far as they can be tested without a GPU.
 
-use crate::common::program::run_process;
 use crate::common::{rerun_test, skip};
 use globalsplat::render::cuda::{CodeFormat, Driver, Nvrtc, cache_folder, load_kernels};
 use std::path::Path;
@@ -101,6 +100,7 @@ fn kernels_are_compiled_once() {
 #[cfg(target_os = "linux")]
 #[test]
 fn doctor_reports_missing_libraries() {
+    use crate::common::program::run_process;
     let driver = fake_driver();
     let doctor = |error: &str| {
         let mut doctor = Command::new(env!("CARGO_BIN_EXE_globalsplat"));

@@ -162,6 +162,8 @@ pub(crate) fn import_photos(
         }
     }
     let is_in_place = is_same_file(source, images);
+    // Where the file system ignores case, another spelling leads to the same folder.
+    fs::create_dir_all(images).map_err(Error::write(images))?;
     let ignores_case = is_same_file(images, &images.with_file_name("IMAGES"));
     let (mut names, mut unmasked) = (HashSet::new(), vec![]);
     let (mut done, large) = (skipped.len(), Mutex::new(()));
@@ -256,7 +258,8 @@ fn write_masks(out: &Path, record: &mut Record, masks: Vec<(Photo, Vec<u8>, Opti
 }
 
 /// Returns a name that COLMAP's lists can hold, and that differs from `taken`, to which it is added; `ignores_case` if the file system takes
-/// `A.jpg` and `a.jpg` for one. White space ends a name, a `#` at its start a comment, and a `\` becomes a `/`.
+/// `A.jpg` and `a.jpg` for one. Replaced by `_` are white space, which ends a name there, a `#` at the start, which begins a comment, and a `\`,
+/// which COLMAP takes for a `/`.
 fn list_name(name: String, taken: &mut HashSet<String>, ignores_case: bool) -> String {
     let mut safe = name.replace(|c: char| c.is_whitespace() || c.is_control() || c == '\\', "_");
     if safe.starts_with('#') {

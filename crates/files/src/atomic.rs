@@ -334,8 +334,9 @@ mod tests {
             (at("socket"), "a socket"),
             (at("below"), "a folder"),
             ("/dev/null".into(), "a device"),
-            ("/proc/self/exe".into(), "an open file of a process"),
             (at("loop"), "can't be written"),
+            #[cfg(target_os = "linux")]
+            ("/proc/self/exe".into(), "an open file of a process"),
         ] {
             for error in [check_writable_file(&path).unwrap_err(), write_file(&path, "new").unwrap_err()] {
                 assert!(error.to_string().contains(found), "{error}");
@@ -361,10 +362,8 @@ mod tests {
         assert!(error.contains("room.ply") && error.contains("can't be written"), "{error}");
         drop(in_use);
         assert_eq!((names(root.path()), fs::read(&file).unwrap()), (vec!["room.ply".into()], b"old".into()));
-        // Names of devices, with which no file can be made.
-        for name in ["NUL", "con"] {
-            assert!(check_writable_file(&root.path().join(name)).unwrap_err().is_invalid_request(), "{name}");
-        }
+        // The name of a device.
+        assert!(check_writable_file(&root.path().join("NUL")).unwrap_err().is_invalid_request());
     }
 
     #[cfg(unix)]

@@ -129,12 +129,13 @@ fn folders() -> Vec<PathBuf> {
     folders
 }
 
-/// Returns the folder of the libtorch that is loaded into this process, or `None` on a system whose libtorch has no part for NVIDIA's GPUs.
+/// Returns `None`: libtorch has no part for NVIDIA's GPUs on this system.
 #[cfg(not(target_os = "linux"))]
 fn libtorch_folder() -> Option<PathBuf> {
     None
 }
 
+/// Returns the folder of the libtorch that is loaded into this process.
 #[cfg(target_os = "linux")]
 fn libtorch_folder() -> Option<PathBuf> {
     use std::ffi::{CStr, OsStr};

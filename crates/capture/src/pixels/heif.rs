@@ -4,6 +4,7 @@
 use super::codec::decode_upright;
 use globalsplat_files::{Error, Result, is_program_missing};
 use image::{DynamicImage, ImageReader, RgbImage};
+use std::io;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
@@ -46,7 +47,7 @@ pub(super) fn decode_heif(encoded: &[u8], file: &Path) -> Result<RgbImage> {
         let expected = "a JPEG or PNG, or libheif on the PATH (Debian and Ubuntu: apt install libheif-examples; macOS: brew install libheif)";
         Error::input(file, "the image", format!("undecodable ({why})"), expected)
     };
-    let not_given = |e: std::io::Error| undecodable(format!("it can't be given to libheif: {e}"));
+    let not_given = |e: io::Error| undecodable(format!("it can't be given to a decoder: {e}"));
     let folder = tempfile::tempdir().map_err(not_given)?;
     let [heif, png, jpeg] = ["photo.heif", "photo.png", "photo.jpg"].map(|name| folder.path().join(name));
     std::fs::write(&heif, encoded).map_err(not_given)?;
@@ -59,17 +60,20 @@ pub(super) fn decode_heif(encoded: &[u8], file: &Path) -> Result<RgbImage> {
             }
             false => command.args([&heif, &png]),
         };
-        command.stdin(Stdio::null()).output()
+        Ok((if program == SIPS { SIPS } else { "libheif" }, command.stdin(Stdio::null()).output()?))
     };
-    let of_system = |why| if cfg!(target_os = "macos") { run(SIPS) } else { Err(why) };
-    let output = run(PROGRAMS[0]).or_else(|_| run(PROGRAMS[1])).or_else(of_system).map_err(|e| {
+    let run_sips = |why| if cfg!(target_os = "macos") { run(SIPS) } else { Err(why) };
+    let output = run(PROGRAMS[0]).or_else(|_| run(PROGRAMS[1])).or_else(run_sips);
+    let (name, output) = output.map_err(|e: io::Error| {
         undecodable(match is_program_missing(&e) {
             true => "libheif isn't on the PATH".to_string(),
             false => format!("libheif can't be started: {e}"),
         })
     })?;
     // sips writes the orientation into a JPEG's EXIF data; libheif turns the pixels.
-    if let Ok(encoded) = std::fs::read(&jpeg) {
+    if let Ok(encoded) = std::fs::read(&jpeg)
+        && output.status.success()
+    {
         return Ok(decode_upright(&encoded, file)?.pixels);
     }
     let decode = |mut reader: ImageReader<_>| {
@@ -81,7 +85,7 @@ pub(super) fn decode_heif(encoded: &[u8], file: &Path) -> Result<RgbImage> {
         let message = String::from_utf8_lossy(&output.stderr);
         let message = message.lines().map(str::trim).collect::<Vec<_>>().join("; ");
         undecodable(format!(
-            "libheif: {}",
+            "{name}: {}",
             if message.is_empty() { output.status.to_string() } else { message }
         ))
     })
