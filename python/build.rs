@@ -7,5 +7,7 @@ fn main() {
         println!("cargo::rustc-cdylib-link-arg=-undefined");
         println!("cargo::rustc-cdylib-link-arg=dynamic_lookup");
         println!("cargo::rustc-cdylib-link-arg=-Wl,-rpath,@loader_path/../torch/lib");
+        // Otherwise its name is the path at which it was linked.
+        println!("cargo::rustc-cdylib-link-arg=-Wl,-install_name,@rpath/_native.abi3.so");
     }
 }
