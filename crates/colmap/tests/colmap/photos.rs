@@ -89,7 +89,7 @@ fn names_of_other_systems_are_replaced() {
     // Some file systems refuse this name.
     let foreign = Path::new("photos").join(std::ffi::OsStr::from_bytes(b"z\xe9.png"));
     let is_foreign = folders.write(foreign, 9).is_ok();
-    let record = folders.import("photos", None).unwrap();
+    let mut record = folders.import("photos", None).unwrap();
     // COLMAP takes a `\` for a `/`.
     assert_eq!(names(&record), ["A.png", "a.png", "a_1.png", "_a_1.png"]);
     for skipped in record["skipped"].as_array().unwrap() {
@@ -97,6 +97,9 @@ fn names_of_other_systems_are_replaced() {
         assert!(is_foreign);
     }
     std::os::unix::fs::symlink("images", folders.at("out/IMAGES")).unwrap();
+    // As if the call had been stopped before all photos were there.
+    record["photos"] = Value::Null;
+    fs::write(folders.at("out/capture.json"), record.to_string()).unwrap();
     let record = folders.import("photos", None).unwrap();
     assert_eq!(names(&record), ["A.png", "_a.png", "a_1.png", "_a_1.png"]);
 }
