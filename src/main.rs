@@ -18,8 +18,8 @@ fn limit_spinning() {
     }
 }
 
-/// Lets the threads of GNU's OpenMP sleep after a tenth of a millisecond of waiting instead of several, unless the user has set how they wait: while they
-/// spin, our own kernels and other processes lack their cores (docs/robustness.md).
+/// Lets the threads of GNU's OpenMP sleep after a tenth of a millisecond of waiting instead of several, unless the user has set how they
+/// wait: while they spin, our own kernels and other processes lack their cores (docs/robustness.md).
 ///
 /// OpenMP reads its environment when it is loaded. Functions in `.preinit_array` run before that, but can't change the environment, so the
 /// program starts once more in the same process. If it can't, it only runs slower.

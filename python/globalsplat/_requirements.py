@@ -1,5 +1,6 @@
 """What the compiled parts of this package need, checked before any of them is loaded."""
 
+import functools
 import importlib.metadata
 import importlib.util
 import platform
@@ -10,6 +11,7 @@ from pathlib import Path
 REQUIRED = "2.11"
 
 
+@functools.cache
 def check_requirements() -> None:
     """Checks the system, the processor and PyTorch.
 
@@ -20,6 +22,7 @@ def check_requirements() -> None:
     torch_folder()
 
 
+@functools.cache
 def torch_folder() -> Path:
     """Returns the folder of the installed PyTorch without importing it.
 

@@ -1,7 +1,7 @@
 //! Datasets: many captures under one name (spec 10.8).
 
 use crate::error::{Error, Result};
-use crate::io::{InputFiles, read_text, real_path};
+use crate::io::{InputFiles, read_text, real_path, relative_name};
 use globalsplat_capture::{
     CHUNK_INDEX_FILE, Capture, Chunk, FoundCaptures, find_captures, folder_name, is_capture, open_capture,
 };
@@ -226,7 +226,7 @@ fn capture_groups(root: &Path, except: &Path) -> Result<(Vec<SceneGroup>, Vec<St
     // Folders with the same name are told apart by their paths below the root.
     let key = |folder: &Path, name: &String| match counts[name] {
         1 => name.clone(),
-        _ => folder.strip_prefix(root).unwrap_or(folder).to_string_lossy().into_owned(),
+        _ => relative_name(folder, root),
     };
     let keys: Vec<String> = folders.iter().zip(&names).map(|(folder, name)| key(folder, name)).collect();
     let group = |(path, key)| SceneGroup { path, source: Source::Folder, keys: vec![key] };

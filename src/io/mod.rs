@@ -33,7 +33,8 @@ pub use weights::{
 };
 
 pub(crate) use globalsplat_files::{
-    AppendFile, FolderLock, expand_path, read_text, real_path, replace_link, sync_dir, write_json,
+    AppendFile, FolderLock, expand_path, read_text, real_path, relative_name, replace_link, sync_dir,
+    write_json,
 };
 
 pub(crate) use event_file::{EventFile, event_files};

@@ -14,8 +14,6 @@ const BRANDS: [&[u8]; 10] =
 
 /// Names of libheif's program: since version 1.18, and before.
 const PROGRAMS: [&str; 2] = ["heif-dec", "heif-convert"];
-/// Program of macOS, which needs no installation.
-const SIPS: &str = "sips";
 
 /// Number of bytes at the start of a file that hold its headers.
 pub(super) const HEADER_BYTES: u64 = 1 << 16;
@@ -51,19 +49,18 @@ pub(super) fn decode_heif(encoded: &[u8], file: &Path) -> Result<RgbImage> {
     let folder = tempfile::tempdir().map_err(not_given)?;
     let [heif, png, jpeg] = ["photo.heif", "photo.png", "photo.jpg"].map(|name| folder.path().join(name));
     std::fs::write(&heif, encoded).map_err(not_given)?;
-    let run = |program| {
-        let mut command = Command::new(program);
-        match program == SIPS {
-            true => {
-                let format = ["-s", "format", "jpeg", "-s", "formatOptions", "best"];
-                command.args(format).arg(&heif).arg("--out").arg(&jpeg)
-            }
-            false => command.args([&heif, &png]),
-        };
-        Ok((if program == SIPS { SIPS } else { "libheif" }, command.stdin(Stdio::null()).output()?))
+    let run = |command: &mut Command| command.stdin(Stdio::null()).output();
+    let run_libheif =
+        |program| run(Command::new(program).args([&heif, &png])).map(|output| ("libheif", output));
+    let run_sips = |why| {
+        if !cfg!(target_os = "macos") {
+            return Err(why);
+        }
+        let format = ["-s", "format", "jpeg", "-s", "formatOptions", "best"];
+        run(Command::new("sips").args(format).arg(&heif).arg("--out").arg(&jpeg))
+            .map(|output| ("sips", output))
     };
-    let run_sips = |why| if cfg!(target_os = "macos") { run(SIPS) } else { Err(why) };
-    let output = run(PROGRAMS[0]).or_else(|_| run(PROGRAMS[1])).or_else(run_sips);
+    let output = run_libheif(PROGRAMS[0]).or_else(|_| run_libheif(PROGRAMS[1])).or_else(run_sips);
     let (name, output) = output.map_err(|e: io::Error| {
         undecodable(match is_program_missing(&e) {
             true => "libheif isn't on the PATH".to_string(),
