@@ -39,6 +39,7 @@ pub mod loss;
 pub mod metrics;
 pub mod model;
 pub mod optim;
+pub mod quality;
 pub mod reconstruct;
 pub mod refine;
 pub mod render;

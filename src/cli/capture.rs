@@ -1,29 +1,41 @@
 //! The command `capture`, and the captures that other commands make of photos.
 
-use super::{Output, progress, signals};
+use super::{Output, open_capture, progress, signals};
 use crate::Error;
+use crate::data;
+use crate::io::{InputFiles, check_writable_file};
+use crate::quality::{CaptureQuality, NextPhoto, Registration, Verdict, write_quality_page};
 use anyhow::Result;
 use clap::Args;
 use globalsplat_colmap::{CaptureOptions, CaptureReport, Colmap, Matching, Step, make_capture};
+use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
-/// Make a capture from a folder of photos or a video: find the camera poses, by COLMAP.
+/// Make a capture from a folder of photos or a video: find the camera poses, by COLMAP, and say what to expect of them.
 ///
 /// COLMAP is the newer of the colmap on the PATH and pycolmap, which `make poses` or `pip install pycolmap` installs;
 /// GLOBALSPLAT_COLMAP names a colmap, or a Python that has pycolmap. It runs on all cores, without a GPU and offline. Ctrl-C
 /// stops it, and the same command continues. Photos that are damaged, of a single color or identical to another are left
 /// out. Of a video, which ffmpeg reads, the sharpest frames are taken, as far apart as the picture has moved.
+///
+/// The capture is good, usable or will fail: whether photos look as the depths of others and the poses predict shows poses that
+/// are wrong, and too little parallax, blur, exposure or coverage show what a splat will suffer from.
 #[derive(Args)]
 #[command(after_help = "Examples:\n  globalsplat capture photos/room --out captures/room\n  \
     globalsplat capture walk.mp4 --frames 150 --out captures/walk\n  \
+    globalsplat capture captures/room --report room.html\n  \
     globalsplat capture photos/garden --out captures/garden --camera-model OPENCV_FISHEYE")]
 pub struct Capture {
-    /// Folder of photos that show the same scene and overlap, or a video
-    #[arg(value_name = "PHOTOS|VIDEO")]
+    /// Folder of photos that show the same scene and overlap, or a video; without --out, a capture with poses, whose quality is measured
+    #[arg(value_name = "PHOTOS|VIDEO|CAPTURE")]
     source: PathBuf,
     /// Folder for the capture: images, sparse and capture.json
     #[arg(long, value_name = "DIR")]
-    out: PathBuf,
+    out: Option<PathBuf>,
+    /// Also write a page about the quality of the capture: a map of its cameras and of what they show, the doubtful photos, and where to
+    /// take more
+    #[arg(long, value_name = "FILE.html")]
+    report: Option<PathBuf>,
     /// Number of frames to take from a video; by default one per 6 % of the picture's longer side that it moves, but 30 to 300
     #[arg(long, value_name = "N")]
     frames: Option<usize>,
@@ -43,25 +55,86 @@ pub struct Capture {
 
 impl Capture {
     pub fn run(self) -> Result<Output> {
+        self.report.iter().try_for_each(|file| check_writable_file(file))?;
+        signals::handle_stop_requests();
+        let Some(out) = &self.out else { return self.measure_capture() };
         let options = CaptureOptions {
             frames: self.frames,
-            camera_model: self.camera_model.map(|model| model.to_uppercase()),
+            camera_model: self.camera_model.as_ref().map(|model| model.to_uppercase()),
             matching: self.matching,
-            masks: self.masks,
+            masks: self.masks.clone(),
             keeps_finished: false,
         };
         if self.frames.is_some() && self.source.is_dir() {
             return Err(Error::request("--frames is for videos, and the source is a folder of photos").into());
         }
-        signals::handle_stop_requests();
         signals::end_at_request(1);
-        let report = run_make_capture(&self.source, &self.out, &options)?;
+        let report = run_make_capture(&self.source, out, &options)?;
+        let quality = self.measure_quality(&open_capture(out)?, Some(registration(&report)))?;
         let mut json = serde_json::to_value(&report)?;
-        json["out"] = self.out.to_string_lossy().into();
-        let (out, name) = (self.out.to_string_lossy(), self.out.file_name().unwrap_or("scene".as_ref()));
+        json["out"] = out.to_string_lossy().into();
+        add_quality(&mut json, &quality)?;
+        let (out, name) = (out.to_string_lossy(), out.file_name().unwrap_or("scene".as_ref()));
         let splat = Path::new(name).with_extension("ply");
         let next = ["globalsplat", "refine", "--scene", &out, "--out", &splat.to_string_lossy()];
-        Ok(Output::new(json, format!("{out}: {report}\nnext: {}", shlex::try_join(next)?)))
+        let quality = describe_quality(&quality);
+        Ok(Output::new(json, format!("{out}: {report}\n{quality}\nnext: {}", shlex::try_join(next)?)))
+    }
+
+    /// Measures the quality of the source, a capture with poses.
+    fn measure_capture(&self) -> Result<Output> {
+        let capture = open_capture(&self.source).map_err(|error| {
+            Error::request(format!("{error}; of photos or a video, --out DIR makes a capture"))
+        })?;
+        let quality = self.measure_quality(&capture, None)?;
+        let mut json = json!({ "capture": self.source.to_string_lossy() });
+        add_quality(&mut json, &quality)?;
+        Ok(Output::new(json, format!("{}: {}", self.source.display(), describe_quality(&quality))))
+    }
+
+    /// Measures the quality of `capture`, with progress on standard error, and writes the page about it.
+    fn measure_quality(
+        &self,
+        capture: &data::Capture,
+        registration: Option<Registration>,
+    ) -> Result<CaptureQuality> {
+        let mut inputs = InputFiles::default();
+        capture.add_input_files(&mut inputs);
+        self.report.iter().try_for_each(|file| inputs.check_file(file))?;
+        let bar = progress::bar(capture.len() as u64, "photos measured");
+        signals::end_at_request(2);
+        let quality = CaptureQuality::measure(capture, registration, |done| {
+            bar.set_position(done as u64);
+            !signals::is_stop_requested()
+        })?;
+        signals::end_at_request(1);
+        bar.finish_and_clear();
+        let Some(quality) = quality else { anyhow::bail!("stopped before the quality was measured") };
+        self.report.iter().try_for_each(|file| write_quality_page(file, capture, &quality))?;
+        Ok(quality)
+    }
+}
+
+/// Returns what a report says of the estimate of poses.
+fn registration(report: &CaptureReport) -> Registration {
+    let &CaptureReport { photos, registered, reprojection_error, .. } = report;
+    Registration { photos, registered, reprojection_error }
+}
+
+/// Adds the verdict and all figures to a result.
+fn add_quality(json: &mut Value, quality: &CaptureQuality) -> Result<()> {
+    json["verdict"] = serde_json::to_value(quality.verdict)?;
+    json["quality"] = serde_json::to_value(quality)?;
+    Ok(())
+}
+
+/// Describes the quality in a line, and the photos to take next in another if it isn't good.
+fn describe_quality(quality: &CaptureQuality) -> String {
+    let next: Vec<String> = quality.next_photos.iter().map(NextPhoto::to_string).collect();
+    match quality.verdict {
+        Verdict::Good => quality.to_string(),
+        _ if next.is_empty() => quality.to_string(),
+        _ => format!("{quality}\nphotos to take next: {}", next.join(", ")),
     }
 }
 

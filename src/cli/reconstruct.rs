@@ -74,6 +74,7 @@ impl Reconstruct {
             masks,
             out,
             resume: false,
+            ignore_verdict: false,
             local_origin,
             options,
             reports: Reports::default(),

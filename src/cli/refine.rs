@@ -16,6 +16,7 @@ use crate::io::{
 };
 use crate::metrics::{CaptureScores, Scores};
 use crate::model::Precision;
+use crate::quality::Verdict;
 use crate::reconstruct::spread_over_path;
 use crate::refine::{
     Budget, Correction, EvalPoint, RefineEvent, RefineLog, RefineOptions, RefineResult, RefineSession,
@@ -70,6 +71,9 @@ pub struct Refine {
     /// --seconds and --steps include those of the earlier runs
     #[arg(long)]
     pub resume: bool,
+    /// Go on with a capture whose verdict is that it will fail
+    #[arg(long)]
+    pub ignore_verdict: bool,
     #[command(flatten)]
     pub local_origin: LocalOrigin,
     #[command(flatten)]
@@ -165,6 +169,12 @@ impl Refine {
         signals::end_at_request(if matches!(init, SceneInit::Model(_)) { 1 } else { 2 });
         let gaussians = session.start()?;
         signals::end_at_request(2);
+        if let (SceneInit::Photos, Some(quality)) = (init, session.quality()) {
+            bar.bar.suspend(|| eprintln!("{}: {quality}", capture.name));
+            if quality.verdict == Verdict::WillFail && !self.ignore_verdict {
+                return Err(Error::failed("nothing is written; --ignore-verdict refines all the same").into());
+            }
+        }
         *log.borrow_mut() =
             self.reports.log.as_ref().map(|folder| RefineLog::open(folder, steps)).transpose()?;
         if self.resume {
@@ -261,6 +271,7 @@ impl Refine {
         let mut json = json!({
             "splat": out, "gaussians": count, "photos": photos, "near_duplicates": session.near_duplicates,
             "steps": steps, "seconds": ended, "begin_seconds": begun, "corrections": corrections,
+            "quality": session.quality(),
             "train": { "before": of(before, of_photos[0]), "after": of(after, of_photos[1]) },
         });
         let row = |name: String, [before, after]: [f64; 2], ssim: f64| {

@@ -3,6 +3,8 @@
 use super::{check_writable_file, encode_photo, write_file};
 use crate::error::{Error, Result};
 use crate::scene::ImageSize;
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
 use image::{Rgb, RgbImage};
 use std::path::Path;
 use tch::{Kind, Tensor};
@@ -29,6 +31,15 @@ pub fn rgb_from_tensor(image: &Tensor) -> Result<RgbImage> {
     let bytes = Vec::<u8>::try_from(bytes.flatten(0, -1)).map_err(Error::external)?;
     RgbImage::from_raw(width as u32, height as u32, bytes)
         .ok_or_else(|| Error::failed("the number of pixels doesn't match the image size"))
+}
+
+/// Returns the URL that has a tensor [3, H, W] or [H, W] (gray) with values in [0, 1] in itself, as a JPEG.
+///
+/// # Errors
+/// Returns an error for another shape, or a size that JPEG doesn't support.
+pub fn jpeg_data_url(image: &Tensor) -> Result<String> {
+    let jpeg = encode_photo(&rgb_from_tensor(image)?, true)?;
+    Ok(format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg)))
 }
 
 /// Returns `true` if `path` has the extension of a PNG.

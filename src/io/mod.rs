@@ -22,8 +22,8 @@ pub use globalsplat_splat_file::{
 
 pub use globalsplat_capture::{decode_photo, encode_photo, read_image};
 pub use images::{
-    Mosaic, check_writable_png, is_png_name, rgb_from_tensor, tensor_from_rgb, tile_horizontally, tiled_size,
-    write_png,
+    Mosaic, check_writable_png, is_png_name, jpeg_data_url, rgb_from_tensor, tensor_from_rgb,
+    tile_horizontally, tiled_size, write_png,
 };
 pub use splat::{fit_splat, rounding_warning};
 pub use video::{VideoWriter, find_ffmpeg};

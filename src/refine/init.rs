@@ -6,6 +6,7 @@ use super::state::RefineState;
 use crate::data::{Capture, PhotoSize, Point, View};
 use crate::error::Result;
 use crate::io::Splat;
+use crate::quality::CaptureQuality;
 use crate::reconstruct::LoadedModel;
 use crate::render::{contributions, largest_contributions};
 use crate::scene::{Camera, RawGaussians, SH_C0};
@@ -77,6 +78,8 @@ pub struct PhotoInit {
     pub depth_maps: Vec<DepthMap>,
     /// Logarithms of the gains of red, green and blue of each photo, if exposures are to be corrected. Their mean is 0.
     pub log_exposures: Option<Vec<[f64; 3]>>,
+    /// Quality of the capture; `None` if the work was ended before all depths were known.
+    pub quality: Option<CaptureQuality>,
 }
 
 /// Creates `count` Gaussians at the depths on which the photos agree, and at `points` of the scene, if some are known. The photos are compared
@@ -90,13 +93,19 @@ pub fn gaussians_from_photos(
     side: f64,
     seed: u64,
     exposures: ExposureCorrection,
-    should_continue: impl FnMut(usize) -> bool,
+    mut should_continue: impl FnMut(usize) -> bool,
 ) -> Option<PhotoInit> {
     let photos = views.iter().map(|view| view.to_small_photo(side)).collect();
-    let PlaneSweepOutput { photos, mut depth_maps } = sweep(photos, points, should_continue);
-    if depth_maps.is_empty() {
+    let mut is_ended = false;
+    let swept = sweep(photos, points, |done| {
+        is_ended = !should_continue(done);
+        !is_ended
+    });
+    if swept.depth_maps.is_empty() {
         return None;
     }
+    let quality = (!is_ended).then(|| CaptureQuality::of_views(views, &swept));
+    let PlaneSweepOutput { photos, mut depth_maps } = swept;
     let log_exposures: Option<Vec<LogGains>> = correct_exposures(exposures, &photos, &depth_maps);
     if let Some(gains) = &log_exposures {
         for (index, map) in &mut depth_maps {
@@ -106,7 +115,7 @@ pub fn gaussians_from_photos(
     }
     let depth_maps: Vec<DepthMap> = depth_maps.into_iter().map(|(_, map)| map).collect();
     let gaussians = sample_gaussians(&depth_maps, points, count, seed);
-    Some(PhotoInit { gaussians, depth_maps, log_exposures })
+    Some(PhotoInit { gaussians, depth_maps, log_exposures, quality })
 }
 
 /// Returns at most `count` of the `known` Gaussians, on the CPU: of those that don't contradict the photos of `depth_maps`, the ones that

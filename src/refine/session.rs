@@ -16,6 +16,7 @@ use crate::device::Stopwatch;
 use crate::error::{Error, Result};
 use crate::io::Splat;
 use crate::metrics::{CaptureScores, ContactSheet, Perceptual, Scores, score_views};
+use crate::quality::CaptureQuality;
 use crate::reconstruct::{LoadedModel, Model, reconstruct, spread_over_path};
 use crate::scene::{Camera, Gaussians, LocalFrame, RawGaussians};
 use crate::stereo::DepthMap;
@@ -131,6 +132,8 @@ pub struct RefineSession<'a> {
     fingerprints: Vec<(String, u32)>,
     /// Depths of some photos, if Gaussians were created from them.
     depth_maps: Vec<DepthMap>,
+    /// Quality of the capture, if Gaussians were created from photos and all depths are known.
+    quality: Option<CaptureQuality>,
     /// Initial exposures of the photos, if they are corrected.
     log_exposures: Option<Vec<LogGains>>,
     steps: u64,
@@ -202,6 +205,7 @@ impl<'a> RefineSession<'a> {
             near_duplicates: 0,
             fingerprints: vec![],
             depth_maps: vec![],
+            quality: None,
             log_exposures: None,
             steps: 0,
             curve: vec![],
@@ -211,6 +215,12 @@ impl<'a> RefineSession<'a> {
     /// Returns the photos that the splat has to match, in the session's frame. After [`RefineSession::start`], near duplicates are removed.
     pub fn photos(&self) -> &[View] {
         &self.photos
+    }
+
+    /// Returns the quality of the capture, which [`RefineSession::start`] measures if Gaussians start from photos and there is time for all
+    /// depths.
+    pub fn quality(&self) -> Option<&CaptureQuality> {
+        self.quality.as_ref()
     }
 
     /// Returns the held-out views, in the session's frame.
@@ -524,7 +534,7 @@ impl<'a> RefineSession<'a> {
         let init =
             gaussians_from_photos(&self.photos, &points, count, side, seed, correction, should_continue);
         self.is_stopped |= is_stopped;
-        let Some(PhotoInit { gaussians, depth_maps, log_exposures }) = init else { return Ok(None) };
+        let Some(PhotoInit { gaussians, depth_maps, log_exposures, quality }) = init else { return Ok(None) };
         let is_continued = matches!(self.init, SceneInit::State(_));
         if let (Some(gains), ExposureCorrection::Auto, false) = (&log_exposures, correction, is_continued) {
             let factors = gains.as_flattened().iter().map(|gain| gain.exp());
@@ -532,7 +542,7 @@ impl<'a> RefineSession<'a> {
             let line = "the exposures of neighboring photos differ, and all are corrected";
             self.warn(&format!("{}: {line}: {min:.2} to {max:.2} times the average", self.capture.name));
         }
-        self.depth_maps = depth_maps;
+        (self.depth_maps, self.quality) = (depth_maps, quality);
         self.log_exposures = log_exposures;
         Ok(Some(gaussians.to_device(self.options.device)))
     }

@@ -113,22 +113,10 @@ impl SmallPhoto {
 
     /// Returns this photo for a comparison with one that `camera` has taken.
     pub fn compared_with(&self, camera: &Camera) -> ComparedPhoto<'_> {
-        // A pixel at inverse depth w is at rotation · ray + w · translation in this camera, up to a factor.
-        let to_this = self.camera.c2w.inverse() * camera.c2w;
-        let rotation = DMat3::from_mat4(to_this);
-        let pixels_of =
-            |k: &Intrinsics| DMat3::from_cols_array(&[k.fx, 0., 0., 0., k.fy, 0., k.cx, k.cy, 1.]);
-        let pixels = pixels_of(&self.camera.intrinsics);
-        let to_pixels = pixels * rotation * pixels_of(&camera.intrinsics).inverse();
         ComparedPhoto {
             gray: &self.gray,
             weight: self.weight.as_ref(),
-            to_pixels: [
-                to_pixels.x_axis,
-                to_pixels.y_axis,
-                to_pixels.z_axis,
-                pixels * to_this.w_axis.truncate(),
-            ],
+            to_pixels: pixels_between(camera, &self.camera),
         }
     }
 
@@ -136,6 +124,17 @@ impl SmallPhoto {
     pub fn size(&self) -> [i64; 2] {
         [i64::from(self.camera.height), i64::from(self.camera.width)]
     }
+}
+
+/// Returns the columns of the matrix that maps (column, row, 1, inverse depth) of a pixel of the camera `from` to (column · z, row · z, z) in
+/// the camera `to`.
+pub(super) fn pixels_between(from: &Camera, to: &Camera) -> [DVec3; 4] {
+    // A pixel at inverse depth w is at rotation · ray + w · translation in the other camera, up to a factor.
+    let transform = to.c2w.inverse() * from.c2w;
+    let pixels_of = |k: &Intrinsics| DMat3::from_cols_array(&[k.fx, 0., 0., 0., k.fy, 0., k.cx, k.cy, 1.]);
+    let pixels = pixels_of(&to.intrinsics);
+    let of_rays = pixels * DMat3::from_mat4(transform) * pixels_of(&from.intrinsics).inverse();
+    [of_rays.x_axis, of_rays.y_axis, of_rays.z_axis, pixels * transform.w_axis.truncate()]
 }
 
 /// Downscales images [.., 3, H, W] and their masks [.., 1, H, W] by `pool`. Colors are means over the pixels that count.

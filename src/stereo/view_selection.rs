@@ -62,6 +62,16 @@ pub fn nearest_to(index: usize, cameras: &[Camera]) -> Option<usize> {
     (0..cameras.len()).filter(|other| from(other) > NEAR_DUPLICATE).min_by(|a, b| from(a).total_cmp(&from(b)))
 }
 
+/// Returns the indices of the other cameras by [`separation`] from camera `index`, the nearest first.
+pub fn nearest_first(index: usize, cameras: &[Camera]) -> Vec<usize> {
+    let apart = separation(cameras);
+    let mut others: Vec<usize> = (0..cameras.len()).filter(|other| *other != index).collect();
+    others.sort_by(|&a, &b| {
+        apart(&cameras[a], &cameras[index]).total_cmp(&apart(&cameras[b], &cameras[index]))
+    });
+    others
+}
+
 /// Returns up to `count` indices of `cameras` by farthest-point sampling with [`separation`]. The first index is 0.
 pub fn farthest_first(cameras: &[Camera], count: usize) -> Vec<usize> {
     let apart = separation(cameras);

@@ -1,12 +1,10 @@
 //! Data about the scene that is embedded in a page.
 
 use crate::data::{Capture, load_views};
-use crate::io::{encode_photo, rgb_from_tensor};
+use crate::io::jpeg_data_url;
 use crate::render::{SplatRenderer, default_eps2d, orbit_around_gaussians};
 use crate::scene::{Camera, Gaussians, ImageSize, Intrinsics, LocalFrame, smooth_path};
 use anyhow::Result;
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
 use glam::DVec3;
 use serde_json::{Value, json};
 
@@ -78,8 +76,7 @@ fn photographed(capture: &Capture, frame: &LocalFrame) -> Result<Vec<Value>> {
     let indices = (0..count).map(|i| i * (capture.len() - 1) / (count - 1).max(1));
     let photographed = |index: usize| {
         let view = load_views(capture, &[index], shrunk(&cameras[index]))?.remove(0);
-        let jpeg = encode_photo(&rgb_from_tensor(&view.image.to_float())?, true)?;
-        let photo = format!("data:image/jpeg;base64,{}", STANDARD.encode(jpeg));
+        let photo = jpeg_data_url(&view.image.to_float())?;
         Ok(page_camera(&view.name, &frame.camera_to_local(&view.camera), Some(photo)))
     };
     indices.map(photographed).collect()

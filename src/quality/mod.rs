@@ -1,0 +1,319 @@
+//! Quality of a capture, told before the time of a refinement is spent: whether its poses fit its photos, whether the photos show enough
+//! parallax and hang together, which of them are blurred or badly exposed, and where more should be taken.
+
+mod consistency;
+mod coverage;
+mod page;
+mod photo;
+
+pub use coverage::NextPhoto;
+pub use page::write_quality_page;
+pub use photo::PhotoQuality;
+
+use crate::data::{Capture, PhotoSize, View, load_views, read_points};
+use crate::error::Result;
+use crate::stereo::{ComparablePhoto, PhotoSurface, PlaneSweepOutput, SWEEP_SIDE, SmallPhoto, sweep};
+use consistency::{Connections, Pair, compare_pairs};
+use coverage::Coverage;
+use glam::DVec3;
+use globalsplat_capture::format_names;
+use serde::Serialize;
+use std::fmt;
+
+/// Longer side in pixels at which sharpness is measured.
+const MEASURED_SIDE: u32 = 1024;
+/// Number of photos that a sentence names.
+const SHOWN_NAMES: usize = 3;
+
+/// Fractions of the pairs of photos that contradict their poses, from which on a capture is usable only, and will fail.
+const CONTRADICTING: (f64, f64) = (0.1, 0.25);
+/// Fractions of the textured patches on whose depths photos agree, below which a capture is usable only, and will fail.
+const AGREEING: (f64, f64) = (0.5, 0.25);
+/// Parallax in degrees below which a capture is usable only, and will fail.
+const PARALLAX: (f64, f64) = (2., 0.3);
+/// Fraction of the photos that may be blurred, or badly exposed, or in no group with the others.
+const MAX_DOUBTFUL: f64 = 0.2;
+/// Fractions of the photos that were registered, below which a capture is usable only, and will fail.
+const REGISTERED: (f64, f64) = (0.8, 0.3);
+/// Mean reprojection error in pixels from which on a capture is usable only.
+const REPROJECTION_ERROR: f64 = 1.5;
+/// Number of photos below which a capture is usable only.
+const FEW_PHOTOS: usize = 5;
+/// Fraction of the surfaces that fewer than three photos show, from which on a capture is usable only.
+const MAX_THIN: f64 = 0.4;
+/// Fraction of the patches that have texture, below which a capture is usable only.
+const MIN_TEXTURED: f64 = 0.1;
+
+/// What to expect of a capture.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verdict {
+    /// Nothing stands in the way of a good splat.
+    Good,
+    /// A splat will have visible faults.
+    Usable,
+    /// A splat will not look like the photos.
+    WillFail,
+}
+
+impl fmt::Display for Verdict {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str(match self {
+            Verdict::Good => "good",
+            Verdict::Usable => "usable",
+            Verdict::WillFail => "will fail",
+        })
+    }
+}
+
+/// Result of an estimate of poses, as structure from motion reports it.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Registration {
+    /// Number of photos.
+    pub photos: usize,
+    /// Number of photos that got a pose.
+    pub registered: usize,
+    /// Mean reprojection error in pixels.
+    pub reprojection_error: f64,
+}
+
+/// Quality of a capture.
+#[derive(Debug, Clone, Serialize)]
+pub struct CaptureQuality {
+    /// Verdict, the worst of all reasons.
+    pub verdict: Verdict,
+    /// Reasons why it isn't good, in sentences without a full stop, the worst first.
+    pub reasons: Vec<String>,
+    /// Result of the estimate of poses, if it is known.
+    pub registration: Option<Registration>,
+    /// Median over photos of the parallax to the farthest photo that shows the same surface, in degrees.
+    pub parallax: f64,
+    /// Fraction of the photos' patches that have texture.
+    pub textured: f64,
+    /// Fraction of the textured patches on whose depths the plane sweep's photos agree.
+    pub agreeing: f64,
+    /// Fraction of the pairs of photos with a common surface that don't look alike there, as one photo's depths and the poses predict.
+    pub contradicting: f64,
+    /// Numbers of photos that such pairs connect, the largest group first.
+    pub groups: Vec<usize>,
+    /// Fraction of the surfaces that fewer than three photos show.
+    pub thin: f64,
+    /// Up to three photos to take next, which show most of the surfaces that too few photos show.
+    pub next_photos: Vec<NextPhoto>,
+    /// Quality of each photo.
+    pub photos: Vec<PhotoQuality>,
+    /// Positions of surfaces in the capture's world, and the number of photos that show each.
+    #[serde(skip)]
+    surfaces: Vec<(DVec3, usize)>,
+}
+
+impl CaptureQuality {
+    /// Measures the quality of `capture`. `registration` is the result of the estimate of its poses. `should_continue` is called with the
+    /// number of photos that are done, and ends the work if it returns `false`; the result is `None` then.
+    ///
+    /// # Errors
+    /// Fails if a photo or the points of the capture can't be read.
+    pub fn measure(
+        capture: &Capture,
+        registration: Option<Registration>,
+        mut should_continue: impl FnMut(usize) -> bool,
+    ) -> Result<Option<Self>> {
+        let (cameras, size) = (capture.cameras(), PhotoSize::Within(MEASURED_SIDE));
+        let mut measured = vec![];
+        let count = rayon::current_num_threads();
+        for first in (0..cameras.len()).step_by(count) {
+            if !should_continue(first) {
+                return Ok(None);
+            }
+            let indices: Vec<usize> = (first..cameras.len().min(first + count)).collect();
+            for some in indices.chunk_by(|&a, &b| size.resized(&cameras[a]) == size.resized(&cameras[b])) {
+                let views = load_views(capture, some, size.resized(&cameras[some[0]]))?;
+                measured.extend(
+                    views.iter().map(|view| (PhotoQuality::measure(view), view.to_small_photo(SWEEP_SIDE))),
+                );
+            }
+        }
+        let (photos, small): (Vec<PhotoQuality>, Vec<SmallPhoto>) = measured.into_iter().unzip();
+        let swept = sweep(small, &read_points(capture)?, |_| should_continue(cameras.len()));
+        Ok((!swept.depth_maps.is_empty()).then(|| CaptureQuality::new(photos, registration, &swept)))
+    }
+
+    /// Measures the quality of the capture of `views`, whose depths are `swept`.
+    pub(crate) fn of_views(views: &[View], swept: &PlaneSweepOutput) -> Self {
+        CaptureQuality::new(views.iter().map(PhotoQuality::measure).collect(), None, swept)
+    }
+
+    fn new(
+        mut photos: Vec<PhotoQuality>,
+        registration: Option<Registration>,
+        swept: &PlaneSweepOutput,
+    ) -> Self {
+        let surfaces: Vec<(usize, PhotoSurface)> =
+            swept.depth_maps.iter().map(|(index, map)| (*index, PhotoSurface::new(map))).collect();
+        let comparable = ComparablePhoto::of_sweep(swept);
+        let pairs = compare_pairs(&surfaces, &comparable);
+        let share = |part: usize, all: usize| part as f64 / all.max(1) as f64;
+        let contradicting = pairs.iter().filter(|pair| !pair.is_consistent).count();
+        for (index, photo) in photos.iter_mut().enumerate() {
+            let of_photo: Vec<&Pair> = pairs.iter().filter(|pair| pair.photos.contains(&index)).collect();
+            let against = of_photo.iter().filter(|pair| !pair.is_consistent).count();
+            photo.contradicting = (!of_photo.is_empty()).then(|| share(against, of_photo.len()));
+        }
+        let patches = || surfaces.iter().flat_map(|(_, surface)| &surface.patches);
+        let textured = patches().filter(|patch| patch.is_textured).count();
+        let sure = patches().filter(|patch| patch.is_textured && patch.is_sure).count();
+        let connections = Connections::new(photos.len(), &pairs);
+        let coverage = Coverage::new(&surfaces, &comparable);
+        let mut quality = CaptureQuality {
+            verdict: Verdict::Good,
+            reasons: vec![],
+            registration,
+            parallax: median_parallax(&pairs, swept),
+            textured: share(textured, patches().count()),
+            agreeing: share(sure, textured),
+            contradicting: share(contradicting, pairs.len()),
+            groups: connections.groups.iter().map(Vec::len).collect(),
+            thin: coverage.thin_share(),
+            surfaces: coverage.points().collect(),
+            next_photos: coverage.next_photos(swept),
+            photos,
+        };
+        let mut reasons = quality.find_reasons(&connections);
+        reasons.sort_by_key(|(verdict, _)| std::cmp::Reverse(*verdict));
+        quality.verdict = reasons.first().map_or(Verdict::Good, |(verdict, _)| *verdict);
+        quality.reasons = reasons.into_iter().map(|(_, reason)| reason).collect();
+        quality
+    }
+
+    /// Returns what stands in the way of a good splat, and what follows from each.
+    fn find_reasons(&self, connections: &Connections) -> Vec<(Verdict, String)> {
+        let mut reasons = vec![];
+        let mut add = |verdict: Option<Verdict>, reason: String| {
+            reasons.extend(verdict.map(|verdict| (verdict, reason)))
+        };
+        let percent = |share: f64| format!("{:.0} %", 100. * share);
+        let name = |photo: &usize| self.photos[*photo].name.clone();
+        let names =
+            |photos: &[usize]| format_names(&photos.iter().map(name).collect::<Vec<_>>(), SHOWN_NAMES);
+        let count = self.photos.len();
+
+        if let Some(Registration { photos, registered, reprojection_error }) = self.registration {
+            let share = registered as f64 / photos.max(1) as f64;
+            add(below(share, REGISTERED), format!("only {registered} of {photos} photos have poses"));
+            let is_large = reprojection_error > REPROJECTION_ERROR;
+            add(
+                is_large.then_some(Verdict::Usable),
+                format!("the reprojection error is {reprojection_error:.1} pixels"),
+            );
+        }
+        add((count < FEW_PHOTOS).then_some(Verdict::Usable), format!("there are only {count} photos"));
+        let parallax = below(self.parallax, PARALLAX);
+        let agreeing = below(self.agreeing, AGREEING);
+        let percentage = percent(self.agreeing);
+        // Photos from one place look alike at an infinite depth, or can't be compared at all.
+        let is_one_place = parallax == Some(Verdict::WillFail)
+            && (agreeing != Some(Verdict::WillFail) || connections.groups.len() == count);
+        if is_one_place {
+            let place = "the photos were taken from one place, which shows no depth: walk instead of turning";
+            add(parallax, place.into());
+        } else {
+            add(parallax.min(Some(Verdict::Usable)), "the photos were taken from nearly one place".into());
+            add(agreeing, format!("photos agree on the depth of only {percentage} of what has texture"));
+            let percentage = percent(self.contradicting);
+            let mut wrong = format!(
+                "poses are wrong: {percentage} of the pairs of photos don't look alike where they should"
+            );
+            if connections.is_contradictory {
+                let [first, second] = [0, 1].map(|group| names(&connections.groups[group]));
+                wrong += &format!("; {first} don't fit {second}");
+            }
+            let fails = connections.is_contradictory.then_some(Verdict::WillFail);
+            add(fails.or(above(self.contradicting, CONTRADICTING)), wrong);
+        }
+        let apart: Vec<usize> = connections.groups[1..].concat();
+        let is_apart = apart.len() as f64 > MAX_DOUBTFUL * count as f64
+            && !connections.is_contradictory
+            && !is_one_place;
+        let line = format!("{} photos share too little with the others: {}", apart.len(), names(&apart));
+        add(is_apart.then_some(Verdict::Usable), line);
+        if let Some((photo, part)) = &connections.bridge {
+            let line = format!(
+                "{} alone connects {} photos with the others: {}",
+                name(photo),
+                part.len(),
+                names(part)
+            );
+            add(Some(Verdict::Usable), line);
+        }
+        let doubtful: Vec<usize> =
+            (0..count).filter(|&photo| self.photos[photo].has_doubtful_pose()).collect();
+        let has_few = !doubtful.is_empty() && self.contradicting < CONTRADICTING.0;
+        add(
+            has_few.then_some(Verdict::Usable),
+            format!("the poses of {} photos are doubtful: {}", doubtful.len(), names(&doubtful)),
+        );
+        for (what, is_bad) in [
+            ("blurred", PhotoQuality::is_blurred as fn(&PhotoQuality) -> bool),
+            ("too dark or too bright", PhotoQuality::is_clipped),
+        ] {
+            let bad: Vec<usize> = (0..count).filter(|&photo| is_bad(&self.photos[photo])).collect();
+            let are_many = bad.len() as f64 > MAX_DOUBTFUL * count as f64;
+            add(
+                are_many.then_some(Verdict::Usable),
+                format!("{} of {count} photos are {what}: {}", bad.len(), names(&bad)),
+            );
+        }
+        let is_thin = self.thin > MAX_THIN;
+        add(
+            is_thin.then_some(Verdict::Usable),
+            format!("{} of the surfaces are in fewer than three photos", percent(self.thin)),
+        );
+        let is_blank = self.textured < MIN_TEXTURED;
+        add(
+            is_blank.then_some(Verdict::Usable),
+            format!("only {} of the photos has texture", percent(self.textured)),
+        );
+        reasons
+    }
+}
+
+/// Formats the verdict and its reasons in one line.
+impl fmt::Display for CaptureQuality {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        let CaptureQuality { verdict, agreeing, parallax, .. } = self;
+        match &self.reasons[..] {
+            [] => write!(
+                f,
+                "{verdict}: photos agree on the depth of {:.0} % of what has texture, parallax {parallax:.0}°",
+                100. * agreeing
+            ),
+            reasons => write!(f, "{verdict}: {}", reasons.join("; ")),
+        }
+    }
+}
+
+/// Returns what follows from a value that should not be below `limits`.
+fn below(value: f64, (usable, fails): (f64, f64)) -> Option<Verdict> {
+    if value < fails { Some(Verdict::WillFail) } else { (value < usable).then_some(Verdict::Usable) }
+}
+
+/// Returns what follows from a value that should not be above `limits`.
+fn above(value: f64, (usable, fails): (f64, f64)) -> Option<Verdict> {
+    below(-value, (-usable, -fails))
+}
+
+/// Returns the median over the photos with depths of the largest parallax to a photo that shows the same surface, in degrees.
+fn median_parallax(pairs: &[Pair], swept: &PlaneSweepOutput) -> f64 {
+    let largest = |(index, map): &(usize, crate::stereo::DepthMap)| {
+        let depth = map.depth.median().double_value(&[]);
+        let distance = |pair: &Pair| {
+            let [a, b] = pair.photos.map(|photo| swept.photos[photo].camera.c2w.w_axis);
+            a.distance(b)
+        };
+        let distances = pairs.iter().filter(|pair| pair.photos[0] == *index).map(distance);
+        (distances.fold(0., f64::max) / depth).to_degrees()
+    };
+    let mut parallaxes: Vec<f64> = swept.depth_maps.iter().map(largest).collect();
+    parallaxes.sort_by(f64::total_cmp);
+    parallaxes[parallaxes.len() / 2]
+}
