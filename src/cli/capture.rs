@@ -4,6 +4,7 @@ use super::{Output, progress, signals};
 use crate::Error;
 use anyhow::Result;
 use clap::Args;
+use clap::builder::BoolishValueParser;
 use globalsplat_colmap::{CaptureOptions, CaptureReport, Colmap, Matching, Step, make_capture};
 use std::path::{Path, PathBuf};
 
@@ -39,6 +40,18 @@ pub struct Capture {
     /// default the folder `masks` among the photos
     #[arg(long, value_name = "DIR")]
     masks: Option<PathBuf>,
+    #[command(flatten)]
+    upright: UprightOption,
+}
+
+/// The option `--upright` of commands that make captures of photos.
+#[derive(Clone, Copy, Args)]
+pub struct UprightOption {
+    /// Turn the capture of the photos upright, with -y up and the floor at y = 0, and scale it to metres if positions of the photos in EXIF
+    /// or in a file geo.txt suffice for it; off: leave COLMAP's coordinates
+    #[arg(long, value_name = "on|off", num_args = 0..=1, require_equals = true, default_missing_value = "on",
+        value_parser = BoolishValueParser::new(), hide_possible_values = true)]
+    upright: Option<bool>,
 }
 
 impl Capture {
@@ -48,6 +61,7 @@ impl Capture {
             camera_model: self.camera_model.map(|model| model.to_uppercase()),
             matching: self.matching,
             masks: self.masks,
+            keeps_coordinates: self.upright.upright == Some(false),
             keeps_finished: false,
         };
         if self.frames.is_some() && self.source.is_dir() {
@@ -114,6 +128,8 @@ pub struct SceneSource {
     /// is kept beside the output, as room_capture for room.ply
     #[arg(long, value_name = "PHOTOS|VIDEO")]
     photos: Option<PathBuf>,
+    #[command(flatten)]
+    upright: UprightOption,
 }
 
 impl SceneSource {
@@ -125,13 +141,21 @@ impl SceneSource {
     /// Returns the path of the capture, and the folder of masks to open it with. If it has to be made, it is made beside the output `out` with
     /// the masks in the folder `masks`, which it then has itself.
     pub fn path<'a>(&self, masks: Option<&'a Path>, out: &Path) -> Result<(PathBuf, Option<&'a Path>)> {
-        let Some(photos) = &self.photos else { return Ok((self.scene.clone().unwrap_or_default(), masks)) };
+        let Some(photos) = &self.photos else {
+            if self.upright.upright.is_some() {
+                let line = "--upright is for --photos; convert --upright turns a splat of a capture";
+                return Err(Error::request(line).into());
+            }
+            return Ok((self.scene.clone().unwrap_or_default(), masks));
+        };
         let name = out.file_name().unwrap_or_default().to_string_lossy();
         let stem = name.rsplit_once('.').map_or(&*name, |(stem, _)| stem);
         let capture = out.with_file_name(format!("{}_capture", stem.trim_end_matches(".compressed")));
         // A capture that `globalsplat capture` made with other settings is used as it is.
         let masks = masks.map(Path::to_owned);
-        let options = CaptureOptions { keeps_finished: true, masks, ..CaptureOptions::default() };
+        let keeps_coordinates = self.upright.upright == Some(false);
+        let options =
+            CaptureOptions { keeps_finished: true, keeps_coordinates, masks, ..CaptureOptions::default() };
         let report = run_make_capture(photos, &capture, &options)?;
         eprintln!("{}: {report}", capture.display());
         Ok((capture, None))

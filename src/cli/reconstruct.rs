@@ -151,6 +151,7 @@ impl Reconstruct {
             "seconds_from_start": from_start,
             "peak_memory_bytes": peak_memory,
             "bytes": bytes,
+            "transform": capture.upright(),
         });
         Ok(Output::new(json, text))
     }

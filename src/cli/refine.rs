@@ -123,6 +123,7 @@ impl Refine {
         let clock = started.filter(|_| !self.scene.is_unposed()).unwrap_or_else(Instant::now);
         self.options.started = Some(clock);
         let capture = open_masked_capture(&path, masks)?;
+        let transform = capture.upright();
         self.check_outputs(&capture, &state_file)?;
         let splat = self.splat.as_deref().map(read_splat).transpose()?;
         warn(splat.as_ref().map_or(&[], |splat| &splat.warnings));
@@ -214,7 +215,9 @@ impl Refine {
             }
         }
         let lpips = if self.reports.lpips { session.score_lpips(&result)? } else { None };
-        Ok(self.describe_result(&session, &result, held_out.as_ref(), lpips.as_ref()))
+        let mut output = self.describe_result(&session, &result, held_out.as_ref(), lpips.as_ref());
+        output.json["transform"] = json!(transform);
+        Ok(output)
     }
 
     /// Returns `true` if the initial Gaussians are a model's.
