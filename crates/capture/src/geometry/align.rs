@@ -12,6 +12,8 @@ const TRIPLES: usize = 400;
 const REFITS: usize = 10;
 /// Distance of an inlier in terms of the median distance. For normally distributed errors in space, 1 in 500 is farther.
 const INLIER: f64 = 2.5;
+/// Distance in metres of positions that count as exact.
+const EXACT: f64 = 1e-3;
 /// Minimum number of inliers.
 const MIN_INLIERS: usize = 5;
 /// Minimum ratio of the positions' spread to their error. Positions that have nothing to do with the cameras have a ratio of about 1.
@@ -62,7 +64,8 @@ pub fn fit_positions(centers: &[DVec3], positions: &[DVec3]) -> Option<(Similari
     let (mut bound, mut to) = scored.min_by(|a, b| a.0.total_cmp(&b.0))?;
     let mut inliers = pairs.clone();
     for _ in 0..REFITS {
-        inliers = pairs.iter().copied().filter(|pair| distance(&to, pair) <= INLIER * bound).collect();
+        inliers =
+            pairs.iter().copied().filter(|pair| distance(&to, pair) <= (INLIER * bound).max(EXACT)).collect();
         to = fit_similarity(&inliers);
         bound = median(&to);
     }
@@ -115,4 +118,87 @@ fn fit_similarity<Pair: std::borrow::Borrow<(DVec3, DVec3)>>(pairs: &[Pair]) -> 
     let rotation = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w));
     let scale = product / square.max(f64::MIN_POSITIVE);
     Similarity { rotation, translation: to - scale * (rotation * from), scale }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Returns `count` camera centers within ±`extent` units of 2.5 m, and their positions in a turned world with errors of `noise` metres
+    /// per axis. One in ten is wrong by up to 300 m.
+    fn walk(random: &mut Rng, count: usize, extent: f64, noise: f64) -> (Vec<DVec3>, Vec<DVec3>) {
+        let mut signed = || 2. * random.f64() - 1.;
+        let turn = DMat3::from_rotation_y(3. * signed()) * DMat3::from_rotation_x(signed());
+        let centers: Vec<DVec3> = (0..count)
+            .map(|_| DVec3::new(extent * signed(), 0.1 * extent * signed(), extent * signed()))
+            .collect();
+        let mut position = |(index, center): (usize, &DVec3)| {
+            let mut normal = || signed() + signed() + signed();
+            let error = noise * DVec3::new(normal(), normal(), normal());
+            let wrong = if index % 10 == 3 { 100. } else { 0. };
+            2.5 * (turn * *center)
+                + DVec3::new(500., -20., 7.)
+                + error
+                + wrong * DVec3::new(normal(), normal(), 0.)
+        };
+        let positions = centers.iter().enumerate().map(&mut position).collect();
+        (centers, positions)
+    }
+
+    #[test]
+    fn scales_are_within_their_errors() {
+        let mut random = Rng::with_seed(1);
+        let mut within = 0;
+        for _ in 0..100 {
+            let (centers, positions) = walk(&mut random, 40, 12., 2.);
+            let (to, fit) = fit_positions(&centers, &positions).unwrap();
+            assert!(fit.is_reliable() && (33..=37).contains(&fit.inliers), "{fit:?}");
+            assert!((1.8..4.5).contains(&fit.error) && fit.scale_error < 0.06, "{fit:?}");
+            within += usize::from((to.scale / 2.5 - 1.).abs() < fit.scale_error);
+        }
+        // Two standard deviations.
+        assert!(within >= 90, "{within} of 100");
+    }
+
+    #[test]
+    fn exact_positions_give_the_exact_transform() {
+        let mut random = Rng::with_seed(2);
+        for (count, wrong) in [(6, 1), (12, 1), (24, 3)] {
+            let (centers, positions) = walk(&mut random, count, 12., 0.);
+            let (to, fit) = fit_positions(&centers, &positions).unwrap();
+            assert!(fit.is_reliable() && fit.error < 1e-9 && fit.inliers == count - wrong, "{fit:?}");
+            let far = centers.iter().zip(&positions).filter(|(a, b)| to.apply(**a).distance(**b) > 1e-9);
+            assert_eq!(far.count(), wrong);
+        }
+    }
+
+    #[test]
+    fn positions_that_have_nothing_to_do_with_the_cameras_are_not_reliable() {
+        let mut random = Rng::with_seed(3);
+        for _ in 0..20 {
+            // Errors of 5 m in a room of 4 m.
+            let (centers, positions) = walk(&mut random, 40, 0.8, 5.);
+            let (_, fit) = fit_positions(&centers, &positions).unwrap();
+            assert!(!fit.is_reliable(), "{fit:?}");
+        }
+        let (centers, _) = walk(&mut random, 10, 12., 0.);
+        assert!(!fit_positions(&centers, &[DVec3::ONE; 10]).unwrap().1.is_reliable());
+        assert!(!fit_positions(&[DVec3::ONE; 10], &centers).unwrap().1.is_reliable());
+        assert!(fit_positions(&centers[..2], &centers[..2]).is_none());
+    }
+
+    #[test]
+    fn lines_determine_the_scale_but_no_vertical_direction() {
+        let mut random = Rng::with_seed(4);
+        let (centers, positions) = walk(&mut random, 30, 12., 0.1);
+        let (_, wide) = fit_positions(&centers, &positions).unwrap();
+        let line: Vec<DVec3> = centers.iter().map(|center| DVec3::X * center.x).collect();
+        let noisy: Vec<DVec3> = line
+            .iter()
+            .map(|center| 2.5 * *center + 0.1 * DVec3::new(random.f64(), random.f64(), random.f64()))
+            .collect();
+        let (to, fit) = fit_positions(&line, &noisy).unwrap();
+        assert!(fit.is_reliable() && (to.scale / 2.5 - 1.).abs() < fit.scale_error, "{fit:?}");
+        assert!(wide.up_error < 0.01 && fit.up_error > 0.1, "{wide:?} {fit:?}");
+    }
 }
