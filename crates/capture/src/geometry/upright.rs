@@ -35,8 +35,10 @@ const REFITS: usize = 10;
 const FLOOR_THICKNESS: f64 = 0.02;
 /// Maximum standard deviation of their heights, in terms of the largest distance. That of points all over the volume is 0.58.
 const MAX_FLOOR_DEVIATION: f64 = 0.4;
-/// Cosine of the largest angle between the floor's normal and the cameras' up direction: 25°.
-const MIN_FLOOR_COS: f64 = 0.9063;
+/// Largest angle between the floor's normal and the up direction that is known before, in standard deviations of the latter, and in radians.
+/// Other planes, such as sloping roofs and dunes, aren't taken for floors.
+const FLOOR_DEVIATIONS: f64 = 3.;
+const MAX_FLOOR_ANGLE: f64 = 0.44;
 /// Minimum share of the points that belong to the floor, and maximum share that is below it.
 const MIN_ON_FLOOR: f64 = 0.08;
 const MAX_BELOW_FLOOR: f64 = 0.1;
@@ -123,7 +125,8 @@ impl fmt::Display for Upright {
 ///
 /// The cameras' x axes are nearly horizontal: up is the direction that is most perpendicular to them, the smallest eigenvector of Σ wᵢ xᵢ xᵢᵀ
 /// with the weights wᵢ of Tukey's biweight. As far as all cameras look in similar directions, the median of their own up directions decides.
-/// A floor refines this: the plane within 25° of it that has the most points on it, few below, and the cameras above. Without a floor, 2 % of the
+/// A floor refines this: the plane within three standard deviations of it, at most 25°, that has the most points on it, few below, and the
+/// cameras above. Without a floor, 2 % of the
 /// points are below y = 0, and without points, the mean camera is there.
 ///
 /// If the positions agree with the cameras, they determine the scale; and also the vertical direction if they do so more precisely
@@ -143,14 +146,15 @@ pub fn estimate_upright(c2w: &[DMat4], points: &[DVec3], positions: &[Option<DVe
     let reliable = fit.filter(|(_, fit)| fit.is_reliable());
 
     let (by_cameras, error) = up_of_cameras(c2w);
-    let by_positions = reliable.filter(|(_, fit)| fit.up_error < error.hypot(COMMON_TILT));
-    let by_positions = by_positions.map(|(to_positions, _)| to_positions.rotation.transpose() * DVec3::Z);
-    let floor = find_floor(points, &centers, by_positions.unwrap_or(by_cameras));
-    let (up, source) = match (by_positions, floor) {
-        (Some(up), _) => (up, UpSource::Positions),
-        (None, Some(floor)) => (floor.normal, UpSource::Floor),
-        (None, None) => (by_cameras, UpSource::Cameras),
+    let error = error.hypot(COMMON_TILT);
+    let (mut up, error, mut source) = match reliable.filter(|(_, fit)| fit.up_error < error) {
+        Some((to, fit)) => (to.rotation.transpose() * DVec3::Z, fit.up_error, UpSource::Positions),
+        None => (by_cameras, error, UpSource::Cameras),
     };
+    let floor = find_floor(points, &centers, up, (FLOOR_DEVIATIONS * error).min(MAX_FLOOR_ANGLE));
+    if let Some(floor) = floor.filter(|_| source == UpSource::Cameras) {
+        (up, source) = (floor.normal, UpSource::Floor);
+    }
     let center = centers.iter().sum::<DVec3>() / centers.len() as f64;
     let height = match floor {
         Some(floor) => floor.point.dot(up),
@@ -231,7 +235,8 @@ impl Plane {
 }
 
 /// Returns the plane of a floor or the ground below cameras at `centers`, among `points`, if there is one.
-fn find_floor(points: &[DVec3], centers: &[DVec3], up: DVec3) -> Option<Plane> {
+/// `up` is known to `max_angle` radians.
+fn find_floor(points: &[DVec3], centers: &[DVec3], up: DVec3, max_angle: f64) -> Option<Plane> {
     let mut random = Rng::with_seed(0);
     let points = random.choose_multiple(points.iter().copied(), FLOOR_POINTS);
     let center = centers.iter().sum::<DVec3>() / centers.len() as f64;
@@ -241,14 +246,14 @@ fn find_floor(points: &[DVec3], centers: &[DVec3], up: DVec3) -> Option<Plane> {
     let low: Vec<DVec3> = points.iter().copied().filter(|point| point.dot(up) < lowest).collect();
     let is_possible = |plane: &Plane| {
         let nearest = quantile(centers.iter().map(|center| plane.height(*center)), CAMERAS_BELOW);
-        plane.normal.dot(up) > MIN_FLOOR_COS && nearest.is_some_and(|height| height > thickness)
+        plane.normal.dot(up) > max_angle.cos() && nearest.is_some_and(|height| height > thickness)
     };
     let share = |is_counted: &dyn Fn(f64) -> bool, plane: &Plane| {
         points.iter().filter(|point| is_counted(plane.height(**point))).count() as f64 / points.len() as f64
     };
     let on = |plane: &Plane| share(&|height| height.abs() < thickness, plane);
     let below = |plane: &Plane| share(&|height| height < -2. * thickness, plane);
-    let tilt = |plane: &Plane| (1. - plane.normal.dot(up)) / (1. - MIN_FLOOR_COS);
+    let tilt = |plane: &Plane| (1. - plane.normal.dot(up)) / (1. - max_angle.cos());
     let score = |plane: &Plane| on(plane) * (1. - TILT_PENALTY * tilt(plane)) - BELOW_WEIGHT * below(plane);
     let candidates = (0..FLOOR_TRIPLES).filter_map(|_| {
         let [a, b, c] = random.choose_multiple(&low, 3)[..] else { return None };
