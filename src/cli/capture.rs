@@ -45,7 +45,7 @@ pub struct Capture {
 }
 
 /// The option `--upright` of commands that make captures of photos.
-#[derive(Clone, Copy, Args)]
+#[derive(Clone, Copy, Default, Args)]
 pub struct UprightOption {
     /// Turn the capture of the photos upright, with -y up and the floor at y = 0, and scale it to metres if positions of the photos in EXIF
     /// or in a file geo.txt suffice for it; off: leave COLMAP's coordinates
@@ -128,8 +128,6 @@ pub struct SceneSource {
     /// is kept beside the output, as room_capture for room.ply
     #[arg(long, value_name = "PHOTOS|VIDEO")]
     photos: Option<PathBuf>,
-    #[command(flatten)]
-    upright: UprightOption,
 }
 
 impl SceneSource {
@@ -140,9 +138,14 @@ impl SceneSource {
 
     /// Returns the path of the capture, and the folder of masks to open it with. If it has to be made, it is made beside the output `out` with
     /// the masks in the folder `masks`, which it then has itself.
-    pub fn path<'a>(&self, masks: Option<&'a Path>, out: &Path) -> Result<(PathBuf, Option<&'a Path>)> {
+    pub fn path<'a>(
+        &self,
+        masks: Option<&'a Path>,
+        upright: UprightOption,
+        out: &Path,
+    ) -> Result<(PathBuf, Option<&'a Path>)> {
         let Some(photos) = &self.photos else {
-            if self.upright.upright.is_some() {
+            if upright.upright.is_some() {
                 let line = "--upright is for --photos; convert --upright turns a splat of a capture";
                 return Err(Error::request(line).into());
             }
@@ -153,7 +156,7 @@ impl SceneSource {
         let capture = out.with_file_name(format!("{}_capture", stem.trim_end_matches(".compressed")));
         // A capture that `globalsplat capture` made with other settings is used as it is.
         let masks = masks.map(Path::to_owned);
-        let keeps_coordinates = self.upright.upright == Some(false);
+        let keeps_coordinates = upright.upright == Some(false);
         let options =
             CaptureOptions { keeps_finished: true, keeps_coordinates, masks, ..CaptureOptions::default() };
         let report = run_make_capture(photos, &capture, &options)?;

@@ -239,7 +239,7 @@ impl Args for Edits {
                 });
             match name {
                 "upright" => argument.num_args(0).default_missing_value(""),
-                "length" => argument.num_args(3),
+                "length" => argument.num_args(3).value_names(["X,Y,Z", "X,Y,Z", "METRES"]),
                 "filter-floaters" => {
                     argument.num_args(0..=1).require_equals(true).default_missing_value("10")
                 }

@@ -1,6 +1,6 @@
 //! The command `refine`, which also does the work of `reconstruct --refine`.
 
-use super::capture::SceneSource;
+use super::capture::{SceneSource, UprightOption};
 use super::progress::{self, Progress};
 use super::splat_out::{self, LocalOrigin};
 use super::{
@@ -59,6 +59,8 @@ pub struct Refine {
     pub weights: Option<PathBuf>,
     #[command(flatten)]
     pub scene: SceneSource,
+    #[command(flatten)]
+    pub upright: UprightOption,
     /// Folder of masks named like the photos, as in photo.jpg.png or photo.png: black pixels are ignored; by default the masks and
     /// transparency of the capture itself
     #[arg(long, value_name = "DIR")]
@@ -118,7 +120,7 @@ impl Refine {
             .try_for_each(|log| check_writable_dir(log).and_then(|()| RefineLog::check(log).map(drop)))?;
         signals::handle_stop_requests();
         signals::end_at_request(1);
-        let (path, masks) = self.scene.path(self.masks.as_deref(), &self.out)?;
+        let (path, masks) = self.scene.path(self.masks.as_deref(), self.upright, &self.out)?;
         // The time budget begins after the poses of photos are found.
         let clock = started.filter(|_| !self.scene.is_unposed()).unwrap_or_else(Instant::now);
         self.options.started = Some(clock);
