@@ -22,7 +22,7 @@
 //! Modules, from the highest level to the lowest; each uses only those after it in this list, and [`scene`]:
 //! [`refine`] optimizes a splat per scene, [`eval`] evaluates methods, [`train`] trains, [`reconstruct`] turns photos into splats,
 //! [`metrics`] compares images, [`config`] defines the configuration of a run, [`optim`] and [`loss`] hold the optimizer and the
-//! losses, [`data`] reads captures, [`stereo`] estimates depths, [`synth`] generates synthetic scenes, [`io`] reads and writes files,
+//! losses, [`quality`] tells what to expect of a capture, [`data`] reads captures, [`stereo`] estimates depths, [`synth`] generates synthetic scenes, [`io`] reads and writes files,
 //! [`distributed`] connects the processes of distributed training, [`render`] is the differentiable splat op, [`model`] the network.
 
 #[cfg(feature = "cli")]

@@ -7,6 +7,7 @@ use crate::io::{InputFiles, check_writable_file};
 use crate::quality::{CaptureQuality, NextPhoto, Registration, Verdict, write_quality_page};
 use anyhow::Result;
 use clap::Args;
+use clap::builder::BoolishValueParser;
 use globalsplat_colmap::{CaptureOptions, CaptureReport, Colmap, Matching, Step, make_capture};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -51,6 +52,18 @@ pub struct Capture {
     /// default the folder `masks` among the photos
     #[arg(long, value_name = "DIR")]
     masks: Option<PathBuf>,
+    #[command(flatten)]
+    upright: UprightOption,
+}
+
+/// The option `--upright` of commands that make captures of photos.
+#[derive(Clone, Copy, Default, Args)]
+pub struct UprightOption {
+    /// Turn the capture of the photos upright, with -y up and the floor at y = 0, and scale it to metres if positions of the photos in EXIF
+    /// or in a file geo.txt suffice for it; off: leave COLMAP's coordinates
+    #[arg(long, value_name = "on|off", num_args = 0..=1, require_equals = true, default_missing_value = "on",
+        value_parser = BoolishValueParser::new(), hide_possible_values = true)]
+    upright: Option<bool>,
 }
 
 impl Capture {
@@ -63,6 +76,7 @@ impl Capture {
             camera_model: self.camera_model.as_ref().map(|model| model.to_uppercase()),
             matching: self.matching,
             masks: self.masks.clone(),
+            keeps_coordinates: self.upright.upright == Some(false),
             keeps_finished: false,
         };
         if self.frames.is_some() && self.source.is_dir() {
@@ -197,14 +211,27 @@ impl SceneSource {
 
     /// Returns the path of the capture, and the folder of masks to open it with. If it has to be made, it is made beside the output `out` with
     /// the masks in the folder `masks`, which it then has itself.
-    pub fn path<'a>(&self, masks: Option<&'a Path>, out: &Path) -> Result<(PathBuf, Option<&'a Path>)> {
-        let Some(photos) = &self.photos else { return Ok((self.scene.clone().unwrap_or_default(), masks)) };
+    pub fn path<'a>(
+        &self,
+        masks: Option<&'a Path>,
+        upright: UprightOption,
+        out: &Path,
+    ) -> Result<(PathBuf, Option<&'a Path>)> {
+        let Some(photos) = &self.photos else {
+            if upright.upright.is_some() {
+                let line = "--upright is for --photos; convert --upright turns a splat of a capture";
+                return Err(Error::request(line).into());
+            }
+            return Ok((self.scene.clone().unwrap_or_default(), masks));
+        };
         let name = out.file_name().unwrap_or_default().to_string_lossy();
         let stem = name.rsplit_once('.').map_or(&*name, |(stem, _)| stem);
         let capture = out.with_file_name(format!("{}_capture", stem.trim_end_matches(".compressed")));
         // A capture that `globalsplat capture` made with other settings is used as it is.
         let masks = masks.map(Path::to_owned);
-        let options = CaptureOptions { keeps_finished: true, masks, ..CaptureOptions::default() };
+        let keeps_coordinates = upright.upright == Some(false);
+        let options =
+            CaptureOptions { keeps_finished: true, keeps_coordinates, masks, ..CaptureOptions::default() };
         let report = run_make_capture(photos, &capture, &options)?;
         eprintln!("{}: {report}", capture.display());
         Ok((capture, None))

@@ -8,7 +8,7 @@ use crate::io::{
 };
 use crate::metrics::psnr_between;
 use crate::render::{SplatEdit, edit_splat, move_cameras, orbit_around_splat};
-use crate::scene::{LocalFrame, splat_frame};
+use crate::scene::{LocalFrame, Upright, splat_frame};
 use anyhow::Result;
 use clap::Args;
 use glam::{DMat4, DVec3};
@@ -40,6 +40,7 @@ const MIN_CUT: f32 = 0.01;
 #[command(after_help = "Examples:\n  globalsplat convert room.ply room.spz\n  \
     globalsplat convert room.ply small.spz --sh-degree 1 --scene captures/room\n  \
     globalsplat convert room.ply shared.ply --clamp-sh --scene captures/room\n  \
+    globalsplat convert room.ply upright.ply --upright --scene captures/room --length 0,0,0 0,0,1.2 2.05\n  \
     globalsplat convert room.ply table.sog --up z --crop-sphere 0,0,0,2 --filter-floaters --scale 10")]
 pub struct Convert {
     /// Input splat: .ply, .compressed.ply, .sog, meta.json, .spz, .splat, .glb, .gltf, .ksplat or .zip
@@ -78,7 +79,9 @@ impl Convert {
         let capture = self.scene.as_deref().map(open_capture).transpose()?;
         let mut inputs = InputFiles::default();
         capture.iter().for_each(|capture| capture.add_input_files(&mut inputs));
-        let (options, edits): (Vec<_>, Vec<_>) = self.edits.read(&mut inputs, warn)?.into_iter().unzip();
+        let cameras = capture.as_ref().map(|capture| capture.cameras());
+        let (options, edits): (Vec<_>, Vec<_>) =
+            self.edits.read(cameras, &mut inputs, warn)?.into_iter().unzip();
         splat_files(&self.to).iter().try_for_each(|file| inputs.check_file(file))?;
         if let Some(file) = &self.cameras_out {
             [&self.from, &self.to].into_iter().for_each(|path| inputs.add_all(splat_files(path)));
@@ -155,12 +158,13 @@ impl Convert {
         let of_file = file_psnr.map(|psnr| format!("; {psnr:.2} dB between the edited splat and the file"));
         let lines = std::iter::once(line(&from))
             .chain(edits.iter().map(|(option, count)| format!("{option}: {count} Gaussians")))
+            .chain(edited.upright.iter().map(Upright::to_string))
             .chain([line(&to), format!("{views} views: {loss}{}", of_file.unwrap_or_default())]);
         let text = lines.collect::<Vec<_>>().join("\n");
         let edits: Vec<_> =
             edits.iter().map(|(edit, count)| json!({ "edit": edit, "gaussians": count })).collect();
         let json = json!({
-            "from": from, "edits": edits, "to": to, "views": views, "psnr": psnr, "file_psnr": file_psnr,
+            "from": from, "transform": edited.from_original.transpose().to_cols_array_2d(), "edits": edits, "to": to, "views": views, "psnr": psnr, "file_psnr": file_psnr,
             "same_pixels": psnr.is_none(),
         });
         Ok(Output::new(json, text))

@@ -1,8 +1,10 @@
 //! Options that edit a splat, in the order in which they are given.
 
 use super::open_capture;
+use crate::error::Error;
 use crate::io::{InputFiles, read_splat_without_invalid, splat_files};
 use crate::render::SplatEdit;
+use crate::scene::Camera;
 use clap::{Arg, ArgAction, ArgMatches, Args, Command, FromArgMatches};
 use glam::{DMat4, DQuat, DVec3};
 use std::f64::consts::{FRAC_PI_2, PI};
@@ -12,12 +14,17 @@ use std::path::PathBuf;
 #[derive(Debug, Clone)]
 enum EditArgument {
     Edit(SplatEdit),
+    Upright,
+    /// One of the three values of `--length`.
+    Numbers(Vec<f64>),
+    /// These values.
+    Length(Vec<EditArgument>),
     PruneUnseen(PathBuf),
     Merge(PathBuf),
 }
 
 /// Name of every option, name of its value, and help.
-const OPTIONS: [(&str, &str, &str); 13] = [
+const OPTIONS: [(&str, &str, &str); 15] = [
     ("scale", "FACTOR", "Scale about the world's origin"),
     ("rotate", "X,Y,Z", "Rotate about the world's x axis, then its y axis, then its z axis, in degrees"),
     ("translate", "X,Y,Z", "Move by a vector"),
@@ -30,6 +37,16 @@ const OPTIONS: [(&str, &str, &str); 13] = [
         "up",
         "AXIS",
         "Rotate a splat whose axis x, y, z, -x, -y or -z points up, so that -y does, as 3DGS and most viewers have it",
+    ),
+    (
+        "upright",
+        "",
+        "Rotate so that -y points up, with the floor at y = 0 and the cameras' center at x = z = 0, by the cameras of --scene and the splat",
+    ),
+    (
+        "length",
+        "X,Y,Z X,Y,Z METRES",
+        "Scale about the world's origin so that the distance between two points is METRES; the page of `view` measures points",
     ),
     (
         "crop-box",
@@ -88,6 +105,13 @@ fn parse(name: &str, text: &str) -> Result<EditArgument, String> {
             Ok(0) | Err(_) => return Err("expected a number of Gaussians, 1 or more".into()),
             Ok(count) => SplatEdit::Decimate(count),
         },
+        "upright" => return Ok(EditArgument::Upright),
+        "length" => {
+            let point = numbers::<3>(text).map(Vec::from);
+            let number = point.or_else(|_| Ok::<_, String>(vec![positive(text)?]));
+            let expected = "expected two points as 1,2,3 and the distance between them, above 0";
+            return number.map(EditArgument::Numbers).map_err(|_| expected.into());
+        }
         "prune-unseen" => return Ok(EditArgument::PruneUnseen(text.into())),
         "merge" => return Ok(EditArgument::Merge(text.into())),
         other => unreachable!("{other} is no option"),
@@ -130,6 +154,24 @@ fn parse_box(text: &str) -> Result<SplatEdit, String> {
     Ok(SplatEdit::CropBox(low.min(high), low.max(high)))
 }
 
+/// Returns the scale with which the distance between two points is a length, from the values of `--length`.
+fn scale_to_length(values: &[EditArgument]) -> Result<SplatEdit, String> {
+    let values = values.iter().map(|value| match value {
+        EditArgument::Numbers(numbers) => &numbers[..],
+        _ => &[],
+    });
+    let [[ax, ay, az], [bx, by, bz], [length]] = values.collect::<Vec<_>>()[..] else {
+        return Err("expected two points as 1,2,3 and the distance between them".into());
+    };
+    let distance = DVec3::new(*ax, *ay, *az).distance(DVec3::new(*bx, *by, *bz));
+    match length / distance {
+        scale if scale > 0. && scale.is_finite() => {
+            Ok(SplatEdit::Transform(DMat4::from_scale(DVec3::splat(scale))))
+        }
+        _ => Err("expected two points that differ".into()),
+    }
+}
+
 /// Returns the rotation with which the axis `up` becomes -y.
 fn rotation_from_up(up: &str) -> Result<DQuat, String> {
     Ok(match &up.to_lowercase()[..] {
@@ -148,16 +190,26 @@ fn rotation_from_up(up: &str) -> Result<DQuat, String> {
 pub struct Edits(Vec<(String, EditArgument)>);
 
 impl Edits {
-    /// Reads the files of the edits, and returns each edit with its option. The files are added to `inputs`; `warn` receives the warnings of the
+    /// Reads the files of the edits, and returns each edit with its option. `cameras` are those of `--scene`. The files are added to `inputs`; `warn` receives the warnings of the
     /// splats that are read.
     pub fn read(
         &self,
+        cameras: Option<Vec<Camera>>,
         inputs: &mut InputFiles,
         warn: impl Fn(&[String]),
     ) -> crate::Result<Vec<(&str, SplatEdit)>> {
-        let mut read = |argument: &EditArgument| -> crate::Result<SplatEdit> {
+        let mut read = |option: &str, argument: &EditArgument| -> crate::Result<SplatEdit> {
             Ok(match argument {
                 EditArgument::Edit(edit) => edit.clone(),
+                EditArgument::Numbers(_) => unreachable!("numbers are the values of a length"),
+                EditArgument::Length(values) => {
+                    scale_to_length(values).map_err(|why| Error::request(format!("{option}: {why}")))?
+                }
+                EditArgument::Upright => SplatEdit::Upright(
+                    cameras
+                        .clone()
+                        .ok_or_else(|| Error::request("--upright needs the cameras of --scene"))?,
+                ),
                 EditArgument::PruneUnseen(path) => {
                     let capture = open_capture(path)?;
                     capture.add_input_files(inputs);
@@ -171,7 +223,7 @@ impl Edits {
                 }
             })
         };
-        self.0.iter().map(|(option, argument)| Ok((&option[..], read(argument)?))).collect()
+        self.0.iter().map(|(option, argument)| Ok((&option[..], read(option, argument)?))).collect()
     }
 }
 
@@ -190,6 +242,8 @@ impl Args for Edits {
                     parse(name, text).map(|argument| (text.to_owned(), argument))
                 });
             match name {
+                "upright" => argument.num_args(0).default_missing_value(""),
+                "length" => argument.num_args(3).value_names(["X,Y,Z", "X,Y,Z", "METRES"]),
                 "filter-floaters" => {
                     argument.num_args(0..=1).require_equals(true).default_missing_value("10")
                 }
@@ -208,13 +262,22 @@ impl FromArgMatches for Edits {
     fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
         let mut edits = vec![];
         for (name, ..) in OPTIONS {
-            let values = matches.get_many::<(String, EditArgument)>(name).into_iter().flatten();
-            let places = matches.indices_of(name).into_iter().flatten();
-            edits.extend(
-                places
-                    .zip(values)
-                    .map(|(place, (text, argument))| (place, (format!("--{name}={text}"), argument.clone()))),
-            );
+            let groups = matches.get_occurrences::<(String, EditArgument)>(name).into_iter().flatten();
+            let mut places = matches.indices_of(name).into_iter().flatten();
+            for group in groups {
+                let (texts, arguments): (Vec<&str>, Vec<&EditArgument>) =
+                    group.map(|(text, argument)| (&text[..], argument)).unzip();
+                let place = places.nth(texts.len() - 1);
+                let argument = match arguments[..] {
+                    [argument] => argument.clone(),
+                    _ => EditArgument::Length(arguments.into_iter().cloned().collect()),
+                };
+                let text = match &texts.join(" ")[..] {
+                    "" => format!("--{name}"),
+                    text => format!("--{name}={text}"),
+                };
+                edits.push((place, (text, argument)));
+            }
         }
         edits.sort_by_key(|(place, _)| *place);
         Ok(Edits(edits.into_iter().map(|(_, edit)| edit).collect()))
@@ -239,9 +302,10 @@ mod tests {
 
     #[test]
     fn edits_are_in_the_order_of_the_options() {
-        let arguments = "x --translate -1,2,3 --scale 2 --filter-floaters --translate 4,5,6 --up -z --crop-sphere 0,0,0,1";
-        let program = Program::try_parse_from(arguments.split(' ')).unwrap();
-        let edits = program.edits.read(&mut InputFiles::default(), |_| ()).unwrap();
+        let arguments = "x --translate -1,2,3 --scale 2 --filter-floaters --translate 4,5,6 --up -z --length -1,0,0 1,0,0 4 \
+                         --upright --crop-sphere 0,0,0,1";
+        let program = Program::try_parse_from(arguments.split_whitespace()).unwrap();
+        let edits = program.edits.read(Some(vec![]), &mut InputFiles::default(), |_| ()).unwrap();
         let options: Vec<_> = edits.iter().map(|(option, _)| *option).collect();
         let expected = [
             "--translate=-1,2,3",
@@ -249,9 +313,15 @@ mod tests {
             "--filter-floaters=10",
             "--translate=4,5,6",
             "--up=-z",
+            "--length=-1,0,0 1,0,0 4",
+            "--upright",
             "--crop-sphere=0,0,0,1",
         ];
         assert_eq!(options, expected);
+        let SplatEdit::Transform(matrix) = edits[5].1 else { panic!() };
+        assert_eq!(matrix, DMat4::from_scale(DVec3::splat(2.)));
+        let error = program.edits.read(None, &mut InputFiles::default(), |_| ()).unwrap_err();
+        assert_eq!(error.to_string(), "--upright needs the cameras of --scene");
         let SplatEdit::CropBox(low, high) = parse_box("-,1,-,2,-,3").unwrap() else { panic!() };
         assert_eq!((low.y, high.x, high.z), (1., 2., 3.));
         assert!(low.x == f64::NEG_INFINITY && low.z == f64::NEG_INFINITY && high.y == f64::INFINITY);
@@ -274,11 +344,21 @@ mod tests {
             ("--crop-sphere 0,0,0,-1", "a radius above 0"),
             ("--min-opacity 1.5", "from 0 to 1"),
             ("--decimate 0", "1 or more"),
+            ("--length 1,2,3 1,2,4 0", "and the distance between them, above 0"),
             ("--up w", "expected x, y, z, -x, -y or -z"),
         ] {
             let error =
                 Program::try_parse_from(std::iter::once("x").chain(arguments.split(' '))).err().unwrap();
             assert!(error.to_string().contains(message), "{arguments}: {error}");
+        }
+        for (values, message) in [
+            ("1,2,3 1,2,3 4", "expected two points that differ"),
+            ("1,2,3 4 1,2,4", "expected two points as 1,2,3"),
+        ] {
+            let arguments = format!("x --length {values}");
+            let edits = Program::try_parse_from(arguments.split(' ')).unwrap().edits;
+            let error = edits.read(None, &mut InputFiles::default(), |_| ()).unwrap_err().to_string();
+            assert!(error.starts_with(&format!("--length={values}: {message}")), "{error}");
         }
     }
 }

@@ -1,4 +1,4 @@
-use super::capture::SceneSource;
+use super::capture::{SceneSource, UprightOption};
 use super::refine::{Refine, Reports};
 use super::splat_out::{self, LocalOrigin};
 use super::{Output, check_views, device, model, open_masked_capture, parse_holdout, signals};
@@ -29,6 +29,8 @@ pub struct Reconstruct {
     weights: Option<PathBuf>,
     #[command(flatten)]
     scene: SceneSource,
+    #[command(flatten)]
+    upright: UprightOption,
     /// Folder of masks named like the photos, as in photo.jpg.png or photo.png: the model doesn't see black pixels; by default the
     /// masks and transparency of the capture itself
     #[arg(long, value_name = "DIR")]
@@ -65,12 +67,13 @@ impl Reconstruct {
             max_views: self.views,
             ..Default::default()
         };
-        let Reconstruct { weights, scene, masks, out, local_origin, device, .. } = self;
+        let Reconstruct { weights, scene, upright, masks, out, local_origin, device, .. } = self;
         Refine {
             splat: None,
             init: Some("model".into()),
             weights,
             scene,
+            upright,
             masks,
             out,
             resume: false,
@@ -97,7 +100,7 @@ impl Reconstruct {
         let mut stopwatch = Stopwatch::default();
         signals::handle_stop_requests();
         signals::end_at_request(1);
-        let path = || self.scene.path(self.masks.as_deref(), &self.out);
+        let path = || self.scene.path(self.masks.as_deref(), self.upright, &self.out);
         let (scene, masks) = if self.scene.is_unposed() { stopwatch.time("poses", path)? } else { path()? };
         let loaded = stopwatch.time("weights", || model::load(self.weights.as_deref(), asked, device))?;
         let capture = stopwatch.time("photos", || open_masked_capture(&scene, masks))?;
@@ -152,6 +155,7 @@ impl Reconstruct {
             "seconds_from_start": from_start,
             "peak_memory_bytes": peak_memory,
             "bytes": bytes,
+            "transform": capture.upright(),
         });
         Ok(Output::new(json, text))
     }

@@ -1,6 +1,6 @@
 //! The command `refine`, which also does the work of `reconstruct --refine`.
 
-use super::capture::SceneSource;
+use super::capture::{SceneSource, UprightOption};
 use super::progress::{self, Progress};
 use super::splat_out::{self, LocalOrigin};
 use super::{
@@ -60,6 +60,8 @@ pub struct Refine {
     pub weights: Option<PathBuf>,
     #[command(flatten)]
     pub scene: SceneSource,
+    #[command(flatten)]
+    pub upright: UprightOption,
     /// Folder of masks named like the photos, as in photo.jpg.png or photo.png: black pixels are ignored; by default the masks and
     /// transparency of the capture itself
     #[arg(long, value_name = "DIR")]
@@ -122,11 +124,12 @@ impl Refine {
             .try_for_each(|log| check_writable_dir(log).and_then(|()| RefineLog::check(log).map(drop)))?;
         signals::handle_stop_requests();
         signals::end_at_request(1);
-        let (path, masks) = self.scene.path(self.masks.as_deref(), &self.out)?;
+        let (path, masks) = self.scene.path(self.masks.as_deref(), self.upright, &self.out)?;
         // The time budget begins after the poses of photos are found.
         let clock = started.filter(|_| !self.scene.is_unposed()).unwrap_or_else(Instant::now);
         self.options.started = Some(clock);
         let capture = open_masked_capture(&path, masks)?;
+        let transform = capture.upright();
         self.check_outputs(&capture, &state_file)?;
         let splat = self.splat.as_deref().map(read_splat).transpose()?;
         warn(splat.as_ref().map_or(&[], |splat| &splat.warnings));
@@ -170,10 +173,11 @@ impl Refine {
         let gaussians = session.start()?;
         signals::end_at_request(2);
         if let (SceneInit::Photos, Some(quality)) = (init, session.quality()) {
-            bar.bar.suspend(|| eprintln!("{}: {quality}", capture.name));
+            let line = format!("{}: {quality}", capture.name);
             if quality.verdict == Verdict::WillFail && !self.ignore_verdict {
-                return Err(Error::failed("nothing is written; --ignore-verdict refines all the same").into());
+                return Err(Error::failed(format!("{line}; --ignore-verdict refines all the same")).into());
             }
+            bar.bar.suspend(|| eprintln!("{line}"));
         }
         *log.borrow_mut() =
             self.reports.log.as_ref().map(|folder| RefineLog::open(folder, steps)).transpose()?;
@@ -224,7 +228,9 @@ impl Refine {
             }
         }
         let lpips = if self.reports.lpips { session.score_lpips(&result)? } else { None };
-        Ok(self.describe_result(&session, &result, held_out.as_ref(), lpips.as_ref()))
+        let mut output = self.describe_result(&session, &result, held_out.as_ref(), lpips.as_ref());
+        output.json["transform"] = json!(transform);
+        Ok(output)
     }
 
     /// Returns `true` if the initial Gaussians are a model's.

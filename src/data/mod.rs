@@ -29,6 +29,8 @@ pub use loading::{BadData, Batch, BatchShard, DataLoader, LoadedScene, SceneGrou
 pub(crate) use nerf_writer::write_nerf_capture;
 pub(crate) use view::MIN_SHORTER_SIDE;
 pub use view::{MIN_SIDE, PhotoSize, Pixels, View, load_all_views, load_views, tensor_from_planes};
+#[cfg(test)]
+pub(crate) use view::{WALL_SIDE, wall};
 
 // Exchanged between processes.
 pub(crate) use loading::BadSceneReport;

@@ -250,6 +250,28 @@ pub fn tensor_from_planes(planes: &Planes) -> Tensor {
     Pixels::from(byte_tensor(planes)).to_float()
 }
 
+/// Side in pixels of the views of [`wall`].
+#[cfg(test)]
+pub(crate) const WALL_SIDE: i64 = 64;
+
+/// Returns the view of a camera at `x` on a wall with a wave pattern at depth 4.
+#[cfg(test)]
+pub(crate) fn wall(x: f64) -> View {
+    use crate::scene::Intrinsics;
+    use glam::{DMat4, DVec3};
+    let side = WALL_SIDE as f64;
+    let axis = |offset: f64| {
+        (Tensor::arange(WALL_SIDE, (Kind::Float, Device::Cpu)) + 0.5 - side / 2.) / side * 4. + offset
+    };
+    let (u, v) = (axis(x).view([1, WALL_SIDE]), axis(0.).view([WALL_SIDE, 1]));
+    let wave = ((&u * 5.).sin() * (&v * 4.).cos() + (&u * 11. + &v * 7.).sin()) * 0.2 + 0.4;
+    let intrinsics = Intrinsics { fx: side, fy: side, cx: side / 2., cy: side / 2. };
+    let c2w = DMat4::from_translation(DVec3::X * x);
+    let camera = Camera { intrinsics, c2w, width: WALL_SIDE as u32, height: WALL_SIDE as u32 };
+    let image = wave.expand([3, WALL_SIDE, WALL_SIDE], false).contiguous();
+    View { name: x.to_string(), image: image.into(), mask: None, camera }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

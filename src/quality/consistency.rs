@@ -2,10 +2,12 @@
 //! pairs.
 
 use crate::scene::Camera;
-use crate::stereo::{Agreement, ComparablePhoto, PhotoSurface, nearest_first};
+use crate::stereo::{
+    Agreement, ComparablePhoto, PhotoSurface, PlaneSweepOutput, are_near_duplicates, nearest_first,
+};
 use rayon::prelude::*;
 
-/// Number of photos, the nearest, that each photo with depths is compared with.
+/// Number of photos, the nearest that aren't near duplicates, that each photo with depths is compared with.
 const COMPARED_PHOTOS: usize = 16;
 /// Minimum fraction of a photo's patches that another one must show for a comparison.
 const MIN_OVERLAP: f64 = 0.1;
@@ -25,17 +27,34 @@ pub(super) struct Pair {
     pub is_consistent: bool,
 }
 
-/// Compares each of `surfaces`, the surfaces of photos with their indices, with the photos nearest to it.
-pub(super) fn compare_pairs(surfaces: &[(usize, PhotoSurface)], photos: &[ComparablePhoto]) -> Vec<Pair> {
+/// Compares each of `surfaces`, the surfaces of photos with their indices, with the `photos` nearest to it.
+pub(super) fn compare_pairs(
+    swept: &PlaneSweepOutput,
+    surfaces: &[(usize, PhotoSurface)],
+    photos: &[ComparablePhoto],
+) -> Vec<Pair> {
     let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
-    let compare = |(index, surface): &(usize, PhotoSurface)| -> Vec<([usize; 2], f64)> {
+    let depths: Vec<f64> =
+        swept.depth_maps.iter().map(|(_, map)| map.depth.median().double_value(&[])).collect();
+    let compare = |((index, surface), depth): (&(usize, PhotoSurface), &f64)| -> Vec<([usize; 2], f64)> {
         let pair = |other: usize| {
             let Agreement { overlap, kappa } = surface.agreement(&photos[other]);
             (overlap > MIN_OVERLAP).then_some(([*index, other], kappa))
         };
-        nearest_first(*index, &cameras).into_iter().take(COMPARED_PHOTOS).filter_map(pair).collect()
+        // Any number of near duplicates, as of a camera at rest, count as one.
+        let (mut pairs, mut distinct) = (vec![], vec![*index]);
+        for other in nearest_first(*index, &cameras) {
+            if distinct.iter().all(|&photo| !are_near_duplicates(&cameras[photo], &cameras[other], *depth)) {
+                distinct.push(other);
+            }
+            if distinct.len() > COMPARED_PHOTOS + 1 {
+                break;
+            }
+            pairs.extend(pair(other));
+        }
+        pairs
     };
-    let pairs: Vec<([usize; 2], f64)> = surfaces.par_iter().flat_map_iter(compare).collect();
+    let pairs: Vec<([usize; 2], f64)> = surfaces.par_iter().zip(&depths).flat_map_iter(compare).collect();
     let mut kappas: Vec<f64> = pairs.iter().map(|(_, kappa)| *kappa).collect();
     kappas.sort_by(f64::total_cmp);
     let median = kappas.get(kappas.len() / 2).copied().unwrap_or(0.);

@@ -12,7 +12,10 @@ pub use photo::PhotoQuality;
 
 use crate::data::{Capture, PhotoSize, View, load_views, read_points};
 use crate::error::Result;
-use crate::stereo::{ComparablePhoto, PhotoSurface, PlaneSweepOutput, SWEEP_SIDE, SmallPhoto, sweep};
+use crate::scene::Camera;
+use crate::stereo::{
+    ComparablePhoto, DepthMap, PhotoSurface, PlaneSweepOutput, SWEEP_SIDE, SmallPhoto, sweep,
+};
 use consistency::{Connections, Pair, compare_pairs};
 use coverage::Coverage;
 use glam::DVec3;
@@ -28,9 +31,11 @@ const SHOWN_NAMES: usize = 3;
 /// Fractions of the pairs of photos that contradict their poses, from which on a capture is usable only, and will fail.
 const CONTRADICTING: (f64, f64) = (0.1, 0.25);
 /// Fractions of the textured patches on whose depths photos agree, below which a capture is usable only, and will fail.
-const AGREEING: (f64, f64) = (0.5, 0.25);
+const AGREEING: (f64, f64) = (0.35, 0.15);
 /// Parallax in degrees below which a capture is usable only, and will fail.
 const PARALLAX: (f64, f64) = (2., 0.3);
+/// Minimum cosine of the angle between the axes of cameras that look in similar directions.
+const SIMILAR_DIRECTION: f64 = 0.5;
 /// Fraction of the photos that may be blurred, or badly exposed, or in no group with the others.
 const MAX_DOUBTFUL: f64 = 0.2;
 /// Fractions of the photos that were registered, below which a capture is usable only, and will fail.
@@ -86,7 +91,8 @@ pub struct CaptureQuality {
     pub reasons: Vec<String>,
     /// Result of the estimate of poses, if it is known.
     pub registration: Option<Registration>,
-    /// Median over photos of the parallax to the farthest photo that shows the same surface, in degrees.
+    /// Median over photos of the largest parallax to a photo that looks in a similar direction, in degrees: their distance in units of the
+    /// scene's depth.
     pub parallax: f64,
     /// Fraction of the photos' patches that have texture.
     pub textured: f64,
@@ -151,7 +157,7 @@ impl CaptureQuality {
         let surfaces: Vec<(usize, PhotoSurface)> =
             swept.depth_maps.iter().map(|(index, map)| (*index, PhotoSurface::new(map))).collect();
         let comparable = ComparablePhoto::of_sweep(swept);
-        let pairs = compare_pairs(&surfaces, &comparable);
+        let pairs = compare_pairs(swept, &surfaces, &comparable);
         let share = |part: usize, all: usize| part as f64 / all.max(1) as f64;
         let contradicting = pairs.iter().filter(|pair| !pair.is_consistent).count();
         for (index, photo) in photos.iter_mut().enumerate() {
@@ -168,7 +174,7 @@ impl CaptureQuality {
             verdict: Verdict::Good,
             reasons: vec![],
             registration,
-            parallax: median_parallax(&pairs, swept),
+            parallax: median_parallax(swept),
             textured: share(textured, patches().count()),
             agreeing: share(sure, textured),
             contradicting: share(contradicting, pairs.len()),
@@ -208,7 +214,8 @@ impl CaptureQuality {
         }
         add((count < FEW_PHOTOS).then_some(Verdict::Usable), format!("there are only {count} photos"));
         let parallax = below(self.parallax, PARALLAX);
-        let agreeing = below(self.agreeing, AGREEING);
+        // Few textured patches tell little.
+        let agreeing = below(self.agreeing, AGREEING).filter(|_| self.textured > MIN_TEXTURED);
         let percentage = percent(self.agreeing);
         // Photos from one place look alike at an infinite depth, or can't be compared at all.
         let is_one_place = parallax == Some(Verdict::WillFail)
@@ -302,18 +309,86 @@ fn above(value: f64, (usable, fails): (f64, f64)) -> Option<Verdict> {
     below(-value, (-usable, -fails))
 }
 
-/// Returns the median over the photos with depths of the largest parallax to a photo that shows the same surface, in degrees.
-fn median_parallax(pairs: &[Pair], swept: &PlaneSweepOutput) -> f64 {
-    let largest = |(index, map): &(usize, crate::stereo::DepthMap)| {
-        let depth = map.depth.median().double_value(&[]);
-        let distance = |pair: &Pair| {
-            let [a, b] = pair.photos.map(|photo| swept.photos[photo].camera.c2w.w_axis);
-            a.distance(b)
-        };
-        let distances = pairs.iter().filter(|pair| pair.photos[0] == *index).map(distance);
-        (distances.fold(0., f64::max) / depth).to_degrees()
+/// Returns the median over the photos with depths of the largest parallax to a photo that looks in a similar direction, in degrees.
+fn median_parallax(swept: &PlaneSweepOutput) -> f64 {
+    let cameras: Vec<Camera> = swept.photos.iter().map(|photo| photo.camera).collect();
+    let largest = |(index, map): &(usize, DepthMap)| {
+        let this = cameras[*index].c2w;
+        let similar = cameras.iter().filter(|other| other.c2w.z_axis.dot(this.z_axis) > SIMILAR_DIRECTION);
+        let distance = similar.map(|other| this.w_axis.distance(other.c2w.w_axis)).fold(0., f64::max);
+        (distance / map.depth.median().double_value(&[])).to_degrees()
     };
     let mut parallaxes: Vec<f64> = swept.depth_maps.iter().map(largest).collect();
     parallaxes.sort_by(f64::total_cmp);
     parallaxes[parallaxes.len() / 2]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::data::wall;
+    use glam::DMat4;
+    use tch::{Kind, Tensor};
+
+    /// Returns a view of a wall whose pattern has sharp edges.
+    fn sharp_wall(x: f64) -> View {
+        let view = wall(x);
+        let image = view.image.to_float();
+        let edges = image.ge(0.4).to_kind(Kind::Float) * 0.3;
+        View { image: (image * 0.5 + edges).into(), ..view }
+    }
+
+    /// Returns the quality of nine views of a wall, each changed by `change`.
+    fn quality(change: impl Fn(usize, View) -> View) -> CaptureQuality {
+        let view = |index: usize| change(index, sharp_wall(0.25 * index as f64 - 1.));
+        let views: Vec<View> = (0..9).map(view).collect();
+        let photos = views.iter().map(|view| view.to_small_photo(SWEEP_SIDE)).collect();
+        CaptureQuality::of_views(&views, &sweep(photos, &[], |_| true))
+    }
+
+    fn with_pose(view: View, change: impl Fn(DMat4) -> DMat4) -> View {
+        View { camera: Camera { c2w: change(view.camera.c2w), ..view.camera }, ..view }
+    }
+
+    #[test]
+    fn right_poses_are_good_and_wrong_ones_will_fail() {
+        let good = quality(|_, view| view);
+        assert_eq!((good.verdict, &good.reasons[..]), (Verdict::Good, &[][..]), "{good}");
+        assert!(good.contradicting == 0. && good.groups == [9] && good.agreeing > 0.8, "{good:?}");
+        // The wall is at depth 4, and each camera has another one 1 to 2 beside it.
+        assert!((15. ..30.).contains(&good.parallax), "{}", good.parallax);
+
+        let turn = DMat4::from_rotation_y(0.1);
+        let turned = quality(|index, view| with_pose(view, |c2w| if index < 4 { turn * c2w } else { c2w }));
+        assert_eq!(turned.verdict, Verdict::WillFail, "{turned}");
+        assert!(turned.to_string().starts_with("will fail: poses are wrong"), "{turned}");
+        assert_eq!(turned.groups, [5, 4], "{turned:?}");
+
+        let place = quality(|index, _| {
+            with_pose(sharp_wall(0.), |c2w| DMat4::from_translation(DVec3::X * 1e-4 * index as f64) * c2w)
+        });
+        assert_eq!(place.verdict, Verdict::WillFail, "{place}");
+    }
+
+    #[test]
+    fn blurred_and_overexposed_photos_are_named() {
+        let blurred = |view: &View| {
+            let image = view.image.to_float().unsqueeze(0);
+            let image = (0..4).fold(image, |image, _| image.avg_pool2d(5, 1, 2, false, false, None));
+            image.squeeze_dim(0)
+        };
+        let white = |view: &View| view.image.to_float() * 9.;
+        for (change, what) in [
+            (&blurred as &dyn Fn(&View) -> Tensor, "3 of 9 photos are blurred: "),
+            (&white, "3 of 9 photos are too dark or too bright: "),
+        ] {
+            let found = quality(|index, view| match index % 3 {
+                0 => View { image: change(&view).into(), ..view },
+                _ => view,
+            });
+            assert_eq!(found.verdict, Verdict::Usable, "{found}");
+            assert!(found.to_string().contains(what), "{found}");
+            assert_eq!(found.photos.iter().filter(|photo| !photo.faults().is_empty()).count(), 3);
+        }
+    }
 }

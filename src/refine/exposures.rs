@@ -195,7 +195,7 @@ mod tests {
 
     /// Returns the view of a camera at `x` on a wall, multiplied by `gains`.
     fn wall(x: f64, gains: [f64; 3]) -> View {
-        let view = crate::refine::tests::wall(x);
+        let view = crate::data::wall(x);
         let gains = Tensor::from_slice(&gains).to_kind(Kind::Float).view([3, 1, 1]);
         View { image: (view.image.to_float() * gains).into(), ..view }
     }

@@ -199,32 +199,15 @@ pub(crate) fn scene_depth(gaussians: &Gaussians, views: &[View]) -> Result<f64> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::data::view_batch;
+    use crate::data::{WALL_SIDE as SIDE, view_batch, wall};
     use crate::device::num_threads;
     use crate::metrics::score_views;
     use crate::render::DEFAULT_EPS2D;
-    use crate::scene::{Intrinsics, RawGaussians};
+    use crate::scene::RawGaussians;
     use crate::stereo::SWEEP_SIDE;
-    use glam::{DMat4, DVec3};
+
     use globalsplat_csrc::runtime::{RecordedOp, WAITING, computing, record_ops};
     use tch::Device;
-
-    const SIDE: i64 = 64;
-
-    /// Returns the view of a camera at `x` on a wall with a wave pattern at depth 4.
-    pub(super) fn wall(x: f64) -> View {
-        let side = SIDE as f64;
-        let axis = |offset: f64| {
-            (Tensor::arange(SIDE, (Kind::Float, Device::Cpu)) + 0.5 - side / 2.) / side * 4. + offset
-        };
-        let (u, v) = (axis(x).view([1, SIDE]), axis(0.).view([SIDE, 1]));
-        let wave = ((&u * 5.).sin() * (&v * 4.).cos() + (&u * 11. + &v * 7.).sin()) * 0.2 + 0.4;
-        let intrinsics = Intrinsics { fx: side, fy: side, cx: side / 2., cy: side / 2. };
-        let c2w = DMat4::from_translation(DVec3::X * x);
-        let camera = Camera { intrinsics, c2w, width: SIDE as u32, height: SIDE as u32 };
-        let image = wave.expand([3, SIDE, SIDE], false).contiguous();
-        View { name: x.to_string(), image: image.into(), mask: None, camera }
-    }
 
     /// Returns seven views of the wall.
     fn walls() -> Vec<View> {

@@ -285,11 +285,6 @@ impl<'a> RefineSession<'a> {
                     let why = "one photo gives no depth: expected two or more, or an initial splat";
                     return Err(Error::request(why));
                 }
-                let center = |view: &View| view.camera.c2w.w_axis;
-                if self.photos.iter().all(|view| center(view) == center(&self.photos[0])) {
-                    let line = "the photos were all taken from one position, so that depth can't be estimated: everything is placed at one distance";
-                    self.warn(&format!("{}: {line}", self.capture.name));
-                }
                 let new = self.gaussians_from_photos(self.initial_count())?.ok_or_else(stopped)?;
                 Gaussians { antialiased: self.options.antialiased, ..raw.insert(new).activate() }
             }
@@ -719,7 +714,8 @@ fn mean_of_every(scores: &CaptureScores, interval: usize) -> Scores {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::refine::tests::{start, wall};
+    use crate::data::wall;
+    use crate::refine::tests::start;
 
     /// A sample that is scored several times has few pixels, and its scores are those of its views.
     #[test]

@@ -2,7 +2,7 @@
 
 use super::{Cameras, default_eps2d, orbit_around_splat, render};
 use crate::error::{Error, Result};
-use crate::scene::{Camera, Gaussians, SH_C0, Similarity, splat_frame};
+use crate::scene::{Camera, Gaussians, SH_C0, Similarity, Upright, estimate_upright, splat_frame};
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use globalsplat_splat_file::{ShRotation, Splat};
 use kd_tree::KdTree;
@@ -46,6 +46,8 @@ fn rotate_sh(sh: &Tensor, rotation: &DMat3) -> Tensor {
 
 /// Contribution to all images, in pixels, below which cameras don't see a Gaussian.
 const MIN_CONTRIBUTION: f32 = 1e-3;
+/// Opacity from which a Gaussian's mean counts as a point on a surface.
+const MIN_SURFACE_OPACITY: f32 = 0.5;
 /// Number of neighbours within whose distance a Gaussian isn't isolated.
 const NEIGHBOURS: usize = 8;
 /// Number of standard deviations that a Gaussian extends to, for its neighbours.
@@ -56,6 +58,9 @@ const EXTENT: f32 = 3.;
 pub enum SplatEdit {
     /// Moves every point x to matrix · x: a rotation, a uniform scale and a translation.
     Transform(DMat4),
+    /// Turns the splat so that -y points up and its floor is at y = 0, as [`estimate_upright`] does by cameras and the means of opaque Gaussians.
+    /// The cameras are in the world of the splat before all edits.
+    Upright(Vec<Camera>),
     /// Removes Gaussians whose mean is outside of the box between two corners.
     CropBox(DVec3, DVec3),
     /// Removes Gaussians whose mean is farther from a center than a radius.
@@ -85,15 +90,22 @@ pub struct EditedSplat {
     pub from_original: DMat4,
     /// Number of Gaussians after each edit.
     pub counts: Vec<usize>,
+    /// What the last [`SplatEdit::Upright`] follows from.
+    pub upright: Option<Upright>,
 }
 
 /// Applies `edits` in their order. [`SplatEdit::Decimate`] keeps what contributes most to the images of `cameras`, which are in the world of
 /// the original splat, or if there are none, to views around the splat.
 ///
 /// # Errors
-/// Fails if a matrix does more than rotate, scale uniformly and translate, if no Gaussian is left, or like [`render`].
+/// Fails if a matrix does more than rotate, scale uniformly and translate, if [`SplatEdit::Upright`] has no cameras, if no Gaussian is left, or like [`render`].
 pub fn edit_splat(original: &Splat, edits: &[SplatEdit], cameras: &[Camera]) -> Result<EditedSplat> {
-    let mut edited = EditedSplat { splat: original.clone(), from_original: DMat4::IDENTITY, counts: vec![] };
+    let mut edited = EditedSplat {
+        splat: original.clone(),
+        from_original: DMat4::IDENTITY,
+        counts: vec![],
+        upright: None,
+    };
     for (index, edit) in edits.iter().enumerate() {
         let before = edited.splat.len();
         edited.apply(edit, cameras)?;
@@ -123,13 +135,16 @@ pub fn move_cameras(cameras: &[Camera], matrix: &DMat4) -> Vec<Camera> {
 impl EditedSplat {
     fn apply(&mut self, edit: &SplatEdit, cameras: &[Camera]) -> Result<()> {
         match edit {
-            SplatEdit::Transform(matrix) => {
-                // With an origin in float64, several moves, or one far away, don't round the positions.
-                if self.splat.origin == DVec3::ZERO {
-                    self.splat = self.splat.with_origin(splat_frame(&self.splat).origin);
-                }
-                self.splat = self.splat.transformed(matrix)?;
-                self.from_original = *matrix * self.from_original;
+            SplatEdit::Transform(matrix) => self.transform(matrix)?,
+            SplatEdit::Upright(cameras) => {
+                let cameras = move_cameras(cameras, &self.from_original);
+                let poses: Vec<DMat4> = cameras.iter().map(|camera| camera.c2w).collect();
+                let is_opaque = |index: &usize| self.splat.opacity(*index) >= MIN_SURFACE_OPACITY;
+                let opaque = (0..self.splat.len()).filter(is_opaque);
+                let means: Vec<DVec3> = opaque.map(|index| mean(&self.splat, index)).collect();
+                let upright = estimate_upright(&poses, &means, &[])?;
+                self.transform(&upright.matrix)?;
+                self.upright = Some(upright);
             }
             SplatEdit::CropBox(min, max) => {
                 self.retain_means(|mean| mean.cmpge(*min).all() && mean.cmple(*max).all())
@@ -160,6 +175,16 @@ impl EditedSplat {
         Ok(())
     }
 
+    fn transform(&mut self, matrix: &DMat4) -> Result<()> {
+        // With an origin in float64, several moves, or one far away, don't round the positions.
+        if self.splat.origin == DVec3::ZERO {
+            self.splat = self.splat.with_origin(splat_frame(&self.splat).origin);
+        }
+        self.splat = self.splat.transformed(matrix)?;
+        self.from_original = *matrix * self.from_original;
+        Ok(())
+    }
+
     fn retain(&mut self, is_kept: impl Fn(&Splat, usize) -> bool) {
         let kept: Vec<usize> = (0..self.splat.len()).filter(|&index| is_kept(&self.splat, index)).collect();
         if kept.len() < self.splat.len() {
@@ -169,8 +194,6 @@ impl EditedSplat {
 
     /// Keeps the Gaussians for whose mean in world coordinates `is_kept` returns `true`.
     fn retain_means(&mut self, is_kept: impl Fn(DVec3) -> bool) {
-        let mean =
-            |splat: &Splat, index: usize| splat.origin + DVec3::from(splat.means[index].map(f64::from));
         self.retain(|splat, index| is_kept(mean(splat, index)));
     }
 
@@ -190,6 +213,11 @@ impl EditedSplat {
         let gaussians = Gaussians::from_splat(&self.splat).to_local(&frame, self.splat.origin);
         contributions(&gaussians, &frame.cameras_to_local(cameras))
     }
+}
+
+/// Returns the mean of a Gaussian in world coordinates.
+fn mean(splat: &Splat, index: usize) -> DVec3 {
+    splat.origin + DVec3::from(splat.means[index].map(f64::from))
 }
 
 /// Returns the distance of each point to its `k`th nearest other point; infinite if there are fewer.

@@ -12,6 +12,7 @@ use globalsplat::io::{
 use globalsplat::reconstruct::load_model;
 use globalsplat::scene::Gaussians;
 use globalsplat::train::latest_checkpoint;
+use globalsplat_capture::read_geo_positions;
 use globalsplat_files::stored_zip;
 use globalsplat_test_kit::formats::{cameras, names, pinhole, write_colmap_binary, write_colmap_text};
 use std::fs;
@@ -24,7 +25,7 @@ use tch::Device;
 pub type Reader = fn(&[u8]);
 
 /// Readers, by the names that `scripts/fuzz.sh` takes and of the folders of their seeds.
-pub const READERS: [(&str, Reader); 28] = [
+pub const READERS: [(&str, Reader); 29] = [
     ("antimatter", antimatter),
     // A camera path of nerfstudio's viewer.
     ("camera_path", |bytes| {
@@ -45,6 +46,9 @@ pub const READERS: [(&str, Reader); 28] = [
     ("evaluation", evaluation),
     ("evaluation_index", |bytes| {
         let _ = EvaluationIndex::read(&file("evaluation_index", "index.json", bytes));
+    }),
+    ("geo_positions", |bytes| {
+        let _ = read_geo_positions(&file("geo_positions", "geo.txt", bytes));
     }),
     ("glb", |bytes| read_and_repair(&file("glb", "splat.glb", bytes))),
     ("gltf", |bytes| read_and_repair(&file("gltf", "splat.gltf", bytes))),

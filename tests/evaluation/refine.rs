@@ -269,7 +269,7 @@ fn photos_of_one_place_count_once() {
     }
 }
 
-/// Cameras that don't move give no depth: a warning says so, and the photos are placed at one distance.
+/// Cameras that don't move give no depth: the verdict says so, and on request the photos are placed at one distance.
 #[test]
 fn photos_from_one_place_are_shown_at_one_distance() {
     let sandbox = Sandbox::new();
@@ -280,9 +280,11 @@ fn photos_from_one_place_are_shown_at_one_distance() {
         views[1].1.c2w = first;
         views
     });
-    let (_, message) =
-        sandbox.succeed_with_messages("refine --scene @room --out @a.ply --gaussians 500 --steps 20");
-    assert_says(&message, &["depth can't be estimated"]);
+    let refine = "refine --scene @room --out @a.ply --gaussians 500 --steps 20";
+    let refused = sandbox.fail(refine, 1);
+    assert_says(&refused, &["will fail: the photos were taken from one place", "--ignore-verdict"]);
+    assert!(!sandbox.path("a.ply").exists());
+    sandbox.run(&format!("{refine} --ignore-verdict"));
     let means = read_splat(&sandbox.path("a.ply")).unwrap().means;
     assert!(means.as_flattened().iter().all(|coordinate| coordinate.is_finite()));
     let refused = sandbox.refuse("eval --splat @a.ply --scene @room --covered");

@@ -6,13 +6,14 @@ mod splat_files;
 
 use crate::common::program::{Sandbox, assert_says};
 use crate::common::psnr;
+use glam::{DMat4, DVec3};
 use globalsplat::data::open_capture;
-use globalsplat::io::{ShLimits, fit_splat, read_image, read_splat};
+use globalsplat::io::{ShLimits, Splat, fit_splat, read_image, read_splat};
 use globalsplat::metrics::psnr_between;
 use globalsplat::scene::{Gaussians, RawGaussians};
 use rand::SeedableRng;
 use rand::rngs::StdRng;
-use serde_json::Value;
+use serde_json::{Value, json};
 use splat_files::{files_with_invalid_values, files_without_a_rotation, random_splat, symmetric, written};
 
 /// Gaussians keep the bits of a splat's parameters, and give them back unless they are infinite.
@@ -25,7 +26,7 @@ fn splats_are_gaussians_and_back() {
     assert_eq!(Vec::<f32>::try_from(raw.log_scales.flatten(0, -1)).unwrap(), splat.log_scales.as_flattened());
     assert_eq!(raw.sh.size(), [1, 300, 9, 3]);
     assert_eq!(raw.sh.double_value(&[0, 7, 8, 1]), f64::from(splat.sh_of(7)[8][1]));
-    let origin = glam::DVec3::new(1e6, 2., 3.);
+    let origin = DVec3::new(1e6, 2., 3.);
     let back = gaussians.to_splat(origin).unwrap();
     assert_eq!((&back.means, &back.quaternions, &back.sh), (&splat.means, &splat.quaternions, &splat.sh));
     assert_eq!((back.origin, back.sh_degree), (origin, 2));
@@ -71,6 +72,54 @@ fn convert_reports_the_loss() {
     let report = sandbox.succeed("convert @room/truth.ply @c.splat");
     assert_says(&report, &["Gaussians, SH degree 0, ", "dB between renders"]);
     assert_eq!(sandbox.output("convert @room/truth.ply @d.ply --sh-degree 4").0, Some(2));
+}
+
+/// A splat of a tilted capture is turned upright, and scaled by a known length.
+#[test]
+fn convert_turns_upright_and_scales_to_a_length() {
+    let sandbox = Sandbox::new();
+    let matrix = |report: &Value| {
+        let rows: [[f64; 4]; 4] = serde_json::from_value(report["transform"].clone()).unwrap();
+        DMat4::from_cols_array_2d(&rows).transpose()
+    };
+    let tilt = "convert @room/truth.ply @turned.ply --rotate 20,-40,100 --translate 1,2,3";
+    let tilt = matrix(&sandbox.json(tilt));
+    sandbox.change_json("room/cameras.json", |json| {
+        for view in json["views"].as_array_mut().unwrap() {
+            let rows: [[f64; 4]; 4] = serde_json::from_value(view["c2w"].take()).unwrap();
+            view["c2w"] = json!((DMat4::from_cols_array_2d(&rows) * tilt.transpose()).to_cols_array_2d());
+        }
+    });
+    let report =
+        sandbox.json("convert @turned.ply @upright.ply --upright --scene @room --length 0,0,0 3,4,0 1");
+    let all = matrix(&report) * tilt;
+    let angle = all.transform_vector3(DVec3::Y).angle_between(DVec3::Y).to_degrees();
+    assert!(angle < 2., "{angle}°");
+    assert!((all.transform_vector3(DVec3::X).length() * 5. - 1.).abs() < 1e-9, "{all}");
+    let [before, after] = ["turned.ply", "upright.ply"].map(|name| read_splat(&sandbox.path(name)).unwrap());
+    let (distance, half) = (
+        |splat: &Splat, a: usize, b: usize| {
+            DVec3::from(splat.means[a].map(f64::from)).distance(DVec3::from(splat.means[b].map(f64::from)))
+        },
+        before.len() / 2,
+    );
+    let ratio = distance(&after, 0, half) / distance(&before, 0, half);
+    assert!((5. * ratio - 1.).abs() < 1e-3, "{ratio}");
+    let edits: Vec<&str> =
+        report["edits"].as_array().unwrap().iter().map(|edit| edit["edit"].as_str().unwrap()).collect();
+    assert_eq!(edits, ["--upright", "--length=0,0,0 3,4,0 1"]);
+    assert_says(
+        &sandbox.succeed("convert @turned.ply @upright.ply --upright --scene @room"),
+        &["upright by the "],
+    );
+    assert_says(
+        &sandbox.refuse("convert @turned.ply @upright.ply --upright"),
+        &["--upright needs the cameras of --scene"],
+    );
+    assert_says(
+        &sandbox.refuse("convert @turned.ply @upright.ply --length 1,2,3 1,2,3 1"),
+        &["--length=1,2,3 1,2,3 1: expected two points that differ"],
+    );
 }
 
 /// Edits are applied in their order and counted, and the loss is measured by cameras that move along.

@@ -12,3 +12,4 @@ mod examples;
 mod film;
 mod outputs;
 mod paths;
+mod quality;

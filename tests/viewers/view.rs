@@ -5,6 +5,7 @@ use crate::common::browser::Browser;
 use crate::common::program::{Sandbox, arg, assert_says, run_process, succeed};
 use crate::common::{captures, has_viewer, write_script};
 use crate::{LEAST, assert_like, own_picture, picture_from_base64};
+use glam::DVec3;
 use globalsplat::data::{load_views, open_capture};
 use globalsplat::io::{Splat, read_splat, write_splat};
 use globalsplat::metrics::psnr;
@@ -210,6 +211,34 @@ fn a_page_shows_the_scene_and_can_be_walked_in() {
     shown.click("#color");
     shown.key("Home");
     shown.wait_for("page.walk.at === 0");
+
+    // Two clicks measure a distance, in the coordinates of the file.
+    shown.key("KeyM");
+    let clicks = [(150., 300.), (400., 260.)];
+    for (x, y) in clicks {
+        for kind in ["mousePressed", "mouseReleased"] {
+            let event = json!({"type": kind, "x": x, "y": y, "button": "left", "clickCount": 1});
+            shown.browser.call("Input.dispatchMouseEvent", event);
+        }
+    }
+    let option = shown.value("document.getElementById('length').textContent");
+    let words: Vec<&str> = option.as_str().unwrap().split(' ').collect();
+    assert!(matches!(words[..], ["--length", _, _, "METRES"]), "{option}");
+    let points = [words[1], words[2]]
+        .map(|point| DVec3::from_slice(&point.split(',').map(|x| x.parse().unwrap()).collect::<Vec<_>>()));
+    let size = ImageSize { width: SIDE, height: SIDE };
+    let camera = open_capture(&capture).unwrap().cameras()[0].with_size(size);
+    for (point, (x, y)) in points.iter().zip(clicks) {
+        let ray = camera.c2w.inverse().transform_point3(*point);
+        let k = camera.intrinsics;
+        let (u, v) = (k.fx * ray.x / ray.z + k.cx, k.fy * ray.y / ray.z + k.cy);
+        assert!(ray.z > 0. && (u - x).hypot(v - y) < 1.5, "{point} is at ({u}, {v}), not at ({x}, {y})");
+    }
+    let text = shown.value("document.getElementById('distance').textContent");
+    let measured: f64 = text.as_str().unwrap().strip_suffix(" units").unwrap().parse().unwrap();
+    assert!((measured / points[0].distance(points[1]) - 1.).abs() < 1e-3, "{text} {points:?}");
+    shown.key("KeyM");
+    assert_eq!(shown.value("measurement.hidden"), true);
 
     // Walking by keys and turning by touch leave the photo.
     let at_photo = shown.place();

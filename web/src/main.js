@@ -2,6 +2,7 @@
 
 import { scene, splat } from "./data.js";
 import { frame } from "./lens.js";
+import { Measure } from "./measure.js";
 import { Stage } from "./stage.js";
 import { Walk } from "./walk.js";
 
@@ -19,6 +20,7 @@ class Page {
   constructor() {
     this.stage = new Stage(canvas, scene);
     this.walk = new Walk(this.stage, canvas);
+    this.measure = new Measure(this.stage, canvas, () => this.showMeasurement());
     this.lens = scene.cameras[0].lens;
     this.stillness = matchMedia("(prefers-reduced-motion: reduce)");
     this.addStrip();
@@ -88,6 +90,7 @@ class Page {
   addButtons() {
     for (const mode of ["color", "depth", "centers"]) at(mode).addEventListener("click", () => this.show(mode));
     at("cameras").addEventListener("click", () => this.toggleCameras());
+    at("measure").addEventListener("click", () => this.measure.toggle());
     at("play").addEventListener("click", () => this.togglePlay());
     at("along").addEventListener("input", () => this.walk.seek(at("along").valueAsNumber));
     at("share").addEventListener("input", () => this.compare());
@@ -97,7 +100,7 @@ class Page {
   addKeys() {
     const keys = {
       Digit1: () => this.show("color"), Digit2: () => this.show("depth"), Digit3: () => this.show("centers"),
-      Space: () => this.togglePlay(), KeyC: () => this.toggleCameras(), KeyH: () => this.toggleControls(),
+      Space: () => this.togglePlay(), KeyC: () => this.toggleCameras(), KeyH: () => this.toggleControls(), KeyM: () => this.measure.toggle(),
       Comma: () => this.jumpBy(-1), Period: () => this.jumpBy(1), Home: () => this.jumpTo(0), Slash: () => this.toggleHelp(),
     };
     addEventListener("keydown", (event) => {
@@ -121,6 +124,19 @@ class Page {
     this.stage.frustums.visible = !this.stage.frustums.visible;
     at("cameras").setAttribute("aria-pressed", this.stage.frustums.visible);
     this.stage.touch();
+  }
+
+  showMeasurement() {
+    const { measure } = this;
+    if (!measure) return;
+    at("measure").setAttribute("aria-pressed", measure.isOn);
+    canvas.classList.toggle("measuring", measure.isOn);
+    const result = measure.result();
+    at("measurement").hidden = !measure.isOn;
+    at("distance").textContent = result
+      ? `${Number(result.distance.toPrecision(4))} ${scene.frame.unit}`
+      : `Click ${measure.places.length ? "the other point" : "two points"}`;
+    at("length").textContent = result?.option ?? "";
   }
 
   togglePlay() {

@@ -1,6 +1,6 @@
 //! The in-memory representation of a capture, common to all file formats.
 
-use crate::geometry::{Camera, ImageSize, check_pose, nearest_rigid_of_scaled};
+use crate::geometry::{Camera, ImageSize, Upright, check_pose, nearest_rigid_of_scaled};
 use crate::holdout::Holdout;
 use crate::image_source::ImageSource;
 use crate::lens::{Lens, LensModel, PinholeView, Projection, split_into_views};
@@ -454,12 +454,7 @@ impl Capture {
         // A COLMAP model consists of several files.
         let form = described.extension().filter(|form| *form == "bin" || *form == "txt");
         let siblings = form.and_then(|_| std::fs::read_dir(parent_of(&described)).ok());
-        // The model of a capture that `globalsplat capture` made is in its folder sparse/0.
-        let record = described.ancestors().nth(3).map(|folder| folder.join(CAPTURE_RECORD));
-        record
-            .iter()
-            .filter(|record| form.is_some() && record.is_file())
-            .for_each(|record| inputs.add(record));
+        self.record().iter().for_each(|record| inputs.add(record));
         for sibling in siblings.into_iter().flatten().flatten() {
             if Path::new(&sibling.file_name()).extension() == form {
                 inputs.add(&sibling.path());
@@ -471,6 +466,21 @@ impl Capture {
             }
             frame.mask.iter().for_each(|mask| inputs.add_photo(mask));
         }
+    }
+
+    /// Returns the file that records how the capture was made, if `globalsplat capture` made it.
+    fn record(&self) -> Option<PathBuf> {
+        // The model is in the capture's folder sparse/0.
+        let is_model = self.file.extension().is_some_and(|form| form == "bin" || form == "txt");
+        let record = self.file.ancestors().nth(3).map(|folder| folder.join(CAPTURE_RECORD));
+        record.filter(|record| is_model && record.is_file())
+    }
+
+    /// Returns the transform from COLMAP's coordinates to those of the capture, if `globalsplat capture` has turned it upright.
+    pub fn upright(&self) -> Option<Upright> {
+        let text = std::fs::read_to_string(self.record()?).ok()?;
+        let mut record: serde_json::Value = serde_json::from_str(&text).ok()?;
+        serde_json::from_value(record["report"]["transform"].take()).ok()
     }
 
     /// Reads the views `indices`, fitted to `size`, or at their own size if it is `None`. A photo is decoded once for all of its views.

@@ -1,6 +1,7 @@
 //! Files of photos and masks: the search for those that a capture names, folders of photos without poses, and the order and forms of names.
 
 use crate::formats::polycam::is_polycam;
+use crate::geo::GEO_FILE;
 use crate::pixels::{PHOTO_EXTENSIONS, SUPPORTED_IMAGES, read_image_size};
 use globalsplat_files::{Error, Result, relative_name};
 use rayon::prelude::*;
@@ -153,7 +154,7 @@ pub struct PhotoList {
 ///
 /// A photo is a file whose contents begin as those of an image, whatever format its extension names, and whose extension is that of a
 /// photo in any case, or missing. So a text file named `.jpg` is none, and neither is a camera's raw file, whose contents begin as those
-/// of a TIFF. Hidden files and folders, files of the system, folders named `masks`, and Polycam's depths and thumbnails are ignored.
+/// of a TIFF. Hidden files and folders, files of the system, [`GEO_FILE`], folders named `masks`, and Polycam's depths and thumbnails are ignored.
 ///
 /// # Errors
 /// Fails if a folder can't be read, or if there is no photo.
@@ -186,7 +187,7 @@ fn collect_files(folder: &Path, files: &mut Vec<PathBuf>) -> Result<()> {
     for entry in std::fs::read_dir(folder).map_err(Error::read(folder))? {
         let entry = entry.map_err(Error::read(folder))?;
         let name = entry.file_name();
-        let is_known = SYSTEM_FILES.iter().chain(others).any(|known| name == *known);
+        let is_known = SYSTEM_FILES.iter().chain(others).any(|known| name == *known) || name == GEO_FILE;
         if name.as_encoded_bytes().starts_with(b".") || is_known {
             continue;
         }

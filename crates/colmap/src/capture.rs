@@ -1,13 +1,14 @@
 //! Captures from photos or a video: which folders may be used, what an earlier call has made, and the steps in their order.
 
 use crate::colmap::Colmap;
-use crate::photos::{find_photo_masks, find_photos};
+use crate::photos::{find_photo_masks, find_photos, find_positions};
 use crate::poses::Estimate;
 use crate::progress::{Progress, Reporter, Step};
 use crate::record::{CaptureReport, FILE, Matching, Record, VideoRecord};
 use crate::video::{check_video, first_visible, remove_frames, write_sharpest_frames};
-use globalsplat_capture::{COLMAP_MODELS, is_polycam, list_photos};
+use globalsplat_capture::{COLMAP_MODELS, GEO_FILE, is_polycam, list_photos};
 use globalsplat_files::{Error, FolderLock, Result, check_writable_dir, is_same_file, real_path};
+use std::collections::BTreeMap;
 use std::fs::{self, DirEntry};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -29,6 +30,9 @@ pub struct CaptureOptions {
     /// Folder of masks, named like the photos; by default the folder `masks` among the photos, if there is one. Black pixels have no
     /// features.
     pub masks: Option<PathBuf>,
+    /// `true` to leave the largest model in COLMAP's coordinates. Otherwise it is turned upright, as by [`estimate_upright`](globalsplat_capture::estimate_upright), and is in metres
+    /// if the positions of the photos in their EXIF data, or in a file `geo.txt` among or beside them, agree with it.
+    pub keeps_coordinates: bool,
     /// `true` to use a finished capture as it is, whatever settings it was made with.
     pub keeps_finished: bool,
 }
@@ -104,6 +108,8 @@ fn make_or_continue(
             Matching::Auto if is_video => Matching::Sequential,
             matching => matching,
         },
+        is_upright: !options.keeps_coordinates,
+        positions: if is_video { BTreeMap::new() } else { find_positions(photos, &found)? },
         masks: find_photo_masks(photos, &found, options.masks.as_deref(), out, old.as_ref())?,
         found,
         ..Record::default()
@@ -160,6 +166,7 @@ fn check_output(photos: &Path, out: &Path, is_video: bool, is_new: bool) -> Resu
     }
     let is_known = |entry: &DirEntry| {
         entry.file_name().as_encoded_bytes().starts_with(b".")
+            || entry.file_name() == GEO_FILE
             || is_same_file(&entry.path(), photos) && (!is_video || first_visible(photos).is_none())
     };
     let other = fs::read_dir(out).into_iter().flatten().flatten().find(|entry| !is_known(entry));

@@ -3,8 +3,9 @@
 use crate::progress::{Progress, Reporter, Step};
 use crate::record::Record;
 use globalsplat_capture::{
-    MASKS_FOLDER, decode_upright, encode_photo, encode_upright, exif_focal, find_masks, find_masks_in,
-    fit_mask, gray_to_rgb, is_equirectangular, list_photos, read_image_size,
+    GEO_FILE, GeoPosition, MASKS_FOLDER, decode_upright, encode_photo, encode_upright, exif_focal,
+    exif_position, find_masks, find_masks_in, fit_mask, gray_to_rgb, is_equirectangular, list_photos,
+    read_geo_positions, read_image_size,
 };
 use globalsplat_files::{
     Error, Result, checksum, is_same_file, parent_of, real_path, relative_name, write_file,
@@ -60,6 +61,9 @@ pub(crate) struct Photo {
     /// `true` if the photo in the folder has more than [`MAX_PIXELS`].
     #[serde(default)]
     pub is_reduced: bool,
+    /// Position that the file's EXIF data tell.
+    #[serde(default)]
+    pub position: Option<GeoPosition>,
     /// `true` if the photo that was found isn't opaque, which makes a mask.
     #[serde(default)]
     pub has_alpha: bool,
@@ -128,6 +132,27 @@ pub(crate) fn find_photo_masks(
             Err(Error::input(folder, "the folder of masks", "one of masks that `capture` wrote", expected))
         }
         None => Ok(described),
+    }
+}
+
+/// Returns the positions of the photos `found` in `folder`, by their names, that a file [`GEO_FILE`] in the folder or beside it lists.
+///
+/// # Errors
+/// Returns an error if the file violates its format, or lists none of the photos.
+pub(crate) fn find_positions(folder: &Path, found: &[FoundPhoto]) -> Result<BTreeMap<String, GeoPosition>> {
+    let files = [folder.join(GEO_FILE), parent_of(folder).join(GEO_FILE)];
+    let Some(file) = files.into_iter().find(|file| file.is_file()) else { return Ok(BTreeMap::new()) };
+    let listed = read_geo_positions(&file)?;
+    let position = |photo: &FoundPhoto| {
+        let (_, name) = photo.name.rsplit_once('/').unwrap_or(("", &photo.name));
+        listed.get(&photo.name).or(listed.get(name)).map(|position| (photo.name.clone(), *position))
+    };
+    let positions: BTreeMap<_, _> = found.iter().filter_map(position).collect();
+    match positions.is_empty() {
+        true => {
+            Err(Error::input(file, "the list of photos", "without any of the folder's", "names as IMG_1.jpg"))
+        }
+        false => Ok(positions),
     }
 }
 
@@ -351,6 +376,7 @@ fn inspect(
         is_equirectangular: is_equirectangular(&encoded),
         is_reduced,
         has_alpha,
+        position: exif_position(&encoded),
     };
     Ok(Inspected { photo, contents, mask })
 }

@@ -4,8 +4,12 @@ use crate::colmap::Colmap;
 use crate::photos::{Photo, SkippedPhoto, import_photos};
 use crate::progress::{Progress, Reporter, Step};
 use crate::record::{CaptureReport, Matching, Record, SHOWN_NAMES};
-use globalsplat_capture::{COLMAP_MODELS, MASKS_FOLDER, format_names, read_colmap_models};
-use globalsplat_files::{Error, Result, write_file};
+use glam::DVec3;
+use globalsplat_capture::{
+    COLMAP_MODELS, GeoPosition, MASKS_FOLDER, Upright, estimate_upright, format_names, read_colmap_models,
+    to_east_north_up,
+};
+use globalsplat_files::{Error, Result, parent_of, write_file};
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -107,9 +111,21 @@ impl Estimate<'_, '_> {
         self.record.photos.as_deref().unwrap_or_default()
     }
 
+    /// Returns the photos, each with the name under which it was found.
+    fn named_photos(&self) -> Vec<(&String, &Photo)> {
+        let Record { found, skipped, .. } = &self.record;
+        let mut names: Vec<&String> = found.iter().map(|photo| &photo.name).collect();
+        names.retain(|name| skipped.iter().all(|photo| photo.name != **name));
+        names.into_iter().zip(self.photos()).collect()
+    }
+
     /// Runs a command of COLMAP on the database, from the progress `start`.
     fn run(&mut self, command: &str, mut options: Value, start: Progress) -> Result<()> {
         options["database_path"] = text(&self.out.join("database.db"));
+        self.run_on_files(command, options, start)
+    }
+
+    fn run_on_files(&mut self, command: &str, options: Value, start: Progress) -> Result<()> {
         self.colmap.run(command, &options, &self.out.join("colmap.log"), start, self.reporter)
     }
 
@@ -258,9 +274,41 @@ impl Estimate<'_, '_> {
             });
             self.run("bundle_adjuster", options, Progress { done: models[0].photos.len(), ..progress })?;
         }
+        self.record.transform =
+            self.record.is_upright.then(|| self.turn_upright(&models[0].folder, progress)).transpose()?;
         remove(&sparse)?;
         fs::rename(&partial, &sparse).map_err(Error::write(&sparse))?;
         Ok(())
+    }
+
+    /// Turns the largest model, in `folder`, upright, and scales it to metres if the photos have positions that agree with it. Other models, which
+    /// nothing connects to it, stay as they are.
+    fn turn_upright(&mut self, folder: &Path, progress: Progress) -> Result<Upright> {
+        // The model of the mapper may have been adjusted since it was read.
+        let model = read_colmap_models(parent_of(folder))?.swap_remove(0);
+        let upright = estimate_upright(&model.c2w, &model.points, &self.positions(&model.photos))?;
+        let (scale, rotation, translation) = upright.matrix.to_scale_rotation_translation();
+        let numbers =
+            [&[scale.x, rotation.w, rotation.x, rotation.y, rotation.z][..], &translation.to_array()];
+        let numbers: Vec<String> = numbers.concat().iter().map(f64::to_string).collect();
+        let options = json!({
+            "input_path": text(folder),
+            "output_path": text(folder),
+            "transform_path": self.write_list("transform.txt", [numbers.join(" ")].into_iter())?,
+        });
+        self.run_on_files("model_transformer", options, Progress { done: model.photos.len(), ..progress })?;
+        Ok(upright)
+    }
+
+    /// Returns the positions of photos in metres, east, north and up, of those that have one.
+    fn positions(&self, names: &[String]) -> Vec<Option<DVec3>> {
+        let by_file = &self.record.positions;
+        let located = self
+            .named_photos()
+            .into_iter()
+            .filter_map(|(name, photo)| Some((&photo.name, by_file.get(name).copied().or(photo.position)?)));
+        let geographic: BTreeMap<&String, GeoPosition> = located.collect();
+        to_east_north_up(&names.iter().map(|name| geographic.get(name).copied()).collect::<Vec<_>>())
     }
 
     /// Returns the result.
@@ -270,13 +318,12 @@ impl Estimate<'_, '_> {
         let registered: BTreeSet<&String> = largest.photos.iter().collect();
         let unregistered = self.photos().iter().filter(|photo| !registered.contains(&photo.name));
         let name = |photo: &Photo| photo.name.clone();
-        let Record { found, masks, skipped, .. } = &self.record;
-        let mut names: Vec<&String> = found.iter().map(|photo| &photo.name).collect();
-        names.retain(|name| skipped.iter().all(|photo| photo.name != **name));
-        let is_unmasked = |(name, photo): &(&String, &Photo)| {
+        let Record { masks, .. } = &self.record;
+        let is_unmasked = |(name, photo): &&(&String, &Photo)| {
             !masks.is_empty() && !masks.contains_key(*name) && !photo.has_alpha
         };
-        let unmasked = names.into_iter().zip(self.photos()).filter(is_unmasked);
+        let unmasked = self.named_photos();
+        let unmasked = unmasked.iter().filter(is_unmasked);
         let is_few = (largest.photos.len() as f64) < FEW_REGISTERED * self.photos().len() as f64;
         Ok(CaptureReport {
             video: None,
@@ -284,11 +331,12 @@ impl Estimate<'_, '_> {
             photos: self.record.found.len(),
             registered: largest.photos.len(),
             reprojection_error: largest.reprojection_error,
-            points: largest.points,
+            points: largest.points.len(),
+            transform: self.record.transform,
             other_files: None,
             skipped: self.record.skipped.clone(),
             reduced: self.photos().iter().filter(|photo| photo.is_reduced).map(name).collect(),
-            unmasked: unmasked.map(|(name, _)| name.clone()).collect(),
+            unmasked: unmasked.map(|(name, _)| (*name).clone()).collect(),
             unregistered: unregistered.map(name).collect(),
             advice: if is_few { vec![ADVICE.to_string()] } else { vec![] },
             models: models.iter().map(|model| model.photos.len()).collect(),
@@ -379,6 +427,7 @@ mod tests {
                 is_equirectangular: false,
                 is_reduced: false,
                 has_alpha: false,
+                position: None,
             }
         };
         for (model, _) in COLMAP_MODELS {

@@ -37,7 +37,7 @@ for name in list(options):
         holder = sections[section] if hasattr(sections[section], key) else pipeline
         setattr(holder, key, options[name])
 
-database = options["database_path"]
+database = options.get("database_path")
 if sys.argv[1] == "feature_extractor":
     names = Path(options["image_list_path"]).read_text(encoding="utf-8").splitlines()
     pycolmap.extract_features(
@@ -67,6 +67,11 @@ elif sys.argv[1] == "bundle_adjuster":
     solver.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     solver.loss_function_scale = 2 * errors[len(errors) // 2] if errors else 1
     pycolmap.bundle_adjustment(model, adjustment)
+    model.write_binary(options["output_path"])
+elif sys.argv[1] == "model_transformer":
+    model = pycolmap.Reconstruction(options["input_path"])
+    scale, w, x, y, z, *translation = map(float, Path(options["transform_path"]).read_text().split())
+    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d([x, y, z, w]), translation))
     model.write_binary(options["output_path"])
 else:
     sys.exit(f"unknown command {sys.argv[1]}")

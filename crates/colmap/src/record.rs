@@ -3,7 +3,7 @@
 use crate::photos::{FoundMask, FoundPhoto, MAX_PIXELS, Photo, SkippedPhoto};
 use crate::progress::Step;
 use crate::video::VideoFrames;
-use globalsplat_capture::format_names;
+use globalsplat_capture::{GeoPosition, Upright, format_names};
 use globalsplat_files::{Error, Result, read_text, write_json};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -113,6 +113,9 @@ pub struct CaptureReport {
     pub reprojection_error: f64,
     /// Number of points of the largest model.
     pub points: usize,
+    /// Transform from COLMAP's coordinates of the largest model to those that were written, unless they are the same.
+    #[serde(default)]
+    pub transform: Option<Upright>,
     /// Line about files in the folder that aren't photos.
     pub other_files: Option<String>,
     /// Photos that are damaged, show nothing, or are identical to another.
@@ -139,6 +142,7 @@ impl fmt::Display for CaptureReport {
             f,
             "{registered} of {photos} photos registered, {points} points, reprojection error {reprojection_error:.2} pixels"
         )?;
+        self.transform.iter().try_for_each(|upright| write!(f, "\n{upright}"))?;
         if self.models.len() > 1 {
             write!(f, "\n{} separate models, of which the largest is used", self.models.len())?;
         }
@@ -173,6 +177,12 @@ pub(crate) struct Record {
     pub camera_model: Option<String>,
     /// Choice of pairs.
     pub matching: Matching,
+    /// `true` to turn the largest model upright.
+    #[serde(default)]
+    pub is_upright: bool,
+    /// The positions of photos in a file, by the names of the photos.
+    #[serde(default)]
+    pub positions: BTreeMap<String, GeoPosition>,
     /// Files of the masks, by the names of their photos.
     pub masks: BTreeMap<String, FoundMask>,
     /// Names of the masks that calls have written. Others in their folder are the user's.
@@ -190,6 +200,9 @@ pub(crate) struct Record {
     pub has_features: bool,
     /// Number of pairs whose features are matched.
     pub matched_pairs: usize,
+    /// Transform from COLMAP's coordinates of the largest model to those that were written.
+    #[serde(skip)]
+    pub transform: Option<Upright>,
     /// Seconds that each step took, in all calls together.
     pub seconds: BTreeMap<Step, f64>,
     /// The result, without what isn't kept: the video and the other files.
@@ -227,7 +240,8 @@ impl Record {
     /// capture stays as it is.
     pub fn update(mut self, new: Record, keeps_finished: bool) -> Record {
         let has_other_masks = self.masks != new.masks;
-        if keeps_finished && self.report.is_some() && (new.masks.is_empty() || !has_other_masks) {
+        let is_kept = (new.masks.is_empty() || !has_other_masks) && (new.is_upright || !self.is_upright);
+        if keeps_finished && self.report.is_some() && is_kept {
             return self;
         }
         // The photos stay frames of their video if the user names their folder.
@@ -240,9 +254,13 @@ impl Record {
             self.seconds.retain(|step, _| *step == Step::Photos);
             return Record { photos: self.photos, skipped: self.skipped, seconds: self.seconds, ..new };
         }
-        if self.matching != new.matching {
+        let matched_pairs = if self.matching == new.matching { self.matched_pairs } else { 0 };
+        if (&self.matching, self.is_upright, &self.positions)
+            != (&new.matching, new.is_upright, &new.positions)
+        {
             self.seconds.remove(&Step::Poses);
-            return Record { matching: new.matching, matched_pairs: 0, report: None, ..self };
+            let Record { matching, is_upright, positions, .. } = new;
+            return Record { matching, is_upright, positions, matched_pairs, report: None, ..self };
         }
         self
     }

@@ -43,6 +43,7 @@ pub fn contents(gaussians: &Gaussians, capture: Option<&Capture>, frame: &LocalF
         None => [&all[..], &all[..1]].concat(),
     };
     let up = -all.iter().map(|camera| camera.c2w.y_axis.truncate()).sum::<DVec3>();
+    let is_metric = capture.and_then(Capture::upright).is_some_and(|upright| upright.is_metric);
     Ok(json!({
         "cameras": cameras,
         "path": path.iter().map(rows).collect::<Vec<_>>(),
@@ -50,6 +51,12 @@ pub fn contents(gaussians: &Gaussians, capture: Option<&Capture>, frame: &LocalF
         "up": up.try_normalize().unwrap_or(DVec3::NEG_Y).to_array(),
         "distance": distance,
         "frustum": FRUSTUM * distance,
+        // World coordinates are origin + scale · local ones.
+        "frame": {
+            "origin": frame.origin.to_array(),
+            "scale": frame.scale,
+            "unit": if is_metric { "m" } else { "units" },
+        },
         // What is added to the diagonal of a Gaussian's projected covariance, in square pixels (spec 6.2), and whether opacities are reduced
         // by what that adds to the area of a Gaussian.
         "blur": default_eps2d(gaussians),

@@ -98,6 +98,7 @@ fn page(name: &str, contents: &Value, spz: &[u8]) -> Markup {
                     img #photo alt="The photo from here" draggable="false";
                     input #share type="range" min="0" max="1" step="any" value="0" aria-label="Photo to the left, picture to the right";
                 }
+                p #measurement role="status" hidden { b #distance {} code #length {} }
                 p #message role="status" { "Loading the scene…" }
                 noscript { p { "This page needs JavaScript; it loads none from elsewhere." } }
                 header {
@@ -109,6 +110,7 @@ fn page(name: &str, contents: &Value, spz: &[u8]) -> Markup {
                             button #centers type="button" aria-pressed="false" title="3" { "Centers" }
                         }
                         button #cameras type="button" aria-pressed="false" title="C" { "Cameras" }
+                        button #measure type="button" aria-pressed="false" title="M" { "Measure" }
                         button #help-button type="button" aria-haspopup="dialog" title="?" { "Help" }
                     }
                 }
@@ -136,6 +138,10 @@ fn help() -> Markup {
         ("Space", "play along the cameras' path"),
         ("1, 2, 3", "color, depth, the Gaussians' centers"),
         ("C", "cameras with their photos"),
+        (
+            "M",
+            "measure: two clicks on the splat give their distance, and below it the option of `convert` that scales the splat to METRES",
+        ),
         ("H", "hide the controls"),
         ("?", "this help"),
     ];

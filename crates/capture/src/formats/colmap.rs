@@ -9,7 +9,7 @@ use crate::geometry::{Camera, ImageSize};
 use crate::lens::{COLMAP_MODELS, Lens, LensModel};
 use crate::photos::{MASKS_FOLDER, find_masks, find_photos, format_names, natural_order, portable};
 use fields::read_entries;
-use glam::{DMat4, DQuat, DVec3};
+use glam::{DMat4, DQuat, DVec3, DVec4};
 use globalsplat_files::{Error, Result};
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
@@ -95,6 +95,15 @@ struct ImageEntry {
     name: String,
 }
 
+impl ImageEntry {
+    /// Returns the camera-to-world matrix: the inverse of x ↦ Rx + t.
+    fn c2w(&self) -> DMat4 {
+        let [w, x, y, z] = self.quaternion;
+        let inverse = DQuat::from_xyzw(x, y, z, w).normalize().conjugate();
+        DMat4::from_rotation_translation(inverse, -(inverse * DVec3::from_array(self.translation)))
+    }
+}
+
 /// Summary of a COLMAP model.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ColmapModel {
@@ -102,8 +111,10 @@ pub struct ColmapModel {
     pub folder: PathBuf,
     /// Names of the photos that have a pose.
     pub photos: Vec<String>,
-    /// Number of points.
-    pub points: usize,
+    /// Camera-to-world pose of each of them.
+    pub c2w: Vec<DMat4>,
+    /// Positions of the points.
+    pub points: Vec<DVec3>,
     /// Mean over the points of the distance between where a point is seen and where the model projects it, in pixels; 0 without points.
     pub reprojection_error: f64,
 }
@@ -119,12 +130,10 @@ pub fn read_colmap_models(sparse: &Path) -> Result<Vec<ColmapModel>> {
         let images = read_images(&folder.join("images.bin"))?;
         let points = read_points_with_errors(&folder.join("points3D.bin"))?;
         let errors: f64 = points.iter().map(|(_, error)| error).sum();
-        Ok(ColmapModel {
-            folder,
-            photos: images.into_iter().map(|image| image.name).collect(),
-            points: points.len(),
-            reprojection_error: errors / points.len().max(1) as f64,
-        })
+        let reprojection_error = errors / points.len().max(1) as f64;
+        let (photos, c2w) = images.into_iter().map(|image| (image.name.clone(), image.c2w())).unzip();
+        let points = points.into_iter().map(|(point, _)| point.position).collect();
+        Ok(ColmapModel { folder, photos, c2w, points, reprojection_error })
     };
     let mut models = folders.map(summarize).collect::<Result<Vec<_>>>()?;
     models.sort_by_key(|model| Reverse(model.photos.len()));
@@ -211,9 +220,7 @@ fn read(
                 return refuse("camera id", image.camera.to_string(), expected);
             }
         };
-        let [w, x, y, z] = image.quaternion;
-        let rotation = DQuat::from_xyzw(x, y, z, w);
-        let length = rotation.length();
+        let length = DVec4::from_array(image.quaternion).length();
         if !(length > 0. && length.is_finite()) {
             let expected = "a quaternion (w, x, y, z) of length 1, or of any above 0";
             return refuse("rotation", format!("{:?}", image.quaternion), expected.into());
@@ -221,14 +228,10 @@ fn read(
         if (length - 1.).abs() > UNIT_TOLERANCE {
             changes.scaled.push((image.name.clone(), length));
         }
-        let translation = DVec3::from_array(image.translation);
-        if !translation.is_finite() {
+        if !DVec3::from_array(image.translation).is_finite() {
             return refuse("translation", format!("{:?}", image.translation), "finite numbers".into());
         }
-        // Invert x ↦ Rx + t.
-        let inverse = rotation.normalize().conjugate();
-        let c2w = DMat4::from_rotation_translation(inverse, -(inverse * translation));
-        let camera = Camera { c2w, ..camera };
+        let camera = Camera { c2w: image.c2w(), ..camera };
         frames.push(Frame {
             image: ImageLocation::File(photo),
             name: portable(&image.name),

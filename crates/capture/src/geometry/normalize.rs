@@ -21,6 +21,13 @@ pub struct Similarity {
     pub scale: f64,
 }
 
+impl Similarity {
+    /// Returns the transformed `point`.
+    pub fn apply(&self, point: DVec3) -> DVec3 {
+        self.scale * (self.rotation * point) + self.translation
+    }
+}
+
 /// Result of [`normalize`].
 #[derive(Debug, Clone)]
 pub struct Normalization {

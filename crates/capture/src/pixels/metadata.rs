@@ -1,6 +1,7 @@
 //! What a photo's metadata say about its camera.
 
 use super::codec::encoded_image_size;
+use crate::geo::GeoPosition;
 use exif::{Context, Exif, In, Reader, Tag, Value};
 use image::metadata::Orientation;
 use image::{ImageDecoder, ImageReader};
@@ -47,6 +48,34 @@ pub fn exif_focal(encoded: &[u8]) -> Option<f64> {
     let stored = number(Tag::PixelXDimension).zip(number(Tag::PixelYDimension));
     let reduction = stored.map_or(1., |(x, y)| width.max(height) / x.max(y));
     Some(number(Tag::FocalLength)? * number(Tag::FocalPlaneXResolution)? / millimetres * reduction)
+}
+
+/// Returns the position that the EXIF data in `encoded`, the contents of a photo's file, tell, or `None` if they tell none. 0° north and
+/// 0° east stand for an unknown position.
+pub fn exif_position(encoded: &[u8]) -> Option<GeoPosition> {
+    let exif = read_exif(encoded)?;
+    let field = |tag| exif.get_field(tag, In::PRIMARY).map(|field| &field.value);
+    let rationals = |tag| match field(tag)? {
+        Value::Rational(numbers) => Some(numbers.iter().map(|number| number.to_f64()).collect::<Vec<_>>()),
+        _ => None,
+    };
+    let is_negative = |tag, negative: u8| match field(tag) {
+        Some(Value::Ascii(text)) => text.first().and_then(|text| text.first()) == Some(&negative),
+        Some(Value::Byte(bytes)) => bytes.first() == Some(&negative),
+        _ => false,
+    };
+    let signed = |value: f64, is_negative: bool| if is_negative { -value } else { value };
+    let degrees = |tag, reference, negative| {
+        let [degrees, minutes, seconds] = rationals(tag)?.try_into().ok()?;
+        Some(signed(degrees + minutes / 60. + seconds / 3600., is_negative(reference, negative)))
+    };
+    let latitude = degrees(Tag::GPSLatitude, Tag::GPSLatitudeRef, b'S')?;
+    let longitude = degrees(Tag::GPSLongitude, Tag::GPSLongitudeRef, b'W')?;
+    let altitude = rationals(Tag::GPSAltitude).and_then(|numbers| numbers.first().copied());
+    let altitude = altitude.filter(|altitude| altitude.is_finite());
+    // 1 stands for below sea level.
+    let altitude = altitude.map(|altitude| signed(altitude, is_negative(Tag::GPSAltitudeRef, 1)));
+    GeoPosition::new(longitude, latitude, altitude).filter(|_| (longitude, latitude) != (0., 0.))
 }
 
 /// Returns the EXIF data in `encoded`, the contents of a photo's file, as far as they aren't damaged.

@@ -17,7 +17,7 @@ pub use codec::{
     read_image_size,
 };
 pub(crate) use codec::{SUPPORTED_IMAGES, has_alpha_channel};
-pub use metadata::{exif_focal, is_equirectangular};
+pub use metadata::{exif_focal, exif_position, is_equirectangular};
 pub use planes::{CHANNELS, Planes};
 pub use resample::{Region, Resampler};
 pub use resize_and_crop::resize_and_crop;

@@ -4,7 +4,7 @@ use crate::assert_refused;
 use crate::photos::{encode, encode_with_exif};
 use exif::experimental::Writer;
 use exif::{Field, In, Rational, Tag, Value};
-use globalsplat_capture::{exif_focal, is_equirectangular, list_photos};
+use globalsplat_capture::{exif_focal, exif_position, is_equirectangular, list_photos};
 use image::{ImageFormat, RgbImage};
 use std::io::Cursor;
 
@@ -100,6 +100,48 @@ fn exif_data_tell_the_focal_length() {
         }
     }
     assert_eq!(exif_focal(b"text"), None);
+}
+
+#[test]
+fn exif_data_tell_the_position() {
+    let field = |tag, value| Field { tag, ifd_num: In::PRIMARY, value };
+    let ratios = |tag, ratios: &[(u32, u32)]| {
+        field(tag, Value::Rational(ratios.iter().map(|&(num, denom)| Rational { num, denom }).collect()))
+    };
+    let text = |tag, letter: &str| field(tag, Value::Ascii(vec![letter.into()]));
+    let west = [
+        ratios(Tag::GPSLatitude, &[(33, 1), (51, 1), (2448, 100)]),
+        text(Tag::GPSLatitudeRef, "S"),
+        ratios(Tag::GPSLongitude, &[(70, 1), (30, 1), (0, 1)]),
+        text(Tag::GPSLongitudeRef, "W"),
+    ];
+    let below = [ratios(Tag::GPSAltitude, &[(125, 10)]), field(Tag::GPSAltitudeRef, Value::Byte(vec![1]))];
+    let east = [
+        ratios(Tag::GPSLatitude, &[(3385, 100), (0, 1), (0, 1)]),
+        ratios(Tag::GPSLongitude, &[(705, 10), (0, 1), (0, 1)]),
+    ];
+    let nowhere = [Tag::GPSLatitude, Tag::GPSLongitude].map(|tag| ratios(tag, &[(0, 1); 3]));
+    let broken = [Tag::GPSLatitude, Tag::GPSLongitude].map(|tag| ratios(tag, &[(0, 0); 3]));
+    for (fields, expected) in [
+        (west.to_vec(), Some((-70.5, -33.8568, None))),
+        ([&west[..], &below].concat(), Some((-70.5, -33.8568, Some(-12.5)))),
+        (east.to_vec(), Some((70.5, 33.85, None))),
+        (west[..2].to_vec(), None),
+        (nowhere.to_vec(), None),
+        (broken.to_vec(), None),
+    ] {
+        let (mut writer, mut exif) = (Writer::new(), Cursor::new(vec![]));
+        fields.iter().for_each(|field| writer.push_field(field));
+        writer.write(&mut exif, true).unwrap();
+        for (extension, bytes) in encode_with_exif(&RgbImage::new(40, 30).into(), exif.get_ref()) {
+            let found = exif_position(&bytes);
+            let numbers = found.map(|position| (position.longitude, position.latitude, position.altitude));
+            let is_right = numbers.zip(expected).map_or(numbers == expected, |(a, b)| {
+                (a.0 - b.0).abs() < 1e-9 && (a.1 - b.1).abs() < 1e-9 && a.2 == b.2
+            });
+            assert!(is_right, "{extension} {fields:?}: {found:?}");
+        }
+    }
 }
 
 /// Entry of a directory in EXIF data: its tag, type, number of values, and value or offset.

@@ -1,8 +1,8 @@
 //! Poses that COLMAP finds for the photos of a synthetic scene, whose poses are known.
 
 use crate::{make, write_noise};
-use glam::DMat4;
-use globalsplat_capture::{Lens, open_capture};
+use glam::{DMat3, DMat4, DVec3, DVec4};
+use globalsplat_capture::{Lens, open_capture, read_points};
 use globalsplat_colmap::{CaptureOptions, CaptureReport, Colmap, Matching, Step, make_capture};
 use globalsplat_synth::{Video, VideoSettings};
 use globalsplat_test_kit::{pose_errors, skip};
@@ -106,6 +106,67 @@ fn poses_are_those_of_the_scene_and_a_stopped_estimate_continues() {
     fs::remove_file(photos.join("05.png")).unwrap();
     let error = fixture.make(&sequential).unwrap_err();
     assert!(error.is_invalid_request() && error.to_string().contains("other or changed photos"), "{error}");
+}
+
+/// Of a synthetic scene, which is in metres with y up, positions are known.
+#[test]
+fn captures_are_upright_and_in_metres_if_positions_are_known() {
+    let Some(fixture) = Fixture::new() else { return };
+    let truth = fixture.write_photos(12, None);
+    let mut options = CaptureOptions::default();
+    let compare = |report: &CaptureReport| {
+        // The angle in degrees between the scene's up direction and the capture's, and the length of a metre in the capture.
+        let cameras = open_capture(&fixture.out).unwrap().cameras();
+        let turn = DMat3::from_mat4(cameras[0].c2w) * DMat3::from_mat4(truth[0]).transpose();
+        let length = |a: &DMat4, b: &DMat4| a.w_axis.distance(b.w_axis);
+        let scale = length(&cameras[0].c2w, &cameras[11].c2w) / length(&truth[0], &truth[11]);
+        let photos = report.transform.map(|upright| upright.positions.map(|fit| fit.inliers));
+        ((turn * DVec3::Y).angle_between(DVec3::NEG_Y).to_degrees(), scale, photos)
+    };
+    let report = fixture.make(&options).unwrap();
+    let (angle, scale, photos) = compare(&report);
+    assert!(angle < 2. && photos == Some(None), "{angle}° {report}");
+    assert!(!report.transform.unwrap().is_metric && (scale - 1.).abs() > 0.01, "{scale} {report}");
+    let upright = open_capture(&fixture.out).unwrap();
+    assert_eq!(upright.upright(), report.transform);
+    // The points move along with the cameras.
+    let floor = read_points(&upright).unwrap().iter().filter(|point| point.position.y.abs() < 0.1).count();
+    assert!(!report.transform.unwrap().has_floor || floor > report.points / 20, "{floor} {report}");
+
+    // COLMAP's own coordinates are those before the transform.
+    options.keeps_coordinates = true;
+    let (report, steps) = fixture.make_steps(&options);
+    assert!(report.transform.is_none() && steps == [Step::Poses].into(), "{steps:?} {report}");
+    assert_eq!(open_capture(&fixture.out).unwrap().upright(), None);
+    // A finished capture is kept only if it isn't what the user doesn't want.
+    options.keeps_finished = true;
+    assert!(fixture.make_steps(&options).1.is_empty());
+    options.keeps_coordinates = false;
+    assert!(fixture.make_steps(&options).1.is_empty());
+    options.keeps_finished = false;
+
+    // In UTM, whose unit is 0.9996 m here. One position is wrong.
+    let line = |(index, pose): (usize, &DMat4)| {
+        let place = pose.w_axis + if index == 5 { DVec4::X * 9. } else { DVec4::ZERO };
+        format!("{index:02}.png {} {} {}\n", 5e5 + place.x, 5.3e6 - place.z, 100. + place.y)
+    };
+    let lines: String = truth.iter().enumerate().map(line).collect();
+    fs::write(fixture.photos.join("geo.txt"), format!("EPSG:32632\n{lines}")).unwrap();
+    let (report, steps) = fixture.make_steps(&options);
+    let (angle, scale, photos) = compare(&report);
+    assert!(report.transform.unwrap().is_metric && steps == [Step::Poses].into(), "{steps:?} {report}");
+    assert_eq!(photos, Some(Some(11)));
+    assert!((scale * 0.9996 - 1.).abs() < 0.01 && angle < 2., "{scale} {angle}°");
+    let text = report.to_string();
+    assert!(text.contains("; in metres by the positions of 11 of 12 photos (error 0."), "{text}");
+    assert!(report.other_files.is_none(), "{text}");
+
+    fs::write(fixture.photos.join("geo.txt"), "EPSG:4326\nother.png 7 48\n").unwrap();
+    let error = fixture.make(&options).unwrap_err();
+    assert!(
+        error.is_invalid_request() && error.to_string().contains("geo.txt: the list of photos"),
+        "{error}"
+    );
 }
 
 #[test]
