@@ -19,7 +19,7 @@ const MAP: f64 = 600.;
 /// Maximum number of surfaces on the map.
 const MAX_SURFACES: usize = 6000;
 /// Fraction of the surfaces at each end that may be outside of the map.
-const OUTSIDE: f64 = 0.03;
+const OUTSIDE: f64 = 0.1;
 
 /// Writes a page with the verdict on `capture`, its figures, a map of its cameras and of the surfaces they show, the photos to take next, and
 /// the doubtful photos.
