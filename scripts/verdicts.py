@@ -19,7 +19,7 @@ from PIL import Image, ImageFilter
 
 PROGRAM = Path(__file__).parents[1] / "target/release/globalsplat"
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-Photo = tuple[Path, np.ndarray, dict[str, float]]
+Photo = tuple[Path, np.ndarray, dict[str, float | str]]
 
 
 def read(folder: Path) -> list[Photo]:
@@ -37,13 +37,13 @@ def read(folder: Path) -> list[Photo]:
     file = next(file for name in ("", "_train") if (file := folder / f"transforms{name}.json").is_file())
     contents = json.loads(file.read_text())
     frames = sorted(contents.pop("frames"), key=lambda frame: (len(frame["file_path"]), frame["file_path"]))
-    lens = {key: value for key, value in contents.items() if isinstance(value, (int, float))}
+    lens = {key: value for key, value in contents.items() if key == "camera_model" or isinstance(value, int | float)}
     paths = [(folder / frame["file_path"], frame) for frame in frames]
     return [
         (
             path,
             np.array(frame["transform_matrix"]),
-            lens | {k: v for k, v in frame.items() if isinstance(v, (int, float))},
+            lens | {k: v for k, v in frame.items() if k == "camera_model" or isinstance(v, int | float)},
         )
         for path, frame in paths
         if path.is_file()

@@ -38,11 +38,11 @@ pub struct Capture {
     #[arg(long, value_name = "FILE.html")]
     report: Option<PathBuf>,
     /// Number of frames to take from a video; by default one per 6 % of the picture's longer side that it moves, but 30 to 300
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", requires = "out")]
     frames: Option<usize>,
     /// Camera model of COLMAP; by default EQUIRECTANGULAR for photos whose metadata say that they show 360 degrees, else OPENCV for
     /// 10 or more photos of one size and focal length, and SIMPLE_RADIAL for fewer
-    #[arg(long, value_name = "MODEL")]
+    #[arg(long, value_name = "MODEL", requires = "out")]
     camera_model: Option<String>,
     /// Pairs of photos to match: exhaustive, which is every pair; sequential, which is each photo with the next 10 by name and those
     /// nearby by GPS, and every pair among 64; or auto, which is sequential for videos and more than 200 photos
@@ -50,7 +50,7 @@ pub struct Capture {
     matching: Matching,
     /// Folder of masks named like the photos, as in photo.jpg.png, photo.png or photo_mask.png: nothing is matched in black pixels; by
     /// default the folder `masks` among the photos
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", requires = "out")]
     masks: Option<PathBuf>,
     #[command(flatten)]
     upright: UprightOption,
@@ -68,7 +68,12 @@ pub struct UprightOption {
 
 impl Capture {
     pub fn run(self) -> Result<Output> {
-        self.report.iter().try_for_each(|file| check_writable_file(file))?;
+        if let Some(page) = &self.report {
+            if page.extension().is_none_or(|extension| extension != "html") {
+                return Err(Error::input(page, "the page's file extension", "another", ".html").into());
+            }
+            check_writable_file(page)?;
+        }
         signals::handle_stop_requests();
         let Some(out) = &self.out else { return self.measure_capture() };
         let options = CaptureOptions {

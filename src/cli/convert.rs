@@ -164,7 +164,7 @@ impl Convert {
         let edits: Vec<_> =
             edits.iter().map(|(edit, count)| json!({ "edit": edit, "gaussians": count })).collect();
         let json = json!({
-            "from": from, "transform": edited.from_original.transpose().to_cols_array_2d(), "edits": edits, "to": to, "views": views, "psnr": psnr, "file_psnr": file_psnr,
+            "from": from, "transform": { "matrix": edited.from_original.transpose().to_cols_array_2d() }, "edits": edits, "to": to, "views": views, "psnr": psnr, "file_psnr": file_psnr,
             "same_pixels": psnr.is_none(),
         });
         Ok(Output::new(json, text))

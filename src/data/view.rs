@@ -1,6 +1,6 @@
 //! Photos in memory: their size, their pixels, and views, which are photos with their cameras.
 
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::io::rgb_from_tensor;
 use crate::scene::{Camera, ImageSize};
 use crate::stereo::SmallPhoto;
@@ -221,6 +221,23 @@ impl View {
         let mask = self.mask.as_ref().map(fit_mask).transpose()?;
         Ok(View { name: self.name.clone(), image: byte_tensor(&planes).into(), mask, camera })
     }
+}
+
+/// Checks that the photos `indices` of `capture`, loaded at `size`, have at least [`MIN_SIDE`] pixels along each side.
+///
+/// # Errors
+/// Returns an error that names the first smaller one.
+pub(crate) fn check_sizes(capture: &Capture, indices: &[usize], size: PhotoSize) -> Result<()> {
+    let cameras = capture.cameras();
+    for &index in indices {
+        let ImageSize { width, height } = size.of(&cameras[index]);
+        if width.min(height) < MIN_SIDE {
+            let field = format!("the size of {}", capture.names().nth(index).unwrap_or_default());
+            let expected = format!("{MIN_SIDE} pixels or more along each side");
+            return Err(Error::input(capture.file(), field, format!("{width}×{height}"), expected));
+        }
+    }
+    Ok(())
 }
 
 /// Reads the views `indices` of `capture` like [`Capture::load`], fitted to `size`, or at their own size if it is `None`.

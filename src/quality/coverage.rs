@@ -1,16 +1,16 @@
-//! Which surfaces too few photos show, and where photos would show most of them.
+//! Coverage of the surfaces by photos, and photos that would show most of those that too few show.
 
-use crate::scene::Camera;
+use crate::scene::{Camera, look_at};
 use crate::stereo::{ComparablePhoto, PhotoSurface, PlaneSweepOutput, projection};
-use glam::{DMat3, DMat4, DVec3};
+use glam::DVec3;
 use rayon::prelude::*;
 use serde::Serialize;
 use std::fmt;
 
 /// Number of photos from which on a surface is well covered.
 const WELL_COVERED: usize = 3;
-/// Every how many patches of a photo one is counted.
-const SAMPLED: usize = 4;
+/// Stride of the patches that are counted.
+const STRIDE: usize = 4;
 /// Distance between a photo and one to take near it, in units of the distance to the surface: about 10°.
 const MOVE: f64 = 0.17;
 /// Number of photos to suggest.
@@ -26,10 +26,10 @@ pub struct NextPhoto {
     /// Direction to step from there, as that photo shows it: left, right, up or down.
     pub step: &'static str,
     /// Position of the camera in the capture's world.
-    pub position: [f64; 3],
+    pub position: DVec3,
     /// Position that it looks at.
-    pub look_at: [f64; 3],
-    /// Fraction of all known surfaces that it shows and at most two photos do.
+    pub look_at: DVec3,
+    /// Fraction of all surfaces that it shows, the photo to start from, too, and at most two photos do.
     pub gain: f64,
 }
 
@@ -57,20 +57,20 @@ impl Coverage {
         let shows: Vec<_> = photos.iter().map(ComparablePhoto::shows).collect();
         let count = |(index, surface): &(usize, PhotoSurface)| -> Vec<_> {
             let count = |position: DVec3| shows.iter().filter(|shows| shows(position)).count();
-            let patches = surface.patches.iter().step_by(SAMPLED);
+            let patches = surface.patches.iter().step_by(STRIDE);
             patches.map(|patch| (*index, patch.position, count(patch.position))).collect()
         };
         Coverage { surfaces: surfaces.par_iter().flat_map_iter(count).collect() }
     }
 
-    fn is_thin(&(_, _, count): &(usize, DVec3, usize)) -> bool {
+    fn is_rarely_seen(&(_, _, count): &(usize, DVec3, usize)) -> bool {
         count < WELL_COVERED
     }
 
     /// Returns the fraction of the surfaces that fewer than three photos show.
-    pub fn thin_share(&self) -> f64 {
-        let thin = self.surfaces.iter().filter(|surface| Self::is_thin(surface)).count();
-        thin as f64 / self.surfaces.len().max(1) as f64
+    pub fn rarely_seen_share(&self) -> f64 {
+        let rarely_seen = self.surfaces.iter().filter(|surface| Self::is_rarely_seen(surface)).count();
+        rarely_seen as f64 / self.surfaces.len().max(1) as f64
     }
 
     /// Returns the positions of all surfaces, and the number of photos that show each.
@@ -83,12 +83,16 @@ impl Coverage {
     pub fn next_photos(mut self, swept: &PlaneSweepOutput) -> Vec<NextPhoto> {
         let mut candidates: Vec<(usize, &'static str, Camera, DVec3)> = vec![];
         for (index, map) in &swept.depth_maps {
-            let thin: Vec<DVec3> =
-                self.surfaces.iter().filter(|s| s.0 == *index && Self::is_thin(s)).map(|s| s.1).collect();
-            if thin.is_empty() {
+            let rarely_seen: Vec<DVec3> = self
+                .surfaces
+                .iter()
+                .filter(|s| s.0 == *index && Self::is_rarely_seen(s))
+                .map(|s| s.1)
+                .collect();
+            if rarely_seen.is_empty() {
                 continue;
             }
-            let target = thin.iter().sum::<DVec3>() / thin.len() as f64;
+            let target = rarely_seen.iter().sum::<DVec3>() / rarely_seen.len() as f64;
             let [right, down, center] = [map.camera.c2w.x_axis, map.camera.c2w.y_axis, map.camera.c2w.w_axis]
                 .map(|axis| axis.truncate());
             for (step, direction) in [("right", right), ("left", -right), ("down", down), ("up", -down)] {
@@ -99,13 +103,17 @@ impl Coverage {
         }
         let mut chosen = vec![];
         while chosen.len() < SUGGESTED {
-            let gain = |(index, _, camera, target): &(usize, &str, Camera, DVec3)| {
-                let (project, center) = (projection(camera), camera.c2w.w_axis.truncate());
+            let shows = |(index, _, camera, target): &(usize, &str, Camera, DVec3)| {
+                let (index, project, center) = (*index, projection(camera), camera.c2w.w_axis.truncate());
                 let far = 2. * center.distance(*target);
-                let shown = |s: &&(usize, DVec3, usize)| {
-                    s.0 == *index && Self::is_thin(s) && center.distance(s.1) < far && project(s.1).is_some()
-                };
-                self.surfaces.iter().filter(shown).count()
+                // Surfaces that other photos know may be occluded.
+                move |surface: &(usize, DVec3, usize)| {
+                    surface.0 == index && center.distance(surface.1) < far && project(surface.1).is_some()
+                }
+            };
+            let gain = |candidate: &(usize, &str, Camera, DVec3)| {
+                let shows = shows(candidate);
+                self.surfaces.iter().filter(|surface| Self::is_rarely_seen(surface) && shows(surface)).count()
             };
             let gains: Vec<usize> = candidates.par_iter().map(gain).collect();
             let Some(best) = (0..gains.len()).rev().max_by_key(|&candidate| gains[candidate]) else { break };
@@ -114,23 +122,12 @@ impl Coverage {
             if gain < MIN_GAIN {
                 break;
             }
-            let project = projection(&camera);
-            for surface in &mut self.surfaces {
-                if project(surface.1).is_some() {
-                    surface.2 = WELL_COVERED;
-                }
-            }
+            let shows = shows(&candidates[best]);
+            self.surfaces.iter_mut().filter(|surface| shows(surface)).for_each(|surface| surface.2 += 1);
             let near = swept.photos[index].name.clone();
-            let position = camera.c2w.w_axis.truncate().to_array();
-            chosen.push(NextPhoto { near, step, position, look_at: target.to_array(), gain });
+            let position = camera.c2w.w_axis.truncate();
+            chosen.push(NextPhoto { near, step, position, look_at: target, gain });
         }
         chosen
     }
-}
-
-/// Returns the pose of a camera at `position` that looks at `target`, with `down` toward the lower edge of its image.
-fn look_at(position: DVec3, target: DVec3, down: DVec3) -> DMat4 {
-    let forward = (target - position).normalize();
-    let right = down.cross(forward).normalize();
-    DMat4::from_mat3_translation(DMat3::from_cols(right, forward.cross(right), forward), position)
 }

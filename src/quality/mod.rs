@@ -1,5 +1,5 @@
 //! Quality of a capture, told before the time of a refinement is spent: whether its poses fit its photos, whether the photos show enough
-//! parallax and hang together, which of them are blurred or badly exposed, and where more should be taken.
+//! parallax and are connected, which of them are blurred or badly exposed, and where more should be taken.
 
 mod consistency;
 mod coverage;
@@ -10,9 +10,9 @@ pub use coverage::NextPhoto;
 pub use page::write_quality_page;
 pub use photo::PhotoQuality;
 
-use crate::data::{Capture, PhotoSize, View, load_views, read_points};
-use crate::error::Result;
-use crate::scene::Camera;
+use crate::data::{Capture, PhotoSize, View, check_sizes, load_views, read_points};
+use crate::error::{Error, Result};
+use crate::scene::{Camera, LocalFrame};
 use crate::stereo::{
     ComparablePhoto, DepthMap, PhotoSurface, PlaneSweepOutput, SWEEP_SIDE, SmallPhoto, sweep,
 };
@@ -45,7 +45,7 @@ const REPROJECTION_ERROR: f64 = 1.5;
 /// Number of photos below which a capture is usable only.
 const FEW_PHOTOS: usize = 5;
 /// Fraction of the surfaces that fewer than three photos show, from which on a capture is usable only.
-const MAX_THIN: f64 = 0.4;
+const MAX_RARELY_SEEN: f64 = 0.4;
 /// Fraction of the patches that have texture, below which a capture is usable only.
 const MIN_TEXTURED: f64 = 0.1;
 
@@ -100,10 +100,10 @@ pub struct CaptureQuality {
     pub agreeing: f64,
     /// Fraction of the pairs of photos with a common surface that don't look alike there, as one photo's depths and the poses predict.
     pub contradicting: f64,
-    /// Numbers of photos that such pairs connect, the largest group first.
+    /// Numbers of photos in the groups that consistent pairs connect, the largest first.
     pub groups: Vec<usize>,
     /// Fraction of the surfaces that fewer than three photos show.
-    pub thin: f64,
+    pub rarely_seen: f64,
     /// Up to three photos to take next, which show most of the surfaces that too few photos show.
     pub next_photos: Vec<NextPhoto>,
     /// Quality of each photo.
@@ -118,13 +118,14 @@ impl CaptureQuality {
     /// number of photos that are done, and ends the work if it returns `false`; the result is `None` then.
     ///
     /// # Errors
-    /// Fails if a photo or the points of the capture can't be read.
+    /// Fails if a photo or the points of the capture can't be read, if a photo is too small, or if fewer than two aren't masked out.
     pub fn measure(
         capture: &Capture,
         registration: Option<Registration>,
         mut should_continue: impl FnMut(usize) -> bool,
     ) -> Result<Option<Self>> {
         let (cameras, size) = (capture.cameras(), PhotoSize::Within(MEASURED_SIDE));
+        check_sizes(capture, &(0..cameras.len()).collect::<Vec<_>>(), size)?;
         let mut measured = vec![];
         let count = rayon::current_num_threads();
         for first in (0..cameras.len()).step_by(count) {
@@ -134,19 +135,39 @@ impl CaptureQuality {
             let indices: Vec<usize> = (first..cameras.len().min(first + count)).collect();
             for some in indices.chunk_by(|&a, &b| size.resized(&cameras[a]) == size.resized(&cameras[b])) {
                 let views = load_views(capture, some, size.resized(&cameras[some[0]]))?;
+                let counted = views.iter().filter(|view| !view.is_masked_out());
                 measured.extend(
-                    views.iter().map(|view| (PhotoQuality::measure(view), view.to_small_photo(SWEEP_SIDE))),
+                    counted.map(|view| (PhotoQuality::measure(view), view.to_small_photo(SWEEP_SIDE))),
                 );
             }
         }
+        if measured.len() < 2 {
+            let field = "the number of photos that aren't masked out";
+            return Err(Error::input(capture.file(), field, measured.len(), "2 or more"));
+        }
         let (photos, small): (Vec<PhotoQuality>, Vec<SmallPhoto>) = measured.into_iter().unzip();
-        let swept = sweep(small, &read_points(capture)?, |_| should_continue(cameras.len()));
-        Ok((!swept.depth_maps.is_empty()).then(|| CaptureQuality::new(photos, registration, &swept)))
+        let mut is_ended = false;
+        let swept = sweep(small, &read_points(capture)?, |_| {
+            is_ended |= !should_continue(cameras.len());
+            !is_ended
+        });
+        Ok((!is_ended).then(|| CaptureQuality::new(photos, registration, &swept)))
     }
 
     /// Measures the quality of the capture of `views`, whose depths are `swept`.
     pub(crate) fn of_views(views: &[View], swept: &PlaneSweepOutput) -> Self {
         CaptureQuality::new(views.iter().map(PhotoQuality::measure).collect(), None, swept)
+    }
+
+    /// Returns the quality with positions in world coordinates, of one with positions in `frame`.
+    pub(crate) fn in_world(mut self, frame: &LocalFrame) -> Self {
+        let to_world = |position: &mut DVec3| *position = frame.point_to_world(*position);
+        self.surfaces.iter_mut().for_each(|(position, _)| to_world(position));
+        self.next_photos.iter_mut().for_each(|photo| {
+            to_world(&mut photo.position);
+            to_world(&mut photo.look_at);
+        });
+        self
     }
 
     fn new(
@@ -160,6 +181,7 @@ impl CaptureQuality {
         let pairs = compare_pairs(swept, &surfaces, &comparable);
         let share = |part: usize, all: usize| part as f64 / all.max(1) as f64;
         let contradicting = pairs.iter().filter(|pair| !pair.is_consistent).count();
+        let distinct = pairs.iter().filter(|pair| !pair.is_near_duplicate).count();
         for (index, photo) in photos.iter_mut().enumerate() {
             let of_photo: Vec<&Pair> = pairs.iter().filter(|pair| pair.photos.contains(&index)).collect();
             let against = of_photo.iter().filter(|pair| !pair.is_consistent).count();
@@ -168,7 +190,8 @@ impl CaptureQuality {
         let patches = || surfaces.iter().flat_map(|(_, surface)| &surface.patches);
         let textured = patches().filter(|patch| patch.is_textured).count();
         let sure = patches().filter(|patch| patch.is_textured && patch.is_sure).count();
-        let connections = Connections::new(photos.len(), &pairs);
+        let with_depths: Vec<usize> = swept.depth_maps.iter().map(|(index, _)| *index).collect();
+        let connections = Connections::new(photos.len(), &with_depths, &pairs);
         let coverage = Coverage::new(&surfaces, &comparable);
         let mut quality = CaptureQuality {
             verdict: Verdict::Good,
@@ -177,9 +200,9 @@ impl CaptureQuality {
             parallax: median_parallax(swept),
             textured: share(textured, patches().count()),
             agreeing: share(sure, textured),
-            contradicting: share(contradicting, pairs.len()),
+            contradicting: share(contradicting, distinct),
             groups: connections.groups.iter().map(Vec::len).collect(),
-            thin: coverage.thin_share(),
+            rarely_seen: coverage.rarely_seen_share(),
             surfaces: coverage.points().collect(),
             next_photos: coverage.next_photos(swept),
             photos,
@@ -205,7 +228,7 @@ impl CaptureQuality {
 
         if let Some(Registration { photos, registered, reprojection_error }) = self.registration {
             let share = registered as f64 / photos.max(1) as f64;
-            add(below(share, REGISTERED), format!("only {registered} of {photos} photos have poses"));
+            add(verdict_below(share, REGISTERED), format!("only {registered} of {photos} photos have poses"));
             let is_large = reprojection_error > REPROJECTION_ERROR;
             add(
                 is_large.then_some(Verdict::Usable),
@@ -213,9 +236,9 @@ impl CaptureQuality {
             );
         }
         add((count < FEW_PHOTOS).then_some(Verdict::Usable), format!("there are only {count} photos"));
-        let parallax = below(self.parallax, PARALLAX);
+        let parallax = verdict_below(self.parallax, PARALLAX);
         // Few textured patches tell little.
-        let agreeing = below(self.agreeing, AGREEING).filter(|_| self.textured > MIN_TEXTURED);
+        let agreeing = verdict_below(self.agreeing, AGREEING).filter(|_| self.textured > MIN_TEXTURED);
         let percentage = percent(self.agreeing);
         // Photos from one place look alike at an infinite depth, or can't be compared at all.
         let is_one_place = parallax == Some(Verdict::WillFail)
@@ -235,15 +258,15 @@ impl CaptureQuality {
                 wrong += &format!("; {first} don't fit {second}");
             }
             let fails = connections.is_contradictory.then_some(Verdict::WillFail);
-            add(fails.or(above(self.contradicting, CONTRADICTING)), wrong);
+            add(fails.or(verdict_above(self.contradicting, CONTRADICTING)), wrong);
         }
-        let apart: Vec<usize> = connections.groups[1..].concat();
+        let apart = &connections.apart;
         let is_apart = apart.len() as f64 > MAX_DOUBTFUL * count as f64
             && !connections.is_contradictory
             && !is_one_place;
-        let line = format!("{} photos share too little with the others: {}", apart.len(), names(&apart));
+        let line = format!("{} photos share too little with the others: {}", apart.len(), names(apart));
         add(is_apart.then_some(Verdict::Usable), line);
-        if let Some((photo, part)) = &connections.bridge {
+        if let Some((photo, part)) = &connections.articulation_photo {
             let line = format!(
                 "{} alone connects {} photos with the others: {}",
                 name(photo),
@@ -270,10 +293,10 @@ impl CaptureQuality {
                 format!("{} of {count} photos are {what}: {}", bad.len(), names(&bad)),
             );
         }
-        let is_thin = self.thin > MAX_THIN;
+        let is_rarely_seen = self.rarely_seen > MAX_RARELY_SEEN;
         add(
-            is_thin.then_some(Verdict::Usable),
-            format!("{} of the surfaces are in fewer than three photos", percent(self.thin)),
+            is_rarely_seen.then_some(Verdict::Usable),
+            format!("{} of the surfaces are in fewer than three photos", percent(self.rarely_seen)),
         );
         let is_blank = self.textured < MIN_TEXTURED;
         add(
@@ -300,13 +323,13 @@ impl fmt::Display for CaptureQuality {
 }
 
 /// Returns what follows from a value that should not be below `limits`.
-fn below(value: f64, (usable, fails): (f64, f64)) -> Option<Verdict> {
+fn verdict_below(value: f64, (usable, fails): (f64, f64)) -> Option<Verdict> {
     if value < fails { Some(Verdict::WillFail) } else { (value < usable).then_some(Verdict::Usable) }
 }
 
 /// Returns what follows from a value that should not be above `limits`.
-fn above(value: f64, (usable, fails): (f64, f64)) -> Option<Verdict> {
-    below(-value, (-usable, -fails))
+fn verdict_above(value: f64, (usable, fails): (f64, f64)) -> Option<Verdict> {
+    verdict_below(-value, (-usable, -fails))
 }
 
 /// Returns the median over the photos with depths of the largest parallax to a photo that looks in a similar direction, in degrees.
@@ -316,7 +339,7 @@ fn median_parallax(swept: &PlaneSweepOutput) -> f64 {
         let this = cameras[*index].c2w;
         let similar = cameras.iter().filter(|other| other.c2w.z_axis.dot(this.z_axis) > SIMILAR_DIRECTION);
         let distance = similar.map(|other| this.w_axis.distance(other.c2w.w_axis)).fold(0., f64::max);
-        (distance / map.depth.median().double_value(&[])).to_degrees()
+        2. * (distance / (2. * map.median_depth())).atan().to_degrees()
     };
     let mut parallaxes: Vec<f64> = swept.depth_maps.iter().map(largest).collect();
     parallaxes.sort_by(f64::total_cmp);

@@ -7,6 +7,7 @@ use crate::io::{jpeg_data_url, write_file};
 use crate::scene::Camera;
 use glam::{DVec2, DVec3};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
+use std::collections::HashMap;
 use std::path::Path;
 
 const STYLE: &str = include_str!("page.css");
@@ -29,6 +30,10 @@ const OUTSIDE: f64 = 0.1;
 pub fn write_quality_page(path: &Path, capture: &Capture, quality: &CaptureQuality) -> Result<()> {
     let doubtful: Vec<usize> =
         (0..quality.photos.len()).filter(|&photo| !quality.photos[photo].faults().is_empty()).collect();
+    let indices: HashMap<&str, usize> = capture.names().zip(0..).collect();
+    let indices: Vec<usize> = quality.photos.iter().map(|photo| indices[&photo.name[..]]).collect();
+    let all = capture.cameras();
+    let cameras: Vec<Camera> = indices.iter().map(|&index| all[index]).collect();
     let title = format!("{}: {}", capture.name, quality.verdict);
     let class = match quality.verdict {
         Verdict::Good => "good",
@@ -53,9 +58,9 @@ pub fn write_quality_page(path: &Path, capture: &Capture, quality: &CaptureQuali
                     @if !quality.reasons.is_empty() { ul { @for reason in &quality.reasons { li { (reason) } } } }
                     (figures(quality))
                     h2 { "From above" }
-                    (map(&capture.cameras(), quality))
+                    (map(&cameras, quality))
                     (next_photos(&quality.next_photos))
-                    @if !doubtful.is_empty() { (doubtful_photos(capture, quality, &doubtful)?) }
+                    @if !doubtful.is_empty() { (doubtful_photos(capture, &indices, quality, &doubtful)?) }
                     footer { "Written by globalsplat " (env!("CARGO_PKG_VERSION")) "." }
                 }
             }
@@ -89,7 +94,7 @@ fn figures(quality: &CaptureQuality) -> Markup {
         ("of the photos has texture", percent(quality.textured)),
         ("of it has a depth on which photos agree", percent(quality.agreeing)),
         ("of the pairs of photos contradict their poses", percent(quality.contradicting)),
-        ("of the surfaces are in fewer than three photos", percent(quality.thin)),
+        ("of the surfaces are in fewer than three photos", percent(quality.rarely_seen)),
     ];
     html! {
         dl {
@@ -139,7 +144,7 @@ fn map(cameras: &[Camera], quality: &CaptureQuality) -> Markup {
                 polygon class=(if photo.faults().is_empty() { "camera" } else { "doubtful" }) points=(corners.join(" ")) { title { (photo.name) } }
             }
             @for (number, next) in (1..).zip(&quality.next_photos) {
-                @let at = place(flat(DVec3::from(next.position)));
+                @let at = place(flat(next.position));
                 circle class="next" cx=(at.x) cy=(at.y) r="8" {}
                 text x=(at.x) y=(at.y + 4.) { (number) }
             }
@@ -160,13 +165,20 @@ fn next_photos(next: &[NextPhoto]) -> Markup {
     }
 }
 
-fn doubtful_photos(capture: &Capture, quality: &CaptureQuality, doubtful: &[usize]) -> Result<Markup> {
+/// Renders the photos `doubtful`. `indices` are those of all photos in `capture`.
+fn doubtful_photos(
+    capture: &Capture,
+    indices: &[usize],
+    quality: &CaptureQuality,
+    doubtful: &[usize],
+) -> Result<Markup> {
     let cameras = capture.cameras();
-    let photo = |&index: &usize| -> Result<Markup> {
+    let photo = |&photo: &usize| -> Result<Markup> {
+        let index = indices[photo];
         let view =
             load_views(capture, &[index], PhotoSize::Within(PHOTO).resized(&cameras[index]))?.remove(0);
         let source = jpeg_data_url(&view.image.to_float())?;
-        let (name, faults) = (&view.name, quality.photos[index].faults().join(", "));
+        let (name, faults) = (&view.name, quality.photos[photo].faults().join(", "));
         Ok(html! { figure { img src=(source) alt=(name); figcaption { b { (name) } ": " (faults) } } })
     };
     let shown: Vec<Markup> = doubtful.iter().take(MAX_PHOTOS).map(photo).collect::<Result<_>>()?;

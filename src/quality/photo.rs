@@ -35,17 +35,24 @@ pub struct PhotoQuality {
 }
 
 impl PhotoQuality {
-    /// Measures a photo at its size. Pairs with other photos are unknown.
+    /// Measures a photo at its size, over the pixels that count. Pairs with other photos are unknown.
     pub fn measure(view: &View) -> Self {
         no_grad(|| {
             let gray = view.image.to_float().mean_dim([0i64].as_slice(), true, Kind::Float);
-            let reduced =
-                gray.unsqueeze(0).avg_pool2d(REDUCTION, REDUCTION, 0, false, true, None).squeeze_dim(0);
-            let share = |mask: Tensor| mask.to_kind(Kind::Float).mean(Kind::Double).double_value(&[]);
+            let counted = view.mask_or_ones().to_float().ge(0.5).to_kind(Kind::Float);
+            let all = counted.sum(Kind::Double).double_value(&[]).max(1.);
+            let share = |mask: Tensor| {
+                (mask.to_kind(Kind::Float) * &counted).sum(Kind::Double).double_value(&[]) / all
+            };
+            let reduce = |image: &Tensor| {
+                image.unsqueeze(0).avg_pool2d(REDUCTION, REDUCTION, 0, false, true, None).squeeze_dim(0)
+            };
+            let edges = edge_gradient(&gray, &counted);
+            let reduced = edge_gradient(&reduce(&gray), &reduce(&counted));
             let (dark, bright) = CLIPPED;
             PhotoQuality {
                 name: view.name.clone(),
-                sharpness: edge_gradient(&gray) / edge_gradient(&reduced).max(1e-6),
+                sharpness: edges / reduced.max(1e-6),
                 too_dark: share(gray.le(dark)),
                 too_bright: share(gray.ge(bright)),
                 contradicting: None,
@@ -69,14 +76,25 @@ impl PhotoQuality {
     }
 }
 
-/// Returns the gradient in gray values per pixel that the steepest edges of an image [1, H, W] have.
-fn edge_gradient(gray: &Tensor) -> f64 {
+/// Returns the gradient in gray values per pixel that the steepest edges of an image [1, H, W] have, between pixels that count as a whole:
+/// where `counted` [1, H, W] is 1.
+fn edge_gradient(gray: &Tensor, counted: &Tensor) -> f64 {
     let [_, height, width] = gray.size()[..] else { unreachable!("an image") };
-    let difference = |dim: i64, side: i64| gray.narrow(dim, 1, side - 1) - gray.narrow(dim, 0, side - 1);
-    let (x, y) =
-        (difference(2, width).narrow(1, 0, height - 1), difference(1, height).narrow(2, 0, width - 1));
-    let squares = (x.square() + y.square()).view([-1]);
-    let count = ((squares.numel() as f64 * EDGES) as i64).max(1);
+    let corner = |image: &Tensor, dim: i64, first: i64| {
+        let [rows, columns] = if dim == 1 { [first, 0] } else { [0, first] };
+        image.narrow(1, rows, height - 1).narrow(2, columns, width - 1)
+    };
+    let difference = |dim: i64| corner(gray, dim, 1) - corner(gray, dim, 0);
+    let is_counted = [corner(counted, 1, 0), corner(counted, 1, 1), corner(counted, 2, 1)]
+        .into_iter()
+        .reduce(|a, b| a.minimum(&b))
+        .expect("three corners")
+        .ge(1.);
+    let squares = (difference(1).square() + difference(2).square()).masked_select(&is_counted);
+    let count = (squares.numel() as f64 * EDGES).ceil() as i64;
+    if count == 0 {
+        return 0.;
+    }
     let (steepest, _) = squares.topk(count, 0, true, false);
     steepest.mean(Kind::Double).sqrt().double_value(&[])
 }

@@ -3,11 +3,11 @@
 use super::known_depths::KnownDepths;
 use super::options::RefineOptions;
 use crate::data::{
-    Capture, MIN_SHORTER_SIDE, MIN_SIDE, PhotoSize, Pixels, View, ViewBatch, load_views, select_views,
+    Capture, MIN_SHORTER_SIDE, PhotoSize, Pixels, View, ViewBatch, check_sizes, load_views, select_views,
     view_matrices,
 };
 use crate::error::{Error, Result};
-use crate::scene::{Camera, ImageSize, Intrinsics};
+use crate::scene::{Camera, Intrinsics};
 use crate::stereo::{DepthMap, are_near_duplicates, pool_masked};
 use rand::Rng;
 use rand::seq::index::sample;
@@ -24,7 +24,7 @@ const NEARLY_EQUAL: f64 = 1e-4;
 /// Reads the photos of `indices` at `size`. `should_continue` is called with the number of photos read so far, and ends the work if it returns `false`.
 ///
 /// # Errors
-/// Fails like [`Capture::load`], if a photo has fewer than [`MIN_SIDE`] pixels along a side, or if `should_continue` ends the work before
+/// Fails like [`Capture::load`], if a photo has fewer than [`MIN_SIDE`](crate::data::MIN_SIDE) pixels along a side, or if `should_continue` ends the work before
 /// all photos are read.
 pub(super) fn load_photos(
     capture: &Capture,
@@ -34,14 +34,7 @@ pub(super) fn load_photos(
 ) -> Result<Vec<View>> {
     let cameras = capture.cameras();
     let size_of = |index: usize| size.resized(&cameras[index]);
-    for &index in indices {
-        let ImageSize { width, height } = size.of(&cameras[index]);
-        if width.min(height) < MIN_SIDE {
-            let field = format!("the size of {}", capture.names().nth(index).unwrap_or_default());
-            let expected = format!("{MIN_SIDE} pixels or more along each side");
-            return Err(Error::input(capture.file(), field, format!("{width}×{height}"), expected));
-        }
-    }
+    check_sizes(capture, indices, size)?;
     let mut views = vec![];
     for some in indices.chunks(READ_AT_ONCE) {
         if !should_continue(views.len()) {

@@ -537,7 +537,8 @@ impl<'a> RefineSession<'a> {
             let line = "the exposures of neighboring photos differ, and all are corrected";
             self.warn(&format!("{}: {line}: {min:.2} to {max:.2} times the average", self.capture.name));
         }
-        (self.depth_maps, self.quality) = (depth_maps, quality);
+        self.quality = quality.map(|quality| quality.in_world(&self.frame));
+        self.depth_maps = depth_maps;
         self.log_exposures = log_exposures;
         Ok(Some(gaussians.to_device(self.options.device)))
     }

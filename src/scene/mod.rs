@@ -8,7 +8,7 @@ mod rays;
 pub(crate) use gaussians::sigmoid;
 pub use gaussians::{Gaussians, RawGaussians, splat_frame};
 pub use globalsplat_capture::{
-    Camera, ImageSize, Intrinsics, LocalFrame, Normalization, Similarity, Upright, estimate_upright,
+    Camera, ImageSize, Intrinsics, LocalFrame, Normalization, Similarity, Upright, estimate_upright, look_at,
     normalize, orbit_around_cameras, orbit_around_point, pose_to_rows, smooth_path,
 };
 pub(crate) use globalsplat_splat_file::SH_C0;

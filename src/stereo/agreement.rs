@@ -1,12 +1,12 @@
-//! Whether a photo looks as the depths of another one predict: the test of their poses that neither has been fitted to.
+//! Test of poses by photos: a photo has to look as the depths of another one predict.
 
 use super::depth_search::{SmallPhoto, pixels_between};
-use super::sweep::{DepthMap, PlaneSweepOutput, numbers};
+use super::sweep::{DepthMap, PlaneSweepOutput, numbers, truths};
 use super::view_selection::pixel_and_depth;
 use crate::scene::Camera;
 use glam::DVec3;
 
-/// Half of a patch's side in pixels, without the pixel in the middle.
+/// Radius of a patch, whose side has 2 · `RADIUS` + 1 pixels.
 const RADIUS: usize = 3;
 /// Distance in pixels between the centers of compared patches.
 const STEP: usize = 2;
@@ -24,7 +24,7 @@ const MIN_COSINE: f64 = 0.866;
 /// Downscaled photo that others are compared with.
 pub(crate) struct ComparablePhoto {
     pub camera: Camera,
-    /// Gray values, row by row.
+    /// Gray values, row by row; not a number where the photo is masked out.
     gray: Vec<f32>,
     /// Depths of the pixels on which photos agree, infinite for others; `None` if no depth of the photo is known.
     depths: Option<Vec<f32>>,
@@ -33,10 +33,13 @@ pub(crate) struct ComparablePhoto {
 impl ComparablePhoto {
     /// Returns the photos of a plane sweep, in their order.
     pub fn of_sweep(swept: &PlaneSweepOutput) -> Vec<Self> {
-        let photo = |photo: &SmallPhoto| ComparablePhoto {
-            camera: photo.camera,
-            gray: numbers(&photo.gray),
-            depths: None,
+        let photo = |photo: &SmallPhoto| {
+            let mut gray = numbers(&photo.gray);
+            if let Some(counted) = photo.counted() {
+                let masked_out = gray.iter_mut().zip(truths(&counted)).filter(|(_, is_counted)| !is_counted);
+                masked_out.for_each(|(value, _)| *value = f32::NAN);
+            }
+            ComparablePhoto { camera: photo.camera, gray, depths: None }
         };
         let mut photos: Vec<Self> = swept.photos.iter().map(photo).collect();
         for (index, map) in &swept.depth_maps {
@@ -52,7 +55,8 @@ impl ComparablePhoto {
         let project = pixel_and_depth(&self.camera);
         move |position| {
             project(position).is_some_and(|(pixel, z)| {
-                self.depths.as_ref().is_none_or(|depths| z <= OCCLUDED * f64::from(depths[pixel]))
+                self.gray[pixel].is_finite()
+                    && self.depths.as_ref().is_none_or(|depths| z <= OCCLUDED * f64::from(depths[pixel]))
             })
         }
     }
@@ -79,7 +83,7 @@ pub(crate) struct SurfacePatch {
     pub is_sure: bool,
 }
 
-/// How well another photo agrees with the surfaces of a photo.
+/// Agreement of another photo with the surfaces of a photo.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Agreement {
     /// Fraction of the patches whose surface the other photo shows from a similar direction, of those that count.
@@ -149,6 +153,9 @@ impl PhotoSurface {
                     counts[1] += 1;
                 }
             }
+        }
+        if right[1] == 0 {
+            return Agreement { overlap: 0., kappa: 0. };
         }
         let [right, chance] = [right, wrong].map(|[alike, all]| alike as f64 / f64::from(all.max(1) as u32));
         Agreement { overlap, kappa: (right - chance) / (1. - chance).max(1e-6) }

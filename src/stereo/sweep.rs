@@ -268,6 +268,12 @@ impl DepthMap {
         numbers(&self.depth)
     }
 
+    /// Returns the median depth of the pixels that count.
+    pub fn median_depth(&self) -> f64 {
+        let depths = self.counted.as_ref().map(|counted| self.depth.masked_select(counted));
+        depths.as_ref().unwrap_or(&self.depth).median().double_value(&[])
+    }
+
     /// Returns the photo's values, channel by channel.
     pub fn colors(&self) -> Vec<f32> {
         numbers(&self.image)

@@ -79,7 +79,7 @@ fn convert_reports_the_loss() {
 fn convert_turns_upright_and_scales_to_a_length() {
     let sandbox = Sandbox::new();
     let matrix = |report: &Value| {
-        let rows: [[f64; 4]; 4] = serde_json::from_value(report["transform"].clone()).unwrap();
+        let rows: [[f64; 4]; 4] = serde_json::from_value(report["transform"]["matrix"].clone()).unwrap();
         DMat4::from_cols_array_2d(&rows).transpose()
     };
     let tilt = "convert @room/truth.ply @turned.ply --rotate 20,-40,100 --translate 1,2,3";

@@ -21,7 +21,7 @@ export class Measure {
     canvas.addEventListener("pointerdown", (event) => (this.down = event));
     canvas.addEventListener("pointerup", (event) => {
       const isClick = this.down && Math.hypot(event.clientX - this.down.clientX, event.clientY - this.down.clientY) <= CLICK;
-      if (this.isOn && isClick && event.button === 0) this.pick(event.clientX, event.clientY);
+      if (this.isOn && isClick && event.isPrimary && event.button === 0 && this.stage.splat) this.pick(event.clientX, event.clientY);
     });
     this.update();
   }

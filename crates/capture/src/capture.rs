@@ -480,7 +480,10 @@ impl Capture {
     pub fn upright(&self) -> Option<Upright> {
         let text = std::fs::read_to_string(self.record()?).ok()?;
         let mut record: serde_json::Value = serde_json::from_str(&text).ok()?;
-        serde_json::from_value(record["report"]["transform"].take()).ok()
+        // Models that aren't connected to the largest one are as COLMAP has left them.
+        let is_largest = record.pointer("/report/registered")?.as_u64()? == self.frames.len() as u64;
+        let transform = record.pointer_mut("/report/transform")?.take();
+        is_largest.then(|| serde_json::from_value(transform).ok()).flatten()
     }
 
     /// Reads the views `indices`, fitted to `size`, or at their own size if it is `None`. A photo is decoded once for all of its views.

@@ -25,8 +25,8 @@ pub use formats::transforms_json::write_transforms_json;
 pub use geo::{GEO_FILE, GeoPosition, read_geo_positions, to_east_north_up};
 pub use geometry::{
     Camera, ImageSize, Intrinsics, LocalFrame, Normalization, PositionFit, Similarity, UpSource, Upright,
-    check_pose, estimate_upright, fit_positions, normalize, orbit_around_cameras, orbit_around_point,
-    pose_to_rows, smooth_path,
+    check_pose, estimate_upright, fit_positions, look_at, normalize, orbit_around_cameras,
+    orbit_around_point, pose_to_rows, smooth_path,
 };
 pub use globalsplat_files::{Error, Result};
 pub use holdout::Holdout;

@@ -109,7 +109,10 @@ fn make_or_continue(
             matching => matching,
         },
         is_upright: !options.keeps_coordinates,
-        positions: if is_video { BTreeMap::new() } else { find_positions(photos, &found)? },
+        positions: match is_video || options.keeps_coordinates {
+            true => BTreeMap::new(),
+            false => find_positions(photos, &found)?,
+        },
         masks: find_photo_masks(photos, &found, options.masks.as_deref(), out, old.as_ref())?,
         found,
         ..Record::default()

@@ -5,6 +5,7 @@ use super::eigen::symmetric_eigen;
 use fastrand::Rng;
 use glam::{DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
+use std::f64::consts::PI;
 
 /// Number of triples of positions that are tried. If half of the positions are outliers, all of them hit one with a probability of 1e-23.
 const TRIPLES: usize = 400;
@@ -47,7 +48,8 @@ impl PositionFit {
 
 /// Returns the similarity that maps camera centers to `positions` of the same cameras in metres, of which nearly half may be wrong: the one of those
 /// through three of them with the least median distance (Rousseeuw, *Least Median of Squares Regression*, 1984), fitted to its inliers.
-/// Returns `None` for fewer than 3 positions.
+/// Returns `None` for fewer than 3 positions, or if those that agree are
+/// all the same.
 pub fn fit_positions(centers: &[DVec3], positions: &[DVec3]) -> Option<(Similarity, PositionFit)> {
     let pairs: Vec<(DVec3, DVec3)> = centers.iter().copied().zip(positions.iter().copied()).collect();
     if pairs.len() < 3 {
@@ -79,7 +81,11 @@ pub fn fit_positions(centers: &[DVec3], positions: &[DVec3]) -> Option<(Similari
     let along = error / (3. * count).sqrt();
     let across = symmetric_eigen(covariance)[1].0.max(0.).sqrt();
     let (positions, inliers) = (pairs.len(), inliers.len());
-    let (scale_error, up_error) = (2. * along / spread, along / across);
+    if spread == 0. {
+        return None;
+    }
+    // Positions on a line leave any angle.
+    let (scale_error, up_error) = (2. * along / spread, (along / across).min(PI));
     Some((to, PositionFit { positions, inliers, error, spread, scale_error, up_error }))
 }
 
@@ -182,7 +188,7 @@ mod tests {
             assert!(!fit.is_reliable(), "{fit:?}");
         }
         let (centers, _) = walk(&mut random, 10, 12., 0.);
-        assert!(!fit_positions(&centers, &[DVec3::ONE; 10]).unwrap().1.is_reliable());
+        assert!(fit_positions(&centers, &[DVec3::ONE; 10]).is_none());
         assert!(!fit_positions(&[DVec3::ONE; 10], &centers).unwrap().1.is_reliable());
         assert!(fit_positions(&centers[..2], &centers[..2]).is_none());
     }

@@ -202,7 +202,7 @@ pub fn pose_to_rows(pose: &DMat4) -> [f64; 16] {
 }
 
 /// Returns the camera-to-world pose of a camera at `eye` that looks at `target`, with its y axis as close to `down` as possible.
-pub(super) fn look_at(eye: DVec3, target: DVec3, down: DVec3) -> DMat4 {
+pub fn look_at(eye: DVec3, target: DVec3, down: DVec3) -> DMat4 {
     let forward = (target - eye).normalize();
     let right = down.cross(forward).normalize();
     let down = forward.cross(right);

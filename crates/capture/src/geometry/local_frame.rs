@@ -56,6 +56,11 @@ impl LocalFrame {
         (point - self.origin) / self.scale
     }
 
+    /// Converts a local point to world coordinates.
+    pub fn point_to_world(&self, point: DVec3) -> DVec3 {
+        self.origin + self.scale * point
+    }
+
     /// Converts a camera in world coordinates to local coordinates. Camera coordinates, and so depths, are then in local units; the
     /// pose stays rigid.
     pub fn camera_to_local(&self, camera: &Camera) -> Camera {

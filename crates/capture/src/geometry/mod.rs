@@ -9,7 +9,7 @@ mod paths;
 mod upright;
 
 pub use align::{PositionFit, fit_positions};
-pub use camera::{Camera, ImageSize, Intrinsics, check_pose, nearest_rigid_of_scaled, pose_to_rows};
+pub use camera::{Camera, ImageSize, Intrinsics, check_pose, look_at, nearest_rigid_of_scaled, pose_to_rows};
 pub use local_frame::LocalFrame;
 pub use normalize::{Normalization, Similarity, normalize};
 pub use paths::{orbit_around_cameras, orbit_around_point, smooth_path};

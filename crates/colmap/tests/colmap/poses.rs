@@ -155,10 +155,12 @@ fn captures_are_upright_and_in_metres_if_positions_are_known() {
     let (report, steps) = fixture.make_steps(&options);
     let (angle, scale, photos) = compare(&report);
     assert!(report.transform.unwrap().is_metric && steps == [Step::Poses].into(), "{steps:?} {report}");
-    assert_eq!(photos, Some(Some(11)));
+    // The wrong one is left out, and of the others at most those farthest off, which differ between COLMAP's runs.
+    assert!(photos.flatten().is_some_and(|count| (9..=11).contains(&count)), "{photos:?}");
     assert!((scale * 0.9996 - 1.).abs() < 0.01 && angle < 2., "{scale} {angle}°");
     let text = report.to_string();
-    assert!(text.contains("; in metres by the positions of 11 of 12 photos (error 0."), "{text}");
+    assert!(text.contains("; in metres by the positions of "), "{text}");
+    assert!(text.contains(" of 12 photos (error 0."), "{text}");
     assert!(report.other_files.is_none(), "{text}");
 
     fs::write(fixture.photos.join("geo.txt"), "EPSG:4326\nother.png 7 48\n").unwrap();
