@@ -242,7 +242,7 @@ impl CaptureQuality {
         let percentage = percent(self.agreeing);
         // Photos from one place look alike at an infinite depth, or can't be compared at all.
         let is_one_place = parallax == Some(Verdict::WillFail)
-            && (agreeing != Some(Verdict::WillFail) || connections.groups.len() == count);
+            && (agreeing != Some(Verdict::WillFail) || self.agreeing == 0.);
         if is_one_place {
             let place = "the photos were taken from one place, which shows no depth: walk instead of turning";
             add(parallax, place.into());
