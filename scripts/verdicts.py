@@ -14,7 +14,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image, ImageFilter
 
 PROGRAM = Path(__file__).parents[1] / "target/release/globalsplat"
@@ -72,7 +71,9 @@ def turned(photos: list[Photo], degrees: float, *, in_place: bool) -> list[Photo
     """Turns the poses of the second half of the photos, each about itself or all about the center of all cameras."""
     axis = np.array([0.3, 1.0, 0.2]) / np.linalg.norm([0.3, 1.0, 0.2])
     cross = np.cross(np.eye(3), -axis)
-    rotation = torch.linalg.matrix_exp(torch.from_numpy(np.radians(degrees) * cross)).numpy()
+    angle = np.radians(degrees)
+    # Rodrigues' formula.
+    rotation = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
     center = np.mean([pose[:3, 3] for _, pose, _ in photos], axis=0)
     result = []
     for index, (path, pose, lens) in enumerate(photos):

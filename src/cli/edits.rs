@@ -15,12 +15,22 @@ use std::path::PathBuf;
 enum EditArgument {
     Edit(SplatEdit),
     Upright,
-    /// One of the three values of `--length`.
-    Numbers(Vec<f64>),
-    /// These values.
-    Length(Vec<EditArgument>),
+    /// Values of `--length`, each its numbers.
+    Length(Vec<Vec<f64>>),
     PruneUnseen(PathBuf),
     Merge(PathBuf),
+}
+
+impl EditArgument {
+    /// Returns the values of both arguments, if these are a length's, or else the second argument.
+    fn joined(self, other: Self) -> Self {
+        match (self, other) {
+            (EditArgument::Length(first), EditArgument::Length(second)) => {
+                EditArgument::Length([first, second].concat())
+            }
+            (_, other) => other,
+        }
+    }
 }
 
 /// Name of every option, name of its value, and help.
@@ -110,7 +120,7 @@ fn parse(name: &str, text: &str) -> Result<EditArgument, String> {
             let point = numbers::<3>(text).map(Vec::from);
             let number = point.or_else(|_| Ok::<_, String>(vec![positive(text)?]));
             let expected = "expected two points as 1,2,3 and the distance between them, above 0";
-            return number.map(EditArgument::Numbers).map_err(|_| expected.into());
+            return number.map(|numbers| EditArgument::Length(vec![numbers])).map_err(|_| expected.into());
         }
         "prune-unseen" => return Ok(EditArgument::PruneUnseen(text.into())),
         "merge" => return Ok(EditArgument::Merge(text.into())),
@@ -155,12 +165,9 @@ fn parse_box(text: &str) -> Result<SplatEdit, String> {
 }
 
 /// Returns the scale with which the distance between two points is a length, from the values of `--length`.
-fn scale_to_length(values: &[EditArgument]) -> Result<SplatEdit, String> {
-    let values = values.iter().map(|value| match value {
-        EditArgument::Numbers(numbers) => &numbers[..],
-        _ => &[],
-    });
-    let [[ax, ay, az], [bx, by, bz], [length]] = values.collect::<Vec<_>>()[..] else {
+fn scale_to_length(values: &[Vec<f64>]) -> Result<SplatEdit, String> {
+    let [[ax, ay, az], [bx, by, bz], [length]] = values.iter().map(Vec::as_slice).collect::<Vec<_>>()[..]
+    else {
         return Err("expected two points as 1,2,3 and the distance between them".into());
     };
     let distance = DVec3::new(*ax, *ay, *az).distance(DVec3::new(*bx, *by, *bz));
@@ -190,8 +197,8 @@ fn rotation_from_up(up: &str) -> Result<DQuat, String> {
 pub struct Edits(Vec<(String, EditArgument)>);
 
 impl Edits {
-    /// Reads the files of the edits, and returns each edit with its option. `cameras` are those of `--scene`. The files are added to `inputs`; `warn` receives the warnings of the
-    /// splats that are read.
+    /// Reads the files of the edits, and returns each edit with its option. `cameras` are those of `--scene`. The files are added to `inputs`;
+    /// `warn` receives the warnings of the splats that are read.
     pub fn read(
         &self,
         cameras: Option<Vec<Camera>>,
@@ -201,7 +208,6 @@ impl Edits {
         let mut read = |option: &str, argument: &EditArgument| -> crate::Result<SplatEdit> {
             Ok(match argument {
                 EditArgument::Edit(edit) => edit.clone(),
-                EditArgument::Numbers(_) => unreachable!("numbers are the values of a length"),
                 EditArgument::Length(values) => {
                     scale_to_length(values).map_err(|why| Error::request(format!("{option}: {why}")))?
                 }
@@ -265,13 +271,10 @@ impl FromArgMatches for Edits {
             let groups = matches.get_occurrences::<(String, EditArgument)>(name).into_iter().flatten();
             let mut places = matches.indices_of(name).into_iter().flatten();
             for group in groups {
-                let (texts, arguments): (Vec<&str>, Vec<&EditArgument>) =
-                    group.map(|(text, argument)| (&text[..], argument)).unzip();
+                let (texts, arguments): (Vec<&str>, Vec<EditArgument>) =
+                    group.map(|(text, argument)| (&text[..], argument.clone())).unzip();
                 let place = places.nth(texts.len() - 1);
-                let argument = match arguments[..] {
-                    [argument] => argument.clone(),
-                    _ => EditArgument::Length(arguments.into_iter().cloned().collect()),
-                };
+                let argument = arguments.into_iter().reduce(EditArgument::joined).expect("a value");
                 let text = match &texts.join(" ")[..] {
                     "" => format!("--{name}"),
                     text => format!("--{name}={text}"),

@@ -27,7 +27,7 @@ pub use globalsplat_synth::SyntheticDataset;
 pub use loading::{BadData, Batch, BatchShard, DataLoader, LoadedScene, SceneGroups, TrainingScenes};
 #[cfg(feature = "cli")]
 pub(crate) use nerf_writer::write_nerf_capture;
-pub(crate) use view::{MIN_SHORTER_SIDE, check_sizes};
+pub(crate) use view::{MIN_SHORTER_SIDE, read_in_batches};
 pub use view::{MIN_SIDE, PhotoSize, Pixels, View, load_all_views, load_views, tensor_from_planes};
 #[cfg(test)]
 pub(crate) use view::{WALL_SIDE, wall};

@@ -81,6 +81,8 @@ pub(crate) const MIN_SHORTER_SIDE: u32 = 32;
 
 /// Minimum side in pixels of a photo that is scored or matched: the side of the SSIM window (spec 9.4).
 pub const MIN_SIDE: u32 = 11;
+/// Number of photos that are read between two calls of `should_continue`.
+const READ_AT_ONCE: usize = 8;
 /// Maximum side in pixels of a photo.
 const MAX_SIDE: u32 = 16_384;
 
@@ -223,11 +225,18 @@ impl View {
     }
 }
 
-/// Checks that the photos `indices` of `capture`, loaded at `size`, have at least [`MIN_SIDE`] pixels along each side.
+/// Reads the photos `indices` of `capture` at `size`, a few at a time, and passes them to `use_views` in their order. `should_continue` is
+/// called with the number of photos read so far. Returns `false` if it has ended the work.
 ///
 /// # Errors
-/// Returns an error that names the first smaller one.
-pub(crate) fn check_sizes(capture: &Capture, indices: &[usize], size: PhotoSize) -> Result<()> {
+/// Fails like [`Capture::load`], and if a photo has fewer than [`MIN_SIDE`] pixels along a side, before any is read.
+pub(crate) fn read_in_batches(
+    capture: &Capture,
+    indices: &[usize],
+    size: PhotoSize,
+    mut should_continue: impl FnMut(usize) -> bool,
+    mut use_views: impl FnMut(Vec<View>),
+) -> Result<bool> {
     let cameras = capture.cameras();
     for &index in indices {
         let ImageSize { width, height } = size.of(&cameras[index]);
@@ -237,7 +246,17 @@ pub(crate) fn check_sizes(capture: &Capture, indices: &[usize], size: PhotoSize)
             return Err(Error::input(capture.file(), field, format!("{width}×{height}"), expected));
         }
     }
-    Ok(())
+    let size_of = |index: usize| size.resized(&cameras[index]);
+    for (batch, some) in indices.chunks(READ_AT_ONCE).enumerate() {
+        if !should_continue(batch * READ_AT_ONCE) {
+            return Ok(false);
+        }
+        // Photos of one size are loaded together, as they share the lens undistortion.
+        for group in some.chunk_by(|&a, &b| size_of(a) == size_of(b)) {
+            use_views(load_views(capture, group, size_of(group[0]))?);
+        }
+    }
+    Ok(true)
 }
 
 /// Reads the views `indices` of `capture` like [`Capture::load`], fitted to `size`, or at their own size if it is `None`.

@@ -1,6 +1,7 @@
 //! File formats: splats, weights (safetensors), images, videos and TensorBoard event files. Files appear complete or not at all.
 
 mod event_file;
+mod html;
 mod images;
 mod splat;
 mod video;
@@ -21,6 +22,7 @@ pub use globalsplat_splat_file::{
 };
 
 pub use globalsplat_capture::{decode_photo, encode_photo, read_image};
+pub use html::html_page;
 pub use images::{
     Mosaic, check_writable_png, is_png_name, jpeg_data_url, rgb_from_tensor, tensor_from_rgb,
     tile_horizontally, tiled_size, write_png,

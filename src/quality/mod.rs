@@ -10,7 +10,7 @@ pub use coverage::NextPhoto;
 pub use page::write_quality_page;
 pub use photo::PhotoQuality;
 
-use crate::data::{Capture, PhotoSize, View, check_sizes, load_views, read_points};
+use crate::data::{Capture, PhotoSize, View, read_in_batches, read_points};
 use crate::error::{Error, Result};
 use crate::scene::{Camera, LocalFrame};
 use crate::stereo::{
@@ -124,34 +124,24 @@ impl CaptureQuality {
         registration: Option<Registration>,
         mut should_continue: impl FnMut(usize) -> bool,
     ) -> Result<Option<Self>> {
-        let (cameras, size) = (capture.cameras(), PhotoSize::Within(MEASURED_SIDE));
-        check_sizes(capture, &(0..cameras.len()).collect::<Vec<_>>(), size)?;
+        let count = capture.len();
+        let (indices, size) = ((0..count).collect::<Vec<_>>(), PhotoSize::Within(MEASURED_SIDE));
         let mut measured = vec![];
-        let count = rayon::current_num_threads();
-        for first in (0..cameras.len()).step_by(count) {
-            if !should_continue(first) {
-                return Ok(None);
-            }
-            let indices: Vec<usize> = (first..cameras.len().min(first + count)).collect();
-            for some in indices.chunk_by(|&a, &b| size.resized(&cameras[a]) == size.resized(&cameras[b])) {
-                let views = load_views(capture, some, size.resized(&cameras[some[0]]))?;
-                let counted = views.iter().filter(|view| !view.is_masked_out());
-                measured.extend(
-                    counted.map(|view| (PhotoQuality::measure(view), view.to_small_photo(SWEEP_SIDE))),
-                );
-            }
+        let measure = |views: Vec<View>| {
+            let counted = views.iter().filter(|view| !view.is_masked_out());
+            measured
+                .extend(counted.map(|view| (PhotoQuality::measure(view), view.to_small_photo(SWEEP_SIDE))));
+        };
+        if !read_in_batches(capture, &indices, size, &mut should_continue, measure)? {
+            return Ok(None);
         }
         if measured.len() < 2 {
             let field = "the number of photos that aren't masked out";
             return Err(Error::input(capture.file(), field, measured.len(), "2 or more"));
         }
         let (photos, small): (Vec<PhotoQuality>, Vec<SmallPhoto>) = measured.into_iter().unzip();
-        let mut is_ended = false;
-        let swept = sweep(small, &read_points(capture)?, |_| {
-            is_ended |= !should_continue(cameras.len());
-            !is_ended
-        });
-        Ok((!is_ended).then(|| CaptureQuality::new(photos, registration, &swept)))
+        let swept = sweep(small, &read_points(capture)?, |_| should_continue(count));
+        Ok(swept.is_complete.then(|| CaptureQuality::new(photos, registration, &swept)))
     }
 
     /// Measures the quality of the capture of `views`, whose depths are `swept`.

@@ -3,10 +3,10 @@
 use super::{CaptureQuality, NextPhoto, PhotoQuality, Verdict};
 use crate::data::{Capture, PhotoSize, load_views};
 use crate::error::Result;
-use crate::io::{jpeg_data_url, write_file};
+use crate::io::{html_page, jpeg_data_url, write_file};
 use crate::scene::Camera;
 use glam::{DVec2, DVec3};
-use maud::{DOCTYPE, Markup, PreEscaped, html};
+use maud::{Markup, html};
 use std::collections::HashMap;
 use std::path::Path;
 
@@ -40,33 +40,20 @@ pub fn write_quality_page(path: &Path, capture: &Capture, quality: &CaptureQuali
         Verdict::Usable => "usable",
         Verdict::WillFail => "fails",
     };
-    let page = html! {
-        (DOCTYPE)
-        html lang="en" {
-            head {
-                meta charset="utf-8";
-                meta name="viewport" content="width=device-width, initial-scale=1";
-                meta name="color-scheme" content="light dark";
-                link rel="icon" href="data:,";
-                title { (title) }
-                style { (PreEscaped(STYLE)) }
-            }
-            body {
-                main {
-                    p { "Capture " (capture.name) }
-                    h1 class=(class) { (quality.verdict) }
-                    @if !quality.reasons.is_empty() { ul { @for reason in &quality.reasons { li { (reason) } } } }
-                    (figures(quality))
-                    h2 { "From above" }
-                    (map(&cameras, quality))
-                    (next_photos(&quality.next_photos))
-                    @if !doubtful.is_empty() { (doubtful_photos(capture, &indices, quality, &doubtful)?) }
-                    footer { "Written by globalsplat " (env!("CARGO_PKG_VERSION")) "." }
-                }
-            }
+    let body = html! {
+        main {
+            p { "Capture " (capture.name) }
+            h1 class=(class) { (quality.verdict) }
+            @if !quality.reasons.is_empty() { ul { @for reason in &quality.reasons { li { (reason) } } } }
+            (figures(quality))
+            h2 { "From above" }
+            (map(&cameras, quality))
+            (next_photos(&quality.next_photos))
+            @if !doubtful.is_empty() { (doubtful_photos(capture, &indices, quality, &doubtful)?) }
+            footer { "Written by globalsplat " (env!("CARGO_PKG_VERSION")) "." }
         }
     };
-    write_file(path, page.into_string())
+    write_file(path, html_page(&title, STYLE, &body).into_string())
 }
 
 impl PhotoQuality {

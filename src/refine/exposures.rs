@@ -46,9 +46,7 @@ struct Ratio {
 fn measure_exposures(photos: &[SmallPhoto], depth_maps: &[(usize, DepthMap)]) -> Vec<LogGains> {
     let mut exposed: Vec<ExposedPhoto> = photos.iter().map(ExposedPhoto::new).collect();
     for (index, map) in depth_maps {
-        let depths = map.depths().into_iter().zip(map.sure_pixels());
-        let known = depths.map(|(depth, is_sure)| if is_sure { depth } else { f32::INFINITY });
-        exposed[*index].depths = Some(known.collect());
+        exposed[*index].depths = Some(map.sure_depths());
     }
     // Ratios of all photos to each photo that has a depth map.
     let ratios = depth_maps.iter().map(|(index, _)| {

@@ -93,19 +93,15 @@ pub fn gaussians_from_photos(
     side: f64,
     seed: u64,
     exposures: ExposureCorrection,
-    mut should_continue: impl FnMut(usize) -> bool,
+    should_continue: impl FnMut(usize) -> bool,
 ) -> Option<PhotoInit> {
     let photos = views.iter().map(|view| view.to_small_photo(side)).collect();
-    let mut is_ended = false;
-    let swept = sweep(photos, points, |done| {
-        is_ended = !should_continue(done);
-        !is_ended
-    });
+    let swept = sweep(photos, points, should_continue);
     if swept.depth_maps.is_empty() {
         return None;
     }
-    let quality = (!is_ended).then(|| CaptureQuality::of_views(views, &swept));
-    let PlaneSweepOutput { photos, mut depth_maps } = swept;
+    let quality = swept.is_complete.then(|| CaptureQuality::of_views(views, &swept));
+    let PlaneSweepOutput { photos, mut depth_maps, .. } = swept;
     let log_exposures: Option<Vec<LogGains>> = correct_exposures(exposures, &photos, &depth_maps);
     if let Some(gains) = &log_exposures {
         for (index, map) in &mut depth_maps {

@@ -205,7 +205,6 @@ mod tests {
     use crate::render::DEFAULT_EPS2D;
     use crate::scene::RawGaussians;
     use crate::stereo::SWEEP_SIDE;
-
     use globalsplat_csrc::runtime::{RecordedOp, WAITING, computing, record_ops};
     use tch::Device;
 

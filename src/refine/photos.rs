@@ -3,7 +3,7 @@
 use super::known_depths::KnownDepths;
 use super::options::RefineOptions;
 use crate::data::{
-    Capture, MIN_SHORTER_SIDE, PhotoSize, Pixels, View, ViewBatch, check_sizes, load_views, select_views,
+    Capture, MIN_SHORTER_SIDE, PhotoSize, Pixels, View, ViewBatch, read_in_batches, select_views,
     view_matrices,
 };
 use crate::error::{Error, Result};
@@ -14,38 +14,27 @@ use rand::seq::index::sample;
 use std::collections::BTreeMap;
 use tch::{Device, Kind, Tensor};
 
-/// Number of photos that are read between two calls of `should_continue`.
-const READ_AT_ONCE: usize = 8;
 /// Longer side in pixels of the downscaled images by which near duplicates are found.
 const COMPARED_SIDE: f64 = 64.;
 /// Maximum mean squared difference of near duplicates: 40 dB.
 const NEARLY_EQUAL: f64 = 1e-4;
 
-/// Reads the photos of `indices` at `size`. `should_continue` is called with the number of photos read so far, and ends the work if it returns `false`.
+/// Reads the photos of `indices` at `size`. `should_continue` is called with the number of photos read so far, and ends the work if it returns
+/// `false`.
 ///
 /// # Errors
-/// Fails like [`Capture::load`], if a photo has fewer than [`MIN_SIDE`](crate::data::MIN_SIDE) pixels along a side, or if `should_continue` ends the work before
-/// all photos are read.
+/// Fails like [`read_in_batches`], and if `should_continue` ends the work before all photos are read.
 pub(super) fn load_photos(
     capture: &Capture,
     indices: &[usize],
     size: PhotoSize,
-    mut should_continue: impl FnMut(usize) -> bool,
+    should_continue: impl FnMut(usize) -> bool,
 ) -> Result<Vec<View>> {
-    let cameras = capture.cameras();
-    let size_of = |index: usize| size.resized(&cameras[index]);
-    check_sizes(capture, indices, size)?;
     let mut views = vec![];
-    for some in indices.chunks(READ_AT_ONCE) {
-        if !should_continue(views.len()) {
-            return Err(Error::failed("stopped before all photos were read: nothing is written"));
-        }
-        // Photos of one size are loaded together, as they share the lens undistortion.
-        for group in some.chunk_by(|&a, &b| size_of(a) == size_of(b)) {
-            views.extend(load_views(capture, group, size_of(group[0]))?);
-        }
+    match read_in_batches(capture, indices, size, should_continue, |some| views.extend(some))? {
+        true => Ok(views),
+        false => Err(Error::failed("stopped before all photos were read: nothing is written")),
     }
-    Ok(views)
 }
 
 /// Returns the longest side of the photos, in pixels.

@@ -43,9 +43,7 @@ impl ComparablePhoto {
         };
         let mut photos: Vec<Self> = swept.photos.iter().map(photo).collect();
         for (index, map) in &swept.depth_maps {
-            let depths = map.depths().into_iter().zip(map.sure_pixels());
-            let known = depths.map(|(depth, is_sure)| if is_sure { depth } else { f32::INFINITY });
-            photos[*index].depths = Some(known.collect());
+            photos[*index].depths = Some(map.sure_depths());
         }
         photos
     }

@@ -52,6 +52,8 @@ pub(crate) struct PlaneSweepOutput {
     pub photos: Vec<SmallPhoto>,
     /// Depths of some of the views, with the views' indices, in their order.
     pub depth_maps: Vec<(usize, DepthMap)>,
+    /// `true` if the work was not ended early.
+    pub is_complete: bool,
 }
 
 /// Computes depths for the pixels of `photos`. If there are many photos, it processes a subset that together shows what all of them show,
@@ -63,9 +65,10 @@ pub(crate) fn sweep(
     mut should_continue: impl FnMut(usize) -> bool,
 ) -> PlaneSweepOutput {
     let mut sweep = Sweep::new(&photos, points);
-    let mut swept: Vec<(usize, DepthMap)> = vec![];
+    let (mut swept, mut is_complete) = (Vec::<(usize, DepthMap)>::new(), true);
     for index in farthest_first(&sweep.cameras, MAX_DEPTH_MAPS) {
-        if !should_continue(swept.len()) {
+        is_complete = should_continue(swept.len());
+        if !is_complete {
             break;
         }
         let scene = sweep.scene_depth(index);
@@ -90,7 +93,7 @@ pub(crate) fn sweep(
         }
     }
     swept.sort_by_key(|(index, _)| *index);
-    PlaneSweepOutput { photos, depth_maps: swept }
+    PlaneSweepOutput { photos, depth_maps: swept, is_complete }
 }
 
 /// Photos whose depths are searched, one after the other.
@@ -266,6 +269,12 @@ impl DepthMap {
     /// Returns the depth of every pixel, row by row.
     pub fn depths(&self) -> Vec<f32> {
         numbers(&self.depth)
+    }
+
+    /// Returns the depth of every pixel on which the photos agree, and infinity for the others, row by row.
+    pub fn sure_depths(&self) -> Vec<f32> {
+        let depths = self.depths().into_iter().zip(self.sure_pixels());
+        depths.map(|(depth, is_sure)| if is_sure { depth } else { f32::INFINITY }).collect()
     }
 
     /// Returns the median depth of the pixels that count.

@@ -30,8 +30,8 @@ pub struct CaptureOptions {
     /// Folder of masks, named like the photos; by default the folder `masks` among the photos, if there is one. Black pixels have no
     /// features.
     pub masks: Option<PathBuf>,
-    /// `true` to leave the largest model in COLMAP's coordinates. Otherwise it is turned upright, as by [`estimate_upright`](globalsplat_capture::estimate_upright), and is in metres
-    /// if the positions of the photos in their EXIF data, or in a file `geo.txt` among or beside them, agree with it.
+    /// `true` to leave the largest model in COLMAP's coordinates. Otherwise it is turned upright, as by
+    /// [`estimate_upright`](globalsplat_capture::estimate_upright), and is in metres if the positions of the photos in their EXIF data, or in a file `geo.txt` among or beside them, agree with it.
     pub keeps_coordinates: bool,
     /// `true` to use a finished capture as it is, whatever settings it was made with.
     pub keeps_finished: bool,

@@ -7,9 +7,9 @@ mod tables;
 
 use super::evaluation::Evaluation;
 use crate::error::{Error, Result};
-use crate::io::write_file;
+use crate::io::{html_page, write_file};
 use entries::{Entry, absent, count, dataset_name, decimal, entries, finite, swatch, thousands};
-use maud::{DOCTYPE, Markup, PreEscaped, html};
+use maud::{Markup, PreEscaped, html};
 use std::path::{Path, PathBuf};
 use tables::{partial_badge, share};
 
@@ -34,37 +34,24 @@ pub fn write_report(path: &Path, evaluations: &[(PathBuf, Evaluation)]) -> Resul
 
 fn page(entries: &[Entry]) -> Result<Markup> {
     let title = title(entries);
-    Ok(html! {
-        (DOCTYPE)
-        html lang="en" {
-            head {
-                meta charset="utf-8";
-                meta name="viewport" content="width=device-width, initial-scale=1";
-                meta name="color-scheme" content="light dark";
-                // Without this link a browser asks the server for an icon.
-                link rel="icon" href="data:,";
-                title { (title) }
-                style { (PreEscaped(STYLE)) }
-            }
-            body {
-                main {
-                    (heading(&title, entries))
-                    (failures(entries))
-                    (tables::comparisons(entries))
-                    (tables::efficiency(entries))
-                    div.halves { (tables::compactness()) (tables::ablations()) }
-                    (scenes::scenes(entries)?)
-                    footer {
-                        p { "Published rows are those of the GlobalSplat paper (Itkin et al.), as printed there. Its "
-                            "numbers for NoPoSplat and AnySplat were first published by C3G, those for EcoSplat by "
-                            "EcoSplat's authors." }
-                        p { "Written by globalsplat " (env!("CARGO_PKG_VERSION")) "." }
-                    }
-                }
-                script { (PreEscaped(SORTING)) }
+    let body = html! {
+        main {
+            (heading(&title, entries))
+            (failures(entries))
+            (tables::comparisons(entries))
+            (tables::efficiency(entries))
+            div.halves { (tables::compactness()) (tables::ablations()) }
+            (scenes::scenes(entries)?)
+            footer {
+                p { "Published rows are those of the GlobalSplat paper (Itkin et al.), as printed there. Its "
+                    "numbers for NoPoSplat and AnySplat were first published by C3G, those for EcoSplat by "
+                    "EcoSplat's authors." }
+                p { "Written by globalsplat " (env!("CARGO_PKG_VERSION")) "." }
             }
         }
-    })
+        script { (PreEscaped(SORTING)) }
+    };
+    Ok(html_page(&title, STYLE, &body))
 }
 
 /// Returns the title of the page.

@@ -89,11 +89,16 @@ pub fn fit_positions(centers: &[DVec3], positions: &[DVec3]) -> Option<(Similari
     Some((to, PositionFit { positions, inliers, error, spread, scale_error, up_error }))
 }
 
+/// Returns v vᵀ.
+pub(super) fn outer(v: DVec3) -> DMat3 {
+    DMat3::from_cols(v * v.x, v * v.y, v * v.z)
+}
+
 /// Returns the mean of v vᵀ, row by row.
 pub(super) fn covariance(vectors: impl Iterator<Item = DVec3>) -> [[f64; 3]; 3] {
     let (mut sum, mut count) = (DMat3::ZERO, 0.);
     for v in vectors {
-        sum += DMat3::from_cols(v * v.x, v * v.y, v * v.z);
+        sum += outer(v);
         count += 1.;
     }
     (sum * f64::recip(f64::max(count, 1.))).to_cols_array_2d()

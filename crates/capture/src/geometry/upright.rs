@@ -1,6 +1,6 @@
 //! The transform of a world of arbitrary orientation to one in which -y points up and the floor is at y = 0.
 
-use super::align::{PositionFit, covariance, fit_positions};
+use super::align::{PositionFit, covariance, fit_positions, outer};
 use super::eigen::symmetric_eigen;
 use fastrand::Rng;
 use glam::{DMat3, DMat4, DQuat, DVec3};
@@ -126,8 +126,7 @@ impl fmt::Display for Upright {
 /// The cameras' x axes are nearly horizontal: up is the direction that is most perpendicular to them, the smallest eigenvector of Σ wᵢ xᵢ xᵢᵀ
 /// with the weights wᵢ of Tukey's biweight. As far as all cameras look in similar directions, the median of their own up directions decides.
 /// A floor refines this: the plane within three standard deviations of it, at most 25°, that has the most points on it, few below, and the
-/// cameras above. Without a floor, 2 % of the
-/// points are below y = 0, and without points, the mean camera is there.
+/// cameras above. Without a floor, 2 % of the points are below y = 0, and without points, the mean camera is there.
 ///
 /// If the positions agree with the cameras, they determine the scale; and also the vertical direction if they do so more precisely
 /// than the cameras, which needs positions that are far apart and not on a line. Otherwise the scale stays.
@@ -199,11 +198,6 @@ fn up_of_cameras(c2w: &[DMat4]) -> (DVec3, f64) {
         error = ROLL / middle.sqrt();
     }
     (up, error)
-}
-
-/// Returns v vᵀ.
-fn outer(v: DVec3) -> DMat3 {
-    DMat3::from_cols(v * v.x, v * v.y, v * v.z)
 }
 
 /// Returns the point with the least sum of distances to unit vectors, which few wrong ones hardly move, by Weiszfeld's iteration.
